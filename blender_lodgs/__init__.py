@@ -1,0 +1,30 @@
+"""The Blender side of LODGS: the only code that imports bpy.
+
+Each module that Blender must know names its classes in ``CLASSES`` and may have ``register()`` and
+``unregister()`` for handlers, menus and properties. They are registered in the order of ``MODULES`` and
+unregistered in reverse.
+"""
+
+import bpy
+
+from . import commands, jobs, operators, panels, preferences, properties, scenes, viewport
+
+MODULES = (properties, preferences, operators, panels, scenes, viewport, jobs, commands)
+
+
+def register() -> None:
+    """Register every class, then each module's handlers and properties, in order."""
+    for module in MODULES:
+        for cls in getattr(module, "CLASSES", ()):
+            bpy.utils.register_class(cls)
+        if hasattr(module, "register"):
+            module.register()
+
+
+def unregister() -> None:
+    """Undo :func:`register` in reverse order."""
+    for module in reversed(MODULES):
+        if hasattr(module, "unregister"):
+            module.unregister()
+        for cls in reversed(getattr(module, "CLASSES", ())):
+            bpy.utils.unregister_class(cls)

@@ -1,0 +1,71 @@
+"""What differs between Blender versions, each found by asking for the feature, never for the version."""
+
+from __future__ import annotations
+
+import bpy
+
+WIDE_TYPE = (
+    "FLOAT4" if "FLOAT4" in bpy.types.Attribute.bl_rna.properties["data_type"].enum_items else "FLOAT_COLOR"
+)
+"""Attribute type for four plain floats: FLOAT4 from Blender 5.2 on, the equally exact FLOAT_COLOR before."""
+
+
+def new_point_cloud(name: str, count: int) -> bpy.types.PointCloud:
+    """A point-cloud datablock of ``count`` points, all at the origin, without users."""
+    cloud = bpy.data.pointclouds.new(name)
+    if hasattr(cloud, "resize"):
+        cloud.resize(count)
+        return cloud
+    # Before PointCloud.resize, only a conversion makes points. In a scene of its own it meets no mode and
+    # leaves the user's selection alone.
+    bpy.data.pointclouds.remove(cloud)
+    mesh = bpy.data.meshes.new(name)
+    mesh.vertices.add(count)
+    carrier, scene = bpy.data.objects.new(name, mesh), bpy.data.scenes.new(name)
+    scene.collection.objects.link(carrier)
+    with bpy.context.temp_override(
+        scene=scene, view_layer=scene.view_layers[0], active_object=carrier, object=carrier,
+        selected_objects=[carrier], selected_editable_objects=[carrier],
+    ):  # fmt: skip
+        bpy.ops.object.convert(target="POINTCLOUD")
+    cloud = carrier.data
+    assert isinstance(cloud, bpy.types.PointCloud)
+    bpy.data.objects.remove(carrier)
+    bpy.data.scenes.remove(scene)
+    bpy.data.meshes.remove(mesh)
+    cloud.name = name
+    return cloud
+
+
+def _identifier(modifier: bpy.types.NodesModifier, name: str) -> str:
+    return next(
+        item.identifier
+        for item in modifier.node_group.interface.items_tree
+        if item.item_type == "SOCKET" and item.in_out == "INPUT" and item.name == name
+    )
+
+
+def input_path(modifier: bpy.types.NodesModifier, name: str) -> str:
+    """The data path, from the modifier's object, of the group input called ``name``."""
+    identifier, owner = _identifier(modifier, name), f'modifiers["{modifier.name}"]'
+    if hasattr(modifier, "properties"):
+        return f"{owner}.properties.inputs.{identifier}.value"
+    return f'{owner}["{identifier}"]'
+
+
+def get_input(modifier: bpy.types.NodesModifier, name: str):
+    """The value of the group input called ``name``."""
+    identifier = _identifier(modifier, name)
+    if hasattr(modifier, "properties"):
+        return getattr(modifier.properties.inputs, identifier).value
+    return modifier[identifier]
+
+
+def set_input(modifier: bpy.types.NodesModifier, name: str, value) -> None:
+    """Sets the group input called ``name``; the object is evaluated anew."""
+    identifier = _identifier(modifier, name)
+    if hasattr(modifier, "properties"):
+        getattr(modifier.properties.inputs, identifier).value = value
+    else:
+        modifier[identifier] = value
+    modifier.id_data.update_tag()

@@ -1,0 +1,1 @@
+"""Geometry-nodes groups, built in code; each states a rule of ``training.lod.rules``."""

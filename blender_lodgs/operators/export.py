@@ -1,0 +1,153 @@
+"""Exports of a splat scene: the bundle, one plain PLY, a folder of levels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+from bpy_extras.io_utils import ExportHelper
+
+from ...training.errors import LodgsError
+from ...training.splats.bundle import write_bundle, write_folder
+from ...training.splats.ply import write_ply
+from .. import scenes
+from .reporting import saying_errors
+
+
+class _OfLevels:
+    """Operators that need levels say so."""
+
+    @classmethod
+    def poll(cls, context):
+        root = scenes.active_root(context)
+        if root is None or not any(item.exists for item in root.lodgs.levels):
+            cls.poll_message_set("Select a splat scene that has levels")
+            return False
+        return True
+
+
+class _Export(_OfLevels, ExportHelper):
+    """What exports to one PLY have in common: a name after the scene, and the browser's overwrite check."""
+
+    filename_ext = ".ply"
+    filter_glob: bpy.props.StringProperty(default="*.ply", options={"HIDDEN"})
+    suffix = ""
+
+    def invoke(self, context, event):
+        root = scenes.active_root(context)
+        name = bpy.path.clean_name(root.name) + self.suffix + self.filename_ext
+        self.filepath = str(Path(bpy.data.filepath).parent / name) if bpy.data.filepath else name
+        return super().invoke(context, event)
+
+    def _path(self) -> Path:
+        return Path(bpy.path.abspath(self.filepath))
+
+
+class LODGS_OT_export_bundle(_Export, bpy.types.Operator):
+    """Export all levels as one file, which other viewers open showing the finest level"""
+
+    bl_idname = "lodgs.export_bundle"
+    bl_label = "Export Bundle"
+
+    order: bpy.props.EnumProperty(
+        name="First",
+        description="The level that comes first in the file, which is what other viewers show",
+        items=[
+            ("finest_first", "Finest Level", "Other viewers show the finest level"),
+            (
+                "stream",
+                "Coarsest Level",
+                "For streaming: what has arrived so far is a complete coarser scene",
+            ),
+        ],
+    )
+
+    @saying_errors
+    def execute(self, context):
+        bundle = scenes.read_levels(scenes.active_root(context))
+        write_bundle(self._path(), bundle, self.order)
+        self.report({"INFO"}, f"{len(bundle.levels)} levels written to {self._path()}")
+        return {"FINISHED"}
+
+
+class LODGS_OT_export_plain(_Export, bpy.types.Operator):
+    """Export one level, or the splats that are shown now, as a plain splat file for any viewer"""
+
+    bl_idname = "lodgs.export_plain"
+    bl_label = "Export Plain PLY"
+    suffix = "_plain"
+
+    source: bpy.props.EnumProperty(
+        name="Splats",
+        description="What is exported",
+        items=[
+            ("SHOWN", "As Shown", "The splats that the viewport shows now, modifiers applied"),
+            ("LEVEL", "One Level", "All splats of one level, modifiers not applied"),
+        ],
+    )
+    level: bpy.props.IntProperty(name="Level", description="1 is the coarsest", default=1, min=1)
+
+    def draw(self, context):
+        self.layout.use_property_split = True
+        self.layout.prop(self, "source")
+        if self.source == "LEVEL":
+            self.layout.prop(self, "level")
+
+    @saying_errors
+    def execute(self, context):
+        root = scenes.active_root(context)
+        if self.source == "LEVEL":
+            splats = scenes.read_level(root, self.level)
+        else:
+            splats = scenes.shown_splats(context, root)
+        write_ply(self._path(), splats)
+        self.report({"INFO"}, f"{len(splats):,} splats written to {self._path()}")
+        return {"FINISHED"}
+
+
+class LODGS_OT_export_folder(_OfLevels, bpy.types.Operator):
+    """Export every level as its own file; splat-transform makes streamed levels for the web of them"""
+
+    bl_idname = "lodgs.export_folder"
+    bl_label = "Export Folder of Levels"
+
+    directory: bpy.props.StringProperty(
+        name="Folder",
+        description="Folder that receives lod0.ply (the finest), lod1.ply, ...",
+        subtype="DIR_PATH",
+    )
+    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
+    replace: bpy.props.BoolProperty(
+        name="Replace", description="Replace levels that are in the folder already", options={"SKIP_SAVE"}
+    )
+
+    def invoke(self, context, event):
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    @saying_errors
+    def execute(self, context):
+        folder = Path(bpy.path.abspath(self.directory))
+        if not self.replace and any(folder.glob("lod*.ply")):
+            raise LodgsError(f"{folder} already holds levels.", "Choose another folder, or tick Replace.")
+        bundle = scenes.read_levels(scenes.active_root(context))
+        command = write_folder(folder, bundle)
+        self.report({"INFO"}, f"{len(bundle.levels)} levels written. For the web: {command}")
+        return {"FINISHED"}
+
+
+def _menu(self, context):
+    self.layout.operator(LODGS_OT_export_bundle.bl_idname, text="Splat Levels, Bundle (.ply)")
+    self.layout.operator(LODGS_OT_export_plain.bl_idname, text="Splats, Plain (.ply)")
+    self.layout.operator(LODGS_OT_export_folder.bl_idname, text="Splat Levels (folder)")
+
+
+CLASSES = (LODGS_OT_export_bundle, LODGS_OT_export_plain, LODGS_OT_export_folder)
+
+
+def register() -> None:
+    bpy.types.TOPBAR_MT_file_export.append(_menu)
+
+
+def unregister() -> None:
+    bpy.types.TOPBAR_MT_file_export.remove(_menu)

@@ -1,0 +1,71 @@
+"""File > Import > Gaussian Splats, and dropping such files into the 3D viewport."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from .. import scenes
+from .reporting import saying_errors
+
+
+class LODGS_OT_import_splats(bpy.types.Operator):
+    """Import a bundle of levels, or any Gaussian splat PLY as a single level"""
+
+    bl_idname = "lodgs.import_splats"
+    bl_label = "Import Splats"
+    bl_options = {"REGISTER", "UNDO", "PRESET"}
+
+    filepath: bpy.props.StringProperty(
+        name="File", description="Bundle or splat PLY", subtype="FILE_PATH", options={"SKIP_SAVE"}
+    )
+    directory: bpy.props.StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE", "HIDDEN"})
+    files: bpy.props.CollectionProperty(
+        type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE", "HIDDEN"}
+    )
+    filter_glob: bpy.props.StringProperty(default="*.ply", options={"HIDDEN"})
+    upright: bpy.props.BoolProperty(
+        name="Upright",
+        description="Turn the scene so that the file's -Y, which is up in most splat files, is up in Blender",
+        default=True,
+    )
+
+    def invoke(self, context, event):
+        if self.filepath or any(file.name for file in self.files):  # dropped
+            return self.execute(context)
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    @saying_errors
+    def execute(self, context):
+        paths = [Path(self.directory, file.name) for file in self.files if file.name]
+        for path in paths or [Path(self.filepath)]:
+            scenes.import_splats(context, bpy.path.abspath(str(path)), upright=self.upright)
+        return {"FINISHED"}
+
+
+class LODGS_FH_splats(bpy.types.FileHandler):
+    bl_idname = "LODGS_FH_splats"
+    bl_label = "Gaussian Splats (LODGS)"
+    bl_import_operator = LODGS_OT_import_splats.bl_idname
+    bl_file_extensions = ".ply"
+
+    @classmethod
+    def poll_drop(cls, context):
+        return context.area is not None and context.area.type == "VIEW_3D"
+
+
+def _menu(self, context):
+    self.layout.operator(LODGS_OT_import_splats.bl_idname, text="Gaussian Splats (.ply)")
+
+
+CLASSES = (LODGS_OT_import_splats, LODGS_FH_splats)
+
+
+def register() -> None:
+    bpy.types.TOPBAR_MT_file_import.append(_menu)
+
+
+def unregister() -> None:
+    bpy.types.TOPBAR_MT_file_import.remove(_menu)

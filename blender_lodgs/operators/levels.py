@@ -1,0 +1,28 @@
+"""Buttons of the list of levels."""
+
+from __future__ import annotations
+
+import bpy
+
+from .. import scenes
+
+
+class LODGS_OT_show_only_level(bpy.types.Operator):
+    """Show this level everywhere, and no other"""
+
+    bl_idname = "lodgs.show_only_level"
+    bl_label = "Only This One"
+    bl_options = {"REGISTER", "UNDO"}
+
+    level: bpy.props.IntProperty(name="Level", description="1 is the coarsest", default=1, min=1)
+
+    @classmethod
+    def poll(cls, context):
+        return scenes.active_root(context) is not None
+
+    def execute(self, context):
+        scenes.show_only(scenes.active_root(context), self.level)
+        return {"FINISHED"}
+
+
+CLASSES = (LODGS_OT_show_only_level,)

@@ -1,0 +1,37 @@
+"""Look through the cameras of a COLMAP scene."""
+
+from __future__ import annotations
+
+import bpy
+
+from .. import scenes
+from .reporting import saying_errors
+
+
+class LODGS_OT_look_through(bpy.types.Operator):
+    """Look through a camera of the scene, with its photograph and the render in its size"""
+
+    bl_idname = "lodgs.look_through"
+    bl_label = "Look Through"
+    bl_options = {"REGISTER", "UNDO"}
+
+    step: bpy.props.IntProperty(
+        name="Step",
+        description="Views to go on by name from the scene's camera; 0 takes the selected camera",
+        options={"SKIP_SAVE"},
+    )
+
+    @classmethod
+    def poll(cls, context):
+        root = scenes.active_root(context)
+        return root is not None and bool(scenes.views(root))
+
+    @saying_errors
+    def execute(self, context):
+        scenes.look_through(context, scenes.active_root(context), self.step)
+        if context.region_data is not None:
+            context.region_data.view_perspective = "CAMERA"
+        return {"FINISHED"}
+
+
+CLASSES = (LODGS_OT_look_through,)

@@ -1,0 +1,129 @@
+"""Operators that start, stop and find trainings. Each calls one function of ``jobs``."""
+
+from __future__ import annotations
+
+import bpy
+
+from ...training.errors import LodgsError
+from .. import jobs, scenes
+from .reporting import saying_errors
+
+
+class _OnRoot:
+    """What the operators below share: they act on the active scene root."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if scenes.active_root(context) is None:
+            cls.poll_message_set("Select a splat scene, or import a COLMAP folder first")  # type: ignore[attr-defined]
+            return False
+        return True
+
+
+def _root(context: bpy.types.Context) -> bpy.types.Object:
+    root = scenes.active_root(context)
+    if root is None:
+        raise LodgsError("No splat scene is selected.", "Select one, or import a COLMAP folder first.")
+    return root
+
+
+def _follow(operator: bpy.types.Operator, watch: jobs.Watch):
+    """Follow a run: to its end in background, from now on in a window."""
+    jobs.follow(watch)
+    if watch.problem:
+        operator.report({"ERROR"}, watch.problem)
+    return {"FINISHED"} if watch.state in {"running", "done"} else {"CANCELLED"}
+
+
+class LODGS_OT_train(_OnRoot, bpy.types.Operator):
+    bl_idname = "lodgs.train"
+    bl_label = "Train"
+    bl_description = "Train splats with levels of detail from the scene's photographs, while you work on"
+    bl_options = {"UNDO"}
+
+    folder: bpy.props.StringProperty(
+        name="Run Folder",
+        description="Folder of the run; empty: a new one where the settings say",
+        subtype="DIR_PATH",
+        options={"SKIP_SAVE", "PATH_SUPPORTS_BLEND_RELATIVE"},
+    )
+
+    @saying_errors
+    def execute(self, context):
+        return _follow(self, jobs.start(_root(context), self.folder))
+
+
+class LODGS_OT_resume_training(_OnRoot, bpy.types.Operator):
+    bl_idname = "lodgs.resume_training"
+    bl_label = "Resume"
+    bl_description = "Go on with the run where it stopped, with the settings that it began with"
+    bl_options = {"UNDO"}
+
+    @saying_errors
+    def execute(self, context):
+        return _follow(self, jobs.resume(_root(context)))
+
+
+class LODGS_OT_cancel_training(_OnRoot, bpy.types.Operator):
+    bl_idname = "lodgs.cancel_training"
+    bl_label = "Cancel"
+    bl_description = "Ask the trainer to save and stop, so that it can be resumed; again: end it at once"
+
+    @saying_errors
+    def execute(self, context):
+        jobs.cancel(_root(context))
+        return {"FINISHED"}
+
+
+class LODGS_OT_open_run(_OnRoot, bpy.types.Operator):
+    bl_idname = "lodgs.open_run"
+    bl_label = "Open Run"
+    bl_description = "Load the levels of a run folder, and follow the run if it is at work"
+    bl_options = {"UNDO"}
+
+    directory: bpy.props.StringProperty(
+        name="Run Folder", subtype="DIR_PATH", options={"SKIP_SAVE", "PATH_SUPPORTS_BLEND_RELATIVE"}
+    )
+
+    def invoke(self, context, event):
+        if self.directory:
+            return self.execute(context)
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    @saying_errors
+    def execute(self, context):
+        watch = jobs.attach(_root(context), self.directory)
+        jobs.follow(watch)
+        return {"FINISHED"}
+
+
+class LODGS_OT_show_log(_OnRoot, bpy.types.Operator):
+    bl_idname = "lodgs.show_log"
+    bl_label = "Show Log"
+    bl_description = "Show the end of the trainer's log; a text block keeps it"
+
+    def invoke(self, context, event):
+        result = self.execute(context)
+        if result == {"FINISHED"}:
+            return context.window_manager.invoke_popup(self, width=900)
+        return result
+
+    @saying_errors
+    def execute(self, context):
+        jobs.log_text(_root(context))
+        return {"FINISHED"}
+
+    def draw(self, context):
+        text = bpy.data.texts.get(jobs.LOG)
+        for line in (text.lines if text else [])[-20:]:
+            self.layout.label(text=line.body)
+
+
+CLASSES = (
+    LODGS_OT_train,
+    LODGS_OT_resume_training,
+    LODGS_OT_cancel_training,
+    LODGS_OT_open_run,
+    LODGS_OT_show_log,
+)

@@ -1,0 +1,97 @@
+"""The list of levels, and how much detail is shown where."""
+
+from __future__ import annotations
+
+import bpy
+
+from .. import objects, scenes
+
+
+def _columns(row: bpy.types.UILayout, *texts: str) -> None:
+    """Four texts in columns with room for millions of splats."""
+    for text, share in zip(texts, (0.18, 0.4, 0.4), strict=False):
+        row = row.split(factor=share)
+        row.label(text=text)
+    row.label(text=texts[-1])
+
+
+class LODGS_UL_levels(bpy.types.UIList):
+    def draw_item(self, context, layout, data, item, icon, active_data, active_property, index=0, flt_flag=0):
+        row = layout.row(align=True)
+        row.prop(item, "show", text="", icon="HIDE_OFF" if item.show else "HIDE_ON", emboss=False)
+        cloud = item.object.data
+        detail = f"{item.s_min:.2g}" if item.has_s_min else ""
+        _columns(row, str(item.number), f"{len(cloud.points):,}", f"{objects.megabytes(cloud):.1f}", detail)
+        alone = data.mode == "SINGLE" and data.single_level == item.number
+        only = row.operator(
+            "lodgs.show_only_level", text="", icon="SOLO_ON" if alone else "SOLO_OFF", emboss=False
+        )
+        only.level = item.number
+
+    def filter_items(self, context, data, propname):
+        return [self.bitflag_filter_item * item.exists for item in getattr(data, propname)], []
+
+
+class _Panel(bpy.types.Panel):
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "LODGS"
+
+    @classmethod
+    def poll(cls, context):
+        root = scenes.active_root(context)
+        return root is not None and any(item.exists for item in root.lodgs.levels)
+
+
+class LODGS_PT_levels(_Panel):
+    bl_label = "Levels"
+    bl_order = 2
+
+    def draw(self, context):
+        settings = scenes.active_root(context).lodgs
+        row = self.layout.row(align=True)
+        row.label(text="", icon="BLANK1")
+        _columns(row, "Level", "Splats", "MB", "Detail")
+        row.label(text="", icon="BLANK1")
+        rows = min(max(len(settings.levels), 3), 6)
+        self.layout.template_list(
+            "LODGS_UL_levels", "", settings, "levels", settings, "active_level", rows=rows
+        )
+
+
+class LODGS_PT_detail(_Panel):
+    bl_label = "Detail"
+    bl_order = 3
+
+    def draw(self, context):
+        root = scenes.active_root(context)
+        settings, layout = root.lodgs, self.layout
+        by_distance = any(item.has_s_min for item in settings.levels)
+        row = layout.row()
+        row.enabled = by_distance
+        row.prop(settings, "mode", expand=True)
+        if not by_distance:
+            layout.label(text="These levels are not made for distances", icon="INFO")
+
+        column = layout.column()
+        column.use_property_split = True
+        if settings.mode == "SINGLE":
+            column.prop(settings, "single_level")
+        else:
+            both = column.column(align=True)
+            both.prop(settings, "level_start")
+            both.prop(settings, "level_end")
+            column.prop(settings, "gamma", slider=True)
+            column.prop(settings, "eye")
+            if settings.eye == "OBJECT":
+                column.prop(settings, "eye_object")
+            elif settings.eye == "TRAINING":
+                column.prop(settings, "camera_center", text="Position")
+            if context.scene.camera is None:
+                layout.label(text="The scene has no camera", icon="ERROR")
+        column.prop(settings, "tell_levels")
+        shown, everything = scenes.count_shown(context, root)
+        layout.label(text=f"{shown:,} of {everything:,} splats shown")
+
+
+CLASSES = (LODGS_UL_levels, LODGS_PT_levels, LODGS_PT_detail)

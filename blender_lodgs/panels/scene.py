@@ -1,0 +1,47 @@
+"""The Scene panel: bring a scene in, and what the chosen one is."""
+
+from __future__ import annotations
+
+import bpy
+
+from .. import scenes
+
+
+class LODGS_PT_scene(bpy.types.Panel):
+    bl_label = "Scene"
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "LODGS"
+    bl_order = 0
+
+    def draw(self, context):
+        layout = self.layout
+        column = layout.column(align=True)
+        column.operator("lodgs.import_colmap", text="Import Photographs (COLMAP)…", icon="CAMERA_DATA")
+        column.operator("lodgs.import_splats", text="Import Splats…", icon="POINTCLOUD_DATA")
+        root = scenes.active_root(context)
+        if root is None:
+            if scenes.roots(context.scene):
+                layout.label(text="Select one of the splat scenes", icon="INFO")
+            return
+        column = layout.column()
+        column.use_property_split = True
+        column.use_property_decorate = False
+        column.prop(root, "name", text="Name")
+        if root.lodgs.scene_folder:
+            column.prop(root.lodgs, "scene_folder", text="Photographs")
+        row = layout.row(align=True)
+        for name, part in (("Cameras", root.lodgs.cameras), ("Points", root.lodgs.points)):
+            if part is not None:
+                row.prop(part, "hide_viewport", text=name, toggle=True, invert_checkbox=True)
+        there = scenes.views(root)
+        if there:
+            row = layout.row(align=True)
+            row.operator("lodgs.look_through", text="", icon="TRIA_LEFT").step = -1
+            camera = context.scene.camera
+            name = camera.name if camera in there else "Look Through"
+            row.operator("lodgs.look_through", text=name, icon="OUTLINER_DATA_CAMERA").step = 0
+            row.operator("lodgs.look_through", text="", icon="TRIA_RIGHT").step = 1
+
+
+CLASSES = (LODGS_PT_scene,)

@@ -1,0 +1,56 @@
+"""The extension's preferences: which Python trains, and on what."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..training.runs.job import BACKENDS
+from . import environment, extension
+
+_LABELS = {"auto": "Fastest There Is", "cpu": "Processor (CPU)", "cuda": "Graphics Card (CUDA)"}
+_BACKENDS = [(name, _LABELS.get(name, name), "") for name in BACKENDS if name != "reference"]
+
+
+class LodgsPreferences(bpy.types.AddonPreferences):
+    bl_idname = extension.ID
+
+    python: bpy.props.StringProperty(
+        name="Trainer's Python",
+        description="Python outside Blender that has PyTorch; empty: the environment made below",
+        subtype="FILE_PATH",
+    )
+    backend: bpy.props.EnumProperty(
+        name="Train On",
+        description="What draws the splats while training",
+        items=_BACKENDS,
+    )
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.use_property_split = True
+        layout.prop(self, "python")
+        layout.prop(self, "backend")
+        making = environment.making
+        if making is not None and making.running:
+            row = layout.row()
+            row.progress(text=making.message, factor=making.fraction)
+            row.operator("lodgs.cancel_environment", text="", icon="X")
+        else:
+            row = layout.row()
+            row.operator("lodgs.make_environment", icon="IMPORT")
+            row.operator("lodgs.check_environment", icon="CHECKMARK")
+            if making is not None:
+                _say(layout, making.problem or making.message, "ERROR" if making.problem else "INFO")
+        report = environment.report
+        if report is not None:
+            torch = report.versions.get("torch", "")
+            _say(layout, f"Ready to train: PyTorch {torch}" if report.ok else report.python, "INFO")
+            for problem in report.problems:
+                _say(layout, problem, "ERROR")
+
+
+def _say(layout: bpy.types.UILayout, text: str, icon: str) -> None:
+    layout.label(text=text, icon=icon)  # type: ignore[arg-type]
+
+
+CLASSES = (LodgsPreferences,)

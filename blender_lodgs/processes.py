@@ -1,0 +1,76 @@
+"""Programs that work beside Blender: how they are started, and how Blender looks after them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from . import extension
+
+INTERVAL = 0.1
+"""Seconds between two looks at a program."""
+
+
+def environment() -> dict[str, str]:
+    """This process's environment for another Python: without what Blender set for its own.
+
+    Compiled code goes to the user's folder, because the extension's may be read-only.
+    """
+    values = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "__PYVENV_LAUNCHER__"))}
+    cache = extension.user_folder("cache")
+    values.setdefault("NUMBA_CACHE_DIR", str(cache / "numba"))
+    return values | {"PYTHONPYCACHEPREFIX": str(cache / "pycache"), "PYTHONUTF8": "1"}
+
+
+def spawn(command: list[str], log: Path, output: Path) -> subprocess.Popen:
+    """Start a program that outlives Blender, in the extension's folder.
+
+    Args:
+        command: program and arguments.
+        log: file to which its standard error is appended.
+        output: file that takes its standard output; what was there before is dropped.
+
+    Raises:
+        OSError: the program or a file cannot be opened.
+    """
+    apart: dict[str, Any] = {"start_new_session": True}
+    if sys.platform == "win32":
+        apart = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
+    with open(log, "ab") as errors, open(output, "wb") as said:
+        return subprocess.Popen(
+            command,
+            cwd=extension.FOLDER,
+            env=environment(),
+            stdin=subprocess.DEVNULL,
+            stdout=said,
+            stderr=errors,
+            **apart,
+        )
+
+
+def follow(step: Callable[[], bool]) -> None:
+    """Call ``step`` about ten times a second until it returns False.
+
+    In a window a timer does that while the user works on, and goes on over undo and the loading of files; in
+    background, where Blender runs no timers, it happens here and this returns when all is over.
+    """
+    if bpy.app.background:
+        while step():
+            time.sleep(INTERVAL)
+    else:
+        bpy.app.timers.register(lambda: INTERVAL if step() else None, persistent=True)
+
+
+def redraw() -> None:
+    """Draw the panels that show a program's progress anew, soon."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type in {"VIEW_3D", "PREFERENCES"}:
+                area.tag_redraw()

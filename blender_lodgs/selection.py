@@ -1,0 +1,131 @@
+"""What is shown of a splat scene: drivers that turn its detail settings into visible levels and distances.
+
+Every level has one modifier, the group "LODGS Distance Band", that is on where levels are chosen by distance.
+All drivers are simple expressions, which Blender evaluates even where it may not run scripts, and they
+follow ``root.lodgs`` and the scene's camera without any handler.
+"""
+
+from __future__ import annotations
+
+import bpy
+
+from . import compat
+from .nodes import distance_band as band
+
+NEVER = 1e30
+"""A distance beyond every scene, in place of infinity, which driver expressions cannot say."""
+
+
+def attach(root: bpy.types.Object) -> None:
+    """Gives every level of a splat scene its modifier and its drivers, anew where they exist already.
+
+    Needed after the list of levels has changed. ``root.lodgs.focal_px`` becomes the scene camera's focal
+    length in pixels; near and far follow ``training.lod.rules.flod_bands``.
+    """
+    _drive_focal_length(root)
+    for index, item in enumerate(root.lodgs.levels):
+        if item.exists:
+            _drive_level(root, index, item)
+    update_inputs(root)
+
+
+def update_inputs(root: bpy.types.Object) -> None:
+    """Hands on to the modifiers what cannot be driven: the chosen eye, and each level's material."""
+    for item in root.lodgs.levels:
+        modifier = item.exists and item.object.modifiers.get(band.NAME)
+        if modifier:
+            slots = item.object.material_slots
+            for name, value in (
+                (band.EYE_OBJECT, root.lodgs.eye_object),
+                (band.MATERIAL, slots[0].material if slots else None),
+            ):
+                if compat.get_input(modifier, name) != value:  # setting evaluates anew
+                    compat.set_input(modifier, name, value)
+            if tuple(compat.get_input(modifier, band.EYE_POSITION)) != tuple(root.lodgs.camera_center):
+                compat.set_input(modifier, band.EYE_POSITION, root.lodgs.camera_center)
+
+
+def _drive_focal_length(root: bpy.types.Object) -> None:
+    """f = lens * fitted side in pixels / fitted side of the sensor, as Blender's render has it.
+
+    Blender measures in widths of a pixel and fits the render's longer side to the sensor's width unless told
+    otherwise. Without a camera, Blender's standard one is assumed.
+    """
+    variables = {
+        "lens": ("camera.data.lens", 50.0),
+        "fit": ("camera.data.sensor_fit", 0.0),
+        "sw": ("camera.data.sensor_width", 36.0),
+        "sh": ("camera.data.sensor_height", 24.0),
+        "rx": ("render.resolution_x", None),
+        "ry": ("render.resolution_y", None),
+        "p": ("render.resolution_percentage", None),
+        "ax": ("render.pixel_aspect_x", None),
+        "ay": ("render.pixel_aspect_y", None),
+    }
+    width, height = "floor(rx * p / 100)", "floor(ry * p / 100)"
+    driver = _driver(
+        root,
+        "lodgs.focal_px",
+        f"lens * ({width} / sw if fit == 1 or (fit == 0 and ax * {width} >= ay * {height})"
+        f" else {height} * ay / ax / (sh if fit == 2 else sw))",
+    )
+    for name, (path, fallback) in variables.items():
+        variable = driver.variables.new()
+        variable.name, variable.type = name, "CONTEXT_PROP"
+        target = variable.targets[0]
+        target.context_property, target.data_path = "ACTIVE_SCENE", path
+        if fallback is not None:
+            target.use_fallback_value, target.fallback_value = True, fallback
+
+
+def _drive_level(root: bpy.types.Object, index: int, item) -> None:
+    thing, number = item.object, item.number
+    modifier = thing.modifiers.get(band.NAME)
+    if modifier is None:
+        modifier = thing.modifiers.new(band.NAME, "NODES")
+        modifier.node_group = band.distance_band()
+        modifier.show_expanded = False
+
+    def drive(path: str, expression: str, *names: str, **paths: str) -> None:
+        driver = _driver(thing, path, expression)
+        for name, source in ({name: name for name in names} | paths).items():
+            variable = driver.variables.new()
+            variable.name, variable.type = name, "SINGLE_PROP"
+            variable.targets[0].id, variable.targets[0].data_path = root, f"lodgs.{source}"
+
+    in_range = f"level_start <= {number} and {number} <= level_end"
+    alone = f"{number} == single_level or (cumulative and {number} <= single_level)"
+    for path in ("hide_viewport", "hide_render"):
+        drive(
+            path,
+            f"0 if show and (({in_range}) if mode == 1 else ({alone})) else 1",
+            "mode", "single_level", "level_start", "level_end", "cumulative", show=f"levels[{index}].show",
+        )  # fmt: skip
+    for path in ("show_viewport", "show_render"):
+        drive(f'modifiers["{modifier.name}"].{path}', "mode == 1", "mode")
+
+    # The finest level in use reaches up to the eye and the coarsest one for ever, whichever numbers exist.
+    levels = root.lodgs.levels
+    finer = levels[index + 1].number if index + 1 < len(levels) else NEVER
+    coarser = levels[index - 1].number if index else 0
+    near, far = compat.input_path(modifier, band.NEAR), compat.input_path(modifier, band.FAR)
+    drive(
+        near,
+        f"(s_min / gamma * focal_px if {finer:g} <= level_end else 0) if {in_range} else {NEVER:g}",
+        "gamma", "focal_px", "level_start", "level_end", s_min=f"levels[{index}].s_min",
+    )  # fmt: skip
+    drive(
+        far,
+        f"s_min / gamma * focal_px if {coarser} >= level_start and {number} <= level_end else {NEVER:g}",
+        "gamma", "focal_px", "level_start", "level_end", s_min=f"levels[{max(index - 1, 0)}].s_min",
+    )  # fmt: skip
+    drive(compat.input_path(modifier, band.EYE), "eye", "eye")
+
+
+def _driver(thing: bpy.types.Object, path: str, expression: str) -> bpy.types.Driver:
+    """A fresh driver of the property at ``path``, without variables."""
+    thing.driver_remove(path)
+    driver = thing.driver_add(path).driver
+    assert driver is not None
+    driver.type, driver.expression = "SCRIPTED", expression
+    return driver

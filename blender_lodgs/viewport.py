@@ -1,0 +1,196 @@
+"""Splats and points in their own colours in Solid shading, where Blender draws every point cloud in one grey.
+
+Each is a flat disc of its radius just in front of the ball that Blender draws, so that other objects hide it
+and are hidden by it as usual. Where the viewport colours by object, at random or in one colour, that is left
+as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import bpy
+import gpu
+import numpy as np
+from mathutils import Matrix, Vector
+
+from ..training.lod.colors import level_color
+from . import objects, scenes
+
+if TYPE_CHECKING:
+    from .properties import SplatScene
+
+Color = tuple[float, float, float, float]
+
+_VERTEX = """
+void main()
+{
+  vec4 clip = model_view_projection * vec4(position, 1.0);
+  vec4 front = clip + color_radius.w * toward;
+  gl_Position = vec4(clip.xy, front.z / max(front.w, 1e-6) * clip.w, clip.w);
+  gl_PointSize = color_radius.w * pixels / clip.w + 2.0; // a pixel around, for the ball's outline
+  // The level's colour (sRGB) in the lightness of the point's (linear), so that the scene stays readable.
+  float lightness = pow(dot(color_radius.rgb, vec3(1.0 / 3.0)), 1.0 / 2.2);
+  color = mix(color_radius.rgb, pow((0.35 + 0.65 * lightness) * tint.rgb, vec3(2.2)), tint.a);
+}
+"""
+_FRAGMENT = """
+void main()
+{
+  vec2 place = 2.0 * gl_PointCoord - 1.0;
+  if (dot(place, place) > 1.0) {
+    discard;
+  }
+  shown = vec4(color, 1.0);
+}
+"""
+
+_shader: gpu.types.GPUShader | None = None
+_batches: dict[int, gpu.types.GPUBatch] = {}
+"""Points on the graphics card, by their object's ``session_uid``; they stay until the object changes."""
+_handle: Any = None
+
+
+def _draw() -> None:
+    context = bpy.context
+    space, view = context.space_data, context.region_data
+    if space.shading.type != "SOLID" or space.shading.color_type in {"OBJECT", "RANDOM", "SINGLE"}:
+        return
+    things = [
+        (thing, tint)
+        for root in scenes.roots(context.scene)
+        for thing, tint in _things(root.lodgs)
+        if thing is not None and thing.visible_get(view_layer=context.view_layer, viewport=space)
+    ]
+    if things:
+        draw(
+            things,
+            context.evaluated_depsgraph_get(),
+            view.view_matrix,
+            view.window_matrix,
+            context.region.height,
+        )
+
+
+def draw(
+    things: list[tuple[bpy.types.Object, Color]],
+    depsgraph: bpy.types.Depsgraph,
+    view: Matrix,
+    projection: Matrix,
+    height: int,
+) -> None:
+    """Draws point clouds as their modifiers leave them into the active framebuffer, tested against its depth.
+
+    Args:
+        things: objects, each with the colour (sRGB) in which to show it; alpha 0 is each point's own.
+        view, projection: from the world to the camera's space, and on to clip space.
+        height: of the framebuffer in pixels.
+    """
+    shader = _disc_shader()
+    shader.bind()
+    gpu.state.depth_test_set("LESS_EQUAL")
+    gpu.state.depth_mask_set(True)
+    gpu.state.program_point_size_set(True)
+    for thing, tint in things:
+        batch = _batches.get(thing.session_uid)
+        if batch is None:
+            batch = _batches[thing.session_uid] = _upload(thing.evaluated_get(depsgraph).data)
+        scale = thing.matrix_world.median_scale
+        shader.uniform_float("model_view_projection", projection @ view @ thing.matrix_world)
+        shader.uniform_float("toward", projection @ Vector((0, 0, scale, 0)))
+        shader.uniform_float("tint", tint)
+        shader.uniform_float("pixels", abs(projection[1][1]) * scale * height)
+        batch.draw(shader)
+    gpu.state.program_point_size_set(False)
+    gpu.state.depth_mask_set(False)
+    gpu.state.depth_test_set("NONE")
+
+
+def _things(settings: SplatScene) -> Iterator[tuple[bpy.types.Object | None, Color]]:
+    """What a splat scene may show, and in which colour."""
+    yield settings.points, (0, 0, 0, 0)
+    for item in settings.levels:
+        yield item.object, (*level_color(item.number), float(settings.tell_levels))
+
+
+def _upload(cloud: bpy.types.PointCloud) -> gpu.types.GPUBatch:
+    """A batch of positions, colours and radii, those of an evaluated point cloud."""
+    count = len(cloud.points)
+    color_radius = np.ones((count, 4), np.float32)
+    colors, radii = (
+        objects.read_attribute(cloud, objects.COLOR),
+        objects.read_attribute(cloud, objects.RADIUS),
+    )
+    if colors is not None:
+        color_radius[:, :3] = colors[:, :3]
+    if radii is not None:
+        color_radius[:, 3] = radii
+    layout = gpu.types.GPUVertFormat()
+    layout.attr_add(id="position", comp_type="F32", len=3, fetch_mode="FLOAT")
+    layout.attr_add(id="color_radius", comp_type="F32", len=4, fetch_mode="FLOAT")
+    vertices = gpu.types.GPUVertBuf(layout, count)
+    if count:
+        vertices.attr_fill("position", objects.read_attribute(cloud, "position"))
+        vertices.attr_fill("color_radius", color_radius)
+    return gpu.types.GPUBatch(type="POINTS", buf=vertices)
+
+
+def _disc_shader() -> gpu.types.GPUShader:
+    global _shader
+    if _shader is None:
+        between = gpu.types.GPUStageInterfaceInfo("lodgs_disc")
+        between.smooth("VEC3", "color")
+        info = gpu.types.GPUShaderCreateInfo()
+        info.push_constant("MAT4", "model_view_projection")
+        info.push_constant("VEC4", "toward")
+        info.push_constant("VEC4", "tint")
+        info.push_constant("FLOAT", "pixels")
+        info.vertex_in(0, "VEC3", "position")
+        info.vertex_in(1, "VEC4", "color_radius")
+        info.vertex_out(between)
+        info.fragment_out(0, "VEC4", "shown")
+        info.vertex_source(_VERTEX)
+        info.fragment_source(_FRAGMENT)
+        _shader = gpu.shader.create_from_info(info)
+    return _shader
+
+
+@bpy.app.handlers.persistent
+def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    """Forgets what has changed; what was deleted goes with all the rest."""
+    if depsgraph.id_type_updated("COLLECTION"):
+        _batches.clear()
+    elif _batches:
+        for update in depsgraph.updates:
+            if update.is_updated_geometry:
+                _batches.pop(update.id.original.session_uid, None)
+
+
+@bpy.app.handlers.persistent
+def _on_load(*_) -> None:
+    _batches.clear()
+
+
+def register() -> None:
+    global _handle
+    if not bpy.app.background:
+        _handle = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW")
+    handlers = bpy.app.handlers
+    for changes in (handlers.depsgraph_update_post, handlers.frame_change_post):
+        changes.append(_on_update)
+    for changes in (handlers.load_post, handlers.undo_post, handlers.redo_post):
+        changes.append(_on_load)
+
+
+def unregister() -> None:
+    global _handle, _shader
+    if _handle is not None:
+        bpy.types.SpaceView3D.draw_handler_remove(_handle, "WINDOW")
+    handlers = bpy.app.handlers
+    for changes in (handlers.depsgraph_update_post, handlers.frame_change_post):
+        changes.remove(_on_update)
+    for changes in (handlers.load_post, handlers.undo_post, handlers.redo_post):
+        changes.remove(_on_load)
+    _batches.clear()
+    _handle = _shader = None

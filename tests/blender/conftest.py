@@ -1,0 +1,66 @@
+"""Blender's Python module with the checkout linked as an extension; each test gets an empty file."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from tools.blender_module import EXTENSION, start_blender
+
+_exit_status: int | None = None
+
+
+@pytest.fixture(scope="session")
+def bpy():
+    """The module; tests that need it are skipped where it is not installed."""
+    if importlib.util.find_spec("bpy") is None:
+        pytest.skip("bpy is not installed in this environment")
+    return start_blender()
+
+
+@pytest.fixture(autouse=True)
+def empty_file(bpy):
+    """An empty file with one empty scene; enabled extensions stay."""
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+
+
+@pytest.fixture
+def lodgs(bpy):
+    """``lodgs("scenes")`` is the extension's ``blender_lodgs.scenes``; ``lodgs("training.errors")`` too."""
+
+    def load(name: str):
+        room = "" if name.startswith("training") else "blender_lodgs."
+        return importlib.import_module(f"{EXTENSION}.{room}{name}")
+
+    return load
+
+
+@pytest.fixture
+def fake(tmp_path, monkeypatch):
+    """``fake("crash")`` sets how the trainer, played by ``fake_trainer.py``, behaves from now on."""
+    program = tmp_path / "python with a space"
+    program.write_text(
+        f'#!/bin/sh\nexec "{sys.executable}" "{Path(__file__).with_name("fake_trainer.py")}" "$@"\n'
+    )
+    program.chmod(0o755)
+    monkeypatch.setenv("LODGS_TRAINER_PYTHON", str(program))
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    return lambda mode="": monkeypatch.setenv("LODGS_FAKE", mode)
+
+
+def pytest_sessionfinish(session, exitstatus):
+    global _exit_status
+    _exit_status = int(exitstatus)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_unconfigure(config):
+    """Blender 4.5 as a module can hang when Python ends, so a session that used it ends at once."""
+    if "bpy" in sys.modules and _exit_status is not None:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(_exit_status)

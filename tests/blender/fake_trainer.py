@@ -1,0 +1,107 @@
+"""Stands in for the trainer's Python: speaks the protocol of a run, and goes wrong as $LODGS_FAKE says.
+
+- ``""``        two levels and done
+- ``slow``      steps until it is asked to stop
+- ``killed``    one level, then SIGKILL to itself
+- ``crash``     one level, then a traceback and exit code 1
+- ``garbage``   noise on stdout and between the events, then as ``""``
+- ``odd``       an event with a field of the wrong kind
+- ``mute``      never says anything and ignores being asked
+- ``full``      an ``error`` event, as when the disk is full
+- ``refused``   an ``error`` event on stdout alone, as before a run folder is its own
+- ``no_torch``  the check finds torch missing
+"""
+
+import json
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+sys.path.insert(0, os.getcwd())
+
+import numpy as np
+
+from training.runs.folder import PROTOCOL, Events, RunFolder
+from training.runs.job import Job
+from training.splats.bundle import Bundle, Level, write_bundle
+from training.splats.gaussians import Splats
+from training.splats.ply import write_ply
+
+COUNTS = {1: 5, 2: 20}
+"""Splats by level."""
+
+
+def splats(count: int) -> Splats:
+    rng = np.random.default_rng(count)
+    return Splats(
+        means=rng.normal(size=(count, 3)).astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        log_scales=np.full((count, 3), -3, np.float32),
+        opacity_logits=np.zeros(count, np.float32),
+        sh=rng.normal(size=(count, 1, 3)).astype(np.float32),
+    )
+
+
+def main() -> int:
+    mode, command = os.environ.get("LODGS_FAKE", ""), sys.argv[3]
+    if command == "check":
+        problems = ["The package torch is missing in here."] if mode == "no_torch" else []
+        print(json.dumps({"torch": "2.13.0", "ok": not problems, "problems": problems}))
+        return 2 if problems else 0
+    job = Job.from_file(Path(sys.argv[4]))
+    folder = RunFolder(job.out)
+    if mode == "mute":
+        time.sleep(60)
+    if mode == "refused":
+        what, remedy = "The run folder belongs to another job.", "Choose another."
+        print(json.dumps({"event": "error", "what": what, "remedy": remedy}))
+        return 2
+    with folder.hold():
+        return run(mode, job, folder, Events(folder, sys.stdout))
+
+
+def run(mode: str, job: Job, folder: RunFolder, say: Events) -> int:
+    say("hello", protocol=PROTOCOL, version="0", method=job.method, preset=job.preset, scene=job.scene,
+        out=job.out, pid=os.getpid())  # fmt: skip
+    say("warning", message="One photograph is missing.")
+    if mode == "full":
+        say("error", what="The disk is full; training stopped.", remedy="Free some space and resume the run.")
+        return 2
+    if mode == "odd":
+        say("progress", stage="level 1 of 2", step=None)
+        say("level", level="one", path=3)
+        return 1
+    for step in range(10_000 if mode == "slow" else 2):
+        say("progress", stage="level 1 of 2", level=1, levels=2, step=step + 1, of=10_000, loss=0.5,
+            psnr=20.0, splats=5, steps_per_s=20.0, eta_s=60.0)  # fmt: skip
+        if folder.take_cancel():
+            say("cancelled", step=step, message="Stopped.")
+            return 3
+        if mode == "slow":
+            time.sleep(0.02)
+    levels = []
+    for number, count in COUNTS.items():
+        path = folder.levels_folder / f"level_{number}.ply"
+        levels.append(Level(number, splats(count), 0.1 if number == 1 else 0.0))
+        write_ply(path, levels[-1].splats)
+        say(
+            "level", level=number, path=f"levels/{path.name}", splats=count, s_min=levels[-1].s_min, psnr=20.0
+        )
+        if mode == "killed":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if mode == "crash":
+            raise RuntimeError("the card caught fire")
+        if mode == "garbage":
+            print("garbage {on stdout")
+            with folder.events_file.open("ab") as file:
+                file.write(b'not json\n{"no": "event"}\n[1, 2]\n\xff\xfe\n')
+    meta = {"camera_center": [1.0, 2.0, 3.0], "focal_px": 100.0, "gamma": 2.0}
+    write_bundle(folder.bundle, Bundle(job.method, levels, meta))
+    say("done", bundle=folder.bundle.name, seconds=1.0)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

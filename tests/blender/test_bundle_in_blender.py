@@ -1,0 +1,61 @@
+"""Blender's own PLY importer, which knows nothing of us, reads the finest level out of our files."""
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture
+def bundle(lodgs):
+    """Two levels with an extra each; the finest has 700 splats."""
+    files, gaussians = lodgs("training.splats.bundle"), lodgs("training.splats.gaussians")
+    random = np.random.default_rng(3)
+
+    def splats(count):
+        shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, 16, 3))
+        arrays = [random.standard_normal(shape, dtype=np.float32) for shape in shapes]
+        return gaussians.Splats(*arrays, {"decay": np.arange(count, dtype="f4")})
+
+    return files.Bundle(
+        "flod", [files.Level(1, splats(50), 0.25), files.Level(2, splats(700), 0.0)], {"gamma": 1.0}
+    )
+
+
+def imported(bpy, path):
+    """The data of the one object that Blender makes of a PLY, and a reader of its float attributes."""
+    before = set(bpy.data.objects)
+    assert bpy.ops.wm.ply_import(filepath=str(path), import_attributes=True) == {"FINISHED"}
+    (made,) = set(bpy.data.objects) - before
+    attributes = made.data.attributes
+
+    def values(name):
+        column = np.empty(len(attributes[name].data), np.float32)
+        attributes[name].data.foreach_get("value", column)
+        return column
+
+    positions = np.empty(3 * len(attributes["position"].data), np.float32)
+    attributes["position"].data.foreach_get("vector", positions)
+    return positions.reshape(-1, 3), values
+
+
+@pytest.mark.parametrize("order,number", [("finest_first", 2), ("stream", 1)])
+def test_bundle(bpy, lodgs, tmp_path, bundle, order, number):
+    lodgs("training.splats.bundle").write_bundle(tmp_path / "bundle.ply", bundle, order)
+    positions, values = imported(bpy, tmp_path / "bundle.ply")
+    check(positions, values, bundle.levels[number - 1].splats)
+
+
+def test_plain(bpy, lodgs, tmp_path, bundle):
+    lodgs("training.splats.ply").write_ply(tmp_path / "plain.ply", bundle.levels[1].splats)
+    positions, values = imported(bpy, tmp_path / "plain.ply")
+    check(positions, values, bundle.levels[1].splats)
+    np.testing.assert_array_equal(values("decay"), np.arange(700))
+
+
+def check(positions, values, splats):
+    assert len(positions) == len(splats)
+    # The importer turns the file's axes; as a set of numbers the positions stay what they are.
+    turned = np.sort(np.abs(positions), axis=1)
+    np.testing.assert_allclose(turned, np.sort(np.abs(splats.means), axis=1), rtol=1e-6)
+    np.testing.assert_array_equal(values("rot_3"), splats.quats[:, 3])
+    np.testing.assert_array_equal(values("f_rest_16"), splats.sh[:, 2, 1])
+    np.testing.assert_array_equal(values("opacity"), splats.opacity_logits)

@@ -1,0 +1,160 @@
+"""``blender --command lodgs``: the same function, called as Blender calls it."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.blender.fake_trainer import COUNTS
+
+SCENE = Path(__file__).resolve().parents[2] / "examples" / "lantern_garden"
+
+
+@pytest.fixture
+def lodgs_command(lodgs):
+    return lambda *arguments: lodgs("commands").main([str(a) for a in arguments])
+
+
+def test_train_saves_and_exports(bpy, lodgs, lodgs_command, fake, tmp_path, capfd):
+    fake()
+    run, blend, bundle = tmp_path / "run", tmp_path / "made" / "out.blend", tmp_path / "made" / "bundle.ply"
+    code = lodgs_command(
+        "train", "--scene", SCENE, "--method", "flod", "--preset", "draft", "--out", run, "--blend", blend,
+        "--export", bundle, "--image-scale", 0.25, "--seed", 3, "--set", "levels=2", "--set", "steps=[4, 5]",
+    )  # fmt: skip
+    assert code == 0
+    said = capfd.readouterr().err
+    for line in ("Level 1: 5 splats, 20.0 dB", "Finished", "warning: One photograph is missing."):
+        assert line in said.splitlines()
+    job = lodgs("training.runs.job").Job.from_file(run / "job.toml")
+    assert (job.seed, job.image_scale, job.parameters["steps"]) == (3, 0.25, [4, 5])
+
+    plyfile = pytest.importorskip("plyfile")  # another reader of the bundle
+    counts = [element.count for element in plyfile.PlyData.read(str(bundle)).elements][:2]
+    assert sorted(counts) == sorted(COUNTS.values())
+    bpy.ops.wm.open_mainfile(filepath=str(blend))
+    (root,) = [thing for thing in bpy.data.objects if thing.lodgs.is_root]
+    assert {i.number: len(i.object.data.points) for i in root.lodgs.levels} == COUNTS
+    assert [thing for thing in root.children if thing.type == "CAMERA"]
+
+    other = tmp_path / "again.ply"
+    assert lodgs_command("export", blend, other) == 0
+    assert other.read_bytes() == bundle.read_bytes()
+    assert lodgs_command("info", bundle) == 0
+    assert "20" in capfd.readouterr().out
+
+
+def test_a_stopped_run_is_gone_on_with(lodgs_command, fake, tmp_path, capfd):
+    train = ("train", "--scene", SCENE, "--out", tmp_path / "run")
+    fake("killed")
+    assert lodgs_command(*train, "--blend", tmp_path / "part.blend") == 1
+    assert "signal 9" in capfd.readouterr().err
+    assert (tmp_path / "part.blend").exists()  # with the level that there is
+    fake("full")
+    assert lodgs_command(*train) == 2
+    assert "The disk is full" in capfd.readouterr().err
+    fake()
+    assert lodgs_command(*train, "--seed", 5) == 2
+    assert "begun with other settings (seed)" in capfd.readouterr().err
+    assert lodgs_command(*train, "--export", tmp_path / "bundle.ply") == 0
+    assert (tmp_path / "bundle.ply").exists()
+    (tmp_path / "bundle.ply").unlink()
+    assert lodgs_command(*train, "--export", tmp_path / "bundle.ply") == 0  # finished: loaded
+    assert (tmp_path / "bundle.ply").exists()
+    assert lodgs_command(*train, "--seed", 5) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["train", "--scene", "nowhere", "--out", "run"], "nowhere"),
+        (["train", "--scene", SCENE, "--out", "run", "--set", "levels"], "--set levels is not NAME=VALUE"),
+        (["train", "--scene", SCENE, "--out", "run", "--set", "wings=2"], "unknown parameter 'wings'"),
+        (["train", "--scene", SCENE, "--out", "run", "--method", "magic"], "magic"),
+        (["train", "--scene", SCENE, "--out", "run", "--image-scale", "7"], "7 is not between"),
+        (["train", "--scene", SCENE, "--out", "run", "--seed", "-1"], "-1 is not between"),
+        (["train", "--scene", SCENE, "--out", "run", "--test-every", "1"], "test_every"),
+        (["import", "nothing.ply", "--blend", "x.blend"], "nothing.ply"),
+        (["export", "nothing.blend", "x.ply"], "nothing.blend"),
+        (["info", "nothing.ply"], "nothing.ply"),
+        (["dance"], "dance"),
+        ([], "required"),
+    ],
+)
+def test_mistakes_end_with_a_sentence_and_two(
+    lodgs_command, fake, tmp_path, monkeypatch, capfd, arguments, says
+):
+    fake()
+    monkeypatch.chdir(tmp_path)
+    assert lodgs_command(*arguments) == 2
+    said = capfd.readouterr().err
+    assert says in said and "Traceback" not in said
+    assert not (tmp_path / "run").exists()
+
+
+def test_help_is_no_mistake(lodgs_command, capfd):
+    assert lodgs_command("--help") == 0
+    assert "train" in capfd.readouterr().out
+
+
+def test_import_makes_a_blend(bpy, lodgs_command, tmp_path):
+    assert lodgs_command("import", SCENE, "--blend", tmp_path / "scene.blend") == 0
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "scene.blend"))
+    assert [thing for thing in bpy.data.objects if thing.lodgs.is_root]
+
+
+COMMAND = """
+import os, sys
+import bpy, addon_utils
+addon_utils.enable("bl_ext.user_default.lodgs", default_set=True)
+from bl_ext.user_default.lodgs.blender_lodgs import commands
+code = commands.main(sys.argv[1:])
+sys.stderr.flush()
+os._exit(code)
+"""
+
+
+def _started(run: Path) -> subprocess.Popen:
+    """A command in a process of its own, whose slow trainer is at work."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", COMMAND, "train", "--scene", str(SCENE), "--out", str(run)],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    end = time.monotonic() + 60
+    while not ((run / "events.jsonl").exists() and "progress" in (run / "events.jsonl").read_text()):
+        assert time.monotonic() < end and process.poll() is None
+        time.sleep(0.05)
+    return process
+
+
+def test_ctrl_c_cancels_politely(bpy, fake, tmp_path):
+    """The signal goes to the command, which asks the trainer and waits for it."""
+    fake("slow")
+    with _started(tmp_path / "run") as process:
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 3
+        assert process.stderr is not None
+        said = process.stderr.read()
+    assert "Cancelled. The same command goes on from here." in said and "Traceback" not in said
+    last = json.loads((tmp_path / "run" / "events.jsonl").read_text().splitlines()[-1])
+    assert last["event"] == "cancelled"
+
+
+def test_the_trainer_outlives_blender(bpy, lodgs, fake, tmp_path):
+    fake("slow")
+    with _started(tmp_path / "run") as process:
+        process.kill()
+    run = lodgs("training.runs.folder").RunFolder(tmp_path / "run")
+    step = run.last("progress")["step"]
+    time.sleep(0.5)
+    assert run.state() == "running" and run.last("progress")["step"] > step
+    run.request_cancel()
+    end = time.monotonic() + 20
+    while run.state() != "cancelled":
+        assert time.monotonic() < end
+        time.sleep(0.05)

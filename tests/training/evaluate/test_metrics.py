@@ -1,0 +1,62 @@
+"""Metrics by hand, and the selective view against a loop over the paper's inequality."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from training.evaluate.metrics import psnr, ssim, to_8_bit
+from training.evaluate.protocol import select_flod
+from training.splats.bundle import Bundle, Level
+from training.splats.gaussians import Splats
+
+
+def test_psnr_of_a_known_difference():
+    target = torch.full((8, 8, 3), 100 / 255)
+    # every value 10 of 255 off: 20 log10(255 / 10) dB
+    assert psnr(target + 10 / 255, target) == pytest.approx(20 * math.log10(25.5), abs=1e-3)
+
+
+def test_images_are_clamped_and_rounded_to_8_bits_first():
+    image = torch.tensor([[[-0.2, 0.5003, 1.7]]])
+    assert (to_8_bit(image) * 255).tolist() == [[[0, 128, 255]]]
+    nearly = torch.full((8, 8, 3), 0.5) + 0.0004  # rounds to the same byte as 0.5
+    assert psnr(nearly, torch.full((8, 8, 3), 0.5)) == math.inf
+
+
+def test_ssim_is_one_for_equal_images_and_falls_with_noise():
+    rng = np.random.default_rng(0)
+    image = torch.from_numpy(rng.uniform(size=(32, 40, 3)).astype(np.float32))
+    assert ssim(image, image) == pytest.approx(1.0)
+    little, much = (image + s * torch.randn(image.shape, generator=torch.manual_seed(0)) for s in (0.05, 0.3))
+    assert 1 > ssim(little, image) > ssim(much, image)
+
+
+def random_splats(count: int, seed: int) -> Splats:
+    rng = np.random.default_rng(seed)
+    return Splats(
+        means=rng.normal(0, 10, (count, 3)).astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        log_scales=np.zeros((count, 3), np.float32),
+        opacity_logits=np.zeros(count, np.float32),
+        sh=rng.normal(size=(count, 1, 3)).astype(np.float32),
+    )
+
+
+@pytest.mark.parametrize("start, end", [(3, 5), (2, 3), (4, 4), (1, 5)])
+def test_the_selective_view_is_the_papers_inequality(start, end):
+    s_min = [0.4, 0.1, 0.025, 0.00625, 0.0]
+    bundle = Bundle("flod", [Level(n, random_splats(200, n), s_min[n - 1]) for n in range(1, 6)])
+    eye, focal, gamma = np.array([1.0, 2, 3]), 900.0, 1.5
+    expected = []
+    for number in range(start, end + 1):  # Eq. 7, splat by splat
+        for mean in bundle.levels[number - 1].splats.means:
+            distance = math.dist(mean, eye)
+            near = 0 if number == end else s_min[number - 1] / gamma * focal
+            far = math.inf if number == start else s_min[number - 2] / gamma * focal
+            if near <= distance < far:
+                expected.append(mean)
+    chosen = select_flod(bundle, eye, focal, gamma, start, end)
+    np.testing.assert_array_equal(chosen.means, np.array(expected, np.float32).reshape(-1, 3))
+    assert len(chosen.sh) == len(chosen.means)

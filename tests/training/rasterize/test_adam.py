@@ -1,0 +1,98 @@
+"""Adam against torch's own, and what densification and resuming need of it."""
+
+import io
+
+import pytest
+import torch
+
+from training.rasterize import Adam
+
+
+def gradients(step, shape):
+    return torch.randn(shape, generator=torch.Generator().manual_seed(step))
+
+
+def test_it_steps_as_torchs_adam_does():
+    start = torch.randn(700, 5, 3, generator=torch.Generator().manual_seed(99))
+    ours = start.clone()
+    rates = torch.full((5, 1), 2e-3)
+    rates[0] = 1e-2
+    adam = Adam({"sh": ours}, {"sh": rates})
+    theirs = [start[:, :1].double().requires_grad_(), start[:, 1:].double().requires_grad_()]
+    expected = torch.optim.Adam(
+        [{"params": [theirs[0]], "lr": 1e-2}, {"params": [theirs[1]], "lr": 2e-3}], eps=1e-15
+    )
+    for step in range(30):
+        gradient = gradients(step, start.shape)
+        adam.step({"sh": gradient})
+        theirs[0].grad, theirs[1].grad = gradient[:, :1].double(), gradient[:, 1:].double()
+        expected.step()
+    torch.testing.assert_close(ours.double(), torch.cat(theirs, 1).detach(), atol=2e-6, rtol=2e-6)
+
+
+def test_a_resumed_run_goes_on_to_the_same_bits():
+    def run(adam, tensors, steps):
+        for step in steps:
+            for tensor in tensors.values():
+                tensor.grad = gradients(step, tensor.shape)
+            adam.step()
+
+    rates = {"means": 1e-3, "sh": torch.full((4, 1), 1e-2)}
+    unbroken = {"means": torch.zeros(50, 3), "sh": torch.zeros(50, 4, 3)}
+    adam = Adam(unbroken, rates)
+    run(adam, unbroken, range(4))
+    file = io.BytesIO()
+    torch.save({"tensors": {k: v.clone() for k, v in unbroken.items()}, "adam": adam.state_dict()}, file)
+    run(adam, unbroken, range(4, 9))
+
+    file.seek(0)
+    saved = torch.load(file, weights_only=True)
+    resumed = Adam(saved["tensors"], rates)
+    resumed.load_state_dict(saved["adam"])
+    run(resumed, saved["tensors"], range(4, 9))
+    for name, tensor in unbroken.items():
+        assert torch.equal(tensor, saved["tensors"][name])
+        assert torch.equal(adam.state[name][1], resumed.state[name][1])
+
+
+def test_rows_come_and_go_with_their_moments():
+    tensor = torch.zeros(6, 3)
+    adam = Adam({"means": tensor}, {"means": 0.1})
+    adam.step({"means": gradients(0, (6, 3))})
+    m, v = adam.state["means"]
+    rows = torch.tensor([4, 1, 4])
+    kept = tensor[rows].clone()
+    adam.replace("means", kept, m[rows], v[rows])
+    assert adam.steps["means"] == 1
+    adam.step({"means": gradients(0, (6, 3))[rows]})
+
+    alone = torch.zeros(6, 3)
+    other = Adam({"means": alone}, {"means": 0.1})
+    for _ in range(2):
+        other.step({"means": gradients(0, (6, 3))})
+    assert torch.equal(kept, alone[rows])
+
+
+def test_a_tensor_without_a_gradient_stays():
+    tensors = {"a": torch.ones(3), "b": torch.ones(3)}
+    adam = Adam(tensors, {"a": 0.1, "b": 0.1})
+    adam.step({"a": torch.ones(3)})
+    assert tensors["b"].equal(torch.ones(3))
+    assert adam.steps == {"a": 1, "b": 0}
+
+
+def test_moments_of_what_is_never_seen_do_not_become_denormal():
+    tensor = torch.zeros(1000)
+    adam = Adam({"a": tensor}, {"a": 1e-3})
+    adam.step({"a": torch.full((1000,), 1e-12)})
+    for _ in range(900):
+        adam.step({"a": torch.zeros(1000)})
+    for moment in adam.state["a"]:
+        assert ((moment == 0) | (moment.abs() > 1.2e-38)).all()
+
+
+def test_what_it_cannot_step_is_refused():
+    with pytest.raises(ValueError, match="learning rates"):
+        Adam({"a": torch.zeros(2)}, {"b": 0.1})
+    with pytest.raises(ValueError, match="contiguous float32"):
+        Adam({"a": torch.zeros(2).double()}, {"a": 0.1})

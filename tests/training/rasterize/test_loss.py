@@ -1,0 +1,58 @@
+"""The photometric loss against scipy, and the fused gradient against autograd in float64."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import correlate1d
+
+from training.rasterize import BACKENDS, Target, photometric_loss
+
+
+def scipy_loss(image, truth, ssim_weight):
+    """In float64, with scipy's filter and the formula of Wang et al. 2004, Eq. 13."""
+    line = np.exp(-(np.arange(-5.0, 6) ** 2) / 4.5)
+    line /= line.sum()
+
+    def window(planes):
+        return correlate1d(correlate1d(planes, line, 0, mode="constant"), line, 1, mode="constant")
+
+    mx, my = window(image), window(truth)
+    vx, vy = window(image**2) - mx**2, window(truth**2) - my**2
+    vxy = window(image * truth) - mx * my
+    c1, c2 = 1e-4, 9e-4
+    ssim = (2 * mx * my + c1) * (2 * vxy + c2) / ((mx**2 + my**2 + c1) * (vx + vy + c2))
+    return (1 - ssim_weight) * np.abs(image - truth).mean() + ssim_weight * (1 - ssim.mean())
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("size", [(50, 75), (16, 64), (3, 5), (1, 130)])
+def test_the_loss_is_scipys(backend, size):
+    random = np.random.default_rng(0)
+    truth = random.random((*size, 3)).astype(np.float32)
+    image = np.clip(truth + random.normal(0, 0.2, truth.shape), 0, 1).astype(np.float32)
+    for ssim_weight in (0.0, 0.2, 1.0):
+        loss = photometric_loss(torch.tensor(image), Target(truth), ssim_weight, backend=backend)
+        expected = scipy_loss(image.astype(np.float64), truth.astype(np.float64), ssim_weight)
+        assert loss.item() == pytest.approx(expected, rel=2e-5)
+
+
+@pytest.mark.parametrize("size", [(50, 75), (16, 64), (3, 5), (1, 130)])
+def test_the_fused_gradient_is_autograds(size):
+    random = torch.Generator().manual_seed(0)
+    truth = torch.rand(*size, 3, generator=random)
+    start = (truth + 0.1 * torch.randn(*size, 3, generator=random)).clamp(0, 1)
+    gradients = []
+    for backend, kind in (("cpu", torch.float32), ("reference", torch.float64)):
+        image = start.to(kind).clone().requires_grad_()
+        (3 * photometric_loss(image, Target(truth.to(kind)), backend=backend)).backward()
+        gradients.append(image.grad.double())
+    assert (gradients[0] - gradients[1]).norm() <= 1e-4 * gradients[1].norm()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_equal_images_have_no_loss(backend):
+    image = torch.rand(20, 30, 3, requires_grad=True)
+    loss = photometric_loss(image, Target(image.detach().clone()), backend=backend)
+    loss.backward()
+    assert loss.item() == pytest.approx(0, abs=1e-6)
+    assert image.grad.abs().max() < 1e-6

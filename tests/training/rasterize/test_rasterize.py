@@ -1,0 +1,296 @@
+"""Both backends against cases worked by hand, and the cpu backend against the float64 reference."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from training.errors import LodgsError
+from training.rasterize import BACKENDS, Target, photometric_loss, rasterize
+from training.rasterize.cpu.bin import TILE, bin_splats
+from training.rasterize.cpu.compile import numba
+from training.rasterize.cpu.fastmath import exp2
+from training.rasterize.cpu.project import COLUMNS, CONIC_XX, CONIC_XY, CONIC_YY, LOG2_OPACITY
+from training.scenes.cameras import Camera
+
+SH_C0 = 0.28209479177387814
+
+
+def isotropic(depths, sigma, opacities, colours, kind=torch.float32):
+    """Round splats on the z axis."""
+    count = len(depths)
+    means = torch.zeros(count, 3)
+    means[:, 2] = torch.tensor(depths)
+    quats = torch.tensor([[2.0, 0.0, 0.0, 0.0]]).repeat(count, 1)
+    logits = torch.logit(torch.tensor(opacities))
+    sh = (torch.tensor(colours).reshape(count, 1, 3) - 0.5) / SH_C0
+    tensors = means, quats, torch.full((count, 3), math.log(sigma)), logits, sh
+    return [tensor.to(kind).requires_grad_() for tensor in tensors]
+
+
+def squared_distance():
+    """From the image point (16, 16) to the pixel centres of a 32x32 image."""
+    offset = np.arange(32) + 0.5 - 16
+    return offset[None, :] ** 2 + offset[:, None] ** 2
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_one_round_splat_on_the_axis(backend, axis_camera):
+    """Its variance is (f sigma / z)² + 0.3; it lies across four tiles."""
+    splats = isotropic([2.0], 0.2, [0.8], [[0.9, 0.6, 0.3]])
+    drawn = rasterize(*splats, axis_camera, background=(0.1, 0.2, 0.4), backend=backend)
+    variance = (40 * 0.2 / 2) ** 2 + 0.3
+    alpha = 0.8 * np.exp(-squared_distance() / (2 * variance))
+    alpha[alpha < 1 / 255] = 0
+    expected = alpha[..., None] * (0.9, 0.6, 0.3) + (1 - alpha[..., None]) * (0.1, 0.2, 0.4)
+    np.testing.assert_allclose(drawn.image.detach(), expected, atol=5e-6)
+    np.testing.assert_allclose(drawn.alpha.detach(), alpha, atol=5e-6)
+    assert drawn.radii[0].item() == pytest.approx(3 * math.sqrt(variance), rel=1e-6)
+
+    drawn.image[10, 20, 0].backward()  # d alpha / d mean = alpha (pixel - mean) / variance
+    by_mean = (0.9 - 0.1) * alpha[10, 20] * np.array([4.5, -5.5]) / variance
+    assert drawn.grad2d[0].item() == pytest.approx(16 * np.linalg.norm(by_mean), rel=1e-4)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_two_splats_blend_front_to_back_whatever_their_order(backend, axis_camera):
+    splats = isotropic([4.0, 2.0], 0.3, [0.9, 0.5], [[1.0, 0.0, 0.2], [0.0, 1.0, 0.2]])
+    drawn = rasterize(*splats, axis_camera, backend=backend).image.detach()
+    far, near = (
+        opacity * np.exp(-squared_distance() / (2 * ((40 * 0.3 / z) ** 2 + 0.3)))
+        for opacity, z in ((0.9, 4), (0.5, 2))
+    )
+    far[far < 1 / 255] = 0
+    near[near < 1 / 255] = 0
+    np.testing.assert_allclose(drawn[..., 0], (1 - near) * far, atol=5e-6)
+    np.testing.assert_allclose(drawn[..., 1], near, atol=5e-6)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_alpha_is_capped_and_dark_pixels_take_no_more(backend, axis_camera):
+    """The first takes 0.99; the second leaves 1e-4, at the bound; the third must not be seen."""
+    splats = isotropic([2.0, 3.0, 4.0], 50.0, [0.9999] * 3, [[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])
+    pixel = rasterize(*splats, axis_camera, backend=backend).image[16, 16].detach()
+    # rounding decides on which side of the bound the second falls
+    assert pixel[0].item() == pytest.approx(0.99, abs=1e-6)
+    assert pixel[1].item() in (pytest.approx(0.0099, abs=1e-6), 0.0)
+    assert pixel[2].item() == 0
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_no_splats_leave_the_background(backend, axis_camera):
+    empty = [torch.zeros(0, *shape, requires_grad=True) for shape in ((3,), (4,), (3,), (), (16, 3))]
+    drawn = rasterize(*empty, axis_camera, background=(0.2, 0.4, 0.6), backend=backend)
+    (drawn.image.sum() + drawn.alpha.sum()).backward()
+    assert torch.equal(drawn.image.detach(), torch.tensor([0.2, 0.4, 0.6]).expand(32, 32, 3))
+    assert drawn.alpha.abs().max() == 0
+    assert all(tensor.grad is not None and tensor.grad.shape == tensor.shape for tensor in empty)
+
+
+def test_the_references_gradients_are_finite_differences(make_splats):
+    camera = Camera("small", 9, 7, 12.0, 11.0, 4.2, 3.3, np.eye(4))
+    splats = [tensor.requires_grad_() for tensor in make_splats(3, seed=4, coefficients=4).values()]
+    weights = torch.tensor([0.9, 0.5, 0.7], dtype=torch.float64, requires_grad=True)
+
+    def draw(*tensors):
+        drawn = rasterize(*tensors[:5], camera, weights=tensors[5], min_scale=0.05, backend="reference")
+        return drawn.image, drawn.alpha
+
+    assert torch.autograd.gradcheck(draw, (*splats, weights), eps=1e-7, atol=1e-6, check_undefined_grad=False)
+
+
+def scene(name, make_splats):
+    """Splats and keyword arguments of ``rasterize``."""
+    if name.startswith("degree"):
+        return make_splats(250, coefficients=(int(name[-1]) + 1) ** 2), {}
+    splats = make_splats({"one": 1, "crowd": 3000}.get(name, 250), seed=len(name))
+    count = len(splats["means"])
+    random = np.random.default_rng(9)
+    if name == "one":
+        splats["means"][:] = torch.tensor([[0.1, -0.2, 3.0]])
+        splats["opacity_logits"][:] = 1
+    elif name == "needles":
+        splats["log_scales"][:, 0] = torch.from_numpy(random.uniform(-1, 0.5, count))
+        splats["log_scales"][:, 1:] = torch.from_numpy(random.uniform(-7, -5, (count, 2)))
+    elif name == "screen-filling":
+        splats["log_scales"][::5] = 1.5
+        splats["opacity_logits"][::5] -= 2
+    elif name == "behind and near":
+        splats["means"][:, 2] = torch.from_numpy(random.uniform(-1, 1, count))
+    elif name == "caps":
+        splats["opacity_logits"][:] = torch.from_numpy(random.choice([-12.0, 3.0, 15.0], count))
+    elif name == "crowd":
+        splats["log_scales"] += 3
+        splats["opacity_logits"][:] = torch.from_numpy(random.uniform(-5.1, -4.5, count))
+    elif name == "active degree":
+        return splats, {"sh_degree": 1}
+    return splats, {}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "degree 0", "degree 1", "degree 2", "degree 3", "degree 4", "active degree",
+        "one", "needles", "screen-filling", "behind and near", "caps", "crowd",
+    ],
+)  # fmt: skip
+def test_cpu_agrees_with_the_reference(name, make_splats, odd_camera):
+    """Images and every gradient, relative L2 at most 1e-3 (most are near 1e-5)."""
+    splats, options = scene(name, make_splats)
+    random = torch.Generator().manual_seed(1)
+    weights = torch.rand(len(splats["means"]), generator=random).double()
+    weights[3::7] = 0
+    truth = torch.rand(50, 75, 3, generator=random).double()
+    found = {}
+    for backend, kind in (("cpu", torch.float32), ("reference", torch.float64)):
+        leaves = [t.to(kind).clone().requires_grad_() for t in (*splats.values(), weights)]
+        drawn = rasterize(
+            *leaves[:5], odd_camera, weights=leaves[5], background=(0.1, 0.5, 0.3), min_scale=0.01,
+            near=0.2, backend=backend, **options,
+        )  # fmt: skip
+        loss = ((drawn.image - truth.to(kind)) ** 2).mean() + (drawn.alpha * truth[..., 0].to(kind)).mean()
+        loss.backward()
+        gradients = {name: leaf.grad for name, leaf in zip((*splats, "weights"), leaves, strict=True)}
+        outputs = {"image": drawn.image.detach(), "alpha": drawn.alpha.detach(), "radii": drawn.radii}
+        found[backend] = {**outputs, "grad2d": drawn.grad2d, **gradients}
+    assert found["reference"]["grad2d"].norm() > 0
+    for output, expected in found["reference"].items():
+        expected = expected.double()
+        error = (found["cpu"][output].double() - expected).norm() / expected.norm().clamp_min(1e-12)
+        assert error <= 1e-3, f"{output}: {error:.1e}"
+
+
+def test_thousands_of_splats_are_blended_on_a_pixel_of_the_crowd(make_splats, odd_camera):
+    """What the scene above claims: opacities so low that darkness comes after more than a thousand."""
+    splats, _ = scene("crowd", make_splats)
+    alpha = torch.sigmoid(splats["opacity_logits"])
+    assert math.log(1e-4) / math.log(1 - alpha.mean().item()) > 1000
+    drawn = rasterize(*(t.float() for t in splats.values()), odd_camera)
+    assert drawn.alpha[25, 37] > 0.99
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_weight_zero_is_as_if_the_splat_were_not_there(backend, make_splats, odd_camera):
+    splats = [tensor.float() for tensor in make_splats(60).values()]
+    weights = (torch.arange(60) % 3 > 0).float()
+    splats[0][0] = float("nan")  # dropped before projection: not even looked at
+    some = rasterize(*splats, odd_camera, weights=weights, backend=backend)
+    kept = rasterize(*(tensor[weights > 0] for tensor in splats), odd_camera, backend=backend)
+    torch.testing.assert_close(some.image, kept.image)
+    torch.testing.assert_close(some.radii[weights > 0], kept.radii)
+    assert backend != "cpu" or torch.equal(some.image, kept.image)
+    assert some.radii[weights == 0].max() == 0
+
+
+def everything(splats, camera, truth):
+    leaves = [tensor.float().clone().requires_grad_() for tensor in splats.values()]
+    drawn = rasterize(*leaves, camera)
+    loss = photometric_loss(drawn.image, truth)
+    loss.backward()
+    return [drawn.image.detach(), drawn.alpha.detach(), drawn.radii, drawn.grad2d, loss.detach()] + [
+        leaf.grad for leaf in leaves
+    ]
+
+
+def test_the_same_bits_whatever_the_number_of_threads(make_splats, odd_camera):
+    splats, truth = make_splats(2000), Target(torch.rand(50, 75, 3))
+    threads = numba.get_num_threads()
+    results = []
+    try:
+        for count in sorted({1, threads}) * 2:
+            numba.set_num_threads(count)
+            results.append(everything(splats, odd_camera, truth))
+    finally:
+        numba.set_num_threads(threads)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+def test_two_renderings_may_wait_for_their_backward(make_splats, odd_camera, axis_camera):
+    splats = make_splats(100)
+    alone = []
+    for camera in (odd_camera, axis_camera):
+        leaves = [tensor.float().clone().requires_grad_() for tensor in splats.values()]
+        rasterize(*leaves, camera).image.square().sum().backward()
+        alone.append([leaf.grad for leaf in leaves])
+    leaves = [tensor.float().clone().requires_grad_() for tensor in splats.values()]
+    images = [rasterize(*leaves, camera).image.square().sum() for camera in (odd_camera, axis_camera)]
+    sum(images).backward()
+    for leaf, first, second in zip(leaves, *alone, strict=True):
+        torch.testing.assert_close(leaf.grad, first + second)
+
+
+def test_every_splat_is_in_every_tile_it_touches_once_and_front_to_back():
+    """Against a plain count over all pixels in float64."""
+    random = np.random.default_rng(3)
+    count, width, height = 400, 100, 60
+    projected = np.zeros((count, COLUMNS), np.float32)
+    mean = random.uniform((-20, -20), (120, 80), (count, 2))
+    axis, angle = np.exp(random.uniform(0, 3.5, (count, 2))), random.uniform(0, np.pi, count)
+    cos, sin = np.cos(angle), np.sin(angle)
+    xx = (axis[:, 0] * cos) ** 2 + (axis[:, 1] * sin) ** 2
+    yy = (axis[:, 0] * sin) ** 2 + (axis[:, 1] * cos) ** 2
+    xy = (axis[:, 0] ** 2 - axis[:, 1] ** 2) * cos * sin
+    opacity = random.uniform(0.01, 1, count)
+    unit = math.log2(math.e) / (xx * yy - xy**2)
+    reach = np.sqrt(2 * np.log(255 * opacity))
+    projected[:, :2] = mean
+    projected[:, CONIC_XX], projected[:, CONIC_XY], projected[:, CONIC_YY] = (
+        unit * yy / 2,
+        -unit * xy,
+        unit * xx / 2,
+    )
+    projected[:, LOG2_OPACITY] = np.log2(opacity)
+    projected[:, 9], projected[:, 10] = reach * np.sqrt(xx), reach * np.sqrt(yy)
+    depth = random.uniform(1, 9, count).astype(np.float32)
+    radii = np.ones(count, np.float32)
+    radii[::9] = 0
+    pairs = bin_splats(projected, depth, radii, width, height)
+
+    row = projected.astype(np.float64)[:, :, None, None]
+    dx = np.arange(112) + 0.5 - row[:, 0]
+    dy = (np.arange(64) + 0.5)[:, None] - row[:, 1]
+    log2_alpha = (
+        row[:, LOG2_OPACITY]
+        - row[:, CONIC_XX] * dx**2
+        - row[:, CONIC_XY] * dx * dy
+        - row[:, CONIC_YY] * dy**2
+    )
+    seen = (log2_alpha >= math.log2(1 / 255)) & (radii > 0)[:, None, None]
+    expected = seen.reshape(count, 4, TILE, 7, TILE).any((2, 4)).reshape(count, 28)
+    listed = np.zeros((count, 28), int)
+    for tile in range(28):
+        splats = pairs.splat[pairs.tile_start[tile] : pairs.tile_start[tile + 1]]
+        np.add.at(listed[:, tile], splats, 1)
+        assert (np.diff(depth[splats]) >= 0).all()
+    assert listed.max() == 1
+    assert (listed[expected] == 1).all()
+    # the test is exact on the rectangle, so what is listed besides lies between the pixel centres
+    assert listed.sum() <= 1.15 * expected.sum()
+    assert (listed.sum(1) == pairs.count).all()
+    for i in np.flatnonzero(pairs.count):
+        assert (pairs.splat[pairs.row[pairs.first[i] : pairs.first[i] + pairs.count[i]]] == i).all()
+
+
+def test_exp2_is_right_to_a_few_parts_in_a_million():
+    @numba.njit
+    def over(xs):
+        return np.array([exp2(x) for x in xs])
+
+    xs = np.linspace(-29.9, 20, 5000).astype(np.float32)
+    np.testing.assert_allclose(over(xs), np.exp2(xs.astype(np.float64)), rtol=4e-6)
+
+
+def test_what_does_not_belong_together_is_refused(make_splats, odd_camera):
+    splats = [tensor.float() for tensor in make_splats(5).values()]
+    with pytest.raises(ValueError, match=r"quats must have shape \(5, 4\)"):
+        rasterize(splats[0], splats[1][:4], *splats[2:], odd_camera)
+    with pytest.raises(ValueError, match="asks for 4"):
+        rasterize(*splats, odd_camera, sh_degree=4)
+    with pytest.raises(ValueError, match="float32"):
+        rasterize(*(tensor.double() for tensor in splats), odd_camera, backend="cpu")
+    with pytest.raises(LodgsError, match="gpu"):
+        rasterize(*splats, odd_camera, backend="gpu")
+    with pytest.raises(ValueError, match="differ in shape"):
+        photometric_loss(torch.zeros(4, 5, 3), Target(torch.zeros(5, 4, 3)))

@@ -1,0 +1,77 @@
+"""Jobs: files, presets, and mistakes in words."""
+
+import json
+from dataclasses import asdict
+
+import pytest
+
+from training.errors import LodgsError
+from training.runs.job import Job
+
+
+def write(path, text):
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_toml_and_json_say_the_same_and_paths_are_relative_to_the_file(tmp_path):
+    toml = write(tmp_path / "job.toml", 'scene = "my scene"\nout = "run"\nseed = 3\n[parameters]\nrho = 2\n')
+    text = json.dumps({"scene": "my scene", "out": "run", "seed": 3, "parameters": {"rho": 2}})
+    assert Job.from_file(toml) == Job.from_file(write(tmp_path / "job.json", text))
+    assert Job.from_file(toml).scene == str(tmp_path / "my scene")
+
+
+def test_a_written_job_reads_back_whatever_its_names(tmp_path):
+    job = Job(
+        scene='/a "quoted" \\ folder/ü 日本',
+        out="/b\tc",
+        parameters={"steps": [1, 2, 3], "levels": 3, "rho": 3.5},
+    )
+    job.write(tmp_path / "job.toml")
+    assert asdict(Job.from_file(tmp_path / "job.toml")) == asdict(job)
+
+
+def test_a_resolved_job_holds_every_parameter_and_resolves_to_itself(tmp_path):
+    job = Job.from_dict({"scene": "/s", "out": "/o", "parameters": {"footprint": 30}}).resolved()
+    job.write(tmp_path / "job.toml")
+    again = Job.from_file(tmp_path / "job.toml")
+    assert again.resolved_parameters() == job.resolved_parameters()
+    assert again.resolved_parameters().footprint == 30
+
+
+def test_one_number_serves_every_level_and_fewer_levels_keep_the_finest():
+    job = Job.from_dict({"scene": "s", "out": "o", "parameters": {"levels": 3, "densify_interval": 50}})
+    parameters = job.resolved_parameters()
+    assert parameters.densify_interval == (50, 50, 50)
+    assert parameters.steps == Job("s", "o").resolved_parameters().steps[-3:]
+
+
+@pytest.mark.parametrize(
+    "text, said",
+    [
+        ('scene = "a"\nout = "b"\nsteps_total = 3\n', "unknown key 'steps_total'"),
+        ('scene = "a"\nout = "b"\n[parameters]\nfootprnt = 3\n', "unknown parameter 'footprnt'"),
+        ('out = "b"\n', "does not say 'scene'"),
+        ("scene = 3\nout = 'b'\n", "is not a path"),
+        ('scene = "a"\nout = "b"\nmethod = "nerf"\n', "no method 'nerf'"),
+        ('scene = "a"\nout = "b"\npreset = "fast"\n', "no preset 'fast'"),
+        ('scene = "a"\nout = "b"\nbackend = "metal"\n', "no backend 'metal'"),
+        ('scene = "a"\nout = "b"\nimage_scale = 0\n', "image_scale = 0"),
+        ('scene = "a"\nout = "b"\nseed = -1\n', "seed = -1"),
+        ('scene = "a"\nout = "b"\nseed = 1.5\n', "seed = 1.5"),
+        ('scene = "a"\nout = "b"\n[parameters]\nsteps = [1, 2]\n', "2 entries for 5 levels"),
+        ('scene = "a"\nout = "b"\n[parameters]\nlevels = 0\n', "levels = 0"),
+        ('scene = "a"\nout = "b"\n[parameters]\nrho = "four"\n', "rho = 'four'"),
+        ('scene = "a"\nout = "b"\n[parameters]\nmax_splats = true\n', "max_splats = True"),
+        ('scene = "a"\nout = "b"\n[parameters]\nrejoin_points = 1\n', "rejoin_points = 1"),
+        ("scene = \n", "is not valid"),
+    ],
+)
+def test_mistakes_are_named(tmp_path, text, said):
+    with pytest.raises(LodgsError, match=said.replace("(", r"\(")):
+        Job.from_file(write(tmp_path / "job.toml", text))
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(LodgsError, match=r"absent\.toml"):
+        Job.from_file(tmp_path / "absent.toml")

@@ -1,0 +1,254 @@
+"""Runs from the outside: the process, its lines, its files, and everything that can befall it."""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from training.methods.flod import Flod
+from training.runs import train as training_loop
+from training.runs.folder import RunFolder
+from training.runs.job import Job
+from training.splats.bundle import read_bundle
+from training.splats.ply import read_ply
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def run_in_process(keys: dict) -> tuple[int, list[dict]]:
+    code = training_loop.train(Job.from_dict(keys))
+    return code, RunFolder(keys["out"]).events()[0]
+
+
+def command(path: Path, keys: dict) -> list[str]:
+    path.write_text(json.dumps(keys))
+    return [sys.executable, "-m", "training", "train", str(path)]
+
+
+@pytest.fixture(scope="module")
+def unbroken(tiny_scene, tmp_path_factory) -> dict:
+    """What an undisturbed run of the tiny job gives: its keys, events, output lines and bundle."""
+    out = tmp_path_factory.mktemp("unbroken")
+    keys = {
+        "scene": str(tiny_scene), "out": str(out / "run"), "image_scale": 1.0, "test_every": 4,
+        "parameters": {
+            "levels": 3, "steps": [20, 20, 30], "footprint": 6.0, "densify_interval": 5, "prune_interval": 10,
+            "overlap_interval": 10, "sh_interval": 15, "grad_threshold": 1e-5, "max_splats": 300,
+        },
+    }  # fmt: skip
+    done = subprocess.run(
+        command(out / "job.json", keys), cwd=ROOT, capture_output=True, text=True, timeout=240
+    )
+    assert done.returncode == 0, done.stderr
+    return {
+        "keys": keys,
+        "lines": done.stdout.splitlines(),
+        "bundle": (out / "run" / "bundle.ply").read_bytes(),
+    }
+
+
+def test_every_line_is_an_event_and_the_file_holds_the_same(unbroken):
+    folder = RunFolder(unbroken["keys"]["out"])
+    printed = [json.loads(line) for line in unbroken["lines"]]
+    assert printed == folder.events()[0]
+    kinds = [event["event"] for event in printed]
+    assert kinds[0] == "hello" and kinds[-1] == "done" and kinds.count("level") == 3
+    assert folder.state() == "done"
+    last = folder.last("progress")
+    assert last is not None and last["step"] == last["of"] == 70
+
+
+def test_levels_and_bundle_agree_and_record_the_constraint(unbroken):
+    folder = RunFolder(unbroken["keys"]["out"])
+    bundle = read_bundle(folder.bundle)
+    assert [level.number for level in bundle.levels] == [1, 2, 3]
+    for level, event in zip(bundle.levels, folder.levels(), strict=True):
+        alone = read_ply(folder.path / event["path"])
+        assert len(level.splats) == event["splats"]
+        np.testing.assert_array_equal(level.splats.means, alone.means)
+        assert level.s_min == pytest.approx(event["s_min"])
+        if level.s_min:
+            assert np.exp(alone.log_scales).min() >= level.s_min * (1 - 1e-5)
+    assert bundle.meta["footprint_px"] == pytest.approx(6.0)
+
+
+def test_training_makes_the_pictures_better(unbroken):
+    quality = [event["psnr"] for event in RunFolder(unbroken["keys"]["out"]).levels()]
+    assert quality == sorted(quality) and quality[-1] > quality[0] + 1
+
+
+@pytest.mark.parametrize("step", [3, 23, 44])
+def test_a_killed_run_resumes_to_the_same_bits(unbroken, tmp_path, step):
+    keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
+    environment = {**os.environ, "LODGS_CHECKPOINT_SECONDS": "0"}  # a checkpoint after every step
+    process = subprocess.Popen(
+        command(tmp_path / "job.json", keys), cwd=ROOT, env=environment, stdout=subprocess.DEVNULL
+    )
+    folder = RunFolder(keys["out"])
+    reached = folder.checkpoints / f"step_{step:07d}.pt"
+    while not reached.exists() and process.poll() is None:
+        time.sleep(0.001)
+    process.kill()
+    process.wait()
+    assert folder.state() == "interrupted"
+    code, events = run_in_process(keys)
+    assert code == 0 and folder.state() == "done"
+    assert any("Going on from step" in event.get("message", "") for event in events)
+    assert folder.bundle.read_bytes() == unbroken["bundle"]
+
+
+@pytest.mark.parametrize("at", [7, 33])
+def test_cancel_by_file_saves_and_resume_gives_the_same_bits(unbroken, tmp_path, monkeypatch, at):
+    keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
+    folder = RunFolder(keys["out"])
+    real = Flod.train_step
+
+    def ask_to_stop(self, step):
+        if step == at:
+            folder.request_cancel()
+        return real(self, step)
+
+    monkeypatch.setattr(Flod, "train_step", ask_to_stop)
+    code, events = run_in_process(keys)
+    assert code == training_loop.CANCELLED and folder.state() == "cancelled"
+    assert events[-1]["event"] == "cancelled" and events[-1]["step"] == at + 1
+    monkeypatch.undo()
+    assert run_in_process(keys)[0] == 0
+    assert folder.bundle.read_bytes() == unbroken["bundle"]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows cancels by the file")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_polite_signal_saves(unbroken, tmp_path, number):
+    keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
+    keys["parameters"] = {**keys["parameters"], "steps": [20, 20, 30000]}
+    process = subprocess.Popen(
+        command(tmp_path / "job.json", keys), cwd=ROOT, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    for line in process.stdout:
+        if '"progress"' in line:
+            process.send_signal(number)
+            break
+    assert process.wait(60) == 3
+    folder = RunFolder(keys["out"])
+    assert folder.state() == "cancelled" and list(folder.checkpoints.glob("*.pt"))
+
+
+def test_two_trainings_in_one_folder_are_refused_and_the_first_goes_on(unbroken, tmp_path):
+    keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
+    folder = RunFolder(keys["out"])
+    folder.make()
+    with folder.hold():
+        assert folder.state() == "running"
+        second = subprocess.run(
+            command(tmp_path / "job.json", keys), cwd=ROOT, capture_output=True, text=True, timeout=120
+        )
+        assert second.returncode == 2
+        assert "already at work" in json.loads(second.stdout.splitlines()[-1])["what"]
+        assert not folder.events()[0], "the refused one leaves no trace in the run"
+    assert folder.state() == "empty"
+
+
+def test_another_job_does_not_touch_a_run(unbroken):
+    folder = RunFolder(unbroken["keys"]["out"])
+    before = folder.events_file.read_bytes()
+    assert training_loop.train(Job.from_dict({**unbroken["keys"], "seed": 9})) == 2
+    assert folder.events_file.read_bytes() == before and folder.state() == "done"
+
+
+def test_another_seed_gives_another_model(unbroken, tmp_path):
+    keys = {**unbroken["keys"], "out": str(tmp_path / "run"), "seed": 1}
+    assert run_in_process(keys)[0] == 0
+    assert RunFolder(keys["out"]).bundle.read_bytes() != unbroken["bundle"]
+
+
+def test_a_full_disk_is_said_and_the_run_resumes(unbroken, tmp_path, monkeypatch):
+    keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
+    real, calls = torch.save, []
+
+    def full_from_the_second_on(*arguments, **options):
+        calls.append(1)
+        if len(calls) >= 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return real(*arguments, **options)
+
+    monkeypatch.setattr(torch, "save", full_from_the_second_on)
+    code, events = run_in_process(keys)
+    folder = RunFolder(keys["out"])
+    assert code == 2 and folder.state() == "failed"
+    assert events[-1]["event"] == "error" and "No space left" in events[-1]["what"]
+    assert "Free some space" in events[-1]["remedy"]
+    assert not [path for path in folder.path.rglob("*") if ".tmp" in path.name], "no half file stays"
+    monkeypatch.undo()
+    assert run_in_process(keys)[0] == 0
+    assert folder.bundle.read_bytes() == unbroken["bundle"]
+
+
+def test_a_damaged_checkpoint_falls_back_to_the_one_before(unbroken, tmp_path):
+    keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
+    assert run_in_process(keys)[0] == 0
+    folder = RunFolder(keys["out"])
+    newest = max(folder.checkpoints.glob("*.pt"))
+    newest.write_bytes(newest.read_bytes()[:1000])
+    folder.bundle.unlink()
+    assert run_in_process(keys)[0] == 0
+    assert folder.bundle.read_bytes() == unbroken["bundle"]
+
+
+def test_an_unexpected_error_is_an_event_and_its_details_go_to_the_log(
+    unbroken, tmp_path, monkeypatch, capsys
+):
+    def broken(*_):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(training_loop._Run, "to_the_end", broken)
+    code, events = run_in_process({**unbroken["keys"], "out": str(tmp_path / "run")})
+    assert code == 1
+    assert events[-1]["event"] == "error" and "a bug" in events[-1]["what"]
+    assert "Traceback" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        (lambda scene: [p.unlink() for p in (scene / "images").iterdir()], "view"),
+        (lambda scene: (scene / "sparse/0/points3D.txt").write_text(""), "no 3D points"),
+        (lambda scene: (scene / "sparse/0/cameras.txt").unlink(), "no COLMAP model"),
+        (lambda scene: [p.unlink() for p in sorted((scene / "images").iterdir())[1:]], "1 usable view"),
+    ],
+)
+def test_scenes_that_cannot_be_trained_on_say_why(tiny_scene, tmp_path, change, said):
+    import shutil
+
+    scene = tmp_path / "scene"
+    shutil.copytree(tiny_scene, scene)
+    change(scene)
+    keys = {"scene": str(scene), "out": str(tmp_path / "run"), "test_every": 0}
+    done = subprocess.run(
+        command(tmp_path / "job.json", keys), cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 2
+    last = json.loads(done.stdout.splitlines()[-1])
+    assert last["event"] == "error" and said in last["what"] and last["remedy"]
+    assert "Traceback" not in done.stderr
+
+
+def test_reading_events_goes_on_where_it_stopped_and_leaves_half_lines(tmp_path):
+    folder = RunFolder(tmp_path)
+    folder.events_file.write_bytes(b'{"event": "hello"}\nnot json\n{"event": "prog')
+    events, offset = folder.events()
+    assert [event["event"] for event in events] == ["hello"]
+    with folder.events_file.open("ab") as file:
+        file.write(b'ress"}\n')
+    events, end = folder.events(offset)
+    assert [event["event"] for event in events] == ["progress"]
+    assert folder.events(end) == ([], end)

@@ -1,0 +1,216 @@
+"""Photographs: sizes from headers and pixels, against arrays written here by other means."""
+
+import os
+import struct
+import zlib
+
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+
+from training.errors import LodgsError
+from training.scenes.images import image_size, load_image, srgb_coded
+
+
+def write_png(path, pixels: np.ndarray) -> None:
+    """8 or 16 bits; 1, 2, 3 or 4 channels, as the PNG specification has it (Pillow cannot write them all)."""
+    height, width, channels = pixels.shape
+    kind = {1: 0, 2: 4, 3: 2, 4: 6}[channels]
+    rows = pixels.astype(pixels.dtype.newbyteorder(">")).reshape(height, -1)
+    data = b"".join(b"\0" + row.tobytes() for row in rows)
+    header = struct.pack(">IIBBBBB", width, height, 8 * pixels.itemsize, kind, 0, 0, 0)
+    with path.open("wb") as file:
+        file.write(b"\x89PNG\r\n\x1a\n")
+        for name, body in ((b"IHDR", header), (b"IDAT", zlib.compress(data)), (b"IEND", b"")):
+            file.write(struct.pack(">I", len(body)) + name + body)
+            file.write(struct.pack(">I", zlib.crc32(name + body)))
+
+
+def write_exr(path, channels, data_window=None, display_window=None) -> None:
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    if data_window:
+        header |= {"dataWindow": data_window, "displayWindow": display_window}
+    with OpenEXR.File(header, channels) as file:
+        file.write(str(path))
+
+
+@pytest.fixture
+def pixels():
+    return np.random.default_rng(0).integers(0, 256, (30, 44, 3)).astype(np.uint8)
+
+
+def test_half_size_is_an_exact_box(tmp_path, pixels):
+    write_png(tmp_path / "a.png", pixels)
+    expected = pixels.reshape(15, 2, 22, 2, 3).astype(float).mean(axis=(1, 3)) / 255
+    image = load_image(tmp_path / "a.png", 22, 15)
+    assert image.dtype == np.float32 and image.shape == (15, 22, 3)
+    np.testing.assert_allclose(image, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [(44, 30), (43, 29), (31, 17), (13, 7), (1, 1)])
+def test_any_smaller_size_is_the_mean_over_each_pixels_area(tmp_path, pixels, size):
+    """Against the same average on a grid that both sizes divide."""
+    width, height = size
+    write_png(tmp_path / "a.png", pixels)
+    fine = np.repeat(np.repeat(pixels / 255, height, axis=0), width, axis=1)
+    expected = fine.reshape(height, 30, width, 44, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(load_image(tmp_path / "a.png", width, height), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_png_of_every_kind(tmp_path, channels):
+    """Grey becomes RGB and alpha is ignored, however transparent."""
+    pixels = np.random.default_rng(1).integers(0, 256, (5, 7, channels)).astype(np.uint8)
+    write_png(tmp_path / "a.png", pixels)
+    color = pixels[..., :3] if channels > 2 else np.repeat(pixels[..., :1], 3, axis=2)
+    assert image_size(tmp_path / "a.png") == (7, 5)
+    np.testing.assert_allclose(load_image(tmp_path / "a.png", 7, 5), color / 255, atol=1e-6)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_png_of_16_bits(tmp_path, channels):
+    pixels = np.random.default_rng(1).integers(0, 65536, (5, 7, channels)).astype(np.uint16)
+    write_png(tmp_path / "a.png", pixels)
+    expected = np.broadcast_to(pixels / 65535, (5, 7, 3))
+    np.testing.assert_allclose(load_image(tmp_path / "a.png", 7, 5), expected, atol=1 / 255)
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"progressive": True}, {"optimize": True}, {"exif": b"Exif\0\0" + bytes(999)}]
+)
+@pytest.mark.parametrize("mode", ["RGB", "L", "CMYK"])
+def test_jpeg(tmp_path, mode, options):
+    path = tmp_path / "a.jpeg"
+    Image.new(mode, (41, 23), 0).save(path, **options)
+    assert image_size(path) == (41, 23)
+    assert load_image(path, 41, 23).shape == (23, 41, 3)
+
+
+def test_jpeg_with_something_appended_is_whole(tmp_path):
+    path = tmp_path / "a.jpg"
+    Image.new("RGB", (41, 23)).save(path)
+    path.write_bytes(path.read_bytes() + b"what a phone appends" * 99)
+    assert image_size(path) == (41, 23)
+
+
+@pytest.mark.parametrize("part", [0.02, 0.3, 0.5, 0.9, 0.999])
+@pytest.mark.parametrize("kind", ["jpg", "png"])
+def test_a_file_cut_short_is_refused(tmp_path, pixels, kind, part):
+    path = tmp_path / f"a.{kind}"
+    if kind == "png":
+        write_png(path, pixels)
+    else:
+        # A thumbnail in the header is a whole JPEG, end marker and all.
+        Image.fromarray(pixels).save(path, exif=b"Exif\0\0\xff\xd8\xff\xd9")
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(len(whole) * part)])
+    with pytest.raises(LodgsError, match=r"cut short|not a JPEG") as error:
+        image_size(path)
+    assert str(path) in error.value.what
+
+
+def test_other_files_are_refused(tmp_path):
+    for name, data in {"empty": b"", "text": b"not a picture", "gif": b"GIF89a" + bytes(20)}.items():
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(LodgsError, match=name):
+            image_size(tmp_path / name)
+        with pytest.raises(LodgsError, match=name):
+            load_image(tmp_path / name, 2, 2)
+    with pytest.raises(LodgsError, match="absent"):
+        image_size(tmp_path / "absent")
+
+
+def test_real_sizes_are_pillows(shared_scenes):
+    paths = sorted(shared_scenes.glob("*/images/*"))[::5]
+    assert paths
+    for path in paths:
+        with Image.open(path) as image:
+            assert image_size(path) == image.size
+
+
+def test_srgb_at_known_values():
+    """IEC 61966-2-1: the toe, middle grey, white, and beyond."""
+    linear = np.array([-1.0, 0.0, 0.002, 0.0031308, 0.18, 0.5, 1.0, 7.0])
+    coded = np.array([0.0, 0.0, 0.02584, 0.04045, 0.46136, 0.73536, 1.0, 1.0])
+    np.testing.assert_allclose(srgb_coded(linear), coded, atol=2e-5)
+
+
+@pytest.mark.parametrize("names", [("R", "G", "B"), ("V.Combined.R", "V.Combined.G", "V.Combined.B"), ("Y",)])
+@pytest.mark.parametrize("kind", [np.float32, np.float16])
+def test_exr_is_linear_with_exposure(tmp_path, names, kind):
+    """Averaged as light, doubled by a stop, then coded; alpha and other passes are ignored."""
+    random = np.random.default_rng(2)
+    channels = {name: random.uniform(0, 1.2, (8, 10)).astype(kind) for name in names}
+    color = np.stack([channels[names[i % len(names)]] for i in range(3)], axis=2).astype(float)
+    write_exr(
+        tmp_path / "a.exr", {**channels, "A": np.zeros((8, 10), kind), "Depth.Z": np.ones((8, 10), kind)}
+    )
+    assert image_size(tmp_path / "a.exr") == (10, 8)
+    half = color.reshape(4, 2, 5, 2, 3).mean(axis=(1, 3))
+    for stops in (0.0, 1.0, -2.5):
+        image = load_image(tmp_path / "a.exr", 5, 4, exposure=stops)
+        np.testing.assert_allclose(image, srgb_coded(half * 2.0**stops), atol=1e-5)
+
+
+@pytest.mark.parametrize("part", [0.01, 0.03, 0.2, 0.5, 0.95, 0.999])
+@pytest.mark.parametrize("compression", ["NO", "ZIPS", "ZIP", "PIZ", "DWAB"])
+def test_an_exr_cut_short_is_refused(tmp_path, capfd, compression, part):
+    """Before OpenEXR sees it, which would print to the standard output."""
+    path = tmp_path / "a.exr"
+    noise = np.random.default_rng(2).uniform(0, 1, (70, 64)).astype(np.float32)
+    header = {"compression": getattr(OpenEXR, f"{compression}_COMPRESSION"), "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, {"R": noise, "G": noise, "B": noise}) as file:
+        file.write(str(path))
+    assert image_size(path) == (64, 70)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(len(whole) * part)])
+    for read in (image_size, lambda path: load_image(path, 64, 70)):
+        with pytest.raises(LodgsError, match="cut short") as error:
+            read(path)
+        assert str(path) in error.value.what
+    assert capfd.readouterr().out == ""
+
+
+@pytest.mark.parametrize("kind", ["tiledimage", "parts"])
+def test_exr_of_other_layouts(tmp_path, kind):
+    path = tmp_path / "a.exr"
+    light = np.random.default_rng(2).uniform(0, 1, (70, 64)).astype(np.float32)
+    channels = {"R": light, "G": light, "B": light}
+    if kind == "parts":
+        depth = OpenEXR.Part({"type": OpenEXR.scanlineimage}, {"Z": light}, "depth")
+        color = OpenEXR.Part({"type": OpenEXR.scanlineimage}, channels, "color")
+        OpenEXR.File([depth, color]).write(str(path))
+    else:
+        tiles = OpenEXR.TileDescription()
+        tiles.xSize = tiles.ySize = 32
+        OpenEXR.File({"type": OpenEXR.tiledimage, "tiles": tiles}, channels).write(str(path))
+    assert image_size(path) == (64, 70)
+    np.testing.assert_allclose(load_image(path, 64, 70)[..., 1], srgb_coded(light), atol=1e-5)
+
+
+def test_exr_without_colour(tmp_path):
+    write_exr(tmp_path / "a.exr", {"Depth.Z": np.ones((8, 10), np.float32)})
+    with pytest.raises(LodgsError, match="R, G and B"):
+        load_image(tmp_path / "a.exr", 10, 8)
+
+
+def test_exr_crop_and_overscan(tmp_path):
+    """The image is the display window: data beside it is dropped, what no data covers is black."""
+    data = np.ones((4, 5), np.float32)
+    window = (np.array([-2, 3], np.int32), np.array([2, 6], np.int32))
+    display = (np.array([0, 0], np.int32), np.array([9, 7], np.int32))
+    write_exr(tmp_path / "a.exr", {"R": data, "G": data, "B": data}, window, display)
+    expected = np.zeros((8, 10, 3))
+    expected[3:7, 0:3] = 1
+    assert image_size(tmp_path / "a.exr") == (10, 8)
+    np.testing.assert_allclose(load_image(tmp_path / "a.exr", 10, 8), expected, atol=1e-6)
+
+
+def test_a_missing_library_or_broken_pixels_are_a_sentence(tmp_path, pixels):
+    path = tmp_path / "a.jpg"
+    Image.fromarray(pixels).save(path)
+    path.write_bytes(path.read_bytes()[: os.path.getsize(path) // 2])
+    with pytest.raises(LodgsError, match="cannot be read as an image") as error:
+        load_image(path, 10, 10)
+    assert str(path) in error.value.what and error.value.remedy

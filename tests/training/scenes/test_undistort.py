@@ -1,0 +1,146 @@
+"""Undistortion, checked on what the pictures show against pycolmap's camera models."""
+
+import os
+import subprocess
+
+import numpy as np
+import pycolmap
+import pytest
+
+from tests.training.scenes import synthetic
+from training.errors import LodgsError
+from training.scenes.colmap import read_scene
+from training.scenes.images import load_image
+from training.scenes.undistort import undistorted
+
+
+def ramps() -> np.ndarray:
+    """Each pixel's own place as its colour: red is x, green is y, both over the whole range."""
+    x, y = np.meshgrid(np.linspace(0, 255, synthetic.WIDTH), np.linspace(0, 255, synthetic.HEIGHT))
+    return np.stack([x, y, 0 * x], axis=2).round().astype(np.uint8)
+
+
+@pytest.mark.parametrize("model", synthetic.DISTORTION)
+def test_every_model_becomes_the_pinhole_that_the_picture_shows(tmp_path, model):
+    """Each pixel of the result holds what the distorted lens saw along the pixel's ray."""
+    lens = synthetic.camera(model)
+    synthetic.write_scene(tmp_path, lens, names=["a.png"], pixels=ramps())
+    scene = read_scene(tmp_path)
+    result = undistorted(scene, tmp_path / "cache")
+    assert result.distorted == [] and result.warnings == []
+    (camera,) = result.cameras
+    np.testing.assert_allclose(camera.world_to_camera, scene.cameras[0].world_to_camera, atol=1e-12)
+    np.testing.assert_array_equal(result.points, scene.points)
+
+    image = load_image(camera.image, camera.width, camera.height)
+    v, u = np.mgrid[2 : camera.height - 2 : 5, 2 : camera.width - 2 : 5]
+    rays = [((u + 0.5 - camera.cx) / camera.fx).ravel(), ((v + 0.5 - camera.cy) / camera.fy).ravel()]
+    seen = np.array([lens.img_from_cam([x, y, 1.0]) for x, y in zip(*rays, strict=True)])
+    shown = image[v, u].reshape(-1, 3) * [synthetic.WIDTH - 1, synthetic.HEIGHT - 1, 0] + 0.5
+    inside = (seen > 1).all(axis=1) & (seen < [synthetic.WIDTH - 1, synthetic.HEIGHT - 1]).all(axis=1)
+    assert inside.mean() > 0.9
+    assert np.abs(shown[:, :2] - seen)[inside].max() < 0.35
+
+
+def test_an_ideal_fisheye_is_undone_too(tmp_path):
+    """COLMAP itself copies a fisheye whose further distortion is zero."""
+    lens = synthetic.camera("OPENCV_FISHEYE", [0, 0, 0, 0])
+    synthetic.write_scene(tmp_path, lens, names=["a.png"], pixels=ramps())
+    result = undistorted(read_scene(tmp_path), tmp_path / "cache")
+    (camera,) = result.cameras
+    assert result.distorted == []
+    # r = f atan(tan) against r = f tan, at a pixel away from the middle
+    u, v = camera.width - 12, int(camera.cy)
+    tangent = (u + 0.5 - camera.cx) / camera.fx
+    shown = load_image(camera.image, camera.width, camera.height)[v, u, 0] * (synthetic.WIDTH - 1) + 0.5
+    assert shown == pytest.approx(47 + 80 * np.arctan(tangent), abs=0.35)
+    assert abs(80 * (tangent - np.arctan(tangent))) > 1
+
+
+def test_names_sizes_and_missing_images(tmp_path):
+    """Unicode, spaces, subfolders; photographs at half the model's size; views without one stay left out."""
+    names = ["a  b #1%20.png", "c/写真 01.png", "c/absent.png", "ä/ö/ü.png"]
+    synthetic.write_scene(tmp_path, synthetic.camera("OPENCV"), names=names)
+    for name in names:
+        synthetic.write_image(tmp_path / "images" / name, ramps()[::2, ::2])
+    (tmp_path / "images" / "c" / "absent.png").unlink()
+    scene = read_scene(tmp_path)
+    result = undistorted(scene, tmp_path / "cache")
+    assert [camera.name for camera in result.cameras] == [names[0], names[1], names[3]]
+    assert result.warnings == scene.warnings and len(scene.warnings) == 1
+    for camera in result.cameras:
+        assert 30 < camera.width <= 60 and camera.fx == pytest.approx(40)
+        assert load_image(camera.image, camera.width, camera.height).shape == (camera.height, camera.width, 3)
+
+
+def test_the_cache_is_known_by_content(tmp_path, monkeypatch):
+    synthetic.write_scene(tmp_path, synthetic.camera("RADIAL"))
+    cache = tmp_path / "cache"
+    scene = read_scene(tmp_path)
+    first = undistorted(scene, cache)
+    assert [path.name for path in cache.iterdir()] == [first.folder.name]  # and nothing half done beside it
+
+    synthetic.write_image(tmp_path / "images" / "a.png", ramps())
+    second = undistorted(read_scene(tmp_path), cache)
+    assert second.folder != first.folder
+
+    monkeypatch.setattr(subprocess, "run", None)  # whatever starts a process now, fails
+    assert undistorted(read_scene(tmp_path), cache).cameras[0].image == second.cameras[0].image
+
+
+def test_a_pinhole_scene_is_returned_as_it_is(tmp_path):
+    synthetic.write_scene(tmp_path)
+    scene = read_scene(tmp_path)
+    assert undistorted(scene, tmp_path / "cache") is scene
+    assert not (tmp_path / "cache").exists()
+
+
+def test_pinhole_views_beside_distorted_ones(tmp_path):
+    """Two cameras: the pinhole one keeps its size, its intrinsics and its picture."""
+    synthetic.write_scene(tmp_path, names=["a.png", "b.png"])
+    model = tmp_path / "text"
+    model.mkdir()
+    (model / "cameras.txt").write_text("1 PINHOLE 96 72 80 82 47 37\n2 SIMPLE_RADIAL 96 72 80 48 36 0.2\n")
+    (model / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 1 0 0 2 b.png\n\n")
+    (model / "points3D.txt").write_text("")
+    scene = read_scene(tmp_path, model=model)
+    assert scene.distorted == ["b.png"]
+    kept, undone = undistorted(scene, tmp_path / "cache").cameras
+    assert (kept.width, kept.height, kept.fx, kept.fy, kept.cx, kept.cy) == (96, 72, 80, 82, 47, 37)
+    np.testing.assert_array_equal(load_image(kept.image, 96, 72), synthetic.noise().astype(np.float32) / 255)
+    assert (undone.width, undone.height) != (96, 72)
+
+
+def test_failures_are_a_sentence_and_leave_nothing(tmp_path):
+    """One camera whose photographs have two sizes; then a model that pycolmap cannot read."""
+    synthetic.write_scene(tmp_path, synthetic.camera("RADIAL"))
+    synthetic.write_image(tmp_path / "images" / "a.png", synthetic.noise(48, 36))
+    with pytest.raises(LodgsError, match="several sizes"):
+        undistorted(read_scene(tmp_path), tmp_path / "cache")
+    synthetic.write_image(tmp_path / "images" / "a.png", synthetic.noise())
+    (tmp_path / "sparse" / "0" / "points3D.bin").unlink()
+    with pytest.raises(LodgsError, match="could not be undone") as error:
+        undistorted(read_scene(tmp_path), tmp_path / "cache")
+    assert "Traceback" not in str(error.value) and error.value.remedy
+    assert os.listdir(tmp_path / "cache") == []
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(LodgsError, match="could not be undone"):
+        undistorted(read_scene(tmp_path), tmp_path / "file")
+
+
+def test_real_lens_keeps_points_on_their_features(shared_scenes, tmp_path):
+    """Each SfM point projects by the pinhole to where pycolmap takes its undistorted keypoint."""
+    scene = read_scene(shared_scenes / "variants" / "distorted_simple_radial")
+    truth = pycolmap.Reconstruction(str(scene.model))
+    views = {image.name: image for image in truth.images.values()}
+    result = undistorted(scene, tmp_path)
+    assert len(result.cameras) == 32 and not result.distorted
+    for camera in result.cameras[::8]:
+        view = views[camera.name]
+        observed = [point for point in view.points2D if point.has_point3D()]
+        tangents = np.array([view.camera.cam_from_img(point.xy) for point in observed])
+        expected = tangents * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+        points = np.array([truth.points3D[point.point3D_id].xyz for point in observed])
+        local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        projected = local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+        assert np.median(np.linalg.norm(projected - expected, axis=1)) < 1

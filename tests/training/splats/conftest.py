@@ -1,0 +1,38 @@
+"""Random splats for the tests of files."""
+
+import numpy as np
+import pytest
+
+from training.splats.gaussians import Splats
+
+
+@pytest.fixture
+def make_splats():
+    """make_splats(count, degree=3, **extras): random splats; every value is unlike every other."""
+    random = np.random.default_rng(7)
+
+    def normal(*shape):
+        return random.standard_normal(shape, dtype=np.float32)
+
+    def make(count, degree=3, **extras):
+        sh = normal(count, (degree + 1) ** 2, 3)
+        return Splats(normal(count, 3), normal(count, 4), normal(count, 3), normal(count), sh, extras)
+
+    return make
+
+
+@pytest.fixture
+def same():
+    """same(a, b): two splats are equal bit for bit, extras and their types too."""
+
+    def compare(a, b):
+        for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
+            assert getattr(b, name).dtype == np.float32
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+        assert list(a.extras) == list(b.extras)
+        for name, column in a.extras.items():
+            assert b.extras[name].dtype == column.dtype
+            np.testing.assert_array_equal(column, b.extras[name], err_msg=name)
+        return True
+
+    return compare

@@ -1,0 +1,345 @@
+"""The bundle and the folder: judged by plyfile, and by readers as strict as the viewers they copy."""
+
+import hashlib
+import json
+import re
+import shlex
+
+import numpy as np
+import pytest
+from plyfile import PlyData
+
+from training.errors import LodgsError
+from training.splats.bundle import (
+    Bundle,
+    Facts,
+    Level,
+    describe,
+    read_bundle,
+    read_facts,
+    read_folder,
+    write_bundle,
+    write_folder,
+)
+from training.splats.gaussians import Splats
+from training.splats.ply import read_ply, write_ply
+
+from . import viewers
+
+COUNTS = (3, 20, 5000)
+S_MIN = (0.1 + 0.2, 1 / 3, 0.0)
+META = {
+    "method": "flod",
+    "camera_center": [1 / 3, -2.0, 1e-300],
+    "focal_px": 601.23456789,
+    "seed": 7,
+    "note": "packed_ end_header f_rest_0 element chunk é \n",
+}
+
+
+@pytest.fixture
+def bundle(make_splats):
+    """Three levels; the middle one has an extra of its own, all have a float and a byte column."""
+    levels = []
+    for number, (count, s_min) in enumerate(zip(COUNTS, S_MIN, strict=True), 1):
+        extras = {"decay": np.arange(count, dtype="f4") + number, "label": np.arange(count).astype("u1")}
+        if number == 2:
+            extras["only_here"] = np.arange(count, dtype="f8") / 3
+        levels.append(Level(number, make_splats(count, 3, **extras), s_min))
+    return Bundle("flod", levels, META)
+
+
+def check_same(a: Bundle, b: Bundle, same):
+    assert (a.method, a.meta, a.cumulative) == (b.method, b.meta, b.cumulative)
+    assert [(x.number, x.s_min) for x in a.levels] == [(x.number, x.s_min) for x in b.levels]
+    assert all(same(x.splats, y.splats) for x, y in zip(a.levels, b.levels, strict=True))
+
+
+@pytest.mark.parametrize("cumulative", [False, True])
+def test_facts_are_those_of_the_bundle(tmp_path, bundle, cumulative, monkeypatch):
+    bundle.cumulative = cumulative
+    write_bundle(tmp_path / "b.ply", bundle)
+    monkeypatch.setattr("training.splats.bundle.splats_from", None)  # no splat is looked at
+    facts = read_facts(tmp_path / "b.ply")
+    assert (facts.method, facts.numbers, facts.meta) == ("flod", [1, 2, 3], META)
+    assert facts.cumulative is cumulative
+    write_ply(tmp_path / "plain.ply", bundle.levels[0].splats)
+    assert read_facts(tmp_path / "plain.ply") == Facts("", [1])
+    (tmp_path / "b.ply").write_bytes((tmp_path / "b.ply").read_bytes().replace(b'"level":2', b'"level":[]'))
+    with pytest.raises(LodgsError, match="cannot be followed"):
+        read_facts(tmp_path / "b.ply")
+
+
+@pytest.mark.parametrize("order", ["finest_first", "stream"])
+@pytest.mark.parametrize("cumulative", [False, True])
+def test_reads_back_bit_for_bit(tmp_path, bundle, same, order, cumulative):
+    bundle.cumulative = cumulative
+    write_bundle(tmp_path / "b.ply", bundle, order)
+    check_same(bundle, read_bundle(tmp_path / "b.ply"), same)
+
+
+def test_unusual_bits_survive(tmp_path, bundle):
+    """NaN payloads, infinities, negative zeros and denormals are values like others."""
+    bits = np.array([0x7FC01234, 0xFF800000, 0x80000000, 0x00000001], np.uint32)
+    bundle.levels[2].splats.means.reshape(-1)[:4] = bits.view("f4")
+    write_bundle(tmp_path / "b.ply", bundle)
+    back = read_bundle(tmp_path / "b.ply").levels[2].splats.means
+    np.testing.assert_array_equal(back.reshape(-1)[:4].view(np.uint32), bits)
+
+
+def test_plyfile_finds_the_finest_level_first(tmp_path, bundle):
+    write_bundle(tmp_path / "b.ply", bundle)
+    data = PlyData.read(str(tmp_path / "b.ply"))
+    assert [(element.name, element.count) for element in data.elements] == [
+        ("vertex", 5000),
+        ("lod_1_vertex", 20),
+        ("lod_2_vertex", 3),
+        ("lod_extra_0", 5000),
+        ("lod_extra_1", 20),
+        ("lod_extra_2", 3),
+    ]
+    finest = bundle.levels[2].splats
+    np.testing.assert_array_equal(data["vertex"]["y"], finest.means[:, 1])
+    np.testing.assert_array_equal(data["vertex"]["f_rest_15"], finest.sh[:, 1, 1])
+    np.testing.assert_array_equal(data["lod_2_vertex"]["scale_2"], bundle.levels[0].splats.log_scales[:, 2])
+    np.testing.assert_array_equal(data["lod_extra_1"]["only_here"], np.arange(20) / 3)
+    assert data["lod_extra_0"].data.dtype == np.dtype([("decay", "<f4"), ("label", "u1")])
+    assert data.obj_info == [] and data.byte_order == "<"
+
+
+def test_offsets_lead_to_each_level(tmp_path, bundle):
+    """What a streaming reader does: comments, then a byte range."""
+    write_bundle(tmp_path / "b.ply", bundle, "stream")
+    header, data = (tmp_path / "b.ply").read_bytes().split(b"end_header\n", 1)
+    facts = [json.loads(text) for text in re.findall(rb"comment lodsplat (.*)\n", header)]
+    levels = [fact for fact in facts if "level" in fact]
+    assert [fact["level"] for fact in levels] == [1, 2, 3] and levels[0]["element"] == "vertex"
+    for fact, level in zip(levels, bundle.levels, strict=True):
+        rows = np.frombuffer(data, "<f4", fact["count"] * 62, fact["offset"]).reshape(-1, 62)
+        np.testing.assert_array_equal(rows[:, :3], level.splats.means)
+
+
+def test_cumulative_rows_run_from_coarse_to_fine_in_one_vertex(tmp_path, bundle):
+    bundle.cumulative = True
+    write_bundle(tmp_path / "b.ply", bundle)
+    rows = PlyData.read(str(tmp_path / "b.ply"))["vertex"].data
+    expected = np.concatenate([level.splats.means[:, 0] for level in bundle.levels])
+    np.testing.assert_array_equal(rows["x"], expected)
+
+
+@pytest.mark.parametrize("cumulative", [False, True])
+def test_strict_viewers_open_it(tmp_path, bundle, cumulative):
+    bundle.cumulative = cumulative
+    write_bundle(tmp_path / "b.ply", bundle)
+    data = (tmp_path / "b.ply").read_bytes()
+    offset, count, columns = viewers.strict(data)["vertex"]
+    assert (offset, count, len(columns)) == (0, 5023 if cumulative else 5000, 62)
+    first = bundle.levels[0 if cumulative else 2].splats
+    rows = viewers.fixed_record(data, degree=3)
+    assert len(rows) == count
+    np.testing.assert_array_equal(rows[:3, :3], first.means[:3])
+    np.testing.assert_array_equal(rows[:3, -4:], first.quats[:3])
+    header = data[: data.index(b"end_header\n")]
+    for word in (b"obj_info", b"packed_", b"element chunk", b"list ", b"\r", b"\n\n"):
+        assert word not in header
+    assert not any(b"f_rest_" in line for line in header.split(b"\n") if line.startswith(b"comment"))
+
+
+def test_readers_that_sum_all_properties_need_the_plain_file(tmp_path, bundle):
+    """The known limit of the bundle, and why plain PLY is there."""
+    write_bundle(tmp_path / "b.ply", bundle)
+    with pytest.raises(ValueError, match="out of bounds"):
+        viewers.sums_all_properties((tmp_path / "b.ply").read_bytes())
+    finest = bundle.levels[2].splats
+    finest.extras = {}
+    write_ply(tmp_path / "plain.ply", finest)
+    rows = viewers.sums_all_properties((tmp_path / "plain.ply").read_bytes())
+    np.testing.assert_array_equal(rows[:, -4:], finest.quats)
+
+
+def test_header_of_five_full_levels_stays_under_10_kb(tmp_path, make_splats):
+    levels = [
+        Level(i, make_splats(2, 3, decay=np.zeros(2, "f4")), 0.123456789012345678 / i) for i in range(1, 6)
+    ]
+    meta = META | {f"parameter_{i}": i / 7 for i in range(12)}
+    write_bundle(tmp_path / "b.ply", Bundle("flod", levels, meta))
+    assert (tmp_path / "b.ply").read_bytes().index(b"end_header\n") < 10 * 1024
+
+
+def test_meta_that_no_header_can_hold_is_one_sentence(tmp_path, bundle):
+    bundle.meta = {"centres": list(range(5000))}
+    with pytest.raises(LodgsError, match="bytes of header"):
+        write_bundle(tmp_path / "b.ply", bundle)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_numpy_numbers_in_meta_read_back_as_plain_ones(tmp_path, bundle):
+    bundle.meta = {"center": np.array([1.5, 2.5]), "focal_px": np.float32(0.1), "n": np.int64(3)}
+    write_bundle(tmp_path / "b.ply", bundle)
+    assert read_bundle(tmp_path / "b.ply").meta == {
+        "center": [1.5, 2.5],
+        "focal_px": float(np.float32(0.1)),
+        "n": 3,
+    }
+
+
+def test_any_plain_ply_reads_as_one_level(tmp_path, make_splats, same):
+    splats = make_splats(5, 4, temperature=np.arange(5, dtype="i2"))
+    write_ply(tmp_path / "a.ply", splats)
+    back = read_bundle(tmp_path / "a.ply")
+    assert (back.method, back.meta, [x.number for x in back.levels]) == ("", {}, [1])
+    assert same(splats, back.levels[0].splats)
+
+
+def test_read_ply_reads_the_finest_level_of_a_bundle(tmp_path, bundle):
+    write_bundle(tmp_path / "b.ply", bundle)
+    np.testing.assert_array_equal(read_ply(tmp_path / "b.ply").means, bundle.levels[2].splats.means)
+
+
+def test_foreign_elements_and_comments_are_passed_over(tmp_path, bundle, same):
+    write_bundle(tmp_path / "b.ply", bundle)
+    data = (tmp_path / "b.ply").read_bytes()
+    data = data.replace(b"comment lodsplat", b"comment made by lodsplat and others {\ncomment lodsplat", 1)
+    data = data.replace(b"end_header\n", b"element camera 2\nproperty double fov\nend_header\n", 1) + bytes(
+        16
+    )
+    (tmp_path / "c.ply").write_bytes(data)
+    check_same(bundle, read_bundle(tmp_path / "c.ply"), same)
+
+
+@pytest.mark.parametrize("missing", [1, 5000])
+def test_a_bundle_cut_short_says_what_is_missing(tmp_path, bundle, missing):
+    write_bundle(tmp_path / "b.ply", bundle)
+    data = (tmp_path / "b.ply").read_bytes()
+    (tmp_path / "b.ply").write_bytes(data[:-missing])
+    with pytest.raises(LodgsError, match=f"cut short: {missing} of its {len(data)} bytes are missing"):
+        read_bundle(tmp_path / "b.ply")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b'lodsplat {"v":1', b'lodsplat {"v":1,'),
+        (b'lodsplat {"v":1,', b"lodsplat {"),
+        (b'lodsplat {"v":1,', b'lodsplat {"v":99,'),
+        (b'"element":"lod_2_vertex"', b'"element":"lod_9_vertex"'),
+        (b'"level":2,"lod":1,"count":20', b'"level":2,"lod":1,"count":21'),
+        (b'"extras":"lod_extra_1"', b'"extras":"lod_extra_2"'),
+        (b'"count":3,', b""),
+        (b'{"level":1', b'[{"level":1'),
+        (b'{"level":1,', b'{"level":"one",'),
+    ],
+)
+def test_a_header_that_contradicts_itself_is_one_sentence(tmp_path, bundle, old, new):
+    write_bundle(tmp_path / "b.ply", bundle)
+    data = (tmp_path / "b.ply").read_bytes()
+    assert data.count(old) == 1
+    (tmp_path / "b.ply").write_bytes(data.replace(old, new))
+    with pytest.raises(
+        LodgsError, match=r"b\.ply (describes its levels|is a bundle of the newer version 99)"
+    ):
+        read_bundle(tmp_path / "b.ply")
+
+
+def test_no_damage_to_the_header_is_a_traceback(tmp_path, make_splats):
+    """Bytes changed, lost and inserted anywhere in the header: read, or one sentence that names the file."""
+    levels = [Level(1, make_splats(3, 1), 0.5), Level(2, make_splats(9, 1, id=np.arange(9, dtype="u1")), 0.0)]
+    path = tmp_path / "b.ply"
+    write_bundle(path, Bundle("flod", levels, {"gamma": 1}))
+    whole = path.read_bytes()
+    end = whole.index(b"end_header\n") + len(b"end_header\n")
+    random = np.random.default_rng(5)
+    refused = 0
+    for _ in range(400):
+        data = bytearray(whole)
+        at, lost = random.integers(end), random.choice([0, 1, 40])
+        data[at : at + lost] = random.choice([b"", b"\n", b"\r", b"0", b"-", b"{", b"\xff", b"element q 3\n"])
+        path.write_bytes(data)
+        try:
+            describe(path)
+        except LodgsError as error:
+            assert "b.ply" in str(error)
+            refused += 1
+    assert 200 < refused < 400
+
+
+def test_levels_of_different_degrees_are_refused(tmp_path, make_splats):
+    levels = [Level(1, make_splats(2, 0)), Level(2, make_splats(2, 3))]
+    with pytest.raises(LodgsError, match="different degrees"):
+        write_bundle(tmp_path / "b.ply", Bundle("flod", levels))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_folder_reads_back_and_its_manifest_tells_the_truth(tmp_path, bundle, same):
+    command = write_folder(tmp_path / "f", bundle)
+    assert sorted(x.name for x in (tmp_path / "f").iterdir()) == [
+        "lod0.ply",
+        "lod1.ply",
+        "lod2.ply",
+        "manifest.json",
+    ]
+    manifest = json.loads((tmp_path / "f" / "manifest.json").read_text())
+    for lod, (fact, level) in enumerate(zip(manifest["levels"], reversed(bundle.levels), strict=True)):
+        file = tmp_path / "f" / f"lod{lod}.ply"
+        data = file.read_bytes()
+        assert (fact["file"], fact["level"], fact["count"]) == (file.name, level.number, len(level.splats))
+        assert (fact["bytes"], fact["sha256"]) == (len(data), hashlib.sha256(data).hexdigest())
+        assert fact["bounds"] == [level.splats.means.min(0).tolist(), level.splats.means.max(0).tolist()]
+    words = shlex.split(command)
+    assert words[0] == "splat-transform" and words[1:-1:3] == [
+        str(tmp_path / "f" / f"lod{i}.ply") for i in range(3)
+    ]
+    assert (
+        words[2:-1:3] == ["-l"] * 3
+        and words[3:-1:3] == ["0", "1", "2"]
+        and words[-1].endswith("lod-meta.json")
+    )
+
+    # All files have the same columns: the extra that only one level has is in the bundle alone.
+    del bundle.levels[1].splats.extras["only_here"]
+    check_same(bundle, read_folder(tmp_path / "f"), same)
+
+
+def test_folder_of_a_cumulative_bundle_holds_complete_scenes(tmp_path, bundle):
+    bundle.cumulative = True
+    write_folder(tmp_path, bundle)
+    assert [len(level.splats) for level in read_folder(tmp_path).levels] == [3, 23, 5023]
+    expected = Splats.concatenated([level.splats for level in bundle.levels])
+    np.testing.assert_array_equal(read_ply(tmp_path / "lod0.ply").sh, expected.sh)
+
+
+def test_folder_without_manifest(tmp_path, make_splats):
+    for lod, count in ((0, 50), (2, 5), (10, 1)):
+        write_ply(tmp_path / f"tree_lod{lod}.ply", make_splats(count))
+    bundle = read_folder(tmp_path)
+    assert [(level.number, len(level.splats)) for level in bundle.levels] == [(1, 1), (2, 5), (3, 50)]
+    write_ply(tmp_path / "lod0.ply", make_splats(1))
+    with pytest.raises(LodgsError, match="2 series"):
+        read_folder(tmp_path)
+
+
+def test_folder_without_levels(tmp_path):
+    with pytest.raises(LodgsError, match="no series of levels"):
+        read_folder(tmp_path)
+    for text in ('{"v": 1, "levels": [{}]}', '{"v": 1, "method": "", "meta": {}, "levels": []}', "[]", "{"):
+        (tmp_path / "manifest.json").write_text(text)
+        with pytest.raises(LodgsError, match=r"manifest\.json describes its levels"):
+            read_folder(tmp_path)
+
+
+def test_describe(tmp_path, bundle):
+    bundle.levels[2].splats.means[:] = [[-1, 2, 3]]
+    bundle.levels[1].splats.means[:] = [[-1, 2, 3]]
+    bundle.levels[0].splats.means[:] = [[5, 2, 0]]
+    write_bundle(tmp_path / "b.ply", bundle)
+    text = describe(tmp_path / "b.ply")
+    assert "flod, 3 levels" in text and "SH degree 3" in text and "(-1, 2, 0) to (5, 2, 3)" in text
+    rows = [line.split() for line in text.splitlines()[3:6]]
+    assert [row[:2] for row in rows] == [["1", "3"], ["2", "20"], ["3", "5,000"]]
+    # 62 floats, a float and a byte of extras each
+    assert rows[2][2] == f"{5000 * (62 * 4 + 5) / 1e6:.2f}" and rows[1][3] == "0.333333"
+    assert "focal_px: 601.23456789" in text
+    write_folder(tmp_path / "f", bundle)
+    assert describe(tmp_path / "f").splitlines()[3].split()[:2] == ["1", "3"]
+    write_ply(tmp_path / "plain.ply", bundle.levels[0].splats)
+    assert "plain 3DGS PLY, 1 level," in describe(tmp_path / "plain.ply")

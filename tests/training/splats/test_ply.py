@@ -1,0 +1,195 @@
+"""Plain PLY: judged by hand-made bytes and by plyfile."""
+
+import struct
+
+import numpy as np
+import pytest
+from plyfile import PlyData, PlyElement
+
+from training.errors import LodgsError
+from training.splats.ply import read_ply, write_ply
+
+# Degree 1, two splats; value = 100 * splat + place of the column.
+GOLDEN_COLUMNS = [
+    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+    *(
+        "f_rest_0",
+        "f_rest_1",
+        "f_rest_2",
+        "f_rest_3",
+        "f_rest_4",
+        "f_rest_5",
+        "f_rest_6",
+        "f_rest_7",
+        "f_rest_8",
+    ),
+    *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+]
+
+
+def golden_values(splat):
+    return [0.0 if name in ("nx", "ny", "nz") else 100.0 * splat + i for i, name in enumerate(GOLDEN_COLUMNS)]
+
+
+def header(kind="binary_little_endian", columns=GOLDEN_COLUMNS, count=2):
+    lines = ["ply", f"format {kind} 1.0", f"element vertex {count}"]
+    return "\n".join([*lines, *(f"property float {name}" for name in columns), "end_header", ""]).encode()
+
+
+GOLDEN = header() + struct.pack("<52f", *golden_values(0), *golden_values(1))
+
+
+def check_golden(splats):
+    """The columns by hand: places 0-2 means, 6-8 DC, 9-17 rest by channel, 18 opacity, 19-21, 22-25."""
+    for i in range(2):
+        o = 100.0 * i
+        assert splats.means[i].tolist() == [o, o + 1, o + 2]
+        assert splats.sh[i].tolist() == [
+            [o + 6, o + 7, o + 8],
+            [o + 9, o + 12, o + 15],  # first coefficient of red, green, blue
+            [o + 10, o + 13, o + 16],
+            [o + 11, o + 14, o + 17],
+        ]
+        assert splats.opacity_logits[i] == o + 18
+        assert splats.log_scales[i].tolist() == [o + 19, o + 20, o + 21]
+        assert splats.quats[i].tolist() == [o + 22, o + 23, o + 24, o + 25]
+
+
+def test_reads_the_original_layout(tmp_path):
+    (tmp_path / "a.ply").write_bytes(GOLDEN)
+    splats = read_ply(tmp_path / "a.ply")
+    check_golden(splats)
+    assert splats.sh_degree == 1 and splats.extras == {}
+
+
+def test_writes_the_original_layout_to_the_byte(tmp_path):
+    (tmp_path / "a.ply").write_bytes(GOLDEN)
+    write_ply(tmp_path / "b.ply", read_ply(tmp_path / "a.ply"))
+    assert (tmp_path / "b.ply").read_bytes() == GOLDEN
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_every_degree_comes_back_and_plyfile_agrees(tmp_path, make_splats, same, degree):
+    count = 5000  # more than one block of rows
+    splats = make_splats(count, degree)
+    write_ply(tmp_path / "a.ply", splats)
+    assert same(splats, read_ply(tmp_path / "a.ply"))
+
+    data = PlyData.read(str(tmp_path / "a.ply"))
+    assert [element.name for element in data.elements] == ["vertex"]
+    rows = data["vertex"].data
+    rest = (degree + 1) ** 2 - 1
+    assert list(rows.dtype.names) == [
+        *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+        *(f"f_rest_{i}" for i in range(3 * rest)),
+        *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+    ]
+    np.testing.assert_array_equal(rows["z"], splats.means[:, 2])
+    np.testing.assert_array_equal(rows["rot_0"], splats.quats[:, 0])
+    for i in range(3 * rest):  # as the reference code: features_rest.transpose(1, 2).flatten(start_dim=1)
+        flat = splats.sh[:, 1:].transpose(0, 2, 1).reshape(count, -1)
+        np.testing.assert_array_equal(rows[f"f_rest_{i}"], flat[:, i])
+
+
+def test_other_byte_order(tmp_path):
+    body = struct.pack(">52f", *golden_values(0), *golden_values(1))
+    (tmp_path / "a.ply").write_bytes(header("binary_big_endian") + body)
+    check_golden(read_ply(tmp_path / "a.ply"))
+
+
+def test_ascii(tmp_path):
+    body = "\n".join(" ".join(map(str, golden_values(i))) for i in range(2)) + "\n"
+    (tmp_path / "a.ply").write_bytes(header("ascii") + body.encode())
+    check_golden(read_ply(tmp_path / "a.ply"))
+
+
+def test_windows_line_ends(tmp_path):
+    body = GOLDEN[len(header()) :]
+    (tmp_path / "a.ply").write_bytes(header().replace(b"\n", b"\r\n") + body)
+    check_golden(read_ply(tmp_path / "a.ply"))
+
+
+def test_other_order_without_normals_and_with_faces(tmp_path):
+    columns = [name for name in reversed(GOLDEN_COLUMNS) if name not in ("nx", "ny", "nz")]
+    rows = np.zeros(2, [(name, "f8") for name in columns])  # doubles, too
+    for name in columns:
+        rows[name] = [golden_values(i)[GOLDEN_COLUMNS.index(name)] for i in range(2)]
+    faces = np.empty(1, [("vertex_indices", "O")])
+    faces["vertex_indices"][0] = np.array([0, 1, 0], "i4")
+    elements = [PlyElement.describe(rows, "vertex"), PlyElement.describe(faces, "face")]
+    PlyData(elements, byte_order="<").write(str(tmp_path / "a.ply"))
+    check_golden(read_ply(tmp_path / "a.ply"))
+
+
+def test_unknown_columns_of_every_type_survive(tmp_path, make_splats, same):
+    kinds = ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"]
+    edge = {
+        kind: np.array([np.finfo(kind).tiny if kind[0] == "f" else np.iinfo(kind).max, 3, 0], kind)
+        for kind in kinds
+    }
+    splats = make_splats(3, 1, **{f"column_{kind}": column for kind, column in edge.items()})
+    write_ply(tmp_path / "a.ply", splats)
+    assert same(splats, read_ply(tmp_path / "a.ply"))
+    rows = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    for kind, column in edge.items():
+        assert rows.dtype[f"column_{kind}"] == np.dtype(kind)
+        np.testing.assert_array_equal(rows[f"column_{kind}"], column)
+
+
+def test_normals_that_mean_something_survive_in_their_place(tmp_path, make_splats, same):
+    splats = make_splats(4, 0, nx=np.arange(4, dtype="f4"), ny=np.zeros(4, "f4"), nz=np.ones(4, "f4"))
+    write_ply(tmp_path / "a.ply", splats)
+    rows = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    assert rows.dtype.names[3:6] == ("nx", "ny", "nz") and rows["nx"].tolist() == [0, 1, 2, 3]
+    assert same(splats, read_ply(tmp_path / "a.ply"))
+
+
+def test_no_splats_at_all(tmp_path, make_splats):
+    write_ply(tmp_path / "a.ply", make_splats(0, 2))
+    splats = read_ply(tmp_path / "a.ply")
+    assert len(splats) == 0 and splats.sh_degree == 2
+
+
+def test_a_selection_is_written_as_it_is(tmp_path, make_splats):
+    splats = make_splats(100, 1, mark=np.arange(100, dtype="u1"))
+    write_ply(tmp_path / "a.ply", splats.select(splats.means[:, 0] > 0))
+    back = read_ply(tmp_path / "a.ply")
+    np.testing.assert_array_equal(back.extras["mark"], np.flatnonzero(splats.means[:, 0] > 0))
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (GOLDEN[:-5], "a.ply is cut short: 5 of its [0-9]+ bytes are missing"),
+        (GOLDEN[:100], "cut short: its header does not end"),
+        (b"", "is not a PLY file"),
+        (b"PK\x03\x04 something else", "is not a PLY file"),
+        (
+            header(columns=["x", "y", "z", "red"]) + bytes(32),
+            r"it has no f_dc_0, f_dc_1, f_dc_2, opacity, scale_0",
+        ),
+        (header(columns=[*GOLDEN_COLUMNS, "f_rest_9"]) + bytes(216), "has 10 f_rest columns"),
+        (header(columns=[*GOLDEN_COLUMNS, "x"]) + bytes(216), "damaged header"),
+        (header().replace(b"float z", b"quad z"), "damaged header"),
+        (header().replace(b"element vertex", b"element point") + bytes(208), "no element vertex"),
+        (header().replace(b"property float x", b"property list uchar int x"), "lists in its vertices"),
+        (header("ascii") + b"1 2 3\n", "is damaged"),
+    ],
+)
+def test_a_bad_file_is_one_sentence(tmp_path, content, sentence):
+    (tmp_path / "a.ply").write_bytes(content)
+    with pytest.raises(LodgsError, match=sentence) as caught:
+        read_ply(tmp_path / "a.ply")
+    assert "a.ply" in caught.value.what and caught.value.remedy
+
+
+def test_a_missing_file_is_one_sentence(tmp_path):
+    with pytest.raises(LodgsError, match=r"none\.ply could not be read: No such file"):
+        read_ply(tmp_path / "none.ply")
+
+
+@pytest.mark.parametrize("name,column", [("two words", np.zeros(2, "f4")), ("flag", np.zeros(2, "i8"))])
+def test_a_column_that_ply_cannot_hold_is_one_sentence(tmp_path, make_splats, name, column):
+    with pytest.raises(LodgsError, match=f"{name}.* cannot be written as PLY"):
+        write_ply(tmp_path / "a.ply", make_splats(2, 0, **{name: column}))
+    assert list(tmp_path.iterdir()) == []

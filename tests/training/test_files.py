@@ -1,0 +1,49 @@
+"""Atomic writes: the old file or the new one, never a part."""
+
+import errno
+import os
+
+import pytest
+
+from training.errors import LodgsError
+from training.files import atomic_write
+
+
+def test_appears_whole_and_leaves_nothing_beside(tmp_path):
+    path = tmp_path / "made" / "a.txt"
+    with atomic_write(path) as temporary:
+        assert temporary.parent == path.parent
+        temporary.write_text("new")
+        assert not path.exists()
+    assert path.read_text() == "new"
+    assert os.listdir(path.parent) == ["a.txt"]
+
+
+def test_a_failure_keeps_the_old_file(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with pytest.raises(KeyError), atomic_write(path) as temporary:
+        temporary.write_text("half")
+        raise KeyError("stop")
+    assert path.read_text() == "old"
+    assert os.listdir(tmp_path) == ["a.txt"]
+
+
+def test_a_full_disk_is_one_sentence(tmp_path):
+    with (
+        pytest.raises(LodgsError, match=r"a\.txt could not be written: No space left"),
+        atomic_write(tmp_path / "a.txt"),
+    ):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_place_that_is_a_file_is_one_sentence(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(LodgsError, match="could not be written"), atomic_write(tmp_path / "file" / "a.txt"):
+        pass
+
+
+def test_an_error_about_another_file_passes_through(tmp_path):
+    with pytest.raises(FileNotFoundError), atomic_write(tmp_path / "a.txt"):
+        (tmp_path / "elsewhere" / "missing.txt").read_bytes()

@@ -1,0 +1,258 @@
+"""Measure a training step by stage, against the machine's own limit: ``make bench``.
+
+Prints a table and saves build/bench/bench.json; ``--base old.json`` compares with an earlier run. Compare
+runs of one machine only, and trust none that says the machine was busy.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+import numpy as np
+import torch
+
+from training.rasterize import Adam, Target, cpu, photometric_loss, rasterize
+from training.rasterize.cpu import adam
+from training.rasterize.cpu.bin import LOG2_ALPHA_MIN
+from training.rasterize.cpu.blend import CAP, T_MIN, row_range
+from training.rasterize.cpu.compile import FAST, f32, kernel, numba, prange
+from training.rasterize.cpu.fastmath import exp2
+from training.scenes.cameras import Camera
+
+CASES = [(10_000, 320, 240), (50_000, 640, 480), (200_000, 640, 480), (200_000, 960, 540)]
+FORWARD_FLOPS, BACKWARD_FLOPS = 26, 47
+"""Operations for each lane of a row that a splat reaches in a tile, counted in the source of ``blend``."""
+STAGES = {
+    "project": (cpu, "project_forward"),
+    "bin": (cpu, "bin_splats"),
+    "blend": (cpu, "blend_forward"),
+    "loss": (cpu, "loss_and_gradient"),
+    "blend_backward": (cpu, "blend_backward"),
+    "project_backward": (cpu, "project_backward"),
+    "adam": (adam, "update"),
+}
+
+
+def synthetic_splats(count: int, seed: int = 0) -> dict[str, torch.Tensor]:
+    """Random splats in a frustum, of log-normal anisotropic scales: about 46 blends a pixel at any count."""
+    random = np.random.default_rng(seed)
+    z = random.uniform(2, 10, count)
+    means = np.stack([random.uniform(-0.55, 0.55, count) * z, random.uniform(-0.42, 0.42, count) * z, z], 1)
+    base = np.log(0.75 / np.sqrt(count)) + np.log(z) + random.normal(0, 0.6, count)
+    log_scales = base[:, None] + random.normal(0, 0.45, (count, 3))
+    quats = random.normal(size=(count, 4))
+    opacity_logits = random.normal(-0.8, 1.6, count)
+    sh = random.normal(size=(count, 16, 3)) * 0.08
+    sh[:, 0] = random.uniform(-1.5, 1.5, (count, 3))
+    arrays = {
+        "means": means,
+        "quats": quats,
+        "log_scales": log_scales,
+        "opacity_logits": opacity_logits,
+        "sh": sh,
+    }
+    return {name: torch.tensor(array, dtype=torch.float32) for name, array in arrays.items()}
+
+
+def synthetic_camera(width: int, height: int) -> Camera:
+    return Camera("bench", width, height, width, width, width / 2, height / 2, np.eye(4))
+
+
+class Step:
+    """A full training step on the synthetic scene."""
+
+    def __init__(self, count: int, width: int, height: int) -> None:
+        self.splats: dict[str, Any] = {
+            name: tensor.requires_grad_() for name, tensor in synthetic_splats(count).items()
+        }
+        self.camera = synthetic_camera(width, height)
+        self.target = Target(np.random.default_rng(1).random((height, width, 3), dtype=np.float32))
+        self.adam = Adam(self.splats, dict.fromkeys(self.splats, 1e-7))
+
+    def __call__(self) -> None:
+        self.adam.zero_grad()
+        drawn = rasterize(**self.splats, camera=self.camera)
+        photometric_loss(drawn.image, self.target).backward()
+        self.adam.step()
+
+
+class Stopwatch:
+    """Adds up the time spent in the stages of the cpu backend, by wrapping them while it is in use."""
+
+    def __enter__(self) -> Stopwatch:
+        self.seconds = dict.fromkeys(STAGES, 0.0)
+        self.originals = {stage: getattr(module, name) for stage, (module, name) in STAGES.items()}
+        for stage, (module, name) in STAGES.items():
+            setattr(module, name, self._timed(stage, self.originals[stage]))
+        return self
+
+    def _timed(self, stage: str, function: Callable) -> Callable:
+        def call(*args):
+            start = time.perf_counter()
+            result = function(*args)
+            self.seconds[stage] += time.perf_counter() - start
+            return result
+
+        return call
+
+    def __exit__(self, *_) -> None:
+        for stage, (module, name) in STAGES.items():
+            setattr(module, name, self.originals[stage])
+
+
+def measure(step: Callable[[], None], seconds: float) -> tuple[dict[str, float], float]:
+    """Milliseconds by stage of the fastest of as many steps as fit, "step" the whole; and CPU time by wall
+    time."""
+    step()
+    best: dict[str, float] = {"step": float("inf")}
+    start, cpu_start = time.perf_counter(), time.process_time()
+    while time.perf_counter() - start < seconds or best["step"] == float("inf"):
+        with Stopwatch() as watch:
+            began = time.perf_counter()
+            step()
+            whole = time.perf_counter() - began
+        if whole * 1e3 < best["step"]:
+            best = {stage: 1e3 * spent for stage, spent in watch.seconds.items()}
+            best["around"] = 1e3 * whole - sum(best.values())
+            best["step"] = 1e3 * whole
+    return best, (time.process_time() - cpu_start) / (time.perf_counter() - start)
+
+
+@kernel(FAST, parallel=True)
+def multiply_add(values, rounds):
+    """64 dependent multiply-adds an element, 4096 elements a thread in the L1 cache."""
+    for thread in prange(values.shape[0]):
+        line = values[thread]
+        for _ in range(rounds):
+            for j in range(line.shape[0]):
+                x = line[j]
+                for _ in range(64):
+                    x = x * f32(0.999) + f32(0.001)
+                line[j] = x
+
+
+def measured_peak() -> float:
+    """Float32 operations a second (1e9) that multiply-adds reach on all threads."""
+    values, rounds = np.ones((numba.get_num_threads(), 4096), np.float32), 2000
+    multiply_add(values, 1)
+    seconds = []
+    for _ in range(5):
+        start = time.perf_counter()
+        multiply_add(values, rounds)
+        seconds.append(time.perf_counter() - start)
+    return values.size * rounds * 128 / min(seconds) / 1e9
+
+
+@kernel(FAST, parallel=True)
+def count_work(projected, splat, tile_start, tiles_x, walked, height, lanes, blends):
+    """Per tile: lanes executed, and splats that a pixel takes light from (pixels beyond the border
+    included)."""
+    for tile in prange(walked.shape[0]):
+        x0, y0 = tile % tiles_x * 16, tile // tiles_x * 16
+        t = np.ones((16, 16), np.float32)
+        for pair in range(tile_start[tile], tile_start[tile] + walked[tile]):
+            row = projected[splat[pair]]
+            top = f32(y0) + f32(0.5)
+            first, last = row_range(row, top, min(16, height - y0))
+            lanes[tile] += 16 * max(0, last - first)
+            for r in range(first, last):
+                for j in range(16):
+                    dx, dy = f32(x0 + j) + f32(0.5) - row[0], f32(r) + top - row[1]
+                    log2_alpha = row[5] - row[2] * dx * dx - row[3] * dx * dy - row[4] * dy * dy
+                    alpha = min(exp2(log2_alpha), CAP)
+                    if log2_alpha >= LOG2_ALPHA_MIN and t[r, j] > 0:
+                        behind = t[r, j] * (f32(1) - alpha)
+                        blends[tile] += behind > T_MIN
+                        t[r, j] = behind if behind > T_MIN else -t[r, j]
+
+
+def work(step: Step) -> tuple[int, float]:
+    """Lanes that one pass executes, and blends a pixel."""
+    seen = {}
+    original = cpu.blend_forward
+
+    def spy(projected, splat, tile_start, tiles_x, background, image, transmittance, walked):
+        original(projected, splat, tile_start, tiles_x, background, image, transmittance, walked)
+        lanes, blends = np.zeros((2, len(walked)), np.int64)
+        count_work(projected, splat, tile_start, tiles_x, walked, len(transmittance), lanes, blends)
+        seen["lanes"], seen["blends"] = int(lanes.sum()), int(blends.sum()) / transmittance.size
+
+    cpu.blend_forward = spy
+    try:
+        with torch.no_grad():
+            rasterize(**step.splats, camera=step.camera)
+    finally:
+        cpu.blend_forward = original
+    return seen["lanes"], seen["blends"]
+
+
+def bench(seconds: float) -> dict:
+    peak = measured_peak()
+    threads = numba.get_num_threads()
+    print(f"{threads} threads, FP32 peak measured {peak:.0f} GFLOP/s")
+    columns = [*STAGES, "around", "step"]
+    print(
+        f"{'splats':>7} {'pixels':>8} {'blends':>6} "
+        + " ".join(f"{c:>8.8}" for c in columns)
+        + "  of peak  busy"
+    )
+    cases = []
+    for count, width, height in CASES:
+        step = Step(count, width, height)
+        lanes, blends = work(step)
+        best, busy = measure(step, seconds)
+        pixel_seconds = (best["blend"] + best["blend_backward"]) / 1e3
+        share = lanes * (FORWARD_FLOPS + BACKWARD_FLOPS) / 1e9 / pixel_seconds / peak
+        cases.append(
+            {
+                "splats": count, "width": width, "height": height, "blends_per_pixel": round(blends, 1),
+                "threads": threads, "step_ms": {name: round(best[name], 2) for name in columns},
+                "kernel_share_of_peak": round(share, 3), "cpu_by_wall_time": round(busy, 2),
+            }
+        )  # fmt: skip
+        print(
+            f"{count:7} {width}x{height} {blends:6.1f} "
+            + " ".join(f"{best[c]:8.2f}" for c in columns)
+            + f" {share:8.1%} {busy:5.2f}"
+        )
+    if max(os.getloadavg()[:1] if hasattr(os, "getloadavg") else [0]) > threads + 1:
+        print("The machine was busy with other work: these times are too long.")
+    return {"peak_gflops": round(peak, 1), "cases": cases}
+
+
+def compare(new: dict, base: dict) -> None:
+    """Print each case's step against the same case of an earlier run."""
+    earlier = {(case["splats"], case["width"], case["height"]): case for case in base["cases"]}
+    for case in new["cases"]:
+        key = case["splats"], case["width"], case["height"]
+        if key in earlier:
+            ratio = case["step_ms"]["step"] / earlier[key]["step_ms"]["step"]
+            print(f"{key[0]} splats, {key[1]}x{key[2]}: {ratio:.2f} of the earlier time")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=5.0, help="time for each case")
+    parser.add_argument("--base", type=Path, help="a bench.json to compare with")
+    parser.add_argument("--out", type=Path, default=Path("build/bench/bench.json"))
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    result = bench(options.seconds)
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    options.out.write_text(json.dumps(result, indent=1) + "\n")
+    print(f"saved {options.out}")
+    if options.base:
+        compare(result, json.loads(options.base.read_text()))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,33 @@
+"""Blender as a Python module with this checkout linked as an extension, for tests and the demo."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+EXTENSION = "bl_ext.user_default.lodgs"
+"""The package that the extension is imported as."""
+
+
+def start_blender():
+    """Imports bpy and enables the extension, in a Blender user folder of its own; returns the module.
+
+    Only once in a process. The user's own Blender settings are neither read nor written.
+    """
+    resources = Path(tempfile.mkdtemp(prefix="lodgs-blender-"))
+    link = resources / "extensions" / "user_default" / "lodgs"
+    link.parent.mkdir(parents=True)
+    link.symlink_to(REPOSITORY, target_is_directory=True)
+    os.environ["BLENDER_USER_RESOURCES"] = str(resources)
+
+    import bpy  # isort: skip
+    import addon_utils  # known only once bpy has been imported
+
+    def fail(error: Exception):
+        raise error
+
+    bpy.context.preferences.use_preferences_save = False
+    addon_utils.enable(EXTENSION, default_set=True, handle_error=fail)  # type: ignore[arg-type]
+    return bpy

@@ -1,0 +1,149 @@
+"""Let another program judge our files: ``make interop``.
+
+Gives bundles, a plain PLY and a folder of levels to PlayCanvas' splat-transform (from npm, run on the CPU)
+and compares its counts, and the values it writes back, with ours. ``python tools/interop.py [BUNDLE.ply]``
+takes a bundle at hand; without one, five levels of random splats are made. Exit code 0: all agree;
+1: something does not; 2: nothing could be checked.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+from plyfile import PlyData
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from training.splats.bundle import Bundle, Level, read_bundle, write_bundle, write_folder  # noqa: E402
+from training.splats.gaussians import Splats  # noqa: E402
+from training.splats.ply import write_ply  # noqa: E402
+
+PACKAGE = "@playcanvas/splat-transform"
+VERSION = "3.7.0"
+FOLDER = ROOT / "build" / "interop"
+
+
+def main() -> int:
+    if not shutil.which("node") or not shutil.which("npm"):
+        print("Nothing was checked: Node.js is missing; install it (with npm) and run this again.")
+        return 2
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    if not install():
+        print(f"Nothing was checked: npm could not install {PACKAGE} {VERSION} (see above).")
+        return 2
+    bundle = read_bundle(sys.argv[1]) if len(sys.argv) > 1 else random_bundle()
+    if bundle.levels[0].splats.sh_degree > 3:
+        print(f"Nothing was checked: {PACKAGE} reads spherical harmonics up to degree 3.")
+        return 2
+    rows = [(what, ours, theirs, ours == theirs) for what, ours, theirs in checks(bundle)]
+    print(f"{'splat-transform ' + VERSION:<34}  {'ours':<34}  {'theirs':<34}")
+    for what, ours, theirs, same in rows:
+        print(f"{what:<34}  {ours!s:<34}  {theirs!s:<34}  {'ok' if same else 'DIFFERENT'}")
+    return 0 if all(same for *_, same in rows) else 1
+
+
+def install() -> bool:
+    """Install the pinned version into build/interop unless it is there."""
+    package = FOLDER / "node_modules" / PACKAGE / "package.json"
+    if package.exists() and json.loads(package.read_text("utf-8"))["version"] == VERSION:
+        return True
+    command = ["npm", "install", "--prefix", str(FOLDER), "--no-audit", "--no-fund", f"{PACKAGE}@{VERSION}"]
+    # npm finds a project in a parent folder unless this one has its own.
+    (FOLDER / "package.json").write_text('{"private": true}\n')
+    return subprocess.run([shutil.which("npm") or "npm", *command[1:]]).returncode == 0
+
+
+def splat_transform(*arguments: str) -> subprocess.CompletedProcess[str]:
+    program = FOLDER / "node_modules" / PACKAGE / "bin" / "cli.mjs"
+    return subprocess.run(["node", str(program), *arguments], capture_output=True, text=True)
+
+
+def random_bundle() -> Bundle:
+    """Five levels of random splats with SH degree 3 and two extras."""
+    random = np.random.default_rng(0)
+
+    def normal(*shape: int) -> np.ndarray:
+        return random.standard_normal(shape, dtype=np.float32)
+
+    levels = []
+    for number, count in enumerate((100, 300, 1000, 3000, 10000), 1):
+        extras = {"decay": normal(count), "label": random.integers(0, 200, count).astype(np.uint8)}
+        sh = 0.3 * normal(count, 16, 3)
+        splats = Splats(normal(count, 3), normal(count, 4), normal(count, 3) - 3, normal(count), sh, extras)
+        levels.append(Level(number, splats, s_min=0.2 * 4.0 ** (1 - number) if number < 5 else 0.0))
+    return Bundle("flod", levels, {"gamma": 1.0, "focal_px": 600.0})
+
+
+def checks(bundle: Bundle):
+    """Yield (what, our answer, splat-transform's answer)."""
+    counts = [len(level.splats) for level in reversed(bundle.levels)]
+    finest = bundle.levels[-1].splats
+    whole = sum(counts) if bundle.cumulative else counts[0]
+
+    path = FOLDER / "bundle.ply"
+    write_bundle(path, bundle)
+    yield "bundle, finest first: splats, SH", (whole, finest.sh_degree), info(path)
+    yield "bundle: values of the finest level", "equal", values(path)
+
+    # The judge must be able to say no.
+    short = FOLDER / "short.ply"
+    short.write_bytes(path.read_bytes()[:-1])
+    yield "bundle, one byte short", "refused", "refused" if info(short) is None else "accepted"
+
+    path = FOLDER / "stream.ply"
+    write_bundle(path, bundle, order="stream")
+    first = whole if bundle.cumulative else counts[-1]
+    yield "bundle, coarsest first: splats, SH", (first, finest.sh_degree), info(path)
+
+    path = FOLDER / "plain.ply"
+    write_ply(path, finest)
+    yield "plain: splats, SH", (counts[0], finest.sh_degree), info(path)
+    yield "plain: values", "equal", values(path)
+
+    folder = FOLDER / "folder"
+    shutil.rmtree(folder, ignore_errors=True)
+    _, *arguments = shlex.split(write_folder(folder, bundle))
+    # Its compression of view-dependent colour takes minutes on a CPU and changes no count: -H 0 drops it.
+    result = splat_transform("-w", "-g", "cpu", *arguments, "-H", "0")
+    meta = Path(arguments[-1])
+    theirs = json.loads(meta.read_text("utf-8"))["counts"] if meta.exists() else failure(result)
+    complete = [sum(counts[lod:]) for lod in range(len(counts))] if bundle.cumulative else counts
+    yield "folder: lod-meta.json counts", complete, theirs
+
+
+def failure(result: subprocess.CompletedProcess[str]) -> str:
+    """What splat-transform said, on one line."""
+    return " ".join(result.stderr.split())[:200] or f"exit code {result.returncode}"
+
+
+def info(path: Path) -> tuple[int, int] | None:
+    """Splats and SH degree as splat-transform reads them; None when it refuses the file."""
+    result = splat_transform("-q", str(path), "--info", "json", "null")
+    if result.returncode:
+        return None
+    facts = json.loads(result.stdout)
+    return facts["numGaussians"], facts["shBands"]
+
+
+def values(path: Path) -> str:
+    """Whether splat-transform writes back every value of ``vertex`` as it read it."""
+    back = path.with_suffix(".back.ply")
+    back.unlink(missing_ok=True)
+    result = splat_transform("-w", str(path), str(back))
+    if result.returncode or not back.exists():
+        return failure(result)
+    ours = PlyData.read(str(path))["vertex"].data
+    theirs = PlyData.read(str(back))["vertex"].data
+    different = [name for name in ours.dtype.names if not np.array_equal(ours[name], theirs[name])]
+    return f"different: {', '.join(different)}" if different else "equal"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,15 @@
+"""The one error that users are meant to see."""
+
+
+class LodgsError(Exception):
+    """A mistake or a limit that a user can act on: shown as one sentence or two, never as a traceback.
+
+    Args:
+        what: what could not be done and why, naming the file or value concerned.
+        remedy: what the user can do about it.
+    """
+
+    def __init__(self, what: str, remedy: str = "") -> None:
+        super().__init__(f"{what} {remedy}".strip())
+        self.what = what
+        self.remedy = remedy

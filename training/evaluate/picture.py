@@ -1,0 +1,76 @@
+"""A bundle as one camera sees it: every level, the selective view and the photograph side by side."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ..files import atomic_write
+from ..lod.colors import level_color
+from ..scenes.cameras import Camera
+from ..splats.bundle import Bundle
+from ..splats.gaussians import Splats
+from .metrics import psnr
+from .protocol import Evaluation, select_flod
+
+SH_C0 = 0.28209479177387814
+
+
+def level_picture(
+    path: Path, bundle: Bundle, evaluation: Evaluation, camera: Camera, gamma: float, start: int, end: int
+) -> None:
+    """Writes a PNG: levels coarse to fine, the selective view, its levels in colours, the photograph.
+
+    Args:
+        path: file to write.
+        camera: a held-out view.
+        gamma, start, end: of the selective view (``protocol.select_flod``).
+    """
+    target = evaluation.target(camera)
+
+    def tile(name: str, splats: Splats) -> tuple[str, torch.Tensor]:
+        image = evaluation.draw(splats, camera)
+        return f"{name}   {len(splats):,} splats   {psnr(image, target):.1f} dB", image
+
+    tiles = [tile(f"level {level.number}", level.splats) for level in bundle.levels]
+    if len(bundle.levels) > 1:
+        view = (camera.center, min(camera.fx, camera.fy), gamma, start, end)
+        tiles.append(tile(f"levels {start} to {end}", select_flod(bundle, *view)))
+        tiles.append(
+            ("which level where", evaluation.draw(select_flod(_in_level_colors(bundle), *view), camera))
+        )
+    tiles.append(("photograph", target))
+    _write_sheet(path, tiles)
+
+
+def _in_level_colors(bundle: Bundle) -> Bundle:
+    levels = []
+    for level in bundle.levels:
+        color = np.array(level_color(level.number), np.float32)
+        # the level's colour, with the splats' own lightness so that the scene stays readable
+        lightness = (0.5 + SH_C0 * level.splats.sh[:, 0]).clip(0, 1).mean(1, keepdims=True)
+        sh = ((0.35 + 0.65 * lightness) * color - 0.5) / SH_C0
+        levels.append(replace(level, splats=replace(level.splats, sh=sh[:, None].astype(np.float32))))
+    return replace(bundle, levels=levels)
+
+
+def _write_sheet(
+    path: Path, tiles: list[tuple[str, torch.Tensor]], columns: int = 4, caption: int = 22
+) -> None:
+    from PIL import Image, ImageDraw, ImageFont
+
+    height, width = tiles[0][1].shape[:2]
+    rows = -(-len(tiles) // columns)
+    columns = min(columns, len(tiles))
+    sheet = Image.new("RGB", (columns * (width + 4) - 4, rows * (height + caption)), (24, 24, 24))
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=13)
+    for place, (name, image) in enumerate(tiles):
+        x, y = place % columns * (width + 4), place // columns * (height + caption)
+        pixels = (image.clamp(0, 1) * 255).round().byte().numpy()
+        sheet.paste(Image.fromarray(pixels), (x, y + caption))
+        draw.text((x + 6, y + 3), name, fill=(230, 230, 230), font=font)
+    with atomic_write(path) as temporary:
+        sheet.save(temporary, format="PNG")

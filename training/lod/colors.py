@@ -1,0 +1,12 @@
+"""A colour for each level of detail, for pictures and viewports that tell which level is where."""
+
+LEVEL_COLORS = (
+    (0.55, 0.34, 0.76), (0.23, 0.49, 0.85), (0.16, 0.66, 0.60), (0.93, 0.72, 0.20), (0.88, 0.32, 0.25),
+    (0.60, 0.60, 0.60), (0.40, 0.25, 0.15), (0.95, 0.60, 0.75),
+)  # fmt: skip
+"""sRGB, coarse to fine: violet, blue, teal, yellow, red, ...; they repeat after the eighth."""
+
+
+def level_color(number: int) -> tuple[float, float, float]:
+    """The colour of level ``number``; 1 is the coarsest."""
+    return LEVEL_COLORS[(number - 1) % len(LEVEL_COLORS)]

@@ -1,0 +1,65 @@
+"""The rules of the papers, as formulas on arrays (numpy or torch: only shared operators are used).
+
+Levels are listed from coarse to fine; level 1 is the first entry. Distances, near and far are in the
+scene's own units (COLMAP's), focal lengths in pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import inf
+
+
+def flod_s_min(s_min_1: float, rho: float, levels: int) -> list[float]:
+    """FLoD's 3D scale constraint of each level (FLoD, Eq. 3): s_min_1 * rho**(1 - l), and 0 at the last.
+
+    Args:
+        s_min_1: constraint of level 1, in scene units (the paper's lambda).
+        rho: factor by which it shrinks from level to level.
+        levels: number of levels; with one level there is no constraint, which is plain 3DGS.
+    """
+    return [s_min_1 * rho ** (1 - level) for level in range(1, levels)] + [0.0]
+
+
+def flod_bands(
+    s_min: Sequence[float], focal_px: float, gamma: float, start: int, end: int
+) -> list[tuple[float, float]]:
+    """The distance band [near, far) in which each level is drawn (FLoD, Eq. 7 and 8).
+
+    d_proj(l) = s_min(l) / gamma * focal_px is where level l's smallest detail covers gamma pixels. Level l
+    serves d_proj(l) <= d < d_proj(l - 1); the finest level in use starts at 0, the coarsest has no end.
+
+    Args:
+        s_min: scale constraint of every level, coarse to fine.
+        focal_px: focal length of the viewing camera in pixels.
+        gamma: screen size threshold in pixels.
+        start, end: the coarsest and the finest level in use, 1-based, inclusive.
+
+    Returns:
+        One (near, far) for each level; (inf, inf) for levels outside [start, end].
+
+    Raises:
+        ValueError: if not 1 <= start <= end <= len(s_min), or gamma is not positive.
+    """
+    if not 1 <= start <= end <= len(s_min):
+        raise ValueError(f"levels {start} to {end} are not a range within 1 to {len(s_min)}")
+    if gamma <= 0:
+        raise ValueError(f"gamma must be positive, not {gamma}")
+
+    def d_proj(level: int) -> float:
+        return s_min[level - 1] / gamma * focal_px
+
+    bands = []
+    for level in range(1, len(s_min) + 1):
+        if not start <= level <= end:
+            bands.append((inf, inf))
+            continue
+        near = 0.0 if level == end else d_proj(level)
+        far = inf if level == start else d_proj(level - 1)
+        bands.append((near, far))
+    return bands
+
+
+def band_mask(distances, near: float, far: float):
+    """Where near <= distance < far, as booleans (N,): the splats whose weight is 1."""
+    return (distances >= near) & (distances < far)

@@ -1,0 +1,107 @@
+"""What methods train on: views at training size, held-out views, and the scene's own units."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from ..errors import LodgsError
+from ..rasterize import Target
+from ..scenes.cameras import Camera
+from ..scenes.colmap import Scene
+from ..scenes.images import load_image
+
+IMAGE_MEMORY = 2 << 30
+"""Bytes of ground truth, with its cached moments, that are kept; further views are read when needed."""
+
+TARGET_BYTES = 36
+"""Bytes a pixel of ground truth: the photograph and its two local moments, float32."""
+
+
+class TrainingData:
+    """A scene's views, resized, with images read when first needed.
+
+    Attributes:
+        train, test: cameras at training size; test views are every n-th by name.
+    """
+
+    def __init__(
+        self, scene: Scene, image_scale: float = 1.0, test_every: int = 8, exposure: float = 0.0
+    ) -> None:
+        if len(scene.points) == 0:
+            raise LodgsError(
+                f"The COLMAP model in {scene.model} has no 3D points, so there is nothing to train from.",
+                "Triangulate the model's points in COLMAP, or choose another model.",
+            )
+        train, test = scene.split(test_every)
+        if len(train) < 2:
+            raise LodgsError(
+                f"The scene {scene.folder} has {len(train)} usable view(s) to train on; 2 are needed.",
+                "Check that the image folder holds the photographs that the model names.",
+            )
+        self.scene, self.exposure = scene, exposure
+        self.train = [_shrunk(camera, image_scale) for camera in train]
+        self.test = [_shrunk(camera, image_scale) for camera in test]
+        self._targets: dict[int, Target] = {}
+        self._room = IMAGE_MEMORY
+
+    @cached_property
+    def extent(self) -> float:
+        """Scene extent in scene units: 1.1 x the largest distance of a camera from their mean."""
+        return self.scene.extent()
+
+    @cached_property
+    def median_depth(self) -> float:
+        """Median depth of the points in the views, in scene units."""
+        return self.scene.median_depth()
+
+    @cached_property
+    def mean_camera(self) -> np.ndarray:
+        """Mean position of the training cameras, (3,)."""
+        return np.mean([camera.center for camera in self.train], axis=0)
+
+    @cached_property
+    def focal(self) -> float:
+        """Focal length in pixels: the training views' median of min(fx, fy)."""
+        return float(np.median([min(camera.fx, camera.fy) for camera in self.train]))
+
+    @property
+    def near(self) -> float:
+        """Depth before which nothing is drawn, in scene units."""
+        return 0.01 * self.median_depth
+
+    @cached_property
+    def threshold_scale(self) -> float:
+        """Factor on 3DGS's gradient threshold for the size of these images.
+
+        The loss is a mean over pixels, and the gradient counts half image widths: for a splat of given
+        size in pixels it grows as the image shrinks, with the inverse of the image's side.
+        """
+        pixels = np.median([camera.width * camera.height for camera in self.train])
+        return float(np.sqrt(1e6 / pixels))
+
+    def training_view(self, step: int, seed: int) -> int:
+        """The index of the view to train at a step: every epoch is a new shuffle, from (seed, epoch)."""
+        epoch, place = divmod(step, len(self.train))
+        return int(np.random.default_rng([seed, epoch]).permutation(len(self.train))[place])
+
+    def image(self, camera: Camera) -> np.ndarray:
+        """The photograph at the camera's size, (H, W, 3) float32, display-coded, 0 to 1."""
+        assert camera.image is not None
+        return load_image(camera.image, camera.width, camera.height, exposure=self.exposure)
+
+    def target(self, view: int) -> Target:
+        """The ground truth of a training view, ready for the loss."""
+        target = self._targets.get(view)
+        if target is None:
+            target = Target(self.image(self.train[view]))
+            size = TARGET_BYTES * self.train[view].width * self.train[view].height
+            if size <= self._room:
+                self._room -= size
+                self._targets[view] = target
+        return target
+
+
+def _shrunk(camera: Camera, scale: float) -> Camera:
+    return camera.resized(max(int(camera.width * scale), 1), max(int(camera.height * scale), 1))

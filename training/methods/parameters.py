@@ -1,0 +1,181 @@
+"""What a job can set: every method's parameters, with their presets. No torch: Blender shows these."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+from ..errors import LodgsError
+
+PRESETS = {
+    "draft": "Minutes on two processor cores: a first look",
+    "standard": "An evening on a laptop, minutes on a GPU",
+    "paper": "The paper's own schedule",
+}
+METHODS = {
+    "flod": "FLoD: independent levels, each limited to a smallest size of detail",
+    "3dgs": "Plain 3D Gaussian splatting: one level, for comparison",
+}
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of FLoD; with ``levels`` = 1 they are those of plain 3DGS. The defaults are the draft's.
+
+    A tuple has one entry for each level, coarse to fine. Sizes and thresholds do not depend on the scene's
+    scale: they are in pixels of the training images or in multiples of the scene extent.
+    """
+
+    levels: int = 5
+    """Number of levels (FLoD: L_max)."""
+    rho: float = 4.0
+    """Factor between the smallest sizes of two neighbouring levels (FLoD: rho)."""
+    footprint: float = 16.0
+    """Pixels that level 1's smallest size covers at the scene's median depth; sets lambda."""
+    s_min_1: float = 0.0
+    """Level 1's smallest size in scene units (FLoD: lambda); 0 takes it from ``footprint``."""
+    steps: tuple[int, ...] = (300, 500, 600, 900, 2000)
+    """Training steps of each level."""
+    densify_until: tuple[float, ...] = (0.5, 0.5, 0.5, 0.5, 0.5)
+    """Share of a level's steps after which splats are no longer added or removed."""
+    densify_interval: tuple[int, ...] = (50, 50, 50, 50, 50)
+    """Steps between two densifications."""
+    grad_threshold: float = 1e-4
+    """Mean image-plane gradient (3DGS units) above which a splat is cloned or split, at one megapixel."""
+    max_splats: int = 120_000
+    """Most splats the last level may have; the ones with the largest gradients are densified first."""
+    budget_ratio: float = 0.65
+    """A level's share of the next finer level's budget of splats, so that every level adds some."""
+    clone_extent: float = 0.01
+    """Splats larger than this multiple of the scene extent are split, smaller ones cloned."""
+    min_opacity: float = 0.005
+    """Splats below this opacity are removed."""
+    prune_interval: int = 100
+    """Steps between two removals of transparent splats."""
+    overlap_interval: int = 50
+    """Steps between two overlap prunings; the last level has none (FLoD, Sec. 4.3)."""
+    rejoin_points: bool = True
+    """Whether structure-from-motion points that overlap pruning took join again at the level that has room
+    for them. Not in the paper; in short schedules it lets finer levels begin from exact positions."""
+    opacity_reset_interval: int = 0
+    """Steps between two opacity resets; 0 never resets."""
+    sh_degree: int = 3
+    """Degree of the spherical harmonics that carry view-dependent colour, 0 to 3."""
+    sh_interval: int = 250
+    """Steps after which the next degree joins in."""
+    ssim_weight: float = 0.2
+    """Weight of D-SSIM against L1 in the loss."""
+    lr_means: float = 3e-4
+    """Learning rate of positions, times the scene extent, at the start of a level."""
+    lr_means_final: float = 3e-5
+    """The same at the end of ``lr_means_steps``."""
+    lr_means_steps: int = 0
+    """Steps over which the positions' rate decays; 0 takes each level's own steps."""
+    lr_scales: float = 1e-2
+    lr_quats: float = 1e-3
+    lr_opacities: float = 5e-2
+    lr_sh: float = 2.5e-3
+    """Learning rate of the base colour; the other harmonics take a twentieth."""
+
+
+_DRAFT = Parameters()
+_STANDARD = replace(
+    _DRAFT,
+    steps=(2_000, 3_000, 4_000, 6_000, 15_000),
+    max_splats=1_000_000,
+    sh_interval=1000,
+    lr_means=1.6e-4,
+    lr_means_final=1.6e-6,
+    lr_scales=5e-3,
+    densify_interval=(100,) * 5,
+)
+_PAPER = replace(
+    _STANDARD,
+    footprint=40.0,
+    steps=(10_000, 15_000, 20_000, 25_000, 30_000),
+    densify_until=(0.5, 0.4, 0.4, 0.4, 0.5),
+    densify_interval=(2000, 1000, 500, 500, 200),
+    overlap_interval=1000,
+    rejoin_points=False,
+    opacity_reset_interval=3000,
+    grad_threshold=2e-4,
+    max_splats=5_000_000,
+    budget_ratio=1.0,
+    lr_means_steps=30_000,
+)
+_PRESETS = {"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER}
+
+
+def preset(method: str, name: str) -> Parameters:
+    """The parameters of a method's preset.
+
+    Raises:
+        LodgsError: if there is no such method or preset.
+    """
+    if method not in METHODS:
+        raise LodgsError(f"There is no method '{method}'.", f"Choose one of: {', '.join(METHODS)}.")
+    if name not in PRESETS:
+        raise LodgsError(f"There is no preset '{name}'.", f"Choose one of: {', '.join(PRESETS)}.")
+    parameters = _PRESETS[name]
+    if method == "3dgs":
+        steps = sum(parameters.steps) if name == "draft" else 30_000
+        interval = min(parameters.densify_interval[-1], 100)
+        parameters = replace(
+            parameters, levels=1, steps=(steps,), densify_until=(0.5,), densify_interval=(interval,)
+        )
+    return parameters
+
+
+def override(parameters: Parameters, values: dict) -> Parameters:
+    """``parameters`` with the named values changed, as a job file gives them.
+
+    A single number for a per-level parameter serves every level; a new number of ``levels`` keeps the
+    last entries of the per-level ones (the finest levels) or repeats the first.
+
+    Raises:
+        LodgsError: on an unknown name, a value of the wrong kind, or a wrong number of entries.
+    """
+    kinds = {f.name: type(getattr(parameters, f.name)) for f in fields(parameters)}
+    unknown = sorted(set(values) - set(kinds))
+    if unknown:
+        raise LodgsError(
+            f"The job sets the unknown parameter '{unknown[0]}'.", f"Known are: {', '.join(kinds)}."
+        )
+    levels = values.get("levels", parameters.levels)
+    if not isinstance(levels, int) or not 1 <= levels <= 12:
+        raise LodgsError(f"levels = {levels!r} is not possible.", "Give a whole number from 1 to 12.")
+    changed = {}
+    for name, kind in kinds.items():
+        value = values.get(name, getattr(parameters, name))
+        if kind is bool:
+            changed[name] = _yes_or_no(name, value)
+        elif kind is tuple:
+            changed[name] = _per_level(name, value, levels, given=name in values)
+        else:
+            changed[name] = _number(name, value, kind)
+    return replace(parameters, **changed)
+
+
+def _number(name: str, value, kind: type):
+    valid = isinstance(value, int) or (kind is float and isinstance(value, float))
+    if not valid or isinstance(value, bool) or value < 0:
+        wanted = "a whole number" if kind is int else "a number"
+        raise LodgsError(f"{name} = {value!r} is not possible.", f"Give {wanted} of at least 0.")
+    return kind(value)
+
+
+def _yes_or_no(name: str, value) -> bool:
+    if not isinstance(value, bool):
+        raise LodgsError(f"{name} = {value!r} is not possible.", "Give true or false.")
+    return value
+
+
+def _per_level(name: str, value, levels: int, given: bool) -> tuple:
+    entries = tuple(value) if isinstance(value, list | tuple) else (value,) * levels
+    kind = float if name == "densify_until" else int
+    if given and len(entries) != levels:
+        raise LodgsError(
+            f"{name} has {len(entries)} entries for {levels} levels.",
+            "Give one for each level, coarse to fine, or a single number.",
+        )
+    entries = entries[:1] * (levels - len(entries)) + entries[-levels:]
+    return tuple(_number(name, entry, kind) for entry in entries)

@@ -1,0 +1,117 @@
+"""Splats to pixels and back: one meaning, several backends.
+
+``reference`` (plain torch) is the definition, ``cpu`` (Numba, gradients by hand) the fast path on any
+computer. A backend is a module with ``rasterize`` and ``photometric_loss`` of the reference's signatures,
+imported when it is first used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib import import_module
+
+import torch
+
+from ..errors import LodgsError
+from ..scenes.cameras import Camera
+from .adam import Adam
+from .rendering import Rendering, Target, View
+from .sh import coefficients, degree_of
+
+__all__ = ["BACKENDS", "Adam", "Rendering", "Target", "photometric_loss", "rasterize", "warm_up"]
+
+BACKENDS = ("cpu", "reference")
+"""Backends by name, the preferred one first: ``auto`` is the first."""
+
+
+def rasterize(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    log_scales: torch.Tensor,
+    opacity_logits: torch.Tensor,
+    sh: torch.Tensor,
+    camera: Camera,
+    *,
+    weights: torch.Tensor | None = None,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    sh_degree: int | None = None,
+    min_scale: float = 0.0,
+    near: float = 0.01,
+    backend: str = "auto",
+) -> Rendering:
+    """Draw splats as a camera sees them; differentiable by every tensor given.
+
+    Projection, alpha and blending are those of 3D Gaussian Splatting (Kerbl et al. 2023); the constants are
+    in :mod:`.rendering`. The view direction's part of the gradient reaches the means.
+
+    Args:
+        means: (N, 3) in the world.
+        quats: (N, 4) rotations wxyz, of any length but zero.
+        log_scales: (N, 3); the standard deviations are exp(log_scales) + min_scale, in world units.
+        opacity_logits: (N,); the opacity is sigmoid(opacity_logits) times the weight.
+        sh: (N, (d+1)², 3) spherical-harmonics coefficients; the colour is 0.5 + Σ c·Y, at least 0.
+        camera: the view; any pinhole, any principal point.
+        weights: (N,) in [0, 1], or None for ones. A splat of weight 0 is dropped before projection.
+        background: colour behind everything.
+        sh_degree: use the coefficients up to this degree only (the others get a gradient of zero); None: all.
+        min_scale: lower bound of every scale, in world units (FLoD, Eq. 4).
+        near: a splat is drawn where its mean lies deeper than this, in world units.
+        backend: one of :data:`BACKENDS`, or "auto".
+
+    Raises:
+        ValueError: for tensors whose shapes do not belong together.
+        LodgsError: for a backend that does not exist.
+    """
+    count = len(means)
+    shapes = {"means": (means, 3), "quats": (quats, 4), "log_scales": (log_scales, 3)}
+    for name, (tensor, columns) in shapes.items():
+        if tensor.shape != (count, columns):
+            raise ValueError(f"{name} must have shape ({count}, {columns}), not {tuple(tensor.shape)}")
+    for name, tensor in (("opacity_logits", opacity_logits), ("weights", weights)):
+        if tensor is not None and tensor.shape != (count,):
+            raise ValueError(f"{name} must have shape ({count},), not {tuple(tensor.shape)}")
+    if sh.ndim != 3 or sh.shape[0] != count or sh.shape[2] != 3:
+        raise ValueError(f"sh must have shape ({count}, coefficients, 3), not {tuple(sh.shape)}")
+    degree = degree_of(sh.shape[1])
+    if sh_degree is not None:
+        if coefficients(sh_degree) > sh.shape[1]:
+            raise ValueError(f"sh has degree {degree}, sh_degree asks for {sh_degree}")
+        degree = sh_degree
+    red, green, blue = (float(value) for value in background)
+    return _backend(backend).rasterize(
+        means, quats, log_scales, opacity_logits, sh, weights,
+        view=View.of(camera, near), background=(red, green, blue), degree=degree, min_scale=float(min_scale),
+    )  # fmt: skip
+
+
+def photometric_loss(
+    image: torch.Tensor, target: Target, ssim_weight: float = 0.2, *, backend: str = "auto"
+) -> torch.Tensor:
+    """(1 − ssim_weight) L1 + ssim_weight (1 − SSIM), as 3DGS (Eq. 7): a scalar, differentiable by the image.
+
+    SSIM has an 11x11 Gaussian window of sigma 1.5 and zeros outside the image.
+
+    Args:
+        image: (H, W, 3), a rendering.
+        target: the photograph; keep it from step to step, its moments are computed once.
+    """
+    if image.shape != target.image.shape:
+        raise ValueError(f"image {tuple(image.shape)} and target {tuple(target.image.shape)} differ in shape")
+    return _backend(backend).photometric_loss(image, target, float(ssim_weight))
+
+
+def warm_up(backend: str = "auto") -> None:
+    """Compile what a training step needs (seconds the first time on a machine, then read from a cache)."""
+    module = _backend(backend)
+    if hasattr(module, "warm_up"):
+        module.warm_up()
+
+
+def _backend(name: str):
+    if name == "auto":
+        name = BACKENDS[0]
+    if name not in BACKENDS:
+        raise LodgsError(
+            f'There is no rasterizer backend "{name}".', f"Choose auto or one of {', '.join(BACKENDS)}."
+        )
+    return import_module(f".{name}", __package__)

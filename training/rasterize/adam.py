@@ -1,0 +1,94 @@
+"""Adam over named tensors whose rows come and go."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+LearningRate = float | torch.Tensor | np.ndarray
+
+
+class Adam:
+    """Adam (Kingma and Ba 2015, Algorithm 1) over splat tensors, with moments that densification can index.
+
+    Args:
+        tensors: leaf tensors (N, ...) by name, contiguous float32 on the CPU.
+        lr: learning rate by name: a number, or an array that broadcasts against one row (for ``sh`` of shape
+            (N, K, 3) a (K, 1) array gives each coefficient its own). Change it between steps as you like.
+        betas, eps: as in the paper; 3DGS uses eps 1e-15.
+
+    Attributes:
+        tensors: the tensors by name.
+        state: (first moment, second moment) by name, tensors of the parameter's shape.
+        steps: how many steps each tensor has seen.
+    """
+
+    def __init__(
+        self,
+        tensors: Mapping[str, torch.Tensor],
+        lr: Mapping[str, LearningRate],
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-15,
+    ) -> None:
+        if set(tensors) != set(lr):
+            raise ValueError(f"learning rates for {sorted(lr)}, tensors for {sorted(tensors)}")
+        self.tensors: dict[str, torch.Tensor] = {}
+        self.state: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}
+        self.steps = dict.fromkeys(tensors, 0)
+        self.lr = dict(lr)
+        self.betas = betas
+        self.eps = eps
+        for name, tensor in tensors.items():
+            self.replace(name, tensor)
+
+    def replace(
+        self, name: str, tensor: torch.Tensor, m: torch.Tensor | None = None, v: torch.Tensor | None = None
+    ) -> None:
+        """Put another tensor in the place of ``name``, with moments of its shape (zeros by default)."""
+        m = torch.zeros_like(tensor, requires_grad=False) if m is None else m
+        v = torch.zeros_like(tensor, requires_grad=False) if v is None else v
+        for each in (tensor, m, v):
+            if each.shape != tensor.shape or each.dtype != torch.float32 or not each.is_contiguous():
+                raise ValueError(f"{name} and its moments must be contiguous float32 of one shape")
+        self.tensors[name] = tensor
+        self.state[name] = (m, v)
+
+    @torch.no_grad()
+    def step(self, grads: Mapping[str, torch.Tensor] | None = None) -> None:
+        """One step in place, by the gradients given or each tensor's own; a tensor without one is left."""
+        from .cpu.adam import update
+
+        for name, tensor in self.tensors.items():
+            gradient = tensor.grad if grads is None else grads.get(name)
+            if gradient is None:
+                continue
+            self.steps[name] += 1
+            m, v = self.state[name]
+            update(
+                tensor.detach().numpy(), gradient.contiguous().numpy(), m.numpy(), v.numpy(),
+                self.lr[name], self.betas, self.eps, self.steps[name],
+            )  # fmt: skip
+
+    def zero_grad(self) -> None:
+        """Forget the gradients, so that the next ``backward`` starts from nothing."""
+        for tensor in self.tensors.values():
+            tensor.grad = None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Moments and step counts: tensors and numbers, as ``torch.load(weights_only=True)`` reads them."""
+        return {
+            "steps": dict(self.steps),
+            "m": {name: m for name, (m, _) in self.state.items()},
+            "v": {name: v for name, (_, v) in self.state.items()},
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Take up what :meth:`state_dict` gave; ValueError where names or shapes differ from the tensors'."""
+        if set(state["steps"]) != set(self.tensors):
+            raise ValueError(f"state of {sorted(state['steps'])}, tensors {sorted(self.tensors)}")
+        for name, tensor in self.tensors.items():
+            self.replace(name, tensor, state["m"][name].clone(), state["v"][name].clone())
+        self.steps = dict(state["steps"])

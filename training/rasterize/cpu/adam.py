@@ -1,0 +1,51 @@
+"""The Adam update."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from .compile import STRICT, f32, kernel, prange, serialised
+
+ROW = 1024
+M_TINY = f32(1e-30)
+V_TINY = f32(1e-36)
+
+
+@kernel(STRICT, parallel=True)
+def _update(parameter, gradient, m, v, lr, keep_m, keep_v, scale_v, eps):
+    """All arrays flat; ``lr`` (width,) repeats along them and has the first moment's bias correction in it.
+
+    Moments of splats that stay out of sight decay into denormal numbers, which are slow; they are cut off far
+    below where they could matter (the root of V_TINY is a thousandth of 3DGS's eps).
+    """
+    width = lr.shape[0]
+    total = parameter.shape[0]
+    for row in prange((total + width - 1) // width):
+        start = row * width
+        for j in range(min(width, total - start)):
+            i = start + j
+            g = gradient[i]
+            first = keep_m * m[i] + (f32(1) - keep_m) * g
+            second = keep_v * v[i] + (f32(1) - keep_v) * (g * g)
+            first = first if abs(first) > M_TINY else f32(0)
+            second = second if second > V_TINY else f32(0)
+            m[i] = first
+            v[i] = second
+            parameter[i] -= lr[j] * first / (math.sqrt(second * scale_v) + eps)
+
+
+@serialised
+def update(parameter, gradient, m, v, lr, betas, eps, step) -> None:
+    """One Adam step in place; ``lr`` is a number or broadcasts against one row of ``parameter``."""
+    correction = 1 - betas[0] ** step
+    lr = np.asarray(lr, np.float32) / np.float32(correction)
+    if lr.size == 1:
+        lr_row = np.full(ROW, lr.item(), np.float32)
+    else:
+        lr_row = np.ascontiguousarray(np.broadcast_to(lr, parameter.shape[1:])).reshape(-1)
+    _update(
+        parameter.reshape(-1), gradient.reshape(-1), m.reshape(-1), v.reshape(-1), lr_row,
+        f32(betas[0]), f32(betas[1]), f32(1 / (1 - betas[1] ** step)), f32(eps),
+    )  # fmt: skip

@@ -1,0 +1,188 @@
+"""Which splats touch which 16x16 tile, front to back: every tile's list of splats.
+
+A pair is one splat in one tile. Splats are sorted by depth once; pairs then go to their tiles by a counting
+sort that keeps that order. Chunks of the depth order, not threads, decide where a pair lies, so the result
+does not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..rendering import ALPHA_MIN
+from .compile import STRICT, f32, inlined, kernel, prange
+from .project import (
+    CONIC_XX,
+    CONIC_XY,
+    CONIC_YY,
+    HALF_HEIGHT,
+    HALF_WIDTH,
+    LOG2_OPACITY,
+    MEAN_X,
+    MEAN_Y,
+)
+
+TILE = 16
+CHUNKS = 32
+LOG2_ALPHA_MIN = f32(math.log2(ALPHA_MIN))
+HALF, TWO, SPAN = f32(0.5), f32(2), f32(TILE - 1)
+
+
+@dataclass
+class Pairs:
+    """Pairs of splats and tiles, tile by tile, front to back in each.
+
+    Attributes:
+        splat: (P,) int32, the splat of each pair.
+        tile_start: (tiles + 1,) int64, where each tile's pairs begin; tiles go row by row.
+        first, count: (N,) int64 and int32: the pairs of splat i are row[first[i] : first[i] + count[i]].
+        row: int64, positions in ``splat``; some are unused.
+    """
+
+    splat: np.ndarray
+    tile_start: np.ndarray
+    first: np.ndarray
+    count: np.ndarray
+    row: np.ndarray
+
+
+@kernel(STRICT)
+def sort_by_depth(keys, splats, other_keys, other_splats):
+    """Sort ``splats`` by their keys, stably: three passes of a radix sort of 11 bits.
+
+    Keys are the bits of positive float32 numbers as uint32, which order as the numbers do. The sorted splats
+    are in ``other_splats``; all four arrays, of one length, are overwritten.
+    """
+    source_keys, source, target_keys, target = keys, splats, other_keys, other_splats
+    for shift in (0, 11, 22):
+        start = np.zeros(2049, np.int64)
+        for i in range(keys.shape[0]):
+            start[((source_keys[i] >> np.uint32(shift)) & np.uint32(2047)) + 1] += 1
+        for digit in range(2048):
+            start[digit + 1] += start[digit]
+        for i in range(keys.shape[0]):
+            digit = (source_keys[i] >> np.uint32(shift)) & np.uint32(2047)
+            target_keys[start[digit]] = source_keys[i]
+            target[start[digit]] = source[i]
+            start[digit] += 1
+        source_keys, target_keys = target_keys, source_keys
+        source, target = target, source
+
+
+@inlined(STRICT)
+def tile_range(middle, reach, tiles):
+    """The first tile and one past the last whose pixel centres may lie within ``reach`` of ``middle``."""
+    low = math.floor((middle - reach - HALF) / f32(TILE))
+    high = math.floor((middle + reach - HALF) / f32(TILE)) + 1
+    return max(0, min(low, tiles)), max(0, min(high, tiles))
+
+
+@inlined(STRICT)
+def touches(row, tile_x, tile_y):
+    """Whether the ellipse on which alpha is ALPHA_MIN meets the rectangle of a tile's pixel centres.
+
+    The quadratic form is convex, so outside the rectangle its minimum lies on one of the edges that face the
+    mean.
+    """
+    left, top = f32(tile_x * TILE) + HALF - row[MEAN_X], f32(tile_y * TILE) + HALF - row[MEAN_Y]
+    right, bottom = left + SPAN, top + SPAN
+    beside, above = left > 0 or right < 0, top > 0 or bottom < 0
+    if not beside and not above:
+        return True
+    a, b, c = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY]
+    least = f32(np.inf)
+    if beside:
+        dx = left if left > 0 else right
+        dy = min(max(-b * dx / (TWO * c), top), bottom)
+        least = (a * dx + b * dy) * dx + c * dy * dy
+    if above:
+        dy = top if top > 0 else bottom
+        dx = min(max(-b * dy / (TWO * a), left), right)
+        least = min(least, (a * dx + b * dy) * dx + c * dy * dy)
+    return least <= row[LOG2_OPACITY] - LOG2_ALPHA_MIN
+
+
+@kernel(STRICT, parallel=True)
+def box_sizes(projected, order, tiles_x, tiles_y, sizes):
+    """How many tiles the bounding box of each splat covers, in depth order."""
+    for k in prange(order.shape[0]):
+        row = projected[order[k]]
+        x0, x1 = tile_range(row[MEAN_X], row[HALF_WIDTH], tiles_x)
+        y0, y1 = tile_range(row[MEAN_Y], row[HALF_HEIGHT], tiles_y)
+        sizes[k] = (x1 - x0) * (y1 - y0)
+
+
+@kernel(STRICT, parallel=True)
+def find_tiles(projected, order, box_start, tiles_x, tiles_y, first, count, hits, histogram):
+    """The one test of splat against tile: list the tiles that each splat touches, and count them by chunk."""
+    total = order.shape[0]
+    for chunk in prange(CHUNKS):
+        tally = histogram[chunk]
+        for k in range(total * chunk // CHUNKS, total * (chunk + 1) // CHUNKS):
+            row = projected[order[k]]
+            x0, x1 = tile_range(row[MEAN_X], row[HALF_WIDTH], tiles_x)
+            y0, y1 = tile_range(row[MEAN_Y], row[HALF_HEIGHT], tiles_y)
+            end = box_start[k]
+            for tile_y in range(y0, y1):
+                for tile_x in range(x0, x1):
+                    if touches(row, tile_x, tile_y):
+                        tile = tile_y * tiles_x + tile_x
+                        hits[end] = tile
+                        tally[tile] += 1
+                        end += 1
+            first[order[k]] = box_start[k]
+            count[order[k]] = end - box_start[k]
+
+
+@kernel(STRICT)
+def start_of_each(histogram, tile_start):
+    """Turn the counts of (chunk, tile) into the places where their pairs begin."""
+    place = 0
+    for tile in range(histogram.shape[1]):
+        tile_start[tile] = place
+        for chunk in range(CHUNKS):
+            size = histogram[chunk, tile]
+            histogram[chunk, tile] = place
+            place += size
+    tile_start[histogram.shape[1]] = place
+
+
+@kernel(STRICT, parallel=True)
+def place_pairs(order, first, count, hits, histogram, splat):
+    """Put every pair in its place, and in ``hits`` the place instead of the tile."""
+    total = order.shape[0]
+    for chunk in prange(CHUNKS):
+        place = histogram[chunk]
+        for k in range(total * chunk // CHUNKS, total * (chunk + 1) // CHUNKS):
+            i = order[k]
+            for hit in range(first[i], first[i] + count[i]):
+                tile = hits[hit]
+                splat[place[tile]] = i
+                hits[hit] = place[tile]
+                place[tile] += 1
+
+
+def bin_splats(projected: np.ndarray, depth: np.ndarray, radii: np.ndarray, width: int, height: int) -> Pairs:
+    """Bin projected splats (N, COLUMNS) of an image of this size; those of radius 0 are in no pair."""
+    tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
+    drawn = np.flatnonzero(radii > 0).astype(np.int32)
+    order = np.empty_like(drawn)
+    keys = depth[drawn].view(np.uint32)
+    sort_by_depth(keys, drawn, np.empty_like(keys), order)
+
+    box_start = np.zeros(len(order) + 1, np.int64)
+    box_sizes(projected, order, tiles_x, tiles_y, box_start[1:])
+    np.cumsum(box_start, out=box_start)
+    first = np.empty(len(radii), np.int64)
+    count = np.zeros(len(radii), np.int32)
+    hits = np.empty(box_start[-1], np.int64)
+    histogram = np.zeros((CHUNKS, tiles_x * tiles_y), np.int64)
+    find_tiles(projected, order, box_start, tiles_x, tiles_y, first, count, hits, histogram)
+    tile_start = np.empty(tiles_x * tiles_y + 1, np.int64)
+    start_of_each(histogram, tile_start)
+    splat = np.empty(tile_start[-1], np.int32)
+    place_pairs(order, first, count, hits, histogram, splat)
+    return Pairs(splat, tile_start, first, count, hits)

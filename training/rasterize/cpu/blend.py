@@ -1,0 +1,209 @@
+"""Every tile's splats blended front to back, and the gradients on the way back.
+
+A pixel sees Σ w c with w = alpha T, T the transmittance of what lies in front (3DGS, Eq. 3). A tile is a
+block of 16 rows of 16 lanes that Numba turns into SIMD; the loop over lanes has no branches. What a tile
+keeps about its pixels lies in one array, so that the compiler need not ask whether two arrays overlap.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..rendering import ALPHA_MAX, TRANSMITTANCE_MIN
+from .bin import LOG2_ALPHA_MIN, TILE
+from .compile import FAST, f32, inlined, kernel, prange
+from .fastmath import exp2
+from .project import (
+    BLUE,
+    CONIC_XX,
+    CONIC_XY,
+    CONIC_YY,
+    G_BLUE,
+    G_DX,
+    G_DXDX,
+    G_DXDY,
+    G_DY,
+    G_DYDY,
+    G_GREEN,
+    G_RED,
+    GREEN,
+    HALF_HEIGHT,
+    LOG2_OPACITY,
+    MEAN_X,
+    MEAN_Y,
+    RED,
+    SUMS,
+    G,
+)
+
+ZERO, HALF, ONE = f32(0), f32(0.5), f32(1)
+CAP, T_MIN = f32(ALPHA_MAX), f32(TRANSMITTANCE_MIN)
+LOOK_EVERY = 16
+"""After this many splats a tile looks whether any of its pixels still takes light."""
+
+
+@inlined(FAST)
+def row_range(row, top, rows):
+    """The rows of a tile, its first pixel centres at y = ``top``, that the splat's ellipse can reach."""
+    first = math.ceil(row[MEAN_Y] - row[HALF_HEIGHT] - top)
+    last = math.floor(row[MEAN_Y] + row[HALF_HEIGHT] - top)
+    return max(0, first), min(rows, last + 1)
+
+
+@kernel(FAST, parallel=True)
+def blend_forward(projected, splat, tile_start, tiles_x, background, image, transmittance, walked):
+    """Fill image (3, H, W), transmittance (H, W) and the pairs walked in each tile until all was dark.
+
+    A lane's T turns negative when its pixel is finished (and is so from the start outside the image):
+    whatever follows then fails the test against T_MIN, and |T| stays.
+    """
+    height, width = transmittance.shape
+    for tile in prange(tile_start.shape[0] - 1):
+        x0, y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
+        rows, columns = min(TILE, height - y0), min(TILE, width - x0)
+        left, top = f32(x0) + HALF, f32(y0) + HALF
+        state = np.zeros((16, 64), np.float32)  # a row: 16 lanes each of T, red, green, blue
+        for r in range(16):
+            for j in range(16):
+                state[r, j] = ONE if r < rows and j < columns else -ONE
+
+        pair = tile_start[tile]
+        look = pair + LOOK_EVERY
+        while pair < tile_start[tile + 1]:
+            row = projected[splat[pair]]
+            xx, xy, yy, log2_opacity = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY], row[LOG2_OPACITY]
+            red, green, blue = row[RED], row[GREEN], row[BLUE]
+            first, last = row_range(row, top, rows)
+            offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
+            for r in range(first, last):
+                dy = f32(r) + offset_y
+                xy_dy, rest = xy * dy, log2_opacity - yy * dy * dy
+                lanes = state[r]
+                for j in range(16):
+                    dx = f32(j) + offset_x
+                    log2_alpha = rest - (xx * dx + xy_dy) * dx
+                    alpha = min(exp2(log2_alpha), CAP)
+                    alpha = alpha if log2_alpha >= LOG2_ALPHA_MIN else ZERO
+                    t = lanes[j]
+                    t_behind = t - alpha * t
+                    takes = t_behind > T_MIN
+                    w = alpha * t if takes else ZERO
+                    lanes[j] = t_behind if takes else -abs(t)
+                    lanes[16 + j] += w * red
+                    lanes[32 + j] += w * green
+                    lanes[48 + j] += w * blue
+            pair += 1
+            if pair == look:
+                look += LOOK_EVERY
+                brightest = -ONE
+                for r in range(16):
+                    for j in range(16):
+                        brightest = max(brightest, state[r, j])
+                if brightest <= ZERO:
+                    break
+        walked[tile] = pair - tile_start[tile]
+
+        for r in range(rows):
+            for j in range(columns):
+                t = abs(state[r, j])
+                transmittance[y0 + r, x0 + j] = t
+                for c in range(3):
+                    image[c, y0 + r, x0 + j] = state[r, 16 + 16 * c + j] + t * background[c]
+
+
+@kernel(FAST, parallel=True)
+def blend_backward(
+    projected, splat, tile_start, tiles_x, walked, image, transmittance, by_image, by_alpha, pair_sums
+):
+    """Fill pair_sums (P, SUMS), each pair's share of its splat's gradients, from those of image and alpha.
+
+    With h = d loss / d image, the loss gets Σ w (c·h) + T_end (background·h − d loss / d alpha) from a pixel.
+    Let Q_i be the part of that sum that lies behind splat i. Then
+        d loss / d alpha_i = T_i (c_i·h) − Q_i / (1 − alpha_i)
+    and, as sigma = −ln alpha + const,
+        g = d loss / d sigma = alpha_i Q_i / (1 − alpha_i) − w_i (c_i·h).
+    Q starts as the whole sum, image·h − T_end d loss / d alpha, and is walked down front to back with T.
+    """
+    height, width = transmittance.shape
+    for tile in prange(tile_start.shape[0] - 1):
+        x0, y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
+        rows, columns = min(TILE, height - y0), min(TILE, width - x0)
+        left, top = f32(x0) + HALF, f32(y0) + HALF
+        # a row: 16 lanes each of T, Q and the three of h; the last row: what one splat's rows add up to
+        state = np.zeros((17, 96), np.float32)
+        sums = state[16]
+        for r in range(16):
+            for j in range(16):
+                if r < rows and j < columns:
+                    y, x = y0 + r, x0 + j
+                    q = -by_alpha[y, x] * transmittance[y, x]
+                    for c in range(3):
+                        state[r, 32 + 16 * c + j] = by_image[c, y, x]
+                        q += image[c, y, x] * by_image[c, y, x]
+                    state[r, j], state[r, 16 + j] = ONE, q
+                else:
+                    state[r, j] = -ONE
+
+        begin = tile_start[tile]
+        for pair in range(begin, begin + walked[tile]):
+            row = projected[splat[pair]]
+            xx, xy, yy, log2_opacity = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY], row[LOG2_OPACITY]
+            red, green, blue = row[RED], row[GREEN], row[BLUE]
+            first, last = row_range(row, top, rows)
+            offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
+            for j in range(96):
+                sums[j] = ZERO
+            for r in range(first, last):
+                dy = f32(r) + offset_y
+                xy_dy, rest, dydy = xy * dy, log2_opacity - yy * dy * dy, dy * dy
+                lanes = state[r]
+                for j in range(16):
+                    dx = f32(j) + offset_x
+                    log2_alpha = rest - (xx * dx + xy_dy) * dx
+                    uncapped = exp2(log2_alpha)
+                    alpha = min(uncapped, CAP)
+                    alpha = alpha if log2_alpha >= LOG2_ALPHA_MIN else ZERO
+                    t = lanes[j]
+                    t_behind = t - alpha * t
+                    takes = t_behind > T_MIN
+                    w = alpha * t if takes else ZERO
+                    lanes[j] = t_behind if takes else -abs(t)
+                    h_red, h_green, h_blue = lanes[32 + j], lanes[48 + j], lanes[64 + j]
+                    seen = w * (red * h_red + green * h_green + blue * h_blue)
+                    q = lanes[16 + j] - seen
+                    lanes[16 + j] = q
+                    g = alpha * q / (ONE - alpha) - seen
+                    g = g if takes and uncapped < CAP else ZERO
+                    sums[j] += g
+                    sums[16 + j] += g * dy
+                    sums[32 + j] += g * dydy
+                    sums[48 + j] += w * h_red
+                    sums[64 + j] += w * h_green
+                    sums[80 + j] += w * h_blue
+            add_lanes(sums, offset_x, pair_sums[pair])
+        for pair in range(begin + walked[tile], tile_start[tile + 1]):
+            for k in range(SUMS):
+                pair_sums[pair, k] = ZERO
+
+
+@inlined(FAST)
+def add_lanes(sums, offset_x, out):
+    """Sum the lanes of one splat in one tile; dx depends on the lane only, so its moments are taken here."""
+    g, g_dx, g_dxdx, g_dy, g_dxdy, g_dydy = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
+    red, green, blue = ZERO, ZERO, ZERO
+    for j in range(16):
+        dx = f32(j) + offset_x
+        g += sums[j]
+        g_dx += sums[j] * dx
+        g_dxdx += sums[j] * dx * dx
+        g_dy += sums[16 + j]
+        g_dxdy += sums[16 + j] * dx
+        g_dydy += sums[32 + j]
+        red += sums[48 + j]
+        green += sums[64 + j]
+        blue += sums[80 + j]
+    out[G], out[G_DX], out[G_DY] = g, g_dx, g_dy
+    out[G_DXDX], out[G_DXDY], out[G_DYDY] = g_dxdx, g_dxdy, g_dydy
+    out[G_RED], out[G_GREEN], out[G_BLUE] = red, green, blue

@@ -1,0 +1,153 @@
+"""The definition: splatting and the photometric loss in plain torch, in any float type.
+
+EWA splatting as in "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (Kerbl et al. 2023), Eq. 3
+to 6, every splat against every pixel: memory grows with their product, so this is for small pictures.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch.nn.functional import conv2d, normalize
+
+from . import sh as harmonics
+from .rendering import ALPHA_MAX, ALPHA_MIN, DILATION, TRANSMITTANCE_MIN, Rendering, Target, View
+
+
+def rasterize(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    log_scales: torch.Tensor,
+    opacity_logits: torch.Tensor,
+    sh: torch.Tensor,
+    weights: torch.Tensor | None,
+    *,
+    view: View,
+    background: tuple[float, float, float],
+    degree: int,
+    min_scale: float,
+) -> Rendering:
+    """See :func:`training.rasterize.rasterize`."""
+    kind = {"dtype": means.dtype, "device": means.device}
+    rotation, translation, eye = (
+        torch.as_tensor(v, **kind) for v in (view.rotation, view.translation, view.eye)
+    )
+    radii = torch.zeros(len(means), dtype=torch.float32, device=means.device)
+    grad2d = torch.zeros_like(radii)
+
+    opacity = torch.sigmoid(opacity_logits) if weights is None else torch.sigmoid(opacity_logits) * weights
+    with torch.no_grad():
+        depth = means @ rotation[2] + translation[2]
+        drawn = ((depth > view.near) & (opacity > ALPHA_MIN)).nonzero()[:, 0]
+    position = means[drawn] @ rotation.T + translation
+    opacity = opacity[drawn]
+    half_covariance = (
+        rotation @ rotation_matrices(quats[drawn]) * (log_scales[drawn].exp() + min_scale)[:, None]
+    )
+    mean2d, (xx, xy, yy) = project(position, half_covariance, view)
+
+    with torch.no_grad():
+        # where alpha falls to its minimum: sigma² = 2 ln(opacity / minimum), along x and along y
+        reach = (2 * torch.log(opacity / ALPHA_MIN)).sqrt()
+        half_width, half_height = reach * xx.sqrt(), reach * yy.sqrt()
+        inside = (mean2d[:, 0] + half_width > 0) & (mean2d[:, 0] - half_width < view.width)
+        inside &= (mean2d[:, 1] + half_height > 0) & (mean2d[:, 1] - half_height < view.height)
+        longest = (xx + yy) / 2 + (((xx - yy) / 2) ** 2 + xy**2).sqrt()
+        radii[drawn] = torch.where(inside, 3 * longest.sqrt(), 0).float()
+
+    if mean2d.requires_grad:
+        to_ndc = torch.tensor([view.width / 2, view.height / 2], **kind)
+
+        def keep_gradient(gradient: torch.Tensor) -> None:
+            grad2d[drawn] = (gradient * to_ndc).norm(dim=1).float()
+
+        mean2d.register_hook(keep_gradient)
+
+    values: list = [None] * harmonics.coefficients(degree)
+    x, y, z = normalize(means[drawn] - eye, dim=1).unbind(1)
+    harmonics.basis(x, y, z, degree, values)
+    colour = (torch.stack(values, 1)[:, :, None] * sh[drawn, : len(values)]).sum(1).add(0.5).clamp_min(0)
+
+    order = position[:, 2].argsort(stable=True)
+    image, transmittance = blend(
+        mean2d[order], xx[order], xy[order], yy[order], opacity[order], colour[order], view, background
+    )
+    return Rendering(image, 1 - transmittance, radii, grad2d)
+
+
+def rotation_matrices(quats: torch.Tensor) -> torch.Tensor:
+    """Rotation matrices (N, 3, 3) of quaternions (N, 4), wxyz, of any length but zero."""
+    w, x, y, z = normalize(quats, dim=1).unbind(1)
+    rows = (
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
+    return torch.stack(rows, 1).view(-1, 3, 3)
+
+
+def project(position: torch.Tensor, half_covariance: torch.Tensor, view: View):
+    """Means (N, 2) in pixels and the three entries xx, xy, yy of the dilated covariances, each (N,).
+
+    Args:
+        position: (N, 3) in camera coordinates.
+        half_covariance: (N, 3, 3) M with covariance M Mᵀ, in camera coordinates.
+    """
+    x, y, z = position.unbind(1)
+    clamped_x = (x / z).clamp(*view.x_limits) * z
+    clamped_y = (y / z).clamp(*view.y_limits) * z
+    # the rows of the Jacobian of (fx x/z, fy y/z), times M
+    row_x = (view.fx / z)[:, None] * half_covariance[:, 0]
+    row_x = row_x - (view.fx * clamped_x / z**2)[:, None] * half_covariance[:, 2]
+    row_y = (view.fy / z)[:, None] * half_covariance[:, 1]
+    row_y = row_y - (view.fy * clamped_y / z**2)[:, None] * half_covariance[:, 2]
+    mean2d = torch.stack([view.fx * x / z + view.cx, view.fy * y / z + view.cy], 1)
+    covariance = (row_x**2).sum(1) + DILATION, (row_x * row_y).sum(1), (row_y**2).sum(1) + DILATION
+    return mean2d, covariance
+
+
+def blend(mean2d, xx, xy, yy, opacity, colour, view: View, background) -> tuple[torch.Tensor, torch.Tensor]:
+    """Image (H, W, 3) and transmittance (H, W) of projected splats (N, ...) given front to back."""
+    kind = {"dtype": mean2d.dtype, "device": mean2d.device}
+    ys = torch.arange(view.height, **kind) + 0.5
+    xs = torch.arange(view.width, **kind) + 0.5
+    dx = xs[None, None, :] - mean2d[:, 0, None, None]
+    dy = ys[None, :, None] - mean2d[:, 1, None, None]
+    xx, xy, yy = xx[:, None, None], xy[:, None, None], yy[:, None, None]
+    distance = (yy * dx**2 - 2 * xy * dx * dy + xx * dy**2) / (xx * yy - xy**2)
+    alpha = (opacity[:, None, None] * torch.exp(-0.5 * distance)).clamp_max(ALPHA_MAX)
+    alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0)
+
+    behind = torch.cumprod(1 - alpha, 0)
+    before = torch.cat([torch.ones_like(behind[:1]), behind[:-1]]) if len(behind) else behind
+    alive = behind > TRANSMITTANCE_MIN
+    weight = torch.where(alive, alpha * before, 0)
+    transmittance = torch.where(alive, 1 - alpha, 1).prod(0)
+    image = torch.einsum("nhw,nc->hwc", weight, colour)
+    return image + transmittance[..., None] * torch.tensor(background, **kind), transmittance
+
+
+def photometric_loss(image: torch.Tensor, target: Target, ssim_weight: float) -> torch.Tensor:
+    """See :func:`training.rasterize.photometric_loss`."""
+    truth = target.image.to(image)
+    return (1 - ssim_weight) * (image - truth).abs().mean() + ssim_weight * (1 - ssim(image, truth))
+
+
+def ssim(image: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+    """Mean structural similarity of two images (H, W, 3) in [0, 1] (Wang et al. 2004), as 3DGS has it:
+    11x11 Gaussian window of sigma 1.5, zeros outside the image."""
+    offsets = torch.arange(11, dtype=image.dtype, device=image.device) - 5
+    line = torch.exp(-(offsets**2) / (2 * 1.5**2))
+    line = line / line.sum()
+    window = (line[:, None] * line[None, :])[None, None]
+
+    def local_mean(planes: torch.Tensor) -> torch.Tensor:
+        return conv2d(planes[:, None], window, padding=5)[:, 0]
+
+    x, y = image.permute(2, 0, 1), truth.permute(2, 0, 1)
+    mean_x, mean_y = local_mean(x), local_mean(y)
+    variance_x = local_mean(x * x) - mean_x**2
+    variance_y = local_mean(y * y) - mean_y**2
+    covariance = local_mean(x * y) - mean_x * mean_y
+    c1, c2 = 0.01**2, 0.03**2
+    similarity = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
+    return (similarity / ((mean_x**2 + mean_y**2 + c1) * (variance_x + variance_y + c2))).mean()

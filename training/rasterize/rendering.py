@@ -1,0 +1,103 @@
+"""What every backend shares: the constants of the definition, the view, the rendering and the target."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..scenes.cameras import Camera
+
+DILATION = 0.3
+"""Added to the variance of each projected splat, in square pixels (3DGS's low-pass filter)."""
+ALPHA_MAX = 0.99
+ALPHA_MIN = 1 / 255
+"""A splat adds nothing to a pixel where its alpha is below this."""
+TRANSMITTANCE_MIN = 1e-4
+"""The splat that would bring a pixel's transmittance to this or below is not blended, nor any behind it."""
+FRUSTUM_MARGIN = 0.3
+"""The projection's Jacobian is taken no further outside the image than this times half its width (height)."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera as the kernels take it: numbers only.
+
+    Attributes:
+        rotation, translation: world to camera, (3, 3) and (3,) float64.
+        eye: camera centre in the world, (3,) float64.
+        fx, fy, cx, cy: intrinsics in pixels, pixel centres at +0.5.
+        x_limits, y_limits: range of x/z and of y/z in which the Jacobian is evaluated.
+        near: depth at or under which a splat is not drawn, in world units.
+    """
+
+    width: int
+    height: int
+    rotation: np.ndarray
+    translation: np.ndarray
+    eye: np.ndarray
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    x_limits: tuple[float, float]
+    y_limits: tuple[float, float]
+    near: float
+
+    @classmethod
+    def of(cls, camera: Camera, near: float) -> View:
+        margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / camera.fx
+        margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / camera.fy
+        return cls(
+            width=camera.width,
+            height=camera.height,
+            rotation=camera.world_to_camera[:3, :3],
+            translation=camera.world_to_camera[:3, 3],
+            eye=camera.center,
+            fx=camera.fx,
+            fy=camera.fy,
+            cx=camera.cx,
+            cy=camera.cy,
+            x_limits=(-camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x),
+            y_limits=(-camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y),
+            near=near,
+        )
+
+
+@dataclass
+class Rendering:
+    """What a camera sees.
+
+    Attributes:
+        image: (H, W, 3), colours over the background; not clamped.
+        alpha: (H, W), one minus the transmittance left behind the last splat.
+        radii: (N,) float32, three standard deviations along the longest axis of the projected splat, in
+            pixels; 0 for a splat that is not drawn.
+        grad2d: (N,) float32, zeros until ``backward`` has run: the length of the loss's gradient by the
+            projected mean, in the units of 3DGS's densification threshold (per pixel, times half the image's
+            width and height). Backward runs that follow overwrite it.
+    """
+
+    image: torch.Tensor
+    alpha: torch.Tensor
+    radii: torch.Tensor
+    grad2d: torch.Tensor
+
+
+class Target:
+    """A photograph to compare with, and what a backend keeps about it between steps.
+
+    Args:
+        image: (H, W, 3) float32 in [0, 1], torch or numpy.
+
+    The cpu backend keeps 36 bytes a pixel: the photograph and its two local moments. Drop the target and make
+    it anew where a scene has more views than memory.
+    """
+
+    def __init__(self, image: torch.Tensor | np.ndarray) -> None:
+        self.image = torch.as_tensor(image)
+        if self.image.ndim != 3 or self.image.shape[2] != 3:
+            raise ValueError(f"a target has shape (H, W, 3), not {tuple(self.image.shape)}")
+        self.cache: dict[str, Any] = {}

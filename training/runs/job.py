@@ -1,0 +1,141 @@
+"""A job: everything that decides a run, as a TOML or JSON file. No torch: Blender writes and reads jobs."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+
+from ..errors import LodgsError
+from ..files import atomic_write
+from ..methods.parameters import METHODS, PRESETS, Parameters, override, preset
+
+__all__ = ["BACKENDS", "METHODS", "PRESETS", "Job"]
+
+BACKENDS = ("auto", "cpu", "reference")
+
+
+@dataclass(frozen=True)
+class Job:
+    """What to train, from what, into which folder.
+
+    Attributes:
+        scene: folder of the COLMAP scene.
+        out: the run's folder; made if it does not exist.
+        method, preset: names from METHODS and PRESETS.
+        seed: makes two runs of one job equal to the bit on one machine.
+        backend: rasterizer, one of BACKENDS.
+        image_scale: training image size over the photograph's, 0 < s <= 1.
+        test_every: every n-th view by name is held out to measure quality; 0 trains on all.
+        exposure: stops added to linear (EXR) images before they are trained on.
+        model, images: the COLMAP model's and the photographs' folder where they are not found by themselves.
+        parameters: changes to the preset's parameters by name (``training.methods.parameters``).
+    """
+
+    scene: str
+    out: str
+    method: str = "flod"
+    preset: str = "draft"
+    seed: int = 0
+    backend: str = "auto"
+    image_scale: float = 0.5
+    test_every: int = 8
+    exposure: float = 0.0
+    model: str = ""
+    images: str = ""
+    parameters: dict = field(default_factory=dict)
+
+    @classmethod
+    def from_file(cls, path: Path) -> Job:
+        """Reads a job; relative paths in it are relative to its folder.
+
+        Raises:
+            LodgsError: if the file cannot be read, or a key or value in it is not possible.
+        """
+        path = Path(path)
+        try:
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise LodgsError(f"The job file {path} cannot be read: {error}.") from error
+        try:
+            values = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
+        except ValueError as error:
+            raise LodgsError(
+                f"The job file {path} is not valid: {error}.", "Correct that line and start again."
+            ) from error
+        if not isinstance(values, dict):
+            raise LodgsError(f"The job file {path} holds no table of keys.")
+        return cls.from_dict(values, folder=path.parent)
+
+    @classmethod
+    def from_dict(cls, values: dict, folder: Path = Path()) -> Job:
+        """Makes a job from the keys of a job file, checked.
+
+        Raises:
+            LodgsError: on an unknown, missing or impossible key.
+        """
+        known = [f.name for f in fields(cls)]
+        unknown = sorted(set(values) - set(known))
+        if unknown:
+            raise LodgsError(
+                f"The job has the unknown key '{unknown[0]}'.", f"Known are: {', '.join(known)}."
+            )
+        for key in ("scene", "out"):
+            if not values.get(key):
+                raise LodgsError(f"The job does not say '{key}'.", f'Add a line: {key} = "..."')
+        values = dict(values)
+        for key in ("scene", "out", "model", "images"):
+            if not isinstance(values.get(key, ""), str):
+                raise LodgsError(f"{key} = {values[key]!r} is not a path.", "Give it in quotation marks.")
+            if values.get(key):
+                values[key] = str((folder / values[key]).expanduser().resolve())
+        job = cls(**values)
+        job._check()
+        return job
+
+    def _check(self) -> None:
+        whole = isinstance(self.seed, int) and isinstance(self.test_every, int)
+        if not whole or self.seed < 0 or self.test_every < 0 or self.test_every == 1:
+            raise LodgsError(
+                f"seed = {self.seed!r}, test_every = {self.test_every!r} is not possible.",
+                "Both are whole numbers of at least 0, and test_every is not 1.",
+            )
+        if not isinstance(self.image_scale, int | float) or not 0 < self.image_scale <= 1:
+            raise LodgsError(
+                f"image_scale = {self.image_scale!r} is not possible.", "Give a number above 0, at most 1."
+            )
+        if not isinstance(self.exposure, int | float):
+            raise LodgsError(f"exposure = {self.exposure!r} is not a number of stops.")
+        if self.backend not in BACKENDS:
+            raise LodgsError(
+                f"There is no backend '{self.backend}'.", f"Choose one of: {', '.join(BACKENDS)}."
+            )
+        if not isinstance(self.parameters, dict):
+            raise LodgsError("parameters is not a table.", "Write them below a line [parameters].")
+        self.resolved_parameters()
+
+    def resolved_parameters(self) -> Parameters:
+        """The preset's parameters with this job's changes."""
+        return override(preset(self.method, self.preset), self.parameters)
+
+    def resolved(self) -> Job:
+        """The same job with every parameter written out, so that a later version repeats it unchanged."""
+        values = asdict(self.resolved_parameters())
+        return replace(
+            self, parameters={k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
+        )
+
+    def write(self, path: Path) -> None:
+        """Writes the job as TOML."""
+        values = asdict(self)
+        table = values.pop("parameters")
+        lines = [_toml_line(name, value) for name, value in values.items()]
+        lines += ["", "[parameters]"] + [_toml_line(name, value) for name, value in table.items()]
+        with atomic_write(path) as temporary:
+            Path(temporary).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _toml_line(name: str, value) -> str:
+    # JSON's strings, numbers, booleans and lists are TOML's as well.
+    return f"{name} = {json.dumps(value, ensure_ascii=False)}"

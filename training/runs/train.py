@@ -1,0 +1,253 @@
+"""The training loop: from a job to levels and a bundle, with checkpoints, events, cancel and resume."""
+
+from __future__ import annotations
+
+import errno
+import math
+import os
+import signal
+import sys
+import time
+import traceback
+from contextlib import contextmanager, suppress
+from dataclasses import asdict
+from typing import IO
+
+import torch
+
+from .. import VERSION
+from ..errors import LodgsError
+from ..evaluate.metrics import psnr
+from ..evaluate.protocol import Evaluation
+from ..files import atomic_write
+from ..methods import create
+from ..methods.data import TrainingData
+from ..rasterize import warm_up
+from ..splats.bundle import Bundle, Level, write_bundle
+from ..splats.ply import read_ply, write_ply
+from .data import training_data
+from .folder import PROTOCOL, Events, RunFolder, event_line
+from .job import Job
+
+DONE, CRASHED, BAD_INPUT, CANCELLED = 0, 1, 2, 3
+"""Exit codes of ``python -m training train``."""
+
+CHECKPOINT_SECONDS = float(os.environ.get("LODGS_CHECKPOINT_SECONDS", "60"))
+PROGRESS_SECONDS = 0.25
+
+
+def train(job: Job, stream: IO[str] | None = None) -> int:
+    """Runs a job, or goes on with it where its run folder was left.
+
+    Args:
+        job: what to do; a run folder that already holds another job is refused.
+        stream: where the events go besides ``events.jsonl``.
+
+    Returns:
+        An exit code. Mistakes end in an ``error`` event, never in a traceback on the stream.
+    """
+    folder = RunFolder(job.out)
+    events = None
+    try:
+        folder.make()
+        with folder.hold():
+            job = job.resolved()
+            _keep_job(job, folder)
+            events = Events(folder, stream)  # from here on the run itself records what happens
+            return _train(job, folder, events)
+    except BaseException as error:
+        if isinstance(error, KeyboardInterrupt):
+            code = CANCELLED
+            event = {"kind": "cancelled", "step": 0, "message": "Stopped before training began."}
+        else:
+            what, remedy, code = _in_words(error)
+            event = {"kind": "error", "what": what, "remedy": remedy}
+        if code == CRASHED:
+            traceback.print_exc(file=sys.stderr)
+        with suppress(OSError):
+            if events is not None:
+                events(**event)
+            elif stream is not None:  # the run is not ours to write into
+                print(event_line(**event), file=stream, flush=True)
+        return code
+    finally:
+        if events is not None:
+            events.close()
+
+
+def _train(job: Job, folder: RunFolder, events: Events) -> int:
+    started = time.monotonic()
+    events(
+        "hello", protocol=PROTOCOL, version=VERSION, method=job.method, preset=job.preset,
+        scene=job.scene, out=str(folder.path), pid=os.getpid(),
+    )  # fmt: skip
+    events("status", message="Reading the scene")
+    data = training_data(job, folder, events)
+    events("status", message="Preparing the kernels (about ten seconds the first time on a computer)")
+    torch.set_num_threads(1)  # torch's thread pool beside Numba's slows both
+    warm_up(job.backend)
+    run = _Run(job, folder, events, data)
+    with _stop_signals() as stopped:
+        if not run.to_the_end(stopped):
+            return CANCELLED
+    run.write_bundle()
+    events("done", bundle=folder.bundle.name, seconds=round(time.monotonic() - started, 1))
+    return DONE
+
+
+class _Run:
+    """A method at work in a run folder.
+
+    Attributes:
+        step: the next step to make; what was made before is in the folder.
+        levels: a record of each finished level, coarse to fine.
+    """
+
+    def __init__(self, job: Job, folder: RunFolder, events: Events, data: TrainingData) -> None:
+        self.job, self.folder, self.events, self.data = job, folder, events, data
+        self.evaluation = Evaluation(data, job.backend)
+        self.method = create(job.method, data, job.resolved_parameters(), job.seed, job.backend)
+        self.step = 0
+        self.levels: list[dict] = []
+        self._resume()
+
+    def to_the_end(self, stopped: list) -> bool:
+        """Trains until all levels are finished (True), or until asked to stop, which saves (False)."""
+        method = self.method
+        self._started, self._started_step = time.monotonic(), self.step
+        last_checkpoint = last_progress = self._started
+        while self.step < method.steps:
+            if stopped or self.folder.take_cancel():
+                self._save()
+                message = f"Stopped at step {self.step} of {method.steps}; it can be resumed."
+                self.events("cancelled", step=self.step, message=message)
+                return False
+            loss, image, view = method.train_step(self.step)
+            if not math.isfinite(loss):
+                raise LodgsError(
+                    f"Training diverged at step {self.step + 1}: the loss is {loss}.",
+                    "Start again with lower learning rates.",
+                )
+            level = method.level_at(self.step)
+            finished = method.finish_level(self.step)
+            self.step += 1
+            if time.monotonic() - last_progress >= PROGRESS_SECONDS or self.step == method.steps:
+                self._tell_progress(level, loss, psnr(image, self.data.target(view).image))
+                last_progress = time.monotonic()
+            if finished is not None:
+                self._write_level(finished)
+            if finished is not None or time.monotonic() - last_checkpoint >= CHECKPOINT_SECONDS:
+                self._save()
+                last_checkpoint = time.monotonic()
+        return True
+
+    def write_bundle(self) -> None:
+        """All levels, as they were written one by one, in one file."""
+        levels = [
+            Level(record["level"], read_ply(self.folder.path / record["path"]), record["s_min"])
+            for record in self.levels
+        ]
+        meta = {**self.method.meta(), "seed": self.job.seed}
+        write_bundle(self.folder.bundle, Bundle(self.job.method, levels, meta))
+
+    def _tell_progress(self, level: int, loss: float, quality: float) -> None:
+        of, levels = self.method.steps, self.method.parameters.levels
+        speed = (self.step - self._started_step) / max(time.monotonic() - self._started, 1e-6)
+        self.events(
+            "progress", stage=f"level {level} of {levels}", level=level, levels=levels,
+            step=self.step, of=of, loss=round(loss, 5), psnr=round(quality, 2), splats=len(self.method.model),
+            steps_per_s=round(speed, 2), eta_s=round((of - self.step) / speed, 1),
+        )  # fmt: skip
+        if time.monotonic() - self._started > 10:  # the speed of about the last ten seconds
+            self._started, self._started_step = time.monotonic(), self.step
+
+    def _write_level(self, level: Level) -> None:
+        path = self.folder.levels_folder / f"level_{level.number}.ply"
+        write_ply(path, level.splats)
+        record = {
+            "level": level.number,
+            "path": f"levels/{path.name}",
+            "splats": len(level.splats),
+            "s_min": level.s_min,
+        }
+        quality = self.evaluation.measure_set(level.splats) if self.evaluation.cameras else {}
+        self.events("level", **{**quality, **record})
+        self.levels.append(record)
+
+    def _save(self) -> None:
+        """Writes a checkpoint, then drops all but it and the one before."""
+        folder = self.folder.checkpoints
+        with atomic_write(folder / f"step_{self.step:07d}.pt") as temporary:
+            torch.save(
+                {"step": self.step, "levels": self.levels, "method": self.method.state_dict()}, temporary
+            )
+        for old in sorted(folder.glob("step_*.pt"))[:-2]:
+            old.unlink(missing_ok=True)
+
+    def _resume(self) -> None:
+        """Takes up the newest checkpoint that can be read; without one the run begins."""
+        for path in sorted(self.folder.checkpoints.glob("step_*.pt"), reverse=True):
+            try:
+                state = torch.load(path, weights_only=True)
+                self.method.load_state_dict(state["method"])
+            except Exception as error:
+                print(f"passing over the checkpoint {path}: {error}", file=sys.stderr)
+                continue
+            self.step, self.levels = state["step"], state["levels"]
+            self.events("status", message=f"Going on from step {self.step} of {self.method.steps}")
+            return
+
+
+def _keep_job(job: Job, folder: RunFolder) -> None:
+    """Writes the job into the run; a run folder keeps to the job that it began with."""
+    if folder.job.exists():
+        before = Job.from_file(folder.job)
+        if asdict(before) != asdict(job):
+            changed = [key for key, value in asdict(job).items() if asdict(before)[key] != value]
+            raise LodgsError(
+                f"The run folder {folder.path} belongs to another job (different: {', '.join(changed)}).",
+                "Choose another run folder, or start the run's own job.toml to resume it.",
+            )
+    else:
+        job.write(folder.job)
+
+
+# -- when things go wrong ------------------------------------------------------------
+
+
+@contextmanager
+def _stop_signals():
+    """A list that becomes non-empty when the process is politely asked to stop."""
+    stopped: list[int] = []
+    names = ("SIGINT", "SIGTERM", "SIGBREAK")  # the last is Windows' CTRL_BREAK_EVENT
+    before = {}
+    for name in names:
+        if hasattr(signal, name):
+            with suppress(ValueError):  # not in the main thread
+                number = getattr(signal, name)
+                before[number] = signal.signal(number, lambda number, _: stopped.append(number))
+    try:
+        yield stopped
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _in_words(error: BaseException) -> tuple[str, str, int]:
+    """What to tell the user of an exception: what, remedy, exit code."""
+    if isinstance(error, LodgsError):
+        return error.what, error.remedy, BAD_INPUT
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        return "The disk is full; training stopped.", "Free some space and resume the run.", BAD_INPUT
+    if isinstance(error, MemoryError):
+        return (
+            "There is not enough memory.",
+            "Lower max_splats or image_scale, or close other programs.",
+            BAD_INPUT,
+        )
+    kind = type(error).__name__
+    return (
+        f"Training stopped on an unexpected {kind}: {error}.",
+        "Its details are in the log; please report it.",
+        CRASHED,
+    )

@@ -1,0 +1,134 @@
+"""Distorted photographs made pinhole, by COLMAP through pycolmap: for the trainer's environment only.
+
+pycolmap runs in a process of its own, because Pillow, which the trainer uses, corrupts memory beside it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
+
+from ..errors import LodgsError
+from .colmap import Scene, read_scene
+
+_VERSION = b"1"  # of what is kept in the cache
+
+
+def undistorted(scene: Scene, cache: Path) -> Scene:
+    """The scene with every lens undone: all views pinhole, `distorted` empty, the world unchanged.
+
+    Photographs and model are written into a folder of `cache` that is named after their content, and taken
+    from there the next time; it appears whole or not at all. A scene without distorted views is returned as
+    it is. Undistorted images are cropped so that no pixel is empty (COLMAP's blank_pixels = 0).
+
+    Raises:
+        LodgsError: pycolmap is missing or fails, one camera's photographs have several sizes, or the cache
+            cannot be written.
+    """
+    if not scene.distorted:
+        return scene
+    try:
+        target = Path(cache) / _content_key(scene)
+        if not target.is_dir():
+            _undistort_into(target, scene)
+    except OSError as error:
+        raise LodgsError(
+            f"The lens distortion of {scene.folder} could not be undone: {error}.",
+            "Check the images and the free space.",
+        ) from error
+    result = read_scene(target, model=target / "sparse", images=target / "images")
+    missing = {camera.name for camera in scene.cameras} - {camera.name for camera in result.cameras}
+    lost = [f"{name} is left out: its lens distortion could not be undone." for name in sorted(missing)]
+    return replace(result, warnings=[*scene.warnings, *lost])
+
+
+def _content_key(scene: Scene) -> str:
+    """A digest of the model's files and of every photograph with its name."""
+    digest = hashlib.blake2b(_VERSION, digest_size=16)
+    model = sorted(path for path in scene.model.iterdir() if path.suffix in (".bin", ".txt"))
+    files = [(path.name, path) for path in model]
+    files += [(camera.name, camera.image) for camera in scene.cameras if camera.image is not None]
+    for name, path in files:
+        digest.update(f"{name}\0{path.stat().st_size}\0".encode("utf-8", "surrogateescape"))
+        with path.open("rb") as file:
+            while block := file.read(1 << 20):
+                digest.update(block)
+    return digest.hexdigest()
+
+
+def _undistort_into(target: Path, scene: Scene) -> None:
+    """Run this module as a program on the scene, in a folder beside the target that then takes its name."""
+    request = {
+        "model": str(scene.model),
+        "images": str(scene.images_folder),
+        "sizes": {camera.name: [camera.width, camera.height] for camera in scene.cameras},
+    }
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix="undistorting-") as work:
+        request["work"] = work
+        child = subprocess.run(
+            [sys.executable, "-m", "training.scenes.undistort"],
+            cwd=Path(__file__).resolve().parents[2],
+            input=json.dumps(request),
+            capture_output=True,
+            encoding="utf-8",
+            errors="replace",
+            check=False,
+        )
+        if child.returncode:
+            lines = child.stderr.strip().splitlines() or [f"exit code {child.returncode}"]
+            raise LodgsError(
+                f"The lens distortion of {scene.folder} could not be undone: {lines[-1]}",
+                "Check the trainer's environment and the free space, or give an undistorted scene "
+                "(colmap image_undistorter).",
+            )
+        try:
+            os.replace(Path(work) / "undistorted", target)
+        except OSError:
+            if not target.is_dir():  # else another process was quicker, with the same content
+                raise
+
+
+def _main() -> None:
+    request = json.load(sys.stdin)
+    try:
+        import pycolmap
+    except ImportError as error:
+        sys.exit(f"pycolmap cannot be loaded: {error}.")
+    model = pycolmap.Reconstruction(request["model"])
+    sizes = defaultdict(set)
+    for image in model.images.values():
+        if image.name in request["sizes"]:
+            sizes[image.camera_id].add(tuple(request["sizes"][image.name]))
+    for camera_id, found in sizes.items():
+        if len(found) > 1:
+            sys.exit(f"the photographs of camera {camera_id} have several sizes: {sorted(found)}.")
+        model.cameras[camera_id].rescale(*found.pop())
+    for camera in model.cameras.values():
+        if camera.is_perspective_fisheye() and camera.is_undistorted():
+            # COLMAP copies an ideal fisheye as if it were a pinhole: bend it, by less than 0.01 px.
+            fx, fy = camera.focal_length_x, camera.focal_length_y
+            cx, cy = camera.principal_point_x, camera.principal_point_y
+            camera.model = pycolmap.CameraModelId.OPENCV_FISHEYE
+            camera.params = [fx, fy, cx, cy, 1e-6, 0, 0, 0]
+    work = Path(request["work"])
+    (work / "model").mkdir()
+    model.write(str(work / "model"))
+    pycolmap.undistort_images(
+        output_path=work / "undistorted",
+        input_path=work / "model",
+        image_path=request["images"],
+        image_names=list(request["sizes"]),
+        jpeg_quality=98,
+    )
+
+
+if __name__ == "__main__":
+    _main()

@@ -1,0 +1,54 @@
+"""A set of 3D Gaussian splats as plain arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+
+
+@dataclass
+class Splats:
+    """N Gaussians in the parametrisation that 3DGS files use.
+
+    Attributes:
+        means: (N, 3) float32, world coordinates.
+        quats: (N, 4) float32, wxyz, normalised or not.
+        log_scales: (N, 3) float32, natural logarithm of the standard deviation along each axis.
+        opacity_logits: (N,) float32; opacity = sigmoid(logit).
+        sh: (N, (degree + 1)**2, 3) float32; colour = 0.5 + sum of coefficient * basis, degree 0 to 4.
+        extras: further per-splat columns by name, each (N,) of a type that PLY knows (8- to 32-bit integers,
+            float32, float64); they survive every read, edit and write.
+    """
+
+    means: np.ndarray
+    quats: np.ndarray
+    log_scales: np.ndarray
+    opacity_logits: np.ndarray
+    sh: np.ndarray
+    extras: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        return int(np.sqrt(self.sh.shape[1])) - 1
+
+    def select(self, index) -> Splats:
+        """The splats at ``index``: a slice, a boolean mask (N,) or an integer array."""
+        columns = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "extras"}
+        return Splats(**columns, extras={name: column[index] for name, column in self.extras.items()})
+
+    @classmethod
+    def concatenated(cls, sets: list[Splats]) -> Splats:
+        """All splats of several sets of one SH degree, in order; only extras that all have are kept."""
+        columns = {
+            f.name: np.concatenate([getattr(s, f.name) for s in sets])
+            for f in fields(cls)
+            if f.name != "extras"
+        }
+        shared = [name for name in sets[0].extras if all(name in s.extras for s in sets)]
+        return cls(
+            **columns, extras={name: np.concatenate([s.extras[name] for s in sets]) for name in shared}
+        )

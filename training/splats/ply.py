@@ -1,0 +1,254 @@
+"""Splats as PLY files: the layout of the original 3DGS, and every dialect of it on reading.
+
+Columns of ``vertex``, in this order, all float: x y z, nx ny nz (zero), f_dc_0..2, f_rest_0.. (all red
+coefficients first, then green, then blue), opacity, scale_0..2, rot_0..3 (Kerbl et al. 2023, reference code).
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from plyfile import PlyData, PlyListProperty, PlyParseError
+
+from ..errors import LodgsError
+from ..files import atomic_write
+from .gaussians import Splats
+
+NORMALS = ("nx", "ny", "nz")
+# PLY names its types as C does; viewers know no others.
+_TYPES = {
+    "i1": "char",
+    "u1": "uchar",
+    "i2": "short",
+    "u2": "ushort",
+    "i4": "int",
+    "u4": "uint",
+    "f4": "float",
+    "f8": "double",
+}
+# Rows are moved between a file's records and our columns in blocks that stay in the processor's cache.
+_BLOCK = 4096
+
+Columns = dict[str, np.ndarray]
+
+
+@dataclass
+class Element:
+    """One element of a PLY: rows of named columns, given in parts that follow one another."""
+
+    name: str
+    parts: Sequence[Columns]
+
+    @property
+    def dtype(self) -> np.dtype:
+        """One row as the file holds it: packed and little-endian."""
+        return np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in self.parts[0].items()])
+
+    @property
+    def count(self) -> int:
+        return sum(len(next(iter(part.values()))) for part in self.parts)
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file."""
+        return self.count * self.dtype.itemsize
+
+
+def read_ply(path: str | Path) -> Splats:
+    """Read the element ``vertex`` of any 3DGS PLY.
+
+    Ascii, little- or big-endian, SH degree 0 to 4, columns in any order and of any scalar type. Missing
+    normals are fine; normals that are all zero, as 3DGS writes them, are dropped. Every other column survives
+    in ``extras`` with its name and type. A bundle reads as its ``vertex``, the finest level by default.
+
+    Raises:
+        LodgsError: not a PLY, cut short, or without the columns of splats.
+    """
+    elements, _ = read_elements(path)
+    return splats_from(elements["vertex"], path)
+
+
+def write_ply(path: str | Path, splats: Splats) -> None:
+    """Write splats as one binary little-endian ``vertex``, extras behind the 3DGS columns.
+
+    Raises:
+        LodgsError: the file cannot be written, or an extra has a name or a type that PLY does not know.
+    """
+    write_elements(path, [Element("vertex", [columns_of(splats) | columns_of_extras(splats)])])
+
+
+def columns_of(splats: Splats) -> Columns:
+    """The 3DGS columns in their order, as views (N,) into the arrays of ``splats``."""
+    zero = np.broadcast_to(np.float32(0), len(splats))
+    rest = splats.sh.shape[1] - 1
+    return {
+        **{name: splats.means[:, i] for i, name in enumerate("xyz")},
+        **{name: splats.extras.get(name, zero) for name in NORMALS},
+        **{f"f_dc_{i}": splats.sh[:, 0, i] for i in range(3)},
+        **{f"f_rest_{i}": splats.sh[:, 1 + i % rest, i // rest] for i in range(3 * rest)},
+        "opacity": splats.opacity_logits,
+        **{f"scale_{i}": splats.log_scales[:, i] for i in range(3)},
+        **{f"rot_{i}": splats.quats[:, i] for i in range(4)},
+    }
+
+
+def columns_of_extras(splats: Splats) -> Columns:
+    """The extras that are columns of their own (normals have their place in the 3DGS layout)."""
+    return {name: column for name, column in splats.extras.items() if name not in NORMALS}
+
+
+def splats_from(rows: np.ndarray, path: str | Path) -> Splats:
+    """Splats from the structured rows of an element that has the 3DGS columns; ``path`` is for the message.
+
+    Raises:
+        LodgsError: columns are missing, or the number of f_rest columns fits no SH degree.
+    """
+    names = rows.dtype.names or ()
+    rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in names)
+    degree = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}.get(rest)
+    if degree is None:
+        raise LodgsError(
+            f"{path} has {rest} f_rest columns, which fits no degree of spherical harmonics.",
+            "0, 9, 24, 45 or 72 belong to degree 0 to 4; export the splats again.",
+        )
+    splats = _empty_splats(len(rows), degree)
+    columns = {name: column for name, column in columns_of(splats).items() if name not in NORMALS}
+    missing = [name for name in columns if name not in names]
+    if missing:
+        raise LodgsError(
+            f"{path} is not a PLY of Gaussian splats: it has no {', '.join(missing)}.",
+            "Choose a PLY that a 3DGS trainer wrote; other point clouds and meshes have no splats.",
+        )
+    extras = {
+        name: np.empty(len(rows), rows.dtype[name].newbyteorder("=")) for name in names if name not in columns
+    }
+    moves = [(column, np.asarray(rows[name])) for name, column in (columns | extras).items()]
+    for block in _blocks(len(rows)):
+        for column, source in moves:
+            column[block] = source[block]
+    if not any(extras[name].any() for name in NORMALS if name in extras):
+        extras = {name: column for name, column in extras.items() if name not in NORMALS}
+    splats.extras = extras
+    return splats
+
+
+def read_elements(path: str | Path) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Elements of a PLY as structured rows (memory-mapped when binary), and its comments in order.
+
+    Raises:
+        LodgsError: not a PLY, no ``vertex`` of splats, or cut short.
+    """
+    path = Path(path)
+    _check_header(path)
+    try:
+        data = PlyData.read(str(path))
+    except (PlyParseError, ValueError, MemoryError) as error:
+        raise LodgsError(f"{path} is damaged: {error}.", "Export or copy it again.") from error
+    comments = data.comments + [comment for element in data.elements for comment in element.comments]
+    return {element.name: element.data for element in data.elements}, comments
+
+
+def write_elements(path: str | Path, elements: Iterable[Element], comments: Sequence[str] = ()) -> None:
+    """Write elements as a binary little-endian PLY, whole or not at all.
+
+    The first element stands on line 3 of the header and the comments follow its properties: so every
+    viewer that was checked reads it.
+
+    Raises:
+        LodgsError: a column's name or type does not exist in PLY, or the file cannot be written.
+    """
+    elements = list(elements)
+    first, *others = [_header_of(element) for element in elements]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *first,
+        *(f"comment {comment}" for comment in comments),
+    ]
+    lines += [line for header in others for line in header] + ["end_header", ""]
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
+        file.write("\n".join(lines).encode("ascii"))
+        for element in elements:
+            records = np.empty(_BLOCK, element.dtype)
+            for part in element.parts:
+                for block in _blocks(len(next(iter(part.values())))):
+                    for name, column in part.items():
+                        records[name][: block.stop - block.start] = column[block]
+                    file.write(records[: block.stop - block.start].data)
+
+
+def _header_of(element: Element) -> list[str]:
+    lines = [f"element {element.name} {element.count}"]
+    for name, column in element.parts[0].items():
+        kind = _TYPES.get(column.dtype.str[1:])
+        if kind is None or not re.fullmatch(r"[!-~]+", name):
+            raise LodgsError(
+                f"The column {name!r} of type {column.dtype} cannot be written as PLY.",
+                f"Give it an ASCII name without spaces and one of the types {', '.join(_TYPES.values())}.",
+            )
+        lines.append(f"property {kind} {name}")
+    return lines
+
+
+def _check_header(path: Path) -> None:
+    """Raise a LodgsError unless the header is that of splats and the file as long as the header promises."""
+    try:
+        with open(path, "rb") as file:
+            start = file.read(1 << 20)
+            size = file.seek(0, io.SEEK_END)
+    except OSError as error:
+        raise LodgsError(
+            f"{path} could not be read: {error.strerror}.", "Check the path and its rights."
+        ) from error
+    if not re.match(rb"ply[ \t]*[\r\n]", start):
+        raise LodgsError(f"{path} is not a PLY file.", "Choose a .ply of Gaussian splats.")
+    end = re.search(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)", start)
+    if end is None:
+        raise LodgsError(f"{path} is cut short: its header does not end.", "Export or copy it again.")
+    counts = [
+        int(count) for count in re.findall(rb"(?m)^[ \t]*element[ \t]+\S+[ \t]+(\d+)", start[: end.end()])
+    ]
+    # plyfile reads headers only together with the data; a header that promises no rows has none.
+    without_rows = re.sub(rb"(?m)^([ \t]*element[ \t]+\S+[ \t]+)\d+", rb"\g<1>0", start[: end.end()])
+    try:
+        header = PlyData.read(io.BytesIO(without_rows))
+    except (PlyParseError, ValueError) as error:
+        raise LodgsError(f"{path} has a damaged header: {error}.", "Export or copy it again.") from error
+    if "vertex" not in header:
+        raise LodgsError(f"{path} has no element vertex.", "Choose a .ply of Gaussian splats.")
+    vertex = header["vertex"]
+    if any(isinstance(column, PlyListProperty) for column in vertex.properties):
+        raise LodgsError(f"{path} has lists in its vertices.", "Choose a .ply of Gaussian splats.")
+    splats_from(vertex.data, path)
+    lists = any(
+        isinstance(column, PlyListProperty) for element in header.elements for column in element.properties
+    )
+    if header.text or lists:
+        return  # only reading tells how long these should be
+    rows = zip(header.elements, counts, strict=True)
+    promised = end.end() + sum(element.dtype().itemsize * count for element, count in rows)
+    if size < promised:
+        raise LodgsError(
+            f"{path} is cut short: {promised - size} of its {promised} bytes are missing.",
+            "Export or copy it again.",
+        )
+
+
+def _empty_splats(count: int, degree: int) -> Splats:
+    return Splats(
+        means=np.empty((count, 3), np.float32),
+        quats=np.empty((count, 4), np.float32),
+        log_scales=np.empty((count, 3), np.float32),
+        opacity_logits=np.empty(count, np.float32),
+        sh=np.empty((count, (degree + 1) ** 2, 3), np.float32),
+    )
+
+
+def _blocks(count: int) -> Iterator[slice]:
+    for start in range(0, count, _BLOCK):
+        yield slice(start, min(start + _BLOCK, count))
