@@ -24,22 +24,21 @@ from training.rasterize import Adam, Target, cpu, photometric_loss, rasterize
 from training.rasterize.cpu import adam
 from training.rasterize.cpu.bin import LOG2_ALPHA_MIN
 from training.rasterize.cpu.blend import CAP, T_MIN, row_range
-from training.rasterize.cpu.compile import FAST, f32, kernel, numba, prange
+from training.rasterize.cpu.compile import FAST, f32, in_parallel, kernel, threads
 from training.rasterize.cpu.fastmath import exp2
 from training.scenes.cameras import Camera
 
 CASES = [(10_000, 320, 240), (50_000, 640, 480), (200_000, 640, 480), (200_000, 960, 540)]
 FORWARD_FLOPS, BACKWARD_FLOPS = 26, 47
 """Operations for each lane of a row that a splat reaches in a tile, counted in the source of ``blend``."""
-STAGES = {
-    "project": (cpu, "project_forward"),
-    "bin": (cpu, "bin_splats"),
-    "blend": (cpu, "blend_forward"),
-    "loss": (cpu, "loss_and_gradient"),
-    "blend_backward": (cpu, "blend_backward"),
-    "project_backward": (cpu, "project_backward"),
-    "adam": (adam, "update"),
+KERNELS = {
+    "project_forward": "project",
+    "blend_forward": "blend",
+    "blend_backward": "blend_backward",
+    "project_backward": "project_backward",
 }
+FUNCTIONS = {"bin": (cpu, "bin_splats"), "loss": (cpu, "loss_and_gradient"), "adam": (adam, "update")}
+STAGES = ("project", "bin", "blend", "loss", "blend_backward", "project_backward", "adam")
 
 
 def synthetic_splats(count: int, seed: int = 0) -> dict[str, torch.Tensor]:
@@ -90,22 +89,24 @@ class Stopwatch:
 
     def __enter__(self) -> Stopwatch:
         self.seconds = dict.fromkeys(STAGES, 0.0)
-        self.originals = {stage: getattr(module, name) for stage, (module, name) in STAGES.items()}
-        for stage, (module, name) in STAGES.items():
-            setattr(module, name, self._timed(stage, self.originals[stage]))
+        self.originals = {stage: getattr(module, name) for stage, (module, name) in FUNCTIONS.items()}
+        for stage, (module, name) in FUNCTIONS.items():
+            setattr(module, name, self._timed(self.originals[stage], lambda *_, stage=stage: stage))
+        cpu.in_parallel = self._timed(in_parallel, lambda kernel, *_: KERNELS[kernel.__name__])
         return self
 
-    def _timed(self, stage: str, function: Callable) -> Callable:
+    def _timed(self, function: Callable, stage_of: Callable) -> Callable:
         def call(*args):
             start = time.perf_counter()
             result = function(*args)
-            self.seconds[stage] += time.perf_counter() - start
+            self.seconds[stage_of(*args)] += time.perf_counter() - start
             return result
 
         return call
 
     def __exit__(self, *_) -> None:
-        for stage, (module, name) in STAGES.items():
+        cpu.in_parallel = in_parallel
+        for stage, (module, name) in FUNCTIONS.items():
             setattr(module, name, self.originals[stage])
 
 
@@ -127,10 +128,10 @@ def measure(step: Callable[[], None], seconds: float) -> tuple[dict[str, float],
     return best, (time.process_time() - cpu_start) / (time.perf_counter() - start)
 
 
-@kernel(FAST, parallel=True)
-def multiply_add(values, rounds):
+@kernel(frozenset({"contract"}))
+def multiply_add(begin, end, values, rounds):
     """64 dependent multiply-adds an element, 4096 elements a thread in the L1 cache."""
-    for thread in prange(values.shape[0]):
+    for thread in range(begin, end):
         line = values[thread]
         for _ in range(rounds):
             for j in range(line.shape[0]):
@@ -142,21 +143,21 @@ def multiply_add(values, rounds):
 
 def measured_peak() -> float:
     """Float32 operations a second (1e9) that multiply-adds reach on all threads."""
-    values, rounds = np.ones((numba.get_num_threads(), 4096), np.float32), 2000
-    multiply_add(values, 1)
+    values, rounds = np.ones((threads(), 4096), np.float32), 2000
+    in_parallel(multiply_add, len(values), 1, values, 1)
     seconds = []
     for _ in range(5):
         start = time.perf_counter()
-        multiply_add(values, rounds)
+        in_parallel(multiply_add, len(values), 1, values, rounds)
         seconds.append(time.perf_counter() - start)
     return values.size * rounds * 128 / min(seconds) / 1e9
 
 
-@kernel(FAST, parallel=True)
-def count_work(projected, splat, tile_start, tiles_x, walked, height, lanes, blends):
+@kernel(FAST)
+def count_work(begin, end, projected, splat, tile_start, tiles_x, walked, height, lanes, blends):
     """Per tile: lanes executed, and splats that a pixel takes light from (pixels beyond the border
     included)."""
-    for tile in prange(walked.shape[0]):
+    for tile in range(begin, end):
         x0, y0 = tile % tiles_x * 16, tile // tiles_x * 16
         t = np.ones((16, 16), np.float32)
         for pair in range(tile_start[tile], tile_start[tile] + walked[tile]):
@@ -178,27 +179,29 @@ def count_work(projected, splat, tile_start, tiles_x, walked, height, lanes, ble
 def work(step: Step) -> tuple[int, float]:
     """Lanes that one pass executes, and blends a pixel."""
     seen = {}
-    original = cpu.blend_forward
 
-    def spy(projected, splat, tile_start, tiles_x, background, image, transmittance, walked):
-        original(projected, splat, tile_start, tiles_x, background, image, transmittance, walked)
-        lanes, blends = np.zeros((2, len(walked)), np.int64)
-        count_work(projected, splat, tile_start, tiles_x, walked, len(transmittance), lanes, blends)
-        seen["lanes"], seen["blends"] = int(lanes.sum()), int(blends.sum()) / transmittance.size
+    def spy(kernel, total, grain, *args):
+        in_parallel(kernel, total, grain, *args)
+        if kernel is cpu.blend_forward:
+            projected, splat, tile_start, tiles_x, _, _, transmittance, walked = args
+            lanes, blends = np.zeros((2, len(walked)), np.int64)
+            rest = projected, splat, tile_start, tiles_x, walked, len(transmittance), lanes, blends
+            in_parallel(count_work, total, grain, *rest)
+            seen["lanes"], seen["blends"] = int(lanes.sum()), int(blends.sum()) / transmittance.size
 
-    cpu.blend_forward = spy
+    cpu.in_parallel = spy
     try:
         with torch.no_grad():
             rasterize(**step.splats, camera=step.camera)
     finally:
-        cpu.blend_forward = original
+        cpu.in_parallel = in_parallel
     return seen["lanes"], seen["blends"]
 
 
 def bench(seconds: float) -> dict:
     peak = measured_peak()
-    threads = numba.get_num_threads()
-    print(f"{threads} threads, FP32 peak measured {peak:.0f} GFLOP/s")
+    count_of_threads = threads()
+    print(f"{count_of_threads} threads, FP32 peak measured {peak:.0f} GFLOP/s")
     columns = [*STAGES, "around", "step"]
     print(
         f"{'splats':>7} {'pixels':>8} {'blends':>6} "
@@ -215,7 +218,7 @@ def bench(seconds: float) -> dict:
         cases.append(
             {
                 "splats": count, "width": width, "height": height, "blends_per_pixel": round(blends, 1),
-                "threads": threads, "step_ms": {name: round(best[name], 2) for name in columns},
+                "threads": count_of_threads, "step_ms": {name: round(best[name], 2) for name in columns},
                 "kernel_share_of_peak": round(share, 3), "cpu_by_wall_time": round(busy, 2),
             }
         )  # fmt: skip
@@ -224,7 +227,7 @@ def bench(seconds: float) -> dict:
             + " ".join(f"{best[c]:8.2f}" for c in columns)
             + f" {share:8.1%} {busy:5.2f}"
         )
-    if max(os.getloadavg()[:1] if hasattr(os, "getloadavg") else [0]) > threads + 1:
+    if max(os.getloadavg()[:1] if hasattr(os, "getloadavg") else [0]) > count_of_threads + 1:
         print("The machine was busy with other work: these times are too long.")
     return {"peak_gflops": round(peak, 1), "cases": cases}
 

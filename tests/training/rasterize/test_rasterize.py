@@ -9,7 +9,7 @@ import torch
 from training.errors import LodgsError
 from training.rasterize import BACKENDS, Target, photometric_loss, rasterize
 from training.rasterize.cpu.bin import TILE, bin_splats
-from training.rasterize.cpu.compile import numba
+from training.rasterize.cpu.compile import numba, set_threads, threads
 from training.rasterize.cpu.fastmath import exp2
 from training.rasterize.cpu.project import COLUMNS, CONIC_XX, CONIC_XY, CONIC_YY, LOG2_OPACITY
 from training.scenes.cameras import Camera
@@ -136,7 +136,7 @@ def scene(name, make_splats):
     ],
 )  # fmt: skip
 def test_cpu_agrees_with_the_reference(name, make_splats, odd_camera):
-    """Images and every gradient, relative L2 at most 1e-3 (most are near 1e-5)."""
+    """Images and every gradient, relative L2 at most 5e-4 (most are near 1e-6)."""
     splats, options = scene(name, make_splats)
     random = torch.Generator().manual_seed(1)
     weights = torch.rand(len(splats["means"]), generator=random).double()
@@ -158,7 +158,7 @@ def test_cpu_agrees_with_the_reference(name, make_splats, odd_camera):
     for output, expected in found["reference"].items():
         expected = expected.double()
         error = (found["cpu"][output].double() - expected).norm() / expected.norm().clamp_min(1e-12)
-        assert error <= 1e-3, f"{output}: {error:.1e}"
+        assert error <= 5e-4, f"{output}: {error:.1e}"
 
 
 def test_thousands_of_splats_are_blended_on_a_pixel_of_the_crowd(make_splats, odd_camera):
@@ -195,14 +195,13 @@ def everything(splats, camera, truth):
 
 def test_the_same_bits_whatever_the_number_of_threads(make_splats, odd_camera):
     splats, truth = make_splats(2000), Target(torch.rand(50, 75, 3))
-    threads = numba.get_num_threads()
-    results = []
+    before, results = threads(), []
     try:
-        for count in sorted({1, threads}) * 2:
-            numba.set_num_threads(count)
+        for count in (1, 2, 16, 1):
+            set_threads(count)
             results.append(everything(splats, odd_camera, truth))
     finally:
-        numba.set_num_threads(threads)
+        set_threads(before)
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 

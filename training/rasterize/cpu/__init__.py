@@ -15,9 +15,12 @@ import torch
 from ..rendering import Rendering, Target, View
 from .bin import TILE, bin_splats
 from .blend import blend_backward, blend_forward
-from .compile import f32, scratch, serialised
+from .compile import f32, in_parallel, scratch, serialised
 from .loss import loss_and_gradient, moments_of
-from .project import COLUMNS, SUMS, lens_of, project_backward, project_forward
+from .project import COLUMNS, GRAIN, SUMS, lens_of, project_backward, project_forward
+
+TILES = 16
+"""How many tiles a thread takes at a time."""
 
 
 def rasterize(
@@ -63,16 +66,16 @@ class _Rasterize(torch.autograd.Function):
         settings = (*lens_of(view), view.width, view.height, degree, f32(min_scale))
         projected = np.empty((count, COLUMNS), np.float32)
         depth = np.empty(count, np.float32)
-        project_forward(*splats, *settings, projected, depth, radii.numpy())
+        in_parallel(project_forward, count, GRAIN, *splats, *settings, projected, depth, radii.numpy())
         pairs = bin_splats(projected, depth, radii.numpy(), view.width, view.height)
 
         image = np.empty((3, view.height, view.width), np.float32)
         transmittance = np.empty((view.height, view.width), np.float32)
         walked = np.empty(len(pairs.tile_start) - 1, np.int64)
         tiles_x = -(-view.width // TILE)
-        blend_forward(
-            projected, pairs.splat, pairs.tile_start, tiles_x, np.array(background, np.float32),
-            image, transmittance, walked,
+        in_parallel(
+            blend_forward, len(walked), TILES, projected, pairs.splat, pairs.tile_start, tiles_x,
+            np.array(background, np.float32), image, transmittance, walked,
         )  # fmt: skip
         ctx.save_for_backward(*tensors)
         ctx.rest = settings, projected, pairs, tiles_x, walked, image, transmittance, radii, grad2d
@@ -84,12 +87,13 @@ class _Rasterize(torch.autograd.Function):
         settings, projected, pairs, tiles_x, walked, image, transmittance, radii, grad2d = ctx.rest
         tensors = ctx.saved_tensors
         pair_sums = scratch("pair_sums", len(pairs.splat), SUMS)
-        blend_backward(
-            projected, pairs.splat, pairs.tile_start, tiles_x, walked, image, transmittance,
-            by_planes.contiguous().numpy(), by_alpha.contiguous().numpy(), pair_sums,
+        in_parallel(
+            blend_backward, len(walked), TILES, projected, pairs.splat, pairs.tile_start, tiles_x, walked,
+            image, transmittance, by_planes.contiguous().numpy(), by_alpha.contiguous().numpy(), pair_sums,
         )  # fmt: skip
         gradients = [torch.empty_like(tensor, requires_grad=False) for tensor in tensors]
-        project_backward(
+        in_parallel(
+            project_backward, len(radii), GRAIN,
             *(tensor.detach().numpy() for tensor in tensors), *settings, projected, radii.numpy(),
             pairs.first, pairs.count, pairs.row, pair_sums,
             *(gradient.numpy() for gradient in gradients), grad2d.numpy(),

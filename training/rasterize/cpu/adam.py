@@ -6,15 +6,17 @@ import math
 
 import numpy as np
 
-from .compile import STRICT, f32, kernel, prange, serialised
+from .compile import STRICT, f32, in_parallel, kernel, serialised
 
 ROW = 1024
+VALUES = 1 << 16
+"""How many a thread takes at a time."""
 M_TINY = f32(1e-30)
 V_TINY = f32(1e-36)
 
 
-@kernel(STRICT, parallel=True)
-def _update(parameter, gradient, m, v, lr, keep_m, keep_v, scale_v, eps):
+@kernel(STRICT)
+def _update(begin, end, parameter, gradient, m, v, lr, keep_m, keep_v, scale_v, eps):
     """All arrays flat; ``lr`` (width,) repeats along them and has the first moment's bias correction in it.
 
     Moments of splats that stay out of sight decay into denormal numbers, which are slow; they are cut off far
@@ -22,7 +24,7 @@ def _update(parameter, gradient, m, v, lr, keep_m, keep_v, scale_v, eps):
     """
     width = lr.shape[0]
     total = parameter.shape[0]
-    for row in prange((total + width - 1) // width):
+    for row in range(begin, end):
         start = row * width
         for j in range(min(width, total - start)):
             i = start + j
@@ -45,7 +47,8 @@ def update(parameter, gradient, m, v, lr, betas, eps, step) -> None:
         lr_row = np.full(ROW, lr.item(), np.float32)
     else:
         lr_row = np.ascontiguousarray(np.broadcast_to(lr, parameter.shape[1:])).reshape(-1)
-    _update(
+    in_parallel(
+        _update, -(-parameter.size // len(lr_row)), -(-VALUES // len(lr_row)),
         parameter.reshape(-1), gradient.reshape(-1), m.reshape(-1), v.reshape(-1), lr_row,
         f32(betas[0]), f32(betas[1]), f32(1 / (1 - betas[1] ** step)), f32(eps),
     )  # fmt: skip

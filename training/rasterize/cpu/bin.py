@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..rendering import ALPHA_MIN
-from .compile import STRICT, f32, inlined, kernel, prange
+from .compile import STRICT, f32, in_parallel, inlined, kernel
 from .project import (
     CONIC_XX,
     CONIC_XY,
@@ -105,21 +105,21 @@ def touches(row, tile_x, tile_y):
     return least <= row[LOG2_OPACITY] - LOG2_ALPHA_MIN
 
 
-@kernel(STRICT, parallel=True)
-def box_sizes(projected, order, tiles_x, tiles_y, sizes):
+@kernel(STRICT)
+def box_sizes(begin, end, projected, order, tiles_x, tiles_y, sizes):
     """How many tiles the bounding box of each splat covers, in depth order."""
-    for k in prange(order.shape[0]):
+    for k in range(begin, end):
         row = projected[order[k]]
         x0, x1 = tile_range(row[MEAN_X], row[HALF_WIDTH], tiles_x)
         y0, y1 = tile_range(row[MEAN_Y], row[HALF_HEIGHT], tiles_y)
         sizes[k] = (x1 - x0) * (y1 - y0)
 
 
-@kernel(STRICT, parallel=True)
-def find_tiles(projected, order, box_start, tiles_x, tiles_y, first, count, hits, histogram):
+@kernel(STRICT)
+def find_tiles(begin, end, projected, order, box_start, tiles_x, tiles_y, first, count, hits, histogram):
     """The one test of splat against tile: list the tiles that each splat touches, and count them by chunk."""
     total = order.shape[0]
-    for chunk in prange(CHUNKS):
+    for chunk in range(begin, end):
         tally = histogram[chunk]
         for k in range(total * chunk // CHUNKS, total * (chunk + 1) // CHUNKS):
             row = projected[order[k]]
@@ -150,11 +150,11 @@ def start_of_each(histogram, tile_start):
     tile_start[histogram.shape[1]] = place
 
 
-@kernel(STRICT, parallel=True)
-def place_pairs(order, first, count, hits, histogram, splat):
+@kernel(STRICT)
+def place_pairs(begin, end, order, first, count, hits, histogram, splat):
     """Put every pair in its place, and in ``hits`` the place instead of the tile."""
     total = order.shape[0]
-    for chunk in prange(CHUNKS):
+    for chunk in range(begin, end):
         place = histogram[chunk]
         for k in range(total * chunk // CHUNKS, total * (chunk + 1) // CHUNKS):
             i = order[k]
@@ -174,15 +174,18 @@ def bin_splats(projected: np.ndarray, depth: np.ndarray, radii: np.ndarray, widt
     sort_by_depth(keys, drawn, np.empty_like(keys), order)
 
     box_start = np.zeros(len(order) + 1, np.int64)
-    box_sizes(projected, order, tiles_x, tiles_y, box_start[1:])
+    in_parallel(box_sizes, len(order), 4096, projected, order, tiles_x, tiles_y, box_start[1:])
     np.cumsum(box_start, out=box_start)
     first = np.empty(len(radii), np.int64)
     count = np.zeros(len(radii), np.int32)
     hits = np.empty(box_start[-1], np.int64)
     histogram = np.zeros((CHUNKS, tiles_x * tiles_y), np.int64)
-    find_tiles(projected, order, box_start, tiles_x, tiles_y, first, count, hits, histogram)
+    in_parallel(
+        find_tiles, CHUNKS, 1,
+        projected, order, box_start, tiles_x, tiles_y, first, count, hits, histogram,
+    )  # fmt: skip
     tile_start = np.empty(tiles_x * tiles_y + 1, np.int64)
     start_of_each(histogram, tile_start)
     splat = np.empty(tile_start[-1], np.int32)
-    place_pairs(order, first, count, hits, histogram, splat)
+    in_parallel(place_pairs, CHUNKS, 1, order, first, count, hits, histogram, splat)
     return Pairs(splat, tile_start, first, count, hits)

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..rendering import ALPHA_MAX, TRANSMITTANCE_MIN
 from .bin import LOG2_ALPHA_MIN, TILE
-from .compile import FAST, f32, inlined, kernel, prange
+from .compile import FAST, f32, inlined, kernel
 from .fastmath import exp2
 from .project import (
     BLUE,
@@ -52,15 +52,17 @@ def row_range(row, top, rows):
     return max(0, first), min(rows, last + 1)
 
 
-@kernel(FAST, parallel=True)
-def blend_forward(projected, splat, tile_start, tiles_x, background, image, transmittance, walked):
+@kernel(FAST)
+def blend_forward(
+    begin, end, projected, splat, tile_start, tiles_x, background, image, transmittance, walked
+):
     """Fill image (3, H, W), transmittance (H, W) and the pairs walked in each tile until all was dark.
 
     A lane's T turns negative when its pixel is finished (and is so from the start outside the image):
     whatever follows then fails the test against T_MIN, and |T| stays.
     """
     height, width = transmittance.shape
-    for tile in prange(tile_start.shape[0] - 1):
+    for tile in range(begin, end):
         x0, y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
         rows, columns = min(TILE, height - y0), min(TILE, width - x0)
         left, top = f32(x0) + HALF, f32(y0) + HALF
@@ -113,9 +115,20 @@ def blend_forward(projected, splat, tile_start, tiles_x, background, image, tran
                     image[c, y0 + r, x0 + j] = state[r, 16 + 16 * c + j] + t * background[c]
 
 
-@kernel(FAST, parallel=True)
+@kernel(FAST)
 def blend_backward(
-    projected, splat, tile_start, tiles_x, walked, image, transmittance, by_image, by_alpha, pair_sums
+    begin,
+    end,
+    projected,
+    splat,
+    tile_start,
+    tiles_x,
+    walked,
+    image,
+    transmittance,
+    by_image,
+    by_alpha,
+    pair_sums,
 ):
     """Fill pair_sums (P, SUMS), each pair's share of its splat's gradients, from those of image and alpha.
 
@@ -127,7 +140,7 @@ def blend_backward(
     Q starts as the whole sum, image·h − T_end d loss / d alpha, and is walked down front to back with T.
     """
     height, width = transmittance.shape
-    for tile in prange(tile_start.shape[0] - 1):
+    for tile in range(begin, end):
         x0, y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
         rows, columns = min(TILE, height - y0), min(TILE, width - x0)
         left, top = f32(x0) + HALF, f32(y0) + HALF
@@ -146,8 +159,8 @@ def blend_backward(
                 else:
                     state[r, j] = -ONE
 
-        begin = tile_start[tile]
-        for pair in range(begin, begin + walked[tile]):
+        lit = tile_start[tile] + walked[tile]
+        for pair in range(tile_start[tile], lit):
             row = projected[splat[pair]]
             xx, xy, yy, log2_opacity = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY], row[LOG2_OPACITY]
             red, green, blue = row[RED], row[GREEN], row[BLUE]
@@ -183,7 +196,7 @@ def blend_backward(
                     sums[64 + j] += w * h_green
                     sums[80 + j] += w * h_blue
             add_lanes(sums, offset_x, pair_sums[pair])
-        for pair in range(begin + walked[tile], tile_start[tile + 1]):
+        for pair in range(lit, tile_start[tile + 1]):
             for k in range(SUMS):
                 pair_sums[pair, k] = ZERO
 

@@ -1,4 +1,10 @@
-"""How kernels are compiled, cached and called. Import numba's names from here only."""
+"""How kernels are compiled, cached and run on several threads. Import numba's names from here only.
+
+Kernels are serial functions of a range of work, and :func:`in_parallel` deals ranges out to threads. Numba's
+own ``parallel=True`` would link the body of each loop into its caller and optimise it a second time, so that
+a kernel rounds otherwise in the process that compiled it than in those that read it from the cache; its
+threads wait for each other at barriers, and its fallback layer aborts on concurrent calls.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +14,7 @@ import os
 import sys
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -35,7 +42,6 @@ os.environ.setdefault("NUMBA_CACHE_DIR", str(_cache_folder()))
 import numba  # noqa: E402
 import numpy as np  # noqa: E402
 
-prange = numba.prange
 f32 = np.float32
 
 FAST = frozenset({"contract", "reassoc", "nsz", "arcp", "afn", "nnan", "ninf"})
@@ -44,14 +50,59 @@ STRICT = frozenset()
 """For what must give the same answer wherever it is compiled."""
 
 
-def kernel(fastmath: frozenset[str], parallel: bool = False) -> Callable[[Callable], Any]:
+def kernel(fastmath: frozenset[str]) -> Callable[[Callable], Any]:
     """Compile a function of arrays: cached on disk, without the GIL, dividing as C does."""
-    return numba.njit(fastmath=set(fastmath), parallel=parallel, cache=True, nogil=True, error_model="numpy")
+    return numba.njit(fastmath=set(fastmath), cache=True, nogil=True, error_model="numpy")
 
 
 def inlined(fastmath: frozenset[str]) -> Callable[[Callable], Any]:
     """Compile a helper into the kernels that call it."""
     return numba.njit(fastmath=set(fastmath), inline="always", error_model="numpy")
+
+
+def available_threads() -> int:
+    """What this process may use: the cores that it is allowed on, or LODGS_THREADS."""
+    wanted = os.environ.get("LODGS_THREADS", "")
+    if wanted.isdecimal() and int(wanted) > 0:
+        return int(wanted)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+_threads = available_threads()
+_pool: ThreadPoolExecutor | None = None
+
+
+def threads() -> int:
+    """How many threads kernels run on."""
+    return _threads
+
+
+def set_threads(count: int) -> None:
+    """Run kernels on this many threads from now on; results do not depend on it."""
+    global _threads, _pool
+    _threads, _pool = count, None
+
+
+def in_parallel(kernel: Callable, total: int, grain: int, *args: Any) -> None:
+    """Call ``kernel(begin, end, *args)`` on all threads, for ranges of at most ``grain`` that cover range(total).
+
+    Whoever is free takes the next range, the caller too, so a thread that the system holds up delays nobody
+    but the range in its hands. What a kernel writes must not depend on how the ranges fall.
+    """
+    global _pool
+    begins = iter(range(0, total, grain))  # next() on it is atomic
+
+    def work() -> None:
+        for begin in begins:
+            kernel(begin, min(begin + grain, total), *args)
+
+    helpers = min(_threads, -(-total // grain)) - 1
+    if helpers > 0 and _pool is None:
+        _pool = ThreadPoolExecutor(_threads - 1, "lodgs-kernels")
+    waiting = [_pool.submit(work) for _ in range(helpers)] if _pool is not None else []
+    work()
+    for helper in waiting:
+        helper.result()
 
 
 _scratch: dict[str, np.ndarray] = {}
@@ -69,7 +120,7 @@ _one_at_a_time = threading.RLock()
 
 
 def serialised(function: Callable) -> Callable:
-    """One call at a time: Numba's workqueue layer, all that some systems have, aborts on concurrent calls."""
+    """One call at a time: scratch arrays and threads are shared."""
 
     @wraps(function)
     def call(*args, **kwargs):

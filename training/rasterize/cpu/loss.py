@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from .compile import FAST, f32, inlined, kernel, prange, scratch
+from .compile import FAST, f32, in_parallel, inlined, kernel, scratch
 
 ROWS, COLUMNS = 16, 64
 """Size of a block."""
+BLOCKS = 32
+"""How many blocks a thread takes at a time."""
 REACH = 5
 HIGH, WIDE = ROWS + 2 * REACH, 80
 """Size of a block with the window's reach around it, zeros outside the image; as wide as SIMD likes it."""
@@ -64,12 +66,12 @@ def window_along(line, out):
         )
 
 
-@kernel(FAST, parallel=True)
-def target_moments(truth, mean, mean_square):
+@kernel(FAST)
+def target_moments(begin, end, truth, mean, mean_square):
     """Windowed mean of y and of y² of a photograph; all (3, H, W)."""
-    channels, height, width = truth.shape
+    _, height, width = truth.shape
     across, down = -(-width // COLUMNS), -(-height // ROWS)
-    for block in prange(channels * down * across):
+    for block in range(begin, end):
         channel, y0, x0 = block // (down * across), block // across % down * ROWS, block % across * COLUMNS
         wide = np.empty((HIGH, WIDE), np.float32)
         lines = np.empty((ROWS, WIDE), np.float32)
@@ -86,16 +88,16 @@ def target_moments(truth, mean, mean_square):
                     wide[r, j] *= wide[r, j]
 
 
-@kernel(FAST, parallel=True)
-def similarity(image, truth, mean_y, mean_yy, by_moments, sums):
+@kernel(FAST)
+def similarity(begin, end, image, truth, mean_y, mean_yy, by_moments, sums):
     """Sum of SSIM per block, and its derivatives by the windowed means of x, x² and xy, (3 of them, 3, H, W).
 
     SSIM = n1 n2 / (d1 d2) with n1 = 2 mx my + C1, n2 = 2 (mxy − mx my) + C2, d1 = mx² + my² + C1 and
     d2 = (mxx − mx²) + (myy − my²) + C2 (Wang et al. 2004, Eq. 13).
     """
-    channels, height, width = image.shape
+    _, height, width = image.shape
     across, down = -(-width // COLUMNS), -(-height // ROWS)
-    for block in prange(channels * down * across):
+    for block in range(begin, end):
         channel, y0, x0 = block // (down * across), block // across % down * ROWS, block % across * COLUMNS
         wide = np.empty((3, HIGH, WIDE), np.float32)  # x, x², xy
         lines = np.empty((3, ROWS, WIDE), np.float32)
@@ -139,16 +141,16 @@ def similarity(image, truth, mean_y, mean_yy, by_moments, sums):
         sums[block] = total
 
 
-@kernel(FAST, parallel=True)
-def loss_gradient(image, truth, by_moments, l1_weight, ssim_weight, gradient, sums):
+@kernel(FAST)
+def loss_gradient(begin, end, image, truth, by_moments, l1_weight, ssim_weight, gradient, sums):
     """d loss / d image (3, H, W), and the sum of |x − y| per block.
 
     The window is symmetric, so what the means' derivatives give back to a pixel is their own windowed mean; x
     reaches the means of x, x² and xy with 1, 2x and y.
     """
-    channels, height, width = image.shape
+    _, height, width = image.shape
     across, down = -(-width // COLUMNS), -(-height // ROWS)
-    for block in prange(channels * down * across):
+    for block in range(begin, end):
         channel, y0, x0 = block // (down * across), block // across % down * ROWS, block % across * COLUMNS
         wide = np.empty((3, HIGH, WIDE), np.float32)
         lines = np.empty((3, ROWS, WIDE), np.float32)
@@ -169,10 +171,14 @@ def loss_gradient(image, truth, by_moments, l1_weight, ssim_weight, gradient, su
         sums[block] = total
 
 
+def block_count(channels: int, height: int, width: int) -> int:
+    return channels * -(-height // ROWS) * -(-width // COLUMNS)
+
+
 def moments_of(truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """What :func:`loss_and_gradient` wants to know about a photograph (3, H, W)."""
     mean, mean_square = np.empty_like(truth), np.empty_like(truth)
-    target_moments(truth, mean, mean_square)
+    in_parallel(target_moments, block_count(*truth.shape), BLOCKS, truth, mean, mean_square)
     return mean, mean_square
 
 
@@ -180,14 +186,13 @@ def loss_and_gradient(
     image: np.ndarray, truth: np.ndarray, moments: tuple[np.ndarray, np.ndarray], ssim_weight: float
 ) -> tuple[float, np.ndarray]:
     """(1 − ssim_weight) L1 + ssim_weight (1 − SSIM) of planes (3, H, W), and its gradient by the image."""
-    channels, height, width = image.shape
-    blocks = channels * -(-height // ROWS) * -(-width // COLUMNS)
+    blocks = block_count(*image.shape)
     similar, different = np.empty(blocks, np.float32), np.empty(blocks, np.float32)
     by_moments = scratch("by_moments", 3, *image.shape)
     gradient = np.empty_like(image)
-    similarity(image, truth, *moments, by_moments, similar)
+    in_parallel(similarity, blocks, BLOCKS, image, truth, *moments, by_moments, similar)
     weights = f32((1 - ssim_weight) / image.size), f32(ssim_weight / image.size)
-    loss_gradient(image, truth, by_moments, *weights, gradient, different)
+    in_parallel(loss_gradient, blocks, BLOCKS, image, truth, by_moments, *weights, gradient, different)
     l1 = different.sum(dtype=np.float64) / image.size
     ssim = similar.sum(dtype=np.float64) / image.size
     return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim), gradient

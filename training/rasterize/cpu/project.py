@@ -13,7 +13,7 @@ import numpy as np
 
 from .. import sh as harmonics
 from ..rendering import ALPHA_MIN, DILATION, View
-from .compile import FAST, f32, inlined, kernel, prange
+from .compile import FAST, f32, inlined, kernel
 
 # The columns of a projected splat: all that blending reads, one row a splat.
 MEAN_X, MEAN_Y = 0, 1
@@ -31,7 +31,8 @@ COLUMNS = 12
 G, G_DX, G_DY, G_DXDX, G_DXDY, G_DYDY, G_RED, G_GREEN, G_BLUE = range(9)
 SUMS = 9
 
-CHUNKS = 64
+GRAIN = 1024
+"""How many splats a thread takes at a time."""
 ZERO, HALF, ONE, TWO = f32(0), f32(0.5), f32(1), f32(2)
 ALPHA_MIN32, DILATION32 = f32(ALPHA_MIN), f32(DILATION)
 LOG2_E = f32(math.log2(math.e))
@@ -80,85 +81,84 @@ def camera_axes(pose, quat, log_scale, min_scale, scale, axes):
     return w, x, y, z, inverse
 
 
-@kernel(FAST, parallel=True)
+@kernel(FAST)
 def project_forward(
-    means, quats, log_scales, opacity_logits, sh, weights, pose, lens, eye, width, height, degree, min_scale,
+    begin, end, means, quats, log_scales, opacity_logits, sh, weights,
+    pose, lens, eye, width, height, degree, min_scale,
     projected, depth, radii,
 ):  # fmt: skip
     """Fill projected (N, COLUMNS), depth (N,) and radii (N,); where the radius is 0 nothing else is set.
 
     ``weights`` is empty where all are one.
     """
-    count = means.shape[0]
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
-    for chunk in prange(CHUNKS):
-        scale = np.empty(3, np.float32)
-        axes = np.empty((3, 3), np.float32)
-        basis = np.empty(25, np.float32)
-        for i in range(count * chunk // CHUNKS, count * (chunk + 1) // CHUNKS):
-            radii[i] = ZERO
-            weight = weights[i] if weights.shape[0] > 0 else ONE
-            if weight <= ZERO:
-                continue
-            mean = means[i]
-            z = to_camera(pose, 2, mean)
-            opacity = weight / (ONE + math.exp(-opacity_logits[i]))
-            if z <= lens[8] or opacity <= ALPHA_MIN32:
-                continue
-            x, y = to_camera(pose, 0, mean), to_camera(pose, 1, mean)
-            camera_axes(pose, quats[i], log_scales[i], min_scale, scale, axes)
+    scale = np.empty(3, np.float32)
+    axes = np.empty((3, 3), np.float32)
+    basis = np.empty(25, np.float32)
+    for i in range(begin, end):
+        radii[i] = ZERO
+        weight = weights[i] if weights.shape[0] > 0 else ONE
+        if weight <= ZERO:
+            continue
+        mean = means[i]
+        z = to_camera(pose, 2, mean)
+        opacity = weight / (ONE + math.exp(-opacity_logits[i]))
+        if z <= lens[8] or opacity <= ALPHA_MIN32:
+            continue
+        x, y = to_camera(pose, 0, mean), to_camera(pose, 1, mean)
+        camera_axes(pose, quats[i], log_scales[i], min_scale, scale, axes)
 
-            rz = ONE / z
-            j0, j2 = fx * rz, -fx * clamp(x * rz, lens[4], lens[5]) * rz
-            k1, k2 = fy * rz, -fy * clamp(y * rz, lens[6], lens[7]) * rz
-            # u and v are the rows of J M
-            u0, u1, u2 = (
-                j0 * axes[0, 0] + j2 * axes[2, 0],
-                j0 * axes[0, 1] + j2 * axes[2, 1],
-                j0 * axes[0, 2] + j2 * axes[2, 2],
-            )
-            v0, v1, v2 = (
-                k1 * axes[1, 0] + k2 * axes[2, 0],
-                k1 * axes[1, 1] + k2 * axes[2, 1],
-                k1 * axes[1, 2] + k2 * axes[2, 2],
-            )
-            uu = u0 * u0 + u1 * u1 + u2 * u2
-            uv = u0 * v0 + u1 * v1 + u2 * v2
-            vv = v0 * v0 + v1 * v1 + v2 * v2
-            # |u × v|² = uu vv − uv², without the cancellation that needles suffer
-            cross0, cross1, cross2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
-            determinant = cross0 * cross0 + cross1 * cross1 + cross2 * cross2
-            determinant += DILATION32 * (uu + vv + DILATION32)
-            xx, yy = uu + DILATION32, vv + DILATION32
+        rz = ONE / z
+        j0, j2 = fx * rz, -fx * clamp(x * rz, lens[4], lens[5]) * rz
+        k1, k2 = fy * rz, -fy * clamp(y * rz, lens[6], lens[7]) * rz
+        # u and v are the rows of J M
+        u0, u1, u2 = (
+            j0 * axes[0, 0] + j2 * axes[2, 0],
+            j0 * axes[0, 1] + j2 * axes[2, 1],
+            j0 * axes[0, 2] + j2 * axes[2, 2],
+        )
+        v0, v1, v2 = (
+            k1 * axes[1, 0] + k2 * axes[2, 0],
+            k1 * axes[1, 1] + k2 * axes[2, 1],
+            k1 * axes[1, 2] + k2 * axes[2, 2],
+        )
+        uu = u0 * u0 + u1 * u1 + u2 * u2
+        uv = u0 * v0 + u1 * v1 + u2 * v2
+        vv = v0 * v0 + v1 * v1 + v2 * v2
+        # |u × v|² = uu vv − uv², without the cancellation that needles suffer
+        cross0, cross1, cross2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
+        determinant = cross0 * cross0 + cross1 * cross1 + cross2 * cross2
+        determinant += DILATION32 * (uu + vv + DILATION32)
+        xx, yy = uu + DILATION32, vv + DILATION32
 
-            mean_x, mean_y = fx * x * rz + cx, fy * y * rz + cy
-            reach = math.sqrt(TWO * math.log(opacity / ALPHA_MIN32))
-            half_width, half_height = reach * math.sqrt(xx), reach * math.sqrt(yy)
-            if mean_x + half_width <= ZERO or mean_x - half_width >= width:
-                continue
-            if mean_y + half_height <= ZERO or mean_y - half_height >= height:
-                continue
-            depth[i] = z
-            half_difference = HALF * (xx - yy)
-            longest = HALF * (xx + yy) + math.sqrt(half_difference * half_difference + uv * uv)
-            radii[i] = f32(3) * math.sqrt(longest)
+        mean_x, mean_y = fx * x * rz + cx, fy * y * rz + cy
+        reach = math.sqrt(TWO * math.log(opacity / ALPHA_MIN32))
+        half_width, half_height = reach * math.sqrt(xx), reach * math.sqrt(yy)
+        if mean_x + half_width <= ZERO or mean_x - half_width >= width:
+            continue
+        if mean_y + half_height <= ZERO or mean_y - half_height >= height:
+            continue
+        depth[i] = z
+        half_difference = HALF * (xx - yy)
+        longest = HALF * (xx + yy) + math.sqrt(half_difference * half_difference + uv * uv)
+        radii[i] = f32(3) * math.sqrt(longest)
 
-            row = projected[i]
-            row[MEAN_X], row[MEAN_Y] = mean_x, mean_y
-            unit = LOG2_E / determinant
-            row[CONIC_XX], row[CONIC_XY], row[CONIC_YY] = HALF * unit * yy, -unit * uv, HALF * unit * xx
-            row[LOG2_OPACITY] = math.log(opacity) * LOG2_E
-            row[HALF_WIDTH], row[HALF_HEIGHT], row[OPACITY] = half_width, half_height, opacity
+        row = projected[i]
+        row[MEAN_X], row[MEAN_Y] = mean_x, mean_y
+        unit = LOG2_E / determinant
+        row[CONIC_XX], row[CONIC_XY], row[CONIC_YY] = HALF * unit * yy, -unit * uv, HALF * unit * xx
+        row[LOG2_OPACITY] = math.log(opacity) * LOG2_E
+        row[HALF_WIDTH], row[HALF_HEIGHT], row[OPACITY] = half_width, half_height, opacity
 
-            dx, dy, dz = mean[0] - eye[0], mean[1] - eye[1], mean[2] - eye[2]
-            inverse = ONE / math.sqrt(dx * dx + dy * dy + dz * dz)
-            sh_basis(dx * inverse, dy * inverse, dz * inverse, degree, basis)
-            red, green, blue = HALF, HALF, HALF
-            for k in range((degree + 1) * (degree + 1)):
-                red += basis[k] * sh[i, k, 0]
-                green += basis[k] * sh[i, k, 1]
-                blue += basis[k] * sh[i, k, 2]
-            row[RED], row[GREEN], row[BLUE] = max(red, ZERO), max(green, ZERO), max(blue, ZERO)
+        dx, dy, dz = mean[0] - eye[0], mean[1] - eye[1], mean[2] - eye[2]
+        inverse = ONE / math.sqrt(dx * dx + dy * dy + dz * dz)
+        sh_basis(dx * inverse, dy * inverse, dz * inverse, degree, basis)
+        red, green, blue = HALF, HALF, HALF
+        for k in range((degree + 1) * (degree + 1)):
+            red += basis[k] * sh[i, k, 0]
+            green += basis[k] * sh[i, k, 1]
+            blue += basis[k] * sh[i, k, 2]
+        row[RED], row[GREEN], row[BLUE] = max(red, ZERO), max(green, ZERO), max(blue, ZERO)
 
 
 @inlined(FAST)
@@ -166,16 +166,18 @@ def covariance_gradient(row, sums):
     """d loss / d (xx, xy, yy) of cov, where the two off-diagonal entries are one variable.
 
     d loss / d conic = H with H_xx = ½ Σ g dx², H_xy = ½ Σ g dx dy (each of the two), H_yy = ½ Σ g dy²; and as
-    conic = cov⁻¹, d loss / d cov = −conic H conic.
+    conic = cov⁻¹, d loss / d cov = −conic H conic. In float64: for a needle these products nearly cancel.
     """
-    a, b, c = TWO * row[CONIC_XX] / LOG2_E, row[CONIC_XY] / LOG2_E, TWO * row[CONIC_YY] / LOG2_E
-    h_xx, h_xy, h_yy = HALF * sums[G_DXDX], HALF * sums[G_DXDY], HALF * sums[G_DYDY]
+    ln2 = math.log(2.0)
+    a, b, c = 2 * ln2 * row[CONIC_XX], ln2 * row[CONIC_XY], 2 * ln2 * row[CONIC_YY]
+    h_xx, h_xy, h_yy = 0.5 * sums[G_DXDX], 0.5 * sums[G_DXDY], 0.5 * sums[G_DYDY]
     t00, t01 = a * h_xx + b * h_xy, a * h_xy + b * h_yy
     t10, t11 = b * h_xx + c * h_xy, b * h_xy + c * h_yy
-    by_xx = -(t00 * a + t01 * b)
-    by_xy = -(t00 * b + t01 * c) - (t10 * a + t11 * b)
-    by_yy = -(t10 * b + t11 * c)
-    return by_xx, by_xy, by_yy, -(a * sums[G_DX] + b * sums[G_DY]), -(b * sums[G_DX] + c * sums[G_DY])
+    by_xx = f32(-(t00 * a + t01 * b))
+    by_xy = f32(-(t00 * b + t01 * c) - (t10 * a + t11 * b))
+    by_yy = f32(-(t10 * b + t11 * c))
+    by_mean_x, by_mean_y = -(a * sums[G_DX] + b * sums[G_DY]), -(b * sums[G_DX] + c * sums[G_DY])
+    return by_xx, by_xy, by_yy, f32(by_mean_x), f32(by_mean_y)
 
 
 @inlined(FAST)
@@ -196,120 +198,119 @@ def quat_gradient(w, x, y, z, inverse, by_rotation, gradient):
     gradient[3] = (by_z - along * z) * inverse
 
 
-@kernel(FAST, parallel=True)
+@kernel(FAST)
 def project_backward(
-    means, quats, log_scales, opacity_logits, sh, weights, pose, lens, eye, width, height, degree, min_scale,
+    begin, end, means, quats, log_scales, opacity_logits, sh, weights,
+    pose, lens, eye, width, height, degree, min_scale,
     projected, radii, first_pair, pair_count, pair_row, pair_sums,
     by_means, by_quats, by_log_scales, by_logits, by_sh, by_weights, grad2d,
 ):  # fmt: skip
     """Fill the gradients of every parameter and grad2d, from the sums that blending left per pair."""
-    count = means.shape[0]
     fx, fy = lens[0], lens[1]
-    for chunk in prange(CHUNKS):
-        scale = np.empty(3, np.float32)
-        axes = np.empty((3, 3), np.float32)
-        by_axes = np.empty((3, 3), np.float32)
-        by_rotation = np.empty((3, 3), np.float32)
-        sums = np.empty(SUMS, np.float32)
-        basis = np.empty(25, np.float32)
-        basis_x = np.empty(25, np.float32)
-        basis_y = np.empty(25, np.float32)
-        basis_z = np.empty(25, np.float32)
-        for i in range(count * chunk // CHUNKS, count * (chunk + 1) // CHUNKS):
-            if radii[i] <= ZERO or pair_count[i] == 0:
-                by_means[i] = ZERO
-                by_quats[i] = ZERO
-                by_log_scales[i] = ZERO
-                by_logits[i] = ZERO
-                by_sh[i] = ZERO
-                grad2d[i] = ZERO
-                if by_weights.shape[0] > 0:
-                    by_weights[i] = ZERO
-                continue
-            sums[:] = ZERO
-            for pair in range(first_pair[i], first_pair[i] + pair_count[i]):
-                for k in range(SUMS):
-                    sums[k] += pair_sums[pair_row[pair], k]
-
-            mean, row = means[i], projected[i]
-            x, y, z = to_camera(pose, 0, mean), to_camera(pose, 1, mean), to_camera(pose, 2, mean)
-            w, qx, qy, qz, inverse = camera_axes(pose, quats[i], log_scales[i], min_scale, scale, axes)
-            rz = ONE / z
-            ratio_x, ratio_y = clamp(x * rz, lens[4], lens[5]), clamp(y * rz, lens[6], lens[7])
-            j0, j2 = fx * rz, -fx * ratio_x * rz
-            k1, k2 = fy * rz, -fy * ratio_y * rz
-            by_xx, by_xy, by_yy, by_mean_x, by_mean_y = covariance_gradient(row, sums)
-            ndc_x, ndc_y = by_mean_x * HALF * width, by_mean_y * HALF * height
-            grad2d[i] = math.sqrt(ndc_x * ndc_x + ndc_y * ndc_y)
-
-            # u = row 0 of J M, v = row 1: xx = u·u, xy = u·v, yy = v·v
-            by_j0, by_j2, by_k1, by_k2 = ZERO, ZERO, ZERO, ZERO
-            for k in range(3):
-                u, v = j0 * axes[0, k] + j2 * axes[2, k], k1 * axes[1, k] + k2 * axes[2, k]
-                by_u, by_v = TWO * by_xx * u + by_xy * v, TWO * by_yy * v + by_xy * u
-                by_j0 += by_u * axes[0, k]
-                by_j2 += by_u * axes[2, k]
-                by_k1 += by_v * axes[1, k]
-                by_k2 += by_v * axes[2, k]
-                by_axes[0, k], by_axes[1, k], by_axes[2, k] = j0 * by_u, k1 * by_v, j2 * by_u + k2 * by_v
-
-            # the mean is in its projection, fx x/z + cx, and in j0 = fx/z and j2 = −fx ratio_x/z,
-            by_x, by_y = by_mean_x * j0, by_mean_y * k1
-            by_z = -(by_x * x + by_y * y + by_j0 * j0 + by_j2 * j2 + by_k1 * k1 + by_k2 * k2) * rz
-            # where ratio_x = x/z unless it is clamped
-            if lens[4] < x * rz and x * rz < lens[5]:
-                by_ratio = -by_j2 * j0
-                by_x += by_ratio * rz
-                by_z -= by_ratio * ratio_x * rz
-            if lens[6] < y * rz and y * rz < lens[7]:
-                by_ratio = -by_k2 * k1
-                by_y += by_ratio * rz
-                by_z -= by_ratio * ratio_y * rz
-
-            # M = R Q diag(s): d loss / d Q = Rᵀ (d loss / d M) diag(s), and s = exp(log_scale) + min_scale
-            for k in range(3):
-                by_scale = ZERO
-                for j in range(3):
-                    by_scale += by_axes[j, k] * axes[j, k]
-                    by_entry = (
-                        pose[0, j] * by_axes[0, k] + pose[1, j] * by_axes[1, k] + pose[2, j] * by_axes[2, k]
-                    )
-                    by_rotation[j, k] = by_entry * scale[k]
-                by_log_scales[i, k] = by_scale * ((scale[k] - min_scale) / scale[k])
-            quat_gradient(w, qx, qy, qz, inverse, by_rotation, by_quats[i])
-
-            # sigma = ln opacity − ln alpha, so d loss / d opacity = −g / opacity; opacity = weight · sigmoid
-            opacity = row[OPACITY]
-            sigmoid = ONE / (ONE + math.exp(-opacity_logits[i]))
-            by_logits[i] = -sums[G] * (ONE - sigmoid)
+    scale = np.empty(3, np.float32)
+    axes = np.empty((3, 3), np.float32)
+    by_axes = np.empty((3, 3), np.float32)
+    by_rotation = np.empty((3, 3), np.float32)
+    sums = np.empty(SUMS, np.float32)
+    basis = np.empty(25, np.float32)
+    basis_x = np.empty(25, np.float32)
+    basis_y = np.empty(25, np.float32)
+    basis_z = np.empty(25, np.float32)
+    for i in range(begin, end):
+        if radii[i] <= ZERO or pair_count[i] == 0:
+            by_means[i] = ZERO
+            by_quats[i] = ZERO
+            by_log_scales[i] = ZERO
+            by_logits[i] = ZERO
+            by_sh[i] = ZERO
+            grad2d[i] = ZERO
             if by_weights.shape[0] > 0:
-                by_weights[i] = -sums[G] * sigmoid / opacity
+                by_weights[i] = ZERO
+            continue
+        sums[:] = ZERO
+        for pair in range(first_pair[i], first_pair[i] + pair_count[i]):
+            for k in range(SUMS):
+                sums[k] += pair_sums[pair_row[pair], k]
 
-            red = sums[G_RED] if row[RED] > ZERO else ZERO
-            green = sums[G_GREEN] if row[GREEN] > ZERO else ZERO
-            blue = sums[G_BLUE] if row[BLUE] > ZERO else ZERO
-            dx, dy, dz = mean[0] - eye[0], mean[1] - eye[1], mean[2] - eye[2]
-            per_length = ONE / math.sqrt(dx * dx + dy * dy + dz * dz)
-            dx, dy, dz = dx * per_length, dy * per_length, dz * per_length
-            sh_basis(dx, dy, dz, degree, basis)
-            sh_basis_gradient(dx, dy, dz, degree, basis_x, basis_y, basis_z)
-            by_dx, by_dy, by_dz = ZERO, ZERO, ZERO
-            active = (degree + 1) * (degree + 1)
-            for k in range(active):
-                by_sh[i, k, 0], by_sh[i, k, 1], by_sh[i, k, 2] = (
-                    basis[k] * red,
-                    basis[k] * green,
-                    basis[k] * blue,
+        mean, row = means[i], projected[i]
+        x, y, z = to_camera(pose, 0, mean), to_camera(pose, 1, mean), to_camera(pose, 2, mean)
+        w, qx, qy, qz, inverse = camera_axes(pose, quats[i], log_scales[i], min_scale, scale, axes)
+        rz = ONE / z
+        ratio_x, ratio_y = clamp(x * rz, lens[4], lens[5]), clamp(y * rz, lens[6], lens[7])
+        j0, j2 = fx * rz, -fx * ratio_x * rz
+        k1, k2 = fy * rz, -fy * ratio_y * rz
+        by_xx, by_xy, by_yy, by_mean_x, by_mean_y = covariance_gradient(row, sums)
+        ndc_x, ndc_y = by_mean_x * HALF * width, by_mean_y * HALF * height
+        grad2d[i] = math.sqrt(ndc_x * ndc_x + ndc_y * ndc_y)
+
+        # u = row 0 of J M, v = row 1: xx = u·u, xy = u·v, yy = v·v
+        by_j0, by_j2, by_k1, by_k2 = ZERO, ZERO, ZERO, ZERO
+        for k in range(3):
+            u, v = j0 * axes[0, k] + j2 * axes[2, k], k1 * axes[1, k] + k2 * axes[2, k]
+            by_u, by_v = TWO * by_xx * u + by_xy * v, TWO * by_yy * v + by_xy * u
+            by_j0 += by_u * axes[0, k]
+            by_j2 += by_u * axes[2, k]
+            by_k1 += by_v * axes[1, k]
+            by_k2 += by_v * axes[2, k]
+            by_axes[0, k], by_axes[1, k], by_axes[2, k] = j0 * by_u, k1 * by_v, j2 * by_u + k2 * by_v
+
+        # the mean is in its projection, fx x/z + cx, and in j0 = fx/z and j2 = −fx ratio_x/z,
+        by_x, by_y = by_mean_x * j0, by_mean_y * k1
+        by_z = -(by_x * x + by_y * y + by_j0 * j0 + by_j2 * j2 + by_k1 * k1 + by_k2 * k2) * rz
+        # where ratio_x = x/z unless it is clamped
+        if lens[4] < x * rz and x * rz < lens[5]:
+            by_ratio = -by_j2 * j0
+            by_x += by_ratio * rz
+            by_z -= by_ratio * ratio_x * rz
+        if lens[6] < y * rz and y * rz < lens[7]:
+            by_ratio = -by_k2 * k1
+            by_y += by_ratio * rz
+            by_z -= by_ratio * ratio_y * rz
+
+        # M = R Q diag(s): d loss / d Q = Rᵀ (d loss / d M) diag(s), and s = exp(log_scale) + min_scale
+        for k in range(3):
+            by_scale = ZERO
+            for j in range(3):
+                by_scale += by_axes[j, k] * axes[j, k]
+                by_entry = (
+                    pose[0, j] * by_axes[0, k] + pose[1, j] * by_axes[1, k] + pose[2, j] * by_axes[2, k]
                 )
-                by_basis = sh[i, k, 0] * red + sh[i, k, 1] * green + sh[i, k, 2] * blue
-                by_dx += by_basis * basis_x[k]
-                by_dy += by_basis * basis_y[k]
-                by_dz += by_basis * basis_z[k]
-            by_sh[i, active:] = ZERO
-            # direction = (mean − eye) / length: only the part across the direction moves it
-            along = by_dx * dx + by_dy * dy + by_dz * dz
-            by_means[i, 0] = (by_dx - along * dx) * per_length
-            by_means[i, 1] = (by_dy - along * dy) * per_length
-            by_means[i, 2] = (by_dz - along * dz) * per_length
-            for k in range(3):
-                by_means[i, k] += pose[0, k] * by_x + pose[1, k] * by_y + pose[2, k] * by_z
+                by_rotation[j, k] = by_entry * scale[k]
+            by_log_scales[i, k] = by_scale * ((scale[k] - min_scale) / scale[k])
+        quat_gradient(w, qx, qy, qz, inverse, by_rotation, by_quats[i])
+
+        # sigma = ln opacity − ln alpha, so d loss / d opacity = −g / opacity; opacity = weight · sigmoid
+        opacity = row[OPACITY]
+        sigmoid = ONE / (ONE + math.exp(-opacity_logits[i]))
+        by_logits[i] = -sums[G] * (ONE - sigmoid)
+        if by_weights.shape[0] > 0:
+            by_weights[i] = -sums[G] * sigmoid / opacity
+
+        red = sums[G_RED] if row[RED] > ZERO else ZERO
+        green = sums[G_GREEN] if row[GREEN] > ZERO else ZERO
+        blue = sums[G_BLUE] if row[BLUE] > ZERO else ZERO
+        dx, dy, dz = mean[0] - eye[0], mean[1] - eye[1], mean[2] - eye[2]
+        per_length = ONE / math.sqrt(dx * dx + dy * dy + dz * dz)
+        dx, dy, dz = dx * per_length, dy * per_length, dz * per_length
+        sh_basis(dx, dy, dz, degree, basis)
+        sh_basis_gradient(dx, dy, dz, degree, basis_x, basis_y, basis_z)
+        by_dx, by_dy, by_dz = ZERO, ZERO, ZERO
+        active = (degree + 1) * (degree + 1)
+        for k in range(active):
+            by_sh[i, k, 0], by_sh[i, k, 1], by_sh[i, k, 2] = (
+                basis[k] * red,
+                basis[k] * green,
+                basis[k] * blue,
+            )
+            by_basis = sh[i, k, 0] * red + sh[i, k, 1] * green + sh[i, k, 2] * blue
+            by_dx += by_basis * basis_x[k]
+            by_dy += by_basis * basis_y[k]
+            by_dz += by_basis * basis_z[k]
+        by_sh[i, active:] = ZERO
+        # direction = (mean − eye) / length: only the part across the direction moves it
+        along = by_dx * dx + by_dy * dy + by_dz * dz
+        by_means[i, 0] = (by_dx - along * dx) * per_length
+        by_means[i, 1] = (by_dy - along * dy) * per_length
+        by_means[i, 2] = (by_dz - along * dz) * per_length
+        for k in range(3):
+            by_means[i, k] += pose[0, k] * by_x + pose[1, k] * by_y + pose[2, k] * by_z
