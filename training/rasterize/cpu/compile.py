@@ -84,7 +84,7 @@ def set_threads(count: int) -> None:
 
 
 def in_parallel(kernel: Callable, total: int, grain: int, *args: Any) -> None:
-    """Call ``kernel(begin, end, *args)`` on all threads, for ranges of at most ``grain`` that cover range(total).
+    """Call ``kernel(begin, end, *args)`` on all threads, for ranges of ``grain`` that cover range(total).
 
     Whoever is free takes the next range, the caller too, so a thread that the system holds up delays nobody
     but the range in its hands. What a kernel writes must not depend on how the ranges fall.
