@@ -1,13 +1,12 @@
 """Every tile's splats blended front to back, and the gradients on the way back.
 
 A pixel sees Σ w c with w = alpha T, T the transmittance of what lies in front (3DGS, Eq. 3). A tile is a
-block of 16 rows of 16 lanes that Numba turns into SIMD; the loop over lanes has no branches. What a tile
-keeps about its pixels lies in one array, so that the compiler need not ask whether two arrays overlap.
+block of 16 rows of 16 lanes that Numba turns into SIMD; the loop over lanes has no branches. What it reads
+and writes lies at fixed distances from one address, so that the compiler need not ask, for every row, whether
+two arrays overlap: those questions took longer than the arithmetic.
 """
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 
@@ -40,6 +39,10 @@ from .project import (
 
 ZERO, HALF, ONE = f32(0), f32(0.5), f32(1)
 CAP, T_MIN = f32(ALPHA_MAX), f32(TRANSMITTANCE_MIN)
+STRIDE = 176
+"""A row of the backward pass: 16 lanes each of the six sums, of the three of h, of T and of Q."""
+H, T, Q = STRIDE + 96, STRIDE + 144, STRIDE + 160
+"""Where a row's own h, T and Q begin, counted from the row above it."""
 LOOK_EVERY = 16
 """After this many splats a tile looks whether any of its pixels still takes light."""
 
@@ -47,8 +50,8 @@ LOOK_EVERY = 16
 @inlined(FAST)
 def row_range(row, top, rows):
     """The rows of a tile, its first pixel centres at y = ``top``, that the splat's ellipse can reach."""
-    first = math.ceil(row[MEAN_Y] - row[HALF_HEIGHT] - top)
-    last = math.floor(row[MEAN_Y] + row[HALF_HEIGHT] - top)
+    first = int(np.ceil(row[MEAN_Y] - row[HALF_HEIGHT] - top))
+    last = int(np.floor(row[MEAN_Y] + row[HALF_HEIGHT] - top))
     return max(0, first), min(rows, last + 1)
 
 
@@ -99,11 +102,11 @@ def blend_forward(
             pair += 1
             if pair == look:
                 look += LOOK_EVERY
-                brightest = -ONE
+                lit = 0
                 for r in range(16):
                     for j in range(16):
-                        brightest = max(brightest, state[r, j])
-                if brightest <= ZERO:
+                        lit += state[r, j] > ZERO
+                if lit == 0:
                     break
         walked[tile] = pair - tile_start[tile]
 
@@ -138,26 +141,26 @@ def blend_backward(
     and, as sigma = −ln alpha + const,
         g = d loss / d sigma = alpha_i Q_i / (1 − alpha_i) − w_i (c_i·h).
     Q starts as the whole sum, image·h − T_end d loss / d alpha, and is walked down front to back with T.
+    A splat's sums are handed down from row to row of its tile.
     """
     height, width = transmittance.shape
+    state = np.zeros(17 * STRIDE, np.float32)  # the row above the first holds sums of zero only
     for tile in range(begin, end):
         x0, y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
         rows, columns = min(TILE, height - y0), min(TILE, width - x0)
         left, top = f32(x0) + HALF, f32(y0) + HALF
-        # a row: 16 lanes each of T, Q and the three of h; the last row: what one splat's rows add up to
-        state = np.zeros((17, 96), np.float32)
-        sums = state[16]
         for r in range(16):
             for j in range(16):
+                lane = (r + 1) * STRIDE + j
                 if r < rows and j < columns:
                     y, x = y0 + r, x0 + j
                     q = -by_alpha[y, x] * transmittance[y, x]
                     for c in range(3):
-                        state[r, 32 + 16 * c + j] = by_image[c, y, x]
+                        state[lane + 96 + 16 * c] = by_image[c, y, x]
                         q += image[c, y, x] * by_image[c, y, x]
-                    state[r, j], state[r, 16 + j] = ONE, q
+                    state[lane + 144], state[lane + 160] = ONE, q
                 else:
-                    state[r, j] = -ONE
+                    state[lane + 144] = -ONE
 
         lit = tile_start[tile] + walked[tile]
         for pair in range(tile_start[tile], lit):
@@ -166,36 +169,36 @@ def blend_backward(
             red, green, blue = row[RED], row[GREEN], row[BLUE]
             first, last = row_range(row, top, rows)
             offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
-            for j in range(96):
-                sums[j] = ZERO
+            for j in range(first * STRIDE, first * STRIDE + 96):
+                state[j] = ZERO
             for r in range(first, last):
                 dy = f32(r) + offset_y
                 xy_dy, rest, dydy = xy * dy, log2_opacity - yy * dy * dy, dy * dy
-                lanes = state[r]
+                above = state[r * STRIDE : (r + 2) * STRIDE]
                 for j in range(16):
                     dx = f32(j) + offset_x
                     log2_alpha = rest - (xx * dx + xy_dy) * dx
                     uncapped = exp2(log2_alpha)
                     alpha = min(uncapped, CAP)
                     alpha = alpha if log2_alpha >= LOG2_ALPHA_MIN else ZERO
-                    t = lanes[j]
+                    t = above[T + j]
                     t_behind = t - alpha * t
                     takes = t_behind > T_MIN
                     w = alpha * t if takes else ZERO
-                    lanes[j] = t_behind if takes else -abs(t)
-                    h_red, h_green, h_blue = lanes[32 + j], lanes[48 + j], lanes[64 + j]
+                    above[T + j] = t_behind if takes else -abs(t)
+                    h_red, h_green, h_blue = above[H + j], above[H + 16 + j], above[H + 32 + j]
                     seen = w * (red * h_red + green * h_green + blue * h_blue)
-                    q = lanes[16 + j] - seen
-                    lanes[16 + j] = q
+                    q = above[Q + j] - seen
+                    above[Q + j] = q
                     g = alpha * q / (ONE - alpha) - seen
                     g = g if takes and uncapped < CAP else ZERO
-                    sums[j] += g
-                    sums[16 + j] += g * dy
-                    sums[32 + j] += g * dydy
-                    sums[48 + j] += w * h_red
-                    sums[64 + j] += w * h_green
-                    sums[80 + j] += w * h_blue
-            add_lanes(sums, offset_x, pair_sums[pair])
+                    above[STRIDE + j] = above[j] + g
+                    above[STRIDE + 16 + j] = above[16 + j] + g * dy
+                    above[STRIDE + 32 + j] = above[32 + j] + g * dydy
+                    above[STRIDE + 48 + j] = above[48 + j] + w * h_red
+                    above[STRIDE + 64 + j] = above[64 + j] + w * h_green
+                    above[STRIDE + 80 + j] = above[80 + j] + w * h_blue
+            add_lanes(state[max(first, last) * STRIDE :], offset_x, pair_sums[pair])
         for pair in range(lit, tile_start[tile + 1]):
             for k in range(SUMS):
                 pair_sums[pair, k] = ZERO
