@@ -40,6 +40,7 @@ lint: setup
 
 bench: setup
 	$(VENV) tools/bench.py $(if $(BASE),--base $(BASE))
+	$(VENV) tools/bench_blender.py
 
 extension: setup
 	$(VENV) tools/extension.py

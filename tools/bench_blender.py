@@ -1,0 +1,120 @@
+"""Measure import and selection in Blender against the number of splats: part of ``make bench``.
+
+Import: a plain PLY of SH degree 3 from file to a level's object, against plyfile reading the same rows.
+Selection: evaluating two levels after the eye moved, against numpy's masks and copies of the same splats.
+Every ratio is of two times from one run.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+import numpy as np
+import plyfile
+
+from tools.blender_module import EXTENSION, start_blender
+
+COUNTS = (10_000, 100_000, 1_000_000)
+S_MIN = 0.003
+"""Puts the border between the two levels in the middle of the splats."""
+
+
+def least(function: Callable[[], object], rounds: int = 3) -> float:
+    """Seconds of the fastest of some calls."""
+    seconds = []
+    for _ in range(rounds):
+        start = time.perf_counter()
+        function()
+        seconds.append(time.perf_counter() - start)
+    return min(seconds)
+
+
+def load(name: str):
+    return importlib.import_module(f"{EXTENSION}.{name}")
+
+
+def random_splats(count: int):
+    random = np.random.default_rng(0)
+    return load("training.splats.gaussians").Splats(
+        means=random.normal(0, 5, (count, 3)).astype(np.float32),
+        quats=random.normal(size=(count, 4)).astype(np.float32),
+        log_scales=random.normal(-4, 0.5, (count, 3)).astype(np.float32),
+        opacity_logits=random.normal(0, 1, count).astype(np.float32),
+        sh=random.normal(0, 0.2, (count, 16, 3)).astype(np.float32),
+    )
+
+
+def import_seconds(bpy, path: Path) -> float:
+    """From file to an object in the scene, display colours included."""
+
+    def once() -> None:
+        thing = load("blender_lodgs.objects").new_splats("bench", load("training.splats.ply").read_ply(path))
+        bpy.data.pointclouds.remove(thing.data)
+
+    return least(once)
+
+
+def selection_seconds(bpy, path: Path) -> tuple[float, float]:
+    """One evaluation after the eye moved, and numpy's way to the same splats' attributes."""
+    splats = load("training.splats.ply").read_ply(path)
+    scenes, level = load("blender_lodgs.scenes"), load("training.splats.bundle").Level
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
+    bpy.context.scene.collection.objects.link(camera)
+    bpy.context.scene.camera = camera
+    with scenes._new_scene(bpy.context, "bench") as root:
+        scenes.set_level(root, level(1, splats, S_MIN))
+        scenes.set_level(root, level(2, splats, 0.0))
+    root.lodgs.mode, root.lodgs.level_start = "SELECTIVE", 1
+    bpy.context.view_layer.update()
+
+    def move() -> None:
+        camera.location.x += 0.01
+        bpy.context.view_layer.update()
+
+    bands = load("training.lod.rules").flod_bands(
+        [S_MIN, 0.0], root.lodgs.focal_px, root.lodgs.gamma, root.lodgs.level_start, root.lodgs.level_end
+    )
+    arrays = (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh)
+
+    def by_numpy() -> None:
+        distances = np.linalg.norm(splats.means, axis=1)
+        for near, far in bands:
+            chosen = load("training.lod.rules").band_mask(distances, near, far)
+            for array in arrays:
+                array[chosen]
+
+    return least(move), least(by_numpy)
+
+
+def main() -> None:
+    bpy = start_blender()
+    print(f"Blender {bpy.app.version_string}; seconds, SH degree 3")
+    print(f"{'splats':>9} {'import':>8} {'plyfile':>8} {'ratio':>6} {'select':>8} {'numpy':>8} {'ratio':>6}")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "bench.ply"
+        for count in COUNTS:
+            load("training.splats.ply").write_ply(path, random_splats(count))
+            whole, rows = (
+                import_seconds(bpy, path),
+                least(lambda: np.array(plyfile.PlyData.read(path)["vertex"].data)),
+            )
+            select, mask = selection_seconds(bpy, path)
+            print(
+                f"{count:9,} {whole:8.3f} {rows:8.3f} {whole / rows:6.1f}"
+                f" {select:8.4f} {mask:8.4f} {select / mask:6.2f}",
+                flush=True,
+            )
+    os._exit(0)  # Blender 4.5 as a module can hang when Python ends
+
+
+if __name__ == "__main__":
+    main()
