@@ -7,7 +7,7 @@ imported when it is first used.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from importlib import import_module
 
 import torch
@@ -15,10 +15,11 @@ import torch
 from ..errors import LodgsError
 from ..scenes.cameras import Camera
 from .adam import Adam
-from .rendering import Rendering, Target, View
+from .features import depths, normals
+from .rendering import OUTPUTS, Rendering, Target, View
 from .sh import coefficients, degree_of
 
-__all__ = ["BACKENDS", "Adam", "Rendering", "Target", "photometric_loss", "rasterize", "warm_up"]
+__all__ = ["BACKENDS", "OUTPUTS", "Adam", "Rendering", "Target", "photometric_loss", "rasterize", "warm_up"]
 
 BACKENDS = ("cpu", "reference")
 """Backends by name, the preferred one first: ``auto`` is the first."""
@@ -37,6 +38,8 @@ def rasterize(
     sh_degree: int | None = None,
     min_scale: float = 0.0,
     near: float = 0.01,
+    antialias: bool = False,
+    outputs: Collection[str] = (),
     backend: str = "auto",
 ) -> Rendering:
     """Draw splats as a camera sees them; differentiable by every tensor given.
@@ -56,10 +59,13 @@ def rasterize(
         sh_degree: use the coefficients up to this degree only (the others get a gradient of zero); None: all.
         min_scale: lower bound of every scale, in world units (FLoD, Eq. 4).
         near: a splat is drawn where its mean lies deeper than this, in world units.
+        antialias: instead of 3DGS's dilation, filter with :data:`.rendering.MIP_VARIANCE` and give what a splat
+            gains in area back in opacity, sqrt(det before / det after) (Mip-Splatting, Yu et al. 2024, Eq. 10).
+        outputs: of :data:`OUTPUTS`, what :class:`Rendering` shall have besides; differentiable, too.
         backend: one of :data:`BACKENDS`, or "auto".
 
     Raises:
-        ValueError: for tensors whose shapes do not belong together.
+        ValueError: for tensors whose shapes do not belong together, or an output that does not exist.
         LodgsError: for a backend that does not exist.
     """
     count = len(means)
@@ -77,11 +83,33 @@ def rasterize(
         if coefficients(sh_degree) > sh.shape[1]:
             raise ValueError(f"sh has degree {degree}, sh_degree asks for {sh_degree}")
         degree = sh_degree
+    if not set(outputs) <= set(OUTPUTS):
+        raise ValueError(f"outputs can be {', '.join(OUTPUTS)}, not {', '.join(outputs)}")
     red, green, blue = (float(value) for value in background)
-    return _backend(backend).rasterize(
+    view = View.of(camera, near)
+    features = []
+    if "depth" in outputs:
+        features.append(depths(means, view)[:, None])
+    if "normals" in outputs:
+        features.append(normals(means, quats, log_scales, view))
+    drawn = _backend(backend).rasterize(
         means, quats, log_scales, opacity_logits, sh, weights,
-        view=View.of(camera, near), background=(red, green, blue), degree=degree, min_scale=float(min_scale),
+        torch.cat(features, 1) if features else means.new_zeros(count, 0),
+        view=view, background=(red, green, blue), degree=degree, min_scale=float(min_scale),
+        antialias=antialias, median="median_depth" in outputs,
     )  # fmt: skip
+    rendering = Rendering(drawn.image, drawn.alpha, drawn.radii, drawn.grad2d)
+    if "depth" in outputs:
+        nothing = drawn.alpha == 0
+        rendering.depth = torch.where(
+            nothing, 0, drawn.features[..., 0] / drawn.alpha.masked_fill(nothing, 1)
+        )
+    if "normals" in outputs:
+        rendering.normals = drawn.features[..., -3:]
+    if drawn.median is not None:
+        padded = torch.cat([depths(means, view), means.new_zeros(1)])  # -1 is the last
+        rendering.median_depth = padded[drawn.median.long()]
+    return rendering
 
 
 def photometric_loss(

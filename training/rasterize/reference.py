@@ -10,7 +10,8 @@ import torch
 from torch.nn.functional import conv2d, normalize
 
 from . import sh as harmonics
-from .rendering import ALPHA_MAX, ALPHA_MIN, DILATION, TRANSMITTANCE_MIN, Rendering, Target, View
+from .features import rotation_matrices
+from .rendering import ALPHA_MAX, ALPHA_MIN, DILATION, MIP_VARIANCE, TRANSMITTANCE_MIN, Drawn, Target, View
 
 
 def rasterize(
@@ -20,12 +21,15 @@ def rasterize(
     opacity_logits: torch.Tensor,
     sh: torch.Tensor,
     weights: torch.Tensor | None,
+    features: torch.Tensor,
     *,
     view: View,
     background: tuple[float, float, float],
     degree: int,
     min_scale: float,
-) -> Rendering:
+    antialias: bool,
+    median: bool,
+) -> Drawn:
     """See :func:`training.rasterize.rasterize`."""
     kind = {"dtype": means.dtype, "device": means.device}
     rotation, translation, eye = (
@@ -43,13 +47,18 @@ def rasterize(
     half_covariance = (
         rotation @ rotation_matrices(quats[drawn]) * (log_scales[drawn].exp() + min_scale)[:, None]
     )
-    mean2d, (xx, xy, yy) = project(position, half_covariance, view)
+    mean2d, (xx, xy, yy), area = project(
+        position, half_covariance, view, MIP_VARIANCE if antialias else DILATION
+    )
+    if antialias:
+        opacity = opacity * area
 
     with torch.no_grad():
         # where alpha falls to its minimum: sigma² = 2 ln(opacity / minimum), along x and along y
-        reach = (2 * torch.log(opacity / ALPHA_MIN)).sqrt()
+        reach = (2 * torch.log((opacity / ALPHA_MIN).clamp_min(1))).sqrt()
         half_width, half_height = reach * xx.sqrt(), reach * yy.sqrt()
         inside = (mean2d[:, 0] + half_width > 0) & (mean2d[:, 0] - half_width < view.width)
+        inside &= opacity > ALPHA_MIN
         inside &= (mean2d[:, 1] + half_height > 0) & (mean2d[:, 1] - half_height < view.height)
         longest = (xx + yy) / 2 + (((xx - yy) / 2) ** 2 + xy**2).sqrt()
         radii[drawn] = torch.where(inside, 3 * longest.sqrt(), 0).float()
@@ -68,25 +77,22 @@ def rasterize(
     colour = (torch.stack(values, 1)[:, :, None] * sh[drawn, : len(values)]).sum(1).add(0.5).clamp_min(0)
 
     order = position[:, 2].argsort(stable=True)
-    image, transmittance = blend(
-        mean2d[order], xx[order], xy[order], yy[order], opacity[order], colour[order], view, background
-    )
-    return Rendering(image, 1 - transmittance, radii, grad2d)
+    weight, transmittance = blend(mean2d[order], xx[order], xy[order], yy[order], opacity[order], view)
+    image = torch.einsum("nhw,nc->hwc", weight, colour[order])
+    image = image + transmittance[..., None] * torch.tensor(background, **kind)
+    blended = torch.einsum("nhw,nc->hwc", weight, features[drawn[order]])
+    middle = None
+    if median:
+        left = 1 - weight.detach().cumsum(0)  # the transmittance, as Σ w = 1 - T
+        past = (left <= 0.5).to(torch.int32)
+        splats = torch.cat([drawn[order], drawn.new_tensor([-1])])
+        none = past.new_ones(1, view.height, view.width)
+        middle = splats[torch.cat([past, none]).argmax(0)].int()
+    return Drawn(image, 1 - transmittance, radii, grad2d, blended, middle)
 
 
-def rotation_matrices(quats: torch.Tensor) -> torch.Tensor:
-    """Rotation matrices (N, 3, 3) of quaternions (N, 4), wxyz, of any length but zero."""
-    w, x, y, z = normalize(quats, dim=1).unbind(1)
-    rows = (
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    )  # fmt: skip
-    return torch.stack(rows, 1).view(-1, 3, 3)
-
-
-def project(position: torch.Tensor, half_covariance: torch.Tensor, view: View):
-    """Means (N, 2) in pixels and the three entries xx, xy, yy of the dilated covariances, each (N,).
+def project(position: torch.Tensor, half_covariance: torch.Tensor, view: View, dilation: float):
+    """Means (N, 2) in pixels, dilated covariances' xx, xy, yy, and sqrt(det before / det after), each (N,).
 
     Args:
         position: (N, 3) in camera coordinates.
@@ -101,12 +107,13 @@ def project(position: torch.Tensor, half_covariance: torch.Tensor, view: View):
     row_y = (view.fy / z)[:, None] * half_covariance[:, 1]
     row_y = row_y - (view.fy * clamped_y / z**2)[:, None] * half_covariance[:, 2]
     mean2d = torch.stack([view.fx * x / z + view.cx, view.fy * y / z + view.cy], 1)
-    covariance = (row_x**2).sum(1) + DILATION, (row_x * row_y).sum(1), (row_y**2).sum(1) + DILATION
-    return mean2d, covariance
+    xx, xy, yy = (row_x**2).sum(1) + dilation, (row_x * row_y).sum(1), (row_y**2).sum(1) + dilation
+    area = torch.linalg.cross(row_x, row_y).norm(dim=1) / (xx * yy - xy**2).sqrt()
+    return mean2d, (xx, xy, yy), area
 
 
-def blend(mean2d, xx, xy, yy, opacity, colour, view: View, background) -> tuple[torch.Tensor, torch.Tensor]:
-    """Image (H, W, 3) and transmittance (H, W) of projected splats (N, ...) given front to back."""
+def blend(mean2d, xx, xy, yy, opacity, view: View) -> tuple[torch.Tensor, torch.Tensor]:
+    """Weights alpha T (N, H, W) of splats given front to back, and the T (H, W) left behind the last."""
     kind = {"dtype": mean2d.dtype, "device": mean2d.device}
     ys = torch.arange(view.height, **kind) + 0.5
     xs = torch.arange(view.width, **kind) + 0.5
@@ -122,8 +129,7 @@ def blend(mean2d, xx, xy, yy, opacity, colour, view: View, background) -> tuple[
     alive = behind > TRANSMITTANCE_MIN
     weight = torch.where(alive, alpha * before, 0)
     transmittance = torch.where(alive, 1 - alpha, 1).prod(0)
-    image = torch.einsum("nhw,nc->hwc", weight, colour)
-    return image + transmittance[..., None] * torch.tensor(background, **kind), transmittance
+    return weight, transmittance
 
 
 def photometric_loss(image: torch.Tensor, target: Target, ssim_weight: float) -> torch.Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -12,6 +12,10 @@ from ..scenes.cameras import Camera
 
 DILATION = 0.3
 """Added to the variance of each projected splat, in square pixels (3DGS's low-pass filter)."""
+MIP_VARIANCE = 0.1
+"""The same of Mip-Splatting's 2D filter, about a pixel's own extent (Yu et al. 2024, Eq. 10)."""
+OUTPUTS = ("depth", "median_depth", "normals")
+"""What can be asked for besides the image and its alpha."""
 ALPHA_MAX = 0.99
 ALPHA_MIN = 1 / 255
 """A splat adds nothing to a pixel where its alpha is below this."""
@@ -78,12 +82,37 @@ class Rendering:
         grad2d: (N,) float32, zeros until ``backward`` has run: the length of the loss's gradient by the
             projected mean, in the units of 3DGS's densification threshold (per pixel, times half the image's
             width and height). Backward runs that follow overwrite it.
+        depth: (H, W), on request: mean depth of what a pixel shows, Σ w z / Σ w, 0 where alpha is 0.
+        median_depth: (H, W), on request: depth of the splat that brings the transmittance to a half or below,
+            0 where none does.
+        normals: (H, W, 3), on request: Σ w n in camera coordinates, n the unit vector of a splat's shortest
+            axis that faces the camera; not normalised.
     """
 
     image: torch.Tensor
     alpha: torch.Tensor
     radii: torch.Tensor
     grad2d: torch.Tensor
+    depth: torch.Tensor | None = None
+    median_depth: torch.Tensor | None = None
+    normals: torch.Tensor | None = None
+
+
+class Drawn(NamedTuple):
+    """What a backend returns: a :class:`Rendering` before its outputs are named.
+
+    Attributes:
+        features: (H, W, F), the features given, blended over zero.
+        median: (H, W) int32, the splat that brings the transmittance to a half or below, -1 where none does;
+            None where it was not asked for.
+    """
+
+    image: torch.Tensor
+    alpha: torch.Tensor
+    radii: torch.Tensor
+    grad2d: torch.Tensor
+    features: torch.Tensor
+    median: torch.Tensor | None
 
 
 class Target:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from training.errors import LodgsError
-from training.rasterize import BACKENDS, Target, photometric_loss, rasterize
+from training.rasterize import BACKENDS, OUTPUTS, Target, photometric_loss, rasterize
 from training.rasterize.cpu.bin import TILE, bin_splats
 from training.rasterize.cpu.compile import numba, set_threads, threads
 from training.rasterize.cpu.fastmath import exp2
@@ -54,6 +54,20 @@ def test_one_round_splat_on_the_axis(backend, axis_camera):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+def test_a_splat_smaller_than_a_pixel_keeps_its_light_when_antialiased(backend, axis_camera):
+    """Its opacity times its area: 0.8 · 2 pi sigma² before and after the filter."""
+    sigma = 0.004
+    splats = isotropic([2.0], sigma, [0.8], [[1.0, 1.0, 1.0]])
+    drawn = rasterize(*splats, axis_camera, antialias=True, backend=backend)
+    variance = (40 * sigma / 2) ** 2
+    opacity = 0.8 * variance / (variance + 0.1)
+    expected = opacity * np.exp(-squared_distance() / (2 * (variance + 0.1)))
+    expected[expected < 1 / 255] = 0
+    assert expected.max() > 0
+    np.testing.assert_allclose(drawn.alpha.detach(), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_two_splats_blend_front_to_back_whatever_their_order(backend, axis_camera):
     splats = isotropic([4.0, 2.0], 0.3, [0.9, 0.5], [[1.0, 0.0, 0.2], [0.0, 1.0, 0.2]])
     drawn = rasterize(*splats, axis_camera, backend=backend).image.detach()
@@ -76,6 +90,51 @@ def test_alpha_is_capped_and_dark_pixels_take_no_more(backend, axis_camera):
     assert pixel[0].item() == pytest.approx(0.99, abs=1e-6)
     assert pixel[1].item() in (pytest.approx(0.0099, abs=1e-6), 0.0)
     assert pixel[2].item() == 0
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_depths_and_normals_of_two_discs(backend, axis_camera):
+    """A disc of opacity 0.4, tilted and turned away, before one of 0.5 that faces the camera."""
+    tilt = math.radians(30)
+    means = torch.tensor([[0.0, 0.0, 4.0], [0.0, 0.0, 2.0]], requires_grad=True)
+    quats = torch.tensor([[1.0, 0.0, 0.0, 0.0], [math.cos(tilt / 2), math.sin(tilt / 2), 0.0, 0.0]])
+    log_scales = torch.tensor([[1.0, 1.0, 0.001], [1.0, 1.0, 0.001]]).mul(5).log()
+    logits = torch.logit(torch.tensor([0.5, 0.4]))
+    drawn = rasterize(
+        means, quats, log_scales, logits, torch.zeros(2, 1, 3), axis_camera, outputs=OUTPUTS, backend=backend
+    )
+    front, back = 0.4, 0.6 * 0.5  # weights at the middle, where both are at their full opacity
+    at = 15, 15
+    assert drawn.alpha[at].item() == pytest.approx(front + back, rel=1e-3)
+    assert drawn.depth[at].item() == pytest.approx((front * 2 + back * 4) / (front + back), rel=1e-3)
+    normal = front * np.array([0, math.sin(tilt), -math.cos(tilt)]) + back * np.array([0, 0, -1])
+    np.testing.assert_allclose(drawn.normals[at].detach(), normal, atol=1e-3)
+    assert drawn.median_depth[at].item() == 4  # 0.6 is left behind the first, 0.3 behind the second
+    drawn.median_depth[at].backward()
+    assert means.grad is not None and means.grad.tolist() == [[0, 0, 1], [0, 0, 0]]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_what_is_empty_has_no_depth(backend, axis_camera):
+    splats = isotropic([2.0], 0.02, [0.4], [[1.0, 1.0, 1.0]])
+    drawn = rasterize(*splats, axis_camera, outputs=OUTPUTS, backend=backend)
+    empty = drawn.alpha == 0
+    assert 0 < empty.sum() < empty.numel()
+    assert (drawn.depth[empty] == 0).all() and (drawn.normals[empty] == 0).all()
+    assert torch.allclose(drawn.depth[~empty], torch.tensor(2.0))
+    assert (drawn.median_depth == 0).all(), "0.4 leaves more than a half"
+    (drawn.depth.sum() + drawn.normals.sum()).backward()
+    assert all(t.grad is None or t.grad.isfinite().all() for t in splats)
+
+
+def test_median_depths_agree_with_the_reference(make_splats, odd_camera):
+    """Pixel for pixel, but for those where rounding decides which splat reaches the half."""
+    splats = make_splats(300)
+    exact = rasterize(*splats.values(), odd_camera, outputs=["median_depth"], backend="reference")
+    found = rasterize(*(t.float() for t in splats.values()), odd_camera, outputs=["median_depth"])
+    same = (found.median_depth - exact.median_depth).abs() < 1e-4
+    assert same.float().mean() > 0.999
+    assert 0.2 < (exact.median_depth > 0).float().mean() < 1
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -107,6 +166,9 @@ def scene(name, make_splats):
     splats = make_splats({"one": 1, "crowd": 3000}.get(name, 250), seed=len(name))
     count = len(splats["means"])
     random = np.random.default_rng(9)
+    if name.startswith("antialiased"):
+        splats["log_scales"] -= 1
+        splats["log_scales"][::2, 0] += 2
     if name == "one":
         splats["means"][:] = torch.tensor([[0.1, -0.2, 3.0]])
         splats["opacity_logits"][:] = 1
@@ -125,14 +187,14 @@ def scene(name, make_splats):
         splats["opacity_logits"][:] = torch.from_numpy(random.uniform(-5.1, -4.5, count))
     elif name == "active degree":
         return splats, {"sh_degree": 1}
-    return splats, {}
+    return splats, {"antialias": name == "antialiased"}
 
 
 @pytest.mark.parametrize(
     "name",
     [
         "degree 0", "degree 1", "degree 2", "degree 3", "degree 4", "active degree",
-        "one", "needles", "screen-filling", "behind and near", "caps", "crowd",
+        "one", "antialiased", "needles", "screen-filling", "behind and near", "caps", "crowd",
     ],
 )  # fmt: skip
 def test_cpu_agrees_with_the_reference(name, make_splats, odd_camera):
@@ -147,12 +209,15 @@ def test_cpu_agrees_with_the_reference(name, make_splats, odd_camera):
         leaves = [t.to(kind).clone().requires_grad_() for t in (*splats.values(), weights)]
         drawn = rasterize(
             *leaves[:5], odd_camera, weights=leaves[5], background=(0.1, 0.5, 0.3), min_scale=0.01,
-            near=0.2, backend=backend, **options,
+            near=0.2, outputs=OUTPUTS, backend=backend, **options,
         )  # fmt: skip
-        loss = ((drawn.image - truth.to(kind)) ** 2).mean() + (drawn.alpha * truth[..., 0].to(kind)).mean()
+        shade = truth.to(kind)
+        loss = ((drawn.image - shade) ** 2).mean() + (drawn.alpha * shade[..., 0]).mean()
+        loss = loss + 0.1 * (drawn.depth * shade[..., 1]).mean() + (drawn.normals * shade).mean()
         loss.backward()
         gradients = {name: leaf.grad for name, leaf in zip((*splats, "weights"), leaves, strict=True)}
-        outputs = {"image": drawn.image.detach(), "alpha": drawn.alpha.detach(), "radii": drawn.radii}
+        outputs = {"image": drawn.image, "alpha": drawn.alpha, "depth": drawn.depth, "normals": drawn.normals}
+        outputs = {"radii": drawn.radii} | {name: output.detach() for name, output in outputs.items()}
         found[backend] = {**outputs, "grad2d": drawn.grad2d, **gradients}
     assert found["reference"]["grad2d"].norm() > 0
     for output, expected in found["reference"].items():
@@ -287,6 +352,8 @@ def test_what_does_not_belong_together_is_refused(make_splats, odd_camera):
         rasterize(splats[0], splats[1][:4], *splats[2:], odd_camera)
     with pytest.raises(ValueError, match="asks for 4"):
         rasterize(*splats, odd_camera, sh_degree=4)
+    with pytest.raises(ValueError, match="outputs can be depth"):
+        rasterize(*splats, odd_camera, outputs=["depths"])
     with pytest.raises(ValueError, match="float32"):
         rasterize(*(tensor.double() for tensor in splats), odd_camera, backend="cpu")
     with pytest.raises(LodgsError, match="gpu"):

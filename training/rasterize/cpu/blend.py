@@ -119,6 +119,41 @@ def blend_forward(
 
 
 @kernel(FAST)
+def blend_median(begin, end, projected, splat, tile_start, tiles_x, walked, median):
+    """Fill median (H, W): the splat that brings a pixel's T to a half or below; others stay."""
+    height, width = median.shape
+    state = np.empty(256, np.float32)
+    chosen = np.empty(256, np.int32)
+    for tile in range(begin, end):
+        x0, y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
+        rows, columns = min(TILE, height - y0), min(TILE, width - x0)
+        left, top = f32(x0) + HALF, f32(y0) + HALF
+        state[:] = ONE
+        chosen[:] = -1
+        for pair in range(tile_start[tile], tile_start[tile] + walked[tile]):
+            row = projected[splat[pair]]
+            first, last = row_range(row, top, rows)
+            offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
+            for r in range(first, last):
+                dy = f32(r) + offset_y
+                xy_dy = row[CONIC_XY] * dy
+                rest = row[LOG2_OPACITY] - row[CONIC_YY] * dy * dy
+                for j in range(16):
+                    dx = f32(j) + offset_x
+                    log2_alpha = rest - (row[CONIC_XX] * dx + xy_dy) * dx
+                    alpha = min(exp2(log2_alpha), CAP)
+                    alpha = alpha if log2_alpha >= LOG2_ALPHA_MIN else ZERO
+                    t = state[16 * r + j]
+                    behind = t - alpha * t
+                    state[16 * r + j] = behind
+                    chosen[16 * r + j] = splat[pair] if t > HALF and behind <= HALF else chosen[16 * r + j]
+        for r in range(rows):
+            for j in range(columns):
+                if chosen[16 * r + j] >= 0:
+                    median[y0 + r, x0 + j] = chosen[16 * r + j]
+
+
+@kernel(FAST)
 def blend_backward(
     begin,
     end,

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from .. import sh as harmonics
-from ..rendering import ALPHA_MIN, DILATION, View
+from ..rendering import ALPHA_MIN, DILATION, MIP_VARIANCE, View
 from .compile import FAST, f32, inlined, kernel
 
 # The columns of a projected splat: all that blending reads, one row a splat.
@@ -34,8 +34,8 @@ SUMS = 9
 GRAIN = 1024
 """How many splats a thread takes at a time."""
 ZERO, HALF, ONE, TWO = f32(0), f32(0.5), f32(1), f32(2)
-ALPHA_MIN32, DILATION32 = f32(ALPHA_MIN), f32(DILATION)
-LOG2_E = f32(math.log2(math.e))
+ALPHA_MIN32, DILATION32, MIP_VARIANCE32 = f32(ALPHA_MIN), f32(DILATION), f32(MIP_VARIANCE)
+LOG2_E, LN2 = f32(math.log2(math.e)), f32(math.log(2))
 
 sh_basis = inlined(FAST)(harmonics.basis)
 sh_basis_gradient = inlined(FAST)(harmonics.basis_gradient)
@@ -84,13 +84,14 @@ def camera_axes(pose, quat, log_scale, min_scale, scale, axes):
 @kernel(FAST)
 def project_forward(
     begin, end, means, quats, log_scales, opacity_logits, sh, weights,
-    pose, lens, eye, width, height, degree, min_scale,
+    pose, lens, eye, width, height, degree, min_scale, antialias,
     projected, depth, radii,
 ):  # fmt: skip
     """Fill projected (N, COLUMNS), depth (N,) and radii (N,); where the radius is 0 nothing else is set.
 
     ``weights`` is empty where all are one.
     """
+    dilation = MIP_VARIANCE32 if antialias else DILATION32
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     scale = np.empty(3, np.float32)
     axes = np.empty((3, 3), np.float32)
@@ -127,9 +128,13 @@ def project_forward(
         vv = v0 * v0 + v1 * v1 + v2 * v2
         # |u × v|² = uu vv − uv², without the cancellation that needles suffer
         cross0, cross1, cross2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
-        determinant = cross0 * cross0 + cross1 * cross1 + cross2 * cross2
-        determinant += DILATION32 * (uu + vv + DILATION32)
-        xx, yy = uu + DILATION32, vv + DILATION32
+        undilated = cross0 * cross0 + cross1 * cross1 + cross2 * cross2
+        determinant = undilated + dilation * (uu + vv + dilation)
+        xx, yy = uu + dilation, vv + dilation
+        if antialias:
+            opacity *= math.sqrt(undilated / determinant)
+            if opacity <= ALPHA_MIN32:
+                continue
 
         mean_x, mean_y = fx * x * rz + cx, fy * y * rz + cy
         reach = math.sqrt(TWO * math.log(opacity / ALPHA_MIN32))
@@ -161,6 +166,16 @@ def project_forward(
         row[RED], row[GREEN], row[BLUE] = max(red, ZERO), max(green, ZERO), max(blue, ZERO)
 
 
+@kernel(FAST)
+def gather_sums(begin, end, first_pair, pair_count, pair_row, pair_sums, sums):
+    """Add what a splat's pairs hold, (P, SUMS), to the splat's row of sums (N, SUMS)."""
+    for i in range(begin, end):
+        if pair_count[i] > 0:
+            for pair in range(first_pair[i], first_pair[i] + pair_count[i]):
+                for k in range(SUMS):
+                    sums[i, k] += pair_sums[pair_row[pair], k]
+
+
 @inlined(FAST)
 def covariance_gradient(row, sums):
     """d loss / d (xx, xy, yy) of cov, where the two off-diagonal entries are one variable.
@@ -178,6 +193,22 @@ def covariance_gradient(row, sums):
     by_yy = f32(-(t10 * b + t11 * c))
     by_mean_x, by_mean_y = -(a * sums[G_DX] + b * sums[G_DY]), -(b * sums[G_DX] + c * sums[G_DY])
     return by_xx, by_xy, by_yy, f32(by_mean_x), f32(by_mean_y)
+
+
+@inlined(FAST)
+def area_gradient(axes, j0, j2, k1, k2, by_log, by_area):
+    """The gradient of ln |u × v| by u and v, (2, 3), times by_log: (v × c, c × u) / |c|² with c = u × v.
+
+    u and v are the rows of J M; that their cross product comes first keeps needles from cancelling.
+    """
+    u0, v0 = j0 * axes[0, 0] + j2 * axes[2, 0], k1 * axes[1, 0] + k2 * axes[2, 0]
+    u1, v1 = j0 * axes[0, 1] + j2 * axes[2, 1], k1 * axes[1, 1] + k2 * axes[2, 1]
+    u2, v2 = j0 * axes[0, 2] + j2 * axes[2, 2], k1 * axes[1, 2] + k2 * axes[2, 2]
+    c0, c1, c2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
+    unit = by_log / (c0 * c0 + c1 * c1 + c2 * c2)
+    by_area[0, 0], by_area[1, 0] = (v1 * c2 - v2 * c1) * unit, (c1 * u2 - c2 * u1) * unit
+    by_area[0, 1], by_area[1, 1] = (v2 * c0 - v0 * c2) * unit, (c2 * u0 - c0 * u2) * unit
+    by_area[0, 2], by_area[1, 2] = (v0 * c1 - v1 * c0) * unit, (c0 * u1 - c1 * u0) * unit
 
 
 @inlined(FAST)
@@ -201,7 +232,7 @@ def quat_gradient(w, x, y, z, inverse, by_rotation, gradient):
 @kernel(FAST)
 def project_backward(
     begin, end, means, quats, log_scales, opacity_logits, sh, weights,
-    pose, lens, eye, width, height, degree, min_scale,
+    pose, lens, eye, width, height, degree, min_scale, antialias,
     projected, radii, first_pair, pair_count, pair_row, pair_sums,
     by_means, by_quats, by_log_scales, by_logits, by_sh, by_weights, grad2d,
 ):  # fmt: skip
@@ -211,6 +242,7 @@ def project_backward(
     axes = np.empty((3, 3), np.float32)
     by_axes = np.empty((3, 3), np.float32)
     by_rotation = np.empty((3, 3), np.float32)
+    by_area = np.zeros((2, 3), np.float32)
     sums = np.empty(SUMS, np.float32)
     basis = np.empty(25, np.float32)
     basis_x = np.empty(25, np.float32)
@@ -243,11 +275,20 @@ def project_backward(
         ndc_x, ndc_y = by_mean_x * HALF * width, by_mean_y * HALF * height
         grad2d[i] = math.sqrt(ndc_x * ndc_x + ndc_y * ndc_y)
 
+        if antialias:
+            # opacity has the factor |u × v| / sqrt(det cov): its logarithm's gradient by u, v and det cov
+            by_log = -sums[G]
+            area_gradient(axes, j0, j2, k1, k2, by_log, by_area)
+            by_xx -= by_log * LN2 * row[CONIC_XX]
+            by_xy -= by_log * LN2 * row[CONIC_XY]
+            by_yy -= by_log * LN2 * row[CONIC_YY]
+
         # u = row 0 of J M, v = row 1: xx = u·u, xy = u·v, yy = v·v
         by_j0, by_j2, by_k1, by_k2 = ZERO, ZERO, ZERO, ZERO
         for k in range(3):
             u, v = j0 * axes[0, k] + j2 * axes[2, k], k1 * axes[1, k] + k2 * axes[2, k]
-            by_u, by_v = TWO * by_xx * u + by_xy * v, TWO * by_yy * v + by_xy * u
+            by_u = TWO * by_xx * u + by_xy * v + by_area[0, k]
+            by_v = TWO * by_yy * v + by_xy * u + by_area[1, k]
             by_j0 += by_u * axes[0, k]
             by_j2 += by_u * axes[2, k]
             by_k1 += by_v * axes[1, k]
@@ -279,12 +320,11 @@ def project_backward(
             by_log_scales[i, k] = by_scale * ((scale[k] - min_scale) / scale[k])
         quat_gradient(w, qx, qy, qz, inverse, by_rotation, by_quats[i])
 
-        # sigma = ln opacity − ln alpha, so d loss / d opacity = −g / opacity; opacity = weight · sigmoid
-        opacity = row[OPACITY]
+        # sigma = ln opacity − ln alpha, so d loss / d ln opacity = −g; opacity = weight · sigmoid
         sigmoid = ONE / (ONE + math.exp(-opacity_logits[i]))
         by_logits[i] = -sums[G] * (ONE - sigmoid)
         if by_weights.shape[0] > 0:
-            by_weights[i] = -sums[G] * sigmoid / opacity
+            by_weights[i] = -sums[G] / weights[i]
 
         red = sums[G_RED] if row[RED] > ZERO else ZERO
         green = sums[G_GREEN] if row[GREEN] > ZERO else ZERO

@@ -1,0 +1,33 @@
+"""What a splat shows besides its colour: values that every backend blends as it blends colours."""
+
+from __future__ import annotations
+
+import torch
+from torch.nn.functional import normalize
+
+from .rendering import View
+
+
+def depths(means: torch.Tensor, view: View) -> torch.Tensor:
+    """Depth (N,) of means (N, 3) along the camera's z axis, in world units."""
+    return means @ torch.as_tensor(view.rotation[2]).to(means) + float(view.translation[2])
+
+
+def normals(means: torch.Tensor, quats: torch.Tensor, log_scales: torch.Tensor, view: View) -> torch.Tensor:
+    """Each splat's shortest axis (N, 3), unit length, in camera coordinates, turned towards the camera."""
+    shortest = log_scales.detach().argmin(dim=1)
+    axis = rotation_matrices(quats)[torch.arange(len(quats), device=quats.device), :, shortest]
+    with torch.no_grad():
+        away = (axis * (means - torch.as_tensor(view.eye).to(means))).sum(1, keepdim=True) > 0
+    return torch.where(away, -axis, axis) @ torch.as_tensor(view.rotation).to(means).T
+
+
+def rotation_matrices(quats: torch.Tensor) -> torch.Tensor:
+    """Rotation matrices (N, 3, 3) of quaternions (N, 4), wxyz, of any length but zero."""
+    w, x, y, z = normalize(quats, dim=1).unbind(1)
+    rows = (
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
+    return torch.stack(rows, 1).view(-1, 3, 3)
