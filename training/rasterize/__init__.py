@@ -7,7 +7,7 @@ imported when it is first used.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from importlib import import_module
 
 import torch
@@ -16,10 +16,13 @@ from ..errors import LodgsError
 from ..scenes.cameras import Camera
 from .adam import Adam
 from .features import depths, normals
-from .rendering import OUTPUTS, Rendering, Target, View
+from .rendering import OUTPUTS, Contributions, Rendering, Target, View
 from .sh import coefficients, degree_of
 
-__all__ = ["BACKENDS", "OUTPUTS", "Adam", "Rendering", "Target", "photometric_loss", "rasterize", "warm_up"]
+__all__ = [
+    "BACKENDS", "OUTPUTS", "Adam", "Contributions", "Rendering", "Target",
+    "contributions", "photometric_loss", "rasterize", "warm_up",
+]  # fmt: skip
 
 BACKENDS = ("cpu", "reference")
 """Backends by name, the preferred one first: ``auto`` is the first."""
@@ -59,8 +62,9 @@ def rasterize(
         sh_degree: use the coefficients up to this degree only (the others get a gradient of zero); None: all.
         min_scale: lower bound of every scale, in world units (FLoD, Eq. 4).
         near: a splat is drawn where its mean lies deeper than this, in world units.
-        antialias: instead of 3DGS's dilation, filter with :data:`.rendering.MIP_VARIANCE` and give what a splat
-            gains in area back in opacity, sqrt(det before / det after) (Mip-Splatting, Yu et al. 2024, Eq. 10).
+        antialias: instead of 3DGS's dilation, filter with :data:`.rendering.MIP_VARIANCE` and give what a
+            splat gains in area back in opacity, sqrt(det before / det after) (Mip-Splatting, Yu et al. 2024,
+            Eq. 10).
         outputs: of :data:`OUTPUTS`, what :class:`Rendering` shall have besides; differentiable, too.
         backend: one of :data:`BACKENDS`, or "auto".
 
@@ -69,13 +73,7 @@ def rasterize(
         LodgsError: for a backend that does not exist.
     """
     count = len(means)
-    shapes = {"means": (means, 3), "quats": (quats, 4), "log_scales": (log_scales, 3)}
-    for name, (tensor, columns) in shapes.items():
-        if tensor.shape != (count, columns):
-            raise ValueError(f"{name} must have shape ({count}, {columns}), not {tuple(tensor.shape)}")
-    for name, tensor in (("opacity_logits", opacity_logits), ("weights", weights)):
-        if tensor is not None and tensor.shape != (count,):
-            raise ValueError(f"{name} must have shape ({count},), not {tuple(tensor.shape)}")
+    _check(means, quats, log_scales, opacity_logits, weights)
     if sh.ndim != 3 or sh.shape[0] != count or sh.shape[2] != 3:
         raise ValueError(f"sh must have shape ({count}, coefficients, 3), not {tuple(sh.shape)}")
     degree = degree_of(sh.shape[1])
@@ -96,9 +94,11 @@ def rasterize(
         means, quats, log_scales, opacity_logits, sh, weights,
         torch.cat(features, 1) if features else means.new_zeros(count, 0),
         view=view, background=(red, green, blue), degree=degree, min_scale=float(min_scale),
-        antialias=antialias, median="median_depth" in outputs,
+        antialias=bool(antialias), median="median_depth" in outputs, absolute="absgrad2d" in outputs,
     )  # fmt: skip
-    rendering = Rendering(drawn.image, drawn.alpha, drawn.radii, drawn.grad2d)
+    rendering = Rendering(
+        drawn.image, drawn.alpha, drawn.radii, drawn.grad2d, drawn.tile_counts, drawn.absgrad2d
+    )
     if "depth" in outputs:
         nothing = drawn.alpha == 0
         rendering.depth = torch.where(
@@ -110,6 +110,55 @@ def rasterize(
         padded = torch.cat([depths(means, view), means.new_zeros(1)])  # -1 is the last
         rendering.median_depth = padded[drawn.median.long()]
     return rendering
+
+
+@torch.no_grad()
+def contributions(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    log_scales: torch.Tensor,
+    opacity_logits: torch.Tensor,
+    cameras: Iterable[Camera],
+    *,
+    weights: torch.Tensor | None = None,
+    min_scale: float = 0.0,
+    near: float = 0.01,
+    antialias: bool = False,
+    backend: str = "auto",
+) -> Contributions:
+    """What each splat gives to the pixels of some views; no picture is kept, nothing is differentiated.
+
+    Args: as for :func:`rasterize`, which draws the same splats with the same weights in a pixel.
+    """
+    _check(means, quats, log_scales, opacity_logits, weights)
+    of = {"dtype": torch.float32, "device": means.device}
+    count = len(means)
+    largest, total, radius = (torch.zeros(count, **of) for _ in range(3))
+    pixels, views = (torch.zeros(count, dtype=torch.int64, device=means.device) for _ in range(2))
+    for camera in cameras:
+        found = _backend(backend).contributions(
+            means, quats, log_scales, opacity_logits, weights,
+            view=View.of(camera, near), min_scale=float(min_scale), antialias=bool(antialias),
+        )  # fmt: skip
+        largest = torch.maximum(largest, found[0])
+        total += found[1]
+        pixels += found[2]
+        views += found[3] > 0
+        radius = torch.maximum(radius, found[3])
+    return Contributions(largest, total, pixels, views, radius)
+
+
+def _check(means, quats, log_scales, opacity_logits, weights) -> None:
+    """ValueError unless all are of as many splats."""
+    count = len(means)
+    for name, tensor, columns in (
+        ("means", means, 3), ("quats", quats, 4), ("log_scales", log_scales, 3),
+    ):  # fmt: skip
+        if tensor.shape != (count, columns):
+            raise ValueError(f"{name} must have shape ({count}, {columns}), not {tuple(tensor.shape)}")
+    for name, tensor in (("opacity_logits", opacity_logits), ("weights", weights)):
+        if tensor is not None and tensor.shape != (count,):
+            raise ValueError(f"{name} must have shape ({count},), not {tuple(tensor.shape)}")
 
 
 def photometric_loss(

@@ -29,6 +29,7 @@ def rasterize(
     min_scale: float,
     antialias: bool,
     median: bool,
+    absolute: bool,
 ) -> Drawn:
     """See :func:`training.rasterize.rasterize`."""
     kind = {"dtype": means.dtype, "device": means.device}
@@ -36,7 +37,8 @@ def rasterize(
         torch.as_tensor(v, **kind) for v in (view.rotation, view.translation, view.eye)
     )
     radii = torch.zeros(len(means), dtype=torch.float32, device=means.device)
-    grad2d = torch.zeros_like(radii)
+    grad2d = torch.zeros(len(means), 2, dtype=torch.float32, device=means.device)
+    absgrad2d = torch.zeros_like(grad2d) if absolute else None
 
     opacity = torch.sigmoid(opacity_logits) if weights is None else torch.sigmoid(opacity_logits) * weights
     with torch.no_grad():
@@ -63,12 +65,12 @@ def rasterize(
         longest = (xx + yy) / 2 + (((xx - yy) / 2) ** 2 + xy**2).sqrt()
         radii[drawn] = torch.where(inside, 3 * longest.sqrt(), 0).float()
 
+    to_ndc = torch.tensor([view.width / 2, view.height / 2], **kind)
+
+    def keep_gradient(gradient: torch.Tensor) -> None:
+        grad2d[drawn] = (gradient * to_ndc).float()
+
     if mean2d.requires_grad:
-        to_ndc = torch.tensor([view.width / 2, view.height / 2], **kind)
-
-        def keep_gradient(gradient: torch.Tensor) -> None:
-            grad2d[drawn] = (gradient * to_ndc).norm(dim=1).float()
-
         mean2d.register_hook(keep_gradient)
 
     values: list = [None] * harmonics.coefficients(degree)
@@ -77,10 +79,22 @@ def rasterize(
     colour = (torch.stack(values, 1)[:, :, None] * sh[drawn, : len(values)]).sum(1).add(0.5).clamp_min(0)
 
     order = position[:, 2].argsort(stable=True)
-    weight, transmittance = blend(mean2d[order], xx[order], xy[order], yy[order], opacity[order], view)
+    offsets = pixel_offsets(mean2d[order], view)
+    weight, transmittance = blend(offsets, xx[order], xy[order], yy[order], opacity[order])
     image = torch.einsum("nhw,nc->hwc", weight, colour[order])
     image = image + transmittance[..., None] * torch.tensor(background, **kind)
+    if absolute:  # features have no part in absgrad2d, so their gradient takes a way of its own
+        weight, _ = blend(pixel_offsets(mean2d[order], view), xx[order], xy[order], yy[order], opacity[order])
     blended = torch.einsum("nhw,nc->hwc", weight, features[drawn[order]])
+    if absgrad2d is not None and mean2d.requires_grad:
+        for axis, offset in enumerate(offsets):
+
+            def keep_absolute(gradient: torch.Tensor, axis: int = axis) -> None:
+                absgrad2d[drawn[order], axis] = (gradient.abs().sum((1, 2)) * to_ndc[axis]).float()
+
+            offset.register_hook(keep_absolute)
+    with torch.no_grad():
+        counts = tile_counts(mean2d, xx, xy, yy, opacity, inside, view)
     middle = None
     if median:
         left = 1 - weight.detach().cumsum(0)  # the transmittance, as Σ w = 1 - T
@@ -88,7 +102,7 @@ def rasterize(
         splats = torch.cat([drawn[order], drawn.new_tensor([-1])])
         none = past.new_ones(1, view.height, view.width)
         middle = splats[torch.cat([past, none]).argmax(0)].int()
-    return Drawn(image, 1 - transmittance, radii, grad2d, blended, middle)
+    return Drawn(image, 1 - transmittance, radii, grad2d, counts, absgrad2d, blended, middle)
 
 
 def project(position: torch.Tensor, half_covariance: torch.Tensor, view: View, dilation: float):
@@ -112,13 +126,55 @@ def project(position: torch.Tensor, half_covariance: torch.Tensor, view: View, d
     return mean2d, (xx, xy, yy), area
 
 
-def blend(mean2d, xx, xy, yy, opacity, view: View) -> tuple[torch.Tensor, torch.Tensor]:
-    """Weights alpha T (N, H, W) of splats given front to back, and the T (H, W) left behind the last."""
+def pixel_offsets(mean2d: torch.Tensor, view: View) -> tuple[torch.Tensor, torch.Tensor]:
+    """From the means (N, 2) to the pixels' centres, along x and along y, each (N, H, W)."""
     kind = {"dtype": mean2d.dtype, "device": mean2d.device}
     ys = torch.arange(view.height, **kind) + 0.5
     xs = torch.arange(view.width, **kind) + 0.5
     dx = xs[None, None, :] - mean2d[:, 0, None, None]
     dy = ys[None, :, None] - mean2d[:, 1, None, None]
+    return dx.expand(-1, view.height, -1), dy.expand(-1, -1, view.width)
+
+
+def tile_counts(mean2d, xx, xy, yy, opacity, inside, view: View) -> torch.Tensor:
+    """How many ellipses alpha = ALPHA_MIN meet the rectangle of the pixel centres of each 16x16 tile."""
+    kind = {"dtype": mean2d.dtype, "device": mean2d.device}
+    left = torch.arange(0, view.width, 16, **kind) + 0.5
+    top = torch.arange(0, view.height, 16, **kind) + 0.5
+    x0, y0 = left - mean2d[:, :1], top - mean2d[:, 1:]
+    x1, y1 = x0 + 15, y0 + 15
+    area = (xx * yy - xy**2)[:, None, None]
+    a, b, c = (entry[:, None, None] / area for entry in (yy, -xy, xx))
+    x0, x1, y0, y1 = x0[:, None, :], x1[:, None, :], y0[:, :, None], y1[:, :, None]
+
+    def distance(x, y):
+        return a * x * x + 2 * b * x * y + c * y * y
+
+    # the form is convex: its least value on the rectangle is at the mean or on an edge
+    least = torch.where((x0 <= 0) & (x1 >= 0) & (y0 <= 0) & (y1 >= 0), 0.0, torch.inf)
+    for x in (x0, x1):
+        least = torch.minimum(least, distance(x, torch.maximum(torch.minimum(-b * x / c, y1), y0)))
+    for y in (y0, y1):
+        least = torch.minimum(least, distance(torch.maximum(torch.minimum(-b * y / a, x1), x0), y))
+    reach = 2 * torch.log((opacity / ALPHA_MIN).clamp_min(1))  # where alpha is at its minimum
+    return ((least <= reach[:, None, None]) & inside[:, None, None]).sum(0)
+
+
+def contributions(means, quats, log_scales, opacity_logits, weights, *, view, min_scale, antialias):
+    """See :func:`training.rasterize.contributions`, for one view."""
+    sh, features = means.new_zeros(len(means), 1, 3), torch.eye(len(means)).to(means)
+    drawn = rasterize(
+        means, quats, log_scales, opacity_logits, sh, weights, features,
+        view=view, background=(0.0, 0.0, 0.0), degree=0, min_scale=min_scale, antialias=antialias,
+        median=False, absolute=False,
+    )  # fmt: skip
+    shares = drawn.features.flatten(0, 1)  # a feature of each splat's own: its weight in every pixel
+    return shares.amax(0).float(), shares.sum(0).float(), (shares > 0).sum(0), drawn.radii
+
+
+def blend(offsets, xx, xy, yy, opacity) -> tuple[torch.Tensor, torch.Tensor]:
+    """Weights alpha T (N, H, W) of splats given front to back, and the T (H, W) left behind the last."""
+    dx, dy = offsets
     xx, xy, yy = xx[:, None, None], xy[:, None, None], yy[:, None, None]
     distance = (yy * dx**2 - 2 * xy * dx * dy + xx * dy**2) / (xx * yy - xy**2)
     alpha = (opacity[:, None, None] * torch.exp(-0.5 * distance)).clamp_max(ALPHA_MAX)

@@ -14,7 +14,7 @@ DILATION = 0.3
 """Added to the variance of each projected splat, in square pixels (3DGS's low-pass filter)."""
 MIP_VARIANCE = 0.1
 """The same of Mip-Splatting's 2D filter, about a pixel's own extent (Yu et al. 2024, Eq. 10)."""
-OUTPUTS = ("depth", "median_depth", "normals")
+OUTPUTS = ("depth", "median_depth", "normals", "absgrad2d")
 """What can be asked for besides the image and its alpha."""
 ALPHA_MAX = 0.99
 ALPHA_MIN = 1 / 255
@@ -79,9 +79,13 @@ class Rendering:
         alpha: (H, W), one minus the transmittance left behind the last splat.
         radii: (N,) float32, three standard deviations along the longest axis of the projected splat, in
             pixels; 0 for a splat that is not drawn.
-        grad2d: (N,) float32, zeros until ``backward`` has run: the length of the loss's gradient by the
-            projected mean, in the units of 3DGS's densification threshold (per pixel, times half the image's
-            width and height). Backward runs that follow overwrite it.
+        grad2d: (N, 2) float32, zeros until ``backward`` has run: the loss's gradient by the projected mean,
+            in the units of 3DGS's densification threshold (per pixel, times half the image's width and
+            height). Backward runs that follow overwrite it.
+        tile_counts: (ceil(H / 16), ceil(W / 16)) int64, how many splats each tile of 16x16 pixels has to look
+            at (LODGE's measure of what a picture costs).
+        absgrad2d: (N, 2), on request: as grad2d, with the absolute values of the pixels' shares of image and
+            alpha summed (AbsGS, Ye et al. 2024).
         depth: (H, W), on request: mean depth of what a pixel shows, Σ w z / Σ w, 0 where alpha is 0.
         median_depth: (H, W), on request: depth of the splat that brings the transmittance to a half or below,
             0 where none does.
@@ -93,9 +97,30 @@ class Rendering:
     alpha: torch.Tensor
     radii: torch.Tensor
     grad2d: torch.Tensor
+    tile_counts: torch.Tensor
+    absgrad2d: torch.Tensor | None = None
     depth: torch.Tensor | None = None
     median_depth: torch.Tensor | None = None
     normals: torch.Tensor | None = None
+
+
+@dataclass
+class Contributions:
+    """What each splat gave to the pixels of one or more views; w = alpha T is its weight in a pixel.
+
+    Attributes:
+        largest: (N,), the largest w (the importance of RadSplat and LODGE).
+        total: (N,), Σ w over pixels (LightGaussian's blended opacity).
+        pixels: (N,) int64, in how many pixels w > 0 (LightGaussian's hits).
+        views: (N,) int64, in how many views it was drawn.
+        radius: (N,), the largest of :attr:`Rendering.radii`.
+    """
+
+    largest: torch.Tensor
+    total: torch.Tensor
+    pixels: torch.Tensor
+    views: torch.Tensor
+    radius: torch.Tensor
 
 
 class Drawn(NamedTuple):
@@ -111,6 +136,8 @@ class Drawn(NamedTuple):
     alpha: torch.Tensor
     radii: torch.Tensor
     grad2d: torch.Tensor
+    tile_counts: torch.Tensor
+    absgrad2d: torch.Tensor | None
     features: torch.Tensor
     median: torch.Tensor | None
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from training.errors import LodgsError
-from training.rasterize import BACKENDS, OUTPUTS, Target, photometric_loss, rasterize
+from training.rasterize import BACKENDS, OUTPUTS, Target, contributions, photometric_loss, rasterize
 from training.rasterize.cpu.bin import TILE, bin_splats
 from training.rasterize.cpu.compile import numba, set_threads, threads
 from training.rasterize.cpu.fastmath import exp2
@@ -50,7 +50,7 @@ def test_one_round_splat_on_the_axis(backend, axis_camera):
 
     drawn.image[10, 20, 0].backward()  # d alpha / d mean = alpha (pixel - mean) / variance
     by_mean = (0.9 - 0.1) * alpha[10, 20] * np.array([4.5, -5.5]) / variance
-    assert drawn.grad2d[0].item() == pytest.approx(16 * np.linalg.norm(by_mean), rel=1e-4)
+    np.testing.assert_allclose(drawn.grad2d[0], 16 * by_mean, rtol=1e-4)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -138,6 +138,56 @@ def test_median_depths_agree_with_the_reference(make_splats, odd_camera):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+def test_what_two_splats_contribute_to_two_views(backend, axis_camera):
+    """Worked by hand: the nearer takes alpha, the farther what is left; one view sees them half as large."""
+    splats = isotropic([4.0, 2.0], 0.3, [0.9, 0.5], [[1.0, 1.0, 1.0]] * 2)
+    half = Camera("half", 32, 32, 20.0, 20.0, 16.0, 16.0, np.eye(4))
+    away = Camera("away", 32, 32, 20.0, 20.0, 16.0, 16.0, np.diag([-1.0, 1.0, -1.0, 1.0]))
+    found = contributions(*splats[:4], [axis_camera, half, away], backend=backend)
+    expected = np.zeros((3, 2))
+    for focal in (40, 20):
+        far, near = (
+            opacity * np.exp(-squared_distance() / (2 * ((focal * 0.3 / z) ** 2 + 0.3)))
+            for opacity, z in ((0.9, 4), (0.5, 2))
+        )
+        far[far < 1 / 255] = near[near < 1 / 255] = 0
+        weights = (1 - near) * far, near
+        expected[0] = np.maximum(expected[0], [w.max() for w in weights])
+        expected[1] += [w.sum() for w in weights]
+        expected[2] += [(w > 0).sum() for w in weights]
+    np.testing.assert_allclose(found.largest, expected[0], rtol=1e-5)
+    np.testing.assert_allclose(found.total, expected[1], rtol=1e-5)
+    np.testing.assert_array_equal(found.pixels, expected[2])
+    assert found.views.tolist() == [2, 2]
+    np.testing.assert_allclose(
+        found.radius, [3 * math.sqrt((40 * 0.3 / z) ** 2 + 0.3) for z in (4, 2)], rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize("name", ["degree 3", "antialiased", "needles", "screen-filling", "caps", "crowd"])
+def test_contributions_agree_with_the_reference(name, make_splats, odd_camera):
+    splats, options = scene(name, make_splats)
+    splats = {key: tensor[:400] for key, tensor in splats.items()}
+    options.pop("sh_degree", None)
+    geometry = list(splats.values())[:4]
+    weights = torch.linspace(0, 1, len(geometry[0])).double()
+    found, exact = (
+        contributions(
+            *(t.to(kind) for t in geometry), [odd_camera], weights=weights.to(kind), min_scale=0.01, near=0.2,
+            backend=backend, **options,
+        )
+        for backend, kind in (("cpu", torch.float32), ("reference", torch.float64))
+    )  # fmt: skip
+    torch.testing.assert_close(found.largest, exact.largest, rtol=1e-3, atol=1e-5)
+    torch.testing.assert_close(found.total, exact.total, rtol=1e-3, atol=2e-2)
+    assert (found.pixels - exact.pixels).abs().sum() <= 1e-3 * exact.pixels.sum()
+    assert torch.equal(found.views, exact.views)
+    drawn = rasterize(*(t.float() for t in splats.values()), odd_camera, weights=weights.float(),
+                      min_scale=0.01, near=0.2, **options)  # fmt: skip
+    assert found.total.sum().item() == pytest.approx(drawn.alpha.sum().item(), rel=1e-4)  # Σ w = alpha
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_no_splats_leave_the_background(backend, axis_camera):
     empty = [torch.zeros(0, *shape, requires_grad=True) for shape in ((3,), (4,), (3,), (), (16, 3))]
     drawn = rasterize(*empty, axis_camera, background=(0.2, 0.4, 0.6), backend=backend)
@@ -218,12 +268,14 @@ def test_cpu_agrees_with_the_reference(name, make_splats, odd_camera):
         gradients = {name: leaf.grad for name, leaf in zip((*splats, "weights"), leaves, strict=True)}
         outputs = {"image": drawn.image, "alpha": drawn.alpha, "depth": drawn.depth, "normals": drawn.normals}
         outputs = {"radii": drawn.radii} | {name: output.detach() for name, output in outputs.items()}
-        found[backend] = {**outputs, "grad2d": drawn.grad2d, **gradients}
+        aside = {"grad2d": drawn.grad2d, "absgrad2d": drawn.absgrad2d, "tile_counts": drawn.tile_counts}
+        found[backend] = {**outputs, **aside, **gradients}
     assert found["reference"]["grad2d"].norm() > 0
     for output, expected in found["reference"].items():
         expected = expected.double()
         error = (found["cpu"][output].double() - expected).norm() / expected.norm().clamp_min(1e-12)
-        assert error <= 5e-4, f"{output}: {error:.1e}"
+        # whether an ellipse just touches a tile is a matter of rounding
+        assert error <= (5e-3 if output == "tile_counts" else 5e-4), f"{output}: {error:.1e}"
 
 
 def test_thousands_of_splats_are_blended_on_a_pixel_of_the_crowd(make_splats, odd_camera):

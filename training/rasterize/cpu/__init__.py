@@ -3,18 +3,20 @@
 ``project`` makes ellipses of splats, ``bin`` sorts them into tiles, ``blend`` makes pixels of them; ``loss``
 compares with a photograph and ``adam`` takes the step. This page joins them to torch's autograd.
 
-torch's own thread pool beside Numba's slows the kernels by half and more: a trainer that uses this backend
+torch's own thread pool beside the kernels' slows them by half and more: a trainer that uses this backend
 calls ``torch.set_num_threads(1)``.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 
 from ..rendering import Drawn, Target, View
-from .bin import TILE, bin_splats
-from .blend import blend_backward, blend_forward, blend_median
+from .bin import TILE, Pairs, bin_splats
+from .blend import blend_backward, blend_backward_absolute, blend_forward, blend_median, blend_weights
 from .compile import f32, in_parallel, scratch, serialised
 from .loss import loss_and_gradient, moments_of
 from .project import (
@@ -22,9 +24,11 @@ from .project import (
     COLUMNS,
     G_RED,
     GRAIN,
+    LN2,
     RED,
     SUMS,
     gather_sums,
+    gather_weights,
     lens_of,
     project_backward,
     project_forward,
@@ -49,24 +53,56 @@ def rasterize(
     min_scale: float,
     antialias: bool,
     median: bool,
+    absolute: bool,
 ) -> Drawn:
     """See :func:`training.rasterize.rasterize`. Tensors are float32 on the CPU; ValueError otherwise.
 
     The image is laid out in planes: ``image.permute(2, 0, 1)`` is contiguous.
     """
     weights = torch.ones(0) if weights is None else weights
-    for tensor in (means, quats, log_scales, opacity_logits, sh, weights, features):
+    tensors = means, quats, log_scales, opacity_logits, sh, weights, features
+    for tensor in tensors:
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
             raise ValueError(
                 f"the cpu backend takes float32 on the CPU, not {tensor.dtype} on {tensor.device}"
             )
-    radii, grad2d = torch.zeros(len(means)), torch.zeros(len(means))
-    middle = torch.full((view.height, view.width), -1, dtype=torch.int32) if median else None
+    aside = _Aside(
+        radii=torch.zeros(len(means)),
+        grad2d=torch.zeros(len(means), 2),
+        absgrad2d=torch.zeros(len(means), 2) if absolute else None,
+        median=torch.full((view.height, view.width), -1, dtype=torch.int32) if median else None,
+        tile_counts=torch.empty(-(-view.height // TILE), -(-view.width // TILE), dtype=torch.int64),
+    )
+    settings = *lens_of(view), view.width, view.height, degree, f32(min_scale), antialias
     planes, alpha, blended = _Rasterize.apply(
-        means, quats, log_scales, opacity_logits, sh, weights, features,
-        view, background, degree, min_scale, antialias, radii, grad2d, middle,
+        *tensors, settings, view, np.array(background, np.float32), aside
+    )
+    return Drawn(
+        image=planes.permute(1, 2, 0), alpha=alpha, radii=aside.radii, grad2d=aside.grad2d,
+        tile_counts=aside.tile_counts, absgrad2d=aside.absgrad2d, features=blended.permute(1, 2, 0),
+        median=aside.median,
     )  # fmt: skip
-    return Drawn(planes.permute(1, 2, 0), alpha, radii, grad2d, blended.permute(1, 2, 0), middle)
+
+
+@dataclass
+class _Aside:
+    """What a rendering tells besides what autograd differentiates; see ``rendering.Drawn``."""
+
+    radii: torch.Tensor
+    grad2d: torch.Tensor
+    absgrad2d: torch.Tensor | None
+    median: torch.Tensor | None
+    tile_counts: torch.Tensor
+
+
+def _project_and_bin(
+    splats: list, settings: tuple, view: View, radii: torch.Tensor
+) -> tuple[np.ndarray, Pairs]:
+    """Projected splats (N, COLUMNS) and their pairs with tiles; fills the radii."""
+    projected = np.empty((len(radii), COLUMNS), np.float32)
+    depth = np.empty(len(radii), np.float32)
+    in_parallel(project_forward, len(radii), GRAIN, *splats, *settings, projected, depth, radii.numpy())
+    return projected, bin_splats(projected, depth, radii.numpy(), view.width, view.height)
 
 
 class _Rasterize(torch.autograd.Function):
@@ -75,82 +111,73 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @serialised
     def forward(
-        ctx, means, quats, log_scales, logits, sh, weights, features,
-        view, background, degree, min_scale, antialias, radii, grad2d, median,
-    ):  # fmt: skip
+        ctx, means, quats, log_scales, logits, sh, weights, features, settings, view, background, aside
+    ):
         tensors = [tensor.contiguous() for tensor in (means, quats, log_scales, logits, sh, weights)]
         splats = [tensor.detach().numpy() for tensor in tensors]
-        count = len(means)
-        settings = (*lens_of(view), view.width, view.height, degree, f32(min_scale), antialias)
-        projected = np.empty((count, COLUMNS), np.float32)
-        depth = np.empty(count, np.float32)
-        in_parallel(project_forward, count, GRAIN, *splats, *settings, projected, depth, radii.numpy())
-        pairs = bin_splats(projected, depth, radii.numpy(), view.width, view.height)
+        projected, pairs = _project_and_bin(splats, settings, view, aside.radii)
+        counts = aside.tile_counts.numpy()
+        counts[:] = np.diff(pairs.tile_start).reshape(counts.shape)
 
+        tiles = pairs.splat, pairs.tile_start, counts.shape[1]
         transmittance = np.empty((view.height, view.width), np.float32)
-        walked = np.empty(len(pairs.tile_start) - 1, np.int64)
-        tiles = pairs.splat, pairs.tile_start, -(-view.width // TILE)
-        passes = [(projected, np.array(background, np.float32))]
-        passes += [(coloured, np.zeros(3, np.float32)) for coloured in _as_colours(features, projected)]
-        images = []
-        for coloured, behind in passes:
-            image = np.empty((3, view.height, view.width), np.float32)
+        walked = np.empty(counts.size, np.int64)
+        passes = [projected, *_as_colours(features, projected)]
+        images = np.empty((len(passes), 3, view.height, view.width), np.float32)
+        for coloured, image in zip(passes, images, strict=True):
+            behind = background if coloured is projected else np.zeros_like(background)
             in_parallel(
-                blend_forward, len(walked), TILES, coloured, *tiles, behind, image, transmittance, walked
+                blend_forward, counts.size, TILES, coloured, *tiles, behind, image, transmittance, walked
             )
-            images.append(image)
-        if median is not None:
-            in_parallel(blend_median, len(walked), TILES, projected, *tiles, walked, median.numpy())
+        if aside.median is not None:
+            in_parallel(blend_median, counts.size, TILES, projected, *tiles, walked, aside.median.numpy())
         ctx.save_for_backward(*tensors)
-        ctx.rest = (
-            settings,
-            [p for p, _ in passes],
-            pairs,
-            tiles,
-            walked,
-            images,
-            transmittance,
-            radii,
-            grad2d,
-        )
-        blended = np.concatenate(images[1:])[: features.shape[1]] if len(images) > 1 else image[:0]
+        ctx.rest = settings, aside, pairs, tiles, walked, passes, images, transmittance
+        blended = images[1:].reshape(-1, view.height, view.width)[: features.shape[1]]
         return tuple(map(torch.from_numpy, (images[0], 1 - transmittance, blended)))
 
     @staticmethod
     @serialised
     def backward(ctx, by_planes, by_alpha, by_blended):
-        settings, passes, pairs, tiles, walked, images, transmittance, radii, grad2d = ctx.rest
-        tensors = ctx.saved_tensors
-        pair_sums = scratch("pair_sums", len(pairs.splat), SUMS)
+        settings, aside, pairs, tiles, walked, passes, images, transmittance = ctx.rest
+        tensors, count = ctx.saved_tensors, len(aside.radii)
+        of_pairs = pairs.first, pairs.count, pairs.row
+        backward, columns = (
+            (blend_backward, SUMS) if aside.absgrad2d is None else (blend_backward_absolute, SUMS + 2)
+        )
+        pair_sums = scratch("pair_sums", len(pairs.splat), columns)
         in_parallel(
-            blend_backward, len(walked), TILES, passes[0], *tiles, walked, images[0], transmittance,
+            backward, walked.size, TILES, passes[0], *tiles, walked, images[0], transmittance,
             by_planes.contiguous().numpy(), by_alpha.contiguous().numpy(), pair_sums,
         )  # fmt: skip
-        by_features = torch.zeros(len(radii), by_blended.shape[0])
-        if len(passes) > 1:
-            further, no_alpha = scratch("further_sums", *pair_sums.shape), np.zeros_like(transmittance)
-            by_image = np.zeros((3 * (len(passes) - 1), *transmittance.shape), np.float32)
-            by_image[: len(by_blended)] = by_blended.numpy()
-            for k, coloured in enumerate(passes[1:]):
-                in_parallel(
-                    blend_backward, len(walked), TILES, coloured, *tiles, walked, images[k + 1],
-                    transmittance, by_image[3 * k : 3 * k + 3], no_alpha, further,
-                )  # fmt: skip
-                pair_sums[:, :G_RED] += further[:, :G_RED]
-                by_three = np.zeros((len(radii), SUMS), np.float32)
-                in_parallel(
-                    gather_sums, len(radii), GRAIN, pairs.first, pairs.count, pairs.row, further, by_three
-                )
-                mine = by_features[:, 3 * k : 3 * k + 3]
-                mine.copy_(torch.from_numpy(by_three[:, G_RED : G_RED + mine.shape[1]]))
+        if aside.absgrad2d is not None:
+            sums = np.zeros((count, columns), np.float32)
+            in_parallel(gather_sums, count, GRAIN, *of_pairs, pair_sums, sums)
+            height, width = transmittance.shape
+            half_size = np.array([width / 2, height / 2], np.float32)
+            np.multiply(sums[:, SUMS:], half_size * LN2, out=aside.absgrad2d.numpy())
+
+        by_features = np.zeros((count, 3 * (len(passes) - 1)), np.float32)
+        by_images = np.zeros_like(images[1:])
+        by_images.reshape(-1, *transmittance.shape)[: len(by_blended)] = by_blended.numpy()
+        no_alpha = np.zeros_like(transmittance)
+        for k, coloured in enumerate(passes[1:]):
+            further, sums = scratch("further_sums", len(pair_sums), SUMS), np.zeros((count, SUMS), np.float32)
+            in_parallel(
+                blend_backward, walked.size, TILES, coloured, *tiles, walked, images[k + 1], transmittance,
+                by_images[k], no_alpha, further,
+            )  # fmt: skip
+            in_parallel(gather_sums, count, GRAIN, *of_pairs, further, sums)
+            by_features[:, 3 * k : 3 * k + 3] = sums[:, G_RED:]
+            pair_sums[:, :G_RED] += further[:, :G_RED]
+
         gradients = [torch.empty_like(tensor, requires_grad=False) for tensor in tensors]
         in_parallel(
-            project_backward, len(radii), GRAIN,
-            *(tensor.detach().numpy() for tensor in tensors), *settings, passes[0], radii.numpy(),
-            pairs.first, pairs.count, pairs.row, pair_sums,
-            *(gradient.numpy() for gradient in gradients), grad2d.numpy(),
+            project_backward, count, GRAIN, *(tensor.detach().numpy() for tensor in tensors), *settings,
+            passes[0], aside.radii.numpy(), *of_pairs, pair_sums,
+            *(gradient.numpy() for gradient in gradients), aside.grad2d.numpy(),
         )  # fmt: skip
-        return *gradients, by_features, *[None] * 8
+        return *gradients, torch.from_numpy(by_features[:, : len(by_blended)]), None, None, None, None
 
 
 def _as_colours(features: torch.Tensor, projected: np.ndarray) -> list[np.ndarray]:
@@ -163,6 +190,40 @@ def _as_colours(features: torch.Tensor, projected: np.ndarray) -> list[np.ndarra
         coloured[:, RED : RED + three.shape[1]] = three
         found.append(coloured)
     return found
+
+
+@serialised
+def contributions(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    log_scales: torch.Tensor,
+    opacity_logits: torch.Tensor,
+    weights: torch.Tensor | None,
+    *,
+    view: View,
+    min_scale: float,
+    antialias: bool,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """See :func:`training.rasterize.contributions`: of one view, the largest, the sum, pixels and radii."""
+    count = len(means)
+    splats = [
+        tensor.detach().contiguous().numpy()
+        for tensor in (
+            means, quats, log_scales, opacity_logits, means.new_zeros(count, 1, 3),
+            means.new_ones(0) if weights is None else weights,
+        )
+    ]  # fmt: skip
+    radii = torch.zeros(count)
+    settings = *lens_of(view), view.width, view.height, 0, f32(min_scale), antialias
+    projected, pairs = _project_and_bin(splats, settings, view, radii)
+    pair_weights, found = scratch("pair_weights", len(pairs.splat), 3), np.empty((count, 3), np.float32)
+    in_parallel(
+        blend_weights, len(pairs.tile_start) - 1, TILES, projected, pairs.splat, pairs.tile_start,
+        -(-view.width // TILE), view.width, view.height, pair_weights,
+    )  # fmt: skip
+    in_parallel(gather_weights, count, GRAIN, pairs.first, pairs.count, pairs.row, pair_weights, found)
+    largest, total, pixels = torch.from_numpy(found).unbind(1)
+    return largest, total, pixels.long(), radii
 
 
 def photometric_loss(image: torch.Tensor, target: Target, ssim_weight: float) -> torch.Tensor:
@@ -190,7 +251,8 @@ class _Photometric(torch.autograd.Function):
 def warm_up() -> None:
     """Compile the kernels, or read them from the cache: one step on one splat."""
     from ...scenes.cameras import Camera
-    from ..adam import Adam
+    from .. import Adam
+    from .. import rasterize as draw
 
     tensors = {
         "means": torch.tensor([[0.0, 0.0, 1.0]]),
@@ -201,10 +263,7 @@ def warm_up() -> None:
     }
     for tensor in tensors.values():
         tensor.requires_grad_()
-    view = View.of(Camera("", 16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4)), 0.01)
-    drawn = rasterize(
-        **tensors, weights=None, features=torch.zeros(1, 0), view=view, background=(0.0, 0.0, 0.0), degree=0,
-        min_scale=0.0, antialias=False, median=False,
-    )  # fmt: skip
+    camera = Camera("", 16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
+    drawn = draw(*tensors.values(), camera, backend="cpu")  # pyright: ignore[reportCallIssue]
     photometric_loss(drawn.image, Target(torch.zeros(16, 16, 3)), 0.2).backward()
     Adam(tensors, dict.fromkeys(tensors, 0.0)).step()

@@ -37,12 +37,8 @@ from .project import (
     G,
 )
 
-ZERO, HALF, ONE = f32(0), f32(0.5), f32(1)
+ZERO, HALF, ONE, TWO = f32(0), f32(0.5), f32(1), f32(2)
 CAP, T_MIN = f32(ALPHA_MAX), f32(TRANSMITTANCE_MIN)
-STRIDE = 176
-"""A row of the backward pass: 16 lanes each of the six sums, of the three of h, of T and of Q."""
-H, T, Q = STRIDE + 96, STRIDE + 144, STRIDE + 160
-"""Where a row's own h, T and Q begin, counted from the row above it."""
 LOOK_EVERY = 16
 """After this many splats a tile looks whether any of its pixels still takes light."""
 
@@ -153,92 +149,6 @@ def blend_median(begin, end, projected, splat, tile_start, tiles_x, walked, medi
                     median[y0 + r, x0 + j] = chosen[16 * r + j]
 
 
-@kernel(FAST)
-def blend_backward(
-    begin,
-    end,
-    projected,
-    splat,
-    tile_start,
-    tiles_x,
-    walked,
-    image,
-    transmittance,
-    by_image,
-    by_alpha,
-    pair_sums,
-):
-    """Fill pair_sums (P, SUMS), each pair's share of its splat's gradients, from those of image and alpha.
-
-    With h = d loss / d image, the loss gets Σ w (c·h) + T_end (background·h − d loss / d alpha) from a pixel.
-    Let Q_i be the part of that sum that lies behind splat i. Then
-        d loss / d alpha_i = T_i (c_i·h) − Q_i / (1 − alpha_i)
-    and, as sigma = −ln alpha + const,
-        g = d loss / d sigma = alpha_i Q_i / (1 − alpha_i) − w_i (c_i·h).
-    Q starts as the whole sum, image·h − T_end d loss / d alpha, and is walked down front to back with T.
-    A splat's sums are handed down from row to row of its tile.
-    """
-    height, width = transmittance.shape
-    state = np.zeros(17 * STRIDE, np.float32)  # the row above the first holds sums of zero only
-    for tile in range(begin, end):
-        x0, y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
-        rows, columns = min(TILE, height - y0), min(TILE, width - x0)
-        left, top = f32(x0) + HALF, f32(y0) + HALF
-        for r in range(16):
-            for j in range(16):
-                lane = (r + 1) * STRIDE + j
-                if r < rows and j < columns:
-                    y, x = y0 + r, x0 + j
-                    q = -by_alpha[y, x] * transmittance[y, x]
-                    for c in range(3):
-                        state[lane + 96 + 16 * c] = by_image[c, y, x]
-                        q += image[c, y, x] * by_image[c, y, x]
-                    state[lane + 144], state[lane + 160] = ONE, q
-                else:
-                    state[lane + 144] = -ONE
-
-        lit = tile_start[tile] + walked[tile]
-        for pair in range(tile_start[tile], lit):
-            row = projected[splat[pair]]
-            xx, xy, yy, log2_opacity = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY], row[LOG2_OPACITY]
-            red, green, blue = row[RED], row[GREEN], row[BLUE]
-            first, last = row_range(row, top, rows)
-            offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
-            for j in range(first * STRIDE, first * STRIDE + 96):
-                state[j] = ZERO
-            for r in range(first, last):
-                dy = f32(r) + offset_y
-                xy_dy, rest, dydy = xy * dy, log2_opacity - yy * dy * dy, dy * dy
-                above = state[r * STRIDE : (r + 2) * STRIDE]
-                for j in range(16):
-                    dx = f32(j) + offset_x
-                    log2_alpha = rest - (xx * dx + xy_dy) * dx
-                    uncapped = exp2(log2_alpha)
-                    alpha = min(uncapped, CAP)
-                    alpha = alpha if log2_alpha >= LOG2_ALPHA_MIN else ZERO
-                    t = above[T + j]
-                    t_behind = t - alpha * t
-                    takes = t_behind > T_MIN
-                    w = alpha * t if takes else ZERO
-                    above[T + j] = t_behind if takes else -abs(t)
-                    h_red, h_green, h_blue = above[H + j], above[H + 16 + j], above[H + 32 + j]
-                    seen = w * (red * h_red + green * h_green + blue * h_blue)
-                    q = above[Q + j] - seen
-                    above[Q + j] = q
-                    g = alpha * q / (ONE - alpha) - seen
-                    g = g if takes and uncapped < CAP else ZERO
-                    above[STRIDE + j] = above[j] + g
-                    above[STRIDE + 16 + j] = above[16 + j] + g * dy
-                    above[STRIDE + 32 + j] = above[32 + j] + g * dydy
-                    above[STRIDE + 48 + j] = above[48 + j] + w * h_red
-                    above[STRIDE + 64 + j] = above[64 + j] + w * h_green
-                    above[STRIDE + 80 + j] = above[80 + j] + w * h_blue
-            add_lanes(state[max(first, last) * STRIDE :], offset_x, pair_sums[pair])
-        for pair in range(lit, tile_start[tile + 1]):
-            for k in range(SUMS):
-                pair_sums[pair, k] = ZERO
-
-
 @inlined(FAST)
 def add_lanes(sums, offset_x, out):
     """Sum the lanes of one splat in one tile; dx depends on the lane only, so its moments are taken here."""
@@ -258,3 +168,142 @@ def add_lanes(sums, offset_x, out):
     out[G], out[G_DX], out[G_DY] = g, g_dx, g_dy
     out[G_DXDX], out[G_DXDY], out[G_DYDY] = g_dxdx, g_dxdy, g_dydy
     out[G_RED], out[G_GREEN], out[G_BLUE] = red, green, blue
+
+
+@kernel(FAST)
+def blend_weights(begin, end, projected, splat, tile_start, tiles_x, width, height, pair_weights):
+    """Fill pair_weights (P, 3): the largest weight, their sum, and the number of pixels of each pair."""
+    state = np.empty(256, np.float32)
+    for tile in range(begin, end):
+        x0, y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
+        rows, columns = min(TILE, height - y0), min(TILE, width - x0)
+        left, top = f32(x0) + HALF, f32(y0) + HALF
+        for r in range(16):
+            for j in range(16):
+                state[16 * r + j] = ONE if r < rows and j < columns else -ONE
+        for pair in range(tile_start[tile], tile_start[tile + 1]):
+            row = projected[splat[pair]]
+            first, last = row_range(row, top, rows)
+            offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
+            largest, total, pixels = ZERO, ZERO, ZERO
+            for r in range(first, last):
+                dy = f32(r) + offset_y
+                xy_dy = row[CONIC_XY] * dy
+                rest = row[LOG2_OPACITY] - row[CONIC_YY] * dy * dy
+                for j in range(16):
+                    dx = f32(j) + offset_x
+                    log2_alpha = rest - (row[CONIC_XX] * dx + xy_dy) * dx
+                    alpha = min(exp2(log2_alpha), CAP)
+                    alpha = alpha if log2_alpha >= LOG2_ALPHA_MIN else ZERO
+                    t = state[16 * r + j]
+                    behind = t - alpha * t
+                    takes = behind > T_MIN
+                    w = alpha * t if takes else ZERO
+                    state[16 * r + j] = behind if takes else -abs(t)
+                    largest = max(largest, w)
+                    total += w
+                    pixels += ONE if w > ZERO else ZERO
+            pair_weights[pair, 0], pair_weights[pair, 1], pair_weights[pair, 2] = largest, total, pixels
+
+
+def _backward(absolute: bool):
+    """The kernel that fills pair_sums (P, SUMS), each pair's share of its splat's gradients.
+
+    With h = d loss / d image, the loss gets Σ w (c·h) + T_end (background·h − d loss / d alpha) from a pixel.
+    Let Q_i be the part of that sum that lies behind splat i. Then
+        d loss / d alpha_i = T_i (c_i·h) − Q_i / (1 − alpha_i)
+    and, as sigma = −ln alpha + const,
+        g = d loss / d sigma = alpha_i Q_i / (1 − alpha_i) − w_i (c_i·h).
+    Q starts as the whole sum, image·h − T_end d loss / d alpha, and is walked down front to back with T.
+    A splat's sums are handed down from row to row of its tile.
+
+    With ``absolute``, pair_sums has two more columns for Σ |d loss / d mean| / ln 2 over pixels, by x and by
+    y (AbsGS, Ye et al. 2024).
+    """
+    # a row: 16 lanes each of the sums, of the three of h, of T and of Q
+    H = 128 if absolute else 96
+    T, Q, stride = H + 48, H + 64, H + 80
+
+    @kernel(FAST)
+    def blend_backward(
+        begin, end, projected, splat, tile_start, tiles_x, walked, image, transmittance,
+        by_image, by_alpha, pair_sums,
+    ):  # fmt: skip
+        height, width = transmittance.shape
+        state = np.zeros(17 * stride, np.float32)  # the row above the first holds sums of zero only
+        for tile in range(begin, end):
+            x0, y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
+            rows, columns = min(TILE, height - y0), min(TILE, width - x0)
+            left, top = f32(x0) + HALF, f32(y0) + HALF
+            for r in range(16):
+                for j in range(16):
+                    lane = (r + 1) * stride + j
+                    if r < rows and j < columns:
+                        y, x = y0 + r, x0 + j
+                        q = -by_alpha[y, x] * transmittance[y, x]
+                        for c in range(3):
+                            state[lane + H + 16 * c] = by_image[c, y, x]
+                            q += image[c, y, x] * by_image[c, y, x]
+                        state[lane + T], state[lane + Q] = ONE, q
+                    else:
+                        state[lane + T] = -ONE
+
+            lit = tile_start[tile] + walked[tile]
+            for pair in range(tile_start[tile], lit):
+                row = projected[splat[pair]]
+                xx, xy, yy, log2_opacity = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY], row[LOG2_OPACITY]
+                red, green, blue = row[RED], row[GREEN], row[BLUE]
+                first, last = row_range(row, top, rows)
+                offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
+                for j in range(first * stride, first * stride + H):
+                    state[j] = ZERO
+                for r in range(first, last):
+                    dy = f32(r) + offset_y
+                    xy_dy, rest, dydy = xy * dy, log2_opacity - yy * dy * dy, dy * dy
+                    above = state[r * stride : (r + 2) * stride]
+                    for j in range(16):
+                        dx = f32(j) + offset_x
+                        log2_alpha = rest - (xx * dx + xy_dy) * dx
+                        uncapped = exp2(log2_alpha)
+                        alpha = min(uncapped, CAP)
+                        alpha = alpha if log2_alpha >= LOG2_ALPHA_MIN else ZERO
+                        t = above[stride + T + j]
+                        t_behind = t - alpha * t
+                        takes = t_behind > T_MIN
+                        w = alpha * t if takes else ZERO
+                        above[stride + T + j] = t_behind if takes else -abs(t)
+                        h_red, h_green, h_blue = (
+                            above[stride + H + j],
+                            above[stride + H + 16 + j],
+                            above[stride + H + 32 + j],
+                        )
+                        seen = w * (red * h_red + green * h_green + blue * h_blue)
+                        q = above[stride + Q + j] - seen
+                        above[stride + Q + j] = q
+                        g = alpha * q / (ONE - alpha) - seen
+                        g = g if takes and uncapped < CAP else ZERO
+                        above[stride + j] = above[j] + g
+                        above[stride + 16 + j] = above[16 + j] + g * dy
+                        above[stride + 32 + j] = above[32 + j] + g * dydy
+                        above[stride + 48 + j] = above[48 + j] + w * h_red
+                        above[stride + 64 + j] = above[64 + j] + w * h_green
+                        above[stride + 80 + j] = above[80 + j] + w * h_blue
+                        if absolute:
+                            by_x, by_y = g * (TWO * xx * dx + xy * dy), g * (xy * dx + TWO * yy * dy)
+                            above[stride + 96 + j] = above[96 + j] + abs(by_x)
+                            above[stride + 112 + j] = above[112 + j] + abs(by_y)
+                sums = state[max(first, last) * stride :]
+                add_lanes(sums, offset_x, pair_sums[pair])
+                if absolute:
+                    pair_sums[pair, SUMS], pair_sums[pair, SUMS + 1] = ZERO, ZERO
+                    for j in range(16):
+                        pair_sums[pair, SUMS] += sums[96 + j]
+                        pair_sums[pair, SUMS + 1] += sums[112 + j]
+            for pair in range(lit, tile_start[tile + 1]):
+                for k in range(pair_sums.shape[1]):
+                    pair_sums[pair, k] = ZERO
+
+    return blend_backward
+
+
+blend_backward, blend_backward_absolute = _backward(False), _backward(True)

@@ -167,12 +167,23 @@ def project_forward(
 
 
 @kernel(FAST)
+def gather_weights(begin, end, first_pair, pair_count, pair_row, pair_weights, weights):
+    """Fill weights (N, 3) from (P, 3): the largest of the first column, the sums of the others."""
+    for i in range(begin, end):
+        largest, total, pixels = ZERO, ZERO, ZERO
+        for pair in range(first_pair[i], first_pair[i] + pair_count[i]):
+            row = pair_weights[pair_row[pair]]
+            largest, total, pixels = max(largest, row[0]), total + row[1], pixels + row[2]
+        weights[i, 0], weights[i, 1], weights[i, 2] = largest, total, pixels
+
+
+@kernel(FAST)
 def gather_sums(begin, end, first_pair, pair_count, pair_row, pair_sums, sums):
-    """Add what a splat's pairs hold, (P, SUMS), to the splat's row of sums (N, SUMS)."""
+    """Add what a splat's pairs hold, (P, K), to the splat's row of sums (N, K)."""
     for i in range(begin, end):
         if pair_count[i] > 0:
             for pair in range(first_pair[i], first_pair[i] + pair_count[i]):
-                for k in range(SUMS):
+                for k in range(sums.shape[1]):
                     sums[i, k] += pair_sums[pair_row[pair], k]
 
 
@@ -273,7 +284,7 @@ def project_backward(
         k1, k2 = fy * rz, -fy * ratio_y * rz
         by_xx, by_xy, by_yy, by_mean_x, by_mean_y = covariance_gradient(row, sums)
         ndc_x, ndc_y = by_mean_x * HALF * width, by_mean_y * HALF * height
-        grad2d[i] = math.sqrt(ndc_x * ndc_x + ndc_y * ndc_y)
+        grad2d[i, 0], grad2d[i, 1] = ndc_x, ndc_y
 
         if antialias:
             # opacity has the factor |u × v| / sqrt(det cov): its logarithm's gradient by u, v and det cov
