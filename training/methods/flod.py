@@ -148,7 +148,7 @@ class Flod:
         self._seen = torch.zeros(len(self.model))
 
     def _remember_gradients(self, rendering) -> None:
-        self._gradient_sum += rendering.grad2d
+        self._gradient_sum += rendering.grad2d.norm(dim=1)
         self._seen += rendering.radii > 0
 
     def _control_density(self, step: int, local: int, level: int, until: float) -> None:

@@ -7,9 +7,11 @@ imported when it is first used.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import replace
 from importlib import import_module
 
+import numpy as np
 import torch
 
 from ..errors import LodgsError
@@ -17,15 +19,18 @@ from ..scenes.cameras import Camera
 from .adam import Adam
 from .features import depths, normals
 from .rendering import OUTPUTS, Contributions, Rendering, Target, View
-from .sh import coefficients, degree_of
+from .sh import degree_of
 
 __all__ = [
     "BACKENDS", "OUTPUTS", "Adam", "Contributions", "Rendering", "Target",
-    "contributions", "photometric_loss", "rasterize", "warm_up",
+    "contributions", "photometric_loss", "rasterize", "render", "warm_up",
 ]  # fmt: skip
 
 BACKENDS = ("cpu", "reference")
 """Backends by name, the preferred one first: ``auto`` is the first."""
+
+STRIP = 1 << 21
+"""Pixels that :func:`render` draws at a time: a Full HD frame at once, an 8k frame in sixteen strips."""
 
 
 def rasterize(
@@ -74,13 +79,7 @@ def rasterize(
     """
     count = len(means)
     _check(means, quats, log_scales, opacity_logits, weights)
-    if sh.ndim != 3 or sh.shape[0] != count or sh.shape[2] != 3:
-        raise ValueError(f"sh must have shape ({count}, coefficients, 3), not {tuple(sh.shape)}")
-    degree = degree_of(sh.shape[1])
-    if sh_degree is not None:
-        if coefficients(sh_degree) > sh.shape[1]:
-            raise ValueError(f"sh has degree {degree}, sh_degree asks for {sh_degree}")
-        degree = sh_degree
+    degree = _degree(sh, count, sh_degree)
     if not set(outputs) <= set(OUTPUTS):
         raise ValueError(f"outputs can be {', '.join(OUTPUTS)}, not {', '.join(outputs)}")
     red, green, blue = (float(value) for value in background)
@@ -110,6 +109,59 @@ def rasterize(
         padded = torch.cat([depths(means, view), means.new_zeros(1)])  # -1 is the last
         rendering.median_depth = padded[drawn.median.long()]
     return rendering
+
+
+@torch.no_grad()
+def render(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    log_scales: torch.Tensor,
+    opacity_logits: torch.Tensor,
+    sh: torch.Tensor,
+    cameras: Iterable[Camera],
+    *,
+    weights: torch.Tensor | None = None,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    sh_degree: int | None = None,
+    min_scale: float = 0.0,
+    near: float = 0.01,
+    antialias: bool = False,
+    kind: str = "float32",
+    strip: int = STRIP,
+    backend: str = "auto",
+) -> Iterator[np.ndarray]:
+    """Draw pictures for eyes, one camera after the other: nothing is kept for gradients.
+
+    Large images are drawn in strips, so that beyond the picture itself little memory is used.
+
+    Args: as for :func:`rasterize`, and
+        kind: "uint8" (colours clamped to 0 to 1, rounded), "float16" or "float32".
+        strip: pixels to draw at a time, about.
+
+    Yields:
+        (H, W, 4) of this kind: the colour over the background, and alpha.
+    """
+    if kind not in ("uint8", "float16", "float32"):
+        raise ValueError(f'kind can be "uint8", "float16" or "float32", not "{kind}"')
+    _check(means, quats, log_scales, opacity_logits, weights)
+    degree = _degree(sh, len(means), sh_degree)
+    red, green, blue = (float(value) for value in background)
+    for camera in cameras:
+        picture = np.empty((camera.height, camera.width, 4), kind)
+        whole = View.of(camera, near)
+        rows = max(strip // camera.width // 16 * 16, 16)
+        for top in range(0, camera.height, rows):
+            part = replace(whole, cy=whole.cy - top, height=min(rows, camera.height - top))
+            drawn = _backend(backend).rasterize(
+                means, quats, log_scales, opacity_logits, sh, weights, means.new_zeros(len(means), 0),
+                view=part, background=(red, green, blue), degree=degree, min_scale=float(min_scale),
+                antialias=bool(antialias), median=False, absolute=False,
+            )  # fmt: skip
+            pixels = torch.cat([drawn.image, drawn.alpha[..., None]], 2)
+            if kind == "uint8":
+                pixels = pixels.clamp_(0, 1).mul_(255).round_()
+            picture[top : top + rows] = pixels.cpu().numpy()
+        yield picture
 
 
 @torch.no_grad()
@@ -161,12 +213,24 @@ def _check(means, quats, log_scales, opacity_logits, weights) -> None:
             raise ValueError(f"{name} must have shape ({count},), not {tuple(tensor.shape)}")
 
 
+def _degree(sh: torch.Tensor, count: int, wanted: int | None) -> int:
+    """The degree to draw with; ValueError unless sh is of ``count`` splats and of that degree at least."""
+    if sh.ndim != 3 or sh.shape[0] != count or sh.shape[2] != 3:
+        raise ValueError(f"sh must have shape ({count}, coefficients, 3), not {tuple(sh.shape)}")
+    degree = degree_of(sh.shape[1])
+    if wanted is not None and wanted > degree:
+        raise ValueError(f"sh has degree {degree}, sh_degree asks for {wanted}")
+    return degree if wanted is None else wanted
+
+
 def photometric_loss(
     image: torch.Tensor, target: Target, ssim_weight: float = 0.2, *, backend: str = "auto"
 ) -> torch.Tensor:
     """(1 − ssim_weight) L1 + ssim_weight (1 − SSIM), as 3DGS (Eq. 7): a scalar, differentiable by the image.
 
-    SSIM has an 11x11 Gaussian window of sigma 1.5 and zeros outside the image.
+    SSIM has an 11x11 Gaussian window of sigma 1.5 and zeros outside the image. Where the target has a mask m,
+    m·image + (1 − m)·photograph is compared, so that what is masked out costs nothing, nor do its neighbours
+    for its sake.
 
     Args:
         image: (H, W, 3), a rendering.
@@ -174,6 +238,9 @@ def photometric_loss(
     """
     if image.shape != target.image.shape:
         raise ValueError(f"image {tuple(image.shape)} and target {tuple(target.image.shape)} differ in shape")
+    if target.mask is not None:
+        truth = target.image.to(image)
+        image = truth + target.mask[..., None].to(image) * (image - truth)
     return _backend(backend).photometric_loss(image, target, float(ssim_weight))
 
 

@@ -50,6 +50,26 @@ def test_the_fused_gradient_is_autograds(size):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+def test_what_is_masked_out_costs_nothing(backend):
+    """As if the photograph showed there what was drawn, and half of a difference where the mask is a half."""
+    random = torch.Generator().manual_seed(0)
+    truth, image = torch.rand(2, 40, 60, 3, generator=random)
+    mask = torch.ones(40, 60)
+    mask[:, 30:], mask[:, 10:20] = 0, 0.5
+    leaf = image.clone().requires_grad_()
+    loss = photometric_loss(leaf, Target(truth, mask), backend=backend)
+    loss.backward()
+    seen = truth.clone()
+    seen[:, :30] = image[:, :30]
+    seen[:, 10:20] = (image[:, 10:20] + truth[:, 10:20]) / 2
+    expected = scipy_loss(seen.double().numpy(), truth.double().numpy(), 0.2)
+    assert loss.item() == pytest.approx(expected, rel=2e-5)
+    assert leaf.grad is not None and leaf.grad[:, 30:].abs().max() == 0 and leaf.grad[:, :30].abs().min() > 0
+    with pytest.raises(ValueError, match="mask has shape"):
+        Target(truth, mask[:5])
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_equal_images_have_no_loss(backend):
     image = torch.rand(20, 30, 3, requires_grad=True)
     loss = photometric_loss(image, Target(image.detach().clone()), backend=backend)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from training.errors import LodgsError
-from training.rasterize import BACKENDS, OUTPUTS, Target, contributions, photometric_loss, rasterize
+from training.rasterize import BACKENDS, OUTPUTS, Target, contributions, photometric_loss, rasterize, render
 from training.rasterize.cpu.bin import TILE, bin_splats
 from training.rasterize.cpu.compile import numba, set_threads, threads
 from training.rasterize.cpu.fastmath import exp2
@@ -308,6 +308,31 @@ def everything(splats, camera, truth):
     return [drawn.image.detach(), drawn.alpha.detach(), drawn.radii, drawn.grad2d, loss.detach()] + [
         leaf.grad for leaf in leaves
     ]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_pictures_for_eyes_are_what_training_sees(backend, make_splats, odd_camera, axis_camera):
+    """In one piece and in strips of 16 rows, of every kind."""
+    splats = [t.float() for t in make_splats(150).values()]
+    options = {"background": (0.9, 0.2, 0.4), "sh_degree": 1, "min_scale": 0.01, "backend": backend}
+    cameras = [odd_camera, axis_camera]
+    for camera, whole, strips, small, half in zip(
+        cameras,
+        render(*splats, cameras, **options),
+        render(*splats, cameras, strip=1, **options),
+        render(*splats, cameras, kind="uint8", **options),
+        render(*splats, cameras, kind="float16", **options),
+        strict=True,
+    ):
+        drawn = rasterize(*splats, camera, **options)
+        expected = torch.cat([drawn.image, drawn.alpha[..., None]], 2).numpy()
+        np.testing.assert_array_equal(whole, expected)
+        np.testing.assert_allclose(strips, expected, atol=2e-5)
+        assert small.dtype == np.uint8 and half.dtype == np.float16
+        np.testing.assert_array_equal(small, np.round(expected.clip(0, 1) * 255))
+        np.testing.assert_allclose(half, expected, atol=2e-3)
+    with pytest.raises(ValueError, match="kind can be"):
+        next(render(*splats, cameras, kind="int8"))
 
 
 def test_the_same_bits_whatever_the_number_of_threads(make_splats, odd_camera):
