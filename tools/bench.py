@@ -1,7 +1,7 @@
-"""Measure a training step by stage, against the machine's own limit: ``make bench``.
+"""Measure the rasterizer by stage, against the machine's own limit: part of ``make bench``.
 
-Prints a table and saves build/bench/bench.json; ``--base old.json`` compares with an earlier run. Compare
-runs of one machine only, and trust none that says the machine was busy.
+Prints tables, saves build/bench/bench.json and bench.png; ``--base old.json`` compares with an earlier run.
+Compare runs of one machine only, and trust none that says the machine was busy.
 """
 
 from __future__ import annotations
@@ -9,7 +9,9 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -20,15 +22,20 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import numpy as np
 import torch
 
-from training.rasterize import Adam, Target, cpu, photometric_loss, rasterize
+from training.rasterize import Adam, Target, cpu, photometric_loss, rasterize, render
 from training.rasterize.cpu import adam
 from training.rasterize.cpu.bin import LOG2_ALPHA_MIN
 from training.rasterize.cpu.blend import CAP, T_MIN, row_range
-from training.rasterize.cpu.compile import FAST, f32, in_parallel, kernel, threads
+from training.rasterize.cpu.compile import FAST, f32, in_parallel, kernel, set_threads, threads
 from training.rasterize.cpu.fastmath import exp2
 from training.scenes.cameras import Camera
 
-CASES = [(10_000, 320, 240), (50_000, 640, 480), (200_000, 640, 480), (200_000, 960, 540)]
+ROOT = Path(__file__).resolve().parent.parent
+CASES = [
+    (count, width, height)
+    for count in (10_000, 50_000, 200_000)
+    for width, height in ((320, 240), (640, 480), (960, 540))
+]
 FORWARD_FLOPS, BACKWARD_FLOPS = 26, 47
 """Operations for each lane of a row that a splat reaches in a tile, counted in the source of ``blend``."""
 KERNELS = {
@@ -130,27 +137,27 @@ def measure(step: Callable[[], None], seconds: float) -> tuple[dict[str, float],
 
 @kernel(frozenset({"contract"}))
 def multiply_add(begin, end, values, rounds):
-    """64 dependent multiply-adds an element, 4096 elements a thread in the L1 cache."""
+    """8 dependent multiply-adds an element, 4096 elements a thread in the L1 cache."""
     for thread in range(begin, end):
         line = values[thread]
         for _ in range(rounds):
             for j in range(line.shape[0]):
                 x = line[j]
-                for _ in range(64):
+                for _ in range(8):
                     x = x * f32(0.999) + f32(0.001)
                 line[j] = x
 
 
 def measured_peak() -> float:
     """Float32 operations a second (1e9) that multiply-adds reach on all threads."""
-    values, rounds = np.ones((threads(), 4096), np.float32), 2000
+    values, rounds = np.ones((threads(), 4096), np.float32), 16_000
     in_parallel(multiply_add, len(values), 1, values, 1)
     seconds = []
     for _ in range(5):
         start = time.perf_counter()
         in_parallel(multiply_add, len(values), 1, values, rounds)
         seconds.append(time.perf_counter() - start)
-    return values.size * rounds * 128 / min(seconds) / 1e9
+    return values.size * rounds * 16 / min(seconds) / 1e9
 
 
 @kernel(FAST)
@@ -232,6 +239,78 @@ def bench(seconds: float) -> dict:
     return {"peak_gflops": round(peak, 1), "cases": cases}
 
 
+def least(function: Callable[[], object], seconds: float) -> float:
+    """Milliseconds of the fastest of as many calls as fit, after one."""
+    function()
+    best, start = float("inf"), time.perf_counter()
+    while time.perf_counter() - start < seconds:
+        began = time.perf_counter()
+        function()
+        best = min(best, time.perf_counter() - began)
+    return 1e3 * best
+
+
+def further(seconds: float) -> dict:
+    """What is not a training step: forward only, weights, threads, the first compilation."""
+    found: dict[str, Any] = {}
+    splats, camera = dict[str, Any](synthetic_splats(200_000)), synthetic_camera(960, 540)
+    found["forward_ms"] = least(lambda: next(render(**splats, cameras=[camera])), seconds)
+
+    weights = torch.from_numpy((np.random.default_rng(2).random(200_000) > 0.7).astype(np.float32))
+    kept = {name: tensor[weights > 0] for name, tensor in splats.items()}
+
+    def draw(some: dict, **options) -> Callable:
+        return lambda: next(render(**some, cameras=[camera], **options))
+
+    found["weights_by_removed"] = least(draw(splats, weights=weights), seconds) / least(draw(kept), seconds)
+
+    step, before = Step(50_000, 640, 480), threads()
+    by_threads = {}
+    try:
+        for count in sorted({1, 2, before, 16}):
+            set_threads(count)
+            by_threads[count] = least(step, seconds)
+    finally:
+        set_threads(before)
+    found["step_ms_by_threads"] = by_threads
+
+    program = (
+        "import time, torch\nfrom training.rasterize import warm_up\nt = time.perf_counter()\nwarm_up()\n"
+    )
+    program += "print(time.perf_counter() - t)"
+    with tempfile.TemporaryDirectory() as folder:
+        environment = os.environ | {"NUMBA_CACHE_DIR": folder}
+        for name in ("cold_s", "cached_s"):
+            run = [sys.executable, "-c", program]
+            said = subprocess.run(run, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
+            found[name] = float(said.stdout)
+    print(f"forward only, 200k splats at 960x540: {found['forward_ms']:.1f} ms")
+    print(f"70 % of the weights zero, against those splats removed: {found['weights_by_removed']:.3f}")
+    one = by_threads[1]
+    print(
+        "step by threads: " + ", ".join(f"{n}: {ms:.1f} ms ({one / ms:.2f}x)" for n, ms in by_threads.items())
+    )
+    print(f"first compilation: {found['cold_s']:.1f} s, from the cache: {found['cached_s']:.2f} s")
+    return found
+
+
+def plot(cases: list[dict], path: Path) -> None:
+    """Stacked bars of the stages of every case."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 5), layout="constrained")
+    axes = figure.subplots()
+    labels = [f"{case['splats'] // 1000}k\n{case['width']}x{case['height']}" for case in cases]
+    bottom = np.zeros(len(cases))
+    for stage in (*STAGES, "around"):
+        heights = np.array([case["step_ms"][stage] for case in cases])
+        axes.bar(labels, heights, bottom=bottom, label=stage)
+        bottom += heights
+    axes.set_ylabel("ms a training step")
+    axes.legend()
+    figure.savefig(path, dpi=120)
+
+
 def compare(new: dict, base: dict) -> None:
     """Print each case's step against the same case of an earlier run."""
     earlier = {(case["splats"], case["width"], case["height"]): case for case in base["cases"]}
@@ -244,13 +323,15 @@ def compare(new: dict, base: dict) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=5.0, help="time for each case")
+    parser.add_argument("--seconds", type=float, default=3.0, help="time for each case")
     parser.add_argument("--base", type=Path, help="a bench.json to compare with")
     parser.add_argument("--out", type=Path, default=Path("build/bench/bench.json"))
     options = parser.parse_args()
     torch.set_num_threads(1)
     result = bench(options.seconds)
+    result |= further(options.seconds)
     options.out.parent.mkdir(parents=True, exist_ok=True)
+    plot(result["cases"], options.out.with_suffix(".png"))
     options.out.write_text(json.dumps(result, indent=1) + "\n")
     print(f"saved {options.out}")
     if options.base:
