@@ -10,6 +10,7 @@ import torch
 from scipy.spatial import KDTree
 
 from ..rasterize import Adam
+from ..rasterize.features import rotation_matrices
 from ..splats.gaussians import Splats
 
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
@@ -154,7 +155,7 @@ def densify(
     parents, scales = chosen[~small], scales[~small]
     children = {name: model[name][parents].repeat((2,) + (1,) * (model[name].dim() - 1)) for name in NAMES}
     local = torch.from_numpy(rng.standard_normal((2 * len(parents), 3), np.float32)) * scales.repeat(2, 1)
-    children["means"] += torch.einsum("nij,nj->ni", rotations(children["quats"]), local)
+    children["means"] += torch.einsum("nij,nj->ni", rotation_matrices(children["quats"]), local)
     children["log_scales"] = constrained_log(scales / 1.6, min_scale).repeat(2, 1)
     alive = torch.ones(len(model), dtype=torch.bool)
     alive[parents] = False
@@ -170,14 +171,3 @@ def constrained_log(scales: torch.Tensor, min_scale: float, floor: float = 0.05)
     gradient is proportional to the difference); a share of ``min_scale`` leaves it free to move.
     """
     return (scales - min_scale).clamp_min(max(floor * min_scale, 1e-9)).log()
-
-
-def rotations(quats: torch.Tensor) -> torch.Tensor:
-    """Rotation matrices (N, 3, 3) of quaternions wxyz (N, 4), normalised here."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, 1).view(-1, 3, 3)
