@@ -46,7 +46,7 @@ def main() -> int:
         ["train", "--scene", str(chosen.scene), "--method", chosen.method, "--preset", "draft",
          "--image-scale", str(chosen.image_scale), "--out", str(run.path),
          "--blend", str(out / "scene.blend"), "--export", str(out / "bundle.ply"),
-         "--set", "max_splats=80000",  # keeps the demo within minutes on two cores
+         "--set", "max_splats=60000",  # keeps the demo within minutes on two cores
          *(word for setting in chosen.set for word in ("--set", setting))]
     )  # fmt: skip
     if code:
