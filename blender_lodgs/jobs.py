@@ -146,6 +146,8 @@ class Watch:
     def _add_level(self, root: bpy.types.Object, event: dict) -> None:
         splats = read_ply(self.folder.path / str(event.get("path")))
         with _in_window():
+            if event["level"] == 1:  # levels that stand here are of an earlier run: two runs never mix
+                scenes.remove_finer_levels(root)
             scenes.set_level(root, Level(event["level"], splats, event.get("s_min")))
             root.lodgs.training.read = self.read
             _undo_step(f"Level {event['level']}")
@@ -154,9 +156,6 @@ class Watch:
     def _finish(self, root: bpy.types.Object) -> None:
         facts = read_facts(self.folder.bundle)
         with _in_window():
-            for item in root.lodgs.levels:
-                if item.exists and item.number not in facts.numbers:  # of an earlier run with more levels
-                    bpy.data.objects.remove(item.object)
             scenes.set_bundle_facts(root, facts)
             root.lodgs.training.read = self.read
             _undo_step("Training finished")

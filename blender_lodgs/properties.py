@@ -102,13 +102,28 @@ def _changed(self, context) -> None:
     self.id_data.update_tag()
 
 
+def _finest(self) -> int:
+    """The finest level that there is; without levels there is no limit yet."""
+    return max((item.number for item in self.levels), default=2**31 - 1)
+
+
+def _single_changed(self, context) -> None:
+    if self.single_level > _finest(self):
+        self.single_level = _finest(self)
+    _changed(self, context)
+
+
 def _start_changed(self, context) -> None:
+    if self.level_start > _finest(self):
+        self.level_start = _finest(self)
     if self.level_end < self.level_start:
         self.level_end = self.level_start
     _changed(self, context)
 
 
 def _end_changed(self, context) -> None:
+    if self.level_end > _finest(self):
+        self.level_end = _finest(self)
     if self.level_start > self.level_end:
         self.level_start = self.level_end
     _changed(self, context)
@@ -214,7 +229,7 @@ class SplatScene(bpy.types.PropertyGroup):
         description="The level that is shown; 1 is the coarsest",
         default=1,
         min=1,
-        update=_changed,
+        update=_single_changed,
     )
     level_start: bpy.props.IntProperty(
         name="Coarsest",

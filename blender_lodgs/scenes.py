@@ -173,6 +173,14 @@ def set_level(root: bpy.types.Object, level: Level) -> bpy.types.Object:
     return thing
 
 
+def remove_finer_levels(root: bpy.types.Object) -> None:
+    """Removes all levels but the coarsest, whose object the coarsest of the next set takes over."""
+    for item in root.lodgs.levels:
+        if item.exists and item.number > 1:
+            bpy.data.objects.remove(item.object)
+    _levels_changed(root)
+
+
 def read_levels(root: bpy.types.Object) -> Bundle:
     """The levels of a splat scene with all that artists have changed in them, in the splats' own world.
 

@@ -115,7 +115,7 @@ def _draw_running(layout: bpy.types.UILayout, watch: jobs.Watch) -> None:
     row.progress(text=f"{message} · {share:.0%}" if progress else message, factor=share)
     row.operator("lodgs.cancel_training", text="", icon="X")
     if aside:
-        layout.label(text=aside.rstrip(")").capitalize(), icon="INFO")
+        say(layout, aside.rstrip(")").capitalize(), "INFO")
     if watch.asked:
         layout.label(text="Cancel again to end it at once", icon="INFO")
     elif watch.silent:

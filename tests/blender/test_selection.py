@@ -206,6 +206,11 @@ def test_one_level_alone(bpy, root):
     assert all(p is None for p in kept(bpy, root))
 
 
+def test_no_level_beyond_the_finest_can_be_chosen(bpy, root):
+    root.lodgs.single_level = root.lodgs.level_end = root.lodgs.level_start = 9
+    assert (root.lodgs.single_level, root.lodgs.level_start, root.lodgs.level_end) == (5, 5, 5)
+
+
 def test_unused_levels_are_not_evaluated(bpy, root):
     root.lodgs.level_start, root.lodgs.level_end = 3, 4
     bpy.context.view_layer.update()

@@ -266,6 +266,20 @@ def test_a_shorter_run_removes_the_levels_of_a_longer_one(bpy, lodgs, jobs, fake
     assert _levels(root) == COUNTS
 
 
+def test_levels_of_two_runs_never_stand_together(bpy, lodgs, jobs, fake, root, tmp_path):
+    """A second training that dies after its first level leaves that level alone."""
+    fake()
+    bpy.ops.lodgs.train(folder=str(tmp_path / "first"))
+    coarsest = root.lodgs.levels[0].object
+    fake("crash")
+    with pytest.raises(RuntimeError):
+        bpy.ops.lodgs.train(folder=str(tmp_path / "second"))
+    assert _levels(root) == {1: COUNTS[1]}
+    assert root.lodgs.levels[0].object == coarsest, "the object stays, with what artists hung on it"
+    assert (root.lodgs.level_end, root.lodgs.single_level) == (1, 1)
+    assert [level.number for level in lodgs("scenes").read_levels(root).levels] == [1]
+
+
 def test_run_folders_do_not_collide(bpy, jobs, fake, root, tmp_path):
     fake()
     first, second = jobs.start(root), jobs.start(root)  # not saved: at home

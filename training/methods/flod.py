@@ -37,6 +37,9 @@ class Flod:
         self.s_min = flod_s_min(s_min_1, p.rho, p.levels)
         self._ends = list(accumulate(p.steps))
         self._points, self._colors = _distinct(data.scene.points, data.scene.point_colors)
+        if len(self._points) > p.max_splats:
+            some = np.random.default_rng(seed).choice(len(self._points), p.max_splats, replace=False)
+            self._points, self._colors = self._points[np.sort(some)], self._colors[np.sort(some)]
         self.model = self._new_model(self._from_points(1))
         self._forget_gradients()
 
@@ -193,10 +196,13 @@ class Flod:
         if self.parameters.rejoin_points:
             # What overlap pruning counts as too close is now half of a smaller size.
             distances, _ = KDTree(tensors["means"].numpy()).query(self._points)
-            free = torch.from_numpy(distances >= after / 2)
-            if len(tensors["means"]) + int(free.sum()) <= self._budget(level):
-                points = self._from_points(level)
-                tensors = {name: torch.cat([tensors[name], points[name][free]]) for name in NAMES}
+            free = np.flatnonzero(distances >= after / 2)
+            room = max(self._budget(level) - len(tensors["means"]), 0)
+            if len(free) > room:
+                rng = np.random.default_rng([self.seed, level, 2])
+                free = np.sort(rng.choice(free, room, replace=False))
+            points = self._from_points(level)
+            tensors = {name: torch.cat([tensors[name], points[name][free]]) for name in NAMES}
         self.model = self._new_model(tensors)
         self._forget_gradients()
 

@@ -42,7 +42,8 @@ class Parameters:
     grad_threshold: float = 1e-4
     """Mean image-plane gradient (3DGS units) above which a splat is cloned or split, at one megapixel."""
     max_splats: int = 120_000
-    """Most splats the last level may have; the ones with the largest gradients are densified first."""
+    """Most splats the last level may have; the ones with the largest gradients are densified first. Of more
+    structure-from-motion points than this, training begins with a random sample."""
     budget_ratio: float = 0.65
     """A level's share of the next finer level's budget of splats, so that every level adds some."""
     clone_extent: float = 0.01
@@ -55,7 +56,8 @@ class Parameters:
     """Steps between two overlap prunings; the last level has none (FLoD, Sec. 4.3)."""
     rejoin_points: bool = True
     """Whether structure-from-motion points that overlap pruning took join again at the level that has room
-    for them. Not in the paper; in short schedules it lets finer levels begin from exact positions."""
+    for them, all or a random sample. Not in the paper; in short schedules it lets finer levels begin from
+    exact positions."""
     opacity_reset_interval: int = 0
     """Steps between two opacity resets; 0 never resets."""
     sh_degree: int = 3

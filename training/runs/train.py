@@ -84,7 +84,7 @@ def _train(job: Job, folder: RunFolder, events: Events) -> int:
     )  # fmt: skip
     events("status", message="Reading the scene")
     data = training_data(job, folder, events)
-    events("status", message="Preparing the kernels (up to half a minute the first time on a computer)")
+    events("status", message="Preparing the kernels (up to two minutes the first time on a computer)")
     torch.set_num_threads(1)  # torch's thread pool beside the kernels' slows both
     _keep_freed_memory()
     warm_up(job.backend)

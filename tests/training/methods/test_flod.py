@@ -78,6 +78,29 @@ def test_points_that_have_room_at_the_next_level_join_again(data):
     assert torch.equal(flod.model["means"].detach(), torch.cat([stayed, expected]))
 
 
+def test_of_more_points_than_there_is_room_for_some_join(data):
+    """As many as there is room for, from all over, the same ones in every run of a seed."""
+    models = []
+    for _ in range(2):
+        flod = make(data, min_opacity=0.0, densify_interval=100, max_splats=50, budget_ratio=0.8)
+        points = flod._points
+        flod.model.keep(torch.arange(len(points)) < 10)
+        flod._rise_to(2)
+        assert len(flod.model) == flod._budget(2) == 40
+        models.append(flod.model["means"].detach())
+    assert torch.equal(*models)
+    joined = {tuple(mean) for mean in models[0][10:].tolist()}
+    assert len(joined) == 30 and joined <= {tuple(point) for point in np.float32(points).tolist()}
+    assert {tuple(point) for point in np.float32(points[10:40]).tolist()} != joined
+
+
+def test_training_begins_with_no_more_points_than_splats_may_be(data):
+    flod = make(data, max_splats=20)
+    assert len(flod.model) == len(flod._points) == 20
+    everything = {tuple(point) for point in data.scene.points.tolist()}
+    assert {tuple(point) for point in flod._points.tolist()} < everything
+
+
 def test_overlap_pruning_equals_brute_force():
     means = torch.from_numpy(np.random.default_rng(3).normal(size=(300, 3)).astype(np.float32))
     distances = torch.cdist(means.double(), means.double())
