@@ -9,9 +9,18 @@ import torch
 from training.errors import LodgsError
 from training.rasterize import BACKENDS, OUTPUTS, Target, contributions, photometric_loss, rasterize, render
 from training.rasterize.cpu.bin import TILE, bin_splats
+from training.rasterize.cpu.blend import row_range
 from training.rasterize.cpu.compile import numba, set_threads, threads
 from training.rasterize.cpu.fastmath import exp2
-from training.rasterize.cpu.project import COLUMNS, CONIC_XX, CONIC_XY, CONIC_YY, LOG2_OPACITY
+from training.rasterize.cpu.project import (
+    COLUMNS,
+    CONIC_XX,
+    CONIC_XY,
+    CONIC_YY,
+    HALF_HEIGHT,
+    LOG2_OPACITY,
+    MEAN_Y,
+)
 from training.scenes.cameras import Camera
 
 SH_C0 = 0.28209479177387814
@@ -412,6 +421,25 @@ def test_every_splat_is_in_every_tile_it_touches_once_and_front_to_back():
     assert (listed.sum(1) == pairs.count).all()
     for i in np.flatnonzero(pairs.count):
         assert (pairs.splat[pairs.row[pairs.first[i] : pairs.first[i] + pairs.count[i]]] == i).all()
+
+
+def test_rows_stay_in_the_tile_whatever_rounding_does():
+    """Kernels write where these rows say: a mean and a reach of 1e9 pixels differ by rows of rounding."""
+
+    @numba.njit
+    def over(projected):
+        return [row_range(row, np.float32(0.5), 16) for row in projected]
+
+    random = np.random.default_rng(0)
+    projected = np.zeros((3000, COLUMNS), np.float32)
+    size = 10 ** random.uniform(0, 9, 3000)
+    projected[:, MEAN_Y] = random.choice([-1, 1], 3000) * size
+    projected[:, HALF_HEIGHT] = size + random.uniform(-40, 40, 3000)
+    rows = np.array(over(projected))
+    assert rows[:, 0].min() == 0 and rows[:, 0].max() == 16 and rows[:, 1].max() == 16
+    by_hand = np.zeros((1, COLUMNS), np.float32)
+    by_hand[0, MEAN_Y], by_hand[0, HALF_HEIGHT] = 6.0, 2.2  # from 3.8 to 8.2: centres 4.5 to 7.5
+    assert over(by_hand) == [(4, 8)]
 
 
 def test_exp2_is_right_to_a_few_parts_in_a_million():

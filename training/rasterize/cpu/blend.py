@@ -48,7 +48,15 @@ def row_range(row, top, rows):
     """The rows of a tile, its first pixel centres at y = ``top``, that the splat's ellipse can reach."""
     first = int(np.ceil(row[MEAN_Y] - row[HALF_HEIGHT] - top))
     last = int(np.floor(row[MEAN_Y] + row[HALF_HEIGHT] - top))
-    return max(0, first), min(rows, last + 1)
+    # the difference of a mean and a reach of millions of pixels is off by rows; first must stay in the tile
+    return max(0, min(first, rows)), min(rows, last + 1)
+
+
+@inlined(FAST)
+def alpha_of(log2_alpha):
+    """Alpha with its cap and its least value."""
+    alpha = min(exp2(log2_alpha), CAP)
+    return alpha if log2_alpha >= LOG2_ALPHA_MIN else ZERO
 
 
 @kernel(FAST)
@@ -85,8 +93,7 @@ def blend_forward(
                 for j in range(16):
                     dx = f32(j) + offset_x
                     log2_alpha = rest - (xx * dx + xy_dy) * dx
-                    alpha = min(exp2(log2_alpha), CAP)
-                    alpha = alpha if log2_alpha >= LOG2_ALPHA_MIN else ZERO
+                    alpha = alpha_of(log2_alpha)
                     t = lanes[j]
                     t_behind = t - alpha * t
                     takes = t_behind > T_MIN
@@ -137,8 +144,7 @@ def blend_median(begin, end, projected, splat, tile_start, tiles_x, walked, medi
                 for j in range(16):
                     dx = f32(j) + offset_x
                     log2_alpha = rest - (row[CONIC_XX] * dx + xy_dy) * dx
-                    alpha = min(exp2(log2_alpha), CAP)
-                    alpha = alpha if log2_alpha >= LOG2_ALPHA_MIN else ZERO
+                    alpha = alpha_of(log2_alpha)
                     t = state[16 * r + j]
                     behind = t - alpha * t
                     state[16 * r + j] = behind
@@ -193,8 +199,7 @@ def blend_weights(begin, end, projected, splat, tile_start, tiles_x, width, heig
                 for j in range(16):
                     dx = f32(j) + offset_x
                     log2_alpha = rest - (row[CONIC_XX] * dx + xy_dy) * dx
-                    alpha = min(exp2(log2_alpha), CAP)
-                    alpha = alpha if log2_alpha >= LOG2_ALPHA_MIN else ZERO
+                    alpha = alpha_of(log2_alpha)
                     t = state[16 * r + j]
                     behind = t - alpha * t
                     takes = behind > T_MIN
