@@ -24,7 +24,7 @@ import bpy
 from ..training.errors import LodgsError
 from ..training.runs.folder import RunFolder
 from ..training.runs.job import Job
-from ..training.splats.bundle import Level, read_facts
+from ..training.splats.bundle import Facts, Level, read_facts
 from ..training.splats.ply import read_ply
 from . import environment, extension, processes, scenes
 
@@ -63,6 +63,7 @@ class Watch:
         levels: the newest ``level`` event of each level.
         warnings: the warnings of this run.
         asked: whether it was asked to stop.
+        method: what it trains.
     """
 
     folder: RunFolder
@@ -75,6 +76,7 @@ class Watch:
     levels: dict[int, dict] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     asked: bool = False
+    method: str = ""
     heard: float = field(default_factory=time.time)
     read: int = 0
 
@@ -131,6 +133,7 @@ class Watch:
         match event["event"]:
             case "hello":
                 self.problem, self.message = "", "Reading the scene"
+                self.method = str(event.get("method", ""))
                 self.warnings.clear()
             case "status":
                 self.message = str(event.get("message", ""))
@@ -146,8 +149,11 @@ class Watch:
     def _add_level(self, root: bpy.types.Object, event: dict) -> None:
         splats = read_ply(self.folder.path / str(event.get("path")))
         with _in_window():
-            if event["level"] == 1:  # levels that stand here are of an earlier run: two runs never mix
-                scenes.remove_finer_levels(root)
+            if event["level"] == 1 and not event.get("again"):
+                scenes.remove_finer_levels(root)  # they are of an earlier run: two runs never mix
+            if "meta" in event:
+                facts = Facts(self.method, [], event["meta"], bool(event.get("cumulative")))
+                scenes.set_bundle_facts(root, facts)
             scenes.set_level(root, Level(event["level"], splats, event.get("s_min")))
             root.lodgs.training.read = self.read
             _undo_step(f"Level {event['level']}")

@@ -24,8 +24,8 @@ SH_C0 = 0.28209479177387814
 
 BASE, SH, SCALE, ROTATION = "radiance:base", "radiance:sh_{}", "scale", "rotation"
 LOG_SCALE, OPACITY_LOGIT, QUATERNION = "log_scale", "opacity_logit", "quaternion"
-COLOR, RADIUS = "display_color", "radius"
-_OWN = {"position", BASE, SCALE, ROTATION, LOG_SCALE, OPACITY_LOGIT, QUATERNION, COLOR, RADIUS}
+COLOR, RADIUS, WEIGHT = "display_color", "radius", "lod_weight"
+_OWN = {"position", BASE, SCALE, ROTATION, LOG_SCALE, OPACITY_LOGIT, QUATERNION, COLOR, RADIUS, WEIGHT}
 _TYPE = "lodgs_type:"  # custom property that remembers a column's type
 _EXTRA = "column:"  # before a file's column whose name means something else to a point cloud
 
@@ -109,7 +109,7 @@ def read_splats(thing: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None =
     """The splats of an object, with all that artists have changed: its data, or what its modifiers leave.
 
     Args:
-        depsgraph: where given, the modifiers are applied as it shows them.
+        depsgraph: where given, the modifiers are applied as it shows them, their weights to the opacities.
 
     Raises:
         LodgsError: if the object carries no splat attributes.
@@ -123,6 +123,8 @@ def read_splats(thing: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None =
     if means is None or base is None or scale is None or rotation is None:
         raise LodgsError(f"{thing.name} carries no splats.", "Undo what took its attributes away.")
 
+    if (weight := read_attribute(cloud, WEIGHT)) is not None:
+        base[:, 3] *= weight
     coefficients = [base[:, :3]]
     while (vector := read_attribute(cloud, SH.format(len(coefficients)))) is not None:
         coefficients.append(vector)

@@ -256,6 +256,31 @@ class SplatScene(bpy.types.PropertyGroup):
         subtype="PIXEL",
         update=_changed,
     )
+    level_offset: bpy.props.FloatProperty(
+        name="Level Offset",
+        description="Levels finer (above 0) or coarser (below 0) than the distance asks for",
+        default=0.0,
+        min=-16.0,
+        max=16.0,
+        soft_min=-4.0,
+        soft_max=4.0,
+        update=_changed,
+    )
+    d_max: bpy.props.FloatProperty(
+        name="Farthest",
+        description="Distance from which on the coarsest level alone is shown, in the scene's own units; "
+        "0 where levels are not those of an octree",
+        update=_changed,
+        options=set(),
+    )
+    d_max_focal: bpy.props.FloatProperty(
+        name="Farthest at Focal Length",
+        description="Focal length in pixels of a camera to which that distance belongs",
+        default=1.0,
+        subtype="PIXEL",
+        update=_changed,
+        options=set(),
+    )
     eye: bpy.props.EnumProperty(
         name="Eye",
         description="From where distances are measured",
@@ -292,6 +317,11 @@ class SplatScene(bpy.types.PropertyGroup):
     )
 
     training: bpy.props.PointerProperty(type=TrainingSettings)
+
+    @property
+    def by_distance(self) -> bool:
+        """Whether the levels say at which distances they are to be shown."""
+        return self.d_max > 0 or any(item.has_s_min for item in self.levels)
 
 
 class View(bpy.types.PropertyGroup):

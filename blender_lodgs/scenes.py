@@ -149,6 +149,8 @@ def set_bundle_facts(root: bpy.types.Object, facts: Bundle | Facts) -> None:
     root.lodgs.method = facts.method
     root.lodgs.cumulative = facts.cumulative
     root.lodgs.meta = json.dumps(facts.meta)
+    root.lodgs.d_max = facts.meta.get("d_max", 0.0) if facts.cumulative else 0.0
+    root.lodgs.d_max_focal = facts.meta.get("focal_px", 1.0)
     if "camera_center" in facts.meta:
         root.lodgs.camera_center = facts.meta["camera_center"]
     _levels_changed(root)

@@ -1,6 +1,7 @@
 """What is shown of a splat scene: drivers that turn its detail settings into visible levels and distances.
 
-Every level has one modifier, the group "LODGS Distance Band", that is on where levels are chosen by distance.
+Every level has one modifier that is on where levels are chosen by distance: the group of its method's rule,
+"LODGS Distance Band" (FLoD) or "LODGS Octree Level" (Octree-GS).
 All drivers are simple expressions, which Blender evaluates even where it may not run scripts, and they
 follow ``root.lodgs`` and the scene's camera without any handler.
 """
@@ -11,6 +12,8 @@ import bpy
 
 from . import compat
 from .nodes import distance_band as band
+from .nodes import octree_level as octree
+from .nodes.building import EYE, EYE_OBJECT, EYE_POSITION, MATERIAL
 
 NEVER = 1e30
 """A distance beyond every scene, in place of infinity, which driver expressions cannot say."""
@@ -32,17 +35,17 @@ def attach(root: bpy.types.Object) -> None:
 def update_inputs(root: bpy.types.Object) -> None:
     """Hands on to the modifiers what cannot be driven: the chosen eye, and each level's material."""
     for item in root.lodgs.levels:
-        modifier = item.exists and item.object.modifiers.get(band.NAME)
+        modifier = item.exists and _modifier(item.object)
         if modifier:
             slots = item.object.material_slots
             for name, value in (
-                (band.EYE_OBJECT, root.lodgs.eye_object),
-                (band.MATERIAL, slots[0].material if slots else None),
+                (EYE_OBJECT, root.lodgs.eye_object),
+                (MATERIAL, slots[0].material if slots else None),
             ):
                 if compat.get_input(modifier, name) != value:  # setting evaluates anew
                     compat.set_input(modifier, name, value)
-            if tuple(compat.get_input(modifier, band.EYE_POSITION)) != tuple(root.lodgs.camera_center):
-                compat.set_input(modifier, band.EYE_POSITION, root.lodgs.camera_center)
+            if tuple(compat.get_input(modifier, EYE_POSITION)) != tuple(root.lodgs.camera_center):
+                compat.set_input(modifier, EYE_POSITION, root.lodgs.camera_center)
 
 
 def _drive_focal_length(root: bpy.types.Object) -> None:
@@ -80,11 +83,14 @@ def _drive_focal_length(root: bpy.types.Object) -> None:
 
 def _drive_level(root: bpy.types.Object, index: int, item) -> None:
     thing, number = item.object, item.number
-    modifier = thing.modifiers.get(band.NAME)
+    by_octree = root.lodgs.d_max > 0
+    modifier = _modifier(thing)
+    group = octree.octree_level() if by_octree else band.distance_band()
     if modifier is None:
-        modifier = thing.modifiers.new(band.NAME, "NODES")
-        modifier.node_group = band.distance_band()
+        modifier = thing.modifiers.new(group.name, "NODES")
         modifier.show_expanded = False
+    if modifier.node_group != group:  # the scene was trained again, with another method
+        modifier.name, modifier.node_group = group.name, group
 
     def drive(path: str, expression: str, *names: str, **paths: str) -> None:
         driver = _driver(thing, path, expression)
@@ -98,11 +104,23 @@ def _drive_level(root: bpy.types.Object, index: int, item) -> None:
     for path in ("hide_viewport", "hide_render"):
         drive(
             path,
-            f"0 if show and (({in_range}) if mode == 1 else ({alone})) else 1",
+            f"0 if show and (({'1' if by_octree else in_range}) if mode == 1 else ({alone})) else 1",
             "mode", "single_level", "level_start", "level_end", "cumulative", show=f"levels[{index}].show",
         )  # fmt: skip
     for path in ("show_viewport", "show_render"):
         drive(f'modifiers["{modifier.name}"].{path}', "mode == 1", "mode")
+    drive(compat.input_path(modifier, EYE), "eye", "eye")
+
+    if by_octree:
+        compat.set_input(modifier, octree.LEVEL, number)
+        compat.set_input(modifier, octree.LEVELS, root.lodgs.levels[-1].number)
+        drive(
+            compat.input_path(modifier, octree.FARTHEST),
+            "d_max * focal_px / d_max_focal",
+            "d_max", "focal_px", "d_max_focal",
+        )  # fmt: skip
+        drive(compat.input_path(modifier, octree.OFFSET), "level_offset", "level_offset")
+        return
 
     # The finest level in use reaches up to the eye and the coarsest one for ever, whichever numbers exist.
     levels = root.lodgs.levels
@@ -119,7 +137,11 @@ def _drive_level(root: bpy.types.Object, index: int, item) -> None:
         f"s_min / gamma * focal_px if {coarser} >= level_start and {number} <= level_end else {NEVER:g}",
         "gamma", "focal_px", "level_start", "level_end", s_min=f"levels[{max(index - 1, 0)}].s_min",
     )  # fmt: skip
-    drive(compat.input_path(modifier, band.EYE), "eye", "eye")
+
+
+def _modifier(thing: bpy.types.Object) -> bpy.types.NodesModifier | None:
+    """The modifier that chooses by distance, whichever rule it has."""
+    return thing.modifiers.get(band.NAME) or thing.modifiers.get(octree.NAME)
 
 
 def _driver(thing: bpy.types.Object, path: str, expression: str) -> bpy.types.Driver:

@@ -27,7 +27,9 @@ def main(arguments: list[str] | None = None) -> int:
         "--from", type=int, default=0, dest="start", help="coarsest level of the selective view"
     )
     evaluate.add_argument("--to", type=int, default=0, dest="end", help="finest level of the selective view")
-
+    evaluate.add_argument(
+        "--offset", type=float, default=0.0, help="levels finer or coarser than the distance asks (Octree-GS)"
+    )
     evaluate.add_argument("--picture", type=Path, help="PNG to write: the levels side by side from one view")
 
     info = commands.add_parser("info", help="say what a bundle or any 3DGS PLY holds")
@@ -67,8 +69,10 @@ def _train(chosen: argparse.Namespace) -> int:
 
 def _evaluate(chosen: argparse.Namespace) -> int:
     from .evaluate.protocol import evaluate_run, table
+    from .lod.selection import Detail
 
-    print(table(evaluate_run(chosen.run, chosen.gamma, chosen.start, chosen.end, chosen.picture)))
+    detail = Detail(chosen.gamma, chosen.start, chosen.end, chosen.offset)
+    print(table(evaluate_run(chosen.run, detail, chosen.picture)))
     return 0
 
 

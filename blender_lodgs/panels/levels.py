@@ -66,7 +66,7 @@ class LODGS_PT_detail(_Panel):
     def draw(self, context):
         root = scenes.active_root(context)
         settings, layout = root.lodgs, self.layout
-        by_distance = any(item.has_s_min for item in settings.levels)
+        by_distance = settings.by_distance
         row = layout.row()
         row.enabled = by_distance
         row.prop(settings, "mode", expand=True)
@@ -78,10 +78,13 @@ class LODGS_PT_detail(_Panel):
         if settings.mode == "SINGLE":
             column.prop(settings, "single_level")
         else:
-            both = column.column(align=True)
-            both.prop(settings, "level_start")
-            both.prop(settings, "level_end")
-            column.prop(settings, "gamma", slider=True)
+            if settings.d_max > 0:
+                column.prop(settings, "level_offset", slider=True)
+            else:
+                both = column.column(align=True)
+                both.prop(settings, "level_start")
+                both.prop(settings, "level_end")
+                column.prop(settings, "gamma", slider=True)
             column.prop(settings, "eye")
             if settings.eye == "OBJECT":
                 column.prop(settings, "eye_object")

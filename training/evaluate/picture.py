@@ -10,38 +10,37 @@ import torch
 
 from ..files import atomic_write
 from ..lod.colors import level_color
+from ..lod.selection import Detail, complete, select
 from ..scenes.cameras import Camera
 from ..splats.bundle import Bundle
 from ..splats.gaussians import Splats
 from .metrics import psnr
-from .protocol import Evaluation, select_flod
+from .protocol import Evaluation
 
 SH_C0 = 0.28209479177387814
 
 
-def level_picture(
-    path: Path, bundle: Bundle, evaluation: Evaluation, camera: Camera, gamma: float, start: int, end: int
-) -> None:
+def level_picture(path: Path, bundle: Bundle, evaluation: Evaluation, camera: Camera, detail: Detail) -> None:
     """Writes a PNG: levels coarse to fine, the selective view, its levels in colours, the photograph.
 
     Args:
         path: file to write.
         camera: a held-out view.
-        gamma, start, end: of the selective view (``protocol.select_flod``).
+        detail: of the selective view.
     """
     target = evaluation.target(camera)
 
-    def tile(name: str, splats: Splats) -> tuple[str, torch.Tensor]:
-        image = evaluation.draw(splats, camera)
+    def tile(name: str, splats: Splats, weights: np.ndarray | None = None) -> tuple[str, torch.Tensor]:
+        image = evaluation.draw(splats, camera, weights)
         return f"{name}   {len(splats):,} splats   {psnr(image, target):.1f} dB", image
 
-    tiles = [tile(f"level {level.number}", level.splats) for level in bundle.levels]
+    tiles = [tile(f"level {level.number}", complete(bundle, level)) for level in bundle.levels]
     if len(bundle.levels) > 1:
-        view = (camera.center, min(camera.fx, camera.fy), gamma, start, end)
-        tiles.append(tile(f"levels {start} to {end}", select_flod(bundle, *view)))
-        tiles.append(
-            ("which level where", evaluation.draw(select_flod(_in_level_colors(bundle), *view), camera))
-        )
+        view = (camera.center, min(camera.fx, camera.fy), detail)
+        name = "by distance" if bundle.cumulative else f"levels {detail.start} to {detail.end}"
+        tiles.append(tile(name, *select(bundle, *view)))
+        colored, weights = select(_in_level_colors(bundle), *view)
+        tiles.append(("which level where", evaluation.draw(colored, camera, weights)))
     tiles.append(("photograph", target))
     _write_sheet(path, tiles)
 

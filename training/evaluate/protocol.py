@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,16 +13,19 @@ import torch
 
 from ..errors import LodgsError
 from ..files import atomic_write
-from ..lod.rules import band_mask, flod_bands
+from ..lod.selection import Detail, complete, select
 from ..methods.data import TrainingData
 from ..rasterize import rasterize
 from ..runs.data import training_data
 from ..runs.folder import RunFolder
 from ..runs.job import Job
 from ..scenes.cameras import Camera
-from ..splats.bundle import Bundle, read_bundle
+from ..splats.bundle import read_bundle
 from ..splats.gaussians import Splats
 from .metrics import psnr, ssim
+
+STANDARD_DETAIL = Detail()
+"""What the rules say, unchanged; FLoD's three finest levels."""
 
 
 class Evaluation:
@@ -43,18 +47,24 @@ class Evaluation:
             self._targets[camera.name] = torch.from_numpy(self.data.image(camera))
         return self._targets[camera.name]
 
-    def draw(self, splats: Splats, camera: Camera) -> torch.Tensor:
-        """A picture of splats on black, (H, W, 3)."""
+    def draw(self, splats: Splats, camera: Camera, weights: np.ndarray | None = None) -> torch.Tensor:
+        """A picture of splats on black, (H, W, 3), with a weight on each splat's opacity."""
         columns = (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh)
         with torch.no_grad():
             tensors = [torch.from_numpy(np.ascontiguousarray(column, np.float32)) for column in columns]
-            return rasterize(*tensors, camera=camera, near=self.data.near, backend=self.backend).image
+            return rasterize(
+                *tensors,
+                camera=camera,
+                weights=None if weights is None else torch.from_numpy(weights),
+                near=self.data.near,
+                backend=self.backend,
+            ).image
 
-    def measure(self, splats_for: Callable[[Camera], Splats]) -> dict:
+    def measure(self, shown_to: Callable[[Camera], tuple[Splats, np.ndarray | None]]) -> dict:
         """Mean quality, splats given to the rasterizer and seconds a frame over the held-out views.
 
         Args:
-            splats_for: the splats that a camera is shown.
+            shown_to: the splats that a camera is shown, with their weights.
 
         Returns:
             ``splats`` (mean count), ``psnr`` (dB), ``ssim``, ``frame_s`` (median, selection included).
@@ -62,8 +72,8 @@ class Evaluation:
         rows = []
         for camera in self.cameras:
             started = time.perf_counter()
-            splats = splats_for(camera)
-            image = self.draw(splats, camera)
+            splats, weights = shown_to(camera)
+            image = self.draw(splats, camera, weights)
             seconds = time.perf_counter() - started
             target = self.target(camera)
             rows.append((psnr(image, target), ssim(image, target), len(splats), seconds))
@@ -77,48 +87,24 @@ class Evaluation:
 
     def measure_set(self, splats: Splats) -> dict:
         """The same for one set of splats that every view is shown."""
-        return self.measure(lambda camera: splats)
+        return self.measure(lambda camera: (splats, None))
 
 
-def select_flod(
-    bundle: Bundle, eye: np.ndarray, focal_px: float, gamma: float, start: int, end: int
-) -> Splats:
-    """The splats of FLoD's selective rendering as one set (FLoD, Eq. 7).
-
-    Args:
-        bundle: levels coarse to fine, with their s_min.
-        eye: (3,) world position that distances are measured from: the camera's, or the mean training camera's
-            for the predetermined set.
-        focal_px: focal length in pixels of the image that is looked at.
-        gamma: screen size threshold in pixels.
-        start, end: coarsest and finest level in use.
-    """
-    bands = flod_bands([level.s_min or 0.0 for level in bundle.levels], focal_px, gamma, start, end)
-    eye = np.asarray(eye, np.float32)
-    chosen = []
-    for level, (near, far) in zip(bundle.levels, bands, strict=True):
-        if start <= level.number <= end:
-            distances = np.linalg.norm(level.splats.means - eye, axis=1)
-            chosen.append(level.splats.select(band_mask(distances, near, far)))
-    return Splats.concatenated(chosen)
-
-
-def evaluate_run(
-    run: Path, gamma: float = 1.0, start: int = 0, end: int = 0, picture: Path | None = None
-) -> dict:
+def evaluate_run(run: Path, detail: Detail = STANDARD_DETAIL, picture: Path | None = None) -> dict:
     """Measures a finished run and writes its ``metrics.json``.
 
     Args:
         run: the run's folder.
-        gamma, start, end: of the selective view; 0 takes the three finest levels.
+        detail: of the selective view.
         picture: a PNG to write, with the levels side by side as the middle held-out view sees them.
 
     Returns:
-        ``levels``: coarse to fine, ``level``, ``s_min``, ``splats``, ``psnr``, ``ssim``, ``frame_s``;
-        ``selective``: per view and predetermined, with ``from``, ``to``, ``gamma``.
+        ``levels``: coarse to fine, ``level``, ``s_min``, ``splats``, ``psnr``, ``ssim``, ``frame_s``; where
+        levels add up, of each with all coarser ones. ``selective``: per view and predetermined (chosen from
+        the mean training camera), with the detail's settings.
 
     Raises:
-        LodgsError: if the run is not finished or holds out no views.
+        LodgsError: if the run is not finished or holds out no views, or such detail cannot be shown.
     """
     folder = RunFolder(run)
     if not folder.bundle.exists():
@@ -128,28 +114,32 @@ def evaluate_run(
     if not data.test:
         raise LodgsError(f"The run {run} holds out no views to measure on.", "Train with test_every = 8.")
     evaluation, bundle = Evaluation(data, job.backend), read_bundle(folder.bundle)
-    end = end or len(bundle.levels)
-    start = start or max(1, end - 2)
-    if not 1 <= start <= end <= len(bundle.levels) or gamma <= 0:
+    finest = len(bundle.levels)
+    end = detail.end or finest
+    detail = replace(detail, start=detail.start or max(1, end - 2), end=end)
+    if not 1 <= detail.start <= detail.end <= finest or detail.gamma <= 0:
         raise LodgsError(
-            f"Levels {start} to {end} with gamma {gamma:g} cannot be shown.",
-            f"Choose levels from 1 to {len(bundle.levels)}, coarse to fine, and a gamma above 0.",
+            f"Levels {detail.start} to {detail.end} with gamma {detail.gamma:g} cannot be shown.",
+            f"Choose levels from 1 to {finest}, coarse to fine, and a gamma above 0.",
         )
     levels = []
     for level in bundle.levels:
-        measured = evaluation.measure_set(level.splats)
+        measured = evaluation.measure_set(complete(bundle, level))
         levels.append({"level": level.number, "s_min": level.s_min, **measured})
     selective = []
-    if len(levels) > 1:
-        shown = {"from": start, "to": end, "gamma": gamma}
+    if finest > 1:
+        if bundle.cumulative:
+            shown = {"offset": detail.offset}
+        else:
+            shown = {"from": detail.start, "to": detail.end, "gamma": detail.gamma}
 
-        def per_view(camera: Camera) -> Splats:
-            return select_flod(bundle, camera.center, min(camera.fx, camera.fy), gamma, start, end)
+        def per_view(camera: Camera) -> tuple[Splats, np.ndarray | None]:
+            return select(bundle, camera.center, min(camera.fx, camera.fy), detail)
 
-        predetermined = select_flod(bundle, data.mean_camera, data.focal, gamma, start, end)
+        predetermined = select(bundle, data.mean_camera, data.focal, detail)
         selective = [
             {"set": "per view", **shown, **evaluation.measure(per_view)},
-            {"set": "predetermined", **shown, **evaluation.measure_set(predetermined)},
+            {"set": "predetermined", **shown, **evaluation.measure(lambda camera: predetermined)},
         ]
     report = {
         "scene": job.scene,
@@ -162,7 +152,7 @@ def evaluate_run(
         from .picture import level_picture
 
         camera = data.test[len(data.test) // 2]
-        level_picture(picture, bundle, evaluation, camera, gamma, start, end)
+        level_picture(picture, bundle, evaluation, camera, detail)
     with atomic_write(folder.metrics) as temporary:
         Path(temporary).write_text(json.dumps(report, indent=1), encoding="utf-8")
     return report
@@ -172,7 +162,11 @@ def table(report: dict) -> str:
     """``evaluate_run``'s report as text."""
     lines = [f"{'':>17} {'s_min':>9} {'splats':>9} {'PSNR':>7} {'SSIM':>7} {'s/frame':>8}"]
     rows = [(f"level {row['level']}", f"{row['s_min'] or 0:.5f}", row) for row in report["levels"]]
-    rows += [(f"{r['to']}-{r['from']} {r['set']}", f"γ = {r['gamma']:g}", r) for r in report["selective"]]
+    for r in report["selective"]:
+        if "gamma" in r:
+            rows.append((f"{r['to']}-{r['from']} {r['set']}", f"γ = {r['gamma']:g}", r))
+        else:
+            rows.append((f"distance {r['set']}", f"{r['offset']:+g}", r))
     lines += [
         f"{name:<17} {size:>9} {r['splats']:>9,} {r['psnr']:>7.2f} {r['ssim']:>7.4f} {r['frame_s']:>8.3f}"
         for name, size, r in rows

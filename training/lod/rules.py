@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import inf
 
+import numpy as np
+
 
 def flod_s_min(s_min_1: float, rho: float, levels: int) -> list[float]:
     """FLoD's 3D scale constraint of each level (FLoD, Eq. 3): s_min_1 * rho**(1 - l), and 0 at the last.
@@ -63,3 +65,31 @@ def flod_bands(
 def band_mask(distances, near: float, far: float):
     """Where near <= distance < far, as booleans (N,): the splats whose weight is 1."""
     return (distances >= near) & (distances < far)
+
+
+def octree_wanted(distances, bias, d_max: float, levels: int):
+    """The level that is wanted at a distance, 1 to ``levels``, not rounded (Octree-GS, Eq. 5 with the bias).
+
+    Args:
+        distances: (N,) from the eye, times the focal length that d_max belongs to over the eye's own.
+        bias: (N,) each splat's bias, in levels, to which a global offset may be added.
+        d_max: the distance from which on level 1 alone is wanted where the bias is 0.
+    """
+    return (_log2(d_max / distances.clip(1e-20)) + bias).clip(0, levels - 1) + 1
+
+
+def octree_weights(wanted, level):
+    """Weights (N,) of splats of a level: 1 below the wanted level, the fraction that is left at it, 0 above.
+
+    Levels add up, and level 1 is always there. Octree-GS, Sec. 4.1: piecewise linear from level to level; in
+    training it is rounded, which is where this is at least one half.
+
+    Args:
+        wanted: (N,) of :func:`octree_wanted`.
+        level: (N,) or a number, 1 is the coarsest.
+    """
+    return (wanted - level + 1).clip(0, 1)
+
+
+def _log2(values):
+    return values.log2() if hasattr(values, "log2") else np.log2(values)

@@ -43,7 +43,7 @@ class TrainingData:
         self.scene, self.exposure = scene, exposure
         self.train = [_shrunk(camera, image_scale) for camera in train]
         self.test = [_shrunk(camera, image_scale) for camera in test]
-        self._targets: dict[int, Target] = {}
+        self._targets: dict[tuple[int, int], Target] = {}
         self._room = IMAGE_MEMORY
 
     @cached_property
@@ -91,15 +91,20 @@ class TrainingData:
         assert camera.image is not None
         return load_image(camera.image, camera.width, camera.height, exposure=self.exposure)
 
-    def target(self, view: int) -> Target:
-        """The ground truth of a training view, ready for the loss."""
-        target = self._targets.get(view)
+    def camera(self, view: int, shrink: int = 1) -> Camera:
+        """A training view, its image ``shrink`` times smaller: what one as far away would see."""
+        return self.train[view] if shrink == 1 else _shrunk(self.train[view], 1 / shrink)
+
+    def target(self, view: int, shrink: int = 1) -> Target:
+        """The ground truth of a training view, ``shrink`` times smaller, ready for the loss."""
+        target = self._targets.get((view, shrink))
         if target is None:
-            target = Target(self.image(self.train[view]))
-            size = TARGET_BYTES * self.train[view].width * self.train[view].height
+            camera = self.camera(view, shrink)
+            target = Target(self.image(camera))
+            size = TARGET_BYTES * camera.width * camera.height
             if size <= self._room:
                 self._room -= size
-                self._targets[view] = target
+                self._targets[view, shrink] = target
         return target
 
 

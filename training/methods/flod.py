@@ -14,48 +14,57 @@ from scipy.spatial import KDTree
 
 from ..errors import LodgsError
 from ..lod.rules import flod_s_min
-from ..rasterize import photometric_loss, rasterize
+from ..rasterize import Target, photometric_loss, rasterize
 from ..splats.bundle import Level
 from .data import TrainingData
-from .model import NAMES, Model, constrained_log, densify, from_points, neighbour_distances
-from .parameters import Parameters
+from .model import (
+    NAMES,
+    Model,
+    constrained_log,
+    densify,
+    distinct,
+    from_points,
+    means_rate,
+    neighbour_distances,
+    splat_model,
+)
+from .parameters import FlodParameters
 
 REFERENCE_PIXELS = 1e6
 """Image size for which 3DGS's gradient threshold was chosen (about one megapixel)."""
 
 
-class Flod:
-    """One run of FLoD, step by step.
+class Method:
+    """One run of FLoD; see ``methods.Method`` for what it does for the loop."""
 
-    Every random choice is drawn from (seed, step), so that a resumed run repeats an unbroken one.
-    """
+    cumulative = False
 
-    def __init__(self, data: TrainingData, parameters: Parameters, seed: int, backend: str) -> None:
+    def __init__(self, data: TrainingData, parameters: FlodParameters, seed: int, backend: str) -> None:
         self.data, self.parameters, self.seed, self.backend = data, parameters, seed, backend
         p = parameters
         s_min_1 = p.s_min_1 or p.footprint * data.median_depth / data.focal
         self.s_min = flod_s_min(s_min_1, p.rho, p.levels)
         self._ends = list(accumulate(p.steps))
-        self._points, self._colors = _distinct(data.scene.points, data.scene.point_colors)
+        self._points, self._colors = distinct(data.scene.points, data.scene.point_colors)
         if len(self._points) > p.max_splats:
             some = np.random.default_rng(seed).choice(len(self._points), p.max_splats, replace=False)
             self._points, self._colors = self._points[np.sort(some)], self._colors[np.sort(some)]
         self.model = self._new_model(self._from_points(1))
-        self._forget_gradients()
 
     # -- what the loop asks of every method ------------------------------------------------------------
 
     @property
     def steps(self) -> int:
-        """Number of steps of the whole run."""
         return self._ends[-1]
 
+    @property
+    def levels(self) -> int:
+        return self.parameters.levels
+
     def level_at(self, step: int) -> int:
-        """The level (1-based) that a step trains."""
         return bisect_right(self._ends, step) + 1
 
-    def train_step(self, step: int) -> tuple[float, torch.Tensor, int]:
-        """Makes one step; the first has number 0. Returns the loss, the image (H, W, 3) and its view."""
+    def train_step(self, step: int) -> tuple[float, torch.Tensor, Target]:
         p, level = self.parameters, self.level_at(step)
         local = step - (self._ends[level - 2] if level > 1 else 0)
         min_scale = self.s_min[level - 1]
@@ -68,29 +77,30 @@ class Flod:
             near=self.data.near,
             backend=self.backend,
         )
-        loss = photometric_loss(rendering.image, self.data.target(view), p.ssim_weight, backend=self.backend)
+        target = self.data.target(view)
+        loss = photometric_loss(rendering.image, target, p.ssim_weight, backend=self.backend)
         loss.backward()
         until = p.densify_until[level - 1] * p.steps[level - 1]
         if local < until:
-            self._remember_gradients(rendering)
-        self.model.adam.lr["means"] = self._means_rate(local, level)
+            self.model.remember(rendering)
+        share = local / (p.lr_means_steps or p.steps[level - 1])
+        self.model.adam.lr["means"] = means_rate(p, share, self.data.extent)
         self.model.adam.step()
         self.model.adam.zero_grad()
         self._control_density(step, local + 1, level, until)
-        return float(loss.detach()), rendering.image.detach(), view
+        return float(loss.detach()), rendering.image.detach(), target
 
-    def finish_level(self, step: int) -> Level | None:
-        """After a step: the level that it completed, or None. Prepares the next one."""
+    def levels_after(self, step: int) -> list[Level]:
+        """The level that the step completed; the next one is then prepared."""
         if step + 1 not in self._ends:
-            return None
+            return []
         level = self.level_at(step)
         finished = Level(level, self.model.splats(self.s_min[level - 1]), self.s_min[level - 1])
         if level < self.parameters.levels:
             self._rise_to(level + 1)
-        return finished
+        return [finished]
 
     def meta(self) -> dict:
-        """What the bundle records of this run."""
         p, data = self.parameters, self.data
         return {
             "rho": p.rho,
@@ -104,17 +114,10 @@ class Flod:
         }
 
     def state_dict(self) -> dict:
-        """Everything that the next step depends on, as tensors and numbers."""
-        return {
-            "model": self.model.state_dict(),
-            "gradient_sum": self._gradient_sum,
-            "seen": self._seen,
-        }
+        return {"model": self.model.state_dict()}
 
     def load_state_dict(self, state: dict) -> None:
-        """Continues from what ``state_dict`` gave."""
         self.model.load_state_dict(state["model"])
-        self._gradient_sum, self._seen = state["gradient_sum"], state["seen"]
 
     # -- inside ----------------------------------------------------------------------------------------
 
@@ -129,30 +132,7 @@ class Flod:
         return int(p.max_splats * p.budget_ratio ** (p.levels - level))
 
     def _new_model(self, tensors: dict[str, torch.Tensor]) -> Model:
-        p = self.parameters
-        return Model(
-            tensors,
-            lr={
-                "means": p.lr_means * self.data.extent,
-                "quats": p.lr_quats,
-                "log_scales": p.lr_scales,
-                "opacity_logits": p.lr_opacities,
-                "sh": torch.tensor([[p.lr_sh]] + [[p.lr_sh / 20]] * ((p.sh_degree + 1) ** 2 - 1)),
-            },
-        )
-
-    def _means_rate(self, local: int, level: int) -> float:
-        p = self.parameters
-        share = min(local / (p.lr_means_steps or p.steps[level - 1]), 1.0)
-        return float(p.lr_means ** (1 - share) * p.lr_means_final**share) * self.data.extent
-
-    def _forget_gradients(self) -> None:
-        self._gradient_sum = torch.zeros(len(self.model))
-        self._seen = torch.zeros(len(self.model))
-
-    def _remember_gradients(self, rendering) -> None:
-        self._gradient_sum += rendering.grad2d.norm(dim=1)
-        self._seen += rendering.radii > 0
+        return splat_model(tensors, self.parameters, self.data.extent)
 
     def _control_density(self, step: int, local: int, level: int, until: float) -> None:
         """Adds, prunes and resets, after the ``local``-th step of a level (counted from 1)."""
@@ -163,18 +143,18 @@ class Flod:
         if local % p.densify_interval[level - 1] == 0:
             densify(
                 self.model,
-                self._gradient_sum / self._seen.clamp_min(1),
+                self.model.mean_gradient(),
                 threshold=p.grad_threshold * self.data.threshold_scale,
                 clone_below=p.clone_extent * self.data.extent,
                 max_splats=self._budget(level),
                 min_scale=self.s_min[level - 1],
                 rng=rng,
             )
-            self._forget_gradients()
+            self.model.forget()
         if p.prune_interval and local % p.prune_interval == 0:
-            self._keep(self.model["opacity_logits"].detach().sigmoid() >= p.min_opacity)
+            self.model.keep(self.model["opacity_logits"].detach().sigmoid() >= p.min_opacity)
         if p.overlap_interval and local % p.overlap_interval == 0 and level < p.levels:
-            self._keep(_apart(self.model["means"].detach(), self.s_min[level - 1] / 2))
+            self.model.keep(_apart(self.model["means"].detach(), self.s_min[level - 1] / 2))
         if p.opacity_reset_interval and local % p.opacity_reset_interval == 0:
             logits = self.model["opacity_logits"].detach()
             self.model.assign("opacity_logits", logits.clamp_max(float(np.log(0.01 / 0.99))))
@@ -183,10 +163,6 @@ class Flod:
                 f"Level {level} lost all its splats at step {step + 1}.",
                 "Lower 'footprint' (or 's_min_1'), so that coarse levels keep more splats.",
             )
-
-    def _keep(self, mask: torch.Tensor) -> None:
-        self.model.keep(mask)
-        self._gradient_sum, self._seen = self._gradient_sum[mask], self._seen[mask]
 
     def _rise_to(self, level: int) -> None:
         """The next level starts from this one: same scales, a smaller constraint, Adam anew (Eq. 5)."""
@@ -204,7 +180,6 @@ class Flod:
             points = self._from_points(level)
             tensors = {name: torch.cat([tensors[name], points[name][free]]) for name in NAMES}
         self.model = self._new_model(tensors)
-        self._forget_gradients()
 
 
 def _apart(means: torch.Tensor, distance: float) -> torch.Tensor:
@@ -215,14 +190,3 @@ def _apart(means: torch.Tensor, distance: float) -> torch.Tensor:
     if len(means) <= 3:
         return torch.ones(len(means), dtype=torch.bool)
     return torch.from_numpy(neighbour_distances(means.numpy()).mean(1) >= distance)
-
-
-def _distinct(points: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points without exact repetitions, which have no distance to take a scale from."""
-    points, index = np.unique(points, axis=0, return_index=True)
-    if len(points) < 4:
-        raise LodgsError(
-            f"The scene has {len(points)} distinct 3D points; training needs at least 4 to begin with.",
-            "Run COLMAP's triangulation again, or choose another model.",
-        )
-    return points, colors[index]

@@ -9,9 +9,11 @@ import numpy as np
 import torch
 from scipy.spatial import KDTree
 
-from ..rasterize import Adam
+from ..errors import LodgsError
+from ..rasterize import Adam, Rendering
 from ..rasterize.features import rotation_matrices
 from ..splats.gaussians import Splats
+from .parameters import Parameters
 
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
 SH_C0 = 0.28209479177387814
@@ -22,10 +24,16 @@ class Model:
 
     Attributes:
         adam: the optimizer, which holds the tensors by name and their moments.
+        columns: what else is kept of every splat and not trained, (N,) tensors by name: they follow when rows
+            go, and are zero for rows that come without them. ``gradient_sum`` and ``seen`` are always there.
     """
 
-    def __init__(self, tensors: dict[str, torch.Tensor], lr: dict) -> None:
+    def __init__(
+        self, tensors: dict[str, torch.Tensor], lr: dict, columns: dict[str, torch.Tensor] | None = None
+    ) -> None:
         self.adam = Adam({name: tensor.requires_grad_(True) for name, tensor in tensors.items()}, lr=lr)
+        self.columns = dict(columns or {})
+        self.forget()
 
     def __len__(self) -> int:
         return len(self["means"])
@@ -39,10 +47,14 @@ class Model:
         for name in NAMES:
             first, second = self.adam.state[name]
             self._replace(name, self[name][mask], first[mask], second[mask])
+        self.columns = {name: column[mask] for name, column in self.columns.items()}
 
     @torch.no_grad()
     def append(self, rows: dict[str, torch.Tensor]) -> None:
         """Adds splats at the end; their moments start at zero, as in 3DGS."""
+        added = len(rows["means"])
+        for name, column in self.columns.items():
+            self.columns[name] = torch.cat([column, rows.get(name, column.new_zeros(added))])
         for name in NAMES:
             first, second = self.adam.state[name]
             blank = torch.zeros_like(rows[name])
@@ -58,25 +70,80 @@ class Model:
         """Gives a parameter new values and forgets its moments."""
         self._replace(name, values, torch.zeros_like(values), torch.zeros_like(values))
 
+    def forget(self) -> None:
+        """Begins anew with what :meth:`remember` adds up."""
+        for name in ("gradient_sum", "seen"):
+            self.columns[name] = torch.zeros(len(self))
+
+    def remember(self, rendering: Rendering) -> None:
+        """After ``backward``: adds up image-plane gradients' norms, and how often each splat was drawn."""
+        self.columns["gradient_sum"] += rendering.grad2d.norm(dim=1)
+        self.columns["seen"] += rendering.radii > 0
+
+    def mean_gradient(self) -> torch.Tensor:
+        """Mean norm (N,) of the image-plane gradient over the views that drew each splat."""
+        return self.columns["gradient_sum"] / self.columns["seen"].clamp_min(1)
+
     def _replace(self, name: str, tensor: torch.Tensor, first: torch.Tensor, second: torch.Tensor) -> None:
         self.adam.replace(name, tensor.requires_grad_(True), first, second)
 
     def state_dict(self) -> dict:
         """Tensors and numbers, as ``torch.load(weights_only=True)`` reads them."""
-        return {"tensors": {name: self[name].detach() for name in NAMES}, "adam": self.adam.state_dict()}
+        return {
+            "tensors": {name: self[name].detach() for name in NAMES},
+            "columns": self.columns,
+            "adam": self.adam.state_dict(),
+        }
 
     def load_state_dict(self, state: dict) -> None:
         """Becomes what ``state_dict`` gave."""
         for name, tensor in state["tensors"].items():
             self.adam.replace(name, tensor.requires_grad_(True))
+        self.columns = state["columns"]
         self.adam.load_state_dict(state["adam"])
 
     def splats(self, min_scale: float = 0.0) -> Splats:
         """A copy as plain arrays, with ``min_scale`` (FLoD, Eq. 4) baked into the scales."""
-        columns = {name: self[name].detach().numpy().copy() for name in NAMES}
+        arrays = {name: self[name].detach().numpy().copy() for name in NAMES}
         if min_scale > 0:
-            columns["log_scales"] = np.log(np.exp(columns["log_scales"]) + np.float32(min_scale))
-        return Splats(**columns, extras={})
+            arrays["log_scales"] = np.log(np.exp(arrays["log_scales"]) + np.float32(min_scale))
+        return Splats(**arrays, extras={})
+
+
+def splat_model(
+    tensors: dict[str, torch.Tensor],
+    parameters: Parameters,
+    extent: float,
+    columns: dict[str, torch.Tensor] | None = None,
+) -> Model:
+    """A model of splats with the learning rates of the parameters, positions' times the scene extent."""
+    p = parameters
+    further = [[p.lr_sh / 20]] * ((p.sh_degree + 1) ** 2 - 1)
+    lr = {
+        "means": p.lr_means * extent,
+        "quats": p.lr_quats,
+        "log_scales": p.lr_scales,
+        "opacity_logits": p.lr_opacities,
+        "sh": torch.tensor([[p.lr_sh], *further]),
+    }
+    return Model(tensors, lr, columns)
+
+
+def means_rate(parameters: Parameters, share: float, extent: float) -> float:
+    """The positions' learning rate after a share of the steps: log-linear from the first to the last."""
+    share = min(share, 1.0)
+    return float(parameters.lr_means ** (1 - share) * parameters.lr_means_final**share) * extent
+
+
+def distinct(points: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points without exact repetitions, which have no distance to take a scale from."""
+    points, index = np.unique(points, axis=0, return_index=True)
+    if len(points) < 4:
+        raise LodgsError(
+            f"The scene has {len(points)} distinct 3D points; training needs at least 4 to begin with.",
+            "Run COLMAP's triangulation again, or choose another model.",
+        )
+    return points, colors[index]
 
 
 def neighbour_distances(means: np.ndarray, neighbours: int = 3) -> np.ndarray:
@@ -86,6 +153,15 @@ def neighbour_distances(means: np.ndarray, neighbours: int = 3) -> np.ndarray:
     """
     distances, _ = KDTree(means).query(means, k=neighbours + 1, workers=-1)
     return distances[:, 1:]
+
+
+def neighbour_scale(points: np.ndarray) -> np.ndarray:
+    """Root mean square distance (N,) of the three nearest neighbours, above 0."""
+    distances = neighbour_distances(points)
+    finite = np.isfinite(distances)
+    squared = np.where(finite, distances, 0) ** 2
+    scale = np.sqrt(squared.sum(1) / np.maximum(finite.sum(1), 1))
+    return np.maximum(scale, 1e-7 * max(float(np.ptp(points)), 1e-30))
 
 
 def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int) -> dict[str, torch.Tensor]:
@@ -99,11 +175,7 @@ def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int) -> dict[
     Returns:
         Tensors by name; scales are the root mean square distance of the three nearest neighbours.
     """
-    distances = neighbour_distances(points)
-    finite = np.isfinite(distances)
-    squared = np.where(finite, distances, 0) ** 2
-    scale = np.sqrt(squared.sum(1) / np.maximum(finite.sum(1), 1))
-    scale = np.maximum(scale, 1e-7 * max(float(np.ptp(points)), 1e-30))
+    scale = neighbour_scale(points)
     count = len(points)
     sh = np.zeros((count, (sh_degree + 1) ** 2, 3), np.float32)
     sh[:, 0] = (colors.astype(np.float32) / 255 - 0.5) / SH_C0

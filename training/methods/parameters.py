@@ -13,16 +13,50 @@ PRESETS = {
 }
 METHODS = {
     "flod": "FLoD: independent levels, each limited to a smallest size of detail",
+    "octree": "Octree-GS: levels of an octree that add up, faded in one by one as the eye comes nearer",
     "3dgs": "Plain 3D Gaussian splatting: one level, for comparison",
 }
 
 
 @dataclass(frozen=True)
 class Parameters:
+    """What every method has. The defaults are the draft's.
+
+    Sizes and thresholds do not depend on the scene's scale: they are in pixels of the training images or in
+    multiples of the scene extent.
+    """
+
+    levels: int = 1
+    """Number of levels of detail."""
+    max_splats: int = 120_000
+    """Most splats; those with the largest gradients are densified first. Of more structure-from-motion
+    points than this, training begins with a random sample."""
+    grad_threshold: float = 1e-4
+    """Mean image-plane gradient (3DGS units) above which splats are added, at one megapixel."""
+    min_opacity: float = 0.005
+    """Splats below this opacity are removed."""
+    sh_degree: int = 3
+    """Degree of the spherical harmonics that carry view-dependent colour, 0 to 3."""
+    sh_interval: int = 250
+    """Steps after which the next degree joins in."""
+    ssim_weight: float = 0.2
+    """Weight of D-SSIM against L1 in the loss."""
+    lr_means: float = 3e-4
+    """Learning rate of positions, times the scene extent, at the start of a level (FLoD) or of the run."""
+    lr_means_final: float = 3e-5
+    """The same at the end."""
+    lr_scales: float = 1e-2
+    lr_quats: float = 1e-3
+    lr_opacities: float = 5e-2
+    lr_sh: float = 2.5e-3
+    """Learning rate of the base colour; the other harmonics take a twentieth."""
+
+
+@dataclass(frozen=True)
+class FlodParameters(Parameters):
     """Parameters of FLoD; with ``levels`` = 1 they are those of plain 3DGS. The defaults are the draft's.
 
-    A tuple has one entry for each level, coarse to fine. Sizes and thresholds do not depend on the scene's
-    scale: they are in pixels of the training images or in multiples of the scene extent.
+    A tuple has one entry for each level, coarse to fine. ``max_splats`` is the last level's.
     """
 
     levels: int = 5
@@ -39,17 +73,10 @@ class Parameters:
     """Share of a level's steps after which splats are no longer added or removed."""
     densify_interval: tuple[int, ...] = (50, 50, 50, 50, 50)
     """Steps between two densifications."""
-    grad_threshold: float = 1e-4
-    """Mean image-plane gradient (3DGS units) above which a splat is cloned or split, at one megapixel."""
-    max_splats: int = 120_000
-    """Most splats the last level may have; the ones with the largest gradients are densified first. Of more
-    structure-from-motion points than this, training begins with a random sample."""
     budget_ratio: float = 0.65
     """A level's share of the next finer level's budget of splats, so that every level adds some."""
     clone_extent: float = 0.01
     """Splats larger than this multiple of the scene extent are split, smaller ones cloned."""
-    min_opacity: float = 0.005
-    """Splats below this opacity are removed."""
     prune_interval: int = 100
     """Steps between two removals of transparent splats."""
     overlap_interval: int = 50
@@ -60,26 +87,51 @@ class Parameters:
     exact positions."""
     opacity_reset_interval: int = 0
     """Steps between two opacity resets; 0 never resets."""
-    sh_degree: int = 3
-    """Degree of the spherical harmonics that carry view-dependent colour, 0 to 3."""
-    sh_interval: int = 250
-    """Steps after which the next degree joins in."""
-    ssim_weight: float = 0.2
-    """Weight of D-SSIM against L1 in the loss."""
-    lr_means: float = 3e-4
-    """Learning rate of positions, times the scene extent, at the start of a level."""
-    lr_means_final: float = 3e-5
-    """The same at the end of ``lr_means_steps``."""
     lr_means_steps: int = 0
     """Steps over which the positions' rate decays; 0 takes each level's own steps."""
-    lr_scales: float = 1e-2
-    lr_quats: float = 1e-3
-    lr_opacities: float = 5e-2
-    lr_sh: float = 2.5e-3
-    """Learning rate of the base colour; the other harmonics take a twentieth."""
 
 
-_DRAFT = Parameters()
+@dataclass(frozen=True)
+class OctreeParameters(Parameters):
+    """Parameters of Octree-GS with explicit anchors. The defaults are the draft's."""
+
+    levels: int = 0
+    """Number of levels (Octree-GS: K); 0 takes it from the range of distances (Eq. 3)."""
+    nearest: float = 0.05
+    """Quantile of the distances from views to points that counts as the smallest (Octree-GS: d_min)."""
+    farthest: float = 0.95
+    """Quantile that counts as the largest (Octree-GS: d_max), from where on level 1 alone is drawn."""
+    coarser_levels: int = 3
+    """Levels before those of Eq. 3, for views from farther away than any photograph."""
+    footprint: float = 0.7
+    """Pixels that the voxel of a level covers where the level is just wanted; sets the voxels' size."""
+    visible_share: float = 0.0
+    """Anchors that fewer than this share of the views want are dropped; those that none wants always are."""
+    steps: int = 4300
+    """Training steps."""
+    coarse_share: float = 0.25
+    """Share of the steps in which levels join one by one; then anchors also grow into the next level."""
+    coarse_factor: float = 1.5
+    """How many times longer a level trains alone than the next one (Octree-GS: 1/omega)."""
+    grow_interval: int = 50
+    """Steps between two growings."""
+    grow_until: float = 0.55
+    """Share of the steps after which anchors are no longer added or removed."""
+    candidates: int = 2
+    """Places that each splat with a large gradient proposes in a growing."""
+    grow_harder: float = 0.2
+    """The gradient's threshold is 2 to this power higher from level to level (Octree-GS: beta)."""
+    bias_rate: float = 0.01
+    """What a level's bias gains in a growing where the gradient is a quarter of the threshold or more."""
+    far_share: float = 0.1
+    """Share of the steps that see a photograph made smaller, as from 2, 4, ... times the distance."""
+    full_share: float = 0.1
+    """Share of the other steps that draw every level wherever it is, as a view at full detail does."""
+    volume_weight: float = 0.0
+    """Weight of the mean of the splats' volumes in the loss, lengths in median depths."""
+
+
+_DRAFT = FlodParameters()
 _STANDARD = replace(
     _DRAFT,
     steps=(2_000, 3_000, 4_000, 6_000, 15_000),
@@ -104,7 +156,32 @@ _PAPER = replace(
     budget_ratio=1.0,
     lr_means_steps=30_000,
 )
-_PRESETS = {"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER}
+_OCTREE = OctreeParameters()
+_OCTREE_STANDARD = replace(
+    _OCTREE,
+    steps=30_000,
+    max_splats=1_000_000,
+    sh_interval=1000,
+    lr_means=1.6e-4,
+    lr_means_final=1.6e-6,
+    lr_scales=5e-3,
+    grow_interval=100,
+)
+_OCTREE_PAPER = replace(
+    _OCTREE_STANDARD,
+    steps=40_000,
+    coarser_levels=0,
+    grow_until=0.625,
+    grad_threshold=2e-4,
+    max_splats=5_000_000,
+    far_share=0.0,
+)
+_FLOD_PRESETS = {"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER}
+_PRESETS = {
+    "flod": _FLOD_PRESETS,
+    "3dgs": _FLOD_PRESETS,
+    "octree": {"draft": _OCTREE, "standard": _OCTREE_STANDARD, "paper": _OCTREE_PAPER},
+}
 
 
 def preset(method: str, name: str) -> Parameters:
@@ -117,8 +194,9 @@ def preset(method: str, name: str) -> Parameters:
         raise LodgsError(f"There is no method '{method}'.", f"Choose one of: {', '.join(METHODS)}.")
     if name not in PRESETS:
         raise LodgsError(f"There is no preset '{name}'.", f"Choose one of: {', '.join(PRESETS)}.")
-    parameters = _PRESETS[name]
+    parameters = _PRESETS[method][name]
     if method == "3dgs":
+        assert isinstance(parameters, FlodParameters)
         steps = sum(parameters.steps) if name == "draft" else 30_000
         interval = min(parameters.densify_interval[-1], 100)
         parameters = replace(
@@ -142,8 +220,9 @@ def override(parameters: Parameters, values: dict) -> Parameters:
         raise LodgsError(
             f"The job sets the unknown parameter '{unknown[0]}'.", f"Known are: {', '.join(kinds)}."
         )
-    levels = values.get("levels", parameters.levels)
-    if not isinstance(levels, int) or not 1 <= levels <= 12:
+    before = parameters.levels
+    levels = values.get("levels", before)
+    if levels != before and (not isinstance(levels, int) or not 1 <= levels <= 12):
         raise LodgsError(f"levels = {levels!r} is not possible.", "Give a whole number from 1 to 12.")
     changed = {}
     for name, kind in kinds.items():

@@ -21,6 +21,7 @@ from ..errors import LodgsError
 from ..evaluate.metrics import psnr
 from ..evaluate.protocol import Evaluation
 from ..files import atomic_write
+from ..lod.selection import complete
 from ..methods import create
 from ..methods.data import TrainingData
 from ..rasterize import warm_up
@@ -124,21 +125,20 @@ class _Run:
                 message = f"Stopped at step {self.step} of {method.steps}; it can be resumed."
                 self.events("cancelled", step=self.step, message=message)
                 return False
-            loss, image, view = method.train_step(self.step)
+            loss, image, target = method.train_step(self.step)
             if not math.isfinite(loss):
                 raise LodgsError(
                     f"Training diverged at step {self.step + 1}: the loss is {loss}.",
                     "Start again with lower learning rates.",
                 )
             level = method.level_at(self.step)
-            finished = method.finish_level(self.step)
+            levels = method.levels_after(self.step)
             self.step += 1
             if time.monotonic() - last_progress >= PROGRESS_SECONDS or self.step == method.steps:
-                self._tell_progress(level, loss, psnr(image, self.data.target(view).image))
+                self._tell_progress(level, loss, psnr(image, target.image))
                 last_progress = time.monotonic()
-            if finished is not None:
-                self._write_level(finished)
-            if finished is not None or time.monotonic() - last_checkpoint >= CHECKPOINT_SECONDS:
+            self._write_levels(levels)
+            if levels or time.monotonic() - last_checkpoint >= CHECKPOINT_SECONDS:
                 self._save()
                 last_checkpoint = time.monotonic()
         return True
@@ -150,10 +150,10 @@ class _Run:
             for record in self.levels
         ]
         meta = {**self.method.meta(), "seed": self.job.seed}
-        write_bundle(self.folder.bundle, Bundle(self.job.method, levels, meta))
+        write_bundle(self.folder.bundle, Bundle(self.job.method, levels, meta, self.method.cumulative))
 
     def _tell_progress(self, level: int, loss: float, quality: float) -> None:
-        of, levels = self.method.steps, self.method.parameters.levels
+        of, levels = self.method.steps, self.method.levels
         speed = (self.step - self._started_step) / max(time.monotonic() - self._started, 1e-6)
         self.events(
             "progress", stage=f"level {level} of {levels}", level=level, levels=levels,
@@ -163,18 +163,24 @@ class _Run:
         if time.monotonic() - self._started > 10:  # the speed of about the last ten seconds
             self._started, self._started_step = time.monotonic(), self.step
 
-    def _write_level(self, level: Level) -> None:
-        path = self.folder.levels_folder / f"level_{level.number}.ply"
-        write_ply(path, level.splats)
-        record = {
-            "level": level.number,
-            "path": f"levels/{path.name}",
-            "splats": len(level.splats),
-            "s_min": level.s_min,
-        }
-        quality = self.evaluation.measure_set(level.splats) if self.evaluation.cameras else {}
-        self.events("level", **{**quality, **record})
-        self.levels.append(record)
+    def _write_levels(self, levels: list[Level]) -> None:
+        """Hands levels over: a file and an event each. A level that came before is replaced."""
+        method, known = self.method, {record["level"]: record for record in self.levels}
+        bundle = Bundle(self.job.method, levels, cumulative=method.cumulative)
+        for level in levels:
+            path = self.folder.levels_folder / f"level_{level.number}.ply"
+            write_ply(path, level.splats)
+            record = {
+                "level": level.number,
+                "path": f"levels/{path.name}",
+                "splats": len(level.splats),
+                "s_min": level.s_min,
+            }
+            quality = self.evaluation.measure_set(complete(bundle, level)) if self.evaluation.cameras else {}
+            facts = {"cumulative": method.cumulative, "meta": method.meta()}
+            self.events("level", **{**quality, **record, **facts, "again": level.number in known})
+            known[level.number] = record
+        self.levels = [known[number] for number in sorted(known)]
 
     def _save(self) -> None:
         """Writes a checkpoint, then drops all but it and the one before."""

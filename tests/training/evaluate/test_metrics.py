@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from training.evaluate.metrics import psnr, ssim, to_8_bit
-from training.evaluate.protocol import select_flod
+from training.lod.selection import Detail, select
 from training.splats.bundle import Bundle, Level
 from training.splats.gaussians import Splats
 
@@ -57,6 +57,7 @@ def test_the_selective_view_is_the_papers_inequality(start, end):
             far = math.inf if number == start else s_min[number - 2] / gamma * focal
             if near <= distance < far:
                 expected.append(mean)
-    chosen = select_flod(bundle, eye, focal, gamma, start, end)
+    chosen, weights = select(bundle, eye, focal, Detail(gamma, start, end))
+    assert weights is None
     np.testing.assert_array_equal(chosen.means, np.array(expected, np.float32).reshape(-1, 3))
     assert len(chosen.sh) == len(chosen.means)

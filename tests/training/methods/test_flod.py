@@ -6,7 +6,7 @@ import torch
 
 from training.errors import LodgsError
 from training.methods.data import TrainingData
-from training.methods.flod import Flod, _apart
+from training.methods.flod import Method, _apart
 from training.methods.model import NAMES
 from training.methods.parameters import override, preset
 from training.rasterize import rasterize
@@ -18,9 +18,9 @@ def data(tiny_scene) -> TrainingData:
     return TrainingData(read_scene(tiny_scene), test_every=4)
 
 
-def make(data, **values) -> Flod:
+def make(data, **values) -> Method:
     values = {"levels": 3, "steps": [6, 6, 6], "footprint": 6.0, "overlap_interval": 0, **values}
-    return Flod(data, override(preset("flod", "draft"), values), seed=0, backend="cpu")
+    return Method(data, override(preset("flod", "draft"), values), seed=0, backend="cpu")
 
 
 def test_footprint_is_in_pixels_at_the_median_depth(data):
@@ -38,9 +38,7 @@ def test_no_splat_is_ever_smaller_than_its_level_allows_and_levels_come_in_order
     for step in range(flod.steps):
         assert flod.level_at(step) == step // 6 + 1
         flod.train_step(step)
-        level = flod.finish_level(step)
-        if level is not None:
-            finished.append(level)
+        finished += flod.levels_after(step)
     assert [level.number for level in finished] == [1, 2, 3]
     for level in finished[:2]:
         assert np.exp(level.splats.log_scales).min() >= level.s_min * (1 - 1e-6)
@@ -60,7 +58,7 @@ def test_the_picture_does_not_jump_when_the_level_rises(data):
     for step in range(6):
         flod.train_step(step)
     before = picture(1)
-    assert flod.finish_level(5) is not None
+    assert len(flod.levels_after(5)) == 1
     torch.testing.assert_close(picture(2), before, atol=2e-5, rtol=0)
     # and it is the new constraint that is in force: the old one would draw larger splats
     assert (picture(1) - before).abs().max() > 0.01
@@ -127,9 +125,7 @@ def test_every_level_keeps_to_its_share_of_the_budget(data):
     counts = []
     for step in range(flod.steps):
         flod.train_step(step)
-        level = flod.finish_level(step)
-        if level is not None:
-            counts.append(len(level.splats))
+        counts += [len(level.splats) for level in flod.levels_after(step)]
     # 200 x 0.5^2 = 50 is fewer than the 60 points to begin with; then 100 and 200 are filled to the last
     assert counts == [60, 100, 200]
 
@@ -138,8 +134,10 @@ def test_gradients_are_averaged_over_the_views_that_saw_a_splat(data):
     flod = make(data, densify_interval=100, prune_interval=100)
     for step in range(3):
         flod.train_step(step)
-    assert 0 < flod._seen.max() <= 3
-    assert (flod._gradient_sum[flod._seen == 0] == 0).all()
+    seen, gradient_sum = flod.model.columns["seen"], flod.model.columns["gradient_sum"]
+    assert 0 < seen.max() <= 3
+    assert (gradient_sum[seen == 0] == 0).all()
+    assert torch.equal(flod.model.mean_gradient(), gradient_sum / seen.clamp_min(1))
 
 
 def test_a_preset_of_the_paper_is_the_papers():

@@ -7,13 +7,14 @@ import signal
 import subprocess
 import sys
 import time
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from training.methods.flod import Flod
+from training.methods import MODULES
 from training.runs import train as training_loop
 from training.runs.folder import RunFolder
 from training.runs.job import Job
@@ -33,16 +34,26 @@ def command(path: Path, keys: dict) -> list[str]:
     return [sys.executable, "-m", "training", "train", str(path)]
 
 
-@pytest.fixture(scope="module")
-def unbroken(tiny_scene, tmp_path_factory) -> dict:
-    """What an undisturbed run of the tiny job gives: its keys, events, output lines and bundle."""
+TINY = {
+    "flod": {
+        "levels": 3, "steps": [20, 20, 30], "footprint": 6.0, "densify_interval": 5, "prune_interval": 10,
+        "overlap_interval": 10, "sh_interval": 15, "grad_threshold": 1e-5, "max_splats": 300,
+    },
+    "octree": {
+        "levels": 3, "steps": 70, "footprint": 6.0, "grow_interval": 5, "far_share": 0.2, "sh_interval": 15,
+        "grad_threshold": 1e-5, "max_splats": 300,
+    },
+}  # fmt: skip
+"""Parameters of a run of 70 steps and 3 levels on the tiny scene, by method."""
+
+
+@pytest.fixture(scope="module", params=TINY)
+def unbroken(request, tiny_scene, tmp_path_factory) -> dict:
+    """What an undisturbed run of the tiny job gives: its keys, output lines and bundle."""
     out = tmp_path_factory.mktemp("unbroken")
     keys = {
         "scene": str(tiny_scene), "out": str(out / "run"), "image_scale": 1.0, "test_every": 4,
-        "parameters": {
-            "levels": 3, "steps": [20, 20, 30], "footprint": 6.0, "densify_interval": 5, "prune_interval": 10,
-            "overlap_interval": 10, "sh_interval": 15, "grad_threshold": 1e-5, "max_splats": 300,
-        },
+        "method": request.param, "parameters": TINY[request.param],
     }  # fmt: skip
     done = subprocess.run(
         command(out / "job.json", keys), cwd=ROOT, capture_output=True, text=True, timeout=240
@@ -60,7 +71,8 @@ def test_every_line_is_an_event_and_the_file_holds_the_same(unbroken):
     printed = [json.loads(line) for line in unbroken["lines"]]
     assert printed == folder.events()[0]
     kinds = [event["event"] for event in printed]
-    assert kinds[0] == "hello" and kinds[-1] == "done" and kinds.count("level") == 3
+    assert kinds[0] == "hello" and kinds[-1] == "done"
+    assert {event["level"] for event in folder.levels()} == {1, 2, 3}
     assert folder.state() == "done"
     last = folder.last("progress")
     assert last is not None and last["step"] == last["of"] == 70
@@ -74,10 +86,15 @@ def test_levels_and_bundle_agree_and_record_the_constraint(unbroken):
         alone = read_ply(folder.path / event["path"])
         assert len(level.splats) == event["splats"]
         np.testing.assert_array_equal(level.splats.means, alone.means)
-        assert level.s_min == pytest.approx(event["s_min"])
+        assert level.splats.extras.keys() == alone.extras.keys()
+        assert level.s_min == event["s_min"]
         if level.s_min:
             assert np.exp(alone.log_scales).min() >= level.s_min * (1 - 1e-5)
-    assert bundle.meta["footprint_px"] == pytest.approx(6.0)
+    if bundle.method == "flod":
+        assert bundle.meta["footprint_px"] == pytest.approx(6.0)
+    else:
+        assert bundle.cumulative and bundle.meta["d_max"] > 0
+        assert bundle.meta["voxel"] * bundle.meta["focal_px"] / bundle.meta["d_max"] == pytest.approx(6.0)
 
 
 def test_training_makes_the_pictures_better(unbroken):
@@ -109,14 +126,15 @@ def test_a_killed_run_resumes_to_the_same_bits(unbroken, tmp_path, step):
 def test_cancel_by_file_saves_and_resume_gives_the_same_bits(unbroken, tmp_path, monkeypatch, at):
     keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
     folder = RunFolder(keys["out"])
-    real = Flod.train_step
+    method = import_module(f"training.methods.{MODULES[keys['method']]}").Method
+    real = method.train_step
 
     def ask_to_stop(self, step):
         if step == at:
             folder.request_cancel()
         return real(self, step)
 
-    monkeypatch.setattr(Flod, "train_step", ask_to_stop)
+    monkeypatch.setattr(method, "train_step", ask_to_stop)
     code, events = run_in_process(keys)
     assert code == training_loop.CANCELLED and folder.state() == "cancelled"
     assert events[-1]["event"] == "cancelled" and events[-1]["step"] == at + 1
@@ -129,7 +147,8 @@ def test_cancel_by_file_saves_and_resume_gives_the_same_bits(unbroken, tmp_path,
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_polite_signal_saves(unbroken, tmp_path, number):
     keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
-    keys["parameters"] = {**keys["parameters"], "steps": [20, 20, 30000]}
+    steps = {"flod": [20, 20, 30000], "octree": 30000}[keys["method"]]
+    keys["parameters"] = {**keys["parameters"], "steps": steps}
     process = subprocess.Popen(
         command(tmp_path / "job.json", keys), cwd=ROOT, stdout=subprocess.PIPE, text=True
     )

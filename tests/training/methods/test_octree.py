@@ -1,0 +1,151 @@
+"""Octree-GS with explicit anchors: what a step draws, how levels join, where anchors grow."""
+
+import numpy as np
+import pytest
+import torch
+
+from training.errors import LodgsError
+from training.methods.data import TrainingData
+from training.methods.octree import Method
+from training.methods.parameters import override, preset
+from training.scenes.colmap import read_scene
+
+
+@pytest.fixture(scope="module")
+def data(tiny_scene) -> TrainingData:
+    return TrainingData(read_scene(tiny_scene), test_every=4)
+
+
+def make(data, **values) -> Method:
+    values = {
+        "levels": 4, "coarser_levels": 0, "nearest": 0.0, "farthest": 1.0, "footprint": 12.0, "steps": 40,
+        "far_share": 0.0, "full_share": 0.0, "candidates": 1, **values,
+    }  # fmt: skip
+    return Method(data, override(preset("octree", "draft"), values), seed=0, backend="cpu")
+
+
+def test_levels_join_one_by_one_each_after_a_shorter_time(data):
+    octree = make(data, levels=6, steps=1000, coarse_share=0.5, coarse_factor=2.0)
+    # half of the levels at once; then intervals of 8, 4, 2, 1 fifteenths of the first 500 steps
+    assert octree.joins == [0, 0, 0, 267, 400, 467]
+    assert [octree.level_at(step) for step in (0, 266, 267, 466, 467, 999)] == [3, 3, 4, 5, 6, 6]
+
+
+def test_a_step_draws_what_is_wanted_of_the_levels_that_have_joined(data):
+    octree = make(data, steps=400, coarse_share=0.5)
+    camera = data.train[0]
+    distance = np.linalg.norm(octree.model["means"].detach().numpy() - camera.center, axis=1)
+    level = octree.model.columns["level"].numpy()
+    for step, newest in ((0, 2), (399, 4)):
+        wanted = np.clip(np.round(np.log2(octree.tree.d_max / distance)), 0, 3) + 1  # Eq. 5, rounded
+        expected = level <= np.minimum(wanted, newest)
+        weights = octree._weights(camera, step, whole=True).numpy()
+        close = np.abs(np.log2(octree.tree.d_max / distance) % 1 - 0.5) < 1e-4
+        assert ((weights > 0) == expected)[~close].all()
+        assert 0 < expected.sum() < len(expected)
+
+
+def test_a_picture_half_as_large_wants_one_level_less(data):
+    octree = make(data, far_share=1.0)
+    octree.model.columns["bias"] += 1  # what the smaller picture takes away
+    near = octree._weights(data.train[0], 39, whole=False)
+    octree.model.columns["bias"] -= 1
+    octree.model.columns["bias"] += 2
+    half = octree._weights(data.camera(0, 2), 39, whole=False)
+    assert torch.equal(near, half)
+
+
+def test_some_steps_see_smaller_pictures_and_some_everything(data):
+    octree = make(data, far_share=0.5, full_share=0.5, steps=400, coarse_share=0.0)
+    shrinks = [octree._shrink(step) for step in range(400)]
+    # 48 pixels high: half is still no smaller than 32 allows, so nothing shrinks
+    assert set(shrinks) == {1}
+    whole = [octree._weights(data.train[0], step, whole=True).mean() == 1 for step in range(200)]
+    assert 60 < sum(whole) < 140
+    assert not any(octree._weights(data.train[0], step, whole=False).mean() == 1 for step in range(20))
+
+
+def test_new_anchors_lie_in_free_voxels_of_their_own_or_the_next_level(data):
+    octree = make(data, steps=400, footprint=6.0, max_splats=10_000, coarse_share=0.0, min_opacity=0.0)
+    before = octree.tree.keys(
+        octree.model["means"].detach().double().numpy(), octree.model.columns["level"].long().numpy()
+    )
+    count = len(octree.model)
+    octree.model.columns["seen"] += 1
+    octree.model.columns["gradient_sum"] += 1  # far above every threshold: all go on to the next level
+    levels = octree.model.columns["level"].clone()
+    octree._grow_and_prune(200)
+    added, level = octree.model["means"][count:], octree.model.columns["level"][count:]
+    assert len(added) > 0
+    keys = octree.tree.keys(added.detach().double().numpy(), level.long().numpy())
+    assert len(set(keys)) == len(keys) and not set(keys) & set(before)
+    assert level.min() == 2 and set(level.tolist()) <= set((levels + 1).tolist())
+    size = octree.tree.size(level.numpy())
+    assert (octree.model["log_scales"][count:].detach().exp().amax(1).numpy() <= size * 1.001).all()
+    assert (octree.model.columns["bias"][:count] == octree.parameters.bias_rate).all()
+
+
+def test_the_thresholds_rise_from_level_to_level(data):
+    """tau 2^(beta (l - 1)): below that of a level nothing grows, below that of the next it stays (Sec. 4.2)."""
+    for factor, expected in ((0.99, None), (1.01, 0), (2.01, 1)):
+        octree = make(
+            data, steps=400, footprint=6.0, coarse_share=0.0, grow_harder=1.0, min_opacity=0.0, max_splats=999
+        )
+        count, level = len(octree.model), octree.model.columns["level"]
+        some = level == 2
+        threshold = octree.parameters.grad_threshold * data.threshold_scale * 2
+        octree.model.columns["seen"] += 1
+        octree.model.columns["gradient_sum"] += threshold * factor * some
+        octree._grow_and_prune(200)
+        grown = octree.model.columns["level"][count:]
+        assert set(grown.tolist()) == (set() if expected is None else {2.0 + expected})
+
+
+def test_no_level_grows_into_the_next_before_all_have_joined(data):
+    octree = make(data, steps=400, footprint=6.0, coarse_share=0.9, max_splats=10_000, min_opacity=0.0)
+    count, levels = len(octree.model), octree.model.columns["level"].clone()
+    octree.model.columns["seen"][levels == 1] += 1
+    octree.model.columns["gradient_sum"][levels == 1] += 1
+    octree._grow_and_prune(200)
+    assert len(octree.model) > count
+    assert (octree.model.columns["level"][count:] == 1).all()
+    assert (octree.model.columns["bias"] == 0).all()
+
+
+def test_what_stays_faint_is_removed_and_what_was_not_seen_stays(data):
+    octree = make(data, grad_threshold=1e9, min_opacity=0.01)
+    columns = octree.model.columns
+    columns["seen"][:10] = 4
+    columns["opacity_sum"][:5] = 4 * 0.02
+    columns["opacity_sum"][5:10] = 4 * 0.005
+    kept = octree.model["means"].detach().clone()
+    octree._grow_and_prune(20)
+    assert torch.equal(octree.model["means"].detach(), torch.cat([kept[:5], kept[10:]]))
+    octree.model.columns["seen"] += 1
+    with pytest.raises(LodgsError, match="No splat is left"):
+        octree._grow_and_prune(20)
+
+
+def test_the_volume_is_measured_in_median_depths(data):
+    octree = make(data, volume_weight=2.0)
+    rendering = octree._draw(data.train[0], torch.ones(len(octree.model)), 0)
+    drawn = rendering.radii > 0
+    expected = 2 * (octree.model["log_scales"][drawn].double().exp() / data.median_depth).prod(1).mean()
+    total = octree._regularised(torch.tensor(3.0), rendering)
+    assert float(total.detach()) == pytest.approx(3 + float(expected.detach()), rel=1e-5)
+
+
+def test_levels_add_up_to_all_splats_with_their_bias(data):
+    octree = make(data, steps=8, coarse_share=0.5)
+    handed_over = {}
+    for step in range(octree.steps):
+        octree.train_step(step)
+        if levels := octree.levels_after(step):
+            handed_over[step + 1] = levels
+    assert list(handed_over) == [octree.joins[-1], 8]
+    levels = handed_over[8]
+    assert [level.number for level in levels] == [1, 2, 3, 4]
+    assert sum(len(level.splats) for level in levels) == len(octree.model)
+    for level in levels:
+        assert (level.splats.extras["lod_level"] == level.number).all()
+        assert "lod_bias" in level.splats.extras

@@ -1,0 +1,242 @@
+"""Octree-GS (Ren et al. 2024) with explicit anchors: levels of an octree that add up, chosen by distance.
+
+An anchor is one Gaussian with parameters of its own and no network. It belongs to a level, and began in a
+voxel of that level in which no other anchor was. What a view draws follows ``lod.rules.octree_weights``,
+rounded while training.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from ..errors import LodgsError
+from ..lod import octree
+from ..lod.rules import octree_wanted, octree_weights
+from ..lod.selection import BIAS
+from ..rasterize import Rendering, Target, photometric_loss, rasterize
+from ..rasterize.features import rotation_matrices
+from ..scenes.cameras import Camera
+from ..splats.bundle import Level
+from .data import TrainingData
+from .model import NAMES, Model, distinct, from_points, means_rate, neighbour_scale, splat_model
+from .parameters import OctreeParameters
+
+SMALLEST = 32
+"""Pixels that the shorter side of a photograph made smaller has at least."""
+
+
+class Method:
+    """One run of Octree-GS; see ``methods.Method`` for what it does for the loop.
+
+    Attributes:
+        tree: the levels and their voxels.
+        joins: the step at which each level joins.
+    """
+
+    cumulative = True
+
+    def __init__(self, data: TrainingData, parameters: OctreeParameters, seed: int, backend: str) -> None:
+        self.data, self.parameters, self.seed, self.backend = data, parameters, seed, backend
+        p = parameters
+        points, colors = distinct(data.scene.points, data.scene.point_colors)
+        self.tree = octree.build(
+            points, data.train, focal_px=data.focal, footprint=p.footprint,
+            quantiles=(p.nearest, p.farthest), levels=p.levels, coarser=p.coarser_levels,
+        )  # fmt: skip
+        self.joins = self._joins()
+        level = octree.anchors(points, self.tree)
+        chosen = np.flatnonzero(level > 0)
+        chosen = chosen[self._worth_having(points[chosen], level[chosen])]
+        if len(chosen) > p.max_splats:
+            chosen = np.sort(np.random.default_rng(seed).choice(chosen, p.max_splats, replace=False))
+        self.model = self._first_model(points[chosen], colors[chosen], level[chosen])
+
+    # -- what the loop asks of every method ------------------------------------------------------------
+
+    @property
+    def steps(self) -> int:
+        return self.parameters.steps
+
+    @property
+    def levels(self) -> int:
+        return self.tree.levels
+
+    def level_at(self, step: int) -> int:
+        return sum(step >= join for join in self.joins)
+
+    def train_step(self, step: int) -> tuple[float, torch.Tensor, Target]:
+        p = self.parameters
+        view, shrink = self.data.training_view(step, self.seed), self._shrink(step)
+        camera, target = self.data.camera(view, shrink), self.data.target(view, shrink)
+        rendering = self._draw(camera, self._weights(camera, step, whole=shrink == 1), step)
+        loss = photometric_loss(rendering.image, target, p.ssim_weight, backend=self.backend)
+        self._regularised(loss, rendering).backward()
+        growing = step < p.grow_until * p.steps
+        if growing and shrink == 1:  # gradients of small pictures are larger
+            self._remember(rendering)
+        self._optimise(step)
+        if growing and (step + 1) % p.grow_interval == 0:
+            self._grow_and_prune(step)
+        return float(loss.detach()), rendering.image.detach(), target
+
+    def levels_after(self, step: int) -> list[Level]:
+        """All levels, when the last one has joined and at the end."""
+        if step + 1 not in (self.joins[-1], self.steps):
+            return []
+        splats, level = self.model.splats(), self.model.columns["level"].numpy()
+        splats.extras = {"lod_level": level.astype(np.uint8), BIAS: self.model.columns["bias"].numpy()}
+        return [Level(number, splats.select(level == number)) for number in range(1, self.levels + 1)]
+
+    def meta(self) -> dict:
+        data = self.data
+        return {
+            "d_max": self.tree.d_max,
+            "voxel": self.tree.voxel,
+            "camera_center": data.mean_camera.tolist(),
+            "focal_px": data.focal,
+            "focal_width": data.train[0].width,
+            "scene_extent": data.extent,
+            "median_depth": data.median_depth,
+        }
+
+    def state_dict(self) -> dict:
+        return {"model": self.model.state_dict()}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.model.load_state_dict(state["model"])
+
+    # -- drawing ---------------------------------------------------------------------------------------
+
+    def _draw(self, camera: Camera, weights: torch.Tensor, step: int) -> Rendering:
+        p = self.parameters
+        return rasterize(
+            *(self.model[name] for name in NAMES),
+            camera=camera,
+            weights=weights,
+            sh_degree=min(p.sh_degree, step // max(p.sh_interval, 1)),
+            near=self.data.near,
+            backend=self.backend,
+        )
+
+    def _regularised(self, loss: torch.Tensor, rendering: Rendering) -> torch.Tensor:
+        """The loss with the volume of what is drawn (Octree-GS, Sec. 7.1)."""
+        if not self.parameters.volume_weight:
+            return loss
+        scales = self.model["log_scales"][rendering.radii > 0].exp() / self.data.median_depth
+        return loss + self.parameters.volume_weight * scales.prod(1).mean()
+
+    def _weights(self, camera: Camera, step: int, whole: bool) -> torch.Tensor:
+        """1 for what a step draws, 0 for the rest; with ``whole``, sometimes for all that has joined."""
+        columns, newest = self.model.columns, self.level_at(step)
+        if whole and np.random.default_rng([self.seed, step, 4]).random() < self.parameters.full_share:
+            return (columns["level"] <= newest).float()
+        eye = torch.as_tensor(camera.center).float()
+        distances = (self.model["means"].detach() - eye).norm(dim=1)
+        distances *= self.tree.focal_px / min(camera.fx, camera.fy)
+        wanted = octree_wanted(distances, columns["bias"], self.tree.d_max, self.levels)
+        return (octree_weights(wanted.clip(1, newest), columns["level"]) >= 0.5).float()
+
+    def _shrink(self, step: int) -> int:
+        """How many times smaller a step's photograph is made: what one as many times farther away sees.
+
+        So levels learn to stand alone that no photograph is far enough away for.
+        """
+        rng = np.random.default_rng([self.seed, step, 3])
+        if rng.random() >= self.parameters.far_share:
+            return 1
+        side = min(min(camera.width, camera.height) for camera in self.data.train)
+        most = min(self.levels - 1, int(np.log2(max(side / SMALLEST, 1))))
+        return 2 ** int(rng.integers(1, most + 1)) if most > 0 else 1
+
+    # -- anchors ---------------------------------------------------------------------------------------
+
+    def _joins(self) -> list[int]:
+        """The coarser half of the levels is there at once; each trains longer than the next (Sec. 4.3)."""
+        p, first = self.parameters, max(self.levels // 2, 1)
+        intervals = p.coarse_factor ** -np.arange(self.levels - first + 1.0)
+        ends = np.cumsum(intervals) / intervals.sum() * p.coarse_share * p.steps
+        return [0] * first + [round(end) for end in ends[:-1]]
+
+    def _worth_having(self, points: np.ndarray, level: np.ndarray) -> np.ndarray:
+        """Whether enough views want the level at a point (N, 3): the paper's weeding, by distance alone."""
+        wanting = np.zeros(len(points))
+        for camera in self.data.train:
+            distances = np.linalg.norm(points - camera.center, axis=1)
+            distances *= self.tree.focal_px / min(camera.fx, camera.fy)
+            wanted = octree_wanted(distances, 0.0, self.tree.d_max, self.levels)
+            wanting += octree_weights(wanted, level) >= 0.5
+        return wanting >= max(self.parameters.visible_share * len(self.data.train), 1)
+
+    def _first_model(self, points: np.ndarray, colors: np.ndarray, level: np.ndarray) -> Model:
+        """Splats at the points; each as large as its neighbours of this or coarser levels are far apart."""
+        tensors = from_points(points, colors, self.parameters.sh_degree)
+        for number in range(1, self.levels + 1):
+            here = level == number
+            if here.any():
+                scale = neighbour_scale(points[level <= number])[here[level <= number]]
+                tensors["log_scales"][here] = torch.from_numpy(np.log(scale)).float()[:, None]
+        zeros = torch.zeros(len(points))
+        columns = {"level": torch.from_numpy(level).float(), "bias": zeros, "opacity_sum": zeros.clone()}
+        return splat_model(tensors, self.parameters, self.data.extent, columns)
+
+    def _remember(self, rendering: Rendering) -> None:
+        self.model.remember(rendering)
+        opacity = self.model["opacity_logits"].detach().sigmoid()
+        self.model.columns["opacity_sum"] += torch.where(rendering.radii > 0, opacity, 0)
+
+    def _optimise(self, step: int) -> None:
+        self.model.adam.lr["means"] = means_rate(self.parameters, step / self.steps, self.data.extent)
+        self.model.adam.step()
+        self.model.adam.zero_grad()
+
+    @torch.no_grad()
+    def _grow_and_prune(self, step: int) -> None:
+        """New anchors in free voxels where gradients are large (Octree-GS, Sec. 4.2); faint ones go.
+
+        A splat proposes places drawn from itself, in its own level, or in the next one if its gradient is
+        above that level's threshold.
+        """
+        p, model, columns = self.parameters, self.model, self.model.columns
+        rng = np.random.default_rng([self.seed, step, 1])
+        gradient, level = model.mean_gradient(), columns["level"]
+        harder = 2**p.grow_harder
+        threshold = p.grad_threshold * self.data.threshold_scale * harder ** (level - 1)
+        target = level.clone()
+        if step >= p.coarse_share * p.steps:
+            target += gradient >= threshold * harder
+            columns["bias"] += p.bias_rate * (gradient >= 0.25 * threshold)
+
+        source = torch.nonzero((gradient >= threshold) & (target <= self.levels)).squeeze(1)
+        order = torch.argsort(gradient[source], descending=True, stable=True)
+        source = source[order].repeat_interleave(p.candidates)
+        rows = {name: model[name][source] for name in NAMES}
+        rows |= {"level": target[source], "bias": columns["bias"][source]}
+        local = torch.from_numpy(rng.standard_normal((len(source), 3), np.float32))
+        local *= rows["log_scales"].exp()
+        rows["means"] += torch.einsum("nij,nj->ni", rotation_matrices(rows["quats"]), local)
+        size = torch.from_numpy(self.tree.size(rows["level"].numpy())).float().log()[:, None]
+        rows["log_scales"] = torch.minimum(rows["log_scales"] - float(np.log(1.6)), size)
+        free = self._free(rows["means"], rows["level"])[: max(p.max_splats - len(model), 0)]
+
+        faint = columns["opacity_sum"] < p.min_opacity * columns["seen"]
+        model.keep(~faint)
+        model.append({name: row[free] for name, row in rows.items()})
+        model.forget()
+        model.columns["opacity_sum"] = torch.zeros(len(model))
+        if not len(model):
+            raise LodgsError(
+                f"No splat is left at step {step + 1}.", "Lower 'min_opacity', or choose another preset."
+            )
+
+    def _free(self, means: torch.Tensor, level: torch.Tensor) -> torch.Tensor:
+        """Indices, in order, of places worth having that are the first in a voxel without an anchor."""
+
+        def keys(means: torch.Tensor, level: torch.Tensor) -> np.ndarray:
+            return self.tree.keys(means.double().numpy(), level.long().numpy())
+
+        proposed = keys(means, level)
+        taken = keys(self.model["means"], self.model.columns["level"])
+        _, first = np.unique(proposed, return_index=True)
+        free = np.sort(first[~np.isin(proposed[first], taken)])
+        return torch.from_numpy(free[self._worth_having(means[free].double().numpy(), level[free].numpy())])
