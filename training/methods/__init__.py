@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from .model import Model
     from .parameters import Parameters
 
-MODULES = {"flod": "flod", "3dgs": "flod", "octree": "octree"}
+MODULES = {"flod": "flod", "3dgs": "flod", "octree": "octree", "octree_neural": "octree_neural"}
 """The module of each method; its class is called ``Method``."""
 
 

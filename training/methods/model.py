@@ -20,12 +20,12 @@ SH_C0 = 0.28209479177387814
 
 
 class Model:
-    """N splats under optimisation.
+    """N splats (or anchors of splats) under optimisation: tensors of N rows, ``means`` among them.
 
     Attributes:
         adam: the optimizer, which holds the tensors by name and their moments.
-        columns: what else is kept of every splat and not trained, (N,) tensors by name: they follow when rows
-            go, and are zero for rows that come without them. ``gradient_sum`` and ``seen`` are always there.
+        columns: what else is kept of every row and not trained, by name: they follow when rows go, and are
+            zero for rows that come without them. ``gradient_sum`` and ``seen`` are always there.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class Model:
     @torch.no_grad()
     def keep(self, mask: torch.Tensor) -> None:
         """Removes the splats where ``mask`` (N,) is False."""
-        for name in NAMES:
+        for name in list(self.adam.tensors):
             first, second = self.adam.state[name]
             self._replace(name, self[name][mask], first[mask], second[mask])
         self.columns = {name: column[mask] for name, column in self.columns.items()}
@@ -54,8 +54,9 @@ class Model:
         """Adds splats at the end; their moments start at zero, as in 3DGS."""
         added = len(rows["means"])
         for name, column in self.columns.items():
-            self.columns[name] = torch.cat([column, rows.get(name, column.new_zeros(added))])
-        for name in NAMES:
+            blank = column.new_zeros(added, *column.shape[1:])
+            self.columns[name] = torch.cat([column, rows.get(name, blank)])
+        for name in list(self.adam.tensors):
             first, second = self.adam.state[name]
             blank = torch.zeros_like(rows[name])
             self._replace(
@@ -73,7 +74,8 @@ class Model:
     def forget(self) -> None:
         """Begins anew with what :meth:`remember` adds up."""
         for name in ("gradient_sum", "seen"):
-            self.columns[name] = torch.zeros(len(self))
+            before = self.columns.get(name, torch.zeros(0))
+            self.columns[name] = torch.zeros(len(self), *before.shape[1:])
 
     def remember(self, rendering: Rendering) -> None:
         """After ``backward``: adds up image-plane gradients' norms, and how often each splat was drawn."""
@@ -81,7 +83,7 @@ class Model:
         self.columns["seen"] += rendering.radii > 0
 
     def mean_gradient(self) -> torch.Tensor:
-        """Mean norm (N,) of the image-plane gradient over the views that drew each splat."""
+        """Mean norm of the image-plane gradient over the views that drew each splat; as ``gradient_sum``."""
         return self.columns["gradient_sum"] / self.columns["seen"].clamp_min(1)
 
     def _replace(self, name: str, tensor: torch.Tensor, first: torch.Tensor, second: torch.Tensor) -> None:
@@ -90,7 +92,7 @@ class Model:
     def state_dict(self) -> dict:
         """Tensors and numbers, as ``torch.load(weights_only=True)`` reads them."""
         return {
-            "tensors": {name: self[name].detach() for name in NAMES},
+            "tensors": {name: tensor.detach() for name, tensor in self.adam.tensors.items()},
             "columns": self.columns,
             "adam": self.adam.state_dict(),
         }

@@ -131,11 +131,15 @@ class Method:
         columns, newest = self.model.columns, self.level_at(step)
         if whole and np.random.default_rng([self.seed, step, 4]).random() < self.parameters.full_share:
             return (columns["level"] <= newest).float()
+        wanted = self._wanted(camera).clip(1, newest)
+        return (octree_weights(wanted, columns["level"]) >= 0.5).float()
+
+    def _wanted(self, camera: Camera) -> torch.Tensor:
+        """The level that a view wants at every splat, not rounded."""
         eye = torch.as_tensor(camera.center).float()
         distances = (self.model["means"].detach() - eye).norm(dim=1)
         distances *= self.tree.focal_px / min(camera.fx, camera.fy)
-        wanted = octree_wanted(distances, columns["bias"], self.tree.d_max, self.levels)
-        return (octree_weights(wanted.clip(1, newest), columns["level"]) >= 0.5).float()
+        return octree_wanted(distances, self.model.columns["bias"], self.tree.d_max, self.levels)
 
     def _shrink(self, step: int) -> int:
         """How many times smaller a step's photograph is made: what one as many times farther away sees.
@@ -198,36 +202,58 @@ class Method:
         above that level's threshold.
         """
         p, model, columns = self.parameters, self.model, self.model.columns
-        rng = np.random.default_rng([self.seed, step, 1])
         gradient, level = model.mean_gradient(), columns["level"]
+        gradient = gradient.view(len(model), -1)  # of each of an anchor's Gaussians
         harder = 2**p.grow_harder
-        threshold = p.grad_threshold * self.data.threshold_scale * harder ** (level - 1)
-        target = level.clone()
+        threshold = (p.grad_threshold * self.data.threshold_scale * harder ** (level - 1))[:, None]
+        target = level[:, None].expand_as(gradient)
         if step >= p.coarse_share * p.steps:
-            target += gradient >= threshold * harder
-            columns["bias"] += p.bias_rate * (gradient >= 0.25 * threshold)
+            target = target + (gradient >= threshold * harder)
+            columns["bias"] += p.bias_rate * (gradient >= 0.25 * threshold).any(1)
 
-        source = torch.nonzero((gradient >= threshold) & (target <= self.levels)).squeeze(1)
-        order = torch.argsort(gradient[source], descending=True, stable=True)
-        source = source[order].repeat_interleave(p.candidates)
-        rows = {name: model[name][source] for name in NAMES}
-        rows |= {"level": target[source], "bias": columns["bias"][source]}
-        local = torch.from_numpy(rng.standard_normal((len(source), 3), np.float32))
-        local *= rows["log_scales"].exp()
-        rows["means"] += torch.einsum("nij,nj->ni", rotation_matrices(rows["quats"]), local)
-        size = torch.from_numpy(self.tree.size(rows["level"].numpy())).float().log()[:, None]
-        rows["log_scales"] = torch.minimum(rows["log_scales"] - float(np.log(1.6)), size)
-        free = self._free(rows["means"], rows["level"])[: max(p.max_splats - len(model), 0)]
+        source, which = torch.nonzero((gradient >= threshold) & (target <= self.levels)).unbind(1)
+        order = torch.argsort(gradient[source, which], descending=True, stable=True)
+        source, which = source[order], which[order]
+        rng = np.random.default_rng([self.seed, step, 1])
+        rows = self._children(source, which, target[source, which], rng)
+        room = self._room() - len(model)
+        free = self._free(rows["means"], rows["level"])[: max(room, 0)]
 
-        faint = columns["opacity_sum"] < p.min_opacity * columns["seen"]
-        model.keep(~faint)
+        model.keep(~self._faint())
         model.append({name: row[free] for name, row in rows.items()})
         model.forget()
-        model.columns["opacity_sum"] = torch.zeros(len(model))
+        model.columns["opacity_sum"].zero_()
         if not len(model):
             raise LodgsError(
                 f"No splat is left at step {step + 1}.", "Lower 'min_opacity', or choose another preset."
             )
+
+    def _room(self) -> int:
+        """Most anchors."""
+        return self.parameters.max_splats
+
+    def _faint(self) -> torch.Tensor:
+        """Anchors (N,) whose opacity was too low on average in the views that drew them."""
+        columns = self.model.columns
+        return columns["opacity_sum"] < self.parameters.min_opacity * columns["seen"]
+
+    def _children(
+        self, source: torch.Tensor, which: torch.Tensor, level: torch.Tensor, rng: np.random.Generator
+    ) -> dict[str, torch.Tensor]:
+        """Rows that anchors propose: a splat's likeness at places drawn from itself, smaller than it.
+
+        Args:
+            source, which: (C,) the anchors, and which of their Gaussians has the large gradient.
+            level: (C,) the level to grow in.
+        """
+        source, level = (x.repeat_interleave(self.parameters.candidates) for x in (source, level))
+        rows = {name: self.model[name][source] for name in NAMES}
+        local = torch.from_numpy(rng.standard_normal((len(source), 3), np.float32))
+        local *= rows["log_scales"].exp()
+        rows["means"] += torch.einsum("nij,nj->ni", rotation_matrices(rows["quats"]), local)
+        size = torch.from_numpy(self.tree.size(level.numpy())).float().log()[:, None]
+        rows["log_scales"] = torch.minimum(rows["log_scales"] - float(np.log(1.6)), size)
+        return rows | {"level": level, "bias": self.model.columns["bias"][source]}
 
     def _free(self, means: torch.Tensor, level: torch.Tensor) -> torch.Tensor:
         """Indices, in order, of places worth having that are the first in a voxel without an anchor."""

@@ -14,6 +14,7 @@ PRESETS = {
 METHODS = {
     "flod": "FLoD: independent levels, each limited to a smallest size of detail",
     "octree": "Octree-GS: levels of an octree that add up, faded in one by one as the eye comes nearer",
+    "octree_neural": "Octree-GS, neural: the same with small networks, as in the paper; baked for Blender",
     "3dgs": "Plain 3D Gaussian splatting: one level, for comparison",
 }
 
@@ -131,6 +132,34 @@ class OctreeParameters(Parameters):
     """Weight of the mean of the splats' volumes in the loss, lengths in median depths."""
 
 
+@dataclass(frozen=True)
+class NeuralOctreeParameters(OctreeParameters):
+    """Parameters of Octree-GS with neural anchors. The defaults are the draft's.
+
+    ``max_splats`` is of Gaussians, ``lr_scales`` of the anchors' extents; harmonics are those of baking.
+    """
+
+    offsets: int = 5
+    """Gaussians of an anchor (Octree-GS: 10)."""
+    features: int = 32
+    """Length of an anchor's feature."""
+    appearance: int = 0
+    """Length of each view's appearance, for photographs in changing light; 0: all are alike."""
+    volume_weight: float = 0.01
+    lr_scales: float = 7e-3
+    lr_features: float = 7.5e-3
+    lr_offsets: float = 1e-2
+    """Learning rate of the Gaussians' offsets, which are in units of their anchor's extent."""
+    lr_offsets_final: float = 1e-4
+    lr_network: float = 2e-3
+    """Learning rate of the opacity's network; the covariance's has twice, the colour's four times as much."""
+    lr_network_final: float = 0.01
+    """What is left of the rates of opacity, colour and appearance at the end, as a share."""
+    lr_appearance: float = 5e-2
+    bake_ridge: float = 0.01
+    """How firmly baking holds the higher harmonics to zero."""
+
+
 _DRAFT = FlodParameters()
 _STANDARD = replace(
     _DRAFT,
@@ -180,6 +209,14 @@ _FLOD_PRESETS = {"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER}
 _PRESETS = {
     "flod": _FLOD_PRESETS,
     "3dgs": _FLOD_PRESETS,
+    "octree_neural": {
+        "draft": NeuralOctreeParameters(),
+        "standard": NeuralOctreeParameters(steps=30_000, max_splats=2_000_000, offsets=10, grow_interval=100),
+        "paper": NeuralOctreeParameters(
+            steps=40_000, max_splats=10_000_000, offsets=10, grow_interval=100, coarser_levels=0,
+            grow_until=0.625, grad_threshold=2e-4, far_share=0.0, full_share=0.0,
+        ),
+    },
     "octree": {"draft": _OCTREE, "standard": _OCTREE_STANDARD, "paper": _OCTREE_PAPER},
 }
 

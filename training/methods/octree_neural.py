@@ -1,0 +1,318 @@
+"""Octree-GS (Ren et al. 2024) with neural anchors, as Scaffold-GS has them (Lu et al. 2024, Sec. 3).
+
+An anchor stands in the middle of a voxel. It has a feature, and offsets to its Gaussians; small networks say
+for each view, from the feature and the direction in which the anchor is seen, what opacity, covariance and
+colour the Gaussians have. For Blender and for files they are baked: see :meth:`Method.bake`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import nn
+from torch.nn.functional import normalize
+
+from ..lod.rules import octree_wanted, octree_weights
+from ..lod.selection import BIAS
+from ..rasterize import Adam, Rendering, rasterize
+from ..rasterize import sh as harmonics
+from ..scenes.cameras import Camera
+from ..splats.bundle import Level
+from ..splats.gaussians import Splats
+from . import octree
+from .data import TrainingData
+from .model import SH_C0, Model, neighbour_scale
+from .parameters import NeuralOctreeParameters
+
+HIDDEN = 32
+"""Width of each network's one hidden layer."""
+MARGIN = 1.3
+"""Anchors are decoded that lie within so many times the image's half width and height."""
+
+
+@dataclass
+class Gaussians:
+    """What anchors become for one view; M Gaussians.
+
+    Attributes:
+        anchor, which: (M,) whose Gaussian each is, and which of its offsets.
+        means, quats, scales, opacities, colors: (M, 3), (M, 4), (M, 3), (M,) and (M, 3).
+    """
+
+    anchor: torch.Tensor
+    which: torch.Tensor
+    means: torch.Tensor
+    quats: torch.Tensor
+    scales: torch.Tensor
+    opacities: torch.Tensor
+    colors: torch.Tensor
+
+
+class Networks(nn.Module):
+    """Feature and viewing direction (and for the colour a view's appearance) to n Gaussians' looks."""
+
+    def __init__(self, features: int, offsets: int, appearance: int, views: int) -> None:
+        super().__init__()
+
+        def network(inputs: int, outputs: int) -> nn.Sequential:
+            return nn.Sequential(nn.Linear(inputs, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, outputs))
+
+        self.opacity = network(features + 3, offsets)
+        self.covariance = network(features + 3, 7 * offsets)
+        self.color = network(features + 3 + appearance, 3 * offsets)
+        self.appearance = nn.Parameter(torch.zeros(views, appearance))
+
+
+class Method(octree.Method):
+    """One run with neural anchors; everything but the Gaussians themselves is that of explicit ones.
+
+    Attributes:
+        networks: shared by all anchors.
+    """
+
+    parameters: NeuralOctreeParameters
+
+    def __init__(
+        self, data: TrainingData, parameters: NeuralOctreeParameters, seed: int, backend: str
+    ) -> None:
+        super().__init__(data, parameters, seed, backend)
+        p = parameters
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.networks = Networks(p.features, p.offsets, p.appearance, len(data.train))
+        names = {name: tensor for name, tensor in self.networks.named_parameters() if tensor.numel()}
+        self._networks_adam = Adam(names, dict.fromkeys(names, 0.0))
+
+    # -- what the loop asks of every method ------------------------------------------------------------
+
+    def levels_after(self, step: int) -> list[Level]:
+        if step + 1 not in (self.joins[-1], self.steps):
+            return []
+        splats = self.bake()
+        level = splats.extras["lod_level"]
+        return [Level(number, splats.select(level == number)) for number in range(1, self.levels + 1)]
+
+    def state_dict(self) -> dict:
+        return super().state_dict() | {
+            "networks": self.networks.state_dict(),
+            "networks_adam": self._networks_adam.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        super().load_state_dict(state)
+        self.networks.load_state_dict(state["networks"])
+        self._networks_adam.load_state_dict(state["networks_adam"])
+
+    # -- drawing ---------------------------------------------------------------------------------------
+
+    def decode(self, camera: Camera, anchors: torch.Tensor, view: int | None = None) -> Gaussians:
+        """The Gaussians of some anchors (indices) for a view; only those of positive opacity.
+
+        Args:
+            view: the training view whose appearance is meant; None: their mean.
+        """
+        p, model = self.parameters, self.model
+        places = model["means"][anchors].detach()
+        eye = torch.as_tensor(camera.center).float()
+        seen = torch.cat([model["features"][anchors], normalize(places - eye, dim=1)], 1)
+        opacity = self.networks.opacity(seen).tanh()
+        index, which = torch.nonzero(opacity.detach() > 0).unbind(1)
+
+        looks = self.networks.covariance(seen).view(-1, p.offsets, 7)[index, which]
+        appearance = self.networks.appearance
+        appearance = appearance.mean(0) if view is None else appearance[view]
+        lit = torch.cat([seen, appearance.expand(len(seen), -1)], 1)
+        colors = self.networks.color(lit).sigmoid().view(-1, p.offsets, 3)[index, which]
+        anchor = anchors[index]
+        extents = model["log_scales"][anchor].exp()
+        return Gaussians(
+            anchor=anchor,
+            which=which,
+            means=places[index] + model["offsets"][anchor, which] * extents[:, :3],
+            quats=looks[:, 3:],
+            scales=extents[:, 3:] * looks[:, :3].sigmoid(),
+            opacities=opacity[index, which],
+            colors=colors,
+        )
+
+    def _draw(self, camera: Camera, weights: torch.Tensor, step: int) -> Rendering:
+        view = self.data.training_view(step, self.seed)
+        self._drawn = self.decode(camera, torch.nonzero(weights > 0)[:, 0][self._inside(camera, weights)], view)
+        return self._rasterize(self._drawn, camera, None)
+
+    def picture(self, camera: Camera) -> torch.Tensor:
+        """What the networks show a camera, (H, W, 3), levels fading as the distance asks."""
+        with torch.no_grad():
+            weights = octree_weights(self._wanted(camera), self.model.columns["level"])
+            anchors = torch.nonzero(weights > 0)[:, 0][self._inside(camera, weights)]
+            gaussians = self.decode(camera, anchors)
+            return self._rasterize(gaussians, camera, weights[gaussians.anchor]).image
+
+    def _rasterize(self, g: Gaussians, camera: Camera, weights: torch.Tensor | None) -> Rendering:
+        return rasterize(
+            g.means, g.quats, g.scales.clamp_min(1e-12).log(), g.opacities.clamp(1e-6, 1 - 1e-6).logit(),
+            g.colors, camera, weights=weights, near=self.data.near, backend=self.backend,
+        )  # fmt: skip
+
+    def _inside(self, camera: Camera, weights: torch.Tensor) -> torch.Tensor:
+        """Which of the anchors of weight above 0 lie where their Gaussians may be seen."""
+        pose = torch.as_tensor(camera.world_to_camera).float()
+        x, y, z = (self.model["means"][weights > 0].detach() @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        beside = (u - camera.width / 2).abs() > MARGIN * camera.width / 2
+        return (z > self.data.near) & ~beside & ((v - camera.height / 2).abs() <= MARGIN * camera.height / 2)
+
+    def _regularised(self, loss: torch.Tensor, rendering: Rendering) -> torch.Tensor:
+        scales = self._drawn.scales / self.data.median_depth
+        return loss + self.parameters.volume_weight * scales.prod(1).mean()
+
+    # -- anchors ---------------------------------------------------------------------------------------
+
+    def _first_model(self, points: np.ndarray, colors: np.ndarray, level: np.ndarray) -> Model:
+        p, count = self.parameters, len(points)
+        rows = self._anchors(torch.from_numpy(points).float(), torch.from_numpy(level))
+        scale = np.empty(count)
+        for number in range(1, self.levels + 1):
+            here = level == number
+            if here.any():
+                scale[here] = neighbour_scale(points[level <= number])[here[level <= number]]
+        rows["log_scales"] = torch.from_numpy(np.repeat(np.log(scale)[:, None], 6, 1)).float()
+        zeros = torch.zeros(count)
+        columns = {
+            "level": torch.from_numpy(level).float(), "bias": zeros,
+            "opacity_sum": zeros.clone(), "anchor_seen": zeros.clone(),
+            "gradient_sum": torch.zeros(count, p.offsets), "seen": torch.zeros(count, p.offsets),
+        }  # fmt: skip
+        lr = {"means": 0.0, "features": p.lr_features, "offsets": p.lr_offsets, "log_scales": p.lr_scales}
+        return Model(rows, lr, columns)
+
+    def _anchors(self, places: torch.Tensor, level: torch.Tensor) -> dict[str, torch.Tensor]:
+        """New anchors in the middle of the voxels of places (C, 3), without a feature yet."""
+        p, count = self.parameters, len(places)
+        size = torch.from_numpy(self.tree.size(level.double().numpy()))[:, None]
+        origin = torch.from_numpy(self.tree.origin)
+        means = (((places.double() - origin) / size).floor() + 0.5) * size + origin
+        return {
+            "means": means.float(),
+            "features": torch.zeros(count, p.features),
+            "offsets": torch.zeros(count, p.offsets, 3),
+            "log_scales": size.log().float().expand(-1, 6).clone(),
+        }
+
+    def _remember(self, rendering: Rendering) -> None:
+        columns, drawn = self.model.columns, self._drawn
+        seen = rendering.radii > 0
+        flat = (drawn.anchor * self.parameters.offsets + drawn.which)[seen]
+        columns["gradient_sum"].view(-1)[flat] += rendering.grad2d.norm(dim=1)[seen]
+        columns["seen"].view(-1)[flat] += 1
+        columns["opacity_sum"].index_add_(0, drawn.anchor, drawn.opacities.detach())
+        columns["anchor_seen"][drawn.anchor.unique()] += 1
+
+    def _optimise(self, step: int) -> None:
+        p, share = self.parameters, step / self.steps
+        self.model.adam.lr["offsets"] = p.lr_offsets ** (1 - share) * p.lr_offsets_final**share
+        self.model.adam.step()
+        self.model.adam.zero_grad()
+        rates = {
+            "opacity": p.lr_network * p.lr_network_final**share,
+            "covariance": 2 * p.lr_network,
+            "color": 4 * p.lr_network * p.lr_network_final**share,
+            "appearance": p.lr_appearance * p.lr_network_final**share,
+        }
+        for name in self._networks_adam.tensors:
+            self._networks_adam.lr[name] = rates[name.split(".")[0]]
+        self._networks_adam.step()
+        self._networks_adam.zero_grad()
+
+    def _grow_and_prune(self, step: int) -> None:
+        super()._grow_and_prune(step)
+        self.model.columns["anchor_seen"].zero_()
+
+    def _room(self) -> int:
+        return self.parameters.max_splats // self.parameters.offsets
+
+    def _faint(self) -> torch.Tensor:
+        columns, p = self.model.columns, self.parameters
+        return columns["opacity_sum"] < p.min_opacity * columns["anchor_seen"]
+
+    def _children(
+        self, source: torch.Tensor, which: torch.Tensor, level: torch.Tensor, rng: np.random.Generator
+    ) -> dict[str, torch.Tensor]:
+        """Anchors in the voxels that the Gaussians with the large gradients are in, with their features."""
+        model = self.model
+        extents = model["log_scales"][source, :3].exp()
+        rows = self._anchors(model["means"][source] + model["offsets"][source, which] * extents, level)
+        rows["features"] = model["features"][source].clone()
+        return rows | {"level": level, "bias": model.columns["bias"][source]}
+
+    # -- baking ----------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def bake(self) -> Splats:
+        """The anchors' Gaussians without networks, with the level and bias of their anchors.
+
+        Opacity and covariance are those of the median, by distance, of the training views that draw the
+        anchor; the colour is the spherical harmonics that fit best, in least squares weighted by opacity,
+        what the networks say in all of those views. Gaussians of no opacity in the median view are left out.
+        """
+        p, count = self.parameters, len(self.model)
+        terms = harmonics.coefficients(p.sh_degree)
+        distances = torch.full((len(self.data.train), count), torch.nan)
+        for view, camera in enumerate(self.data.train):
+            drawn = self._drawn_by(camera)
+            eye = torch.as_tensor(camera.center).float()
+            distances[view, drawn] = (self.model["means"][drawn] - eye).norm(dim=1)
+        middle = distances.nanmedian(0).values
+        median_view = (distances - middle).abs().nan_to_num(torch.inf).argmin(0)
+
+        shape = (count, p.offsets)
+        opacities, scales, quats = torch.zeros(shape), torch.ones(*shape, 3), torch.ones(*shape, 4)
+        means = torch.zeros(*shape, 3)
+        products = torch.zeros(*shape, terms, terms)
+        colors = torch.zeros(*shape, terms, 3)
+        for view, camera in enumerate(self.data.train):
+            drawn = torch.nonzero(~distances[view].isnan())[:, 0]
+            g = self.decode(camera, drawn, view)
+            eye = torch.as_tensor(camera.center).float()
+            basis: list = [None] * terms
+            x, y, z = normalize(g.means - eye, dim=1).unbind(1)
+            harmonics.basis(x, y, z, p.sh_degree, basis)
+            values = torch.stack(torch.broadcast_tensors(*[torch.as_tensor(b) for b in basis]), 1)
+            if values.shape[0] != len(x):
+                values = values.expand(len(x), -1)
+            weighted = values * g.opacities[:, None]
+            products[g.anchor, g.which] += weighted[:, :, None] * values[:, None]
+            colors[g.anchor, g.which] += weighted[:, :, None] * (g.colors - 0.5)[:, None]
+            here = median_view[g.anchor] == view
+            at = g.anchor[here], g.which[here]
+            opacities[at], scales[at], quats[at], means[at] = (
+                g.opacities[here], g.scales[here], g.quats[here], g.means[here],
+            )  # fmt: skip
+        kept = opacities > 0
+        anchor = torch.nonzero(kept)[:, 0]
+        products, colors = products[kept], colors[kept]
+        # few directions leave the higher harmonics open: they are held to zero
+        ridge = p.bake_ridge * products[:, 0, 0] / SH_C0**2
+        held = torch.eye(terms)
+        held[0, 0] = 1e-3
+        fitted = torch.linalg.solve(products + ridge[:, None, None] * held, colors)
+        columns = self.model.columns
+        return Splats(
+            means=means[kept].numpy(),
+            quats=quats[kept].numpy(),
+            log_scales=scales[kept].clamp_min(1e-12).log().numpy(),
+            opacity_logits=opacities[kept].clamp(1e-6, 1 - 1e-6).logit().numpy(),
+            sh=fitted.numpy(),
+            extras={
+                "lod_level": columns["level"][anchor].numpy().astype(np.uint8),
+                BIAS: columns["bias"][anchor].numpy(),
+            },
+        )
+
+    def _drawn_by(self, camera: Camera) -> torch.Tensor:
+        """The anchors (indices) that a view draws, with all levels joined."""
+        weights = octree_weights(self._wanted(camera), self.model.columns["level"])
+        weights = torch.where(weights >= 0.5, weights, 0)
+        return torch.nonzero(weights > 0)[:, 0][self._inside(camera, weights)]
