@@ -19,7 +19,7 @@ from ..scenes.cameras import Camera
 from .adam import Adam
 from .features import depths, normals
 from .rendering import OUTPUTS, Contributions, Rendering, Target, View
-from .sh import degree_of
+from .sh import C0, degree_of
 
 __all__ = [
     "BACKENDS", "OUTPUTS", "Adam", "Contributions", "Rendering", "Target",
@@ -60,7 +60,8 @@ def rasterize(
         quats: (N, 4) rotations wxyz, of any length but zero.
         log_scales: (N, 3); the standard deviations are exp(log_scales) + min_scale, in world units.
         opacity_logits: (N,); the opacity is sigmoid(opacity_logits) times the weight.
-        sh: (N, (d+1)², 3) spherical-harmonics coefficients; the colour is 0.5 + Σ c·Y, at least 0.
+        sh: (N, (d+1)², 3) spherical-harmonics coefficients; the colour is 0.5 + Σ c·Y, at least 0. Or (N, 3)
+            colours, the same from everywhere, at least 0 as well.
         camera: the view; any pinhole, any principal point.
         weights: (N,) in [0, 1], or None for ones. A splat of weight 0 is dropped before projection.
         background: colour behind everything.
@@ -79,6 +80,7 @@ def rasterize(
     """
     count = len(means)
     _check(means, quats, log_scales, opacity_logits, weights)
+    sh = _coefficients(sh)
     degree = _degree(sh, count, sh_degree)
     if not set(outputs) <= set(OUTPUTS):
         raise ValueError(f"outputs can be {', '.join(OUTPUTS)}, not {', '.join(outputs)}")
@@ -144,6 +146,7 @@ def render(
     if kind not in ("uint8", "float16", "float32"):
         raise ValueError(f'kind can be "uint8", "float16" or "float32", not "{kind}"')
     _check(means, quats, log_scales, opacity_logits, weights)
+    sh = _coefficients(sh)
     degree = _degree(sh, len(means), sh_degree)
     red, green, blue = (float(value) for value in background)
     for camera in cameras:
@@ -213,10 +216,15 @@ def _check(means, quats, log_scales, opacity_logits, weights) -> None:
             raise ValueError(f"{name} must have shape ({count},), not {tuple(tensor.shape)}")
 
 
+def _coefficients(sh: torch.Tensor) -> torch.Tensor:
+    """Plain colours (N, 3) as the coefficients (N, 1, 3) that give them; coefficients as they are."""
+    return ((sh - 0.5) / C0)[:, None] if sh.ndim == 2 else sh
+
+
 def _degree(sh: torch.Tensor, count: int, wanted: int | None) -> int:
     """The degree to draw with; ValueError unless sh is of ``count`` splats and of that degree at least."""
     if sh.ndim != 3 or sh.shape[0] != count or sh.shape[2] != 3:
-        raise ValueError(f"sh must have shape ({count}, coefficients, 3), not {tuple(sh.shape)}")
+        raise ValueError(f"sh must be ({count}, coefficients, 3) or ({count}, 3), not {tuple(sh.shape)}")
     degree = degree_of(sh.shape[1])
     if wanted is not None and wanted > degree:
         raise ValueError(f"sh has degree {degree}, sh_degree asks for {wanted}")

@@ -63,6 +63,27 @@ def test_one_round_splat_on_the_axis(backend, axis_camera):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+def test_colours_may_be_given_as_they_are(backend, axis_camera):
+    """The picture is alpha times the colour, the gradient by a colour Σ alpha; below 0 there is neither."""
+    *splats, _ = isotropic([2.0], 0.2, [0.8], [[0.0, 0.0, 0.0]])
+    colours = torch.tensor([[0.9, 0.25, -0.1]], requires_grad=True)
+    drawn = rasterize(*splats, colours, axis_camera, backend=backend)
+    alpha = drawn.alpha.detach()
+    assert alpha.max() > 0.7
+    torch.testing.assert_close(drawn.image.detach(), alpha[..., None] * torch.tensor([0.9, 0.25, 0.0]))
+    drawn.image.sum().backward()
+    assert colours.grad is not None
+    total = alpha.sum().item()
+    np.testing.assert_allclose(colours.grad, [[total, total, 0]], rtol=1e-5)
+    (picture,) = render(*splats, colours, [axis_camera], backend=backend)
+    np.testing.assert_array_equal(picture[..., :3], drawn.image.detach())
+    with pytest.raises(ValueError, match=r"sh must be \(1, coefficients, 3\) or \(1, 3\)"):
+        rasterize(*splats, colours[:, :2], axis_camera, backend=backend)
+    with pytest.raises(ValueError, match="asks for 1"):
+        rasterize(*splats, colours, axis_camera, sh_degree=1, backend=backend)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_a_splat_smaller_than_a_pixel_keeps_its_light_when_antialiased(backend, axis_camera):
     """Its opacity times its area: 0.8 · 2 pi sigma² before and after the filter."""
     sigma = 0.004
