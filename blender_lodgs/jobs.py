@@ -387,8 +387,14 @@ def make_job(root: bpy.types.Object, out: Path, parameters: dict) -> Job:
 
 def changes(settings: TrainingSettings) -> dict:
     """The method's parameters that the panel changes from the preset's, by name."""
-    names = ("max_splats",) if settings.method == "3dgs" else ("levels", "footprint", "max_splats")
-    return {name: value for name in names if (value := getattr(settings, name))}
+    return {name: value for name in offered(settings.method) if (value := getattr(settings, name))}
+
+
+def offered(method: str) -> tuple[str, ...]:
+    """The parameters of a method that the panel offers, beside the presets."""
+    return {"3dgs": ("max_splats",), "flod": ("levels", "footprint", "max_splats")}.get(
+        method, ("levels", "max_splats")
+    )
 
 
 def _launch(root: bpy.types.Object, run: RunFolder, job: Job | None) -> Watch:

@@ -60,10 +60,8 @@ class LODGS_PT_training_advanced(bpy.types.Panel):
         layout.use_property_decorate = False
         layout.prop(settings, "seed")
         layout.prop(settings, "test_every")
-        if settings.method != "3dgs":
-            layout.prop(settings, "levels")
-            layout.prop(settings, "footprint")
-        layout.prop(settings, "max_splats")
+        for name in jobs.offered(settings.method):
+            layout.prop(settings, name)
         layout.prop(settings, "model")
         layout.prop(settings, "images")
         layout.prop(settings, "output")
@@ -82,8 +80,10 @@ def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
     column.prop(settings, "preset")
     column.prop(settings, "image_scale")
     try:
-        steps = override(preset(settings.method, settings.preset), jobs.changes(settings)).steps
-        column.label(text=f"{sum(steps):,} steps in {len(steps)} level{'s'[: len(steps) > 1]}")
+        parameters = override(preset(settings.method, settings.preset), jobs.changes(settings))
+        levels = parameters.levels  # 0: the scene decides
+        text = f" in {levels} level{'s'[: levels > 1]}" if levels else ""
+        column.label(text=f"{parameters.total_steps:,} steps{text}")
     except LodgsError as error:
         say(layout, str(error), "ERROR")
         return

@@ -14,13 +14,14 @@ import torch
 from ..errors import LodgsError
 from ..files import atomic_write
 from ..lod.selection import Detail, complete, select
+from ..methods import create
 from ..methods.data import TrainingData
 from ..rasterize import rasterize
 from ..runs.data import training_data
 from ..runs.folder import RunFolder
 from ..runs.job import Job
 from ..scenes.cameras import Camera
-from ..splats.bundle import read_bundle
+from ..splats.bundle import Bundle, read_bundle
 from ..splats.gaussians import Splats
 from .metrics import psnr, ssim
 
@@ -69,21 +70,35 @@ class Evaluation:
         Returns:
             ``splats`` (mean count), ``psnr`` (dB), ``ssim``, ``frame_s`` (median, selection included).
         """
+        counts = []
+
+        def picture(camera: Camera) -> torch.Tensor:
+            splats, weights = shown_to(camera)
+            counts.append(len(splats))
+            return self.draw(splats, camera, weights)
+
+        quality = self.measure_pictures(picture)
+        return {"splats": round(float(np.mean(counts))), **quality}
+
+    def measure_pictures(self, picture: Callable[[Camera], torch.Tensor]) -> dict:
+        """``psnr``, ``ssim`` and ``frame_s`` as :meth:`measure`, of pictures however they are made."""
         rows = []
         for camera in self.cameras:
             started = time.perf_counter()
-            splats, weights = shown_to(camera)
-            image = self.draw(splats, camera, weights)
+            image = picture(camera)
             seconds = time.perf_counter() - started
             target = self.target(camera)
-            rows.append((psnr(image, target), ssim(image, target), len(splats), seconds))
+            rows.append((psnr(image, target), ssim(image, target), seconds))
         table = np.array(rows)
         return {
-            "splats": round(float(table[:, 2].mean())),
             "psnr": round(float(table[:, 0].mean()), 3),
             "ssim": round(float(table[:, 1].mean()), 4),
-            "frame_s": round(float(np.median(table[:, 3])), 4),
+            "frame_s": round(float(np.median(table[:, 2])), 4),
         }
+
+    def measure_by_distance(self, bundle: Bundle, detail: Detail = STANDARD_DETAIL) -> dict:
+        """The same of what each view is shown of a bundle by its distances."""
+        return self.measure(lambda camera: select(bundle, camera.center, min(camera.fx, camera.fy), detail))
 
     def measure_set(self, splats: Splats) -> dict:
         """The same for one set of splats that every view is shown."""
@@ -101,7 +116,8 @@ def evaluate_run(run: Path, detail: Detail = STANDARD_DETAIL, picture: Path | No
     Returns:
         ``levels``: coarse to fine, ``level``, ``s_min``, ``splats``, ``psnr``, ``ssim``, ``frame_s``; where
         levels add up, of each with all coarser ones. ``selective``: per view and predetermined (chosen from
-        the mean training camera), with the detail's settings.
+        the mean training camera), with the detail's settings. ``networks``: of a model that was baked,
+        before that.
 
     Raises:
         LodgsError: if the run is not finished or holds out no views, or such detail cannot be shown.
@@ -133,12 +149,9 @@ def evaluate_run(run: Path, detail: Detail = STANDARD_DETAIL, picture: Path | No
         else:
             shown = {"from": detail.start, "to": detail.end, "gamma": detail.gamma}
 
-        def per_view(camera: Camera) -> tuple[Splats, np.ndarray | None]:
-            return select(bundle, camera.center, min(camera.fx, camera.fy), detail)
-
         predetermined = select(bundle, data.mean_camera, data.focal, detail)
         selective = [
-            {"set": "per view", **shown, **evaluation.measure(per_view)},
+            {"set": "per view", **shown, **evaluation.measure_by_distance(bundle, detail)},
             {"set": "predetermined", **shown, **evaluation.measure(lambda camera: predetermined)},
         ]
     report = {
@@ -148,6 +161,11 @@ def evaluate_run(run: Path, detail: Detail = STANDARD_DETAIL, picture: Path | No
         "levels": levels,
         "selective": selective,
     }
+    if folder.model.exists():
+        method = create(job.method, data, job.resolved_parameters(), job.seed, job.backend)
+        with np.load(folder.model, allow_pickle=False) as arrays:
+            method.load_arrays(arrays)
+        report["networks"] = evaluation.measure_pictures(method.picture)
     if picture is not None:
         from .picture import level_picture
 
@@ -167,6 +185,8 @@ def table(report: dict) -> str:
             rows.append((f"{r['to']}-{r['from']} {r['set']}", f"γ = {r['gamma']:g}", r))
         else:
             rows.append((f"distance {r['set']}", f"{r['offset']:+g}", r))
+    if "networks" in report:
+        rows.append(("with networks", "", {"splats": 0, **report["networks"]}))
     lines += [
         f"{name:<17} {size:>9} {r['splats']:>9,} {r['psnr']:>7.2f} {r['ssim']:>7.4f} {r['frame_s']:>8.3f}"
         for name, size, r in rows

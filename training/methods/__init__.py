@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
+    import numpy as np
     import torch
 
     from ..rasterize import Target
+    from ..scenes.cameras import Camera
     from ..splats.bundle import Level
     from .data import TrainingData
     from .model import Model
@@ -57,6 +60,18 @@ class Method(Protocol):
 
     def meta(self) -> dict:
         """What a bundle records of this run: all that choosing levels by distance needs."""
+        ...
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What levels do not hold of the model, to go on with it or to draw it; empty where they hold all."""
+        ...
+
+    def load_arrays(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Takes the model from what ``arrays`` gave."""
+        ...
+
+    def picture(self, camera: Camera) -> torch.Tensor:
+        """What the model itself shows a camera, (H, W, 3); asked only where ``arrays`` gives some."""
         ...
 
     def state_dict(self) -> dict:

@@ -6,6 +6,7 @@ With one level there is no constraint, and this is plain 3DGS (Kerbl et al. 2023
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Mapping
 from itertools import accumulate
 
 import numpy as np
@@ -15,6 +16,7 @@ from scipy.spatial import KDTree
 from ..errors import LodgsError
 from ..lod.rules import flod_s_min
 from ..rasterize import Target, photometric_loss, rasterize
+from ..scenes.cameras import Camera
 from ..splats.bundle import Level
 from .data import TrainingData
 from .model import (
@@ -112,6 +114,15 @@ class Method:
             "median_depth": data.median_depth,
             "footprint_px": self.s_min[0] * data.focal / data.median_depth,
         }
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {}
+
+    def load_arrays(self, arrays: Mapping[str, np.ndarray]) -> None:
+        raise NotImplementedError("the levels hold all")
+
+    def picture(self, camera: Camera) -> torch.Tensor:
+        raise NotImplementedError("the levels hold all")
 
     def state_dict(self) -> dict:
         return {"model": self.model.state_dict()}

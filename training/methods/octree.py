@@ -7,6 +7,8 @@ rounded while training.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 
@@ -99,6 +101,15 @@ class Method:
             "scene_extent": data.extent,
             "median_depth": data.median_depth,
         }
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {}
+
+    def load_arrays(self, arrays: Mapping[str, np.ndarray]) -> None:
+        raise NotImplementedError("the levels hold all")
+
+    def picture(self, camera: Camera) -> torch.Tensor:
+        raise NotImplementedError("the levels hold all")
 
     def state_dict(self) -> dict:
         return {"model": self.model.state_dict()}

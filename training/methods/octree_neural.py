@@ -7,6 +7,7 @@ colour the Gaussians have. For Blender and for files they are baked: see :meth:`
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,7 @@ import torch
 from torch import nn
 from torch.nn.functional import normalize
 
-from ..lod.rules import octree_wanted, octree_weights
+from ..lod.rules import octree_weights
 from ..lod.selection import BIAS
 from ..rasterize import Adam, Rendering, rasterize
 from ..rasterize import sh as harmonics
@@ -94,6 +95,23 @@ class Method(octree.Method):
         level = splats.extras["lod_level"]
         return [Level(number, splats.select(level == number)) for number in range(1, self.levels + 1)]
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Anchors by name, ``network.<name>`` for the networks' weights."""
+        model = self.model.adam.tensors | {name: self.model.columns[name] for name in ("level", "bias")}
+        networks = {f"network.{name}": tensor for name, tensor in self.networks.state_dict().items()}
+        return {name: tensor.detach().numpy() for name, tensor in (model | networks).items()}
+
+    def load_arrays(self, arrays: Mapping[str, np.ndarray]) -> None:
+        tensors = {name: torch.from_numpy(arrays[name]) for name in self.model.adam.tensors}
+        count, p = len(tensors["means"]), self.parameters
+        columns = {name: torch.from_numpy(arrays[name]) for name in ("level", "bias")}
+        columns |= {name: torch.zeros(count) for name in ("opacity_sum", "anchor_seen")}
+        columns |= {name: torch.zeros(count, p.offsets) for name in ("gradient_sum", "seen")}
+        self.model = Model(tensors, self.model.adam.lr, columns)
+        self.networks.load_state_dict(
+            {name: torch.from_numpy(arrays[f"network.{name}"]) for name in self.networks.state_dict()}
+        )
+
     def state_dict(self) -> dict:
         return super().state_dict() | {
             "networks": self.networks.state_dict(),
@@ -139,15 +157,14 @@ class Method(octree.Method):
 
     def _draw(self, camera: Camera, weights: torch.Tensor, step: int) -> Rendering:
         view = self.data.training_view(step, self.seed)
-        self._drawn = self.decode(camera, torch.nonzero(weights > 0)[:, 0][self._inside(camera, weights)], view)
+        self._drawn = self.decode(camera, self._visible(camera, weights), view)
         return self._rasterize(self._drawn, camera, None)
 
     def picture(self, camera: Camera) -> torch.Tensor:
         """What the networks show a camera, (H, W, 3), levels fading as the distance asks."""
         with torch.no_grad():
             weights = octree_weights(self._wanted(camera), self.model.columns["level"])
-            anchors = torch.nonzero(weights > 0)[:, 0][self._inside(camera, weights)]
-            gaussians = self.decode(camera, anchors)
+            gaussians = self.decode(camera, self._visible(camera, weights))
             return self._rasterize(gaussians, camera, weights[gaussians.anchor]).image
 
     def _rasterize(self, g: Gaussians, camera: Camera, weights: torch.Tensor | None) -> Rendering:
@@ -156,13 +173,14 @@ class Method(octree.Method):
             g.colors, camera, weights=weights, near=self.data.near, backend=self.backend,
         )  # fmt: skip
 
-    def _inside(self, camera: Camera, weights: torch.Tensor) -> torch.Tensor:
-        """Which of the anchors of weight above 0 lie where their Gaussians may be seen."""
+    def _visible(self, camera: Camera, weights: torch.Tensor) -> torch.Tensor:
+        """The anchors (indices) of weight above 0 whose Gaussians may be in the image."""
         pose = torch.as_tensor(camera.world_to_camera).float()
-        x, y, z = (self.model["means"][weights > 0].detach() @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
+        x, y, z = (self.model["means"].detach() @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
         u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
         beside = (u - camera.width / 2).abs() > MARGIN * camera.width / 2
-        return (z > self.data.near) & ~beside & ((v - camera.height / 2).abs() <= MARGIN * camera.height / 2)
+        beyond = (v - camera.height / 2).abs() > MARGIN * camera.height / 2
+        return torch.nonzero((weights > 0) & (z > self.data.near) & ~beside & ~beyond)[:, 0]
 
     def _regularised(self, loss: torch.Tensor, rendering: Rendering) -> torch.Tensor:
         scales = self._drawn.scales / self.data.median_depth
@@ -279,9 +297,7 @@ class Method(octree.Method):
             basis: list = [None] * terms
             x, y, z = normalize(g.means - eye, dim=1).unbind(1)
             harmonics.basis(x, y, z, p.sh_degree, basis)
-            values = torch.stack(torch.broadcast_tensors(*[torch.as_tensor(b) for b in basis]), 1)
-            if values.shape[0] != len(x):
-                values = values.expand(len(x), -1)
+            values = torch.stack(basis, 1)
             weighted = values * g.opacities[:, None]
             products[g.anchor, g.which] += weighted[:, :, None] * values[:, None]
             colors[g.anchor, g.which] += weighted[:, :, None] * (g.colors - 0.5)[:, None]
@@ -314,5 +330,4 @@ class Method(octree.Method):
     def _drawn_by(self, camera: Camera) -> torch.Tensor:
         """The anchors (indices) that a view draws, with all levels joined."""
         weights = octree_weights(self._wanted(camera), self.model.columns["level"])
-        weights = torch.where(weights >= 0.5, weights, 0)
-        return torch.nonzero(weights > 0)[:, 0][self._inside(camera, weights)]
+        return self._visible(camera, (weights >= 0.5).float())

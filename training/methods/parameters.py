@@ -52,6 +52,11 @@ class Parameters:
     lr_sh: float = 2.5e-3
     """Learning rate of the base colour; the other harmonics take a twentieth."""
 
+    @property
+    def total_steps(self) -> int:
+        """Training steps of a whole run."""
+        raise NotImplementedError
+
 
 @dataclass(frozen=True)
 class FlodParameters(Parameters):
@@ -90,6 +95,10 @@ class FlodParameters(Parameters):
     """Steps between two opacity resets; 0 never resets."""
     lr_means_steps: int = 0
     """Steps over which the positions' rate decays; 0 takes each level's own steps."""
+
+    @property
+    def total_steps(self) -> int:
+        return sum(self.steps)
 
 
 @dataclass(frozen=True)
@@ -130,6 +139,10 @@ class OctreeParameters(Parameters):
     """Share of the other steps that draw every level wherever it is, as a view at full detail does."""
     volume_weight: float = 0.0
     """Weight of the mean of the splats' volumes in the loss, lengths in median depths."""
+
+    @property
+    def total_steps(self) -> int:
+        return self.steps
 
 
 @dataclass(frozen=True)
@@ -213,8 +226,15 @@ _PRESETS = {
         "draft": NeuralOctreeParameters(),
         "standard": NeuralOctreeParameters(steps=30_000, max_splats=2_000_000, offsets=10, grow_interval=100),
         "paper": NeuralOctreeParameters(
-            steps=40_000, max_splats=10_000_000, offsets=10, grow_interval=100, coarser_levels=0,
-            grow_until=0.625, grad_threshold=2e-4, far_share=0.0, full_share=0.0,
+            steps=40_000,
+            max_splats=10_000_000,
+            offsets=10,
+            grow_interval=100,
+            coarser_levels=0,
+            grow_until=0.625,
+            grad_threshold=2e-4,
+            far_share=0.0,
+            full_share=0.0,
         ),
     },
     "octree": {"draft": _OCTREE, "standard": _OCTREE_STANDARD, "paper": _OCTREE_PAPER},

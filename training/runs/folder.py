@@ -1,6 +1,7 @@
 """A run's folder and what can be read from it, by anyone, at any time. No torch: Blender polls it.
 
     run/  job.toml  events.jsonl  checkpoints/  levels/level_1.ply ..  bundle.ply  metrics.json
+          model.npz (what a method with networks has beside its levels)
           trainer.log, trainer.out (what a trainer that Blender started printed)  lock  cancel
 
 ``events.jsonl`` holds one JSON object a line, the same lines that the trainer prints. While a trainer runs,
@@ -34,6 +35,7 @@ class RunFolder:
         self.levels_folder = self.path / "levels"
         self.bundle = self.path / "bundle.ply"
         self.metrics = self.path / "metrics.json"
+        self.model = self.path / "model.npz"
         self.log = self.path / "trainer.log"
         self._lock = self.path / "lock"
         self._cancel = self.path / "cancel"

@@ -14,6 +14,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from typing import IO
 
+import numpy as np
 import torch
 
 from .. import VERSION
@@ -150,7 +151,17 @@ class _Run:
             for record in self.levels
         ]
         meta = {**self.method.meta(), "seed": self.job.seed}
-        write_bundle(self.folder.bundle, Bundle(self.job.method, levels, meta, self.method.cumulative))
+        bundle = Bundle(self.job.method, levels, meta, self.method.cumulative)
+        if arrays := self.method.arrays():
+            with atomic_write(self.folder.model) as temporary, open(temporary, "wb") as file:
+                np.savez(file, **arrays)
+            if self.evaluation.cameras:
+                before = self.evaluation.measure_pictures(self.method.picture)["psnr"]
+                after = self.evaluation.measure_by_distance(bundle)["psnr"]
+                meta |= {"neural_psnr": before, "baked_psnr": after}
+                message = f"Held-out views: {before:.2f} dB with networks, {after:.2f} dB baked"
+                self.events("status", message=message)
+        write_bundle(self.folder.bundle, bundle)
 
     def _tell_progress(self, level: int, loss: float, quality: float) -> None:
         of, levels = self.method.steps, self.method.levels

@@ -86,7 +86,7 @@ def test_new_anchors_lie_in_free_voxels_of_their_own_or_the_next_level(data):
 
 
 def test_the_thresholds_rise_from_level_to_level(data):
-    """tau 2^(beta (l - 1)): below that of a level nothing grows, below that of the next it stays (Sec. 4.2)."""
+    """tau 2^(beta (l - 1)), Sec. 4.2: below a level's nothing grows, below the next one's it stays."""
     for factor, expected in ((0.99, None), (1.01, 0), (2.01, 1)):
         octree = make(
             data, steps=400, footprint=6.0, coarse_share=0.0, grow_harder=1.0, min_opacity=0.0, max_splats=999
