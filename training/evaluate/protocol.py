@@ -14,7 +14,7 @@ from ..errors import LodgsError
 from ..files import atomic_write
 from ..lod.rules import band_mask, flod_bands
 from ..methods.data import TrainingData
-from ..rasterize import rasterize
+from ..rasterize import device_of, rasterize
 from ..runs.data import training_data
 from ..runs.folder import RunFolder
 from ..runs.job import Job
@@ -33,7 +33,7 @@ class Evaluation:
     """
 
     def __init__(self, data: TrainingData, backend: str = "auto") -> None:
-        self.data, self.backend = data, backend
+        self.data, self.backend, self.device = data, backend, device_of(backend)
         self.cameras = data.test
         self._targets: dict[str, torch.Tensor] = {}
 
@@ -44,11 +44,12 @@ class Evaluation:
         return self._targets[camera.name]
 
     def draw(self, splats: Splats, camera: Camera) -> torch.Tensor:
-        """A picture of splats on black, (H, W, 3)."""
+        """A picture of splats on black, (H, W, 3), on the CPU."""
         columns = (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh)
         with torch.no_grad():
-            tensors = [torch.from_numpy(np.ascontiguousarray(column, np.float32)) for column in columns]
-            return rasterize(*tensors, camera=camera, near=self.data.near, backend=self.backend).image
+            arrays = (torch.from_numpy(np.ascontiguousarray(column, np.float32)) for column in columns)
+            tensors = [array.to(self.device) for array in arrays]
+            return rasterize(*tensors, camera=camera, near=self.data.near, backend=self.backend).image.cpu()
 
     def measure(self, splats_for: Callable[[Camera], Splats]) -> dict:
         """Mean quality, splats given to the rasterizer and seconds a frame over the held-out views.

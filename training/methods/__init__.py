@@ -8,6 +8,7 @@ def create(name: str, data, parameters, seed: int, backend: str):
         name: a key of ``parameters.METHODS``.
         data: a ``data.TrainingData``.
         parameters: a ``parameters.Parameters``.
+        backend: the rasterizer's; the tensors live where it draws (``rasterize.device_of``).
     """
     from .flod import Flod
 

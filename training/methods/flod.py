@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from ..errors import LodgsError
 from ..lod.rules import flod_s_min
-from ..rasterize import photometric_loss, rasterize
+from ..rasterize import device_of, photometric_loss, rasterize
 from ..splats.bundle import Level
 from .data import TrainingData
 from .model import NAMES, Model, constrained_log, densify, from_points, neighbour_distances
@@ -32,6 +32,7 @@ class Flod:
 
     def __init__(self, data: TrainingData, parameters: Parameters, seed: int, backend: str) -> None:
         self.data, self.parameters, self.seed, self.backend = data, parameters, seed, backend
+        self.device = device_of(backend)
         p = parameters
         s_min_1 = p.s_min_1 or p.footprint * data.median_depth / data.focal
         self.s_min = flod_s_min(s_min_1, p.rho, p.levels)
@@ -119,7 +120,7 @@ class Flod:
     # -- inside ----------------------------------------------------------------------------------------
 
     def _from_points(self, level: int) -> dict[str, torch.Tensor]:
-        tensors = from_points(self._points, self._colors, self.parameters.sh_degree)
+        tensors = from_points(self._points, self._colors, self.parameters.sh_degree, self.device)
         tensors["log_scales"] = constrained_log(tensors["log_scales"].exp(), self.s_min[level - 1])
         return tensors
 
@@ -147,8 +148,8 @@ class Flod:
         return float(p.lr_means ** (1 - share) * p.lr_means_final**share) * self.data.extent
 
     def _forget_gradients(self) -> None:
-        self._gradient_sum = torch.zeros(len(self.model))
-        self._seen = torch.zeros(len(self.model))
+        self._gradient_sum = torch.zeros(len(self.model), device=self.device)
+        self._seen = torch.zeros(len(self.model), device=self.device)
 
     def _remember_gradients(self, rendering) -> None:
         self._gradient_sum += rendering.grad2d.norm(dim=1)
@@ -174,7 +175,7 @@ class Flod:
         if p.prune_interval and local % p.prune_interval == 0:
             self._keep(self.model["opacity_logits"].detach().sigmoid() >= p.min_opacity)
         if p.overlap_interval and local % p.overlap_interval == 0 and level < p.levels:
-            self._keep(_apart(self.model["means"].detach(), self.s_min[level - 1] / 2))
+            self._keep(_apart(self.model["means"].detach().cpu(), self.s_min[level - 1] / 2))
         if p.opacity_reset_interval and local % p.opacity_reset_interval == 0:
             logits = self.model["opacity_logits"].detach()
             self.model.assign("opacity_logits", logits.clamp_max(float(np.log(0.01 / 0.99))))
@@ -185,6 +186,7 @@ class Flod:
             )
 
     def _keep(self, mask: torch.Tensor) -> None:
+        mask = mask.to(self.device)
         self.model.keep(mask)
         self._gradient_sum, self._seen = self._gradient_sum[mask], self._seen[mask]
 
@@ -195,7 +197,7 @@ class Flod:
         tensors["log_scales"] = constrained_log(tensors["log_scales"].exp() + before, after)
         if self.parameters.rejoin_points:
             # What overlap pruning counts as too close is now half of a smaller size.
-            distances, _ = KDTree(tensors["means"].numpy()).query(self._points)
+            distances, _ = KDTree(tensors["means"].cpu().numpy()).query(self._points)
             free = np.flatnonzero(distances >= after / 2)
             room = max(self._budget(level) - len(tensors["means"]), 0)
             if len(free) > room:

@@ -73,7 +73,7 @@ class Model:
 
     def splats(self, min_scale: float = 0.0) -> Splats:
         """A copy as plain arrays, with ``min_scale`` (FLoD, Eq. 4) baked into the scales."""
-        columns = {name: self[name].detach().numpy().copy() for name in NAMES}
+        columns = {name: self[name].detach().cpu().numpy().copy() for name in NAMES}
         if min_scale > 0:
             columns["log_scales"] = np.log(np.exp(columns["log_scales"]) + np.float32(min_scale))
         return Splats(**columns, extras={})
@@ -88,13 +88,16 @@ def neighbour_distances(means: np.ndarray, neighbours: int = 3) -> np.ndarray:
     return distances[:, 1:]
 
 
-def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int) -> dict[str, torch.Tensor]:
+def from_points(
+    points: np.ndarray, colors: np.ndarray, sh_degree: int, device: torch.device | str = "cpu"
+) -> dict[str, torch.Tensor]:
     """Splats from structure-from-motion points, as 3DGS begins: round, nearly transparent, coloured.
 
     Args:
         points: (N, 3) world coordinates, at least two distinct ones.
         colors: (N, 3) uint8, display-coded.
         sh_degree: the degree for which coefficients are made; those above 0 start at zero.
+        device: where the tensors are made.
 
     Returns:
         Tensors by name; scales are the root mean square distance of the three nearest neighbours.
@@ -109,13 +112,14 @@ def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int) -> dict[
     sh[:, 0] = (colors.astype(np.float32) / 255 - 0.5) / SH_C0
     quats = np.zeros((count, 4), np.float32)
     quats[:, 0] = 1
-    return {
+    tensors = {
         "means": torch.tensor(points, dtype=torch.float32),
         "quats": torch.from_numpy(quats),
         "log_scales": torch.from_numpy(np.repeat(np.log(scale)[:, None], 3, 1).astype(np.float32)),
         "opacity_logits": torch.full((count,), float(np.log(0.1 / 0.9))),
         "sh": torch.from_numpy(sh),
     }
+    return {name: tensor.to(device) for name, tensor in tensors.items()}
 
 
 @torch.no_grad()
@@ -154,10 +158,11 @@ def densify(
     clones = {name: model[name][chosen[small]] for name in NAMES}
     parents, scales = chosen[~small], scales[~small]
     children = {name: model[name][parents].repeat((2,) + (1,) * (model[name].dim() - 1)) for name in NAMES}
-    local = torch.from_numpy(rng.standard_normal((2 * len(parents), 3), np.float32)) * scales.repeat(2, 1)
+    local = torch.from_numpy(rng.standard_normal((2 * len(parents), 3), np.float32)).to(scales)
+    local = local * scales.repeat(2, 1)
     children["means"] += torch.einsum("nij,nj->ni", rotation_matrices(children["quats"]), local)
     children["log_scales"] = constrained_log(scales / 1.6, min_scale).repeat(2, 1)
-    alive = torch.ones(len(model), dtype=torch.bool)
+    alive = torch.ones(len(model), dtype=torch.bool, device=parents.device)
     alive[parents] = False
     model.keep(alive)
     model.append({name: torch.cat([clones[name], children[name]]) for name in NAMES})
