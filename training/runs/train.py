@@ -262,7 +262,7 @@ def _in_words(error: BaseException) -> tuple[str, str, int]:
         return error.what, error.remedy, BAD_INPUT
     if isinstance(error, OSError) and error.errno == errno.ENOSPC:
         return "The disk is full; training stopped.", "Free some space and resume the run.", BAD_INPUT
-    if isinstance(error, MemoryError | torch.OutOfMemoryError):
+    if isinstance(error, MemoryError | torch.cuda.OutOfMemoryError):
         return (
             "There is not enough memory.",
             "Lower max_splats or image_scale, or close other programs.",
