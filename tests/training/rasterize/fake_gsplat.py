@@ -117,9 +117,9 @@ class _Pixels(torch.autograd.Function):
 
 def _tiles(offsets, ids, tile):
     """The splats of each tile, front to back, and its pixels' centres."""
-    ends = [*offsets.flatten().tolist()[1:], len(ids)]
-    pixel = torch.arange(tile * tile)
-    for number, (start, end) in enumerate(zip(offsets.flatten().tolist(), ends, strict=True)):
+    starts = offsets.flatten().cpu().tolist()
+    pixel = torch.arange(tile * tile, device=ids.device)
+    for number, (start, end) in enumerate(zip(starts, [*starts[1:], len(ids)], strict=True)):
         row, column = divmod(number, offsets.shape[1])
         assert start <= end
         yield ids[start:end], (column * tile + pixel % tile + 0.5, row * tile + pixel // tile + 0.5)
