@@ -26,6 +26,8 @@ VERSIONS = ((3, 11), (3, 14))
 """Oldest and newest Python that the pinned packages exist for."""
 
 REQUIREMENTS = extension.FOLDER / "requirements" / "trainer.txt"
+CUDA_REQUIREMENTS = extension.FOLDER / "requirements" / "cuda.txt"
+"""What an NVIDIA GPU needs besides: installed where there is one, and nvcc to compile with."""
 _READY = "lodgs-ready.json"
 _REMEDY = "Make an environment in the preferences of LODGS, or choose another Python there."
 
@@ -126,7 +128,7 @@ class Making:
         running: whether it is still at work.
     """
 
-    def __init__(self, base: Path, folder: Path, requirements: Path) -> None:
+    def __init__(self, base: Path, folder: Path, requirements: list[Path]) -> None:
         self.message, self.fraction, self.problem, self.running = "Making the environment", 0.0, "", True
         self._base, self._folder, self._requirements = base, folder, requirements
         self._process: subprocess.Popen[str] | None = None
@@ -152,7 +154,7 @@ class Making:
             self._run([str(self._base), "-m", "venv", str(self._folder)])
             python = str(_python_of(self._folder))
             pip = [python, "-m", "pip", "install", "--disable-pip-version-check", "--no-input"]
-            self._run([*pip, "-r", str(self._requirements)])
+            self._run([*pip, *(f"--requirement={file}" for file in self._requirements)])
             (self._folder / _READY).write_text(json.dumps({"base": str(self._base)}), encoding="utf-8")
             self.message, self.fraction = "The environment is ready", 1.0
         except (LodgsError, OSError) as error:
@@ -229,7 +231,10 @@ def make() -> Making:
         folder.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise LodgsError(f"The folder {folder.parent} cannot be made: {error.strerror}.") from error
-    making, report = Making(find_base(), folder, REQUIREMENTS), None
+    requirements = [REQUIREMENTS]
+    if shutil.which("nvidia-smi") and shutil.which("nvcc"):
+        requirements.append(CUDA_REQUIREMENTS)
+    making, report = Making(find_base(), folder, requirements), None
     return making
 
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import bpy
 
-from ..training.runs.job import BACKENDS
 from . import environment, extension
 
-_LABELS = {"auto": "Fastest There Is", "cpu": "Processor (CPU)", "cuda": "Graphics Card (CUDA)"}
-_BACKENDS = [(name, _LABELS.get(name, name), "") for name in BACKENDS if name != "reference"]
+_BACKENDS = [
+    ("auto", "Automatic", "The NVIDIA graphics card where training works on it, else the processor"),
+    ("cpu", "CPU", "The processor: works on every computer"),
+    ("cuda", "NVIDIA GPU (CUDA)", "The graphics card: needs gsplat in the trainer's Python"),
+]
+"""The trainer's backends but for the reference, which is slow."""
 
 
 class LodgsPreferences(bpy.types.AddonPreferences):
@@ -21,7 +24,7 @@ class LodgsPreferences(bpy.types.AddonPreferences):
     )
     backend: bpy.props.EnumProperty(
         name="Train On",
-        description="What draws the splats while training",
+        description="What draws the splats while training; a run may go on with another one",
         items=_BACKENDS,
     )
 

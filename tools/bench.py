@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import numpy as np
 import torch
 
-from training.rasterize import Adam, Target, cpu, photometric_loss, rasterize, render
+from training.rasterize import Adam, Target, cpu, photometric_loss, rasterize, render, resolve
 from training.rasterize.cpu import adam
 from training.rasterize.cpu.bin import LOG2_ALPHA_MIN
 from training.rasterize.cpu.blend import CAP, T_MIN, row_range
@@ -76,9 +76,9 @@ def synthetic_camera(width: int, height: int) -> Camera:
 class Step:
     """A full training step on the synthetic scene."""
 
-    def __init__(self, count: int, width: int, height: int) -> None:
+    def __init__(self, count: int, width: int, height: int, device: str = "cpu") -> None:
         self.splats: dict[str, Any] = {
-            name: tensor.requires_grad_() for name, tensor in synthetic_splats(count).items()
+            name: tensor.to(device).requires_grad_() for name, tensor in synthetic_splats(count).items()
         }
         self.camera = synthetic_camera(width, height)
         self.target = Target(np.random.default_rng(1).random((height, width, 3), dtype=np.float32))
@@ -284,6 +284,10 @@ def further(seconds: float) -> dict:
             run = [sys.executable, "-c", program]
             said = subprocess.run(run, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
             found[name] = float(said.stdout)
+    if resolve("auto") == "cuda":
+        step = Step(200_000, 960, 540, "cuda")
+        found["cuda_step_ms"] = least(lambda: (step(), torch.cuda.synchronize()), seconds)
+        print(f"training step on the GPU, 200k splats at 960x540: {found['cuda_step_ms']:.1f} ms")
     print(f"forward only, 200k splats at 960x540: {found['forward_ms']:.1f} ms")
     print(f"70 % of the weights zero, against those splats removed: {found['weights_by_removed']:.3f}")
     one = by_threads[1]

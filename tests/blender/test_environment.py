@@ -122,6 +122,22 @@ def test_make_an_environment(bpy, environment, preferences, online, tmp_path, mo
     assert any("torch is missing" in problem for problem in environment.check(python).problems)
 
 
+def test_what_a_gpu_needs_is_installed_where_it_can_be_compiled(
+    bpy, environment, preferences, online, tmp_path, monkeypatch
+):
+    """Seen by what pip says of a file of requirements that cannot be met."""
+    for name in ("REQUIREMENTS", "CUDA_REQUIREMENTS"):
+        (tmp_path / name).write_text("./no-gsplat\n" if "CUDA" in name else "")
+        monkeypatch.setattr(environment, name, tmp_path / name)
+    which, programs = environment.shutil.which, {}
+    monkeypatch.setattr(environment.shutil, "which", lambda name: programs.get(name, which(name)))
+    programs |= {"nvidia-smi": "/nvidia-smi", "nvcc": None}
+    assert bpy.ops.lodgs.make_environment() == {"FINISHED"}
+    programs["nvcc"] = "/nvcc"
+    with pytest.raises(RuntimeError, match="no-gsplat"):
+        bpy.ops.lodgs.make_environment()
+
+
 def test_a_failed_environment_leaves_nothing(bpy, environment, preferences, online, tmp_path, monkeypatch):
     requirements = tmp_path / "requirements.txt"
     requirements.write_text("./no-such-package\n")

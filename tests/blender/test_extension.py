@@ -51,7 +51,8 @@ def test_zip_holds_what_it_needs_and_nothing_else(archive):
         for r in ("blender_lodgs", "training")
         for p in (REPOSITORY / r).rglob("*.py")
     }
-    others = {"__init__.py", "blender_manifest.toml", "LICENSE", "requirements/trainer.txt"}
+    others = {"__init__.py", "blender_manifest.toml", "LICENSE"}
+    others |= {"requirements/trainer.txt", "requirements/cuda.txt"}
     wheels = set(tomllib.loads((REPOSITORY / "blender_manifest.toml").read_text())["wheels"])
     assert {n for n in names if not n.endswith("/")} == code | others | {w.removeprefix("./") for w in wheels}
 

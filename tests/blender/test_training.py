@@ -75,6 +75,19 @@ def test_settings_become_the_job(bpy, lodgs, jobs, fake, root, tmp_path):
     assert job.parameters["footprint"] == 16.0  # 0 in the panel: the preset's
 
 
+@pytest.mark.parametrize("backend", ["auto", "cpu", "cuda"])
+def test_what_trains_is_a_preference(bpy, lodgs, jobs, fake, root, tmp_path, backend):
+    preferences = lodgs("extension").preferences()
+    assert preferences.backend == "auto"
+    fake()
+    try:
+        preferences.backend = backend
+        bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
+    finally:
+        preferences.backend = "auto"
+    assert lodgs("training.runs.job").Job.from_file(tmp_path / "run" / "job.toml").backend == backend
+
+
 @pytest.mark.parametrize(
     ("mode", "state", "says"),
     [

@@ -1,5 +1,6 @@
 """A COLMAP scene small enough to train on in a second."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -71,3 +72,14 @@ def write_tiny_scene(folder: Path, views: int = 9, points: int = 60) -> Path:
 @pytest.fixture(scope="session")
 def tiny_scene(tmp_path_factory) -> Path:
     return write_tiny_scene(tmp_path_factory.mktemp("scene") / "tiny")
+
+
+@pytest.fixture
+def fake_card(monkeypatch):
+    """The cuda backend on the CPU: gsplat's place is taken by ``fake_gsplat``."""
+    from tests.training.rasterize import fake_gsplat
+    from training.rasterize import cuda
+
+    monkeypatch.setitem(sys.modules, "gsplat", fake_gsplat)
+    monkeypatch.setattr(cuda, "DEVICE", "cpu")
+    monkeypatch.setattr(cuda, "problem", lambda: None)

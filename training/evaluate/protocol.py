@@ -16,7 +16,7 @@ from ..files import atomic_write
 from ..lod.selection import Detail, complete, select
 from ..methods import create
 from ..methods.data import TrainingData
-from ..rasterize import rasterize
+from ..rasterize import device_of, rasterize
 from ..runs.data import training_data
 from ..runs.folder import RunFolder
 from ..runs.job import Job
@@ -38,7 +38,7 @@ class Evaluation:
     """
 
     def __init__(self, data: TrainingData, backend: str = "auto") -> None:
-        self.data, self.backend = data, backend
+        self.data, self.backend, self.device = data, backend, device_of(backend)
         self.cameras = data.test
         self._targets: dict[str, torch.Tensor] = {}
 
@@ -49,17 +49,20 @@ class Evaluation:
         return self._targets[camera.name]
 
     def draw(self, splats: Splats, camera: Camera, weights: np.ndarray | None = None) -> torch.Tensor:
-        """A picture of splats on black, (H, W, 3), with a weight on each splat's opacity."""
+        """A picture of splats on black, (H, W, 3), on the CPU, with a weight on each splat's opacity."""
         columns = (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh)
+
+        def tensor(column: np.ndarray) -> torch.Tensor:
+            return torch.from_numpy(np.ascontiguousarray(column, np.float32)).to(self.device)
+
         with torch.no_grad():
-            tensors = [torch.from_numpy(np.ascontiguousarray(column, np.float32)) for column in columns]
             return rasterize(
-                *tensors,
+                *map(tensor, columns),
                 camera=camera,
-                weights=None if weights is None else torch.from_numpy(weights),
+                weights=None if weights is None else tensor(weights),
                 near=self.data.near,
                 backend=self.backend,
-            ).image
+            ).image.cpu()
 
     def measure(self, shown_to: Callable[[Camera], tuple[Splats, np.ndarray | None]]) -> dict:
         """Mean quality, splats given to the rasterizer and seconds a frame over the held-out views.

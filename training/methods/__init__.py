@@ -88,6 +88,7 @@ def create(name: str, data: TrainingData, parameters: Parameters, seed: int, bac
 
     Args:
         name: a key of ``parameters.METHODS``.
+        backend: the rasterizer's; the tensors live where it draws (``rasterize.device_of``).
     """
     module = import_module(f".{MODULES[name]}", __package__)
     return module.Method(data, parameters, seed, backend)

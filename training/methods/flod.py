@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 
 from ..errors import LodgsError
 from ..lod.rules import flod_s_min
-from ..rasterize import Target, photometric_loss, rasterize
+from ..rasterize import Target, device_of, photometric_loss, rasterize
 from ..scenes.cameras import Camera
 from ..splats.bundle import Level
 from .data import TrainingData
@@ -43,6 +43,7 @@ class Method:
 
     def __init__(self, data: TrainingData, parameters: FlodParameters, seed: int, backend: str) -> None:
         self.data, self.parameters, self.seed, self.backend = data, parameters, seed, backend
+        self.device = device_of(backend)
         p = parameters
         s_min_1 = p.s_min_1 or p.footprint * data.median_depth / data.focal
         self.s_min = flod_s_min(s_min_1, p.rho, p.levels)
@@ -133,7 +134,7 @@ class Method:
     # -- inside ----------------------------------------------------------------------------------------
 
     def _from_points(self, level: int) -> dict[str, torch.Tensor]:
-        tensors = from_points(self._points, self._colors, self.parameters.sh_degree)
+        tensors = from_points(self._points, self._colors, self.parameters.sh_degree, self.device)
         tensors["log_scales"] = constrained_log(tensors["log_scales"].exp(), self.s_min[level - 1])
         return tensors
 
@@ -165,7 +166,8 @@ class Method:
         if p.prune_interval and local % p.prune_interval == 0:
             self.model.keep(self.model["opacity_logits"].detach().sigmoid() >= p.min_opacity)
         if p.overlap_interval and local % p.overlap_interval == 0 and level < p.levels:
-            self.model.keep(_apart(self.model["means"].detach(), self.s_min[level - 1] / 2))
+            means = self.model["means"].detach().cpu()
+            self.model.keep(_apart(means, self.s_min[level - 1] / 2))
         if p.opacity_reset_interval and local % p.opacity_reset_interval == 0:
             logits = self.model["opacity_logits"].detach()
             self.model.assign("opacity_logits", logits.clamp_max(float(np.log(0.01 / 0.99))))
@@ -182,7 +184,7 @@ class Method:
         tensors["log_scales"] = constrained_log(tensors["log_scales"].exp() + before, after)
         if self.parameters.rejoin_points:
             # What overlap pruning counts as too close is now half of a smaller size.
-            distances, _ = KDTree(tensors["means"].numpy()).query(self._points)
+            distances, _ = KDTree(tensors["means"].cpu().numpy()).query(self._points)
             free = np.flatnonzero(distances >= after / 2)
             room = max(self._budget(level) - len(tensors["means"]), 0)
             if len(free) > room:

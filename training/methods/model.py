@@ -43,7 +43,8 @@ class Model:
 
     @torch.no_grad()
     def keep(self, mask: torch.Tensor) -> None:
-        """Removes the splats where ``mask`` (N,) is False."""
+        """Removes the splats where ``mask`` (N,), on any device, is False."""
+        mask = mask.to(self["means"].device)
         for name in list(self.adam.tensors):
             first, second = self.adam.state[name]
             self._replace(name, self[name][mask], first[mask], second[mask])
@@ -74,8 +75,8 @@ class Model:
     def forget(self) -> None:
         """Begins anew with what :meth:`remember` adds up."""
         for name in ("gradient_sum", "seen"):
-            before = self.columns.get(name, torch.zeros(0))
-            self.columns[name] = torch.zeros(len(self), *before.shape[1:])
+            shape = self.columns[name].shape[1:] if name in self.columns else ()
+            self.columns[name] = torch.zeros(len(self), *shape, device=self["means"].device)
 
     def remember(self, rendering: Rendering) -> None:
         """After ``backward``: adds up image-plane gradients' norms, and how often each splat was drawn."""
@@ -106,7 +107,7 @@ class Model:
 
     def splats(self, min_scale: float = 0.0) -> Splats:
         """A copy as plain arrays, with ``min_scale`` (FLoD, Eq. 4) baked into the scales."""
-        arrays = {name: self[name].detach().numpy().copy() for name in NAMES}
+        arrays = {name: self[name].detach().cpu().numpy().copy() for name in NAMES}
         if min_scale > 0:
             arrays["log_scales"] = np.log(np.exp(arrays["log_scales"]) + np.float32(min_scale))
         return Splats(**arrays, extras={})
@@ -166,13 +167,16 @@ def neighbour_scale(points: np.ndarray) -> np.ndarray:
     return np.maximum(scale, 1e-7 * max(float(np.ptp(points)), 1e-30))
 
 
-def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int) -> dict[str, torch.Tensor]:
+def from_points(
+    points: np.ndarray, colors: np.ndarray, sh_degree: int, device: torch.device | str = "cpu"
+) -> dict[str, torch.Tensor]:
     """Splats from structure-from-motion points, as 3DGS begins: round, nearly transparent, coloured.
 
     Args:
         points: (N, 3) world coordinates, at least two distinct ones.
         colors: (N, 3) uint8, display-coded.
         sh_degree: the degree for which coefficients are made; those above 0 start at zero.
+        device: where the tensors are made.
 
     Returns:
         Tensors by name; scales are the root mean square distance of the three nearest neighbours.
@@ -183,13 +187,14 @@ def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int) -> dict[
     sh[:, 0] = (colors.astype(np.float32) / 255 - 0.5) / SH_C0
     quats = np.zeros((count, 4), np.float32)
     quats[:, 0] = 1
-    return {
+    tensors = {
         "means": torch.tensor(points, dtype=torch.float32),
         "quats": torch.from_numpy(quats),
         "log_scales": torch.from_numpy(np.repeat(np.log(scale)[:, None], 3, 1).astype(np.float32)),
         "opacity_logits": torch.full((count,), float(np.log(0.1 / 0.9))),
         "sh": torch.from_numpy(sh),
     }
+    return {name: tensor.to(device) for name, tensor in tensors.items()}
 
 
 @torch.no_grad()
@@ -228,10 +233,11 @@ def densify(
     clones = {name: model[name][chosen[small]] for name in NAMES}
     parents, scales = chosen[~small], scales[~small]
     children = {name: model[name][parents].repeat((2,) + (1,) * (model[name].dim() - 1)) for name in NAMES}
-    local = torch.from_numpy(rng.standard_normal((2 * len(parents), 3), np.float32)) * scales.repeat(2, 1)
+    local = torch.from_numpy(rng.standard_normal((2 * len(parents), 3), np.float32)).to(scales)
+    local = local * scales.repeat(2, 1)
     children["means"] += torch.einsum("nij,nj->ni", rotation_matrices(children["quats"]), local)
     children["log_scales"] = constrained_log(scales / 1.6, min_scale).repeat(2, 1)
-    alive = torch.ones(len(model), dtype=torch.bool)
+    alive = torch.ones(len(model), dtype=torch.bool, device=parents.device)
     alive[parents] = False
     model.keep(alive)
     model.append({name: torch.cat([clones[name], children[name]]) for name in NAMES})

@@ -16,7 +16,7 @@ from ..errors import LodgsError
 from ..lod import octree
 from ..lod.rules import octree_wanted, octree_weights
 from ..lod.selection import BIAS
-from ..rasterize import Rendering, Target, photometric_loss, rasterize
+from ..rasterize import Rendering, Target, device_of, photometric_loss, rasterize
 from ..rasterize.features import rotation_matrices
 from ..scenes.cameras import Camera
 from ..splats.bundle import Level
@@ -40,6 +40,7 @@ class Method:
 
     def __init__(self, data: TrainingData, parameters: OctreeParameters, seed: int, backend: str) -> None:
         self.data, self.parameters, self.seed, self.backend = data, parameters, seed, backend
+        self.device = device_of(backend)
         p = parameters
         points, colors = distinct(data.scene.points, data.scene.point_colors)
         self.tree = octree.build(
@@ -86,8 +87,8 @@ class Method:
         """All levels, when the last one has joined and at the end."""
         if step + 1 not in (self.joins[-1], self.steps):
             return []
-        splats, level = self.model.splats(), self.model.columns["level"].numpy()
-        splats.extras = {"lod_level": level.astype(np.uint8), BIAS: self.model.columns["bias"].numpy()}
+        splats, level = self.model.splats(), self.model.columns["level"].cpu().numpy()
+        splats.extras = {"lod_level": level.astype(np.uint8), BIAS: self.model.columns["bias"].cpu().numpy()}
         return [Level(number, splats.select(level == number)) for number in range(1, self.levels + 1)]
 
     def meta(self) -> dict:
@@ -147,8 +148,8 @@ class Method:
 
     def _wanted(self, camera: Camera) -> torch.Tensor:
         """The level that a view wants at every splat, not rounded."""
-        eye = torch.as_tensor(camera.center).float()
-        distances = (self.model["means"].detach() - eye).norm(dim=1)
+        means = self.model["means"].detach()
+        distances = (means - torch.as_tensor(camera.center).to(means)).norm(dim=1)
         distances *= self.tree.focal_px / min(camera.fx, camera.fy)
         return octree_wanted(distances, self.model.columns["bias"], self.tree.d_max, self.levels)
 
@@ -193,6 +194,9 @@ class Method:
                 tensors["log_scales"][here] = torch.from_numpy(np.log(scale)).float()[:, None]
         zeros = torch.zeros(len(points))
         columns = {"level": torch.from_numpy(level).float(), "bias": zeros, "opacity_sum": zeros.clone()}
+        tensors, columns = (
+            {name: tensor.to(self.device) for name, tensor in some.items()} for some in (tensors, columns)
+        )
         return splat_model(tensors, self.parameters, self.data.extent, columns)
 
     def _remember(self, rendering: Rendering) -> None:
@@ -210,7 +214,8 @@ class Method:
         """New anchors in free voxels where gradients are large (Octree-GS, Sec. 4.2); faint ones go.
 
         A splat proposes places drawn from itself, in its own level, or in the next one if its gradient is
-        above that level's threshold.
+        above that level's threshold. What there is room for rises with the steps, so that the first gradients
+        do not take it all.
         """
         p, model, columns = self.parameters, self.model, self.model.columns
         gradient, level = model.mean_gradient(), columns["level"]
@@ -227,7 +232,7 @@ class Method:
         source, which = source[order], which[order]
         rng = np.random.default_rng([self.seed, step, 1])
         rows = self._children(source, which, target[source, which], rng)
-        room = self._room() - len(model)
+        room = int(self._room() * min((step + 1) / (p.grow_until * self.steps), 1.0)) - len(model)
         free = self._free(rows["means"], rows["level"])[: max(room, 0)]
 
         model.keep(~self._faint())
@@ -259,21 +264,22 @@ class Method:
         """
         source, level = (x.repeat_interleave(self.parameters.candidates) for x in (source, level))
         rows = {name: self.model[name][source] for name in NAMES}
-        local = torch.from_numpy(rng.standard_normal((len(source), 3), np.float32))
+        local = torch.from_numpy(rng.standard_normal((len(source), 3), np.float32)).to(self.device)
         local *= rows["log_scales"].exp()
         rows["means"] += torch.einsum("nij,nj->ni", rotation_matrices(rows["quats"]), local)
-        size = torch.from_numpy(self.tree.size(level.numpy())).float().log()[:, None]
-        rows["log_scales"] = torch.minimum(rows["log_scales"] - float(np.log(1.6)), size)
+        size = self.tree.voxel * 2 ** (1 - level[:, None])
+        rows["log_scales"] = torch.minimum(rows["log_scales"] - float(np.log(1.6)), size.log())
         return rows | {"level": level, "bias": self.model.columns["bias"][source]}
 
     def _free(self, means: torch.Tensor, level: torch.Tensor) -> torch.Tensor:
         """Indices, in order, of places worth having that are the first in a voxel without an anchor."""
 
         def keys(means: torch.Tensor, level: torch.Tensor) -> np.ndarray:
-            return self.tree.keys(means.double().numpy(), level.long().numpy())
+            return self.tree.keys(means.double().cpu().numpy(), level.long().cpu().numpy())
 
         proposed = keys(means, level)
         taken = keys(self.model["means"], self.model.columns["level"])
         _, first = np.unique(proposed, return_index=True)
         free = np.sort(first[~np.isin(proposed[first], taken)])
-        return torch.from_numpy(free[self._worth_having(means[free].double().numpy(), level[free].numpy())])
+        free = free[self._worth_having(means[free].double().cpu().numpy(), level[free].cpu().numpy())]
+        return torch.from_numpy(free).to(self.device)

@@ -82,7 +82,7 @@ class Method(octree.Method):
         p = parameters
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            self.networks = Networks(p.features, p.offsets, p.appearance, len(data.train))
+            self.networks = Networks(p.features, p.offsets, p.appearance, len(data.train)).to(self.device)
         names = {name: tensor for name, tensor in self.networks.named_parameters() if tensor.numel()}
         self._networks_adam = Adam(names, dict.fromkeys(names, 0.0))
 
@@ -99,15 +99,15 @@ class Method(octree.Method):
         """Anchors by name, ``network.<name>`` for the networks' weights."""
         model = self.model.adam.tensors | {name: self.model.columns[name] for name in ("level", "bias")}
         networks = {f"network.{name}": tensor for name, tensor in self.networks.state_dict().items()}
-        return {name: tensor.detach().numpy() for name, tensor in (model | networks).items()}
+        return {name: tensor.detach().cpu().numpy() for name, tensor in (model | networks).items()}
 
     def load_arrays(self, arrays: Mapping[str, np.ndarray]) -> None:
-        tensors = {name: torch.from_numpy(arrays[name]) for name in self.model.adam.tensors}
-        count, p = len(tensors["means"]), self.parameters
-        columns = {name: torch.from_numpy(arrays[name]) for name in ("level", "bias")}
-        columns |= {name: torch.zeros(count) for name in ("opacity_sum", "anchor_seen")}
-        columns |= {name: torch.zeros(count, p.offsets) for name in ("gradient_sum", "seen")}
-        self.model = Model(tensors, self.model.adam.lr, columns)
+        def tensors(*names: str) -> dict[str, torch.Tensor]:
+            return {name: torch.from_numpy(arrays[name]).to(self.device) for name in names}
+
+        rows = tensors(*self.model.adam.tensors)
+        columns = self._columns(len(rows["means"])) | tensors("level", "bias")
+        self.model = Model(rows, self.model.adam.lr, columns)
         self.networks.load_state_dict(
             {name: torch.from_numpy(arrays[f"network.{name}"]) for name in self.networks.state_dict()}
         )
@@ -133,7 +133,7 @@ class Method(octree.Method):
         """
         p, model = self.parameters, self.model
         places = model["means"][anchors].detach()
-        eye = torch.as_tensor(camera.center).float()
+        eye = torch.as_tensor(camera.center).to(places)
         seen = torch.cat([model["features"][anchors], normalize(places - eye, dim=1)], 1)
         opacity = self.networks.opacity(seen).tanh()
         index, which = torch.nonzero(opacity.detach() > 0).unbind(1)
@@ -175,8 +175,9 @@ class Method(octree.Method):
 
     def _visible(self, camera: Camera, weights: torch.Tensor) -> torch.Tensor:
         """The anchors (indices) of weight above 0 whose Gaussians may be in the image."""
-        pose = torch.as_tensor(camera.world_to_camera).float()
-        x, y, z = (self.model["means"].detach() @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
+        means = self.model["means"].detach()
+        pose = torch.as_tensor(camera.world_to_camera).to(means)
+        x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
         u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
         beside = (u - camera.width / 2).abs() > MARGIN * camera.width / 2
         beyond = (v - camera.height / 2).abs() > MARGIN * camera.height / 2
@@ -197,25 +198,29 @@ class Method(octree.Method):
             if here.any():
                 scale[here] = neighbour_scale(points[level <= number])[here[level <= number]]
         rows["log_scales"] = torch.from_numpy(np.repeat(np.log(scale)[:, None], 6, 1)).float()
-        zeros = torch.zeros(count)
-        columns = {
-            "level": torch.from_numpy(level).float(), "bias": zeros,
-            "opacity_sum": zeros.clone(), "anchor_seen": zeros.clone(),
-            "gradient_sum": torch.zeros(count, p.offsets), "seen": torch.zeros(count, p.offsets),
-        }  # fmt: skip
+        rows = {name: row.to(self.device) for name, row in rows.items()}
+        columns = self._columns(count)
+        columns["level"] += torch.from_numpy(level).to(self.device)
         lr = {"means": 0.0, "features": p.lr_features, "offsets": p.lr_offsets, "log_scales": p.lr_scales}
         return Model(rows, lr, columns)
+
+    def _columns(self, count: int) -> dict[str, torch.Tensor]:
+        """Zeros for all that is kept of anchors; of each of their Gaussians, how often and how steep."""
+        single, each = (count,), (count, self.parameters.offsets)
+        shapes = dict.fromkeys(("level", "bias", "opacity_sum", "anchor_seen"), single)
+        shapes |= dict.fromkeys(("gradient_sum", "seen"), each)
+        return {name: torch.zeros(shape, device=self.device) for name, shape in shapes.items()}
 
     def _anchors(self, places: torch.Tensor, level: torch.Tensor) -> dict[str, torch.Tensor]:
         """New anchors in the middle of the voxels of places (C, 3), without a feature yet."""
         p, count = self.parameters, len(places)
-        size = torch.from_numpy(self.tree.size(level.double().numpy()))[:, None]
-        origin = torch.from_numpy(self.tree.origin)
+        size = self.tree.voxel * 2 ** (1 - level.double()[:, None])
+        origin = torch.from_numpy(self.tree.origin).to(size)
         means = (((places.double() - origin) / size).floor() + 0.5) * size + origin
         return {
             "means": means.float(),
-            "features": torch.zeros(count, p.features),
-            "offsets": torch.zeros(count, p.offsets, 3),
+            "features": torch.zeros(count, p.features, device=places.device),
+            "offsets": torch.zeros(count, p.offsets, 3, device=places.device),
             "log_scales": size.log().float().expand(-1, 6).clone(),
         }
 
@@ -276,26 +281,26 @@ class Method(octree.Method):
         what the networks say in all of those views. Gaussians of no opacity in the median view are left out.
         """
         p, count = self.parameters, len(self.model)
-        terms = harmonics.coefficients(p.sh_degree)
-        distances = torch.full((len(self.data.train), count), torch.nan)
+        places, columns, terms = self.model["means"], self.model.columns, harmonics.coefficients(p.sh_degree)
+
+        def zeros(*shape: int) -> torch.Tensor:
+            return torch.zeros(count, *shape, device=self.device)
+
+        distances = torch.stack([zeros()] * len(self.data.train)) + torch.nan
         for view, camera in enumerate(self.data.train):
             drawn = self._drawn_by(camera)
-            eye = torch.as_tensor(camera.center).float()
-            distances[view, drawn] = (self.model["means"][drawn] - eye).norm(dim=1)
+            eye = torch.as_tensor(camera.center).to(places)
+            distances[view, drawn] = (places[drawn] - eye).norm(dim=1)
         middle = distances.nanmedian(0).values
         median_view = (distances - middle).abs().nan_to_num(torch.inf).argmin(0)
 
-        shape = (count, p.offsets)
-        opacities, scales, quats = torch.zeros(shape), torch.ones(*shape, 3), torch.ones(*shape, 4)
-        means = torch.zeros(*shape, 3)
-        products = torch.zeros(*shape, terms, terms)
-        colors = torch.zeros(*shape, terms, 3)
+        means, quats, scales = zeros(p.offsets, 3), zeros(p.offsets, 4), zeros(p.offsets, 3)
+        opacities = zeros(p.offsets)
+        products, colors = zeros(p.offsets, terms, terms), zeros(p.offsets, terms, 3)
         for view, camera in enumerate(self.data.train):
-            drawn = torch.nonzero(~distances[view].isnan())[:, 0]
-            g = self.decode(camera, drawn, view)
-            eye = torch.as_tensor(camera.center).float()
+            g = self.decode(camera, torch.nonzero(~distances[view].isnan())[:, 0], view)
+            x, y, z = normalize(g.means - torch.as_tensor(camera.center).to(places), dim=1).unbind(1)
             basis: list = [None] * terms
-            x, y, z = normalize(g.means - eye, dim=1).unbind(1)
             harmonics.basis(x, y, z, p.sh_degree, basis)
             values = torch.stack(basis, 1)
             weighted = values * g.opacities[:, None]
@@ -303,28 +308,24 @@ class Method(octree.Method):
             colors[g.anchor, g.which] += weighted[:, :, None] * (g.colors - 0.5)[:, None]
             here = median_view[g.anchor] == view
             at = g.anchor[here], g.which[here]
-            opacities[at], scales[at], quats[at], means[at] = (
-                g.opacities[here], g.scales[here], g.quats[here], g.means[here],
-            )  # fmt: skip
+            means[at], quats[at], scales[at] = g.means[here], g.quats[here], g.scales[here]
+            opacities[at] = g.opacities[here]
         kept = opacities > 0
-        anchor = torch.nonzero(kept)[:, 0]
         products, colors = products[kept], colors[kept]
         # few directions leave the higher harmonics open: they are held to zero
-        ridge = p.bake_ridge * products[:, 0, 0] / SH_C0**2
-        held = torch.eye(terms)
-        held[0, 0] = 1e-3
-        fitted = torch.linalg.solve(products + ridge[:, None, None] * held, colors)
-        columns = self.model.columns
+        held = torch.full((terms,), p.bake_ridge, device=self.device)
+        held[0] = 1e-3 * p.bake_ridge
+        products += held.diag() * (products[:, :1, :1] / SH_C0**2)
+        fitted = torch.linalg.solve(products, colors)
+        anchor = torch.nonzero(kept)[:, 0]
+        columns = {name: columns[name][anchor].cpu().numpy() for name in ("level", "bias")}
         return Splats(
-            means=means[kept].numpy(),
-            quats=quats[kept].numpy(),
-            log_scales=scales[kept].clamp_min(1e-12).log().numpy(),
-            opacity_logits=opacities[kept].clamp(1e-6, 1 - 1e-6).logit().numpy(),
-            sh=fitted.numpy(),
-            extras={
-                "lod_level": columns["level"][anchor].numpy().astype(np.uint8),
-                BIAS: columns["bias"][anchor].numpy(),
-            },
+            means=means[kept].cpu().numpy(),
+            quats=quats[kept].cpu().numpy(),
+            log_scales=scales[kept].clamp_min(1e-12).log().cpu().numpy(),
+            opacity_logits=opacities[kept].clamp(1e-6, 1 - 1e-6).logit().cpu().numpy(),
+            sh=fitted.cpu().numpy(),
+            extras={"lod_level": columns["level"].astype(np.uint8), BIAS: columns["bias"]},
         )
 
     def _drawn_by(self, camera: Camera) -> torch.Tensor:

@@ -1,8 +1,8 @@
 """Splats to pixels and back: one meaning, several backends.
 
 ``reference`` (plain torch) is the definition, ``cpu`` (Numba, gradients by hand) the fast path on any
-computer. A backend is a module with ``rasterize`` and ``photometric_loss`` of the reference's signatures,
-imported when it is first used.
+computer, ``cuda`` (gsplat) that on NVIDIA graphics cards. A backend is a module with ``rasterize``,
+``contributions`` and ``photometric_loss`` of the reference's signatures, imported when it is first used.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from .sh import C0, degree_of
 
 __all__ = [
     "BACKENDS", "OUTPUTS", "Adam", "Contributions", "Rendering", "Target",
-    "contributions", "photometric_loss", "rasterize", "render", "warm_up",
+    "contributions", "device_of", "photometric_loss", "rasterize", "render", "resolve", "warm_up",
 ]  # fmt: skip
 
-BACKENDS = ("cpu", "reference")
-"""Backends by name, the preferred one first: ``auto`` is the first."""
+BACKENDS = ("cpu", "cuda", "reference")
+"""Backends by name; :func:`resolve` says which one ``auto`` is."""
 
 STRIP = 1 << 21
 """Pixels that :func:`render` draws at a time: a Full HD frame at once, an 8k frame in sixteen strips."""
@@ -72,11 +72,11 @@ def rasterize(
             splat gains in area back in opacity, sqrt(det before / det after) (Mip-Splatting, Yu et al. 2024,
             Eq. 10).
         outputs: of :data:`OUTPUTS`, what :class:`Rendering` shall have besides; differentiable, too.
-        backend: one of :data:`BACKENDS`, or "auto".
+        backend: one of :data:`BACKENDS`, or "auto": cuda for tensors on a GPU, else cpu.
 
     Raises:
         ValueError: for tensors whose shapes do not belong together, or an output that does not exist.
-        LodgsError: for a backend that does not exist.
+        LodgsError: for a backend that does not exist, or does not work on this computer.
     """
     count = len(means)
     _check(means, quats, log_scales, opacity_logits, weights)
@@ -91,7 +91,7 @@ def rasterize(
         features.append(depths(means, view)[:, None])
     if "normals" in outputs:
         features.append(normals(means, quats, log_scales, view))
-    drawn = _backend(backend).rasterize(
+    drawn = _backend(backend, means).rasterize(
         means, quats, log_scales, opacity_logits, sh, weights,
         torch.cat(features, 1) if features else means.new_zeros(count, 0),
         view=view, background=(red, green, blue), degree=degree, min_scale=float(min_scale),
@@ -155,7 +155,7 @@ def render(
         rows = max(strip // camera.width // 16 * 16, 16)
         for top in range(0, camera.height, rows):
             part = replace(whole, cy=whole.cy - top, height=min(rows, camera.height - top))
-            drawn = _backend(backend).rasterize(
+            drawn = _backend(backend, means).rasterize(
                 means, quats, log_scales, opacity_logits, sh, weights, means.new_zeros(len(means), 0),
                 view=part, background=(red, green, blue), degree=degree, min_scale=float(min_scale),
                 antialias=bool(antialias), median=False, absolute=False,
@@ -191,7 +191,7 @@ def contributions(
     largest, total, radius = (torch.zeros(count, **of) for _ in range(3))
     pixels, views = (torch.zeros(count, dtype=torch.int64, device=means.device) for _ in range(2))
     for camera in cameras:
-        found = _backend(backend).contributions(
+        found = _backend(backend, means).contributions(
             means, quats, log_scales, opacity_logits, weights,
             view=View.of(camera, near), min_scale=float(min_scale), antialias=bool(antialias),
         )  # fmt: skip
@@ -249,21 +249,51 @@ def photometric_loss(
     if target.mask is not None:
         truth = target.image.to(image)
         image = truth + target.mask[..., None].to(image) * (image - truth)
-    return _backend(backend).photometric_loss(image, target, float(ssim_weight))
+    return _backend(backend, image).photometric_loss(image, target, float(ssim_weight))
+
+
+def resolve(backend: str) -> str:
+    """The backend that a name means on this computer: ``auto`` is cuda where that works, else cpu.
+
+    Raises:
+        LodgsError: for a backend that does not exist, or does not work on this computer.
+    """
+    from . import cuda
+
+    if backend == "auto":
+        return "cpu" if cuda.problem() else "cuda"
+    if backend not in BACKENDS:
+        raise LodgsError(
+            f'There is no rasterizer backend "{backend}".', f"Choose auto or one of {', '.join(BACKENDS)}."
+        )
+    if backend == "cuda" and (problem := cuda.problem()):
+        raise problem
+    return backend
+
+
+def device_of(backend: str) -> torch.device:
+    """Where the tensors live that a backend draws; LodgsError as :func:`resolve`."""
+    from . import cuda
+
+    return torch.device(cuda.DEVICE if resolve(backend) == "cuda" else "cpu")
 
 
 def warm_up(backend: str = "auto") -> None:
-    """Compile what a training step needs (seconds the first time on a machine, then read from a cache)."""
-    module = _backend(backend)
-    if hasattr(module, "warm_up"):
-        module.warm_up()
+    """Make one step on one splat, so that kernels are compiled: the first time on a computer this takes some
+    seconds on the cpu and some minutes with cuda; later they are read from a cache."""
+    one = {
+        "means": [[0.0, 0.0, 1.0]], "quats": [[1.0, 0.0, 0.0, 0.0]], "log_scales": [[0.0] * 3],
+        "opacity_logits": [0.0], "sh": [[[0.0] * 3]],
+    }  # fmt: skip
+    device = device_of(backend)
+    tensors = {name: torch.tensor(v, device=device, requires_grad=True) for name, v in one.items()}
+    camera = Camera("", 16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
+    drawn = rasterize(*tensors.values(), camera, backend=backend)  # pyright: ignore[reportCallIssue]
+    photometric_loss(drawn.image, Target(torch.zeros(16, 16, 3)), backend=backend).backward()
+    Adam(tensors, dict.fromkeys(tensors, 0.0)).step()
 
 
-def _backend(name: str):
-    if name == "auto":
-        name = BACKENDS[0]
-    if name not in BACKENDS:
-        raise LodgsError(
-            f'There is no rasterizer backend "{name}".', f"Choose auto or one of {', '.join(BACKENDS)}."
-        )
-    return import_module(f".{name}", __package__)
+def _backend(name: str, tensor: torch.Tensor):
+    if name == "auto":  # whoever made the tensors has chosen
+        name = "cuda" if tensor.is_cuda else "cpu"
+    return import_module(f".{resolve(name)}", __package__)

@@ -15,7 +15,7 @@ class Adam:
     """Adam (Kingma and Ba 2015, Algorithm 1) over splat tensors, with moments that densification can index.
 
     Args:
-        tensors: leaf tensors (N, ...) by name, contiguous float32 on the CPU.
+        tensors: leaf tensors (N, ...) by name, contiguous float32, on the CPU or on a GPU.
         lr: learning rate by name: a number, or an array that broadcasts against one row (for ``sh`` of shape
             (N, K, 3) a (K, 1) array gives each coefficient its own). Change it between steps as you like.
         betas, eps: as in the paper; 3DGS uses eps 1e-15.
@@ -66,11 +66,12 @@ class Adam:
             if gradient is None:
                 continue
             self.steps[name] += 1
-            m, v = self.state[name]
-            update(
-                tensor.detach().numpy(), gradient.contiguous().numpy(), m.numpy(), v.numpy(),
-                self.lr[name], self.betas, self.eps, self.steps[name],
-            )  # fmt: skip
+            arrays = tensor.detach(), gradient.contiguous(), *self.state[name]
+            rest = self.lr[name], self.betas, self.eps, self.steps[name]
+            if tensor.device.type == "cpu":
+                update(*(array.numpy() for array in arrays), *rest)
+            else:
+                update_in_torch(*arrays, *rest)
 
     def zero_grad(self) -> None:
         """Forget the gradients, so that the next ``backward`` starts from nothing."""
@@ -92,3 +93,11 @@ class Adam:
         for name, tensor in self.tensors.items():
             self.replace(name, tensor, state["m"][name].clone(), state["v"][name].clone())
         self.steps = dict(state["steps"])
+
+
+def update_in_torch(parameter, gradient, m, v, lr, betas, eps, step) -> None:
+    """One Adam step in place, as ``cpu.adam.update`` makes it, on any device."""
+    m.lerp_(gradient, 1 - betas[0])
+    v.mul_(betas[1]).addcmul_(gradient, gradient, value=1 - betas[1])
+    rate = torch.as_tensor(lr, dtype=torch.float32, device=m.device) / (1 - betas[0] ** step)
+    parameter.sub_(rate * m / (v / (1 - betas[1] ** step)).sqrt_().add_(eps))

@@ -6,12 +6,16 @@ to 6, every splat against every pixel: memory grows with their product, so this 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch.nn.functional import conv2d, normalize
 
 from . import sh as harmonics
 from .features import rotation_matrices
 from .rendering import ALPHA_MAX, ALPHA_MIN, DILATION, MIP_VARIANCE, TRANSMITTANCE_MIN, Drawn, Target, View
+
+Moments = tuple[torch.Tensor, torch.Tensor]
 
 
 def rasterize(
@@ -33,38 +37,12 @@ def rasterize(
 ) -> Drawn:
     """See :func:`training.rasterize.rasterize`."""
     kind = {"dtype": means.dtype, "device": means.device}
-    rotation, translation, eye = (
-        torch.as_tensor(v, **kind) for v in (view.rotation, view.translation, view.eye)
+    seen = ellipses(
+        means, quats, log_scales, opacity_logits, weights, view=view, min_scale=min_scale, antialias=antialias
     )
-    radii = torch.zeros(len(means), dtype=torch.float32, device=means.device)
+    drawn, mean2d, (xx, xy, yy), opacity = seen.drawn, seen.mean2d, seen.covariance, seen.opacity
     grad2d = torch.zeros(len(means), 2, dtype=torch.float32, device=means.device)
     absgrad2d = torch.zeros_like(grad2d) if absolute else None
-
-    opacity = torch.sigmoid(opacity_logits) if weights is None else torch.sigmoid(opacity_logits) * weights
-    with torch.no_grad():
-        depth = means @ rotation[2] + translation[2]
-        drawn = ((depth > view.near) & (opacity > ALPHA_MIN)).nonzero()[:, 0]
-    position = means[drawn] @ rotation.T + translation
-    opacity = opacity[drawn]
-    half_covariance = (
-        rotation @ rotation_matrices(quats[drawn]) * (log_scales[drawn].exp() + min_scale)[:, None]
-    )
-    mean2d, (xx, xy, yy), area = project(
-        position, half_covariance, view, MIP_VARIANCE if antialias else DILATION
-    )
-    if antialias:
-        opacity = opacity * area
-
-    with torch.no_grad():
-        # where alpha falls to its minimum: sigma² = 2 ln(opacity / minimum), along x and along y
-        reach = (2 * torch.log((opacity / ALPHA_MIN).clamp_min(1))).sqrt()
-        half_width, half_height = reach * xx.sqrt(), reach * yy.sqrt()
-        inside = (mean2d[:, 0] + half_width > 0) & (mean2d[:, 0] - half_width < view.width)
-        inside &= opacity > ALPHA_MIN
-        inside &= (mean2d[:, 1] + half_height > 0) & (mean2d[:, 1] - half_height < view.height)
-        longest = (xx + yy) / 2 + (((xx - yy) / 2) ** 2 + xy**2).sqrt()
-        radii[drawn] = torch.where(inside, 3 * longest.sqrt(), 0).float()
-
     to_ndc = torch.tensor([view.width / 2, view.height / 2], **kind)
 
     def keep_gradient(gradient: torch.Tensor) -> None:
@@ -74,11 +52,11 @@ def rasterize(
         mean2d.register_hook(keep_gradient)
 
     values: list = [None] * harmonics.coefficients(degree)
-    x, y, z = normalize(means[drawn] - eye, dim=1).unbind(1)
+    x, y, z = normalize(means[drawn] - torch.as_tensor(view.eye, **kind), dim=1).unbind(1)
     harmonics.basis(x, y, z, degree, values)
     colour = (torch.stack(values, 1)[:, :, None] * sh[drawn, : len(values)]).sum(1).add(0.5).clamp_min(0)
 
-    order = position[:, 2].argsort(stable=True)
+    order = seen.depth.argsort(stable=True)
     offsets = pixel_offsets(mean2d[order], view)
     weight, transmittance = blend(offsets, xx[order], xy[order], yy[order], opacity[order])
     image = torch.einsum("nhw,nc->hwc", weight, colour[order])
@@ -93,8 +71,7 @@ def rasterize(
                 absgrad2d[drawn[order], axis] = (gradient.abs().sum((1, 2)) * to_ndc[axis]).float()
 
             offset.register_hook(keep_absolute)
-    with torch.no_grad():
-        counts = tile_counts(mean2d, xx, xy, yy, opacity, inside, view)
+    counts = tile_counts(seen, view)
     middle = None
     if median:
         left = 1 - weight.detach().cumsum(0)  # the transmittance, as Σ w = 1 - T
@@ -102,11 +79,72 @@ def rasterize(
         splats = torch.cat([drawn[order], drawn.new_tensor([-1])])
         none = past.new_ones(1, view.height, view.width)
         middle = splats[torch.cat([past, none]).argmax(0)].int()
-    return Drawn(image, 1 - transmittance, radii, grad2d, counts, absgrad2d, blended, middle)
+    return Drawn(image, 1 - transmittance, seen.radii, grad2d, counts, absgrad2d, blended, middle)
+
+
+class Ellipses(NamedTuple):
+    """The n splats in front of a camera as ellipses on its image.
+
+    Attributes:
+        drawn: (n,) int64, which splats they are.
+        depth: (n,) along the camera's z axis.
+        mean2d, covariance, determinant: see :func:`project`.
+        opacity: (n,), with weights and the antialiasing's loss in it.
+        inside: (n,) bool, where the ellipse alpha = ALPHA_MIN meets the image.
+        radii: (N,) float32 of all splats, as ``Rendering.radii``.
+    """
+
+    drawn: torch.Tensor
+    depth: torch.Tensor
+    mean2d: torch.Tensor
+    covariance: tuple[torch.Tensor, torch.Tensor, torch.Tensor]
+    determinant: torch.Tensor
+    opacity: torch.Tensor
+    inside: torch.Tensor
+    radii: torch.Tensor
+
+
+def ellipses(means, quats, log_scales, opacity_logits, weights, *, view, min_scale, antialias) -> Ellipses:
+    """Which splats a camera sees, and where: differentiable in all but what is inside."""
+    rotation, translation = (
+        torch.as_tensor(v, dtype=means.dtype, device=means.device) for v in (view.rotation, view.translation)
+    )
+    opacity = torch.sigmoid(opacity_logits) if weights is None else torch.sigmoid(opacity_logits) * weights
+    with torch.no_grad():
+        depth = means @ rotation[2] + translation[2]
+        drawn = ((depth > view.near) & (opacity > ALPHA_MIN)).nonzero()[:, 0]
+    position = means[drawn] @ rotation.T + translation
+    opacity = opacity[drawn]
+    half_covariance = (
+        rotation @ rotation_matrices(quats[drawn]) * (log_scales[drawn].exp() + min_scale)[:, None]
+    )
+    mean2d, covariance, determinant, area = project(
+        position, half_covariance, view, MIP_VARIANCE if antialias else DILATION
+    )
+    if antialias:
+        opacity = opacity * area
+    with torch.no_grad():
+        xx, xy, yy = covariance
+        # where alpha falls to its minimum: sigma² = 2 ln(opacity / minimum), along x and along y
+        reach = squared_reach(opacity).sqrt()
+        half_width, half_height = reach * xx.sqrt(), reach * yy.sqrt()
+        inside = (mean2d[:, 0] + half_width > 0) & (mean2d[:, 0] - half_width < view.width)
+        inside &= opacity > ALPHA_MIN
+        inside &= (mean2d[:, 1] + half_height > 0) & (mean2d[:, 1] - half_height < view.height)
+        longest = (xx + yy) / 2 + (((xx - yy) / 2) ** 2 + xy**2).sqrt()
+        radii = torch.zeros(len(means), dtype=torch.float32, device=means.device)
+        radii[drawn] = torch.where(inside, 3 * longest.sqrt(), 0).float()
+    return Ellipses(drawn, position[:, 2], mean2d, covariance, determinant, opacity, inside, radii)
+
+
+def squared_reach(opacity: torch.Tensor) -> torch.Tensor:
+    """dᵀ cov⁻¹ d where alpha is at its minimum."""
+    return 2 * torch.log((opacity / ALPHA_MIN).clamp_min(1))
 
 
 def project(position: torch.Tensor, half_covariance: torch.Tensor, view: View, dilation: float):
-    """Means (N, 2) in pixels, dilated covariances' xx, xy, yy, and sqrt(det before / det after), each (N,).
+    """Means (N, 2) in pixels, dilated covariances' xx, xy, yy, their determinant, and sqrt(det before / det
+    after), each (N,).
 
     Args:
         position: (N, 3) in camera coordinates.
@@ -121,9 +159,10 @@ def project(position: torch.Tensor, half_covariance: torch.Tensor, view: View, d
     row_y = (view.fy / z)[:, None] * half_covariance[:, 1]
     row_y = row_y - (view.fy * clamped_y / z**2)[:, None] * half_covariance[:, 2]
     mean2d = torch.stack([view.fx * x / z + view.cx, view.fy * y / z + view.cy], 1)
-    xx, xy, yy = (row_x**2).sum(1) + dilation, (row_x * row_y).sum(1), (row_y**2).sum(1) + dilation
-    area = torch.linalg.cross(row_x, row_y).norm(dim=1) / (xx * yy - xy**2).sqrt()
-    return mean2d, (xx, xy, yy), area
+    xx, xy, yy = (row_x**2).sum(1), (row_x * row_y).sum(1), (row_y**2).sum(1)
+    before = torch.linalg.cross(row_x, row_y).norm(dim=1)  # xx yy - xy² would cancel in float32
+    determinant = before**2 + dilation * (xx + yy) + dilation**2
+    return mean2d, (xx + dilation, xy, yy + dilation), determinant, before / determinant.sqrt()
 
 
 def pixel_offsets(mean2d: torch.Tensor, view: View) -> tuple[torch.Tensor, torch.Tensor]:
@@ -136,19 +175,30 @@ def pixel_offsets(mean2d: torch.Tensor, view: View) -> tuple[torch.Tensor, torch
     return dx.expand(-1, view.height, -1), dy.expand(-1, -1, view.width)
 
 
-def tile_counts(mean2d, xx, xy, yy, opacity, inside, view: View) -> torch.Tensor:
+@torch.no_grad()
+def tile_counts(seen: Ellipses, view: View) -> torch.Tensor:
     """How many ellipses alpha = ALPHA_MIN meet the rectangle of the pixel centres of each 16x16 tile."""
-    kind = {"dtype": mean2d.dtype, "device": mean2d.device}
-    left = torch.arange(0, view.width, 16, **kind) + 0.5
-    top = torch.arange(0, view.height, 16, **kind) + 0.5
-    x0, y0 = left - mean2d[:, :1], top - mean2d[:, 1:]
+    mean2d, (xx, xy, yy) = seen.mean2d[:, :, None, None], (v[:, None, None] for v in seen.covariance)
+    left = 16 * torch.arange(-(-view.width // 16), device=xx.device)
+    top = 16 * torch.arange(-(-view.height // 16), device=xx.device)[:, None]
+    conic = yy, -xy, xx
+    offset = left + 0.5 - mean2d[:, 0], top + 0.5 - mean2d[:, 1]
+    determinant, reach = seen.determinant[:, None, None], squared_reach(seen.opacity)[:, None, None]
+    return (meets_tile(offset, conic, determinant, reach) & seen.inside[:, None, None]).sum(0)
+
+
+def meets_tile(offset, conic, determinant, reach) -> torch.Tensor:
+    """Whether ellipses meet the rectangle of a tile's pixel centres; all arguments broadcast.
+
+    Args:
+        offset: x and y from the ellipse's middle to the tile's first pixel centre.
+        conic, determinant, reach: the ellipse is a x² + 2 b x y + c y² = reach · determinant.
+    """
+    (x0, y0), (a, b, c) = offset, conic
     x1, y1 = x0 + 15, y0 + 15
-    area = (xx * yy - xy**2)[:, None, None]
-    a, b, c = (entry[:, None, None] / area for entry in (yy, -xy, xx))
-    x0, x1, y0, y1 = x0[:, None, :], x1[:, None, :], y0[:, :, None], y1[:, :, None]
 
     def distance(x, y):
-        return a * x * x + 2 * b * x * y + c * y * y
+        return (a * x * x + 2 * b * x * y + c * y * y) / determinant
 
     # the form is convex: its least value on the rectangle is at the mean or on an edge
     least = torch.where((x0 <= 0) & (x1 >= 0) & (y0 <= 0) & (y1 >= 0), 0.0, torch.inf)
@@ -156,8 +206,7 @@ def tile_counts(mean2d, xx, xy, yy, opacity, inside, view: View) -> torch.Tensor
         least = torch.minimum(least, distance(x, torch.maximum(torch.minimum(-b * x / c, y1), y0)))
     for y in (y0, y1):
         least = torch.minimum(least, distance(torch.maximum(torch.minimum(-b * y / a, x1), x0), y))
-    reach = 2 * torch.log((opacity / ALPHA_MIN).clamp_min(1))  # where alpha is at its minimum
-    return ((least <= reach[:, None, None]) & inside[:, None, None]).sum(0)
+    return least <= reach
 
 
 def contributions(means, quats, log_scales, opacity_logits, weights, *, view, min_scale, antialias):
@@ -191,25 +240,40 @@ def blend(offsets, xx, xy, yy, opacity) -> tuple[torch.Tensor, torch.Tensor]:
 def photometric_loss(image: torch.Tensor, target: Target, ssim_weight: float) -> torch.Tensor:
     """See :func:`training.rasterize.photometric_loss`."""
     truth = target.image.to(image)
-    return (1 - ssim_weight) * (image - truth).abs().mean() + ssim_weight * (1 - ssim(image, truth))
+    return loss_to(image, truth, moments(truth), ssim_weight)
 
 
-def ssim(image: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+def loss_to(image: torch.Tensor, truth: torch.Tensor, of_truth: Moments, ssim_weight: float) -> torch.Tensor:
+    """The loss against a photograph (H, W, 3) whose moments are known."""
+    difference = (image - truth).abs().mean()
+    return (1 - ssim_weight) * difference + ssim_weight * (1 - ssim(image, truth, of_truth))
+
+
+def ssim(image: torch.Tensor, truth: torch.Tensor, of_truth: Moments) -> torch.Tensor:
     """Mean structural similarity of two images (H, W, 3) in [0, 1] (Wang et al. 2004), as 3DGS has it:
     11x11 Gaussian window of sigma 1.5, zeros outside the image."""
-    offsets = torch.arange(11, dtype=image.dtype, device=image.device) - 5
-    line = torch.exp(-(offsets**2) / (2 * 1.5**2))
-    line = line / line.sum()
-    window = (line[:, None] * line[None, :])[None, None]
-
-    def local_mean(planes: torch.Tensor) -> torch.Tensor:
-        return conv2d(planes[:, None], window, padding=5)[:, 0]
-
     x, y = image.permute(2, 0, 1), truth.permute(2, 0, 1)
-    mean_x, mean_y = local_mean(x), local_mean(y)
-    variance_x = local_mean(x * x) - mean_x**2
-    variance_y = local_mean(y * y) - mean_y**2
-    covariance = local_mean(x * y) - mean_x * mean_y
+    mean_x, square_x, product = windowed(torch.cat([x, x * x, x * y])).split(3)
+    mean_y, variance_y = of_truth
+    variance_x = square_x - mean_x**2
+    covariance = product - mean_x * mean_y
     c1, c2 = 0.01**2, 0.03**2
     similarity = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
     return (similarity / ((mean_x**2 + mean_y**2 + c1) * (variance_x + variance_y + c2))).mean()
+
+
+def moments(image: torch.Tensor) -> Moments:
+    """Local means and variances (3, H, W) of an image (H, W, 3)."""
+    planes = image.permute(2, 0, 1)
+    mean, square = windowed(torch.cat([planes, planes * planes])).split(3)
+    return mean, square - mean**2
+
+
+def windowed(planes: torch.Tensor) -> torch.Tensor:
+    """Local means of planes (C, H, W)."""
+    offsets = torch.arange(11, dtype=planes.dtype, device=planes.device) - 5
+    line = torch.exp(-(offsets**2) / (2 * 1.5**2))
+    line = (line / line.sum()).expand(len(planes), 1, 1, 11)
+    # every plane a channel of its own: such convolutions keep float32's digits on GPUs, others may not (TF32)
+    along_x = conv2d(planes[None], line, padding=(0, 5), groups=len(planes))
+    return conv2d(along_x, line.mT, padding=(5, 0), groups=len(planes))[0]

@@ -13,7 +13,7 @@ from ..methods.parameters import METHODS, PRESETS, Parameters, override, preset
 
 __all__ = ["BACKENDS", "METHODS", "PRESETS", "Job"]
 
-BACKENDS = ("auto", "cpu", "reference")
+BACKENDS = ("auto", "cpu", "cuda", "reference")
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,9 @@ class Job:
         scene: folder of the COLMAP scene.
         out: the run's folder; made if it does not exist.
         method, preset: names from METHODS and PRESETS.
-        seed: makes two runs of one job equal to the bit on one machine.
-        backend: rasterizer, one of BACKENDS.
+        seed: makes two runs of one job equal to the bit on one machine, but not with the cuda backend.
+        backend: rasterizer, one of BACKENDS; auto is cuda where that works, else cpu. A run may go on with
+            another one.
         image_scale: training image size over the photograph's, 0 < s <= 1.
         test_every: every n-th view by name is held out to measure quality; 0 trains on all.
         exposure: stops added to linear (EXR) images before they are trained on.

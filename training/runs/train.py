@@ -25,7 +25,7 @@ from ..files import atomic_write
 from ..lod.selection import complete
 from ..methods import create
 from ..methods.data import TrainingData
-from ..rasterize import warm_up
+from ..rasterize import cuda, device_of, resolve, warm_up
 from ..splats.bundle import Bundle, Level, write_bundle
 from ..splats.ply import read_ply, write_ply
 from .data import training_data
@@ -86,11 +86,13 @@ def _train(job: Job, folder: RunFolder, events: Events) -> int:
     )  # fmt: skip
     events("status", message="Reading the scene")
     data = training_data(job, folder, events)
-    events("status", message="Preparing the kernels (up to two minutes the first time on a computer)")
+    events("status", message="Preparing the kernels (some minutes the first time on a computer)")
     torch.set_num_threads(1)  # torch's thread pool beside the kernels' slows both
     _keep_freed_memory()
-    warm_up(job.backend)
-    run = _Run(job, folder, events, data)
+    backend = resolve(job.backend)
+    warm_up(backend)
+    _tell_backend(backend, events)
+    run = _Run(job, backend, folder, events, data)
     with _stop_signals() as stopped:
         if not run.to_the_end(stopped):
             return CANCELLED
@@ -107,10 +109,11 @@ class _Run:
         levels: a record of each finished level, coarse to fine.
     """
 
-    def __init__(self, job: Job, folder: RunFolder, events: Events, data: TrainingData) -> None:
+    def __init__(self, job: Job, backend: str, folder: RunFolder, events: Events, data: TrainingData) -> None:
         self.job, self.folder, self.events, self.data = job, folder, events, data
-        self.evaluation = Evaluation(data, job.backend)
-        self.method = create(job.method, data, job.resolved_parameters(), job.seed, job.backend)
+        self.evaluation = Evaluation(data, backend)
+        self.method = create(job.method, data, job.resolved_parameters(), job.seed, backend)
+        self._device = device_of(backend)
         self.step = 0
         self.levels: list[dict] = []
         self._resume()
@@ -136,7 +139,7 @@ class _Run:
             levels = method.levels_after(self.step)
             self.step += 1
             if time.monotonic() - last_progress >= PROGRESS_SECONDS or self.step == method.steps:
-                self._tell_progress(level, loss, psnr(image, target.image))
+                self._tell_progress(level, loss, psnr(image.cpu(), target.image.cpu()))
                 last_progress = time.monotonic()
             self._write_levels(levels)
             if levels or time.monotonic() - last_checkpoint >= CHECKPOINT_SECONDS:
@@ -207,7 +210,7 @@ class _Run:
         """Takes up the newest checkpoint that can be read; without one the run begins."""
         for path in sorted(self.folder.checkpoints.glob("step_*.pt"), reverse=True):
             try:
-                state = torch.load(path, weights_only=True)
+                state = torch.load(path, map_location=self._device, weights_only=True)
                 self.method.load_state_dict(state["method"])
             except Exception as error:
                 print(f"passing over the checkpoint {path}: {error}", file=sys.stderr)
@@ -218,17 +221,26 @@ class _Run:
 
 
 def _keep_job(job: Job, folder: RunFolder) -> None:
-    """Writes the job into the run; a run folder keeps to the job that it began with."""
+    """Writes the job into the run; a run folder keeps to the job that it began with, but for the backend."""
     if folder.job.exists():
-        before = Job.from_file(folder.job)
-        if asdict(before) != asdict(job):
-            changed = [key for key, value in asdict(job).items() if asdict(before)[key] != value]
+        before = asdict(Job.from_file(folder.job))
+        changed = [key for key, value in asdict(job).items() if key != "backend" and before[key] != value]
+        if changed:
             raise LodgsError(
                 f"The run folder {folder.path} belongs to another job (different: {', '.join(changed)}).",
                 "Choose another run folder, or start the run's own job.toml to resume it.",
             )
-    else:
-        job.write(folder.job)
+        if before["backend"] == job.backend:
+            return
+    job.write(folder.job)
+
+
+def _tell_backend(backend: str, events: Events) -> None:
+    """Which rasterizer trains; and why it is not a GPU's, where there is a GPU that could."""
+    names = {"cpu": "the CPU", "cuda": "the NVIDIA GPU", "reference": "the CPU, by the slow reference"}
+    if backend == "cpu" and torch.cuda.is_available() and (problem := cuda.problem()):
+        events("warning", message=f"The NVIDIA GPU is not used. {problem}")
+    events("status", message=f"Training on {names[backend]}", backend=backend)
 
 
 def _keep_freed_memory() -> None:
@@ -267,7 +279,7 @@ def _in_words(error: BaseException) -> tuple[str, str, int]:
         return error.what, error.remedy, BAD_INPUT
     if isinstance(error, OSError) and error.errno == errno.ENOSPC:
         return "The disk is full; training stopped.", "Free some space and resume the run.", BAD_INPUT
-    if isinstance(error, MemoryError):
+    if isinstance(error, MemoryError | torch.cuda.OutOfMemoryError):
         return (
             "There is not enough memory.",
             "Lower max_splats or image_scale, or close other programs.",

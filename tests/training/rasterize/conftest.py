@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from training.rasterize import BACKENDS
 from training.scenes.cameras import Camera
 
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
@@ -28,6 +29,14 @@ def random_splats(count: int, seed: int = 0, coefficients: int = 16) -> dict[str
 @pytest.fixture
 def make_splats():
     return random_splats
+
+
+@pytest.fixture(params=BACKENDS)
+def backend(request) -> str:
+    """Every backend by name; cuda on the CPU, as ``fake_card`` has it."""
+    if request.param == "cuda":
+        request.getfixturevalue("fake_card")
+    return request.param
 
 
 @pytest.fixture

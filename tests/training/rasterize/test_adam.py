@@ -6,6 +6,8 @@ import pytest
 import torch
 
 from training.rasterize import Adam
+from training.rasterize.adam import update_in_torch
+from training.rasterize.cpu.adam import update
 
 
 def gradients(step, shape):
@@ -28,6 +30,24 @@ def test_it_steps_as_torchs_adam_does():
         theirs[0].grad, theirs[1].grad = gradient[:, :1].double(), gradient[:, 1:].double()
         expected.step()
     torch.testing.assert_close(ours.double(), torch.cat(theirs, 1).detach(), atol=2e-6, rtol=2e-6)
+
+
+@pytest.mark.parametrize("lr", [1e-2, torch.tensor([[1e-2], [1e-3], [1e-3], [2e-3]])])
+def test_plain_torch_steps_as_the_kernel_and_as_the_formula_do(lr):
+    """What GPUs run, on the CPU: against the kernel, and against Algorithm 1 in float64."""
+    start = torch.randn(300, 4, 3, generator=torch.Generator().manual_seed(99))
+    ours, kernels = ([start.clone(), torch.zeros_like(start), torch.zeros_like(start)] for _ in range(2))
+    exact, m, v = start.double(), torch.zeros(()).double(), torch.zeros(()).double()
+    for step in range(1, 31):
+        gradient = gradients(step, start.shape) * (step % 3)
+        update_in_torch(ours[0], gradient, *ours[1:], lr, (0.9, 0.999), 1e-15, step)
+        arrays = [array.numpy() for array in (kernels[0], gradient, *kernels[1:])]
+        update(*arrays, lr, (0.9, 0.999), 1e-15, step)
+        m, v = 0.9 * m + 0.1 * gradient.double(), 0.999 * v + 0.001 * gradient.double() ** 2
+        exact -= lr * (m / (1 - 0.9**step)) / ((v / (1 - 0.999**step)).sqrt() + 1e-15)
+    for one, other in zip(ours, kernels, strict=True):
+        torch.testing.assert_close(one, other, atol=2e-6, rtol=2e-5)
+    torch.testing.assert_close(ours[0].double(), exact, atol=2e-6, rtol=2e-5)
 
 
 def test_a_resumed_run_goes_on_to_the_same_bits():

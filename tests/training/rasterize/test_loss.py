@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.ndimage import correlate1d
 
-from training.rasterize import BACKENDS, Target, photometric_loss
+from training.rasterize import Target, photometric_loss
 
 
 def scipy_loss(image, truth, ssim_weight):
@@ -24,7 +24,6 @@ def scipy_loss(image, truth, ssim_weight):
     return (1 - ssim_weight) * np.abs(image - truth).mean() + ssim_weight * (1 - ssim.mean())
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("size", [(50, 75), (16, 64), (3, 5), (1, 130)])
 def test_the_loss_is_scipys(backend, size):
     random = np.random.default_rng(0)
@@ -49,7 +48,6 @@ def test_the_fused_gradient_is_autograds(size):
     assert (gradients[0] - gradients[1]).norm() <= 1e-4 * gradients[1].norm()
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_what_is_masked_out_costs_nothing(backend):
     """As if the photograph showed there what was drawn, and half of a difference where the mask is a half."""
     random = torch.Generator().manual_seed(0)
@@ -69,7 +67,6 @@ def test_what_is_masked_out_costs_nothing(backend):
         Target(truth, mask[:5])
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_equal_images_have_no_loss(backend):
     image = torch.rand(20, 30, 3, requires_grad=True)
     loss = photometric_loss(image, Target(image.detach().clone()), backend=backend)

@@ -29,6 +29,10 @@ def run_in_process(keys: dict) -> tuple[int, list[dict]]:
     return code, RunFolder(keys["out"]).events()[0]
 
 
+def method_of(keys: dict) -> type:
+    return import_module(f"training.methods.{MODULES[keys['method']]}").Method
+
+
 def command(path: Path, keys: dict) -> list[str]:
     path.write_text(json.dumps(keys))
     return [sys.executable, "-m", "training", "train", str(path)]
@@ -130,7 +134,7 @@ def test_a_killed_run_resumes_to_the_same_bits(unbroken, tmp_path, step):
 def test_cancel_by_file_saves_and_resume_gives_the_same_bits(unbroken, tmp_path, monkeypatch, at):
     keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
     folder = RunFolder(keys["out"])
-    method = import_module(f"training.methods.{MODULES[keys['method']]}").Method
+    method = method_of(keys)
     real = method.train_step
 
     def ask_to_stop(self, step):
@@ -147,11 +151,59 @@ def test_cancel_by_file_saves_and_resume_gives_the_same_bits(unbroken, tmp_path,
     assert folder.bundle.read_bytes() == unbroken["bundle"]
 
 
+def test_a_run_begun_on_one_backend_goes_on_with_another(unbroken, tmp_path, monkeypatch, fake_card):
+    """With the cuda backend on the CPU, to the middle of level 2; then with the cpu backend to the end."""
+    keys = {**unbroken["keys"], "out": str(tmp_path / "run"), "backend": "cuda"}
+    keys["parameters"] = {**keys["parameters"], "steps": [6, 6, 6] if keys["method"] == "flod" else 18}
+    folder, method = RunFolder(keys["out"]), method_of(keys)
+    real = method.train_step
+
+    def ask_to_stop(self, step):
+        if step == 8:
+            folder.request_cancel()
+        return real(self, step)
+
+    monkeypatch.setattr(method, "train_step", ask_to_stop)
+    code, events = run_in_process(keys)
+    assert code == training_loop.CANCELLED
+    assert [event["backend"] for event in events if "backend" in event] == ["cuda"]
+    monkeypatch.undo()
+    code, events = run_in_process({**keys, "backend": "cpu"})
+    assert code == 0 and {event["level"] for event in folder.levels()} == {1, 2, 3}
+    assert any("Going on from step 9 of 18" in event.get("message", "") for event in events)
+    assert [event["backend"] for event in events if "backend" in event] == ["cuda", "cpu"]
+    assert Job.from_file(folder.job).backend == "cpu", "what measures the run draws with what there is"
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this computer has a GPU")
+def test_without_a_gpu_cuda_is_refused_and_auto_is_the_cpu(unbroken, tmp_path):
+    code, events = run_in_process({**unbroken["keys"], "out": str(tmp_path / "run"), "backend": "cuda"})
+    assert code == 2 and "no NVIDIA GPU" in events[-1]["what"] and "auto" in events[-1]["remedy"]
+    events, _ = RunFolder(unbroken["keys"]["out"]).events()
+    assert [event["backend"] for event in events if "backend" in event] == ["cpu"]
+
+
+def test_a_gpu_that_is_not_used_is_a_warning(unbroken, tmp_path, monkeypatch):
+    from training.rasterize import cuda
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    cuda.problem.cache_clear()
+    try:
+        keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
+        code, events = run_in_process({**keys, "parameters": {**keys["parameters"], "steps": [1, 1, 1]}})
+    finally:
+        cuda.problem.cache_clear()
+    assert code == 0
+    (warning,) = [event["message"] for event in events if event["event"] == "warning"]
+    assert "GPU is not used" in warning and "pip install gsplat" in warning
+
+
 @pytest.mark.skipif(os.name == "nt", reason="Windows cancels by the file")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_polite_signal_saves(unbroken, tmp_path, number):
     keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
-    steps = {"flod": [20, 20, 30000], "octree": 30000, "octree_neural": 30000}[keys["method"]]
+    steps = [20, 20, 30000] if keys["method"] == "flod" else 30000
     keys["parameters"] = {**keys["parameters"], "steps": steps}
     process = subprocess.Popen(
         command(tmp_path / "job.json", keys), cwd=ROOT, stdout=subprocess.PIPE, text=True

@@ -1,0 +1,142 @@
+"""What the cuda backend calls of gsplat 1.5, in plain torch on the CPU, for pictures of some thousand pixels.
+
+Written from gsplat's interface and from what its kernels do, not from their text: a leading camera dimension,
+int32 places and splats that index the flattened (camera, splat), alpha capped at 0.999, and the absolute
+gradients left during backward as ``absgrad`` on the very tensor of means that was given. It refuses what the
+kernels refuse or would misread. A test holds its signatures against the real ones where gsplat is installed.
+"""
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from training.rasterize import sh
+
+CHANNELS = 513
+
+
+def spherical_harmonics(
+    degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None
+) -> Tensor:
+    """Σ c·Y (..., 3), without the half; directions need not have unit length.
+
+    The signs and the order of gsplat's basis, compared by hand with this one's, are the same in all degrees.
+    """
+    assert masks is None
+    assert (degrees_to_use + 1) ** 2 <= coeffs.shape[-2] and coeffs.shape[:-2] == dirs.shape[:-1]
+    assert dirs.shape[-1] == coeffs.shape[-1] == 3
+    assert dirs.dtype == coeffs.dtype == torch.float32
+    values: list = [None] * sh.coefficients(degrees_to_use)
+    sh.basis(*normalize(dirs, dim=-1).unbind(-1), degrees_to_use, values)
+    return (torch.stack(values, -1)[..., None] * coeffs[..., : len(values), :]).sum(-2)
+
+
+def rasterize_to_pixels(
+    means2d: Tensor,
+    conics: Tensor,
+    colors: Tensor,
+    opacities: Tensor,
+    image_width: int,
+    image_height: int,
+    tile_size: int,
+    isect_offsets: Tensor,
+    flatten_ids: Tensor,
+    backgrounds: Tensor | None = None,
+    masks: Tensor | None = None,
+    packed: bool = False,
+    absgrad: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Colours (1, H, W, channels) and alphas (1, H, W, 1) of one camera."""
+    cameras, count = means2d.shape[:2]
+    channels = colors.shape[-1]
+    assert cameras == 1 and masks is None and not packed
+    assert means2d.shape == (1, count, 2) and conics.shape == (1, count, 3)
+    assert colors.shape == (1, count, channels) and opacities.shape == (1, count)
+    assert backgrounds is None or backgrounds.shape == (1, channels)
+    assert 0 < channels <= CHANNELS, f"Unsupported number of color channels: {channels}"
+    rows, columns = isect_offsets.shape[1:]
+    assert rows * tile_size >= image_height and columns * tile_size >= image_width
+    assert isect_offsets.dtype == flatten_ids.dtype == torch.int32
+    floats = [means2d, conics, colors, opacities, *([] if backgrounds is None else [backgrounds])]
+    assert all(each.dtype == torch.float32 for each in floats)
+    assert len(flatten_ids) == 0 or 0 <= flatten_ids.min() <= flatten_ids.max() < count
+    return _Pixels.apply(
+        means2d.contiguous(), conics.contiguous(), colors.contiguous(), opacities.contiguous(), backgrounds,
+        (image_width, image_height, tile_size), isect_offsets[0], flatten_ids.long(), absgrad,
+    )  # type: ignore[return-value] # fmt: skip
+
+
+class _Pixels(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, means, conics, colors, opacities, backgrounds, size, offsets, ids, absgrad):
+        ctx.save_for_backward(means, conics, colors, opacities, backgrounds, offsets, ids)
+        ctx.rest = size, absgrad
+        width, height, tile = size
+        image, alpha = (
+            means.new_zeros(1, height, width, colors.shape[-1]),
+            means.new_zeros(1, height, width, 1),
+        )
+        for some, (x, y) in _tiles(offsets, ids, tile):
+            shown, left = _blend(
+                *_deltas(means[0, some], x, y), conics[0, some], colors[0, some], opacities[0, some]
+            )
+            shown = shown if backgrounds is None else shown + left[:, None] * backgrounds[0]
+            there = (x < width) & (y < height)
+            image[0, y[there].long(), x[there].long()] = shown[there]
+            alpha[0, y[there].long(), x[there].long(), 0] = 1 - left[there]
+        return image, alpha
+
+    @staticmethod
+    def backward(ctx, by_image, by_alpha):
+        means, conics, colors, opacities, backgrounds, offsets, ids = ctx.saved_tensors
+        (width, height, tile), absgrad = ctx.rest
+        signed, absolute = torch.zeros_like(means), torch.zeros_like(means)
+        others = [torch.zeros_like(each) for each in (conics, colors, opacities)]
+        for some, (x, y) in _tiles(offsets, ids, tile):
+            there = (x < width) & (y < height)
+            x, y = x[there], y[there]
+            leaves = [
+                *_deltas(means[0, some], x, y),
+                *(each[0, some] for each in (conics, colors, opacities)),
+            ]
+            leaves = [leaf.detach().requires_grad_() for leaf in leaves]
+            with torch.enable_grad():
+                shown, left = _blend(*leaves)
+                shown = shown if backgrounds is None else shown + left[:, None] * backgrounds[0]
+                loss = (shown * by_image[0, y.long(), x.long()]).sum()
+                loss = loss - (left * by_alpha[0, y.long(), x.long(), 0]).sum()
+            *by_delta, by_conic, by_color, by_opacity = torch.autograd.grad(loss, leaves)
+            signed[0].index_add_(0, some, torch.stack(by_delta, -1).sum(1))
+            absolute[0].index_add_(0, some, torch.stack(by_delta, -1).abs().sum(1))
+            for total, part in zip(others, (by_conic, by_color, by_opacity), strict=True):
+                total[0].index_add_(0, some, part)
+        if absgrad:
+            means.absgrad = absolute
+        return signed, *others, None, None, None, None, None
+
+
+def _tiles(offsets, ids, tile):
+    """The splats of each tile, front to back, and its pixels' centres."""
+    starts = offsets.flatten().cpu().tolist()
+    pixel = torch.arange(tile * tile, device=ids.device)
+    for number, (start, end) in enumerate(zip(starts, [*starts[1:], len(ids)], strict=True)):
+        row, column = divmod(number, offsets.shape[1])
+        assert start <= end
+        yield ids[start:end], (column * tile + pixel % tile + 0.5, row * tile + pixel // tile + 0.5)
+
+
+def _deltas(means, x, y):
+    """From pixels to means, (n, pixels) each."""
+    return means[:, :1] - x, means[:, 1:] - y
+
+
+def _blend(dx, dy, conics, colors, opacities):
+    """Colours (pixels, channels) without background, and the transmittance left (pixels,)."""
+    a, b, c = (each[:, None] for each in conics.unbind(1))
+    sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+    alpha = (opacities[:, None] * torch.exp(-sigma)).clamp_max(0.999)
+    alpha = torch.where((sigma >= 0) & (alpha >= 1 / 255), alpha, 0)
+    behind = torch.cat([torch.ones_like(alpha[:1]), 1 - alpha]).cumprod(0)
+    taken = behind[1:] > 1e-4
+    weight = torch.where(taken, alpha * behind[:-1], 0)
+    return weight.T @ colors, torch.where(taken, 1 - alpha, 1).prod(0)

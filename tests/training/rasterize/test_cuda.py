@@ -1,0 +1,287 @@
+"""The cuda backend against the float64 reference: with gsplat's place taken on the CPU, and on a GPU if any.
+
+gsplat caps alpha at 0.999. Where pictures and gradients are compared, the reference's cap is lifted to that:
+the cap, and nothing else, is what they are allowed to differ by.
+"""
+
+import inspect
+import sys
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from tests.training.rasterize import fake_gsplat
+from tests.training.rasterize.scenes import CONTRIBUTING, SCENES, contributed, drawn_and_differentiated
+from training import rasterize as rasterizer
+from training.errors import LodgsError
+from training.rasterize import Target, cuda, device_of, photometric_loss, rasterize, reference, resolve
+from training.rasterize.features import depths
+from training.rasterize.reference import ellipses, squared_reach
+from training.rasterize.rendering import View
+from training.scenes.cameras import Camera
+
+GSPLAT_CAP = 0.999
+
+
+@pytest.fixture(
+    params=[
+        "cpu",
+        pytest.param(
+            "cuda",
+            marks=pytest.mark.skipif(
+                not torch.cuda.is_available(), reason="no NVIDIA GPU that torch can use"
+            ),
+        ),
+    ]
+)
+def device(request) -> str:
+    """Where the cuda backend draws: on the CPU as ``fake_card`` has it, and on a GPU with gsplat itself."""
+    if request.param == "cpu":
+        request.getfixturevalue("fake_card")
+    elif problem := cuda.problem():
+        pytest.skip(f"no NVIDIA GPU that gsplat works on: {problem}")
+    return request.param
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_it_agrees_with_the_reference(name, device, make_splats, odd_camera, monkeypatch):
+    """Every output and gradient, relative L2 at most 5e-4; the GPU's fast exponential may cost some more."""
+    found = drawn_and_differentiated(name, make_splats, odd_camera, "cuda", torch.float32, device)
+    monkeypatch.setattr(reference, "ALPHA_MAX", GSPLAT_CAP)
+    exact = drawn_and_differentiated(name, make_splats, odd_camera, "reference", torch.float64)
+    assert exact["grad2d"].norm() > 0 and exact["absgrad2d"].norm() > exact["grad2d"].norm()
+    bound = 5e-4 if device == "cpu" else 2e-3
+    for output, expected in exact.items():
+        error = (found[output] - expected).norm() / expected.norm().clamp_min(1e-12)
+        # whether an ellipse just touches a tile is a matter of rounding
+        assert error <= (5e-3 if output == "tile_counts" else bound), f"{output}: {error:.1e}"
+
+
+def test_the_cap_is_all_that_differs_and_little(device, make_splats, odd_camera):
+    """One opaque splat changes a pixel by at most 0.999 - 0.99; below 0.99 nothing changes."""
+    splats = {name: tensor[:1].clone() for name, tensor in make_splats(1).items()}
+    splats["means"][:] = torch.tensor([0.1, -0.2, 3.0])
+    splats["log_scales"][:] = -0.5
+    for logit, most in ((12.0, GSPLAT_CAP - 0.99), (4.0, 0.0)):
+        splats["opacity_logits"][:] = logit
+        found, exact = (
+            rasterize(*(t.to(on, kind) for t in splats.values()), odd_camera, backend=backend).alpha.cpu()
+            for backend, kind, on in (
+                ("cuda", torch.float32, device),
+                ("reference", torch.float64, "cpu"),
+            )
+        )
+        difference = (found - exact).abs().max().item()
+        assert difference <= most + 1e-4 and (most == 0 or difference > 0.5 * most)
+
+
+@pytest.mark.parametrize("name", CONTRIBUTING)
+def test_contributions_agree_with_the_reference(name, device, make_splats, odd_camera, monkeypatch):
+    """Also when a few splats at a time are walked over. These have the definition's cap of 0.99."""
+    exact, alpha = contributed(name, make_splats, odd_camera, "reference", torch.float64)
+    for pairs in (1 << 24, 20 * 256 * 3):
+        monkeypatch.setattr(cuda, "WALK", pairs)
+        found, _ = contributed(name, make_splats, odd_camera, "cuda", torch.float32, device)
+        torch.testing.assert_close(found["largest"], exact["largest"], rtol=1e-3, atol=1e-5)
+        torch.testing.assert_close(found["total"], exact["total"], rtol=1e-3, atol=2e-2)
+        assert (found["pixels"] - exact["pixels"]).abs().sum() <= 1e-3 * exact["pixels"].sum()
+        assert torch.equal(found["views"], exact["views"])
+        assert found["total"].sum().item() == pytest.approx(alpha, rel=1e-4)
+
+
+def test_median_depths_agree_with_the_reference(device, make_splats, odd_camera, monkeypatch):
+    """Pixel for pixel, but for those where rounding decides which splat reaches the half."""
+    monkeypatch.setattr(cuda, "WALK", 20 * 256 * 4)
+    splats = make_splats(300)
+    found, exact = (
+        rasterize(
+            *(t.to(on, kind) for t in splats.values()), odd_camera, outputs=["median_depth"], backend=backend
+        ).median_depth.cpu()
+        for backend, kind, on in (("cuda", torch.float32, device), ("reference", torch.float64, "cpu"))
+    )
+    assert ((found - exact).abs() < 1e-4).float().mean() > 0.999
+    assert 0.2 < (exact > 0).float().mean() < 1
+
+
+def test_every_splat_is_in_every_tile_it_touches_once_and_front_to_back(device, make_splats, odd_camera):
+    """Against a count over all pixels in float64, as the cpu backend's pairs."""
+    splats = list(make_splats(400, seed=2).values())[:4]
+    options = {"view": View.of(odd_camera, 0.2), "min_scale": 0.01, "antialias": False}
+    visible = cuda.Visible.of(*(t.to(device, torch.float32) for t in splats), None, **options)
+    tiles = cuda.Tiles.of(visible, options["view"])
+    exact = ellipses(*splats, None, **options)
+
+    (xx, xy, yy), mean = (v[:, None, None] for v in exact.covariance), exact.mean2d[:, :, None, None]
+    dx, dy = torch.arange(80) + 0.5 - mean[:, 0], (torch.arange(64) + 0.5)[:, None] - mean[:, 1]
+    distance = (yy * dx**2 - 2 * xy * dx * dy + xx * dy**2) / (xx * yy - xy**2)
+    touched = (distance <= squared_reach(exact.opacity)[:, None, None]) & exact.inside[:, None, None]
+    touched = touched.reshape(-1, 4, 16, 5, 16).any(4).any(2)
+    expected = torch.zeros(400, 4, 5, dtype=torch.bool)
+    expected[exact.drawn] = touched
+
+    listed = torch.zeros(400, 4, 5, dtype=torch.int64)
+    for tile, (start, count) in enumerate(zip(tiles.start.flatten(), tiles.counts.flatten(), strict=True)):
+        rows = tiles.splat[start : start + count].long()
+        assert (rows.diff() > 0).all()  # the rows are front to back, so each once and in order
+        listed[visible.which[rows].cpu(), tile // 5, tile % 5] += 1
+    assert tiles.counts.sum() == len(tiles.splat) and listed.max() == 1
+    depth = depths(splats[0][visible.which.cpu()], options["view"])
+    torch.testing.assert_close(depth, exact.depth[exact.inside].sort().values)
+    assert (listed[expected] == 1).float().mean() > 0.999
+    assert listed.sum() <= 1.15 * expected.sum()
+
+
+def test_the_loss_and_its_gradient_are_the_references(device):
+    random = torch.Generator().manual_seed(0)
+    truth = torch.rand(50, 75, 3, generator=random)
+    start, mask = (truth + 0.1 * torch.randn(truth.shape, generator=random)).clamp(0, 1), truth[..., 0]
+    target = Target(truth, mask)
+    for _ in range(2):  # the second time from what the target keeps
+        losses, gradients = [], []
+        for backend, kind, on in (("cuda", torch.float32, device), ("reference", torch.float64, "cpu")):
+            image = start.to(on, kind, copy=True).requires_grad_()
+            loss = photometric_loss(image, target, backend=backend)
+            loss.backward()
+            losses.append(loss.item())
+            gradients.append(image.grad.cpu().double())
+        assert losses[0] == pytest.approx(losses[1], rel=2e-5)
+        assert (gradients[0] - gradients[1]).norm() <= 1e-4 * gradients[1].norm()
+    assert target.cache["cuda"][0].device.type == device
+
+
+def test_two_backwards_give_the_same_and_nothing_is_kept(device, make_splats, odd_camera):
+    """What a rendering holds goes with it: a cycle through autograd's graph would stay for ever."""
+    import gc
+    import weakref
+
+    leaves = [t.to(device, torch.float32).requires_grad_() for t in make_splats(50).values()]
+    drawn = rasterize(*leaves, odd_camera, outputs=["absgrad2d"], backend="cuda")
+    loss = drawn.image.sum()
+    loss.backward(retain_graph=True)
+    first = [leaf.grad.clone() for leaf in leaves] + [drawn.grad2d.clone(), drawn.absgrad2d.clone()]
+    for leaf in leaves:
+        leaf.grad = None
+    loss.backward()
+    again = [leaf.grad for leaf in leaves] + [drawn.grad2d, drawn.absgrad2d]
+    for one, other in zip(first, again, strict=True):
+        torch.testing.assert_close(one, other)
+
+    node = loss.grad_fn
+    while type(node).__name__ != "_BlendBackward":
+        node = node.next_functions[0][0]
+    inputs = [weakref.ref(each) for each in node.inner[0]]
+    gc.disable()
+    try:
+        del node, drawn, loss
+        assert all(ref() is None for ref in inputs)
+    finally:
+        gc.enable()
+
+
+def test_float32_on_the_card_is_asked_for(device, make_splats, odd_camera):
+    splats = [t.to(device, torch.float32) for t in make_splats(5).values()]
+    with pytest.raises(ValueError, match=r"float32 on a GPU, not torch\.float64"):
+        rasterize(*(t.double() for t in splats), odd_camera, backend="cuda")
+    with pytest.raises(ValueError, match="on meta"):
+        rasterize(*(t.to("meta") for t in splats), odd_camera, backend="cuda")
+
+
+# -- which backend, and why not --------------------------------------------------------
+
+
+@pytest.fixture
+def card(monkeypatch):
+    """A computer on which torch sees a GPU (that computes on the CPU) and gsplat is installed."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(cuda, "DEVICE", "cpu")
+    monkeypatch.setitem(sys.modules, "gsplat", fake_gsplat)
+    cuda.problem.cache_clear()
+    yield
+    cuda.problem.cache_clear()
+
+
+def test_auto_is_cuda_where_a_gpu_and_gsplat_are(card, monkeypatch):
+    assert resolve("auto") == resolve("cuda") == "cuda"
+    monkeypatch.setattr(cuda, "DEVICE", "cuda")
+    assert device_of("auto") == torch.device("cuda")
+    assert resolve("cpu") == "cpu" and device_of("reference") == torch.device("cpu")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this computer has a GPU")
+def test_auto_is_cpu_without_a_gpu():
+    assert resolve("auto") == "cpu" and device_of("auto") == torch.device("cpu")
+    with pytest.raises(LodgsError, match=r"no NVIDIA GPU that torch can use\..*auto or cpu"):
+        resolve("cuda")
+
+
+def test_auto_follows_the_tensors_that_it_is_given(card, monkeypatch, make_splats, odd_camera):
+    def refuse(*_, **__):
+        raise AssertionError("tensors on the CPU went to the GPU")
+
+    monkeypatch.setattr(cuda, "rasterize", refuse)
+    assert rasterize(*(t.float() for t in make_splats(5).values()), odd_camera).image.shape == (50, 75, 3)
+    assert rasterizer._backend("auto", SimpleNamespace(is_cuda=True)) is cuda  # type: ignore[arg-type]
+
+
+def test_what_is_missing_is_said_with_a_remedy(card, monkeypatch):
+    def problem_with(gsplat) -> str:
+        monkeypatch.setitem(sys.modules, "gsplat", gsplat)
+        cuda.problem.cache_clear()
+        assert resolve("auto") == "cpu"
+        with pytest.raises(LodgsError) as caught:
+            resolve("cuda")
+        return str(caught.value)
+
+    assert "needs gsplat" in (said := problem_with(None)) and "pip install gsplat" in said
+
+    def uncompiled(*_):
+        return getattr(None, "spherical_harmonics_fwd")  # noqa: B009, as gsplat does without nvcc
+
+    def failing(*_):
+        print("setting up CUDA")
+        raise RuntimeError("no kernel image is available\nand a long trace")
+
+    assert "nvcc was not found" in problem_with(SimpleNamespace(spherical_harmonics=uncompiled))
+    said = problem_with(SimpleNamespace(spherical_harmonics=failing))
+    assert "do not work here: no kernel image is available." in said and "trace" not in said
+
+
+def test_standard_output_stays_clear_while_gsplat_compiles(card, monkeypatch, capsys):
+    def loud(*args):
+        print("setting up CUDA")
+        return fake_gsplat.spherical_harmonics(*args)
+
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(spherical_harmonics=loud))
+    assert cuda.problem() is None
+    said = capsys.readouterr()
+    assert said.out == "" and "setting up" in said.err
+
+
+@pytest.mark.parametrize("name", ["rasterize_to_pixels", "spherical_harmonics"])
+def test_the_stand_in_is_called_as_gsplat_is(name):
+    gsplat = pytest.importorskip("gsplat", reason="gsplat is not installed")
+    real, ours = (inspect.signature(getattr(module, name)) for module in (gsplat, fake_gsplat))
+    assert [(p.name, p.default) for p in real.parameters.values()] == [
+        (p.name, p.default) for p in ours.parameters.values()
+    ]
+
+
+def test_a_warm_up_is_a_step(fake_card, monkeypatch):
+    called = []
+    original = cuda.rasterize
+    monkeypatch.setattr(cuda, "rasterize", lambda *a, **k: called.append(1) or original(*a, **k))
+    rasterizer.warm_up("cuda")
+    assert called == [1]
+
+
+def test_a_camera_that_sees_nothing_leaves_the_background(device, make_splats):
+    """Nothing to look at in any tile: gsplat is not asked, and gradients are zeros."""
+    import numpy as np
+
+    away = Camera("away", 20, 10, 10.0, 10.0, 5.0, 5.0, np.diag([-1.0, 1.0, -1.0, 1.0]))
+    leaves = [t.to(device, torch.float32).requires_grad_() for t in make_splats(5).values()]
+    drawn = rasterize(*leaves, away, background=(0.2, 0.4, 0.6), outputs=["depth"], backend="cuda")
+    (drawn.image.sum() + drawn.depth.sum()).backward()
+    assert torch.equal(drawn.image.detach().cpu(), torch.tensor([0.2, 0.4, 0.6]).expand(10, 20, 3))
+    assert all(leaf.grad is not None and leaf.grad.abs().max() == 0 for leaf in leaves)
