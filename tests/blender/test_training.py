@@ -351,3 +351,37 @@ def test_the_real_trainer(bpy, jobs, tmp_path, monkeypatch):
     watch.process.kill()
     _wait(watch, lambda: not watch.running)
     assert "signal 9" in watch.problem
+
+
+def test_octree_levels_add_up_and_follow_the_distance(bpy, lodgs, jobs, tmp_path, monkeypatch):
+    """The real trainer again: all levels arrive together, twice, and choose by distance at once."""
+    if not TRAINER:
+        pytest.skip("no trainer; set LODGS_TRAINER_PYTHON")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
+    bpy.ops.lodgs.import_colmap(directory=str(REPOSITORY / "examples" / "lantern_garden"), photographs=False)
+    (root,) = [thing for thing in bpy.data.objects if thing.lodgs.is_root]
+    root.lodgs.training.image_scale, root.lodgs.training.method = 0.1, "octree"
+    watch = jobs.start(root, str(tmp_path / "run"), {"levels": 3, "steps": 12, "coarse_share": 0.5})
+    _wait(watch, lambda: len(watch.levels) == 3, 120)
+    finest = root.lodgs.levels[-1].object
+    _wait(watch, lambda: not watch.running, 60)
+    assert (watch.state, watch.problem) == ("done", "")
+    settings = root.lodgs
+    assert settings.cumulative and settings.by_distance and settings.d_max > 0
+    assert list(_levels(root)) == [1, 2, 3]
+    assert settings.levels[-1].object == finest, "a newer version of a level keeps its object"
+    settings.mode = "SELECTIVE"
+    bpy.context.view_layer.update()
+    shown, everything = lodgs("scenes").count_shown(bpy.context, root)
+    settings.level_offset = -16
+    bpy.context.view_layer.update()
+    assert lodgs("scenes").count_shown(bpy.context, root)[0] == len(settings.levels[0].object.data.points)
+    assert 0 < shown <= everything
+    bundles = lodgs("training.splats.bundle")
+    bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "again.ply"))
+    ours, theirs = (bundles.read_bundle(p) for p in (tmp_path / "again.ply", watch.folder.bundle))
+    assert ours.cumulative and ours.meta == theirs.meta
+    for a, b in zip(ours.levels, theirs.levels, strict=True):
+        assert (a.splats.means == b.splats.means).all()
+        assert (a.splats.extras["lod_bias"] == b.splats.extras["lod_bias"]).all()
+        assert (a.splats.extras["lod_level"] == a.number).all()

@@ -33,6 +33,12 @@ def method_of(keys: dict) -> type:
     return import_module(f"training.methods.{MODULES[keys['method']]}").Method
 
 
+def lasting(keys: dict, total: int) -> dict:
+    """The job's keys with another number of steps in all, a multiple of 3."""
+    steps = [total // 3] * 3 if keys["method"] == "flod" else total
+    return {**keys, "parameters": {**keys["parameters"], "steps": steps}}
+
+
 def command(path: Path, keys: dict) -> list[str]:
     path.write_text(json.dumps(keys))
     return [sys.executable, "-m", "training", "train", str(path)]
@@ -154,7 +160,7 @@ def test_cancel_by_file_saves_and_resume_gives_the_same_bits(unbroken, tmp_path,
 def test_a_run_begun_on_one_backend_goes_on_with_another(unbroken, tmp_path, monkeypatch, fake_card):
     """With the cuda backend on the CPU, to the middle of level 2; then with the cpu backend to the end."""
     keys = {**unbroken["keys"], "out": str(tmp_path / "run"), "backend": "cuda"}
-    keys["parameters"] = {**keys["parameters"], "steps": [6, 6, 6] if keys["method"] == "flod" else 18}
+    keys = lasting(keys, 18)
     folder, method = RunFolder(keys["out"]), method_of(keys)
     real = method.train_step
 
@@ -191,7 +197,7 @@ def test_a_gpu_that_is_not_used_is_a_warning(unbroken, tmp_path, monkeypatch):
     cuda.problem.cache_clear()
     try:
         keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
-        code, events = run_in_process({**keys, "parameters": {**keys["parameters"], "steps": [1, 1, 1]}})
+        code, events = run_in_process(lasting(keys, 3))
     finally:
         cuda.problem.cache_clear()
     assert code == 0
@@ -203,8 +209,7 @@ def test_a_gpu_that_is_not_used_is_a_warning(unbroken, tmp_path, monkeypatch):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_polite_signal_saves(unbroken, tmp_path, number):
     keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
-    steps = [20, 20, 30000] if keys["method"] == "flod" else 30000
-    keys["parameters"] = {**keys["parameters"], "steps": steps}
+    keys = lasting(keys, 30000)
     process = subprocess.Popen(
         command(tmp_path / "job.json", keys), cwd=ROOT, stdout=subprocess.PIPE, text=True
     )
