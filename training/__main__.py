@@ -32,6 +32,10 @@ def main(arguments: list[str] | None = None) -> int:
     )
     evaluate.add_argument("--picture", type=Path, help="PNG to write: the levels side by side from one view")
 
+    evaluate.add_argument(
+        "--far", action="store_true", help="measure as well how levels do from 2, 4 and 8 times the distance"
+    )
+
     info = commands.add_parser("info", help="say what a bundle or any 3DGS PLY holds")
     info.add_argument("file", type=Path)
 
@@ -72,7 +76,7 @@ def _evaluate(chosen: argparse.Namespace) -> int:
     from .lod.selection import Detail
 
     detail = Detail(chosen.gamma, chosen.start, chosen.end, chosen.offset)
-    print(table(evaluate_run(chosen.run, detail, chosen.picture)))
+    print(table(evaluate_run(chosen.run, detail, chosen.picture, chosen.far)))
     return 0
 
 

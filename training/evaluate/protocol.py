@@ -16,7 +16,7 @@ from ..files import atomic_write
 from ..lod.selection import Detail, complete, select
 from ..methods import create
 from ..methods.data import TrainingData
-from ..rasterize import device_of, rasterize
+from ..rasterize import Rendering, device_of, rasterize
 from ..runs.data import training_data
 from ..runs.folder import RunFolder
 from ..runs.job import Job
@@ -50,6 +50,10 @@ class Evaluation:
 
     def draw(self, splats: Splats, camera: Camera, weights: np.ndarray | None = None) -> torch.Tensor:
         """A picture of splats on black, (H, W, 3), on the CPU, with a weight on each splat's opacity."""
+        return self.render(splats, camera, weights).image.cpu()
+
+    def render(self, splats: Splats, camera: Camera, weights: np.ndarray | None = None) -> Rendering:
+        """The same with all that a rendering tells."""
         columns = (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh)
 
         def tensor(column: np.ndarray) -> torch.Tensor:
@@ -62,7 +66,7 @@ class Evaluation:
                 weights=None if weights is None else tensor(weights),
                 near=self.data.near,
                 backend=self.backend,
-            ).image.cpu()
+            )
 
     def measure(self, shown_to: Callable[[Camera], tuple[Splats, np.ndarray | None]]) -> dict:
         """Mean quality, splats given to the rasterizer and seconds a frame over the held-out views.
@@ -108,19 +112,22 @@ class Evaluation:
         return self.measure(lambda camera: (splats, None))
 
 
-def evaluate_run(run: Path, detail: Detail = STANDARD_DETAIL, picture: Path | None = None) -> dict:
+def evaluate_run(
+    run: Path, detail: Detail = STANDARD_DETAIL, picture: Path | None = None, far: bool = False
+) -> dict:
     """Measures a finished run and writes its ``metrics.json``.
 
     Args:
         run: the run's folder.
         detail: of the selective view.
         picture: a PNG to write, with the levels side by side as the middle held-out view sees them.
+        far: measure also how levels do from farther away (``distance``).
 
     Returns:
         ``levels``: coarse to fine, ``level``, ``s_min``, ``splats``, ``psnr``, ``ssim``, ``frame_s``; where
         levels add up, of each with all coarser ones. ``selective``: per view and predetermined (chosen from
         the mean training camera), with the detail's settings. ``networks``: of a model that was baked,
-        before that.
+        before that. ``farther`` and ``jumps`` (of the middle held-out view), where asked for.
 
     Raises:
         LodgsError: if the run is not finished or holds out no views, or such detail cannot be shown.
@@ -169,6 +176,11 @@ def evaluate_run(run: Path, detail: Detail = STANDARD_DETAIL, picture: Path | No
         with np.load(folder.model, allow_pickle=False) as arrays:
             method.load_arrays(arrays)
         report["networks"] = evaluation.measure_pictures(method.picture)
+    if far and finest > 1:
+        from .distance import farther, jumps
+
+        report["farther"] = farther(evaluation, bundle, detail)
+        report["jumps"] = jumps(evaluation, bundle, detail, data.test[len(data.test) // 2])
     if picture is not None:
         from .picture import level_picture
 
@@ -194,4 +206,13 @@ def table(report: dict) -> str:
         f"{name:<17} {size:>9} {r['splats']:>9,} {r['psnr']:>7.2f} {r['ssim']:>7.4f} {r['frame_s']:>8.3f}"
         for name, size, r in rows
     ]
+    for row in report.get("farther", []):
+        lines.append(
+            f"{row['factor']}x the distance: {row['drawn']:,} of {row['drawn_full']:,} splats drawn, "
+            f"{row['psnr']:.1f} dB against full detail"
+        )
+    if "jumps" in report:
+        lines.append(
+            "largest jump: {faded} times that of full detail, {hard} unfaded".format(**report["jumps"])
+        )
     return "\n".join(lines)

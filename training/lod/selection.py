@@ -22,12 +22,14 @@ class Detail:
         gamma: pixels that the smallest detail of a level may cover before a finer one is due (FLoD).
         start, end: coarsest and finest level in use; 0 for the third finest and the finest (FLoD).
         offset: levels finer, or below 0 coarser, than the distance asks for (Octree-GS).
+        fade: whether levels fade in, or are there at once from the middle on (Octree-GS).
     """
 
     gamma: float = 1.0
     start: int = 0
     end: int = 0
     offset: float = 0.0
+    fade: bool = True
 
 
 def select(
@@ -41,7 +43,7 @@ def select(
     """
     eye = np.asarray(eye, np.float32)
     if bundle.cumulative and "d_max" in bundle.meta:
-        return _select_octree(bundle, eye, focal_px, detail.offset)
+        return _select_octree(bundle, eye, focal_px, detail)
     return _select_flod(bundle, eye, focal_px, detail), None
 
 
@@ -66,15 +68,16 @@ def _select_flod(bundle: Bundle, eye: np.ndarray, focal_px: float, detail: Detai
 
 
 def _select_octree(
-    bundle: Bundle, eye: np.ndarray, focal_px: float, offset: float
+    bundle: Bundle, eye: np.ndarray, focal_px: float, detail: Detail
 ) -> tuple[Splats, np.ndarray]:
     chosen, weights = [], []
     levels = bundle.levels[-1].number
     for level in bundle.levels:
         distances = np.linalg.norm(level.splats.means - eye, axis=1) * (bundle.meta["focal_px"] / focal_px)
-        bias = level.splats.extras.get(BIAS, np.float32(0)) + np.float32(offset)
+        bias = level.splats.extras.get(BIAS, np.zeros(1, np.float32)) + np.float32(detail.offset)
         wanted = octree_wanted(distances, bias, bundle.meta["d_max"], levels)
         weight = octree_weights(wanted, level.number).astype(np.float32)
+        weight = weight if detail.fade else (weight >= 0.5).astype(np.float32)
         chosen.append(level.splats.select(weight > 0))
         weights.append(weight[weight > 0])
     return Splats.concatenated(chosen), np.concatenate(weights)

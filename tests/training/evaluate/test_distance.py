@@ -1,0 +1,92 @@
+"""From farther away: the camera, the rule on a whole bundle, and what fading is good for."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from training.evaluate.distance import farther, jumps, pulled_back
+from training.evaluate.protocol import Evaluation
+from training.lod.selection import Detail, complete, select
+from training.scenes.cameras import Camera
+from training.splats.bundle import Bundle, Level
+from training.splats.gaussians import Splats
+
+
+def splats(count: int, seed: int, size: float, bias: float = 0.0) -> Splats:
+    rng = np.random.default_rng(seed)
+    return Splats(
+        means=rng.uniform((-1, -1, 4), (1, 1, 6), (count, 3)).astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        log_scales=np.full((count, 3), np.log(size), np.float32),
+        opacity_logits=np.full(count, 1.0, np.float32),
+        sh=rng.uniform(-1, 1, (count, 1, 3)).astype(np.float32),
+        extras={"lod_bias": np.full(count, bias, np.float32)},
+    )
+
+
+@pytest.fixture
+def bundle() -> Bundle:
+    """Full detail up to a distance of 8, level 1 alone from 32 on."""
+    levels = [Level(1, splats(60, 1, 0.3)), Level(2, splats(200, 2, 0.1)), Level(3, splats(800, 3, 0.05))]
+    return Bundle("octree", levels, {"d_max": 32.0, "focal_px": 100.0}, cumulative=True)
+
+
+@pytest.fixture
+def camera() -> Camera:
+    return Camera("a", 64, 64, 100.0, 100.0, 32.0, 32.0, np.eye(4))
+
+
+@pytest.fixture
+def evaluation(camera) -> Evaluation:
+    data = SimpleNamespace(test=[camera], median_depth=5.0, near=0.01)
+    return Evaluation(data, "cpu")  # pyright: ignore[reportArgumentType]
+
+
+def test_what_lies_at_the_depth_is_so_many_times_as_far(camera):
+    rng = np.random.default_rng(0)
+    pose = np.eye(4)
+    pose[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    pose[:3, 3] = rng.normal(size=3)
+    view = Camera("a", 64, 64, 100.0, 100.0, 32.0, 32.0, pose)
+    target = np.linalg.inv(pose) @ [0, 0, 5, 1]  # straight ahead
+    for factor in (1, 2, 8):
+        back = pulled_back(view, factor, 5.0)
+        assert np.linalg.norm(target[:3] - back.center) == pytest.approx(5 * factor)
+        assert np.allclose((back.world_to_camera @ target)[:2], 0)
+
+
+def test_the_rule_of_the_paper_on_a_whole_bundle(bundle):
+    eye, focal = np.array([0.5, 0, -9.0]), 80.0
+    chosen, weights = select(bundle, eye, focal, Detail(offset=0.25))
+    assert weights is not None
+    expected = []
+    for level in bundle.levels:  # splat by splat: L* = log2(d_max / d) + offset, the fraction at the last
+        for mean in level.splats.means:
+            distance = np.linalg.norm(mean - eye) * 100 / focal
+            wanted = min(max(np.log2(32 / distance) + 0.25, 0), 2)
+            weight = min(max(wanted + 2 - level.number, 0), 1)
+            if weight > 0:
+                expected.append((*mean, weight))
+    assert len(expected) > 300
+    np.testing.assert_allclose(np.column_stack([chosen.means, weights]), expected, atol=1e-5)
+
+
+def test_a_level_comes_with_all_coarser_ones_only_where_they_add_up(bundle):
+    assert len(complete(bundle, bundle.levels[1])) == 260
+    apart = Bundle("flod", bundle.levels)
+    assert len(complete(apart, apart.levels[1])) == 200
+
+
+def test_fewer_splats_are_drawn_from_farther_away(bundle, evaluation):
+    rows = farther(evaluation, bundle, Detail())
+    assert [row["factor"] for row in rows] == [1, 2, 4, 8]
+    drawn = [row["drawn"] for row in rows]
+    assert drawn[0] == rows[0]["drawn_full"] and np.isinf(rows[0]["psnr"])
+    assert drawn[0] > drawn[2] > drawn[3]
+    assert all(np.isfinite(row["psnr"]) for row in rows[2:])
+
+
+def test_fading_takes_the_jumps_away(bundle, evaluation, camera):
+    found = jumps(evaluation, bundle, Detail(), camera)
+    assert found["faded"] < found["hard"]
