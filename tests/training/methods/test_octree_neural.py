@@ -1,0 +1,162 @@
+"""Octree-GS with neural anchors: decoding as the papers say, baking against the networks themselves."""
+
+import numpy as np
+import pytest
+import torch
+
+from training.methods.data import TrainingData
+from training.methods.octree_neural import Method
+from training.methods.parameters import override, preset
+from training.rasterize import rasterize
+from training.scenes.colmap import read_scene
+
+
+@pytest.fixture(scope="module")
+def data(tiny_scene) -> TrainingData:
+    return TrainingData(read_scene(tiny_scene), test_every=4)
+
+
+def make(data, **values) -> Method:
+    values = {
+        "levels": 3, "coarser_levels": 0, "nearest": 0.0, "farthest": 1.0, "footprint": 12.0, "steps": 40,
+        "offsets": 4, "features": 8, "far_share": 0.0, "full_share": 0.0, "sh_degree": 2, **values,
+    }  # fmt: skip
+    method = Method(data, override(preset("octree_neural", "draft"), values), seed=0, backend="cpu")
+    rng = torch.Generator().manual_seed(1)
+    for name in ("features", "offsets"):  # as if trained
+        method.model[name].data.copy_(torch.randn(method.model[name].shape, generator=rng))
+    return method
+
+
+def test_an_anchor_stands_in_the_middle_of_its_voxel(data):
+    method = make(data)
+    means, level = method.model["means"].detach().double().numpy(), method.model.columns["level"].numpy()
+    cells = (means - method.tree.origin) / method.tree.size(level)[:, None]
+    np.testing.assert_allclose(cells % 1, 0.5, atol=1e-4)
+
+
+def test_decoding_is_the_papers(data):
+    """One anchor by hand in float64: Scaffold-GS, Sec. 3.2, Gaussian by Gaussian."""
+    method, camera = make(data), data.train[2]
+    counts = method.decode(camera, torch.arange(len(method.model))).anchor.bincount()
+    anchor = int((counts == 2).nonzero()[0])
+    g = method.decode(camera, torch.tensor([anchor]))
+    tensors = method.model.adam.tensors
+    model = {name: tensor.detach()[anchor].double().numpy() for name, tensor in tensors.items()}
+    direction = model["means"] - camera.center
+    direction /= np.linalg.norm(direction)
+    inputs = np.concatenate([model["features"], direction])
+
+    def network(net):
+        (w1, b1), (w2, b2) = ((x.weight.detach().double().numpy(), x.bias.detach().double().numpy())
+                              for x in (net[0], net[2]))  # fmt: skip
+        return w2 @ np.maximum(w1 @ inputs + b1, 0) + b2
+
+    opacity = np.tanh(network(method.networks.opacity))
+    shown = np.flatnonzero(opacity > 0)
+    assert len(shown) == 2 and g.which.tolist() == shown.tolist()
+    looks = network(method.networks.covariance).reshape(4, 7)[shown]
+    extents = np.exp(model["log_scales"])
+    for name, expected in {
+        "opacities": opacity[shown],
+        "colors": 1 / (1 + np.exp(-network(method.networks.color).reshape(4, 3)[shown])),
+        "means": model["means"] + model["offsets"][shown] * extents[:3],
+        "scales": extents[3:] / (1 + np.exp(-looks[:, :3])),
+        "quats": looks[:, 3:],
+    }.items():
+        np.testing.assert_allclose(getattr(g, name).detach().numpy(), expected, rtol=1e-5, atol=1e-6)
+
+
+def draw(splats, camera, data):
+    columns = (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh)
+    return rasterize(*map(torch.from_numpy, columns), camera=camera, near=data.near).image
+
+
+def ever_drawn(method: Method) -> torch.Tensor:
+    """Anchors (indices) that a training view draws; others are not baked."""
+    return torch.cat([method._drawn_by(camera) for camera in method.data.train]).unique()
+
+
+def blind(method: Method, *names: str) -> None:
+    """Networks that do not look at the direction."""
+    for name in names:
+        getattr(method.networks, name)[0].weight.data[:, -3:] = 0
+
+
+def test_baking_loses_nothing_where_nothing_depends_on_the_view(data):
+    method = make(data)
+    blind(method, "opacity", "covariance", "color")
+    baked = method.bake()
+    for camera in (data.train[0], data.test[0]):
+        with torch.no_grad():
+            everything = method._rasterize(method.decode(camera, ever_drawn(method)), camera, None).image
+        assert everything.max() > 0.2
+        assert (draw(baked, camera, data) - everything).abs().max() < 1e-3
+
+
+def test_opacity_and_covariance_are_those_of_the_median_view(data):
+    method = make(data)
+    baked = method.bake()
+    means, anchors = method.model["means"].detach(), []
+    for anchor in range(len(method.model)):
+        seen = [camera for camera in data.train if anchor in method._drawn_by(camera)]
+        if not seen:
+            continue
+        far = [float((means[anchor] - torch.as_tensor(c.center).float()).norm()) for c in seen]
+        camera = seen[int(np.argsort(far)[(len(far) - 1) // 2])]
+        anchors.append(method.decode(camera, torch.tensor([anchor])))
+    opacity = torch.cat([g.opacities for g in anchors]).detach()
+    scales = torch.cat([g.scales for g in anchors]).detach()
+    np.testing.assert_allclose(1 / (1 + np.exp(-baked.opacity_logits)), opacity, rtol=1e-4)
+    np.testing.assert_allclose(np.exp(baked.log_scales), scales, rtol=1e-4)
+
+
+def test_harmonics_fit_colours_that_are_harmonics(data):
+    """Colours that change linearly with the direction are found again between the training views."""
+    method = make(data, bake_ridge=1e-5)
+    blind(method, "opacity", "covariance")
+    # sigmoid(x) is x/4 + 1/2 near 0: a first layer of directions that stay positive, a faint second one
+    first, last = method.networks.color[0], method.networks.color[2]
+    first.weight.data.zero_()
+    first.weight.data[:3, -3:] = torch.eye(3)
+    first.bias.data[:] = 1.0
+    last.weight.data.mul_(0.5)
+    baked = method.bake()
+    camera = data.test[1]
+    with torch.no_grad():
+        g = method.decode(camera, ever_drawn(method))
+        shown = method._rasterize(g, camera, None).image
+        flat = np.array(baked.sh)
+        flat[:, 1:] = 0
+    error = (draw(baked, camera, data) - shown).abs().mean()
+    baked.sh = flat
+    assert error < 0.3 * (draw(baked, camera, data) - shown).abs().mean()
+
+
+def test_the_networks_come_back_from_their_arrays(data, tmp_path):
+    method = make(data, appearance=2)
+    for step in range(4):
+        method.train_step(step)
+    np.savez(tmp_path / "model.npz", **method.arrays())  # pyright: ignore[reportArgumentType]
+    other = make(data, appearance=2)
+    with np.load(tmp_path / "model.npz", allow_pickle=False) as arrays:
+        other.load_arrays(arrays)
+    camera = data.test[0]
+    assert torch.equal(other.picture(camera), method.picture(camera))
+    other.train_step(4)  # and training can go on
+
+
+def test_new_anchors_come_where_steep_gaussians_are(data):
+    method = make(data, steps=400, coarse_share=0.0, min_opacity=0.0, max_splats=10_000)
+    count, columns = len(method.model), method.model.columns
+    columns["seen"] += 1
+    columns["gradient_sum"][:, 1] += 1  # one of each anchor's four
+    places = method.model["means"] + method.model["offsets"][:, 1] * method.model["log_scales"].exp()[:, :3]
+    level = (columns["level"] + 1).clamp_max(99)
+    keys = method.tree.keys(places.detach().double().numpy(), level.long().numpy())
+    method._grow_and_prune(200)
+    added = method.model["means"][count:].detach().double().numpy()
+    assert len(added) > 0
+    grown = method.tree.keys(added, method.model.columns["level"][count:].long().numpy())
+    assert set(grown) <= set(keys)
+    assert (method.model["offsets"][count:] == 0).all()
