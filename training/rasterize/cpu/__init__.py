@@ -9,6 +9,7 @@ calls ``torch.set_num_threads(1)``.
 
 from __future__ import annotations
 
+import gc
 from dataclasses import dataclass
 
 import numpy as np
@@ -249,21 +250,31 @@ class _Photometric(torch.autograd.Function):
 
 
 def warm_up() -> None:
-    """Compile the kernels, or read them from the cache: one step on one splat."""
+    """Compile the kernels, or read them from the cache: one step on one splat.
+
+    Numba makes millions of objects on the way; looking among them for garbage, again and again, would take a
+    fifth of the time.
+    """
     from ...scenes.cameras import Camera
     from .. import Adam
     from .. import rasterize as draw
 
-    tensors = {
-        "means": torch.tensor([[0.0, 0.0, 1.0]]),
-        "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-        "log_scales": torch.zeros(1, 3),
-        "opacity_logits": torch.zeros(1),
-        "sh": torch.zeros(1, 1, 3),
-    }
-    for tensor in tensors.values():
-        tensor.requires_grad_()
-    camera = Camera("", 16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
-    drawn = draw(*tensors.values(), camera, backend="cpu")  # pyright: ignore[reportCallIssue]
-    photometric_loss(drawn.image, Target(torch.zeros(16, 16, 3)), 0.2).backward()
-    Adam(tensors, dict.fromkeys(tensors, 0.0)).step()
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        tensors = {
+            "means": torch.tensor([[0.0, 0.0, 1.0]]),
+            "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+            "log_scales": torch.zeros(1, 3),
+            "opacity_logits": torch.zeros(1),
+            "sh": torch.zeros(1, 1, 3),
+        }
+        for tensor in tensors.values():
+            tensor.requires_grad_()
+        camera = Camera("", 16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
+        drawn = draw(*tensors.values(), camera, backend="cpu")  # pyright: ignore[reportCallIssue]
+        photometric_loss(drawn.image, Target(torch.zeros(16, 16, 3)), 0.2).backward()
+        Adam(tensors, dict.fromkeys(tensors, 0.0)).step()
+    finally:
+        if collects:
+            gc.enable()

@@ -52,12 +52,27 @@ STRICT = frozenset()
 
 def kernel(fastmath: frozenset[str]) -> Callable[[Callable], Any]:
     """Compile a function of arrays: cached on disk, without the GIL, dividing as C does."""
-    return numba.njit(fastmath=set(fastmath), cache=True, nogil=True, error_model="numpy")
+    return numba.njit(
+        fastmath=set(fastmath), cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True
+    )
+
+
+def helper(fastmath: frozenset[str]) -> Callable[[Callable], Any]:
+    """Compile a function for kernels only. LLVM decides whether it becomes part of its caller.
+
+    Numba's own ``inline="always"`` copies the source into every caller and infers its types there again.
+    """
+    return numba.njit(
+        fastmath=set(fastmath), error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True
+    )
 
 
 def inlined(fastmath: frozenset[str]) -> Callable[[Callable], Any]:
-    """Compile a helper into the kernels that call it."""
-    return numba.njit(fastmath=set(fastmath), inline="always", error_model="numpy")
+    """As :func:`helper`, always a part of its caller: for what inner loops call."""
+    return numba.njit(
+        fastmath=set(fastmath), error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True,
+        forceinline=True,
+    )  # fmt: skip
 
 
 def available_threads() -> int:
