@@ -25,7 +25,7 @@ import torch
 from training.rasterize import Adam, Target, cpu, photometric_loss, rasterize, render
 from training.rasterize.cpu import adam
 from training.rasterize.cpu.bin import LOG2_ALPHA_MIN
-from training.rasterize.cpu.blend import CAP, T_MIN, row_range
+from training.rasterize.cpu.blend import CAP, T_MIN, rows_of_strip
 from training.rasterize.cpu.compile import FAST, f32, in_parallel, kernel, set_threads, threads
 from training.rasterize.cpu.fastmath import exp2
 from training.scenes.cameras import Camera
@@ -170,7 +170,7 @@ def count_work(begin, end, projected, splat, tile_start, tiles_x, walked, height
         for pair in range(tile_start[tile], tile_start[tile] + walked[tile]):
             row = projected[splat[pair]]
             top = f32(y0) + f32(0.5)
-            first, last = row_range(row, top, min(16, height - y0))
+            first, last = rows_of_strip(row, f32(x0) + f32(0.5), f32(15), top, min(16, height - y0))
             lanes[tile] += 16 * max(0, last - first)
             for r in range(first, last):
                 for j in range(16):
@@ -190,7 +190,7 @@ def work(step: Step) -> tuple[int, float]:
     def spy(kernel, total, grain, *args):
         in_parallel(kernel, total, grain, *args)
         if kernel is cpu.blend_forward:
-            projected, splat, tile_start, tiles_x, _, _, transmittance, walked = args
+            projected, splat, tile_start, tiles_x, _, _, transmittance, walked, _ = args
             lanes, blends = np.zeros((2, len(walked)), np.int64)
             rest = projected, splat, tile_start, tiles_x, walked, len(transmittance), lanes, blends
             in_parallel(count_work, total, grain, *rest)

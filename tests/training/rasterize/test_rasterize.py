@@ -9,8 +9,7 @@ import torch
 from training.errors import LodgsError
 from training.rasterize import BACKENDS, OUTPUTS, Target, contributions, photometric_loss, rasterize, render
 from training.rasterize.cpu.bin import TILE, bin_splats
-from training.rasterize.cpu.blend import row_range
-from training.rasterize.cpu.compile import numba, set_threads, threads
+from training.rasterize.cpu.compile import Buffers, numba, set_threads, threads
 from training.rasterize.cpu.fastmath import exp2
 from training.rasterize.cpu.project import (
     COLUMNS,
@@ -18,8 +17,12 @@ from training.rasterize.cpu.project import (
     CONIC_XY,
     CONIC_YY,
     HALF_HEIGHT,
+    HALF_WIDTH,
     LOG2_OPACITY,
-    MEAN_Y,
+    RISE,
+    SLOPE,
+    X_OF_TOP,
+    rows_of_strip,
 )
 from training.scenes.cameras import Camera
 
@@ -396,7 +399,8 @@ def test_every_splat_is_in_every_tile_it_touches_once_and_front_to_back():
     depth = random.uniform(1, 9, count).astype(np.float32)
     radii = np.ones(count, np.float32)
     radii[::9] = 0
-    pairs = bin_splats(projected, depth, radii, width, height)
+    drawn = np.flatnonzero(radii).astype(np.int32)
+    pairs = bin_splats(projected, drawn, depth[drawn], width, height, Buffers())
 
     row = projected.astype(np.float64)[:, :, None, None]
     dx = np.arange(112) + 0.5 - row[:, 0]
@@ -423,23 +427,51 @@ def test_every_splat_is_in_every_tile_it_touches_once_and_front_to_back():
         assert (pairs.splat[pairs.row[pairs.first[i] : pairs.first[i] + pairs.count[i]]] == i).all()
 
 
+def ellipses(count, random, largest):
+    """Projected splats as ``project_forward`` makes them, and their covariances and reaches in float64."""
+    angle, axes = random.uniform(0, np.pi, count), np.exp(random.uniform(-0.5, math.log(largest), (2, count)))
+    cos, sin = np.cos(angle), np.sin(angle)
+    xx, yy = (axes[0] * cos) ** 2 + (axes[1] * sin) ** 2, (axes[0] * sin) ** 2 + (axes[1] * cos) ** 2
+    xy = (axes[0] ** 2 - axes[1] ** 2) * cos * sin
+    reach = random.uniform(0.3, 3.3, count)
+    projected = np.zeros((count, COLUMNS), np.float32)
+    projected[:, HALF_WIDTH], projected[:, HALF_HEIGHT] = reach * np.sqrt(xx), reach * np.sqrt(yy)
+    projected[:, SLOPE], projected[:, RISE] = xy / xx, reach * axes[0] * axes[1] / np.sqrt(xx)
+    projected[:, X_OF_TOP] = xy / yy * projected[:, HALF_HEIGHT]
+    return projected, np.array([[xx, xy], [xy, yy]]).transpose(2, 0, 1), reach
+
+
+@numba.njit
+def rows_over(projected):
+    return [rows_of_strip(row, np.float32(0.5), np.float32(15), np.float32(0.5), 16) for row in projected]
+
+
+def test_the_rows_of_a_tile_hold_every_pixel_of_the_ellipse_and_hardly_more():
+    """Against all 256 pixel centres in float64."""
+    random = np.random.default_rng(4)
+    projected, covariance, reach = ellipses(3000, random, 30.0)
+    projected[:, :2] = random.uniform(-15, 31, (3000, 2))
+    rows = np.array(rows_over(projected))
+    centres = np.stack(np.meshgrid(np.arange(16) + 0.5, np.arange(16) + 0.5), -1)
+    offset = centres - projected[:, None, None, :2].astype(np.float64)
+    squared = np.einsum("nyxi,nij,nyxj->nyx", offset, np.linalg.inv(covariance), offset)
+    inside = (squared <= (reach**2)[:, None, None]).any(2)
+    assert 0.2 < inside.any(1).mean() < 0.9
+    listed = (np.arange(16) >= rows[:, :1]) & (np.arange(16) < rows[:, 1:])
+    assert listed[inside].all()
+    # besides, a row whose centres the ellipse passes between
+    assert listed.sum() < 1.1 * inside.sum()
+
+
 def test_rows_stay_in_the_tile_whatever_rounding_does():
     """Kernels write where these rows say: a mean and a reach of 1e9 pixels differ by rows of rounding."""
-
-    @numba.njit
-    def over(projected):
-        return [row_range(row, np.float32(0.5), 16) for row in projected]
-
     random = np.random.default_rng(0)
-    projected = np.zeros((3000, COLUMNS), np.float32)
-    size = 10 ** random.uniform(0, 9, 3000)
-    projected[:, MEAN_Y] = random.choice([-1, 1], 3000) * size
-    projected[:, HALF_HEIGHT] = size + random.uniform(-40, 40, 3000)
-    rows = np.array(over(projected))
+    projected, _, _ = ellipses(3000, random, 1e9)
+    half = projected[:, [HALF_WIDTH, HALF_HEIGHT]]
+    projected[:, :2] = random.choice([-1, 1], (3000, 2)) * half * random.choice([0, 0.5, 1], (3000, 2))
+    rows = np.array(rows_over(projected))
     assert rows[:, 0].min() == 0 and rows[:, 0].max() == 16 and rows[:, 1].max() == 16
-    by_hand = np.zeros((1, COLUMNS), np.float32)
-    by_hand[0, MEAN_Y], by_hand[0, HALF_HEIGHT] = 6.0, 2.2  # from 3.8 to 8.2: centres 4.5 to 7.5
-    assert over(by_hand) == [(4, 8)]
+    assert (rows[:, 0] <= rows[:, 1]).all()
 
 
 def test_exp2_is_right_to_a_few_parts_in_a_million():

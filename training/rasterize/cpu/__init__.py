@@ -18,7 +18,7 @@ import torch
 from ..rendering import Drawn, Target, View
 from .bin import TILE, Pairs, bin_splats
 from .blend import blend_backward, blend_backward_absolute, blend_forward, blend_median, blend_weights
-from .compile import f32, in_parallel, scratch, serialised
+from .compile import Buffers, f32, in_parallel, serialised
 from .loss import loss_and_gradient, moments_of
 from .project import (
     BLUE,
@@ -97,13 +97,19 @@ class _Aside:
 
 
 def _project_and_bin(
-    splats: list, settings: tuple, view: View, radii: torch.Tensor
+    splats: list, settings: tuple, view: View, radii: torch.Tensor, buffers: Buffers
 ) -> tuple[np.ndarray, Pairs]:
-    """Projected splats (N, COLUMNS) and their pairs with tiles; fills the radii."""
-    projected = np.empty((len(radii), COLUMNS), np.float32)
-    depth = np.empty(len(radii), np.float32)
-    in_parallel(project_forward, len(radii), GRAIN, *splats, *settings, projected, depth, radii.numpy())
-    return projected, bin_splats(projected, depth, radii.numpy(), view.width, view.height)
+    """Projected splats (N, COLUMNS), of which only the drawn are set, and their pairs with tiles.
+
+    Fills the radii, which are zeros. What is returned lives in ``buffers``.
+    """
+    weights = splats[-1]
+    some = (np.flatnonzero(weights > 0) if len(weights) else np.arange(len(radii))).astype(np.int32)
+    projected = buffers.take("projected", np.float32, len(radii), COLUMNS)
+    depths = np.empty(len(some), np.float32)
+    in_parallel(project_forward, len(some), GRAIN, *splats, *settings, some, depths, projected, radii.numpy())
+    drawn = np.flatnonzero(depths)
+    return projected, bin_splats(projected, some[drawn], depths[drawn], view.width, view.height, buffers)
 
 
 class _Rasterize(torch.autograd.Function):
@@ -116,39 +122,43 @@ class _Rasterize(torch.autograd.Function):
     ):
         tensors = [tensor.contiguous() for tensor in (means, quats, log_scales, logits, sh, weights)]
         splats = [tensor.detach().numpy() for tensor in tensors]
-        projected, pairs = _project_and_bin(splats, settings, view, aside.radii)
+        buffers = Buffers()
+        projected, pairs = _project_and_bin(splats, settings, view, aside.radii, buffers)
         counts = aside.tile_counts.numpy()
         counts[:] = np.diff(pairs.tile_start).reshape(counts.shape)
 
         tiles = pairs.splat, pairs.tile_start, counts.shape[1]
-        transmittance = np.empty((view.height, view.width), np.float32)
+        transmittance = buffers.take("transmittance", np.float32, view.height, view.width)
         walked = np.empty(counts.size, np.int64)
+        reached = buffers.take("reached", np.uint8, len(pairs.splat), 2)
         passes = [projected, *_as_colours(features, projected)]
         images = np.empty((len(passes), 3, view.height, view.width), np.float32)
         for coloured, image in zip(passes, images, strict=True):
             behind = background if coloured is projected else np.zeros_like(background)
             in_parallel(
-                blend_forward, counts.size, TILES, coloured, *tiles, behind, image, transmittance, walked
-            )
+                blend_forward, counts.size, TILES, coloured, *tiles, behind, image, transmittance, walked,
+                reached,
+            )  # fmt: skip
         if aside.median is not None:
             in_parallel(blend_median, counts.size, TILES, projected, *tiles, walked, aside.median.numpy())
         ctx.save_for_backward(*tensors)
-        ctx.rest = settings, aside, pairs, tiles, walked, passes, images, transmittance
+        ctx.rest = buffers, settings, aside, pairs, tiles, walked, reached, passes, images, transmittance
         blended = images[1:].reshape(-1, view.height, view.width)[: features.shape[1]]
         return tuple(map(torch.from_numpy, (images[0], 1 - transmittance, blended)))
 
     @staticmethod
     @serialised
     def backward(ctx, by_planes, by_alpha, by_blended):
-        settings, aside, pairs, tiles, walked, passes, images, transmittance = ctx.rest
+        _, settings, aside, pairs, tiles, walked, reached, passes, images, transmittance = ctx.rest
         tensors, count = ctx.saved_tensors, len(aside.radii)
         of_pairs = pairs.first, pairs.count, pairs.row
         backward, columns = (
             (blend_backward, SUMS) if aside.absgrad2d is None else (blend_backward_absolute, SUMS + 2)
         )
-        pair_sums = scratch("pair_sums", len(pairs.splat), columns)
+        working = Buffers()
+        pair_sums = working.take("pair_sums", np.float32, len(pairs.splat), columns)
         in_parallel(
-            backward, walked.size, TILES, passes[0], *tiles, walked, images[0], transmittance,
+            backward, walked.size, TILES, passes[0], *tiles, walked, reached, images[0], transmittance,
             by_planes.contiguous().numpy(), by_alpha.contiguous().numpy(), pair_sums,
         )  # fmt: skip
         if aside.absgrad2d is not None:
@@ -163,10 +173,11 @@ class _Rasterize(torch.autograd.Function):
         by_images.reshape(-1, *transmittance.shape)[: len(by_blended)] = by_blended.numpy()
         no_alpha = np.zeros_like(transmittance)
         for k, coloured in enumerate(passes[1:]):
-            further, sums = scratch("further_sums", len(pair_sums), SUMS), np.zeros((count, SUMS), np.float32)
+            further = working.take(f"further_sums {k}", np.float32, len(pair_sums), SUMS)
+            sums = np.zeros((count, SUMS), np.float32)
             in_parallel(
-                blend_backward, walked.size, TILES, coloured, *tiles, walked, images[k + 1], transmittance,
-                by_images[k], no_alpha, further,
+                blend_backward, walked.size, TILES, coloured, *tiles, walked, reached, images[k + 1],
+                transmittance, by_images[k], no_alpha, further,
             )  # fmt: skip
             in_parallel(gather_sums, count, GRAIN, *of_pairs, further, sums)
             by_features[:, 3 * k : 3 * k + 3] = sums[:, G_RED:]
@@ -216,8 +227,10 @@ def contributions(
     ]  # fmt: skip
     radii = torch.zeros(count)
     settings = *lens_of(view), view.width, view.height, 0, f32(min_scale), antialias
-    projected, pairs = _project_and_bin(splats, settings, view, radii)
-    pair_weights, found = scratch("pair_weights", len(pairs.splat), 3), np.empty((count, 3), np.float32)
+    buffers = Buffers()
+    projected, pairs = _project_and_bin(splats, settings, view, radii, buffers)
+    pair_weights = buffers.take("pair_weights", np.float32, len(pairs.splat), 3)
+    found = np.empty((count, 3), np.float32)
     in_parallel(
         blend_weights, len(pairs.tile_start) - 1, TILES, projected, pairs.splat, pairs.tile_start,
         -(-view.width // TILE), view.width, view.height, pair_weights,

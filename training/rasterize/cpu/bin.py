@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..rendering import ALPHA_MIN
-from .compile import STRICT, f32, in_parallel, inlined, kernel
+from .compile import STRICT, Buffers, f32, in_parallel, inlined, kernel
 from .project import (
     CONIC_XX,
     CONIC_XY,
@@ -39,7 +39,7 @@ class Pairs:
         splat: (P,) int32, the splat of each pair.
         tile_start: (tiles + 1,) int64, where each tile's pairs begin; tiles go row by row.
         first, count: (N,) int64 and int32: the pairs of splat i are row[first[i] : first[i] + count[i]].
-        row: int64, positions in ``splat``; some are unused.
+        row: int32, positions in ``splat``; some are unused.
     """
 
     splat: np.ndarray
@@ -165,27 +165,32 @@ def place_pairs(begin, end, order, first, count, hits, histogram, splat):
                 place[tile] += 1
 
 
-def bin_splats(projected: np.ndarray, depth: np.ndarray, radii: np.ndarray, width: int, height: int) -> Pairs:
-    """Bin projected splats (N, COLUMNS) of an image of this size; those of radius 0 are in no pair."""
+def bin_splats(
+    projected: np.ndarray, drawn: np.ndarray, depths: np.ndarray, width: int, height: int, buffers: Buffers
+) -> Pairs:
+    """Bin the splats ``drawn`` (M,) int32, of these depths (M,), of the projected (N, COLUMNS).
+
+    Both index arrays are overwritten; what is returned lives in ``buffers``.
+    """
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-    drawn = np.flatnonzero(radii > 0).astype(np.int32)
     order = np.empty_like(drawn)
-    keys = depth[drawn].view(np.uint32)
+    keys = depths.view(np.uint32)
     sort_by_depth(keys, drawn, np.empty_like(keys), order)
 
     box_start = np.zeros(len(order) + 1, np.int64)
     in_parallel(box_sizes, len(order), 4096, projected, order, tiles_x, tiles_y, box_start[1:])
     np.cumsum(box_start, out=box_start)
-    first = np.empty(len(radii), np.int64)
-    count = np.zeros(len(radii), np.int32)
-    hits = np.empty(box_start[-1], np.int64)
-    histogram = np.zeros((CHUNKS, tiles_x * tiles_y), np.int64)
+    first = buffers.take("first", np.int64, len(projected))
+    count = buffers.take("count", np.int32, len(projected))
+    count[:] = 0
+    hits = buffers.take("hits", np.int32, int(box_start[-1]))
+    histogram = np.zeros((CHUNKS, tiles_x * tiles_y), np.int32)
     in_parallel(
         find_tiles, CHUNKS, 1,
         projected, order, box_start, tiles_x, tiles_y, first, count, hits, histogram,
     )  # fmt: skip
     tile_start = np.empty(tiles_x * tiles_y + 1, np.int64)
     start_of_each(histogram, tile_start)
-    splat = np.empty(tile_start[-1], np.int32)
+    splat = buffers.take("splat", np.int32, int(tile_start[-1]))
     in_parallel(place_pairs, CHUNKS, 1, order, first, count, hits, histogram, splat)
     return Pairs(splat, tile_start, first, count, hits)

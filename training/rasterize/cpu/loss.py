@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .compile import FAST, f32, helper, in_parallel, kernel, scratch
+from .compile import FAST, Buffers, f32, helper, in_parallel, kernel
 
 ROWS, COLUMNS = 16, 64
 """Size of a block."""
@@ -188,7 +188,8 @@ def loss_and_gradient(
     """(1 − ssim_weight) L1 + ssim_weight (1 − SSIM) of planes (3, H, W), and its gradient by the image."""
     blocks = block_count(*image.shape)
     similar, different = np.empty(blocks, np.float32), np.empty(blocks, np.float32)
-    by_moments = scratch("by_moments", 3, *image.shape)
+    buffers = Buffers()
+    by_moments = buffers.take("by_moments", np.float32, 3, *image.shape)
     gradient = np.empty_like(image)
     in_parallel(similarity, blocks, BLOCKS, image, truth, moments, by_moments, similar)
     weights = f32((1 - ssim_weight) / image.size), f32(ssim_weight / image.size)

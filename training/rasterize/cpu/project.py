@@ -23,8 +23,11 @@ CONIC_XX, CONIC_XY, CONIC_YY, LOG2_OPACITY = 2, 3, 4, 5
 RED, GREEN, BLUE = 6, 7, 8
 HALF_WIDTH, HALF_HEIGHT = 9, 10
 """Reach of the ellipse on which alpha is ALPHA_MIN, along x and y, in pixels."""
-OPACITY = 11
-COLUMNS = 12
+SLOPE, RISE, X_OF_TOP = 11, 12, 13
+"""At dx from the mean that ellipse lies between dy = SLOPE dx ± RISE sqrt(1 − (dx / HALF_WIDTH)²); its
+greatest dy, HALF_HEIGHT, is at dx = X_OF_TOP."""
+COLUMNS = 16
+"""A row is one cache line of 64 bytes."""
 
 # The columns of what blending's backward pass sums up for a splat, with sigma = -ln(alpha / opacity) and
 # (dx, dy) = pixel − mean: g = d loss / d sigma, its moments, and d loss / d colour.
@@ -34,6 +37,8 @@ SUMS = 9
 GRAIN = 1024
 """How many splats a thread takes at a time."""
 ZERO, HALF, ONE, TWO = f32(0), f32(0.5), f32(1), f32(2)
+MARGIN = f32(1 / 64)
+"""Pixels by which the ellipse's rows and columns are taken too far, against rounding."""
 ALPHA_MIN32, DILATION32, MIP_VARIANCE32 = f32(ALPHA_MIN), f32(DILATION), f32(MIP_VARIANCE)
 LOG2_E, LN2 = f32(math.log2(math.e)), f32(math.log(2))
 
@@ -56,6 +61,31 @@ def to_camera(pose, axis, mean):
 @inlined(FAST)
 def clamp(value, low, high):
     return min(max(value, low), high)
+
+
+@inlined(FAST)
+def rows_of_strip(row, left, across, top, rows):
+    """The first row and one past the last that a splat's ellipse reaches in a strip of pixel columns.
+
+    The strip's pixel centres lie between x = ``left`` and ``left + across``; its rows are at y = ``top``,
+    ``top`` + 1, … The ellipse is convex, so its greatest dy in the strip is where the strip comes closest to
+    X_OF_TOP; and by symmetry with the least.
+    """
+    half_width = row[HALF_WIDTH] + MARGIN
+    near = left - row[MEAN_X]
+    far = near + across
+    if near > half_width or far < -half_width:
+        return 0, 0
+    per_width = ONE / half_width
+    highest, lowest = clamp(row[X_OF_TOP], near, far), clamp(-row[X_OF_TOP], near, far)
+    high, low = highest * per_width, lowest * per_width
+    dy_high = row[SLOPE] * highest + row[RISE] * math.sqrt(max(ONE - high * high, ZERO))
+    dy_low = row[SLOPE] * lowest - row[RISE] * math.sqrt(max(ONE - low * low, ZERO))
+    middle = row[MEAN_Y] - top + ONE
+    # clamped before they become whole numbers: a mean and a reach may be of millions of pixels
+    first = int(clamp(middle + dy_low - MARGIN, ZERO, f32(rows)))
+    last = int(clamp(middle + dy_high + MARGIN, ZERO, f32(rows)))
+    return first, max(first, last)
 
 
 @inlined(FAST)
@@ -85,9 +115,10 @@ def camera_axes(pose, quat, log_scale, min_scale, scale, axes):
 def project_forward(
     begin, end, means, quats, log_scales, opacity_logits, sh, weights,
     pose, lens, eye, width, height, degree, min_scale, antialias,
-    projected, depth, radii,
+    some, depths, projected, radii,
 ):  # fmt: skip
-    """Fill projected (N, COLUMNS), depth (N,) and radii (N,); where the radius is 0 nothing else is set.
+    """Fill depths (M,) of the splats ``some`` (M,), 0 for those not drawn; of the others fill the rows of
+    projected (N, COLUMNS) and radii (N,).
 
     ``weights`` is empty where all are one.
     """
@@ -96,11 +127,10 @@ def project_forward(
     scale = np.empty(3, np.float32)
     axes = np.empty((3, 3), np.float32)
     basis = np.empty(25, np.float32)
-    for i in range(begin, end):
-        radii[i] = ZERO
+    for k in range(begin, end):
+        i = some[k]
+        depths[k] = ZERO
         weight = weights[i] if weights.shape[0] > 0 else ONE
-        if weight <= ZERO:
-            continue
         mean = means[i]
         z = to_camera(pose, 2, mean)
         opacity = weight / (ONE + math.exp(-opacity_logits[i]))
@@ -143,7 +173,7 @@ def project_forward(
             continue
         if mean_y + half_height <= ZERO or mean_y - half_height >= height:
             continue
-        depth[i] = z
+        depths[k] = z
         half_difference = HALF * (xx - yy)
         longest = HALF * (xx + yy) + math.sqrt(half_difference * half_difference + uv * uv)
         radii[i] = f32(3) * math.sqrt(longest)
@@ -153,7 +183,12 @@ def project_forward(
         unit = LOG2_E / determinant
         row[CONIC_XX], row[CONIC_XY], row[CONIC_YY] = HALF * unit * yy, -unit * uv, HALF * unit * xx
         row[LOG2_OPACITY] = math.log(opacity) * LOG2_E
-        row[HALF_WIDTH], row[HALF_HEIGHT], row[OPACITY] = half_width, half_height, opacity
+        row[HALF_WIDTH], row[HALF_HEIGHT] = half_width, half_height
+        row[SLOPE], row[RISE], row[X_OF_TOP] = (
+            uv / xx,
+            reach * math.sqrt(determinant / xx),
+            uv / yy * half_height,
+        )
 
         dx, dy, dz = mean[0] - eye[0], mean[1] - eye[1], mean[2] - eye[2]
         inverse = ONE / math.sqrt(dx * dx + dy * dy + dz * dz)
