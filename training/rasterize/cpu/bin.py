@@ -14,7 +14,9 @@ import numpy as np
 
 from ..rendering import ALPHA_MIN
 from .compile import STRICT, Buffers, f32, in_parallel, inlined, kernel
+from .fastmath import fetch_ahead
 from .project import (
+    AHEAD,
     CONIC_XX,
     CONIC_XY,
     CONIC_YY,
@@ -38,7 +40,7 @@ class Pairs:
     Attributes:
         splat: (P,) int32, the splat of each pair.
         tile_start: (tiles + 1,) int64, where each tile's pairs begin; tiles go row by row.
-        first, count: (N,) int64 and int32: the pairs of splat i are row[first[i] : first[i] + count[i]].
+        first, count: (M,) int64 and int32: the pairs of splat i are row[first[i] : first[i] + count[i]].
         row: int32, positions in ``splat``; some are unused.
     """
 
@@ -109,6 +111,7 @@ def touches(row, tile_x, tile_y):
 def box_sizes(begin, end, projected, order, tiles_x, tiles_y, sizes):
     """How many tiles the bounding box of each splat covers, in depth order."""
     for k in range(begin, end):
+        fetch_ahead(projected, order[min(k + AHEAD, order.shape[0] - 1)], 0)
         row = projected[order[k]]
         x0, x1 = tile_range(row[MEAN_X], row[HALF_WIDTH], tiles_x)
         y0, y1 = tile_range(row[MEAN_Y], row[HALF_HEIGHT], tiles_y)
@@ -122,6 +125,7 @@ def find_tiles(begin, end, projected, order, box_start, tiles_x, tiles_y, first,
     for chunk in range(begin, end):
         tally = histogram[chunk]
         for k in range(total * chunk // CHUNKS, total * (chunk + 1) // CHUNKS):
+            fetch_ahead(projected, order[min(k + AHEAD, total - 1)], 0)
             row = projected[order[k]]
             x0, x1 = tile_range(row[MEAN_X], row[HALF_WIDTH], tiles_x)
             y0, y1 = tile_range(row[MEAN_Y], row[HALF_HEIGHT], tiles_y)
@@ -168,9 +172,9 @@ def place_pairs(begin, end, order, first, count, hits, histogram, splat):
 def bin_splats(
     projected: np.ndarray, drawn: np.ndarray, depths: np.ndarray, width: int, height: int, buffers: Buffers
 ) -> Pairs:
-    """Bin the splats ``drawn`` (M,) int32, of these depths (M,), of the projected (N, COLUMNS).
+    """Bin those of the projected splats (M, COLUMNS) that are ``drawn`` (D,) int32, at these depths (D,).
 
-    Both index arrays are overwritten; what is returned lives in ``buffers``.
+    Both are overwritten; what is returned lives in ``buffers``.
     """
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     order = np.empty_like(drawn)

@@ -13,8 +13,9 @@ import numpy as np
 from ..rendering import ALPHA_MAX, TRANSMITTANCE_MIN
 from .bin import LOG2_ALPHA_MIN, TILE
 from .compile import FAST, f32, inlined, kernel
-from .fastmath import exp2
+from .fastmath import exp2, fetch_ahead
 from .project import (
+    AHEAD,
     BLUE,
     CONIC_XX,
     CONIC_XY,
@@ -258,6 +259,9 @@ def _backward(absolute: bool):
 
             lit = tile_start[tile] + walked[tile]
             for pair in range(tile_start[tile], lit):
+                if pair % AHEAD == 0:
+                    for later in range(pair + AHEAD, min(pair + 2 * AHEAD, lit)):
+                        fetch_ahead(projected, splat[later], 0)
                 row = projected[splat[pair]]
                 xx, xy, yy, log2_opacity = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY], row[LOG2_OPACITY]
                 red, green, blue = row[RED], row[GREEN], row[BLUE]

@@ -14,6 +14,7 @@ import numpy as np
 from .. import sh as harmonics
 from ..rendering import ALPHA_MIN, DILATION, MIP_VARIANCE, View
 from .compile import FAST, f32, inlined, kernel
+from .fastmath import fetch_ahead
 
 # The columns of a projected splat: all that blending reads, one row a splat.
 MEAN_X, MEAN_Y = 0, 1
@@ -36,6 +37,8 @@ SUMS = 9
 
 GRAIN = 1024
 """How many splats a thread takes at a time."""
+AHEAD = 8
+"""So many splats ahead memory is asked for what lies apart: splats that weights leave, sums of pairs."""
 ZERO, HALF, ONE, TWO = f32(0), f32(0.5), f32(1), f32(2)
 MARGIN = f32(1 / 64)
 """Pixels by which the ellipse's rows and columns are taken too far, against rounding."""
@@ -117,8 +120,8 @@ def project_forward(
     pose, lens, eye, width, height, degree, min_scale, antialias,
     some, depths, projected, radii,
 ):  # fmt: skip
-    """Fill depths (M,) of the splats ``some`` (M,), 0 for those not drawn; of the others fill the rows of
-    projected (N, COLUMNS) and radii (N,).
+    """Project the splats ``some`` (M,): fill depths (M,), 0 for those not drawn, and of the others the rows
+    of projected (M, COLUMNS) and radii (N,).
 
     ``weights`` is empty where all are one.
     """
@@ -129,6 +132,12 @@ def project_forward(
     basis = np.empty(25, np.float32)
     for k in range(begin, end):
         i = some[k]
+        ahead = some[min(k + AHEAD, some.shape[0] - 1)]
+        fetch_ahead(means, ahead, 0)
+        fetch_ahead(quats, ahead, 0)
+        fetch_ahead(log_scales, ahead, 0)
+        for line in range((sh.shape[1] * 3 + 15) // 16):
+            fetch_ahead(sh, ahead, line)
         depths[k] = ZERO
         weight = weights[i] if weights.shape[0] > 0 else ONE
         mean = means[i]
@@ -178,7 +187,7 @@ def project_forward(
         longest = HALF * (xx + yy) + math.sqrt(half_difference * half_difference + uv * uv)
         radii[i] = f32(3) * math.sqrt(longest)
 
-        row = projected[i]
+        row = projected[k]
         row[MEAN_X], row[MEAN_Y] = mean_x, mean_y
         unit = LOG2_E / determinant
         row[CONIC_XX], row[CONIC_XY], row[CONIC_YY] = HALF * unit * yy, -unit * uv, HALF * unit * xx
@@ -203,7 +212,7 @@ def project_forward(
 
 @kernel(FAST)
 def gather_weights(begin, end, first_pair, pair_count, pair_row, pair_weights, weights):
-    """Fill weights (N, 3) from (P, 3): the largest of the first column, the sums of the others."""
+    """Fill weights (M, 3) from (P, 3): the largest of the first column, the sums of the others."""
     for i in range(begin, end):
         largest, total, pixels = ZERO, ZERO, ZERO
         for pair in range(first_pair[i], first_pair[i] + pair_count[i]):
@@ -214,7 +223,7 @@ def gather_weights(begin, end, first_pair, pair_count, pair_row, pair_weights, w
 
 @kernel(FAST)
 def gather_sums(begin, end, first_pair, pair_count, pair_row, pair_sums, sums):
-    """Add what a splat's pairs hold, (P, K), to the splat's row of sums (N, K)."""
+    """Add what a splat's pairs hold, (P, K), to the splat's row of sums (M, K)."""
     for i in range(begin, end):
         if pair_count[i] > 0:
             for pair in range(first_pair[i], first_pair[i] + pair_count[i]):
@@ -279,10 +288,11 @@ def quat_gradient(w, x, y, z, inverse, by_rotation, gradient):
 def project_backward(
     begin, end, means, quats, log_scales, opacity_logits, sh, weights,
     pose, lens, eye, width, height, degree, min_scale, antialias,
-    projected, radii, first_pair, pair_count, pair_row, pair_sums,
+    some, projected, first_pair, pair_count, pair_row, pair_sums,
     by_means, by_quats, by_log_scales, by_logits, by_sh, by_weights, grad2d,
 ):  # fmt: skip
-    """Fill the gradients of every parameter and grad2d, from the sums that blending left per pair."""
+    """Fill the gradients of every parameter of the splats ``some``, and their grad2d, from the sums that
+    blending left per pair."""
     fx, fy = lens[0], lens[1]
     scale = np.empty(3, np.float32)
     axes = np.empty((3, 3), np.float32)
@@ -294,8 +304,15 @@ def project_backward(
     basis_x = np.empty(25, np.float32)
     basis_y = np.empty(25, np.float32)
     basis_z = np.empty(25, np.float32)
-    for i in range(begin, end):
-        if radii[i] <= ZERO or pair_count[i] == 0:
+    count = some.shape[0]
+    for s in range(begin, end):
+        i = some[s]
+        ahead = min(s + 2 * AHEAD, count - 1)
+        fetch_ahead(pair_row, first_pair[ahead], 0)
+        ahead = min(s + AHEAD, count - 1)
+        for pair in range(first_pair[ahead], first_pair[ahead] + pair_count[ahead]):
+            fetch_ahead(pair_sums, pair_row[pair], 0)
+        if pair_count[s] == 0:
             by_means[i] = ZERO
             by_quats[i] = ZERO
             by_log_scales[i] = ZERO
@@ -305,12 +322,13 @@ def project_backward(
             if by_weights.shape[0] > 0:
                 by_weights[i] = ZERO
             continue
-        sums[:] = ZERO
-        for pair in range(first_pair[i], first_pair[i] + pair_count[i]):
+        for k in range(SUMS):
+            sums[k] = ZERO
+        for pair in range(first_pair[s], first_pair[s] + pair_count[s]):
             for k in range(SUMS):
                 sums[k] += pair_sums[pair_row[pair], k]
 
-        mean, row = means[i], projected[i]
+        mean, row = means[i], projected[s]
         x, y, z = to_camera(pose, 0, mean), to_camera(pose, 1, mean), to_camera(pose, 2, mean)
         w, qx, qy, qz, inverse = camera_axes(pose, quats[i], log_scales[i], min_scale, scale, axes)
         rz = ONE / z
