@@ -1,15 +1,26 @@
 """Both backends against cases worked by hand, and the cpu backend against the float64 reference."""
 
 import math
+import threading
+from collections import Counter
 
 import numpy as np
 import pytest
 import torch
 
 from training.errors import LodgsError
-from training.rasterize import BACKENDS, OUTPUTS, Target, contributions, photometric_loss, rasterize, render
+from training.rasterize import (
+    BACKENDS,
+    OUTPUTS,
+    Target,
+    contributions,
+    cpu,
+    photometric_loss,
+    rasterize,
+    render,
+)  # fmt: skip
 from training.rasterize.cpu.bin import TILE, bin_splats
-from training.rasterize.cpu.compile import Buffers, numba, set_threads, threads
+from training.rasterize.cpu.compile import Buffers, in_parallel, numba, set_threads, threads
 from training.rasterize.cpu.fastmath import exp2
 from training.rasterize.cpu.project import (
     COLUMNS,
@@ -360,6 +371,64 @@ def test_the_same_bits_whatever_the_number_of_threads(make_splats, odd_camera):
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
+@pytest.fixture
+def sixteen_threads():
+    before = threads()
+    set_threads(16)
+    yield
+    set_threads(before)
+
+
+def test_sixteen_threads_take_every_range_once_and_none_more_than_another(sixteen_threads):
+    """All sixteen are held until each has a range, so five ranges apiece is the only way through."""
+    together, taken = threading.Barrier(16, timeout=20), []
+
+    def work(begin, end, width):
+        assert end - begin == width
+        taken.append((begin, threading.get_ident()))
+        together.wait()
+
+    in_parallel(work, 16 * 5 * 7, 7, 7)
+    assert sorted(begin for begin, _ in taken) == list(range(0, 16 * 5 * 7, 7))
+    by_thread = Counter(thread for _, thread in taken)
+    assert len(by_thread) == 16 and set(by_thread.values()) == {5}
+
+
+def test_the_last_range_ends_where_the_work_does(sixteen_threads):
+    taken = []
+    in_parallel(lambda begin, end: taken.append((begin, end)), 10, 4)
+    assert sorted(taken) == [(0, 4), (4, 8), (8, 10)]
+    with pytest.raises(ZeroDivisionError):  # what goes wrong in a thread goes wrong for the caller
+        in_parallel(lambda begin, end: 1 // (begin - 8), 10, 4)
+
+
+def test_ranges_are_fine_enough_for_sixteen_threads(make_splats, sixteen_threads, monkeypatch):
+    """Work counted in pairs for tiles, in rows for the rest: whoever is free takes the next range."""
+    width, height = 640, 480
+    camera = Camera("even", width, height, 500.0, 500.0, 320.0, 240.0, np.eye(4))
+    splats = {name: tensor.float() for name, tensor in make_splats(40_000).items()}
+    splats["means"][:, :2] *= splats["means"][:, 2:] * 0.7
+    splats["log_scales"] -= 2
+    leaves = [tensor.requires_grad_() for tensor in splats.values()]
+    dealt = []
+
+    def spy(kernel, total, grain, *args):
+        dealt.append((kernel.__name__, total, grain))
+        in_parallel(kernel, total, grain, *args)
+
+    monkeypatch.setattr(cpu, "in_parallel", spy)
+    drawn = rasterize(*leaves, camera)
+    drawn.image.sum().backward()
+    tiles = drawn.tile_counts.flatten().numpy()
+    assert {name for name, *_ in dealt} >= {"project_forward", "blend_forward", "blend_backward"}
+    for name, total, grain in dealt:
+        work = tiles if total == len(tiles) else np.ones(total)
+        loads = np.zeros(16)
+        for begin in range(0, total, grain):
+            loads[loads.argmin()] += work[begin : begin + grain].sum()
+        assert loads.max() <= 1.35 * loads.mean(), name
+
+
 def test_two_renderings_may_wait_for_their_backward(make_splats, odd_camera, axis_camera):
     splats = make_splats(100)
     alone = []
@@ -372,6 +441,18 @@ def test_two_renderings_may_wait_for_their_backward(make_splats, odd_camera, axi
     sum(images).backward()
     for leaf, first, second in zip(leaves, *alone, strict=True):
         torch.testing.assert_close(leaf.grad, first + second)
+
+
+def test_buffers_go_to_the_next_only_when_their_owner_is_gone():
+    one, other = Buffers(), Buffers()
+    first, second = (owner.take("of a test", np.float32, 100, 16) for owner in (one, other))
+    first[:], second[:] = 1, 2
+    assert (first == 1).all() and not np.shares_memory(first, second)
+    assert first.ctypes.data % 64 == 0
+    address = first.ctypes.data
+    del one, first
+    assert Buffers().take("of a test", np.int32, 3).ctypes.data == address
+    assert Buffers().take("of a test", np.uint8, 1 << 20).size == 1 << 20, "one too small is not given"
 
 
 def test_every_splat_is_in_every_tile_it_touches_once_and_front_to_back():

@@ -59,8 +59,10 @@ def sort_by_depth(keys, splats, other_keys, other_splats):
     are in ``other_splats``; all four arrays, of one length, are overwritten.
     """
     source_keys, source, target_keys, target = keys, splats, other_keys, other_splats
+    start = np.empty(2049, np.int64)
     for shift in (0, 11, 22):
-        start = np.zeros(2049, np.int64)
+        for digit in range(2049):
+            start[digit] = 0
         for i in range(keys.shape[0]):
             start[((source_keys[i] >> np.uint32(shift)) & np.uint32(2047)) + 1] += 1
         for digit in range(2048):

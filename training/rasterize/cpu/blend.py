@@ -75,14 +75,16 @@ def blend_forward(
     whatever follows then fails the test against T_MIN, and |T| stays.
     """
     height, width = transmittance.shape
+    state = np.empty((16, 64), np.float32)  # a row: 16 lanes each of T, red, green, blue
     for tile in range(begin, end):
         x0, y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
         rows, columns = min(TILE, height - y0), min(TILE, width - x0)
         left, top = f32(x0) + HALF, f32(y0) + HALF
-        state = np.zeros((16, 64), np.float32)  # a row: 16 lanes each of T, red, green, blue
         for r in range(16):
             for j in range(16):
                 state[r, j] = ONE if r < rows and j < columns else -ONE
+            for j in range(16, 64):
+                state[r, j] = ZERO
 
         pair = tile_start[tile]
         lit = 1
@@ -239,7 +241,9 @@ def _backward(absolute: bool):
         by_image, by_alpha, pair_sums,
     ):  # fmt: skip
         height, width = transmittance.shape
-        state = np.zeros(17 * stride, np.float32)  # the row above the first holds sums of zero only
+        state = np.empty(17 * stride, np.float32)  # the row above the first holds sums of zero only
+        for j in range(state.shape[0]):
+            state[j] = ZERO
         for tile in range(begin, end):
             x0, y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
             rows, columns = min(TILE, height - y0), min(TILE, width - x0)

@@ -50,29 +50,28 @@ STRICT = frozenset()
 """For what must give the same answer wherever it is compiled."""
 
 
+_OPTIONS: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True}
+"""Dividing as C does, and not callable from C, which would take a wrapper."""
+_HELPER: dict[str, Any] = {**_OPTIONS, "no_cpython_wrapper": True}
+
+
 def kernel(fastmath: frozenset[str]) -> Callable[[Callable], Any]:
-    """Compile a function of arrays: cached on disk, without the GIL, dividing as C does."""
-    return numba.njit(
-        fastmath=set(fastmath), cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True
-    )
+    """Compile a function of arrays: cached on disk, without the GIL."""
+    return numba.njit(fastmath=set(fastmath), cache=True, nogil=True, **_OPTIONS)
 
 
 def helper(fastmath: frozenset[str]) -> Callable[[Callable], Any]:
     """Compile a function for kernels only. LLVM decides whether it becomes part of its caller.
 
-    Numba's own ``inline="always"`` copies the source into every caller and infers its types there again.
+    Numba's own ``inline="always"`` copies the source into every caller and infers its types there again,
+    which takes longer than all else.
     """
-    return numba.njit(
-        fastmath=set(fastmath), error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True
-    )
+    return numba.njit(**_HELPER, fastmath=set(fastmath))
 
 
 def inlined(fastmath: frozenset[str]) -> Callable[[Callable], Any]:
     """As :func:`helper`, always a part of its caller: for what inner loops call."""
-    return numba.njit(
-        fastmath=set(fastmath), error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True,
-        forceinline=True,
-    )  # fmt: skip
+    return numba.njit(**_HELPER, fastmath=set(fastmath), forceinline=True)
 
 
 def available_threads() -> int:

@@ -5,6 +5,8 @@ Numba finds SVML only with Intel's LLVM, and libm's exp is scalar.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from llvmlite import ir
 from numba import types
@@ -43,7 +45,7 @@ def truncated(typing_context, x):
 
 
 @intrinsic
-def fetch_ahead(typing_context, array, row, line):
+def _fetch_ahead(typing_context, array, row, line):
     """Ask the memory for 64 bytes of a row, beginning at 64 · line: they will be read in a while."""
 
     def generate(context, builder, signature, args):
@@ -60,6 +62,9 @@ def fetch_ahead(typing_context, array, row, line):
         return context.get_dummy_value()
 
     return types.void(array, types.intp, types.intp), generate
+
+
+fetch_ahead: Any = _fetch_ahead  # for type checkers, which do not know that numba passes the first argument
 
 
 @inlined(FAST)

@@ -105,7 +105,9 @@ def similarity(begin, end, image, truth, moments_of_y, by_moments, sums):
     wide = np.empty((3, HIGH, WIDE), np.float32)  # x, x², xy
     line = np.empty(WIDE, np.float32)
     moments = np.empty((3, ROWS, COLUMNS), np.float32)
-    of_y = np.zeros((2, COLUMNS), np.float32)
+    of_y = np.empty((2, COLUMNS), np.float32)
+    for j in range(COLUMNS):  # beyond the image's border they stay
+        of_y[0, j], of_y[1, j] = ZERO, ZERO
     for block in range(begin, end):
         channel, y0, x0, rows, columns = place_of(block, height, width)
         read_padded(image[channel], y0, x0, wide[0])

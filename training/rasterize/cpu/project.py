@@ -298,7 +298,9 @@ def project_backward(
     axes = np.empty((3, 3), np.float32)
     by_axes = np.empty((3, 3), np.float32)
     by_rotation = np.empty((3, 3), np.float32)
-    by_area = np.zeros((2, 3), np.float32)
+    by_area = np.empty((2, 3), np.float32)
+    for k in range(3):
+        by_area[0, k], by_area[1, k] = ZERO, ZERO
     sums = np.empty(SUMS, np.float32)
     basis = np.empty(25, np.float32)
     basis_x = np.empty(25, np.float32)
@@ -313,12 +315,14 @@ def project_backward(
         for pair in range(first_pair[ahead], first_pair[ahead] + pair_count[ahead]):
             fetch_ahead(pair_sums, pair_row[pair], 0)
         if pair_count[s] == 0:
-            by_means[i] = ZERO
-            by_quats[i] = ZERO
-            by_log_scales[i] = ZERO
+            for k in range(3):
+                by_means[i, k], by_log_scales[i, k] = ZERO, ZERO
+            for k in range(4):
+                by_quats[i, k] = ZERO
+            for k in range(sh.shape[1]):
+                by_sh[i, k, 0], by_sh[i, k, 1], by_sh[i, k, 2] = ZERO, ZERO, ZERO
             by_logits[i] = ZERO
-            by_sh[i] = ZERO
-            grad2d[i] = ZERO
+            grad2d[i, 0], grad2d[i, 1] = ZERO, ZERO
             if by_weights.shape[0] > 0:
                 by_weights[i] = ZERO
             continue
@@ -410,7 +414,8 @@ def project_backward(
             by_dx += by_basis * basis_x[k]
             by_dy += by_basis * basis_y[k]
             by_dz += by_basis * basis_z[k]
-        by_sh[i, active:] = ZERO
+        for k in range(active, sh.shape[1]):
+            by_sh[i, k, 0], by_sh[i, k, 1], by_sh[i, k, 2] = ZERO, ZERO, ZERO
         # direction = (mean − eye) / length: only the part across the direction moves it
         along = by_dx * dx + by_dy * dy + by_dz * dz
         by_means[i, 0] = (by_dx - along * dx) * per_length
