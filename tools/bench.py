@@ -258,8 +258,8 @@ def bench(seconds: float) -> dict:
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0
     if load > count_of_threads + 1 or busy < 0.75 * count_of_threads:
         print(
-            f"The machine was busy with other work (load {load:.1f}, {busy:.1f} of {count_of_threads} threads at "
-            "work): these times are too long."
+            f"The machine had other work (load {load:.1f}, {busy:.1f} of {count_of_threads} threads "
+            "at work): these times are too long."
         )
     pair = bytes_a_pair(Step(200_000, 960, 540))
     print(f"memory beyond the splats, 200k at 960x540: {pair:.0f} bytes a pair of splat and tile")
