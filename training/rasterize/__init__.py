@@ -7,6 +7,7 @@ computer, ``cuda`` (gsplat) that on NVIDIA graphics cards. A backend is a module
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from importlib import import_module
@@ -280,7 +281,11 @@ def device_of(backend: str) -> torch.device:
 
 def warm_up(backend: str = "auto") -> None:
     """Make one step on one splat, so that kernels are compiled: the first time on a computer this takes some
-    seconds on the cpu and some minutes with cuda; later they are read from a cache."""
+    seconds on the cpu and some minutes with cuda; later they are read from a cache.
+
+    Numba makes millions of objects on the way; looking among them for garbage, again and again, would take a
+    fifth of the time.
+    """
     one = {
         "means": [[0.0, 0.0, 1.0]], "quats": [[1.0, 0.0, 0.0, 0.0]], "log_scales": [[0.0] * 3],
         "opacity_logits": [0.0], "sh": [[[0.0] * 3]],
@@ -288,9 +293,15 @@ def warm_up(backend: str = "auto") -> None:
     device = device_of(backend)
     tensors = {name: torch.tensor(v, device=device, requires_grad=True) for name, v in one.items()}
     camera = Camera("", 16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
-    drawn = rasterize(*tensors.values(), camera, backend=backend)  # pyright: ignore[reportCallIssue]
-    photometric_loss(drawn.image, Target(torch.zeros(16, 16, 3)), backend=backend).backward()
-    Adam(tensors, dict.fromkeys(tensors, 0.0)).step()
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        drawn = rasterize(*tensors.values(), camera, backend=backend)  # pyright: ignore[reportCallIssue]
+        photometric_loss(drawn.image, Target(torch.zeros(16, 16, 3)), backend=backend).backward()
+        Adam(tensors, dict.fromkeys(tensors, 0.0)).step()
+    finally:
+        if collects:
+            gc.enable()
 
 
 def _backend(name: str, tensor: torch.Tensor):

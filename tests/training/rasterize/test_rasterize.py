@@ -1,6 +1,8 @@
 """Every backend against cases worked by hand, and the cpu backend against the float64 reference."""
 
 import math
+import threading
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -8,10 +10,9 @@ import torch
 
 from tests.training.rasterize.scenes import CONTRIBUTING, SCENES, contributed, drawn_and_differentiated, scene
 from training.errors import LodgsError
-from training.rasterize import OUTPUTS, Target, contributions, photometric_loss, rasterize, render
+from training.rasterize import OUTPUTS, Target, contributions, cpu, photometric_loss, rasterize, render
 from training.rasterize.cpu.bin import TILE, bin_splats
-from training.rasterize.cpu.blend import row_range
-from training.rasterize.cpu.compile import numba, set_threads, threads
+from training.rasterize.cpu.compile import Buffers, in_parallel, numba, set_threads, threads
 from training.rasterize.cpu.fastmath import exp2
 from training.rasterize.cpu.project import (
     COLUMNS,
@@ -19,8 +20,12 @@ from training.rasterize.cpu.project import (
     CONIC_XY,
     CONIC_YY,
     HALF_HEIGHT,
+    HALF_WIDTH,
     LOG2_OPACITY,
-    MEAN_Y,
+    RISE,
+    SLOPE,
+    X_OF_TOP,
+    rows_of_strip,
 )
 from training.scenes.cameras import Camera
 
@@ -307,6 +312,64 @@ def test_the_same_bits_whatever_the_number_of_threads(make_splats, odd_camera):
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
+@pytest.fixture
+def sixteen_threads():
+    before = threads()
+    set_threads(16)
+    yield
+    set_threads(before)
+
+
+def test_sixteen_threads_take_every_range_once_and_none_more_than_another(sixteen_threads):
+    """All sixteen are held until each has a range, so five ranges apiece is the only way through."""
+    together, taken = threading.Barrier(16, timeout=20), []
+
+    def work(begin, end, width):
+        assert end - begin == width
+        taken.append((begin, threading.get_ident()))
+        together.wait()
+
+    in_parallel(work, 16 * 5 * 7, 7, 7)
+    assert sorted(begin for begin, _ in taken) == list(range(0, 16 * 5 * 7, 7))
+    by_thread = Counter(thread for _, thread in taken)
+    assert len(by_thread) == 16 and set(by_thread.values()) == {5}
+
+
+def test_the_last_range_ends_where_the_work_does(sixteen_threads):
+    taken = []
+    in_parallel(lambda begin, end: taken.append((begin, end)), 10, 4)
+    assert sorted(taken) == [(0, 4), (4, 8), (8, 10)]
+    with pytest.raises(ZeroDivisionError):  # what goes wrong in a thread goes wrong for the caller
+        in_parallel(lambda begin, end: 1 // (begin - 8), 10, 4)
+
+
+def test_ranges_are_fine_enough_for_sixteen_threads(make_splats, sixteen_threads, monkeypatch):
+    """Work counted in pairs for tiles, in rows for the rest: whoever is free takes the next range."""
+    width, height = 640, 480
+    camera = Camera("even", width, height, 500.0, 500.0, 320.0, 240.0, np.eye(4))
+    splats = {name: tensor.float() for name, tensor in make_splats(40_000).items()}
+    splats["means"][:, :2] *= splats["means"][:, 2:] * 0.7
+    splats["log_scales"] -= 2
+    leaves = [tensor.requires_grad_() for tensor in splats.values()]
+    dealt = []
+
+    def spy(kernel, total, grain, *args):
+        dealt.append((kernel.__name__, total, grain))
+        in_parallel(kernel, total, grain, *args)
+
+    monkeypatch.setattr(cpu, "in_parallel", spy)
+    drawn = rasterize(*leaves, camera)
+    drawn.image.sum().backward()
+    tiles = drawn.tile_counts.flatten().numpy()
+    assert {name for name, *_ in dealt} >= {"project_forward", "blend_forward", "blend_backward"}
+    for name, total, grain in dealt:
+        work = tiles if total == len(tiles) else np.ones(total)
+        loads = np.zeros(16)
+        for begin in range(0, total, grain):
+            loads[loads.argmin()] += work[begin : begin + grain].sum()
+        assert loads.max() <= 1.35 * loads.mean(), name
+
+
 def test_two_renderings_may_wait_for_their_backward(make_splats, odd_camera, axis_camera):
     splats = make_splats(100)
     alone = []
@@ -319,6 +382,18 @@ def test_two_renderings_may_wait_for_their_backward(make_splats, odd_camera, axi
     sum(images).backward()
     for leaf, first, second in zip(leaves, *alone, strict=True):
         torch.testing.assert_close(leaf.grad, first + second)
+
+
+def test_buffers_go_to_the_next_only_when_their_owner_is_gone():
+    one, other = Buffers(), Buffers()
+    first, second = (owner.take("of a test", np.float32, 100, 16) for owner in (one, other))
+    first[:], second[:] = 1, 2
+    assert (first == 1).all() and not np.shares_memory(first, second)
+    assert first.ctypes.data % 64 == 0
+    address = first.ctypes.data
+    del one, first
+    assert Buffers().take("of a test", np.int32, 3).ctypes.data == address
+    assert Buffers().take("of a test", np.uint8, 1 << 20).size == 1 << 20, "one too small is not given"
 
 
 def test_every_splat_is_in_every_tile_it_touches_once_and_front_to_back():
@@ -346,7 +421,8 @@ def test_every_splat_is_in_every_tile_it_touches_once_and_front_to_back():
     depth = random.uniform(1, 9, count).astype(np.float32)
     radii = np.ones(count, np.float32)
     radii[::9] = 0
-    pairs = bin_splats(projected, depth, radii, width, height)
+    drawn = np.flatnonzero(radii).astype(np.int32)
+    pairs = bin_splats(projected, drawn, depth[drawn], width, height, Buffers())
 
     row = projected.astype(np.float64)[:, :, None, None]
     dx = np.arange(112) + 0.5 - row[:, 0]
@@ -373,23 +449,51 @@ def test_every_splat_is_in_every_tile_it_touches_once_and_front_to_back():
         assert (pairs.splat[pairs.row[pairs.first[i] : pairs.first[i] + pairs.count[i]]] == i).all()
 
 
+def ellipses(count, random, largest):
+    """Projected splats as ``project_forward`` makes them, and their covariances and reaches in float64."""
+    angle, axes = random.uniform(0, np.pi, count), np.exp(random.uniform(-0.5, math.log(largest), (2, count)))
+    cos, sin = np.cos(angle), np.sin(angle)
+    xx, yy = (axes[0] * cos) ** 2 + (axes[1] * sin) ** 2, (axes[0] * sin) ** 2 + (axes[1] * cos) ** 2
+    xy = (axes[0] ** 2 - axes[1] ** 2) * cos * sin
+    reach = random.uniform(0.3, 3.3, count)
+    projected = np.zeros((count, COLUMNS), np.float32)
+    projected[:, HALF_WIDTH], projected[:, HALF_HEIGHT] = reach * np.sqrt(xx), reach * np.sqrt(yy)
+    projected[:, SLOPE], projected[:, RISE] = xy / xx, reach * axes[0] * axes[1] / np.sqrt(xx)
+    projected[:, X_OF_TOP] = xy / yy * projected[:, HALF_HEIGHT]
+    return projected, np.array([[xx, xy], [xy, yy]]).transpose(2, 0, 1), reach
+
+
+@numba.njit
+def rows_over(projected):
+    return [rows_of_strip(row, np.float32(0.5), np.float32(15), np.float32(0.5), 16) for row in projected]
+
+
+def test_the_rows_of_a_tile_hold_every_pixel_of_the_ellipse_and_hardly_more():
+    """Against all 256 pixel centres in float64."""
+    random = np.random.default_rng(4)
+    projected, covariance, reach = ellipses(3000, random, 30.0)
+    projected[:, :2] = random.uniform(-15, 31, (3000, 2))
+    rows = np.array(rows_over(projected))
+    centres = np.stack(np.meshgrid(np.arange(16) + 0.5, np.arange(16) + 0.5), -1)
+    offset = centres - projected[:, None, None, :2].astype(np.float64)
+    squared = np.einsum("nyxi,nij,nyxj->nyx", offset, np.linalg.inv(covariance), offset)
+    inside = (squared <= (reach**2)[:, None, None]).any(2)
+    assert 0.2 < inside.any(1).mean() < 0.9
+    listed = (np.arange(16) >= rows[:, :1]) & (np.arange(16) < rows[:, 1:])
+    assert listed[inside].all()
+    # besides, a row whose centres the ellipse passes between
+    assert listed.sum() < 1.1 * inside.sum()
+
+
 def test_rows_stay_in_the_tile_whatever_rounding_does():
     """Kernels write where these rows say: a mean and a reach of 1e9 pixels differ by rows of rounding."""
-
-    @numba.njit
-    def over(projected):
-        return [row_range(row, np.float32(0.5), 16) for row in projected]
-
     random = np.random.default_rng(0)
-    projected = np.zeros((3000, COLUMNS), np.float32)
-    size = 10 ** random.uniform(0, 9, 3000)
-    projected[:, MEAN_Y] = random.choice([-1, 1], 3000) * size
-    projected[:, HALF_HEIGHT] = size + random.uniform(-40, 40, 3000)
-    rows = np.array(over(projected))
+    projected, _, _ = ellipses(3000, random, 1e9)
+    half = projected[:, [HALF_WIDTH, HALF_HEIGHT]]
+    projected[:, :2] = random.choice([-1, 1], (3000, 2)) * half * random.choice([0, 0.5, 1], (3000, 2))
+    rows = np.array(rows_over(projected))
     assert rows[:, 0].min() == 0 and rows[:, 0].max() == 16 and rows[:, 1].max() == 16
-    by_hand = np.zeros((1, COLUMNS), np.float32)
-    by_hand[0, MEAN_Y], by_hand[0, HALF_HEIGHT] = 6.0, 2.2  # from 3.8 to 8.2: centres 4.5 to 7.5
-    assert over(by_hand) == [(4, 8)]
+    assert (rows[:, 0] <= rows[:, 1]).all()
 
 
 def test_exp2_is_right_to_a_few_parts_in_a_million():

@@ -17,7 +17,7 @@ import torch
 from ..rendering import Drawn, Target, View
 from .bin import TILE, Pairs, bin_splats
 from .blend import blend_backward, blend_backward_absolute, blend_forward, blend_median, blend_weights
-from .compile import f32, in_parallel, scratch, serialised
+from .compile import Buffers, f32, in_parallel, serialised
 from .loss import loss_and_gradient, moments_of
 from .project import (
     BLUE,
@@ -96,13 +96,19 @@ class _Aside:
 
 
 def _project_and_bin(
-    splats: list, settings: tuple, view: View, radii: torch.Tensor
-) -> tuple[np.ndarray, Pairs]:
-    """Projected splats (N, COLUMNS) and their pairs with tiles; fills the radii."""
-    projected = np.empty((len(radii), COLUMNS), np.float32)
-    depth = np.empty(len(radii), np.float32)
-    in_parallel(project_forward, len(radii), GRAIN, *splats, *settings, projected, depth, radii.numpy())
-    return projected, bin_splats(projected, depth, radii.numpy(), view.width, view.height)
+    splats: list, settings: tuple, view: View, radii: torch.Tensor, buffers: Buffers
+) -> tuple[np.ndarray, np.ndarray, Pairs]:
+    """The M splats that have a weight; these projected, (M, COLUMNS); and their pairs with tiles.
+
+    All that follows counts only these M. Fills the radii, which are zeros. The last two live in ``buffers``.
+    """
+    weights = splats[-1]
+    some = (np.flatnonzero(weights > 0) if len(weights) else np.arange(len(radii))).astype(np.int32)
+    projected = buffers.take("projected", np.float32, len(some), COLUMNS)
+    depths = np.empty(len(some), np.float32)
+    in_parallel(project_forward, len(some), GRAIN, *splats, *settings, some, depths, projected, radii.numpy())
+    drawn = np.flatnonzero(depths).astype(np.int32)
+    return some, projected, bin_splats(projected, drawn, depths[drawn], view.width, view.height, buffers)
 
 
 class _Rasterize(torch.autograd.Function):
@@ -115,39 +121,57 @@ class _Rasterize(torch.autograd.Function):
     ):
         tensors = [tensor.contiguous() for tensor in (means, quats, log_scales, logits, sh, weights)]
         splats = [tensor.detach().numpy() for tensor in tensors]
-        projected, pairs = _project_and_bin(splats, settings, view, aside.radii)
+        buffers = Buffers()
+        some, projected, pairs = _project_and_bin(splats, settings, view, aside.radii, buffers)
         counts = aside.tile_counts.numpy()
         counts[:] = np.diff(pairs.tile_start).reshape(counts.shape)
 
         tiles = pairs.splat, pairs.tile_start, counts.shape[1]
-        transmittance = np.empty((view.height, view.width), np.float32)
+        transmittance = buffers.take("transmittance", np.float32, view.height, view.width)
         walked = np.empty(counts.size, np.int64)
-        passes = [projected, *_as_colours(features, projected)]
+        reached = buffers.take("reached", np.uint8, len(pairs.splat), 2)
+        passes = [projected, *_as_colours(features.detach().numpy()[some], projected)]
         images = np.empty((len(passes), 3, view.height, view.width), np.float32)
         for coloured, image in zip(passes, images, strict=True):
             behind = background if coloured is projected else np.zeros_like(background)
             in_parallel(
-                blend_forward, counts.size, TILES, coloured, *tiles, behind, image, transmittance, walked
-            )
+                blend_forward, counts.size, TILES, coloured, *tiles, behind, image, transmittance, walked,
+                reached,
+            )  # fmt: skip
         if aside.median is not None:
-            in_parallel(blend_median, counts.size, TILES, projected, *tiles, walked, aside.median.numpy())
+            median = aside.median.numpy()
+            in_parallel(blend_median, counts.size, TILES, projected, *tiles, walked, median)
+            median[median >= 0] = some[median[median >= 0]]
         ctx.save_for_backward(*tensors)
-        ctx.rest = settings, aside, pairs, tiles, walked, passes, images, transmittance
+        ctx.rest = (
+            buffers,
+            settings,
+            aside,
+            some,
+            pairs,
+            tiles,
+            walked,
+            reached,
+            passes,
+            images,
+            transmittance,
+        )
         blended = images[1:].reshape(-1, view.height, view.width)[: features.shape[1]]
         return tuple(map(torch.from_numpy, (images[0], 1 - transmittance, blended)))
 
     @staticmethod
     @serialised
     def backward(ctx, by_planes, by_alpha, by_blended):
-        settings, aside, pairs, tiles, walked, passes, images, transmittance = ctx.rest
-        tensors, count = ctx.saved_tensors, len(aside.radii)
+        _, settings, aside, some, pairs, tiles, walked, reached, passes, images, transmittance = ctx.rest
+        tensors, count = ctx.saved_tensors, len(some)
         of_pairs = pairs.first, pairs.count, pairs.row
         backward, columns = (
             (blend_backward, SUMS) if aside.absgrad2d is None else (blend_backward_absolute, SUMS + 2)
         )
-        pair_sums = scratch("pair_sums", len(pairs.splat), columns)
+        working = Buffers()
+        pair_sums = working.take("pair_sums", np.float32, len(pairs.splat), columns)
         in_parallel(
-            backward, walked.size, TILES, passes[0], *tiles, walked, images[0], transmittance,
+            backward, walked.size, TILES, passes[0], *tiles, walked, reached, images[0], transmittance,
             by_planes.contiguous().numpy(), by_alpha.contiguous().numpy(), pair_sums,
         )  # fmt: skip
         if aside.absgrad2d is not None:
@@ -155,37 +179,40 @@ class _Rasterize(torch.autograd.Function):
             in_parallel(gather_sums, count, GRAIN, *of_pairs, pair_sums, sums)
             height, width = transmittance.shape
             half_size = np.array([width / 2, height / 2], np.float32)
-            np.multiply(sums[:, SUMS:], half_size * LN2, out=aside.absgrad2d.numpy())
+            aside.absgrad2d.numpy()[some] = sums[:, SUMS:] * (half_size * LN2)
 
-        by_features = np.zeros((count, 3 * (len(passes) - 1)), np.float32)
+        by_features = np.zeros((len(aside.radii), 3 * (len(passes) - 1)), np.float32)
         by_images = np.zeros_like(images[1:])
         by_images.reshape(-1, *transmittance.shape)[: len(by_blended)] = by_blended.numpy()
         no_alpha = np.zeros_like(transmittance)
         for k, coloured in enumerate(passes[1:]):
-            further, sums = scratch("further_sums", len(pair_sums), SUMS), np.zeros((count, SUMS), np.float32)
+            further = working.take(f"further_sums {k}", np.float32, len(pair_sums), SUMS)
+            sums = np.zeros((count, SUMS), np.float32)
             in_parallel(
-                blend_backward, walked.size, TILES, coloured, *tiles, walked, images[k + 1], transmittance,
-                by_images[k], no_alpha, further,
+                blend_backward, walked.size, TILES, coloured, *tiles, walked, reached, images[k + 1],
+                transmittance, by_images[k], no_alpha, further,
             )  # fmt: skip
             in_parallel(gather_sums, count, GRAIN, *of_pairs, further, sums)
-            by_features[:, 3 * k : 3 * k + 3] = sums[:, G_RED:]
+            by_features[some, 3 * k : 3 * k + 3] = sums[:, G_RED:]
             pair_sums[:, :G_RED] += further[:, :G_RED]
 
-        gradients = [torch.empty_like(tensor, requires_grad=False) for tensor in tensors]
+        # of splats without a weight no kernel writes the gradients
+        empty = torch.empty_like if count == len(aside.radii) else torch.zeros_like
+        gradients = [empty(tensor, requires_grad=False) for tensor in tensors]
         in_parallel(
             project_backward, count, GRAIN, *(tensor.detach().numpy() for tensor in tensors), *settings,
-            passes[0], aside.radii.numpy(), *of_pairs, pair_sums,
+            some, passes[0], *of_pairs, pair_sums,
             *(gradient.numpy() for gradient in gradients), aside.grad2d.numpy(),
         )  # fmt: skip
         return *gradients, torch.from_numpy(by_features[:, : len(by_blended)]), None, None, None, None
 
 
-def _as_colours(features: torch.Tensor, projected: np.ndarray) -> list[np.ndarray]:
+def _as_colours(features: np.ndarray, projected: np.ndarray) -> list[np.ndarray]:
     """Projected splats with three features each in the place of their colours, zeros where they run out."""
     found = []
     for first in range(0, features.shape[1], 3):
         coloured = projected.copy()
-        three = features[:, first : first + 3].detach().numpy()
+        three = features[:, first : first + 3]
         coloured[:, RED : BLUE + 1] = 0
         coloured[:, RED : RED + three.shape[1]] = three
         found.append(coloured)
@@ -215,14 +242,17 @@ def contributions(
     ]  # fmt: skip
     radii = torch.zeros(count)
     settings = *lens_of(view), view.width, view.height, 0, f32(min_scale), antialias
-    projected, pairs = _project_and_bin(splats, settings, view, radii)
-    pair_weights, found = scratch("pair_weights", len(pairs.splat), 3), np.empty((count, 3), np.float32)
+    buffers = Buffers()
+    some, projected, pairs = _project_and_bin(splats, settings, view, radii, buffers)
+    pair_weights = buffers.take("pair_weights", np.float32, len(pairs.splat), 3)
+    found, everywhere = np.empty((len(some), 3), np.float32), np.zeros((count, 3), np.float32)
     in_parallel(
         blend_weights, len(pairs.tile_start) - 1, TILES, projected, pairs.splat, pairs.tile_start,
         -(-view.width // TILE), view.width, view.height, pair_weights,
     )  # fmt: skip
-    in_parallel(gather_weights, count, GRAIN, pairs.first, pairs.count, pairs.row, pair_weights, found)
-    largest, total, pixels = torch.from_numpy(found).unbind(1)
+    in_parallel(gather_weights, len(some), GRAIN, pairs.first, pairs.count, pairs.row, pair_weights, found)
+    everywhere[some] = found
+    largest, total, pixels = torch.from_numpy(everywhere).unbind(1)
     return largest, total, pixels.long(), radii
 
 

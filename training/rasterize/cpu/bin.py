@@ -13,8 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..rendering import ALPHA_MIN
-from .compile import STRICT, f32, in_parallel, inlined, kernel
+from .compile import STRICT, Buffers, f32, in_parallel, inlined, kernel
+from .fastmath import fetch_ahead
 from .project import (
+    AHEAD,
     CONIC_XX,
     CONIC_XY,
     CONIC_YY,
@@ -38,8 +40,8 @@ class Pairs:
     Attributes:
         splat: (P,) int32, the splat of each pair.
         tile_start: (tiles + 1,) int64, where each tile's pairs begin; tiles go row by row.
-        first, count: (N,) int64 and int32: the pairs of splat i are row[first[i] : first[i] + count[i]].
-        row: int64, positions in ``splat``; some are unused.
+        first, count: (M,) int64 and int32: the pairs of splat i are row[first[i] : first[i] + count[i]].
+        row: int32, positions in ``splat``; some are unused.
     """
 
     splat: np.ndarray
@@ -57,8 +59,10 @@ def sort_by_depth(keys, splats, other_keys, other_splats):
     are in ``other_splats``; all four arrays, of one length, are overwritten.
     """
     source_keys, source, target_keys, target = keys, splats, other_keys, other_splats
+    start = np.empty(2049, np.int64)
     for shift in (0, 11, 22):
-        start = np.zeros(2049, np.int64)
+        for digit in range(2049):
+            start[digit] = 0
         for i in range(keys.shape[0]):
             start[((source_keys[i] >> np.uint32(shift)) & np.uint32(2047)) + 1] += 1
         for digit in range(2048):
@@ -109,6 +113,7 @@ def touches(row, tile_x, tile_y):
 def box_sizes(begin, end, projected, order, tiles_x, tiles_y, sizes):
     """How many tiles the bounding box of each splat covers, in depth order."""
     for k in range(begin, end):
+        fetch_ahead(projected, order[min(k + AHEAD, order.shape[0] - 1)], 0)
         row = projected[order[k]]
         x0, x1 = tile_range(row[MEAN_X], row[HALF_WIDTH], tiles_x)
         y0, y1 = tile_range(row[MEAN_Y], row[HALF_HEIGHT], tiles_y)
@@ -122,6 +127,7 @@ def find_tiles(begin, end, projected, order, box_start, tiles_x, tiles_y, first,
     for chunk in range(begin, end):
         tally = histogram[chunk]
         for k in range(total * chunk // CHUNKS, total * (chunk + 1) // CHUNKS):
+            fetch_ahead(projected, order[min(k + AHEAD, total - 1)], 0)
             row = projected[order[k]]
             x0, x1 = tile_range(row[MEAN_X], row[HALF_WIDTH], tiles_x)
             y0, y1 = tile_range(row[MEAN_Y], row[HALF_HEIGHT], tiles_y)
@@ -165,27 +171,32 @@ def place_pairs(begin, end, order, first, count, hits, histogram, splat):
                 place[tile] += 1
 
 
-def bin_splats(projected: np.ndarray, depth: np.ndarray, radii: np.ndarray, width: int, height: int) -> Pairs:
-    """Bin projected splats (N, COLUMNS) of an image of this size; those of radius 0 are in no pair."""
+def bin_splats(
+    projected: np.ndarray, drawn: np.ndarray, depths: np.ndarray, width: int, height: int, buffers: Buffers
+) -> Pairs:
+    """Bin those of the projected splats (M, COLUMNS) that are ``drawn`` (D,) int32, at these depths (D,).
+
+    Both are overwritten; what is returned lives in ``buffers``.
+    """
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-    drawn = np.flatnonzero(radii > 0).astype(np.int32)
     order = np.empty_like(drawn)
-    keys = depth[drawn].view(np.uint32)
+    keys = depths.view(np.uint32)
     sort_by_depth(keys, drawn, np.empty_like(keys), order)
 
     box_start = np.zeros(len(order) + 1, np.int64)
     in_parallel(box_sizes, len(order), 4096, projected, order, tiles_x, tiles_y, box_start[1:])
     np.cumsum(box_start, out=box_start)
-    first = np.empty(len(radii), np.int64)
-    count = np.zeros(len(radii), np.int32)
-    hits = np.empty(box_start[-1], np.int64)
-    histogram = np.zeros((CHUNKS, tiles_x * tiles_y), np.int64)
+    first = buffers.take("first", np.int64, len(projected))
+    count = buffers.take("count", np.int32, len(projected))
+    count[:] = 0
+    hits = buffers.take("hits", np.int32, int(box_start[-1]))
+    histogram = np.zeros((CHUNKS, tiles_x * tiles_y), np.int32)
     in_parallel(
         find_tiles, CHUNKS, 1,
         projected, order, box_start, tiles_x, tiles_y, first, count, hits, histogram,
     )  # fmt: skip
     tile_start = np.empty(tiles_x * tiles_y + 1, np.int64)
     start_of_each(histogram, tile_start)
-    splat = np.empty(tile_start[-1], np.int32)
+    splat = buffers.take("splat", np.int32, int(tile_start[-1]))
     in_parallel(place_pairs, CHUNKS, 1, order, first, count, hits, histogram, splat)
     return Pairs(splat, tile_start, first, count, hits)

@@ -13,8 +13,9 @@ import numpy as np
 from ..rendering import ALPHA_MAX, TRANSMITTANCE_MIN
 from .bin import LOG2_ALPHA_MIN, TILE
 from .compile import FAST, f32, inlined, kernel
-from .fastmath import exp2
+from .fastmath import exp2, fetch_ahead
 from .project import (
+    AHEAD,
     BLUE,
     CONIC_XX,
     CONIC_XY,
@@ -28,28 +29,32 @@ from .project import (
     G_GREEN,
     G_RED,
     GREEN,
-    HALF_HEIGHT,
     LOG2_OPACITY,
     MEAN_X,
     MEAN_Y,
     RED,
     SUMS,
     G,
+    rows_of_strip,
 )
 
 ZERO, HALF, ONE, TWO = f32(0), f32(0.5), f32(1), f32(2)
 CAP, T_MIN = f32(ALPHA_MAX), f32(TRANSMITTANCE_MIN)
+SPAN = f32(TILE - 1)
+"""From a tile's first pixel centre to its last."""
 LOOK_EVERY = 16
 """After this many splats a tile looks whether any of its pixels still takes light."""
 
 
 @inlined(FAST)
-def row_range(row, top, rows):
-    """The rows of a tile, its first pixel centres at y = ``top``, that the splat's ellipse can reach."""
-    first = int(np.ceil(row[MEAN_Y] - row[HALF_HEIGHT] - top))
-    last = int(np.floor(row[MEAN_Y] + row[HALF_HEIGHT] - top))
-    # the difference of a mean and a reach of millions of pixels is off by rows; first must stay in the tile
-    return max(0, min(first, rows)), min(rows, last + 1)
+def find_rows(projected, splat, begin, end, left, top, rows, reached):
+    """Fill reached (P, 2): the first and one past the last row of the tile that each of some pairs reaches.
+
+    Done ahead of blending, which would have to wait for the roots.
+    """
+    for pair in range(begin, end):
+        first, last = rows_of_strip(projected[splat[pair]], left, SPAN, top, rows)
+        reached[pair, 0], reached[pair, 1] = first, last
 
 
 @inlined(FAST)
@@ -61,56 +66,57 @@ def alpha_of(log2_alpha):
 
 @kernel(FAST)
 def blend_forward(
-    begin, end, projected, splat, tile_start, tiles_x, background, image, transmittance, walked
+    begin, end, projected, splat, tile_start, tiles_x, background, image, transmittance, walked, reached
 ):
-    """Fill image (3, H, W), transmittance (H, W) and the pairs walked in each tile until all was dark.
+    """Fill image (3, H, W), transmittance (H, W), the pairs walked in each tile until all was dark, and the
+    rows reached by each of those pairs, (P, 2) uint8.
 
     A lane's T turns negative when its pixel is finished (and is so from the start outside the image):
     whatever follows then fails the test against T_MIN, and |T| stays.
     """
     height, width = transmittance.shape
+    state = np.empty((16, 64), np.float32)  # a row: 16 lanes each of T, red, green, blue
     for tile in range(begin, end):
         x0, y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
         rows, columns = min(TILE, height - y0), min(TILE, width - x0)
         left, top = f32(x0) + HALF, f32(y0) + HALF
-        state = np.zeros((16, 64), np.float32)  # a row: 16 lanes each of T, red, green, blue
         for r in range(16):
             for j in range(16):
                 state[r, j] = ONE if r < rows and j < columns else -ONE
+            for j in range(16, 64):
+                state[r, j] = ZERO
 
         pair = tile_start[tile]
-        look = pair + LOOK_EVERY
-        while pair < tile_start[tile + 1]:
-            row = projected[splat[pair]]
-            xx, xy, yy, log2_opacity = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY], row[LOG2_OPACITY]
-            red, green, blue = row[RED], row[GREEN], row[BLUE]
-            first, last = row_range(row, top, rows)
-            offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
-            for r in range(first, last):
-                dy = f32(r) + offset_y
-                xy_dy, rest = xy * dy, log2_opacity - yy * dy * dy
-                lanes = state[r]
-                for j in range(16):
-                    dx = f32(j) + offset_x
-                    log2_alpha = rest - (xx * dx + xy_dy) * dx
-                    alpha = alpha_of(log2_alpha)
-                    t = lanes[j]
-                    t_behind = t - alpha * t
-                    takes = t_behind > T_MIN
-                    w = alpha * t if takes else ZERO
-                    lanes[j] = t_behind if takes else -abs(t)
-                    lanes[16 + j] += w * red
-                    lanes[32 + j] += w * green
-                    lanes[48 + j] += w * blue
-            pair += 1
-            if pair == look:
-                look += LOOK_EVERY
-                lit = 0
-                for r in range(16):
+        lit = 1
+        while lit > 0 and pair < tile_start[tile + 1]:
+            start, end = pair, min(pair + LOOK_EVERY, tile_start[tile + 1])
+            find_rows(projected, splat, start, end, left, top, rows, reached)
+            for pair in range(start, end):
+                row = projected[splat[pair]]
+                xx, xy, yy, log2_opacity = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY], row[LOG2_OPACITY]
+                red, green, blue = row[RED], row[GREEN], row[BLUE]
+                offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
+                for r in range(int(reached[pair, 0]), int(reached[pair, 1])):
+                    dy = f32(r) + offset_y
+                    xy_dy, rest = xy * dy, log2_opacity - yy * dy * dy
+                    lanes = state[r]
                     for j in range(16):
-                        lit += state[r, j] > ZERO
-                if lit == 0:
-                    break
+                        dx = f32(j) + offset_x
+                        log2_alpha = rest - (xx * dx + xy_dy) * dx
+                        alpha = alpha_of(log2_alpha)
+                        t = lanes[j]
+                        t_behind = t - alpha * t
+                        takes = t_behind > T_MIN
+                        w = alpha * t if takes else ZERO
+                        lanes[j] = t_behind if takes else -abs(t)
+                        lanes[16 + j] += w * red
+                        lanes[32 + j] += w * green
+                        lanes[48 + j] += w * blue
+            pair = end
+            lit = 0
+            for r in range(16):
+                for j in range(16):
+                    lit += state[r, j] > ZERO
         walked[tile] = pair - tile_start[tile]
 
         for r in range(rows):
@@ -135,7 +141,7 @@ def blend_median(begin, end, projected, splat, tile_start, tiles_x, walked, medi
         chosen[:] = -1
         for pair in range(tile_start[tile], tile_start[tile] + walked[tile]):
             row = projected[splat[pair]]
-            first, last = row_range(row, top, rows)
+            first, last = rows_of_strip(row, left, SPAN, top, rows)
             offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
             for r in range(first, last):
                 dy = f32(r) + offset_y
@@ -189,7 +195,7 @@ def blend_weights(begin, end, projected, splat, tile_start, tiles_x, width, heig
                 state[16 * r + j] = ONE if r < rows and j < columns else -ONE
         for pair in range(tile_start[tile], tile_start[tile + 1]):
             row = projected[splat[pair]]
-            first, last = row_range(row, top, rows)
+            first, last = rows_of_strip(row, left, SPAN, top, rows)
             offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
             largest, total, pixels = ZERO, ZERO, ZERO
             for r in range(first, last):
@@ -231,11 +237,13 @@ def _backward(absolute: bool):
 
     @kernel(FAST)
     def blend_backward(
-        begin, end, projected, splat, tile_start, tiles_x, walked, image, transmittance,
+        begin, end, projected, splat, tile_start, tiles_x, walked, reached, image, transmittance,
         by_image, by_alpha, pair_sums,
     ):  # fmt: skip
         height, width = transmittance.shape
-        state = np.zeros(17 * stride, np.float32)  # the row above the first holds sums of zero only
+        state = np.empty(17 * stride, np.float32)  # the row above the first holds sums of zero only
+        for j in range(state.shape[0]):
+            state[j] = ZERO
         for tile in range(begin, end):
             x0, y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
             rows, columns = min(TILE, height - y0), min(TILE, width - x0)
@@ -255,10 +263,13 @@ def _backward(absolute: bool):
 
             lit = tile_start[tile] + walked[tile]
             for pair in range(tile_start[tile], lit):
+                if pair % AHEAD == 0:
+                    for later in range(pair + AHEAD, min(pair + 2 * AHEAD, lit)):
+                        fetch_ahead(projected, splat[later], 0)
                 row = projected[splat[pair]]
                 xx, xy, yy, log2_opacity = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY], row[LOG2_OPACITY]
                 red, green, blue = row[RED], row[GREEN], row[BLUE]
-                first, last = row_range(row, top, rows)
+                first, last = int(reached[pair, 0]), int(reached[pair, 1])
                 offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
                 for j in range(first * stride, first * stride + H):
                     state[j] = ZERO

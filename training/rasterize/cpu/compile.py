@@ -50,14 +50,28 @@ STRICT = frozenset()
 """For what must give the same answer wherever it is compiled."""
 
 
+_OPTIONS: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True}
+"""Dividing as C does, and not callable from C, which would take a wrapper."""
+_HELPER: dict[str, Any] = {**_OPTIONS, "no_cpython_wrapper": True}
+
+
 def kernel(fastmath: frozenset[str]) -> Callable[[Callable], Any]:
-    """Compile a function of arrays: cached on disk, without the GIL, dividing as C does."""
-    return numba.njit(fastmath=set(fastmath), cache=True, nogil=True, error_model="numpy")
+    """Compile a function of arrays: cached on disk, without the GIL."""
+    return numba.njit(fastmath=set(fastmath), cache=True, nogil=True, **_OPTIONS)
+
+
+def helper(fastmath: frozenset[str]) -> Callable[[Callable], Any]:
+    """Compile a function for kernels only. LLVM decides whether it becomes part of its caller.
+
+    Numba's own ``inline="always"`` copies the source into every caller and infers its types there again,
+    which takes longer than all else.
+    """
+    return numba.njit(**_HELPER, fastmath=set(fastmath))
 
 
 def inlined(fastmath: frozenset[str]) -> Callable[[Callable], Any]:
-    """Compile a helper into the kernels that call it."""
-    return numba.njit(fastmath=set(fastmath), inline="always", error_model="numpy")
+    """As :func:`helper`, always a part of its caller: for what inner loops call."""
+    return numba.njit(**_HELPER, fastmath=set(fastmath), forceinline=True)
 
 
 def available_threads() -> int:
@@ -105,22 +119,40 @@ def in_parallel(kernel: Callable, total: int, grain: int, *args: Any) -> None:
         helper.result()
 
 
-_scratch: dict[str, np.ndarray] = {}
+_idle: dict[str, list[np.ndarray]] = {}
 
 
-def scratch(name: str, *shape: int) -> np.ndarray:
-    """A float32 array to use and forget within one serialised call; fresh pages would cost milliseconds."""
-    size = math.prod(shape)
-    if name not in _scratch or _scratch[name].size < size:
-        _scratch[name] = np.empty(size + size // 4, np.float32)
-    return _scratch[name][:size].reshape(shape)
+class Buffers:
+    """Arrays that go to the next who asks for their names once this object is gone.
+
+    Fresh pages from the system would cost milliseconds a step. Two renderings that wait for their backward
+    passes have their own arrays. Nothing that outlives this object may be a view of one.
+    """
+
+    def __init__(self) -> None:
+        self._taken: list[tuple[str, np.ndarray]] = []
+
+    def take(self, name: str, kind: Any, *shape: int) -> np.ndarray:
+        """An array of this type and shape that holds anything."""
+        size = math.prod(shape) * np.dtype(kind).itemsize
+        idle = _idle.get(name)
+        buffer = idle.pop() if idle else None
+        if buffer is None or len(buffer) < size:
+            fresh = np.empty(size + size // 4 + 64, np.uint8)
+            buffer = fresh[-fresh.ctypes.data % 64 :]  # rows of 64 bytes are to be one cache line each
+        self._taken.append((name, buffer))
+        return buffer[:size].view(kind).reshape(shape)
+
+    def __del__(self) -> None:
+        for name, buffer in self._taken:
+            _idle.setdefault(name, []).append(buffer)
 
 
 _one_at_a_time = threading.RLock()
 
 
 def serialised(function: Callable) -> Callable:
-    """One call at a time: scratch arrays and threads are shared."""
+    """One call at a time: the threads are shared."""
 
     @wraps(function)
     def call(*args, **kwargs):

@@ -14,6 +14,7 @@ import numpy as np
 from .. import sh as harmonics
 from ..rendering import ALPHA_MIN, DILATION, MIP_VARIANCE, View
 from .compile import FAST, f32, inlined, kernel
+from .fastmath import fetch_ahead
 
 # The columns of a projected splat: all that blending reads, one row a splat.
 MEAN_X, MEAN_Y = 0, 1
@@ -23,8 +24,11 @@ CONIC_XX, CONIC_XY, CONIC_YY, LOG2_OPACITY = 2, 3, 4, 5
 RED, GREEN, BLUE = 6, 7, 8
 HALF_WIDTH, HALF_HEIGHT = 9, 10
 """Reach of the ellipse on which alpha is ALPHA_MIN, along x and y, in pixels."""
-OPACITY = 11
-COLUMNS = 12
+SLOPE, RISE, X_OF_TOP = 11, 12, 13
+"""At dx from the mean that ellipse lies between dy = SLOPE dx ± RISE sqrt(1 − (dx / HALF_WIDTH)²); its
+greatest dy, HALF_HEIGHT, is at dx = X_OF_TOP."""
+COLUMNS = 16
+"""A row is one cache line of 64 bytes."""
 
 # The columns of what blending's backward pass sums up for a splat, with sigma = -ln(alpha / opacity) and
 # (dx, dy) = pixel − mean: g = d loss / d sigma, its moments, and d loss / d colour.
@@ -33,7 +37,11 @@ SUMS = 9
 
 GRAIN = 1024
 """How many splats a thread takes at a time."""
+AHEAD = 8
+"""So many splats ahead memory is asked for what lies apart: splats that weights leave, sums of pairs."""
 ZERO, HALF, ONE, TWO = f32(0), f32(0.5), f32(1), f32(2)
+MARGIN = f32(1 / 64)
+"""Pixels by which the ellipse's rows and columns are taken too far, against rounding."""
 ALPHA_MIN32, DILATION32, MIP_VARIANCE32 = f32(ALPHA_MIN), f32(DILATION), f32(MIP_VARIANCE)
 LOG2_E, LN2 = f32(math.log2(math.e)), f32(math.log(2))
 
@@ -56,6 +64,31 @@ def to_camera(pose, axis, mean):
 @inlined(FAST)
 def clamp(value, low, high):
     return min(max(value, low), high)
+
+
+@inlined(FAST)
+def rows_of_strip(row, left, across, top, rows):
+    """The first row and one past the last that a splat's ellipse reaches in a strip of pixel columns.
+
+    The strip's pixel centres lie between x = ``left`` and ``left + across``; its rows are at y = ``top``,
+    ``top`` + 1, … The ellipse is convex, so its greatest dy in the strip is where the strip comes closest to
+    X_OF_TOP; and by symmetry with the least.
+    """
+    half_width = row[HALF_WIDTH] + MARGIN
+    near = left - row[MEAN_X]
+    far = near + across
+    if near > half_width or far < -half_width:
+        return 0, 0
+    per_width = ONE / half_width
+    highest, lowest = clamp(row[X_OF_TOP], near, far), clamp(-row[X_OF_TOP], near, far)
+    high, low = highest * per_width, lowest * per_width
+    dy_high = row[SLOPE] * highest + row[RISE] * math.sqrt(max(ONE - high * high, ZERO))
+    dy_low = row[SLOPE] * lowest - row[RISE] * math.sqrt(max(ONE - low * low, ZERO))
+    middle = row[MEAN_Y] - top + ONE
+    # clamped before they become whole numbers: a mean and a reach may be of millions of pixels
+    first = int(clamp(middle + dy_low - MARGIN, ZERO, f32(rows)))
+    last = int(clamp(middle + dy_high + MARGIN, ZERO, f32(rows)))
+    return first, max(first, last)
 
 
 @inlined(FAST)
@@ -85,9 +118,10 @@ def camera_axes(pose, quat, log_scale, min_scale, scale, axes):
 def project_forward(
     begin, end, means, quats, log_scales, opacity_logits, sh, weights,
     pose, lens, eye, width, height, degree, min_scale, antialias,
-    projected, depth, radii,
+    some, depths, projected, radii,
 ):  # fmt: skip
-    """Fill projected (N, COLUMNS), depth (N,) and radii (N,); where the radius is 0 nothing else is set.
+    """Project the splats ``some`` (M,): fill depths (M,), 0 for those not drawn, and of the others the rows
+    of projected (M, COLUMNS) and radii (N,).
 
     ``weights`` is empty where all are one.
     """
@@ -96,11 +130,16 @@ def project_forward(
     scale = np.empty(3, np.float32)
     axes = np.empty((3, 3), np.float32)
     basis = np.empty(25, np.float32)
-    for i in range(begin, end):
-        radii[i] = ZERO
+    for k in range(begin, end):
+        i = some[k]
+        ahead = some[min(k + AHEAD, some.shape[0] - 1)]
+        fetch_ahead(means, ahead, 0)
+        fetch_ahead(quats, ahead, 0)
+        fetch_ahead(log_scales, ahead, 0)
+        for line in range((sh.shape[1] * 3 + 15) // 16):
+            fetch_ahead(sh, ahead, line)
+        depths[k] = ZERO
         weight = weights[i] if weights.shape[0] > 0 else ONE
-        if weight <= ZERO:
-            continue
         mean = means[i]
         z = to_camera(pose, 2, mean)
         opacity = weight / (ONE + math.exp(-opacity_logits[i]))
@@ -143,17 +182,22 @@ def project_forward(
             continue
         if mean_y + half_height <= ZERO or mean_y - half_height >= height:
             continue
-        depth[i] = z
+        depths[k] = z
         half_difference = HALF * (xx - yy)
         longest = HALF * (xx + yy) + math.sqrt(half_difference * half_difference + uv * uv)
         radii[i] = f32(3) * math.sqrt(longest)
 
-        row = projected[i]
+        row = projected[k]
         row[MEAN_X], row[MEAN_Y] = mean_x, mean_y
         unit = LOG2_E / determinant
         row[CONIC_XX], row[CONIC_XY], row[CONIC_YY] = HALF * unit * yy, -unit * uv, HALF * unit * xx
         row[LOG2_OPACITY] = math.log(opacity) * LOG2_E
-        row[HALF_WIDTH], row[HALF_HEIGHT], row[OPACITY] = half_width, half_height, opacity
+        row[HALF_WIDTH], row[HALF_HEIGHT] = half_width, half_height
+        row[SLOPE], row[RISE], row[X_OF_TOP] = (
+            uv / xx,
+            reach * math.sqrt(determinant / xx),
+            uv / yy * half_height,
+        )
 
         dx, dy, dz = mean[0] - eye[0], mean[1] - eye[1], mean[2] - eye[2]
         inverse = ONE / math.sqrt(dx * dx + dy * dy + dz * dz)
@@ -168,7 +212,7 @@ def project_forward(
 
 @kernel(FAST)
 def gather_weights(begin, end, first_pair, pair_count, pair_row, pair_weights, weights):
-    """Fill weights (N, 3) from (P, 3): the largest of the first column, the sums of the others."""
+    """Fill weights (M, 3) from (P, 3): the largest of the first column, the sums of the others."""
     for i in range(begin, end):
         largest, total, pixels = ZERO, ZERO, ZERO
         for pair in range(first_pair[i], first_pair[i] + pair_count[i]):
@@ -179,7 +223,7 @@ def gather_weights(begin, end, first_pair, pair_count, pair_row, pair_weights, w
 
 @kernel(FAST)
 def gather_sums(begin, end, first_pair, pair_count, pair_row, pair_sums, sums):
-    """Add what a splat's pairs hold, (P, K), to the splat's row of sums (N, K)."""
+    """Add what a splat's pairs hold, (P, K), to the splat's row of sums (M, K)."""
     for i in range(begin, end):
         if pair_count[i] > 0:
             for pair in range(first_pair[i], first_pair[i] + pair_count[i]):
@@ -244,38 +288,51 @@ def quat_gradient(w, x, y, z, inverse, by_rotation, gradient):
 def project_backward(
     begin, end, means, quats, log_scales, opacity_logits, sh, weights,
     pose, lens, eye, width, height, degree, min_scale, antialias,
-    projected, radii, first_pair, pair_count, pair_row, pair_sums,
+    some, projected, first_pair, pair_count, pair_row, pair_sums,
     by_means, by_quats, by_log_scales, by_logits, by_sh, by_weights, grad2d,
 ):  # fmt: skip
-    """Fill the gradients of every parameter and grad2d, from the sums that blending left per pair."""
+    """Fill the gradients of every parameter of the splats ``some``, and their grad2d, from the sums that
+    blending left per pair."""
     fx, fy = lens[0], lens[1]
     scale = np.empty(3, np.float32)
     axes = np.empty((3, 3), np.float32)
     by_axes = np.empty((3, 3), np.float32)
     by_rotation = np.empty((3, 3), np.float32)
-    by_area = np.zeros((2, 3), np.float32)
+    by_area = np.empty((2, 3), np.float32)
+    for k in range(3):
+        by_area[0, k], by_area[1, k] = ZERO, ZERO
     sums = np.empty(SUMS, np.float32)
     basis = np.empty(25, np.float32)
     basis_x = np.empty(25, np.float32)
     basis_y = np.empty(25, np.float32)
     basis_z = np.empty(25, np.float32)
-    for i in range(begin, end):
-        if radii[i] <= ZERO or pair_count[i] == 0:
-            by_means[i] = ZERO
-            by_quats[i] = ZERO
-            by_log_scales[i] = ZERO
+    count = some.shape[0]
+    for s in range(begin, end):
+        i = some[s]
+        ahead = min(s + 2 * AHEAD, count - 1)
+        fetch_ahead(pair_row, first_pair[ahead], 0)
+        ahead = min(s + AHEAD, count - 1)
+        for pair in range(first_pair[ahead], first_pair[ahead] + pair_count[ahead]):
+            fetch_ahead(pair_sums, pair_row[pair], 0)
+        if pair_count[s] == 0:
+            for k in range(3):
+                by_means[i, k], by_log_scales[i, k] = ZERO, ZERO
+            for k in range(4):
+                by_quats[i, k] = ZERO
+            for k in range(sh.shape[1]):
+                by_sh[i, k, 0], by_sh[i, k, 1], by_sh[i, k, 2] = ZERO, ZERO, ZERO
             by_logits[i] = ZERO
-            by_sh[i] = ZERO
-            grad2d[i] = ZERO
+            grad2d[i, 0], grad2d[i, 1] = ZERO, ZERO
             if by_weights.shape[0] > 0:
                 by_weights[i] = ZERO
             continue
-        sums[:] = ZERO
-        for pair in range(first_pair[i], first_pair[i] + pair_count[i]):
+        for k in range(SUMS):
+            sums[k] = ZERO
+        for pair in range(first_pair[s], first_pair[s] + pair_count[s]):
             for k in range(SUMS):
                 sums[k] += pair_sums[pair_row[pair], k]
 
-        mean, row = means[i], projected[i]
+        mean, row = means[i], projected[s]
         x, y, z = to_camera(pose, 0, mean), to_camera(pose, 1, mean), to_camera(pose, 2, mean)
         w, qx, qy, qz, inverse = camera_axes(pose, quats[i], log_scales[i], min_scale, scale, axes)
         rz = ONE / z
@@ -357,7 +414,8 @@ def project_backward(
             by_dx += by_basis * basis_x[k]
             by_dy += by_basis * basis_y[k]
             by_dz += by_basis * basis_z[k]
-        by_sh[i, active:] = ZERO
+        for k in range(active, sh.shape[1]):
+            by_sh[i, k, 0], by_sh[i, k, 1], by_sh[i, k, 2] = ZERO, ZERO, ZERO
         # direction = (mean − eye) / length: only the part across the direction moves it
         along = by_dx * dx + by_dy * dy + by_dz * dz
         by_means[i, 0] = (by_dx - along * dx) * per_length
