@@ -76,7 +76,8 @@ class Method:
         loss = photometric_loss(rendering.image, target, p.ssim_weight, backend=self.backend)
         self._regularised(loss, rendering).backward()
         growing = step < p.grow_until * p.steps
-        if growing and shrink == 1:  # gradients of small pictures are larger
+        if growing and (shrink == 1 or step < self.joins[-1]):
+            rendering.grad2d /= shrink  # the gradients of smaller pictures are larger
             self._remember(rendering)
         self._optimise(step)
         if growing and (step + 1) % p.grow_interval == 0:
@@ -156,14 +157,17 @@ class Method:
     def _shrink(self, step: int) -> int:
         """How many times smaller a step's photograph is made: what one as many times farther away sees.
 
-        So levels learn to stand alone that no photograph is far enough away for.
+        Levels that finer ones have not joined yet see what they would be wanted for; later some steps do, so
+        that levels learn to stand alone that no photograph is far enough away for.
         """
-        rng = np.random.default_rng([self.seed, step, 3])
-        if rng.random() >= self.parameters.far_share:
-            return 1
         side = min(min(camera.width, camera.height) for camera in self.data.train)
         most = min(self.levels - 1, int(np.log2(max(side / SMALLEST, 1))))
-        return 2 ** int(rng.integers(1, most + 1)) if most > 0 else 1
+        if step < self.joins[-1]:
+            return 2 ** min(self.levels - self.level_at(step), most)
+        rng = np.random.default_rng([self.seed, step, 3])
+        if most == 0 or rng.random() >= self.parameters.far_share:
+            return 1
+        return 2 ** int(rng.integers(1, most + 1))
 
     # -- anchors ---------------------------------------------------------------------------------------
 
@@ -267,8 +271,7 @@ class Method:
         local = torch.from_numpy(rng.standard_normal((len(source), 3), np.float32)).to(self.device)
         local *= rows["log_scales"].exp()
         rows["means"] += torch.einsum("nij,nj->ni", rotation_matrices(rows["quats"]), local)
-        size = self.tree.voxel * 2 ** (1 - level[:, None])
-        rows["log_scales"] = torch.minimum(rows["log_scales"] - float(np.log(1.6)), size.log())
+        rows["log_scales"] -= float(np.log(1.6))
         return rows | {"level": level, "bias": self.model.columns["bias"][source]}
 
     def _free(self, means: torch.Tensor, level: torch.Tensor) -> torch.Tensor:

@@ -55,6 +55,28 @@ def test_a_picture_half_as_large_wants_one_level_less(data):
     assert torch.equal(near, half)
 
 
+def test_levels_that_are_there_see_what_they_are_wanted_for(data, monkeypatch):
+    monkeypatch.setattr("training.methods.octree.SMALLEST", 4)
+    octree = make(data, levels=4, steps=400, coarse_share=0.5)
+    assert [octree.joins[2:], octree._shrink(0)] == [[95, 158], 4]  # two of four levels: two halvings
+    assert [octree._shrink(step) for step in (94, 95, 157, 158, 399)] == [4, 2, 2, 1, 1]
+    monkeypatch.setattr("training.methods.octree.SMALLEST", 20)  # of 48 pixels: one halving at most
+    assert octree._shrink(0) == 2
+
+
+def test_gradients_of_smaller_pictures_count_for_as_much(data):
+    """The same splats, the same step, one picture half as large: no densification for that alone."""
+    sums = []
+    for shrink in (1, 2):
+        octree = make(data, levels=2, steps=40)
+        octree._shrink = lambda step, shrink=shrink: shrink
+        octree._weights = lambda *_, octree=octree, **__: torch.ones(len(octree.model))
+        octree.joins = [0, 39]
+        octree.train_step(0)
+        sums.append(octree.model.columns["gradient_sum"].sum())
+    assert 0.5 < sums[1] / sums[0] < 2.0
+
+
 def test_some_steps_see_smaller_pictures_and_some_everything(data):
     octree = make(data, far_share=0.5, full_share=0.5, steps=400, coarse_share=0.0)
     shrinks = [octree._shrink(step) for step in range(400)]
@@ -80,8 +102,8 @@ def test_new_anchors_lie_in_free_voxels_of_their_own_or_the_next_level(data):
     keys = octree.tree.keys(added.detach().double().numpy(), level.long().numpy())
     assert len(set(keys)) == len(keys) and not set(keys) & set(before)
     assert level.min() == 2 and set(level.tolist()) <= set((levels + 1).tolist())
-    size = octree.tree.size(level.numpy())
-    assert (octree.model["log_scales"][count:].detach().exp().amax(1).numpy() <= size * 1.001).all()
+    scales = octree.model["log_scales"].detach().exp()[:, 0]
+    assert torch.isclose(scales[count:, None] * 1.6, scales[None, :count]).any(1).all()
     assert (octree.model.columns["bias"][:count] == octree.parameters.bias_rate).all()
 
 
