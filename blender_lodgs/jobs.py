@@ -15,7 +15,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -156,7 +156,8 @@ class Watch:
                 scenes.set_bundle_facts(root, facts)
             scenes.set_level(root, Level(event["level"], splats, event.get("s_min")))
             root.lodgs.training.read = self.read
-            _undo_step(f"Level {event['level']}")
+            if not event.get("more"):  # levels that come together are one step
+                _undo_step(f"Level {event['level']}")
         self.levels[event["level"]] = event
 
     def _finish(self, root: bpy.types.Object) -> None:
@@ -228,7 +229,7 @@ def start(root: bpy.types.Object, folder: str = "", parameters: dict | None = No
 
 
 def resume(root: bpy.types.Object) -> Watch:
-    """Go on with the root's newest run, with the settings that it was started with.
+    """Go on with the root's newest run, with the settings that it was started with, on what trains now.
 
     Raises:
         LodgsError: there is no such run, or it is at work or finished.
@@ -241,7 +242,9 @@ def resume(root: bpy.types.Object) -> Watch:
         raise LodgsError(f"The run in {run.path} is already at work.", "Wait for it or cancel it.")
     if state == "done":
         raise LodgsError(f"The run in {run.path} is finished.", "Press Train for a new one.")
-    return _launch(root, run, None)
+    job = Job.from_file(run.job)
+    backend = extension.preferences().backend  # what this computer has, and what its user wants now
+    return _launch(root, run, None if job.backend == backend else replace(job, backend=backend))
 
 
 def start_or_resume(root: bpy.types.Object, folder: str, parameters: dict | None = None) -> Watch:
@@ -257,7 +260,8 @@ def start_or_resume(root: bpy.types.Object, folder: str, parameters: dict | None
     if state in {"empty", "running"}:
         return start(root, folder, parameters)
     before, now = Job.from_file(run.job).resolved(), make_job(root, run.path, parameters or {}).resolved()
-    changed = [f.name for f in fields(Job) if getattr(before, f.name) != getattr(now, f.name)]
+    names = [f.name for f in fields(Job) if f.name != "backend"]
+    changed = [name for name in names if getattr(before, name) != getattr(now, name)]
     if changed:
         raise LodgsError(
             f"The run in {run.path} was begun with other settings ({', '.join(changed)}).",

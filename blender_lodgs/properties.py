@@ -45,7 +45,8 @@ class TrainingSettings(bpy.types.PropertyGroup):
     )
     levels: bpy.props.IntProperty(
         name="Levels",
-        description="Number of levels of detail; 0 takes the preset's",
+        description="Number of levels of detail; 0 takes the preset's, or with Octree-GS what the distances "
+        "in the scene ask for",
         default=0,
         min=0,
         max=12,
@@ -61,7 +62,7 @@ class TrainingSettings(bpy.types.PropertyGroup):
     )
     max_splats: bpy.props.IntProperty(
         name="Most Splats",
-        description="Most splats that a level may have; 0 takes the preset's",
+        description="Most splats at full detail; 0 takes the preset's",
         default=0,
         min=0,
         step=1000,
@@ -226,7 +227,8 @@ class SplatScene(bpy.types.PropertyGroup):
     )
     single_level: bpy.props.IntProperty(
         name="Level",
-        description="The level that is shown; 1 is the coarsest",
+        description="The level that is shown; 1 is the coarsest. Where levels add up, all coarser ones are "
+        "shown with it",
         default=1,
         min=1,
         update=_single_changed,
@@ -311,8 +313,8 @@ class SplatScene(bpy.types.PropertyGroup):
 
     tell_levels: bpy.props.BoolProperty(
         name="Colour by Level",
-        description="In Solid shading, show which level is where: violet, blue, teal, yellow, red from "
-        "coarse to fine",
+        description="In Solid shading, show which level is where, in colours from violet (coarse) through "
+        "blue, teal, yellow and red on",
         options=set(),
     )
 

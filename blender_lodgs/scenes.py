@@ -18,6 +18,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ..training.errors import LodgsError
+from ..training.lod.selection import complete
 from ..training.scenes.cameras import Camera
 from ..training.scenes.colmap import Scene, read_scene
 from ..training.scenes.orientation import up_rotation
@@ -179,7 +180,10 @@ def remove_finer_levels(root: bpy.types.Object) -> None:
     """Removes all levels but the coarsest, whose object the coarsest of the next set takes over."""
     for item in root.lodgs.levels:
         if item.exists and item.number > 1:
+            cloud = item.object.data
             bpy.data.objects.remove(item.object)
+            if not cloud.users:
+                bpy.data.pointclouds.remove(cloud)
     _levels_changed(root)
 
 
@@ -205,14 +209,15 @@ def read_levels(root: bpy.types.Object) -> Bundle:
 
 
 def read_level(root: bpy.types.Object, number: int) -> Splats:
-    """One level with all that artists have changed in it.
+    """One level with all that artists have changed in it; where levels add up, with all coarser ones.
 
     Raises:
         LodgsError: there is no such level.
     """
-    for item in root.lodgs.levels:
-        if item.number == number and item.exists:
-            return objects.read_splats(item.object)
+    bundle = read_levels(root)
+    for level in bundle.levels:
+        if level.number == number:
+            return complete(bundle, level)
     raise LodgsError(f"{root.name} has no level {number}.", "Choose one from the list of levels.")
 
 
@@ -254,10 +259,10 @@ def count_shown(context: bpy.types.Context, root: bpy.types.Object) -> tuple[int
 
 
 def show_only(root: bpy.types.Object, number: int) -> None:
-    """Shows one level everywhere."""
+    """Shows one level everywhere; where levels add up, with all coarser ones."""
     root.lodgs.mode, root.lodgs.single_level = "SINGLE", number
     for item in root.lodgs.levels:
-        if item.number == number:
+        if item.number == number or (root.lodgs.cumulative and item.number < number):
             item.show = True
 
 

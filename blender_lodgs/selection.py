@@ -84,13 +84,7 @@ def _drive_focal_length(root: bpy.types.Object) -> None:
 def _drive_level(root: bpy.types.Object, index: int, item) -> None:
     thing, number = item.object, item.number
     by_octree = root.lodgs.d_max > 0
-    modifier = _modifier(thing)
-    group = octree.octree_level() if by_octree else band.distance_band()
-    if modifier is None:
-        modifier = thing.modifiers.new(group.name, "NODES")
-        modifier.show_expanded = False
-    if modifier.node_group != group:  # the scene was trained again, with another method
-        modifier.name, modifier.node_group = group.name, group
+    modifier = _modifier_of(thing, octree.octree_level() if by_octree else band.distance_band())
 
     def drive(path: str, expression: str, *names: str, **paths: str) -> None:
         driver = _driver(thing, path, expression)
@@ -137,6 +131,24 @@ def _drive_level(root: bpy.types.Object, index: int, item) -> None:
         f"s_min / gamma * focal_px if {coarser} >= level_start and {number} <= level_end else {NEVER:g}",
         "gamma", "focal_px", "level_start", "level_end", s_min=f"levels[{max(index - 1, 0)}].s_min",
     )  # fmt: skip
+
+
+def _modifier_of(thing: bpy.types.Object, group: bpy.types.GeometryNodeTree) -> bpy.types.NodesModifier:
+    """The modifier with this rule, made where there is none, in the place of one with another rule."""
+    modifier = _modifier(thing)
+    place = len(thing.modifiers)
+    if modifier is not None and modifier.node_group != group:  # trained again, with another method
+        place = thing.modifiers.find(modifier.name)
+        for driver in list(thing.animation_data.drivers if thing.animation_data else ()):
+            if driver.data_path.startswith(f'modifiers["{modifier.name}"]'):
+                thing.animation_data.drivers.remove(driver)
+        thing.modifiers.remove(modifier)
+        modifier = None
+    if modifier is None:
+        modifier = thing.modifiers.new(group.name, "NODES")
+        modifier.node_group, modifier.show_expanded = group, False
+        thing.modifiers.move(len(thing.modifiers) - 1, min(place, len(thing.modifiers) - 1))
+    return modifier
 
 
 def _modifier(thing: bpy.types.Object) -> bpy.types.NodesModifier | None:

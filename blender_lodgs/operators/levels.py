@@ -8,7 +8,7 @@ from .. import scenes
 
 
 class LODGS_OT_show_only_level(bpy.types.Operator):
-    """Show this level everywhere, and no other"""
+    """Show this level everywhere; where levels add up, with all coarser ones"""
 
     bl_idname = "lodgs.show_only_level"
     bl_label = "Only This One"

@@ -51,9 +51,10 @@ class LODGS_PT_levels(_Panel):
         settings = scenes.active_root(context).lodgs
         row = self.layout.row(align=True)
         row.label(text="", icon="BLANK1")
-        _columns(row, "Level", "Splats", "MB", "Detail")
+        _columns(row, "Level", "Adds" if settings.cumulative else "Splats", "MB",
+                 "" if settings.cumulative else "Detail")  # fmt: skip
         row.label(text="", icon="BLANK1")
-        rows = min(max(len(settings.levels), 3), 6)
+        rows = min(max(len(settings.levels), 3), 10)
         self.layout.template_list(
             "LODGS_UL_levels", "", settings, "levels", settings, "active_level", rows=rows
         )

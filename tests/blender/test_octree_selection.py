@@ -96,6 +96,43 @@ def test_one_level_means_all_up_to_it(bpy, root):
     assert all(item.object.visible_get() for item in root.lodgs.levels)
 
 
+def test_the_star_shows_what_an_eye_had_hidden(bpy, lodgs, root):
+    root.lodgs.levels[0].show = root.lodgs.levels[2].show = False
+    bpy.ops.lodgs.show_only_level(level=2)
+    bpy.context.view_layer.update()
+    assert [item.object.visible_get() for item in root.lodgs.levels] == [True, True, False, False]
+
+
+def test_a_level_is_exported_with_all_that_it_adds_to(bpy, lodgs, root):
+    splats = lodgs("scenes").read_level(root, 3)
+    assert len(splats) == 3 * COUNT
+    means = np.empty(3 * COUNT, np.float32)
+    root.lodgs.levels[1].object.data.attributes["position"].data.foreach_get("vector", means)
+    assert (splats.means[COUNT : 2 * COUNT] == means.reshape(-1, 3)).all()
+
+
+def test_another_method_leaves_no_driver_of_the_first(bpy, lodgs, root):
+    """Trained again with FLoD and back: each level has one modifier, with the drivers of its rule only."""
+    Facts = lodgs("training.splats.bundle").Facts
+    thing = root.lodgs.levels[0].object
+    thing.modifiers.new("mine", "NODES")
+    for meta, cumulative, name in (
+        ({}, False, "LODGS Distance Band"),
+        ({"d_max": 2.0}, True, "LODGS Octree Level"),
+    ):
+        lodgs("scenes").set_bundle_facts(root, Facts("", [], meta, cumulative))
+        for item in root.lodgs.levels:
+            names = [modifier.name for modifier in item.object.modifiers if modifier.name != "mine"]
+            assert names == [name]
+            paths = [driver.data_path for driver in item.object.animation_data.drivers]
+            assert len(paths) == len(set(paths))
+            assert all(name in path for path in paths if path.startswith("modifiers"))
+            assert all(driver.driver.is_valid for driver in item.object.animation_data.drivers)
+        assert [modifier.name for modifier in thing.modifiers] == [name, "mine"], "in its old place"
+    bpy.context.view_layer.update()
+    assert sum(len(weights) for weights, _ in shown(bpy, root)) > COUNT
+
+
 def test_what_is_shown_is_exported_as_it_fades(bpy, lodgs, root):
     bpy.context.scene.camera.location = (3, -2, 1)
     bpy.context.view_layer.update()

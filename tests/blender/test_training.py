@@ -353,6 +353,17 @@ def test_the_real_trainer(bpy, jobs, tmp_path, monkeypatch):
     assert "signal 9" in watch.problem
 
 
+def test_resuming_takes_what_trains_now(bpy, lodgs, jobs, fake, root, tmp_path):
+    fake("killed")
+    with pytest.raises(RuntimeError):
+        bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
+    lodgs("extension").preferences().backend = "cpu"
+    fake()
+    bpy.ops.lodgs.resume_training()
+    Job = lodgs("training.runs.job").Job
+    assert Job.from_file(tmp_path / "run" / "job.toml").backend == "cpu"
+
+
 def test_octree_levels_add_up_and_follow_the_distance(bpy, lodgs, jobs, tmp_path, monkeypatch):
     """The real trainer again: all levels arrive together, twice, and choose by distance at once."""
     if not TRAINER:

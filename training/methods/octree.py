@@ -218,8 +218,8 @@ class Method:
         """New anchors in free voxels where gradients are large (Octree-GS, Sec. 4.2); faint ones go.
 
         A splat proposes places drawn from itself, in its own level, or in the next one if its gradient is
-        above that level's threshold. What there is room for rises with the steps, so that the first gradients
-        do not take it all.
+        above that level's threshold. What there is room for rises with the square of the steps, so that most
+        is left for finer levels.
         """
         p, model, columns = self.parameters, self.model, self.model.columns
         gradient, level = model.mean_gradient(), columns["level"]
@@ -236,7 +236,7 @@ class Method:
         source, which = source[order], which[order]
         rng = np.random.default_rng([self.seed, step, 1])
         rows = self._children(source, which, target[source, which], rng)
-        room = int(self._room() * min((step + 1) / (p.grow_until * self.steps), 1.0)) - len(model)
+        room = int(self._room() * min((step + 1) / (p.grow_until * self.steps), 1.0) ** 2) - len(model)
         free = self._free(rows["means"], rows["level"])[: max(room, 0)]
 
         model.keep(~self._faint())

@@ -113,7 +113,7 @@ class OctreeParameters(Parameters):
     """Quantile that counts as the largest (Octree-GS: d_max), from where on level 1 alone is drawn."""
     coarser_levels: int = 3
     """Levels before those of Eq. 3, for views from farther away than any photograph."""
-    footprint: float = 0.7
+    footprint: float = 1.0
     """Pixels that the voxel of a level covers where the level is just wanted; sets the voxels' size."""
     visible_share: float = 0.0
     """Anchors that fewer than this share of the views want are dropped; those that none wants always are."""

@@ -162,8 +162,8 @@ class _Run:
                 before = self.evaluation.measure_pictures(self.method.picture)["psnr"]
                 after = self.evaluation.measure_by_distance(bundle)["psnr"]
                 meta |= {"neural_psnr": before, "baked_psnr": after}
-                message = f"Held-out views: {before:.2f} dB with networks, {after:.2f} dB baked"
-                self.events("status", message=message)
+                message = f"Held-out views: {before:.2f} dB with networks, {after:.2f} dB baked for Blender."
+                self.events("warning", message=message)
         write_bundle(self.folder.bundle, bundle)
 
     def _tell_progress(self, level: int, loss: float, quality: float) -> None:
@@ -181,7 +181,7 @@ class _Run:
         """Hands levels over: a file and an event each. A level that came before is replaced."""
         method, known = self.method, {record["level"]: record for record in self.levels}
         bundle = Bundle(self.job.method, levels, cumulative=method.cumulative)
-        for level in levels:
+        for place, level in enumerate(levels, 1):
             path = self.folder.levels_folder / f"level_{level.number}.ply"
             write_ply(path, level.splats)
             record = {
@@ -192,7 +192,10 @@ class _Run:
             }
             quality = self.evaluation.measure_set(complete(bundle, level)) if self.evaluation.cameras else {}
             facts = {"cumulative": method.cumulative, "meta": method.meta()}
-            self.events("level", **{**quality, **record, **facts, "again": level.number in known})
+            self.events(
+                "level",
+                **{**quality, **record, **facts, "again": level.number in known, "more": place < len(levels)},
+            )
             known[level.number] = record
         self.levels = [known[number] for number in sorted(known)]
 
