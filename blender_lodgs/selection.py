@@ -146,6 +146,7 @@ def _modifier_of(thing: bpy.types.Object, group: bpy.types.GeometryNodeTree) -> 
         modifier = None
     if modifier is None:
         modifier = thing.modifiers.new(group.name, "NODES")
+        assert isinstance(modifier, bpy.types.NodesModifier)
         modifier.node_group, modifier.show_expanded = group, False
         thing.modifiers.move(len(thing.modifiers) - 1, min(place, len(thing.modifiers) - 1))
     return modifier

@@ -38,8 +38,8 @@ def problem() -> LodgsError | None:
     if not torch.cuda.is_available():
         return LodgsError(
             "This computer has no NVIDIA GPU that torch can use.",
-            "Train on the CPU (Train On in Blender, backend = auto or cpu in a job), or install the driver and a "
-            "torch built for CUDA.",
+            "Train on the CPU (Train On in Blender, backend = auto or cpu in a job), or install the driver "
+            "and a torch built for CUDA.",
         )
     try:
         with redirect_stdout(sys.stderr):  # it talks; the trainer's standard output is for events
