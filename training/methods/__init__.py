@@ -34,6 +34,7 @@ class Method(Protocol):
     """
 
     cumulative: bool
+    model: Model
 
     def __init__(self, data: TrainingData, parameters: Parameters, seed: int, backend: str) -> None: ...
 
@@ -42,9 +43,6 @@ class Method(Protocol):
 
     @property
     def levels(self) -> int: ...
-
-    @property
-    def model(self) -> Model: ...
 
     def level_at(self, step: int) -> int:
         """The finest level (1-based) that a step trains."""
@@ -64,15 +62,15 @@ class Method(Protocol):
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What levels do not hold of the model, to go on with it or to draw it; empty where they hold all."""
-        ...
+        return {}
 
     def load_arrays(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Takes the model from what ``arrays`` gave."""
-        ...
+        raise NotImplementedError("the levels hold all")
 
     def picture(self, camera: Camera) -> torch.Tensor:
         """What the model itself shows a camera, (H, W, 3); asked only where ``arrays`` gives some."""
-        ...
+        raise NotImplementedError("the levels hold all")
 
     def state_dict(self) -> dict:
         """Everything that the next step depends on, as tensors and numbers."""

@@ -6,7 +6,6 @@ With one level there is no constraint, and this is plain 3DGS (Kerbl et al. 2023
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Mapping
 from itertools import accumulate
 
 import numpy as np
@@ -16,8 +15,8 @@ from scipy.spatial import KDTree
 from ..errors import LodgsError
 from ..lod.rules import flod_s_min
 from ..rasterize import Target, device_of, photometric_loss, rasterize
-from ..scenes.cameras import Camera
 from ..splats.bundle import Level
+from . import Method as Interface
 from .data import TrainingData
 from .model import (
     NAMES,
@@ -36,7 +35,7 @@ REFERENCE_PIXELS = 1e6
 """Image size for which 3DGS's gradient threshold was chosen (about one megapixel)."""
 
 
-class Method:
+class Method(Interface):
     """One run of FLoD; see ``methods.Method`` for what it does for the loop."""
 
     cumulative = False
@@ -115,15 +114,6 @@ class Method:
             "median_depth": data.median_depth,
             "footprint_px": self.s_min[0] * data.focal / data.median_depth,
         }
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        return {}
-
-    def load_arrays(self, arrays: Mapping[str, np.ndarray]) -> None:
-        raise NotImplementedError("the levels hold all")
-
-    def picture(self, camera: Camera) -> torch.Tensor:
-        raise NotImplementedError("the levels hold all")
 
     def state_dict(self) -> dict:
         return {"model": self.model.state_dict()}

@@ -7,8 +7,6 @@ rounded while training.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 import torch
 
@@ -20,6 +18,7 @@ from ..rasterize import Rendering, Target, device_of, photometric_loss, rasteriz
 from ..rasterize.features import rotation_matrices
 from ..scenes.cameras import Camera
 from ..splats.bundle import Level
+from . import Method as Interface
 from .data import TrainingData
 from .model import NAMES, Model, distinct, from_points, means_rate, neighbour_scale, splat_model
 from .parameters import OctreeParameters
@@ -28,7 +27,7 @@ SMALLEST = 32
 """Pixels that the shorter side of a photograph made smaller has at least."""
 
 
-class Method:
+class Method(Interface):
     """One run of Octree-GS; see ``methods.Method`` for what it does for the loop.
 
     Attributes:
@@ -103,15 +102,6 @@ class Method:
             "scene_extent": data.extent,
             "median_depth": data.median_depth,
         }
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        return {}
-
-    def load_arrays(self, arrays: Mapping[str, np.ndarray]) -> None:
-        raise NotImplementedError("the levels hold all")
-
-    def picture(self, camera: Camera) -> torch.Tensor:
-        raise NotImplementedError("the levels hold all")
 
     def state_dict(self) -> dict:
         return {"model": self.model.state_dict()}
@@ -189,19 +179,23 @@ class Method:
         return wanting >= max(self.parameters.visible_share * len(self.data.train), 1)
 
     def _first_model(self, points: np.ndarray, colors: np.ndarray, level: np.ndarray) -> Model:
-        """Splats at the points; each as large as its neighbours of this or coarser levels are far apart."""
+        """Splats at the points (N, 3), of levels (N,); their size is :meth:`_log_spacing`."""
         tensors = from_points(points, colors, self.parameters.sh_degree)
-        for number in range(1, self.levels + 1):
-            here = level == number
-            if here.any():
-                scale = neighbour_scale(points[level <= number])[here[level <= number]]
-                tensors["log_scales"][here] = torch.from_numpy(np.log(scale)).float()[:, None]
+        tensors["log_scales"] = self._log_spacing(points, level, columns=3)
         zeros = torch.zeros(len(points))
         columns = {"level": torch.from_numpy(level).float(), "bias": zeros, "opacity_sum": zeros.clone()}
         tensors, columns = (
             {name: tensor.to(self.device) for name, tensor in some.items()} for some in (tensors, columns)
         )
         return splat_model(tensors, self.parameters, self.data.extent, columns)
+
+    def _log_spacing(self, points: np.ndarray, level: np.ndarray, columns: int) -> torch.Tensor:
+        """Log of how far apart points of a level and coarser ones are, (N, columns)."""
+        scale = np.empty(len(points))
+        for number in np.unique(level):
+            upto = level <= number
+            scale[level == number] = neighbour_scale(points[upto])[level[upto] == number]
+        return torch.from_numpy(np.repeat(np.log(scale)[:, None], columns, 1)).float()
 
     def _remember(self, rendering: Rendering) -> None:
         self.model.remember(rendering)

@@ -24,7 +24,7 @@ from ..splats.bundle import Level
 from ..splats.gaussians import Splats
 from . import octree
 from .data import TrainingData
-from .model import SH_C0, Model, neighbour_scale
+from .model import SH_C0, Model
 from .parameters import NeuralOctreeParameters
 
 HIDDEN = 32
@@ -192,12 +192,7 @@ class Method(octree.Method):
     def _first_model(self, points: np.ndarray, colors: np.ndarray, level: np.ndarray) -> Model:
         p, count = self.parameters, len(points)
         rows = self._anchors(torch.from_numpy(points).float(), torch.from_numpy(level))
-        scale = np.empty(count)
-        for number in range(1, self.levels + 1):
-            here = level == number
-            if here.any():
-                scale[here] = neighbour_scale(points[level <= number])[here[level <= number]]
-        rows["log_scales"] = torch.from_numpy(np.repeat(np.log(scale)[:, None], 6, 1)).float()
+        rows["log_scales"] = self._log_spacing(points, level, columns=6)
         rows = {name: row.to(self.device) for name, row in rows.items()}
         columns = self._columns(count)
         columns["level"] += torch.from_numpy(level).to(self.device)

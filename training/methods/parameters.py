@@ -217,6 +217,8 @@ _OCTREE_PAPER = replace(
     grad_threshold=2e-4,
     max_splats=5_000_000,
     far_share=0.0,
+    full_share=0.0,
+    candidates=1,
 )
 _FLOD_PRESETS = {"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER}
 _PRESETS = {
