@@ -308,12 +308,17 @@ def further(seconds: float) -> dict:
         "import time, torch\nfrom training.rasterize import warm_up\nt = time.perf_counter()\nwarm_up()\n"
     )
     program += "print(time.perf_counter() - t)"
-    with tempfile.TemporaryDirectory() as folder:
-        environment = os.environ | {"NUMBA_CACHE_DIR": folder}
-        for name in ("cold_s", "cached_s"):
-            run = [sys.executable, "-c", program]
-            said = subprocess.run(run, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
-            found[name] = float(said.stdout)
+    for name in ("cold_s", "cached_s"):
+        found[name] = float("inf")
+    for _ in range(3):
+        with tempfile.TemporaryDirectory() as folder:
+            environment = os.environ | {"NUMBA_CACHE_DIR": folder}
+            for name in ("cold_s", "cached_s"):
+                run = [sys.executable, "-c", program]
+                said = subprocess.run(
+                    run, cwd=ROOT, env=environment, capture_output=True, text=True, check=True
+                )
+                found[name] = min(found[name], float(said.stdout))
     if resolve("auto") == "cuda":
         step = Step(200_000, 960, 540, "cuda")
         found["cuda_step_ms"] = least(lambda: (step(), torch.cuda.synchronize()), seconds)

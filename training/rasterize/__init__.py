@@ -10,6 +10,7 @@ from __future__ import annotations
 import gc
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from importlib import import_module
 
 import numpy as np
@@ -286,6 +287,20 @@ def warm_up(backend: str = "auto") -> None:
     Numba makes millions of objects on the way; looking among them for garbage, again and again, would take a
     fifth of the time.
     """
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        if resolve(backend) == "cpu":
+            from .cpu.compile import compile_in_two_processes
+
+            compile_in_two_processes(partial(_step, "cpu"))
+        _step(backend)
+    finally:
+        if collects:
+            gc.enable()
+
+
+def _step(backend: str) -> None:
     one = {
         "means": [[0.0, 0.0, 1.0]], "quats": [[1.0, 0.0, 0.0, 0.0]], "log_scales": [[0.0] * 3],
         "opacity_logits": [0.0], "sh": [[[0.0] * 3]],
@@ -293,15 +308,9 @@ def warm_up(backend: str = "auto") -> None:
     device = device_of(backend)
     tensors = {name: torch.tensor(v, device=device, requires_grad=True) for name, v in one.items()}
     camera = Camera("", 16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
-    collects = gc.isenabled()
-    gc.disable()
-    try:
-        drawn = rasterize(*tensors.values(), camera, backend=backend)  # pyright: ignore[reportCallIssue]
-        photometric_loss(drawn.image, Target(torch.zeros(16, 16, 3)), backend=backend).backward()
-        Adam(tensors, dict.fromkeys(tensors, 0.0)).step()
-    finally:
-        if collects:
-            gc.enable()
+    drawn = rasterize(*tensors.values(), camera, backend=backend)  # pyright: ignore[reportCallIssue]
+    photometric_loss(drawn.image, Target(torch.zeros(16, 16, 3)), backend=backend).backward()
+    Adam(tensors, dict.fromkeys(tensors, 0.0)).step()
 
 
 def _backend(name: str, tensor: torch.Tensor):

@@ -1,6 +1,9 @@
 """Every backend against cases worked by hand, and the cpu backend against the float64 reference."""
 
 import math
+import os
+import subprocess
+import sys
 import threading
 from collections import Counter
 
@@ -519,3 +522,24 @@ def test_what_does_not_belong_together_is_refused(make_splats, odd_camera):
         rasterize(*splats, odd_camera, backend="gpu")
     with pytest.raises(ValueError, match="differ in shape"):
         photometric_loss(torch.zeros(4, 5, 3), Target(torch.zeros(5, 4, 3)))
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes are not forked elsewhere")
+def test_the_first_time_two_processes_compile_every_kernel_once(tmp_path):
+    program = """
+from training.rasterize import warm_up
+warm_up("cpu")
+from training.rasterize.cpu import adam, bin, blend, loss, project
+modules = adam, bin, blend, loss, project
+kernels = {k for m in modules for k in vars(m).values() if hasattr(k, "stats") and k.stats.cache_path}
+compiled = sum(sum(kernel.stats.cache_misses.values()) for kernel in kernels)
+read = sum(sum(kernel.stats.cache_hits.values()) for kernel in kernels)
+print(compiled, read)
+"""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "LODGS_THREADS": "2"}
+    said = subprocess.run(
+        [sys.executable, "-c", program], env=environment, stdout=subprocess.PIPE, check=True
+    )
+    compiled, read = map(int, said.stdout.split())
+    assert compiled > 0 and read > 0
+    assert compiled + read == len(list(tmp_path.rglob("*.nbi")))

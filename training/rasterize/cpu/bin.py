@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..rendering import ALPHA_MIN
-from .compile import STRICT, Buffers, f32, in_parallel, inlined, kernel
+from .compile import STRICT, Buffers, at_once, f32, in_parallel, inlined, kernel
 from .fastmath import fetch_ahead
 from .project import (
     AHEAD,
@@ -181,7 +181,7 @@ def bin_splats(
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     order = np.empty_like(drawn)
     keys = depths.view(np.uint32)
-    sort_by_depth(keys, drawn, np.empty_like(keys), order)
+    at_once(sort_by_depth, keys, drawn, np.empty_like(keys), order)
 
     box_start = np.zeros(len(order) + 1, np.int64)
     in_parallel(box_sizes, len(order), 4096, projected, order, tiles_x, tiles_y, box_start[1:])
@@ -195,8 +195,8 @@ def bin_splats(
         find_tiles, CHUNKS, 1,
         projected, order, box_start, tiles_x, tiles_y, first, count, hits, histogram,
     )  # fmt: skip
-    tile_start = np.empty(tiles_x * tiles_y + 1, np.int64)
-    start_of_each(histogram, tile_start)
+    tile_start = np.zeros(tiles_x * tiles_y + 1, np.int64)
+    at_once(start_of_each, histogram, tile_start)
     splat = buffers.take("splat", np.int32, int(tile_start[-1]))
     in_parallel(place_pairs, CHUNKS, 1, order, first, count, hits, histogram, splat)
     return Pairs(splat, tile_start, first, count, hits)

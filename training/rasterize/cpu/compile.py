@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import hashlib
 import math
+import multiprocessing
 import os
 import sys
+import tempfile
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -104,6 +106,9 @@ def in_parallel(kernel: Callable, total: int, grain: int, *args: Any) -> None:
     but the range in its hands. What a kernel writes must not depend on how the ranges fall.
     """
     global _pool
+    if _noted is not None:
+        _noted[kernel] = (0, 0, *args)
+        return
     begins = iter(range(0, total, grain))  # next() on it is atomic
 
     def work() -> None:
@@ -117,6 +122,65 @@ def in_parallel(kernel: Callable, total: int, grain: int, *args: Any) -> None:
     work()
     for helper in waiting:
         helper.result()
+
+
+def at_once(kernel: Callable, *args: Any) -> None:
+    """Call a kernel whose work cannot be dealt out."""
+    if _noted is not None:
+        _noted[kernel] = args
+        return
+    kernel(*args)
+
+
+_noted: dict[Any, tuple] | None = None
+"""While this is a dictionary, kernels are not run but noted in it, with arguments that make little work."""
+
+
+def compile_in_two_processes(step: Callable[[], Any]) -> None:
+    """Fill an empty cache with the kernels that ``step`` calls, in two thirds of the time of one process.
+
+    Numba compiles in Python and holds the GIL, so threads would not help. Nothing is done where there is a
+    cache already, where only one thread is to be used, or where a process cannot be forked (macOS's own libraries
+    do not bear it): a fresh one would import torch first, and the main program as well.
+
+    Args:
+        step: is content with kernels that do nothing.
+    """
+    cached = any(Path(numba.config.CACHE_DIR).rglob("*.nbi"))  # type: ignore[attr-defined]
+    if cached or threads() == 1 or not sys.platform.startswith("linux"):
+        return
+    with tempfile.TemporaryDirectory(prefix="lodgs-") as taken:
+        fork = multiprocessing.get_context("fork")
+        other = fork.Process(target=_compile_share, args=(step, taken, -1), daemon=True)
+        other.start()
+        try:
+            _compile_share(step, taken, 1)
+            other.join()
+        finally:
+            other.kill()
+            other.join()
+
+
+def _compile_share(step: Callable[[], Any], taken: str, direction: int) -> None:
+    """Compile those kernels of a step that nobody has taken yet, by a file in the folder ``taken``.
+
+    One process begins with the first module and one with the last, as kernels of a module share helpers.
+    """
+    global _noted
+    _noted = {}
+    try:
+        with np.errstate(all="ignore"):  # it reckons with whatever the memory held
+            step()
+        noted = _noted
+    finally:
+        _noted = None
+    by_module = sorted(noted, key=lambda kernel: (kernel.py_func.__module__, kernel.py_func.__name__))
+    for kernel in by_module[::direction]:
+        try:
+            (Path(taken) / kernel.py_func.__name__).touch(exist_ok=False)
+        except FileExistsError:
+            continue
+        kernel(*noted[kernel])
 
 
 _idle: dict[str, list[np.ndarray]] = {}
