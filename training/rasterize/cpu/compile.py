@@ -140,8 +140,8 @@ def compile_in_two_processes(step: Callable[[], Any]) -> None:
     """Fill an empty cache with the kernels that ``step`` calls, in two thirds of the time of one process.
 
     Numba compiles in Python and holds the GIL, so threads would not help. Nothing is done where there is a
-    cache already, where only one thread is to be used, or where a process cannot be forked (macOS's own libraries
-    do not bear it): a fresh one would import torch first, and the main program as well.
+    cache already, where only one thread is to be used, or where a process cannot be forked (macOS's own
+    libraries do not bear it): a fresh one would import torch first, and the main program as well.
 
     Args:
         step: is content with kernels that do nothing.
