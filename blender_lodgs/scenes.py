@@ -123,7 +123,8 @@ def import_splats(context: bpy.types.Context, path: Path | str, *, upright: bool
     """A bundle, a folder of levels, or any 3DGS PLY as a single level, as a new splat scene.
 
     Args:
-        upright: turn the root so that -y, which is up in most splat files, is up; otherwise leave the axes.
+        upright: turn the root as the bundle says, or without that so that -y, which is up in most splat
+            files, is up; otherwise leave the axes.
 
     Returns:
         The scene root.
@@ -135,7 +136,9 @@ def import_splats(context: bpy.types.Context, path: Path | str, *, upright: bool
     bundle = read_folder(path) if path.is_dir() else read_bundle(path)
     with _new_scene(context, path.stem) as root:
         if upright:
-            root.rotation_euler = (-np.pi / 2, 0, 0)
+            root.rotation_mode = "QUATERNION"
+            rows = bundle.meta.get("up_rotation", ((1, 0, 0), (0, 0, 1), (0, -1, 0)))
+            root.rotation_quaternion = Matrix(rows).to_quaternion()
         for level in bundle.levels:
             _put_level(root, level)
         set_bundle_facts(root, bundle)

@@ -87,6 +87,15 @@ def test_upright_turns_minus_y_up(bpy, lodgs, file):
     assert np.array(root.matrix_world)[:3, :3] @ [0, -1, 0] == pytest.approx([0, 0, 1], abs=1e-6)
 
 
+def test_upright_is_as_the_bundle_says(bpy, lodgs, bundle, tmp_path):
+    turned = np.array([[0, 0.6, 0.8], [1, 0, 0], [0, 0.8, -0.6]])  # a rotation
+    bundle.meta["up_rotation"] = turned
+    lodgs("training.splats.bundle").write_bundle(tmp_path / "b.ply", bundle)
+    root = lodgs("scenes").import_splats(bpy.context, tmp_path / "b.ply")
+    bpy.context.view_layer.update()
+    assert np.array(root.matrix_world)[:3, :3] == pytest.approx(turned, abs=1e-6)
+
+
 def test_one_level_and_what_is_shown(bpy, lodgs, bundle, file, tmp_path):
     bpy.ops.lodgs.import_splats(filepath=str(file))
     root, out = the_root(bpy), tmp_path / "out.ply"

@@ -81,6 +81,8 @@ class Method(Interface):
         self._optimise(step)
         if growing and (step + 1) % p.grow_interval == 0:
             self._grow_and_prune(step)
+        if (step + 1) % p.grow_interval == 0 or step + 1 == self.steps:
+            self._settle()
         return float(loss.detach()), rendering.image.detach(), target
 
     def levels_after(self, step: int) -> list[Level]:
@@ -148,14 +150,16 @@ class Method(Interface):
         """How many times smaller a step's photograph is made: what one as many times farther away sees.
 
         Levels that finer ones have not joined yet see what they would be wanted for; later some steps do, so
-        that levels learn to stand alone that no photograph is far enough away for.
+        that levels learn to stand alone that no photograph is far enough away for. Not in the paper.
         """
         side = min(min(camera.width, camera.height) for camera in self.data.train)
         most = min(self.levels - 1, int(np.log2(max(side / SMALLEST, 1))))
+        if most == 0 or self.parameters.far_share == 0:
+            return 1
         if step < self.joins[-1]:
             return 2 ** min(self.levels - self.level_at(step), most)
         rng = np.random.default_rng([self.seed, step, 3])
-        if most == 0 or rng.random() >= self.parameters.far_share:
+        if rng.random() >= self.parameters.far_share:
             return 1
         return 2 ** int(rng.integers(1, most + 1))
 
@@ -241,6 +245,20 @@ class Method(Interface):
             raise LodgsError(
                 f"No splat is left at step {step + 1}.", "Lower 'min_opacity', or choose another preset."
             )
+
+    def _settle(self) -> None:
+        """Splats that have become too wide for their level move to the coarser one that they fit.
+
+        From far away they are seen long after their level is no longer wanted. Not in the paper.
+        """
+        columns = self.model.columns
+        columns["level"] = self._fitting(columns["level"], self.model["log_scales"].detach())
+
+    def _fitting(self, level: torch.Tensor, log_scales: torch.Tensor) -> torch.Tensor:
+        """The finest level (N,), at most the given one, for splats whose scales have these logs (N, 3)."""
+        widest = log_scales.amax(1) / float(np.log(2))
+        fitting = (1 + float(np.log2(self.parameters.spread * self.tree.voxel)) - widest).floor()
+        return torch.minimum(level, fitting.clamp_min(1))
 
     def _room(self) -> int:
         """Most anchors."""

@@ -248,6 +248,9 @@ class Method(octree.Method):
         super()._grow_and_prune(step)
         self.model.columns["anchor_seen"].zero_()
 
+    def _settle(self) -> None:
+        """Nothing: an anchor's level is its voxel's; that of its Gaussians is found when they are baked."""
+
     def _room(self) -> int:
         return self.parameters.max_splats // self.parameters.offsets
 
@@ -313,14 +316,18 @@ class Method(octree.Method):
         products += held.diag() * (products[:, :1, :1] / SH_C0**2)
         fitted = torch.linalg.solve(products, colors)
         anchor = torch.nonzero(kept)[:, 0]
-        columns = {name: columns[name][anchor].cpu().numpy() for name in ("level", "bias")}
+        log_scales = scales[kept].clamp_min(1e-12).log()
+        level = self._fitting(columns["level"][anchor], log_scales)
         return Splats(
             means=means[kept].cpu().numpy(),
             quats=quats[kept].cpu().numpy(),
-            log_scales=scales[kept].clamp_min(1e-12).log().cpu().numpy(),
+            log_scales=log_scales.cpu().numpy(),
             opacity_logits=opacities[kept].clamp(1e-6, 1 - 1e-6).logit().cpu().numpy(),
             sh=fitted.cpu().numpy(),
-            extras={"lod_level": columns["level"].astype(np.uint8), BIAS: columns["bias"]},
+            extras={
+                "lod_level": level.cpu().numpy().astype(np.uint8),
+                BIAS: columns["bias"][anchor].cpu().numpy(),
+            },
         )
 
     def _drawn_by(self, camera: Camera) -> torch.Tensor:

@@ -113,8 +113,11 @@ class OctreeParameters(Parameters):
     """Quantile that counts as the largest (Octree-GS: d_max), from where on level 1 alone is drawn."""
     coarser_levels: int = 3
     """Levels before those of Eq. 3, for views from farther away than any photograph."""
-    footprint: float = 1.0
+    footprint: float = 1.7
     """Pixels that the voxel of a level covers where the level is just wanted; sets the voxels' size."""
+    spread: float = 16.0
+    """Voxels of its level that a splat's largest standard deviation may span; wider ones move to a coarser
+    level."""
     visible_share: float = 0.0
     """Anchors that fewer than this share of the views want are dropped; those that none wants always are."""
     steps: int = 4300
@@ -134,7 +137,8 @@ class OctreeParameters(Parameters):
     bias_rate: float = 0.01
     """What a level's bias gains in a growing where the gradient is a quarter of the threshold or more."""
     far_share: float = 0.1
-    """Share of the steps that see a photograph made smaller, as from 2, 4, ... times the distance."""
+    """Share of the steps that see a photograph made smaller, as from 2, 4, ... times the distance; if it is
+    not 0, so do all steps before the finest level has joined."""
     full_share: float = 0.1
     """Share of the other steps that draw every level wherever it is, as a view at full detail does."""
     volume_weight: float = 0.0
@@ -213,6 +217,8 @@ _OCTREE_PAPER = replace(
     _OCTREE_STANDARD,
     steps=40_000,
     coarser_levels=0,
+    footprint=1.0,
+    spread=1e9,
     grow_until=0.625,
     grad_threshold=2e-4,
     max_splats=5_000_000,
@@ -233,6 +239,8 @@ _PRESETS = {
             offsets=10,
             grow_interval=100,
             coarser_levels=0,
+            footprint=1.0,
+            spread=1e9,
             grow_until=0.625,
             grad_threshold=2e-4,
             far_share=0.0,

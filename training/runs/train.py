@@ -26,6 +26,7 @@ from ..lod.selection import complete
 from ..methods import create
 from ..methods.data import TrainingData
 from ..rasterize import cuda, device_of, resolve, warm_up
+from ..scenes.orientation import up_rotation
 from ..splats.bundle import Bundle, Level, write_bundle
 from ..splats.ply import read_ply, write_ply
 from .data import training_data
@@ -153,7 +154,8 @@ class _Run:
             Level(record["level"], read_ply(self.folder.path / record["path"]), record["s_min"])
             for record in self.levels
         ]
-        meta = {**self.method.meta(), "seed": self.job.seed}
+        up = up_rotation(self.data.scene.cameras).round(6)
+        meta = {**self.method.meta(), "up_rotation": up, "seed": self.job.seed}
         bundle = Bundle(self.job.method, levels, meta, self.method.cumulative)
         if arrays := self.method.arrays():
             with atomic_write(self.folder.model) as temporary, open(temporary, "wb") as file:

@@ -29,6 +29,10 @@ _TAG = "lodsplat "
 _FORBIDDEN = ("packed_", "f_rest_", "end_header", "element chunk")
 # Some viewers read no further than 10 KB to find the end of the header.
 _MAX_COMMENTS = 2560
+# What readers rely on of meta.
+_META_SHAPES = {
+    "camera_center": (3,), "up_rotation": (3, 3), "gamma": (), "focal_px": (), "d_max": (),
+}  # fmt: skip
 
 
 @dataclass
@@ -240,6 +244,7 @@ def read_folder(folder: str | Path) -> Bundle:
             levels = [_level(fact, read_ply(folder / Path(fact["file"]).name)) for fact in facts]
             if not levels:
                 raise ValueError("no levels")
+            _check_meta(manifest["meta"])
             return Bundle(manifest["method"], levels, manifest["meta"])
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise _contradiction(manifest_file, error) from error
@@ -319,6 +324,7 @@ def _parse(comments: list[str], path: str | Path) -> tuple[Facts | None, list[di
         if not numbers:
             raise ValueError("no levels")
         meta = next((fact["meta"] for fact in facts if "meta" in fact), {})
+        _check_meta(meta)
         return Facts(head["method"], numbers, meta, head["cumulative"]), facts
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise _contradiction(path, error) from error
@@ -327,6 +333,13 @@ def _parse(comments: list[str], path: str | Path) -> tuple[Facts | None, list[di
 def _check_version(head: dict, path: str | Path) -> None:
     if head["v"] > FORMAT_VERSION:
         raise LodgsError(f"{path} is a bundle of the newer version {head['v']}.", "Update LODGS to read it.")
+
+
+def _check_meta(meta: dict) -> None:
+    """ValueError or TypeError where a fact that readers rely on is not as many numbers as it should be."""
+    for name, shape in _META_SHAPES.items():
+        if name in meta and np.asarray(meta[name], np.float64).shape != shape:
+            raise ValueError(f"{name} is not of shape {shape}")
 
 
 def _contradiction(path: str | Path, error: Exception) -> LodgsError:

@@ -57,11 +57,12 @@ def test_a_picture_half_as_large_wants_one_level_less(data):
 
 def test_levels_that_are_there_see_what_they_are_wanted_for(data, monkeypatch):
     monkeypatch.setattr("training.methods.octree.SMALLEST", 4)
-    octree = make(data, levels=4, steps=400, coarse_share=0.5)
+    octree = make(data, levels=4, steps=400, coarse_share=0.5, far_share=1e-9)
     assert [octree.joins[2:], octree._shrink(0)] == [[95, 158], 4]  # two of four levels: two halvings
     assert [octree._shrink(step) for step in (94, 95, 157, 158, 399)] == [4, 2, 2, 1, 1]
     monkeypatch.setattr("training.methods.octree.SMALLEST", 20)  # of 48 pixels: one halving at most
     assert octree._shrink(0) == 2
+    assert make(data, levels=4, steps=400, coarse_share=0.5, far_share=0.0)._shrink(0) == 1
 
 
 def test_gradients_of_smaller_pictures_count_for_as_much(data):
@@ -146,6 +147,18 @@ def test_what_stays_faint_is_removed_and_what_was_not_seen_stays(data):
     octree.model.columns["seen"] += 1
     with pytest.raises(LodgsError, match="No splat is left"):
         octree._grow_and_prune(20)
+
+
+def test_what_is_too_wide_for_its_level_moves_to_the_coarser_one_that_it_fits(data):
+    octree = make(data, spread=2.0)
+    octree.model.columns["level"][:] = 4
+    octree.model.columns["level"][3] = 2
+    voxels = torch.tensor([1 / 8, 1 / 3, 1.1, 1 / 8])  # of level 1; those of level 4 are an eighth of it
+    octree.model["log_scales"].detach()[:4] = (2 * octree.tree.voxel * voxels).log()[:, None] - torch.tensor(
+        [1.0, 0.001, 3.0]  # only the widest counts
+    )
+    octree._settle()
+    assert octree.model.columns["level"][:4].tolist() == [4, 2, 1, 2]
 
 
 def test_the_volume_is_measured_in_median_depths(data):

@@ -18,6 +18,8 @@ from training.methods import MODULES
 from training.runs import train as training_loop
 from training.runs.folder import RunFolder
 from training.runs.job import Job
+from training.scenes.colmap import read_scene
+from training.scenes.orientation import up_rotation
 from training.splats.bundle import read_bundle
 from training.splats.ply import read_ply
 
@@ -104,6 +106,8 @@ def test_levels_and_bundle_agree_and_record_the_constraint(unbroken):
         assert level.s_min == event["s_min"]
         if level.s_min:
             assert np.exp(alone.log_scales).min() >= level.s_min * (1 - 1e-5)
+    upright = up_rotation(read_scene(Path(unbroken["keys"]["scene"])).cameras)
+    np.testing.assert_allclose(bundle.meta["up_rotation"], upright, atol=1e-6)
     if bundle.method == "flod":
         assert bundle.meta["footprint_px"] == pytest.approx(6.0)
     else:

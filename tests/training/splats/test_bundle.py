@@ -228,6 +228,8 @@ def test_a_bundle_cut_short_says_what_is_missing(tmp_path, bundle, missing):
         (b'"count":3,', b""),
         (b'{"level":1', b'[{"level":1'),
         (b'{"level":1,', b'{"level":"one",'),
+        (b'"meta":{', b'"meta":{"up_rotation":[0,0,1],'),
+        (b'"meta":{', b'"meta":{"d_max":"far",'),
     ],
 )
 def test_a_header_that_contradicts_itself_is_one_sentence(tmp_path, bundle, old, new):
