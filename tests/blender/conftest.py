@@ -7,6 +7,7 @@ import os
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tools.blender_module import EXTENSION, start_blender
@@ -37,6 +38,35 @@ def lodgs(bpy):
         return importlib.import_module(f"{EXTENSION}.{room}{name}")
 
     return load
+
+
+@pytest.fixture
+def frame(bpy):
+    """``frame(size, draw)``: what ``draw()`` leaves in a float framebuffer, (size, size, 4), row 0 below.
+
+    Tests that draw are skipped where this Blender has no graphics in background.
+    """
+    import gpu
+
+    if not hasattr(gpu, "init"):
+        pytest.skip("no graphics in background before Blender 5.2")
+    try:
+        gpu.init()
+    except Exception as error:
+        pytest.skip(f"no graphics here: {error}")
+
+    def drawn(size, draw):
+        screen = gpu.types.GPUOffScreen(size, size, format="RGBA32F")
+        with screen.bind():
+            frame = gpu.state.active_framebuffer_get()
+            frame.clear(color=(0, 0, 0, 0), depth=1.0)
+            draw()
+            buffer = frame.read_color(0, 0, size, size, 4, 0, "FLOAT")
+        buffer.dimensions = size * size * 4
+        screen.free()
+        return np.array(buffer, np.float32).reshape(size, size, 4)
+
+    return drawn
 
 
 @pytest.fixture
