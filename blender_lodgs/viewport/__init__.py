@@ -25,7 +25,7 @@ _handle: Any = None
 
 def draws_splats(scene: bpy.types.Scene) -> bool:
     """Whether viewports draw a Blender scene's splats as Gaussians, by our own shaders."""
-    return scene.lodgs_viewport.splats and compat.native_splat_type() is None
+    return scene.lodgs_viewport.splats and not compat.NATIVE_SPLATS
 
 
 def _draw() -> None:
@@ -61,7 +61,7 @@ def _points(
 ) -> Iterator[tuple[bpy.types.Object | None, tuple[float, float, float, float]]]:
     """What of a splat scene is drawn as points, and in which colour; alpha 0 is each point's own."""
     yield settings.points, (0, 0, 0, 0)
-    if levels and compat.native_splat_type() is None:
+    if levels and not compat.NATIVE_SPLATS:
         for item in settings.levels:
             yield item.object, (*level_color(item.number), float(settings.tell != "OWN"))
 

@@ -336,7 +336,7 @@ def draw(
 
     gpu.state.depth_test_set("NONE")
     gpu.state.blend_set("ADDITIVE_PREMULT")  # the shader leaves room for what is there
-    with frame.bind():
+    with frame.bind():  # type: ignore[union-attr]
         shader, quad = _program("composite")
         shader.bind()
         shader.uniform_sampler("colors", screen.texture_color)
