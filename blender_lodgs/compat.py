@@ -20,7 +20,7 @@ def _native_splats() -> tuple[str, str] | None:
 
 
 NATIVE_SPLATS = _native_splats()
-"""The property of point clouds, and its value, that has Blender draw splats itself; None before Blender 5.3."""
+"""The property of point clouds, and its value, that has Blender draw splats itself; None before 5.3."""
 
 
 def make_native(cloud: bpy.types.PointCloud) -> bool:
