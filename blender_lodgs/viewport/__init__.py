@@ -31,7 +31,7 @@ def draws_splats(scene: bpy.types.Scene) -> bool:
 def _draw() -> None:
     context = bpy.context
     space, region, view = context.space_data, context.region, context.region_data
-    eye.drawn(region, context.scene, view.view_matrix, view.window_matrix)
+    eye.drawn(region, context.scene, view)
     with_splats = draws_splats(context.scene) and space.shading.type != "WIREFRAME"
     if space.shading.type == "SOLID" and space.shading.color_type not in {"OBJECT", "RANDOM", "SINGLE"}:
         things = [

@@ -21,7 +21,9 @@ _newest: tuple[str, tuple[float, float, float], float] | None = None
 """Of the view that moved last, until it is handed on: Blender scene, eye in the world, focal length."""
 
 
-def place(view: Matrix, projection: Matrix, width: int) -> tuple[tuple[float, float, float], float]:
+def place(
+    view: Matrix, projection: Matrix, width: int, distance: float
+) -> tuple[tuple[float, float, float], float]:
     """The eye of a view in the world, and its focal length in pixels.
 
     Without perspective all depths are as large: as large as with perspective at the point that the view turns
@@ -30,22 +32,22 @@ def place(view: Matrix, projection: Matrix, width: int) -> tuple[tuple[float, fl
     Args:
         view, projection: from the world to the camera's space, and on to clip space.
         width: of the region in pixels.
+        distance: from the eye to the point that the view turns about.
     """
     eye = tuple(view.inverted().translation)
     focal = projection[0][0] * width / 2
     if projection[3][3] != 0:
-        middle = -projection[2][3] / projection[2][2]  # depth in the middle between the clipping planes
-        focal *= max(abs(middle), 1e-6)
+        focal *= distance
     return eye, focal
 
 
-def drawn(region: bpy.types.Region, scene: bpy.types.Scene, view: Matrix, projection: Matrix) -> None:
+def drawn(region: bpy.types.Region, scene: bpy.types.Scene, looks: bpy.types.RegionView3D) -> None:
     """A viewport is being drawn; where its view has moved it is the eye from now on."""
     global _newest
     if not any(_follows(root) for root in scenes.roots(scene)):
         _last.clear()
         return
-    seen = projection @ view
+    seen = looks.window_matrix @ looks.view_matrix
     key = region.as_pointer()
     if key in _last and _last[key] == seen:
         return
@@ -53,7 +55,9 @@ def drawn(region: bpy.types.Region, scene: bpy.types.Scene, view: Matrix, projec
     _last[key] = seen
     if first:  # a viewport that was only just opened has not moved
         return
-    _newest = (scene.name, *place(view, projection, region.width))
+    _newest = (
+        scene.name, *place(looks.view_matrix, looks.window_matrix, region.width, looks.view_distance)
+    )  # fmt: skip
     if not bpy.app.timers.is_registered(_hand_on):
         bpy.app.timers.register(_hand_on, first_interval=PAUSE)
 

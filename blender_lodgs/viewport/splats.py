@@ -152,17 +152,47 @@ void main()
 }
 """
 _COMPOSITE_FRAGMENT = """
+vec3 linear(vec3 code)
+{
+  return mix(pow((code + 0.055) / 1.055, vec3(2.4)), code / 12.92, lessThanEqual(code, vec3(0.04045)));
+}
+
+// What a pixel would show without the overlay that covers part of it: what pixels nearby do that have none.
+vec3 without(ivec2 pixel, vec3 otherwise)
+{
+  ivec2 size = textureSize(overlay, 0);
+  for (int away = 2; away <= 8; away *= 2) {
+    for (int i = 0; i < 9; i++) {
+      ivec2 nearby = clamp(pixel + away * ivec2(i % 3 - 1, i / 3 - 1), ivec2(0), size - 1);
+      vec4 there = texelFetch(overlay, nearby, 0);
+      if (there.a == 0.0) {
+        return linear(there.rgb);
+      }
+    }
+  }
+  return otherwise;
+}
+
 // Blender's buffer is linear with a gamma of 2.2, and so is how it lies over the scene; splats lie over it as
 // displayed, d = s + (1 - a) b. What is written does so over black (b = 0) and, in the mean of the channels,
-// over white (b = 1).
+// over white (b = 1). Overlays are in the buffer already, and so is the background, which has alpha 0: it is
+// faded by the blending, which would fade thin overlays with it, so that those are added again.
 void main()
 {
   vec4 splats = texture(colors, at);
-  float over = 1.0 - texelFetch(overlay, ivec2(at * vec2(textureSize(overlay, 0))), 0).r;
   vec3 black = pow(clamp(splats.rgb, 0.0, 1.0), vec3(2.2));
   vec3 white = pow(clamp(splats.rgb + 1.0 - splats.a, 0.0, 1.0), vec3(2.2));
   float alpha = 1.0 - dot(white - black, vec3(1.0 / 3.0));
-  drawn = over * vec4(black, alpha);
+
+  ivec2 pixel = ivec2(at * vec2(textureSize(overlay, 0)));
+  vec4 there = texelFetch(overlay, pixel, 0);
+  float room = 1.0 - there.a;
+  vec3 again = vec3(0.0);
+  if (there.a > 0.0 && there.a < 1.0) {
+    again = linear(there.rgb);
+    again -= without(pixel, again);
+  }
+  drawn = room * vec4(black + alpha * again, alpha);
 }
 """
 
@@ -261,22 +291,22 @@ def instances_texture(arrangement: Arrangement) -> gpu.types.GPUTexture:
 
 
 class Canvas:
-    """The offscreen buffer that splats are blended in; one for each viewport, made anew for another size."""
+    """The framebuffer that splats are blended in; one for each viewport, made anew for another size.
+
+    It is no ``GPUOffScreen``: making one leaves the framebuffer that is being drawn into unbound.
+    """
 
     def __init__(self) -> None:
-        self._screen: gpu.types.GPUOffScreen | None = None
+        self.size = (0, 0)
+        self.colors: gpu.types.GPUTexture | None = None
+        self.frame: gpu.types.GPUFrameBuffer | None = None
 
-    def of_size(self, width: int, height: int) -> gpu.types.GPUOffScreen:
-        screen = self._screen
-        if screen is None or (screen.width, screen.height) != (width, height):
-            self.free()
-            self._screen = screen = gpu.types.GPUOffScreen(width, height, format="RGBA16F")
-        return screen
-
-    def free(self) -> None:
-        if self._screen is not None:
-            self._screen.free()
-        self._screen = None
+    def resize(self, size: tuple[int, int]) -> None:
+        """Makes it (width, height) large."""
+        if size != self.size:
+            self.size, self.colors = size, gpu.types.GPUTexture(size, format="RGBA16F")
+            self._depth = gpu.types.GPUTexture(size, format="DEPTH_COMPONENT32F")
+            self.frame = gpu.types.GPUFrameBuffer(depth_slot=self._depth, color_slots=self.colors)
 
 
 def draw(
@@ -298,18 +328,22 @@ def draw(
         worlds: each placement's ``matrix_world``, (4, 4) float64.
         view, projection: from the world to the camera's space, and on to clip space.
         resolution: of the splats, over that of the framebuffer.
-        under_overlays: leave what the framebuffer shows already on top, where it has alpha.
+        under_overlays: leave what the framebuffer shows already on top, where it has alpha; it is coded in
+            sRGB, as a viewport's is.
     """
     frame = gpu.state.active_framebuffer_get()
     _, _, width, height = gpu.state.viewport_get()
     depth = gpu.types.GPUTexture((width, height), format="R32F", data=frame.read_depth(0, 0, width, height))
-    overlay = _overlay_alpha(frame, width, height) if under_overlays else _nothing()
-
+    overlay = _once("nothing", _nothing)
+    if under_overlays:
+        overlay = gpu.types.GPUTexture(
+            (width, height), format="RGBA8", data=frame.read_color(0, 0, width, height, 4, 0, "FLOAT")
+        )
     placements = _placements(worlds, view, projection)  # a texture is freed with its last name
     size = max(1, round(width * resolution)), max(1, round(height * resolution))
-    screen = canvas.of_size(*size)
-    with screen.bind():  # type: ignore[attr-defined]
-        gpu.state.active_framebuffer_get().clear(color=(0, 0, 0, 0), depth=1.0)
+    canvas.resize(size)
+    with canvas.frame.bind():  # type: ignore[union-attr]
+        canvas.frame.clear(color=(0, 0, 0, 0), depth=1.0)
         gpu.state.color_mask_set(False, False, False, False)
         gpu.state.depth_test_set("ALWAYS")
         gpu.state.depth_mask_set(True)
@@ -335,22 +369,13 @@ def draw(
         quad.draw_instanced(shader, instance_count=count)
 
     gpu.state.depth_test_set("NONE")
-    gpu.state.blend_set("ADDITIVE_PREMULT")  # the shader leaves room for what is there
-    with frame.bind():  # type: ignore[union-attr]
-        shader, quad = _program("composite")
-        shader.bind()
-        shader.uniform_sampler("colors", screen.texture_color)
-        shader.uniform_sampler("overlay", overlay)
-        quad.draw(shader)
+    gpu.state.blend_set("ALPHA_PREMULT")
+    shader, quad = _program("composite")
+    shader.bind()
+    shader.uniform_sampler("colors", canvas.colors)
+    shader.uniform_sampler("overlay", overlay)
+    quad.draw(shader)
     gpu.state.blend_set("NONE")
-
-
-def _overlay_alpha(frame: gpu.types.GPUFrameBuffer, width: int, height: int) -> gpu.types.GPUTexture:
-    """How much of each pixel is covered already."""
-    seen = np.frombuffer(frame.read_color(0, 0, width, height, 4, 0, "UBYTE"), np.uint8)  # type: ignore
-    alpha = seen[3::4].astype(np.float32) / np.float32(255)
-    data = gpu.types.Buffer("FLOAT", len(alpha), alpha)
-    return gpu.types.GPUTexture((width, height), format="R32F", data=data)
 
 
 def _placements(worlds: Sequence[np.ndarray], view: Matrix, projection: Matrix) -> gpu.types.GPUTexture:
@@ -398,10 +423,7 @@ def _palette() -> gpu.types.GPUTexture:
 
 
 def _nothing() -> gpu.types.GPUTexture:
-    return _once(
-        "nothing",
-        lambda: gpu.types.GPUTexture((1, 1), format="R32F", data=gpu.types.Buffer("FLOAT", 1, [0.0])),
-    )
+    return gpu.types.GPUTexture((1, 1), format="RGBA8", data=gpu.types.Buffer("FLOAT", 4, [0.0] * 4))
 
 
 def _program(name: str) -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:

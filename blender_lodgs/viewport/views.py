@@ -71,10 +71,22 @@ def draw(context: bpy.types.Context) -> None:
     view.resolution = settings.moving / 100 if now - view.moved < STILL else 1.0
     draw_sets(
         view, sets, context.evaluated_depsgraph_get(), region_data.view_matrix, region_data.window_matrix,
-        settings.budget, under_overlays=space.overlay.show_overlays,
+        settings.budget, under_overlays=space.overlay.show_overlays and not _shows_photograph(context),
     )  # fmt: skip
     if view.asked is not None or view.resolution < 1:
         _wake_later()
+
+
+def _shows_photograph(context: bpy.types.Context) -> bool:
+    """Whether a camera's picture fills the view: it lies among the overlays, and would cover the splats."""
+    camera = context.space_data.camera or context.scene.camera
+    return (
+        context.region_data.view_perspective == "CAMERA"
+        and camera is not None
+        and camera.type == "CAMERA"
+        and camera.data.show_background_images
+        and any(picture.show_background_image for picture in camera.data.background_images)
+    )
 
 
 def draw_sets(
@@ -230,8 +242,6 @@ def changed(depsgraph: bpy.types.Depsgraph) -> None:
 def forget() -> None:
     """Frees everything that is kept between drawings."""
     global _uploaded, _keys
-    for view in _views.values():
-        view.canvas.free()
     _views.clear()
     _stale.clear()
     _uploaded, _keys = None, ()

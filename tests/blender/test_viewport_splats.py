@@ -3,6 +3,7 @@
 import importlib.util
 import os
 import subprocess
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -62,12 +63,13 @@ def add(bpy, lodgs):
 def picture(bpy, lodgs, frame, camera):
     """``picture(**options)``: what the camera sees of all splats, (SIZE, SIZE, 4) linear, row 0 above.
 
-    ``before`` is called to draw into the framebuffer first; ``view`` is what a viewport keeps.
+    ``before`` is called to draw into the framebuffer first; ``view`` is what a viewport keeps; ``coded`` is
+    what the framebuffer holds before.
     """
     views = lodgs("viewport.views")
     views.forget()
 
-    def drawn(before=None, view=None, budget=10**6, under_overlays=False, wait=True):
+    def drawn(before=None, view=None, budget=10**6, under_overlays=False, wait=True, coded=None):
         depsgraph = bpy.context.evaluated_depsgraph_get()
         matrix = camera.matrix_world.inverted()
         projection = camera.calc_matrix_camera(depsgraph, x=SIZE, y=SIZE)
@@ -81,7 +83,7 @@ def picture(bpy, lodgs, frame, camera):
                 under_overlays=under_overlays, wait=wait,
             )  # fmt: skip
 
-        return frame(SIZE, draw)[::-1]
+        return frame(SIZE, draw, coded)[::-1]
 
     yield drawn
     views.forget()
@@ -280,23 +282,27 @@ def test_splats_before_a_mesh_hide_it_and_those_behind_are_hidden(bpy, lodgs, ad
     assert psnr(seen, truth([(splats, np.eye(4))], keep=before)) > 45
 
 
-def test_overlays_stay_on_top(bpy, lodgs, add, picture):
-    """What covers a pixel already is not touched; what covers half of it lets half of the splats through."""
+def test_overlays_stay_on_top_and_the_background_does_not(bpy, lodgs, add, picture, frame):
+    """In a buffer like Blender's: a background of alpha 0, and over it bars that cover it or half of it."""
     import gpu
 
     add(make_splats(lodgs, degree=0))
+    ground, line = np.array([0.2, 0.2, 0.2]), np.array([1.0, 0.5, 0.0])
+    cover = np.zeros((SIZE, SIZE))
+    cover[:, 100:102], cover[:, 260:264], cover[300:302] = 1.0, 0.5, 0.25
+    before = np.zeros((SIZE, SIZE, 4), np.float32)
+    before[..., :3] = cover[..., None] * line + (1 - cover[..., None]) * ground
+    before[..., 3] = cover
 
-    def cover(alpha):
-        def draw(matrix):
-            gpu.state.active_framebuffer_get().clear(color=(alpha, 0, 0, alpha), depth=1.0)
-
-        return draw
-
-    bare = picture(before=cover(0.0), under_overlays=True)
-    assert (picture(before=cover(1.0), under_overlays=True) == (1, 0, 0, 1)).all()
-    half = picture(before=cover(0.5), under_overlays=True)
-    left = 1 - round(0.5 * 255) / 255
-    assert np.allclose(half, (0.5, 0, 0, 0.5) + left * bare, atol=1e-3)
+    seen = picture(under_overlays=True, coded=before[::-1])
+    plain = picture()
+    alpha = plain[..., 3:]
+    scene = plain[..., :3] + (1 - alpha) * ground
+    expected = cover[..., None] * line + (1 - cover[..., None]) * scene
+    assert alpha.max() > 0.99 and alpha.min() == 0
+    assert np.abs(seen[..., :3] - expected).max() < 0.02
+    assert np.abs(seen[cover == 1] - before[cover == 1]).max() < 0.01
+    assert gpu.state.blend_get() == "NONE"
 
 
 def test_over_white_and_black_the_picture_is_that_of_display_space(bpy, lodgs, add, picture):
@@ -312,3 +318,124 @@ def test_over_white_and_black_the_picture_is_that_of_display_space(bpy, lodgs, a
     color, alpha = seen[y, x, 0], seen[y, x, 3]
     assert color ** (1 / 2.2) == pytest.approx(0.3, abs=2e-3)
     assert (color + (1 - alpha)) ** (1 / 2.2) == pytest.approx(0.3 + 0.5, abs=2e-3)
+
+
+def test_only_changed_splats_are_uploaded_again(bpy, lodgs, camera, picture, frame):
+    """Not for time, views, selection by distance, levels seen before or moved objects."""
+    scenes, bundle, views = lodgs("scenes"), lodgs("training.splats.bundle"), lodgs("viewport.views")
+    scene = bpy.context.scene
+    with scenes._new_scene(bpy.context, "scene") as root:
+        for number, s_min in ((1, 0.003), (2, 0.0)):
+            scenes.set_level(root, bundle.Level(number, make_splats(lodgs, 500, 3, number), s_min))
+    root.lodgs.mode, root.lodgs.level_start = "SELECTIVE", 1
+    root.lodgs.gamma = 0.45  # the border lies among the splats
+    for number, x in ((1, 2.0), (20, 4.0)):
+        camera.location.x = x
+        camera.keyframe_insert("location", frame=number)
+    scene.frame_set(1)
+    view = views.View()
+    counts = set()
+
+    def drawn():
+        seen = picture(view=view)
+        counts.add(view.arrangement.count)
+        return seen
+
+    first = drawn()
+    uploads = views.uploads
+    pictures = [first]
+    for number in (5, 10, 20):
+        scene.frame_set(number)
+        pictures.append(drawn())
+    assert len(counts) > 2, "the selection follows the camera"
+    root.location.z = 0.3
+    bpy.context.view_layer.update()
+    pictures.append(drawn())
+    assert all(not np.array_equal(a, b) for a, b in pairwise(pictures))
+    root.lodgs.mode = "SINGLE"
+    for number in (1, 2, 1, 2):
+        root.lodgs.single_level = number
+        bpy.context.view_layer.update()
+        drawn()
+    assert views.uploads == uploads
+    cloud = root.lodgs.levels[1].object.data
+    cloud.attributes["position"].data.foreach_set("vector", np.zeros(1500, np.float32))
+    cloud.update_tag()
+    bpy.context.view_layer.update()
+    last = pictures[-1]
+    assert not np.array_equal(drawn(), last) and views.uploads == uploads + 1
+
+
+def test_artists_own_modifiers_are_drawn(bpy, lodgs, add, picture):
+    """What geometry nodes make of splats is uploaded, and again when they make something else of them."""
+    views, view = lodgs("viewport.views"), lodgs("viewport.views").View()
+    thing = add(make_splats(lodgs, 500))
+    before = picture(view=view)
+    group = bpy.data.node_groups.new("move", "GeometryNodeTree")
+    for way in ("INPUT", "OUTPUT"):
+        group.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
+    source, move, end = (
+        group.nodes.new(k) for k in ("NodeGroupInput", "GeometryNodeSetPosition", "NodeGroupOutput")
+    )
+    group.links.new(source.outputs[0], move.inputs["Geometry"])
+    group.links.new(move.outputs[0], end.inputs[0])
+    move.inputs["Offset"].default_value = (0, 0, 0.5)
+    thing.modifiers.new("move", "NODES").node_group = group
+    bpy.context.view_layer.update()
+    uploads = views.uploads
+    after = picture(view=view)
+    assert views.uploads == uploads + 1
+    thing.modifiers.remove(thing.modifiers["move"])
+    thing.location.z = 0.5
+    bpy.context.view_layer.update()
+    assert np.abs(after - picture(view=view)).max() < 0.02
+    assert np.abs(after - before).max() > 0.2
+
+
+def test_the_order_is_only_found_anew_when_the_view_turns(bpy, lodgs, add, picture, camera):
+    add(make_splats(lodgs, 500))
+    view = lodgs("viewport.views").View()
+    picture(view=view)
+    first = view.arrangement
+    camera.location.x += 0.5
+    bpy.context.view_layer.update()
+    picture(view=view)
+    assert view.arrangement is first
+    camera.rotation_euler.z += 0.1
+    bpy.context.view_layer.update()
+    picture(view=view)
+    assert view.arrangement is not first
+
+
+def test_drawing_does_not_wait_for_the_order(bpy, lodgs, add, picture, camera, monkeypatch):
+    """With a thread that takes its time, the last order is drawn at once."""
+    import threading
+
+    views = lodgs("viewport.views")
+    add(make_splats(lodgs, 500))
+    view, go, arrange = views.View(), threading.Event(), views.arrange
+    first = picture(view=view)
+    monkeypatch.setattr(views, "arrange", lambda *a: go.wait(20) and arrange(*a))
+    camera.rotation_euler.z += 0.02
+    bpy.context.view_layer.update()
+    second = picture(view=view, wait=False)
+    assert view.asked is not None and second[..., 3].max() > 0.9
+    assert not np.array_equal(first, second), "the view itself is the new one"
+    go.set()
+    picture(view=view)
+    assert view.asked is None
+
+
+def test_points_are_hidden_in_viewports_and_there_in_renders(bpy, lodgs, add):
+    thing = add(make_splats(lodgs, 50))
+    scene = bpy.context.scene
+
+    def radii():
+        bpy.context.view_layer.update()
+        cloud = thing.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+        return lodgs("objects").read_attribute(cloud, "radius")
+
+    assert (radii() == 0).all()
+    assert not thing.modifiers["LODGS Display"].show_render
+    scene.lodgs_viewport.splats = False
+    assert (radii() > 0).all()
