@@ -12,18 +12,18 @@ from mathutils import Matrix, Vector
 
 from .. import scenes, selection
 
+Place = tuple[float, float, float]
+
 PAUSE = 0.08
 """Seconds between two changes of the eye while the view moves: each chooses the detail anew."""
 
 _last: dict[int, Matrix] = {}
 """What each viewport's region looked through when it was last drawn."""
-_newest: tuple[str, tuple[float, float, float], float] | None = None
+_newest: tuple[str, Place, float] | None = None
 """Of the view that moved last, until it is handed on: Blender scene, eye in the world, focal length."""
 
 
-def place(
-    view: Matrix, projection: Matrix, width: int, distance: float
-) -> tuple[tuple[float, float, float], float]:
+def place(view: Matrix, projection: Matrix, width: int, distance: float) -> tuple[Place, float]:
     """The eye of a view in the world, and its focal length in pixels.
 
     Without perspective all depths are as large: as large as with perspective at the point that the view turns
@@ -62,7 +62,7 @@ def drawn(region: bpy.types.Region, scene: bpy.types.Scene, looks: bpy.types.Reg
         bpy.app.timers.register(_hand_on, first_interval=PAUSE)
 
 
-def follow(scene: bpy.types.Scene, eye: tuple[float, float, float], focal_px: float) -> None:
+def follow(scene: bpy.types.Scene, eye: Place, focal_px: float) -> None:
     """Has all splat scenes whose eye is the viewport measure distances from a place in the world."""
     for root in scenes.roots(scene):
         if _follows(root):

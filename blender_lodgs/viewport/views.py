@@ -105,26 +105,47 @@ def draw_sets(
     Args:
         view: what was drawn there last; changed.
         view_matrix, projection: from the world to the camera's space, and on to clip space.
-        budget: most splats to draw.
+        budget, wait: see :func:`prepare`.
         under_overlays: see ``splats.draw``.
-        wait: for the splats' order, rather than drawing them in the last one that there is.
     """
-    if not sets:
-        view.uploaded = view.arrangement = view.instances = view.asked = None
+    wanted = prepare(view, sets, depsgraph, view_matrix, budget, wait)
+    if view.uploaded is None or view.arrangement is None or view.instances is None:
         return
-    uploaded = _upload(sets)
-    request = Request(_placements(sets, uploaded, depsgraph), tuple(view_matrix[2][:3]), budget)
-    _arrange(view, uploaded, request, wait)
-    if view.arrangement is None or not view.arrangement.count:
+    if not view.arrangement.count:
         return
-    assert view.uploaded is not None and view.instances is not None
     placements = view.arrangement.request.placements
-    if _alike(placements, request.placements):  # what moves, moves at once; its order follows
-        placements = request.placements
+    if _alike(placements, wanted.placements):  # what moves, moves at once; its order follows
+        placements = wanted.placements
     splats.draw(
         view.uploaded, view.instances, view.arrangement.count, [placement.world for placement in placements],
         view_matrix, projection, view.canvas, resolution=view.resolution, under_overlays=under_overlays,
     )  # fmt: skip
+
+
+def prepare(
+    view: View,
+    sets: list[shown.SplatSet],
+    depsgraph: bpy.types.Depsgraph,
+    view_matrix: Matrix,
+    budget: int,
+    wait: bool = False,
+) -> Request:
+    """All that comes before drawing: what has changed is uploaded, and what has been found taken over.
+
+    Args:
+        budget: most splats to draw.
+        wait: for the splats' order, rather than going on with the last one that there is.
+
+    Returns:
+        What is to be drawn, which ``view.arrangement`` may not answer yet.
+    """
+    if not sets:
+        view.uploaded = view.arrangement = view.instances = view.asked = None
+        return Request((), (0.0, 0.0, 1.0), budget)
+    uploaded = _upload(sets)
+    request = Request(_placements(sets, uploaded, depsgraph), tuple(view_matrix[2][:3]), budget)
+    _arrange(view, uploaded, request, wait)
+    return request
 
 
 def left_out() -> int:
