@@ -52,7 +52,7 @@ class SplatSet:
         return len(self.means)
 
     def in_world(self, matrix: np.ndarray) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Means, quats and log-scales where a transform (4, 4) puts them; any affine one that keeps volume."""
+        """Means, quats and log-scales where a transform (4, 4) puts them, any affine one."""
         key = matrix.tobytes()
         if self._there is None or self._there[0] != key:
             self._there = key, self._moved(torch.from_numpy(matrix))
@@ -77,7 +77,8 @@ class SplatSet:
         own = np.linalg.solve(matrix, np.append(eye, 1.0))[:3]
         directions = normalize(self.means - torch.as_tensor(own).to(self.means), dim=1)
         values: list = [None] * self.sh.shape[1]
-        basis(*directions.unbind(1), degree_of(len(values)), values)
+        x, y, z = directions.unbind(1)
+        basis(x, y, z, degree_of(len(values)), values)
         return (0.5 + torch.einsum("kn,nkc->nc", torch.stack(values), self.sh)).clamp_min(0)
 
 

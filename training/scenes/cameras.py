@@ -55,7 +55,7 @@ class Camera:
         """This view of a world as seen from inside an object in it: pixels stay the same.
 
         Args:
-            matrix: (4, 4) from the object to the world: rotation, one scale above 0 for all axes, translation.
+            matrix: (4, 4) from the object to the world: rotation, one scale above 0, translation.
 
         Returns:
             The camera in the object's coordinates, and how many units of the world one of its units is.
