@@ -335,16 +335,36 @@ class View(bpy.types.PropertyGroup):
     fy: bpy.props.FloatProperty(name="Focal Length Y", description="In pixels", subtype="PIXEL")
 
 
-CLASSES = (View, TrainingSettings, SplatLevel, SplatScene)
+class RenderSettings(bpy.types.PropertyGroup):
+    """How the engine LODGS renders a Blender scene (``Scene.lodgs_render``)."""
+
+    background: bpy.props.FloatVectorProperty(
+        name="Background",
+        description="Colour behind the splats, as the display shows it. Splats of photographs are trained "
+        "over black",
+        size=3,
+        min=0.0,
+        max=1.0,
+        subtype="COLOR_GAMMA",
+    )
+    use_pass_levels: bpy.props.BoolProperty(
+        name="Levels",
+        description="Passes that tell which level each pixel shows, and how much of it every level fills",
+    )
+
+
+CLASSES = (View, TrainingSettings, SplatLevel, SplatScene, RenderSettings)
 
 
 def register() -> None:
-    """Attach the groups to Blender's objects and cameras."""
+    """Attach the groups to Blender's objects, cameras and scenes."""
     bpy.types.Object.lodgs = bpy.props.PointerProperty(type=SplatScene)
     bpy.types.Camera.lodgs = bpy.props.PointerProperty(type=View)
+    bpy.types.Scene.lodgs_render = bpy.props.PointerProperty(type=RenderSettings)
 
 
 def unregister() -> None:
     """Detach them again."""
+    del bpy.types.Scene.lodgs_render
     del bpy.types.Camera.lodgs
     del bpy.types.Object.lodgs

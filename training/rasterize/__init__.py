@@ -149,21 +149,25 @@ def strips(
     antialias: bool = False,
     outputs: Collection[str] = (),
     features: torch.Tensor | None = None,
+    window: tuple[int, int, int, int] | None = None,
     strip: int = STRIP,
     backend: str = "auto",
 ) -> Iterator[tuple[int, Rendering]]:
     """Draw a picture for eyes strip by strip, from the top: nothing is kept for gradients or between strips.
 
     Args: as for :func:`rasterize`, and
+        window: left, top, width and height in pixels of the part of the camera's image to draw; None: all.
         strip: pixels to draw at a time, about.
 
     Yields:
         The first row of a strip, and what it shows.
     """
-    whole = View.of(camera, near)
-    rows = max(strip // camera.width // 16 * 16, 16)
-    for top in range(0, camera.height, rows):
-        part = replace(whole, cy=whole.cy - top, height=min(rows, camera.height - top))
+    left, above, width, height = window or (0, 0, camera.width, camera.height)
+    whole = replace(View.of(camera, near), width=width)
+    whole = replace(whole, cx=whole.cx - left, cy=whole.cy - above)
+    rows = max(strip // width // 16 * 16, 16)
+    for top in range(0, height, rows):
+        part = replace(whole, cy=whole.cy - top, height=min(rows, height - top))
         yield top, _draw(
             means, quats, log_scales, opacity_logits, sh, part, weights=weights, background=background,
             sh_degree=sh_degree, min_scale=min_scale, antialias=antialias, outputs=outputs,

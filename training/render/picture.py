@@ -11,7 +11,6 @@ import numpy as np
 
 from ..errors import LodgsError
 from ..files import atomic_write
-from ..scenes.cameras import Camera
 
 NOTHING = 1e10
 """Depth where a pixel shows nothing, as Blender's renderers say it."""
@@ -44,13 +43,14 @@ class Picture:
     @classmethod
     def empty(
         cls,
-        camera: Camera,
+        width: int,
+        height: int,
         background: tuple[float, float, float] | None,
         depth: bool = False,
         levels: list[int] | None = None,
     ) -> Picture:
         """A picture of nothing but the background."""
-        shape = camera.height, camera.width
+        shape = height, width
         image = np.empty((*shape, 3), np.float32)
         image[:] = background or (0.0, 0.0, 0.0)
         return cls(

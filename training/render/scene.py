@@ -104,6 +104,7 @@ def draw(
     background: tuple[float, float, float] | None = (0.0, 0.0, 0.0),
     depth: bool = False,
     levels: bool = False,
+    window: tuple[int, int, int, int] | None = None,
     backend: str = "auto",
     wanted: Callable[[float], bool] = lambda share: True,
 ) -> Picture | None:
@@ -117,6 +118,7 @@ def draw(
         background: display-coded colour behind the splats; None leaves it transparent.
         depth: draw the pass as well.
         levels: as well, how much of each pixel every level fills.
+        window: left, top, width and height in pixels of the part of the camera's image to draw; None: all.
         backend: rasterizer.
         wanted: told the share that is done from time to time; False ends it.
 
@@ -130,7 +132,9 @@ def draw(
         linear = one.matrix[:3, :3]
         if not np.isfinite(one.matrix).all() or np.linalg.cond(linear) > FLAT or not linear.any():
             raise LodgsError("A set of splats is scaled to nothing.", "Give its object a scale above 0.")
-    picture = Picture.empty(camera, background, depth, sorted({x.level for x in placed}) if levels else [])
+    width, height = window[2:] if window else (camera.width, camera.height)
+    numbers = sorted({one.level for one in placed}) if levels else []
+    picture = Picture.empty(width, height, background, depth, numbers)
     some = [one for one in placed if len(one.splats)]
     if not some:
         return picture
@@ -139,8 +143,8 @@ def draw(
         features = _membership(some, picture) if levels else None
         for top, drawn in strips(
             *columns, camera, weights=weights, background=background or (0.0, 0.0, 0.0), near=near,
-            outputs=("depth", "median_depth") if depth else (), features=features, strip=STRIP,
-            backend=backend,
+            outputs=("depth", "median_depth") if depth else (), features=features, window=window,
+            strip=STRIP, backend=backend,
         ):  # fmt: skip
             rows = slice(top, top + len(drawn.alpha))
             picture.image[rows] = drawn.image.cpu().numpy()
@@ -152,12 +156,12 @@ def draw(
                 picture.depth[rows] = torch.where(drawn.alpha > 0, seen, NOTHING).cpu().numpy()
             if drawn.features is not None:
                 picture.masks[:, rows] = drawn.features.permute(2, 0, 1).cpu().numpy()
-            if not wanted((top + len(drawn.alpha)) / camera.height):
+            if not wanted((top + len(drawn.alpha)) / height):
                 return None
     except (MemoryError, torch.cuda.OutOfMemoryError) as error:
         raise LodgsError(
             f"There is not enough memory to draw {sum(len(x.splats) for x in some):,} splats "
-            f"at {camera.width}x{camera.height}.",
+            f"at {width}x{height}.",
             "Render a coarser level or a smaller picture.",
         ) from error
     return picture

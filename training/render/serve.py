@@ -5,7 +5,7 @@ output; arrays lie in files of one folder (``wire``), which belongs to this proc
 standard input ends, however the other program ended.
 
     {"frame": 7, "out": NAME, "camera": {...}, "near": 0.1, "background": [r, g, b] or null,
-     "depth": true, "levels": true,
+     "depth": true, "levels": true, "window": [left, top, width, height] or null,
      "sets": [{"file": NAME, "count": N, "matrix": 4x4, "level": 3}, ...]}
     {"cancel": 7}
 
@@ -35,7 +35,7 @@ from .. import VERSION
 from ..errors import LodgsError
 from ..rasterize import resolve
 from ..runs.folder import event_line
-from ..scenes.cameras import camera_from_dict
+from ..scenes.cameras import Camera, camera_from_dict
 from . import wire
 from .scene import Placed, SplatSet, draw
 
@@ -104,7 +104,7 @@ class _Server:
     def _answer(self, request: dict, frame: int | None) -> None:
         started = time.perf_counter()
         camera, near = camera_from_dict(request["camera"])
-        background = request.get("background")
+        background, window = request.get("background"), request.get("window")
         placed = self._placed(request["sets"])
 
         def wanted(share: float) -> bool:
@@ -113,17 +113,17 @@ class _Server:
 
         picture = draw(
             placed, camera, near=near, background=tuple(background) if background else None,
-            depth=bool(request.get("depth")), levels=bool(request.get("levels")), backend=self._backend,
-            wanted=wanted,
+            depth=bool(request.get("depth")), levels=bool(request.get("levels")),
+            window=_window(window, camera) if window else None, backend=self._backend, wanted=wanted,
         )  # fmt: skip
         if picture is None or frame in self._cancelled:
             self._cancelled.discard(frame)  # type: ignore[arg-type]
             self.say("cancelled", frame=frame)
             return
-        passes = picture.passes()
+        passes, (height, width) = picture.passes(), picture.alpha.shape
         wire.write_planes(self._folder / Path(request["out"]).name, np.stack(list(passes.values())))
         self.say(
-            "frame", frame=frame, passes=list(passes), height=camera.height, width=camera.width,
+            "frame", frame=frame, passes=list(passes), height=height, width=width,
             seconds=round(time.perf_counter() - started, 4),
         )  # fmt: skip
 
@@ -146,3 +146,12 @@ class _Server:
         shutil.rmtree(self._folder, ignore_errors=True)
         sys.stderr.flush()
         os._exit(0)
+
+
+def _window(given: list, camera: Camera) -> tuple[int, int, int, int]:
+    """A request's window; ValueError where it is no part of the camera's image."""
+    left, top, width, height = map(int, given)
+    inside = 0 <= left < left + width <= camera.width and 0 <= top < top + height <= camera.height
+    if not inside:
+        raise ValueError(f"the window {given} is not in the image")
+    return left, top, width, height
