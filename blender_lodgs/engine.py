@@ -111,6 +111,12 @@ def splat_sets(depsgraph: bpy.types.Depsgraph) -> list[renderer.Set]:
     return found
 
 
+def size(render: bpy.types.RenderSettings) -> tuple[int, int]:
+    """Width and height of the whole picture in pixels, in Blender's arithmetic."""
+    percent = render.resolution_percentage
+    return max(render.resolution_x * percent // 100, 1), max(render.resolution_y * percent // 100, 1)
+
+
 def border(render: bpy.types.RenderSettings, width: int, height: int) -> tuple[int, int, int, int]:
     """Left, bottom, width and height of the part of the picture that is rendered, in Blender's arithmetic."""
     if not render.use_border:

@@ -70,6 +70,7 @@ class Renderer:
         environment.require(python)
         self._folder = Path(tempfile.mkdtemp(prefix="lodgs-render-", dir=bpy.app.tempdir or None))
         self._log = self._folder / "renderer.log"
+        self._fresh = True  # the first frame on a computer compiles, for some seconds
         self._known: dict[int, Path] = {}
         self._numbers = itertools.count(1)
         self._answers: queue.SimpleQueue[dict | None] = queue.SimpleQueue()
@@ -180,7 +181,7 @@ class Renderer:
 
     def _wait(self, frame: int, wanted: Wanted) -> dict:
         """The answer to a frame. What is no longer wanted is cancelled, and waited for."""
-        text, share, cancelled = "Starting the renderer" if frame == 1 else "Rendering", 0.0, False
+        text, share, cancelled = "Preparing the renderer" if self._fresh else "Rendering", 0.0, False
         while True:
             try:
                 answer = self._answers.get(timeout=0.1)
@@ -189,12 +190,10 @@ class Renderer:
             if answer is None:
                 raise Stopped
             kind, of = answer.get("event"), answer.get("frame")
-            if kind == "hello":
-                text = "Rendering"
-                if answer["protocol"] != wire.PROTOCOL:
-                    raise LodgsError("The renderer is of another version.", "Restart Blender.")
-            elif kind == "progress" and of == frame:
-                share, text = answer["share"], "Rendering"
+            if kind == "hello" and answer["protocol"] != wire.PROTOCOL:
+                raise LodgsError("The renderer is of another version.", "Restart Blender.")
+            if kind == "progress" and of == frame:
+                share, text, self._fresh = answer["share"], "Rendering", False
             elif kind in {"frame", "cancelled", "error"} and of in {frame, None}:
                 return answer
             if not wanted(share, text) and not cancelled:

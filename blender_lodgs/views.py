@@ -52,3 +52,26 @@ def _world_to_camera(thing: bpy.types.Object) -> np.ndarray:
     found = np.eye(4)
     found[:3, :3], found[:3, 3] = rotation, -rotation @ pose[:3, 3]
     return found
+
+
+def view_from(
+    root: bpy.types.Object, depsgraph: bpy.types.Depsgraph, width: int, height: int
+) -> tuple[Camera, float]:
+    """What the scene's camera sees, in the coordinates of a splat scene, which are those of its files.
+
+    Raises:
+        LodgsError: there is no camera to render through, or the root is stretched.
+    """
+    thing = depsgraph.scene.camera
+    if thing is None:
+        raise LodgsError("The scene has no camera.", "Add one, or look through one of the views.")
+    camera, near = view_of(thing.evaluated_get(depsgraph), depsgraph, width, height)
+    matrix = np.array(root.evaluated_get(depsgraph).matrix_world, np.float64)
+    scales = np.linalg.norm(matrix[:3, :3], axis=0)
+    if scales.min() <= 0 or scales.max() > 1.0001 * scales.min() or np.linalg.det(matrix[:3, :3]) <= 0:
+        raise LodgsError(
+            f"'{root.name}' is stretched, which no camera of its files can show.",
+            "Give it one scale for all axes.",
+        )
+    inside, unit = camera.within(matrix)
+    return inside, near / unit

@@ -1,0 +1,368 @@
+"""F12 with the engine LODGS and the real renderer: pixels, passes, animations, and what can go wrong."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from training.splats.bundle import Bundle, Level, write_bundle
+from training.splats.gaussians import Splats
+
+ROOT = Path(__file__).resolve().parents[2]
+TRAINER = os.environ.get("LODGS_TRAINER_PYTHON", "")
+NOTHING = 1e10
+
+
+@pytest.fixture(scope="module", autouse=True)
+def trainer():
+    if not TRAINER:
+        pytest.skip("no trainer; set LODGS_TRAINER_PYTHON")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_renderer(lodgs_module):
+    yield
+    lodgs_module("renderer").close()
+
+
+@pytest.fixture(scope="module")
+def lodgs_module(bpy):
+    import importlib
+
+    from tools.blender_module import EXTENSION
+
+    return lambda name: importlib.import_module(f"{EXTENSION}.blender_lodgs.{name}")
+
+
+@pytest.fixture(autouse=True)
+def kept_renderer(lodgs, monkeypatch, empty_file):
+    """Starting the renderer takes seconds: these tests share one, though each has a new file."""
+    handlers = sys.modules["bpy"].app.handlers.load_pre
+    on_load = lodgs("renderer")._on_load
+    if on_load in handlers:
+        handlers.remove(on_load)
+
+
+def random_splats(count: int, degree: int = 3, seed: int = 0) -> Splats:
+    rng = np.random.default_rng(seed)
+    return Splats(
+        means=rng.uniform(-0.7, 0.7, (count, 3)).astype(np.float32),
+        quats=rng.normal(size=(count, 4)).astype(np.float32),
+        log_scales=rng.normal(-3, 0.6, (count, 3)).astype(np.float32),
+        opacity_logits=rng.normal(1, 1.5, count).astype(np.float32),
+        sh=(rng.normal(size=(count, (degree + 1) ** 2, 3)) * 0.3).astype(np.float32),
+    )
+
+
+@pytest.fixture
+def bundle(tmp_path) -> Path:
+    path = tmp_path / "bundle.ply"
+    levels = [Level(1, random_splats(150), 0.05), Level(2, random_splats(1500, seed=1), 0.0)]
+    write_bundle(path, Bundle("flod", levels))
+    return path
+
+
+@pytest.fixture
+def scene(bpy, lodgs, bundle):
+    """A bundle, turned and moved and scaled, and a camera before it; LODGS renders it to PNG."""
+    scene = bpy.context.scene
+    root = lodgs("scenes").import_splats(bpy.context, bundle)
+    root.location, root.scale = (1, 2, -0.5), (1.7,) * 3
+    root.rotation_euler = (-1.2, 0.3, 0.4)
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    scene.collection.objects.link(camera)
+    camera.location, camera.rotation_euler = (1.3, -5.5, 0.2), (1.45, 0, 0.02)
+    camera.data.shift_x = 0.03
+    scene.camera = camera
+    lodgs("engine").use(scene)
+    scene.render.dither_intensity = 0
+    scene.render.resolution_x, scene.render.resolution_y = 640, 480
+    return scene
+
+
+def f12(bpy, tmp_path, name="f12.png") -> np.ndarray:
+    """Renders; the file's values (H, W, 4) as they lie in it, rows from the top."""
+    path = tmp_path / name
+    bpy.context.scene.render.filepath = str(path)
+    assert bpy.ops.render.render(write_still=True) == {"FINISHED"}
+    return pixels(bpy, path)
+
+
+def pixels(bpy, path: Path) -> np.ndarray:
+    image = bpy.data.images.load(str(path))
+    image.colorspace_settings.name = "Non-Color"
+    image.alpha_mode = "CHANNEL_PACKED"
+    values = np.empty(image.size[0] * image.size[1] * 4, np.float32)
+    image.pixels.foreach_get(values)
+    values = values.reshape(image.size[1], image.size[0], 4)[::-1]
+    bpy.data.images.remove(image)
+    return values
+
+
+def bytes_of(values: np.ndarray) -> np.ndarray:
+    return np.round(values * 255).astype(np.uint8)
+
+
+def without_blender(bundle: Path, camera: Path, out: Path, *options: str) -> None:
+    """``python -m training render`` of a camera that Blender has written."""
+    command = [TRAINER, "-m", "training", "render", str(bundle), "--camera", str(camera), "--out", str(out)]
+    subprocess.run([*command, *options], cwd=ROOT, check=True)
+
+
+def passes(bpy, lodgs, **settings):
+    """The planes that the engine draws of the scene as it is."""
+    engine, scene = lodgs("engine"), bpy.context.scene
+    scene.view_layers[0].use_pass_z = scene.lodgs_render.use_pass_levels = True
+    width, height = engine.size(scene.render)
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    return engine.frame(depsgraph, width, height, engine.border(scene.render, width, height), **settings)
+
+
+@pytest.mark.parametrize("transparent", [False, True])
+def test_f12_is_what_training_render_draws_to_the_bit(bpy, scene, bundle, tmp_path, transparent):
+    scene.render.film_transparent = transparent
+    scene.render.image_settings.color_mode = "RGBA"
+    shown = f12(bpy, tmp_path)
+    camera = tmp_path / "camera.json"
+    assert bpy.ops.lodgs.export_camera(filepath=str(camera)) == {"FINISHED"}
+    options = ["--background", "transparent"] if transparent else []
+    without_blender(bundle, camera, tmp_path / "trainer.png", *options)
+    expected = pixels(bpy, tmp_path / "trainer.png")
+    assert shown.shape == (480, 640, 4) and bytes_of(shown[..., :3]).max() > 200
+    np.testing.assert_array_equal(bytes_of(shown), bytes_of(expected))
+
+
+def test_levels_by_distance_are_what_training_render_chooses(bpy, lodgs, scene, bundle, tmp_path):
+    root = lodgs("scenes").roots(scene)[0]
+    root.lodgs.mode, root.lodgs.gamma = "SELECTIVE", 10
+    shown = f12(bpy, tmp_path)
+    camera = tmp_path / "camera.json"
+    bpy.ops.lodgs.export_camera(filepath=str(camera))
+    without_blender(bundle, camera, tmp_path / "trainer.png", "--gamma", "10", "--from", "1", "--to", "2")
+    np.testing.assert_array_equal(bytes_of(shown), bytes_of(pixels(bpy, tmp_path / "trainer.png")))
+    levels = passes(bpy, lodgs)["Level.X"]
+    assert {1, 2} <= set(np.unique(levels))  # both have their part
+
+
+def test_an_imported_view_is_the_photographs_camera(bpy, lodgs, bundle, tmp_path):
+    """Rendered from Blender's camera, and from COLMAP's own numbers: but for float32, the same."""
+    from training.scenes.cameras import write_camera
+    from training.scenes.colmap import read_scene
+
+    folder = ROOT / "examples" / "lantern_garden"
+    photographed = lodgs("scenes").import_colmap(bpy.context, folder, photographs=False)
+    photographed.lodgs.points.hide_render = True
+    root = lodgs("scenes").import_splats(bpy.context, bundle, upright=False)
+    bpy.context.view_layer.update()
+    root.matrix_world = photographed.matrix_world
+    bpy.context.scene.render.dither_intensity = 0
+    lodgs("engine").use(bpy.context.scene)
+    shown = f12(bpy, tmp_path)
+    view = next(c for c in read_scene(folder).cameras if c.name == bpy.context.scene.camera.name)
+    write_camera(tmp_path / "camera.json", view, bpy.context.scene.camera.data.clip_start)
+    without_blender(bundle, tmp_path / "camera.json", tmp_path / "trainer.png")
+    difference = np.abs(bytes_of(shown).astype(int) - bytes_of(pixels(bpy, tmp_path / "trainer.png")))
+    assert difference.max() <= 1 and (difference > 0).mean() < 0.01
+
+
+def test_depth_and_levels(bpy, lodgs, scene):
+    planes = passes(bpy, lodgs)
+    covered = planes["Level.X"] > 0
+    assert 0.1 < covered.mean() < 0.9
+    depth = planes["Depth.Z"]
+    assert (depth[~covered] == NOTHING).all()
+    assert depth[covered].min() > 1 and depth[covered].max() < 15  # the set is 7.5 away and 5 deep
+    np.testing.assert_array_equal(planes["Level.X"][covered], 2)
+    assert planes["Level 2.X"].max() > 0.9
+    assert planes["Combined.A"].min() == 1
+
+
+def test_border_and_percentage(bpy, scene, tmp_path):
+    whole = f12(bpy, tmp_path)
+    scene.render.use_border = scene.render.use_crop_to_border = True
+    scene.render.border_min_x, scene.render.border_max_x = 0.31, 0.66
+    scene.render.border_min_y, scene.render.border_max_y = 0.2, 0.81
+    cropped = f12(bpy, tmp_path)
+    part = whole[480 - 388 : 480 - 96, 198:422]
+    assert cropped.shape == part.shape == (292, 224, 4)
+    assert np.abs(cropped - part).max() <= 1.001 / 255
+    scene.render.use_crop_to_border = False
+    framed = f12(bpy, tmp_path)
+    assert framed.shape == whole.shape
+    np.testing.assert_array_equal(framed[480 - 388 : 480 - 96, 198:422], cropped)
+    scene.render.use_border, scene.render.resolution_percentage = False, 50
+    small = f12(bpy, tmp_path)
+    assert small.shape == (240, 320, 4)
+    assert np.abs(small - whole.reshape(240, 2, 320, 2, 4).mean((1, 3))).mean() < 0.02
+
+
+def test_background_colour(bpy, scene, tmp_path):
+    scene.lodgs_render.background = (1, 0.5, 0)
+    assert bytes_of(f12(bpy, tmp_path))[0, 0].tolist() == [255, 128, 0, 255]
+
+
+def test_two_sets_and_an_instance(bpy, lodgs, scene, bundle, tmp_path):
+    """A second import and a copy of a collection, each elsewhere: all are in the picture."""
+    alone = passes(bpy, lodgs)["Level.X"] > 0
+    left = lodgs("scenes").import_splats(bpy.context, bundle)
+    left.location = (-1.5, 2, 0)
+    instance = bpy.data.objects.new("instance", None)
+    instance.instance_type = "COLLECTION"
+    instance.instance_collection = left.users_collection[0]
+    instance.location = (5, 0, 0)
+    scene.collection.objects.link(instance)
+    bpy.context.view_layer.update()
+    drawn = passes(bpy, lodgs)["Level.X"] > 0
+    assert len(lodgs("engine").splat_sets(bpy.context.evaluated_depsgraph_get())) == 3
+    assert drawn[:, :150].sum() > alone[:, :150].sum() + 1000
+    assert drawn[:, 500:].sum() > alone[:, 500:].sum() + 1000
+
+
+def test_an_animation_starts_the_renderer_once(bpy, lodgs, scene, tmp_path, monkeypatch):
+    renderer, started = lodgs("renderer"), []
+    renderer.close()
+    converse = lodgs("processes").converse
+    monkeypatch.setattr(
+        lodgs("processes"), "converse", lambda *a: started.append(converse(*a)) or started[-1]
+    )
+    written = []
+    write_set = renderer.wire.write_set
+    monkeypatch.setattr(renderer.wire, "write_set", lambda *a: written.append(a) or write_set(*a))
+    scene.frame_end = 24
+    scene.render.resolution_percentage = 20
+    camera = scene.camera
+    for frame, x in ((1, 0.3), (24, 2.3)):
+        camera.location.x = x
+        camera.keyframe_insert("location", frame=frame)
+    scene.render.filepath = str(tmp_path / "frame_")
+    assert bpy.ops.render.render(animation=True) == {"FINISHED"}
+    frames = sorted(tmp_path.glob("frame_*.png"))
+    assert len(frames) == 24 and len(started) == 1 and len(written) == 1
+    first, middle, last = (pixels(bpy, frames[i]) for i in (0, 12, 23))
+    assert np.abs(first - middle).max() > 0.2 and np.abs(middle - last).max() > 0.2
+    assert started[0].poll() is None
+
+
+def test_what_changes_is_handed_over(bpy, lodgs, scene, tmp_path):
+    before = f12(bpy, tmp_path)
+    cloud = lodgs("scenes").roots(scene)[0].lodgs.levels[1].object.data
+    base = lodgs("objects").read_attribute(cloud, "radiance:base")
+    base[:, :3] = 0
+    lodgs("objects").write_attribute(
+        cloud, "radiance:base", cloud.attributes["radiance:base"].data_type, base
+    )
+    cloud.update_tag()
+    after = f12(bpy, tmp_path)
+    assert np.abs(before - after).mean() > 0.01
+
+
+def test_cancel(bpy, lodgs, scene, monkeypatch):
+    """Asked to stop, it stops soon and without a picture; the renderer is the same and draws on."""
+    passes(bpy, lodgs)
+    process = lodgs("renderer")._renderer.process
+    scene.render.resolution_x, scene.render.resolution_y = 6000, 4500
+    told = []
+
+    def wanted(share, text):
+        told.append((share, text))
+        return not share > 0
+
+    started = time.monotonic()
+    assert passes(bpy, lodgs, wanted=wanted) is None
+    assert told[-1][0] < 0.5, "it went on drawing"
+    assert time.monotonic() - started < 30
+    scene.render.resolution_x, scene.render.resolution_y = 64, 48
+    assert passes(bpy, lodgs)["Combined.R"].shape == (48, 64)
+    assert lodgs("renderer")._renderer.process is process
+
+
+def test_a_killed_renderer_is_started_again(bpy, lodgs, scene, tmp_path, capsys):
+    before = f12(bpy, tmp_path)
+    process = lodgs("renderer")._renderer.process
+    folder = lodgs("renderer")._renderer._folder
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    np.testing.assert_array_equal(f12(bpy, tmp_path), before)
+    assert lodgs("renderer")._renderer.process is not process
+    assert not folder.exists()
+    assert "The renderer was killed (signal 9)" in capsys.readouterr().out
+
+
+def test_a_renderer_that_always_dies_is_told(bpy, lodgs, scene, tmp_path, monkeypatch):
+    lodgs("renderer").close()
+    program = tmp_path / "dies"
+    program.write_text(
+        f'#!/bin/sh\n[ "$3" = serve ] && {{ echo "no luck today" >&2; exit 7; }}\nexec "{TRAINER}" "$@"\n'
+    )
+    program.chmod(0o755)
+    monkeypatch.setenv("LODGS_TRAINER_PYTHON", str(program))
+    scene.render.filepath = str(tmp_path / "none.png")
+    with pytest.raises(RuntimeError, match=r"exit code 7\. no luck today"):
+        bpy.ops.render.render(write_still=True)
+    assert not (tmp_path / "none.png").exists()
+    assert lodgs("renderer")._renderer is None
+
+
+def test_without_a_trainer_it_says_so(bpy, lodgs, scene, tmp_path, monkeypatch):
+    lodgs("renderer").close()
+    monkeypatch.delenv("LODGS_TRAINER_PYTHON")
+    scene.render.filepath = str(tmp_path / "none.png")
+    with pytest.raises(RuntimeError, match="need a Python with PyTorch"):
+        bpy.ops.render.render(write_still=True)
+    assert not (tmp_path / "none.png").exists()
+
+
+def test_other_lenses_are_refused(bpy, scene):
+    scene.camera.data.type = "ORTHO"
+    with pytest.raises(RuntimeError, match="'camera' is ortho"):
+        bpy.ops.render.render()
+
+
+def test_nothing_to_see_is_the_background(bpy, lodgs, scene, tmp_path):
+    for thing in bpy.data.objects:
+        thing.hide_render = thing.type != "CAMERA"
+    lodgs("scenes").roots(scene)[0].lodgs.levels[1].show = False
+    assert f12(bpy, tmp_path)[..., :3].max() == 0
+
+
+def test_no_program_outlives_blender(bundle, tmp_path):
+    """A Blender that renders and is then killed: its renderer ends, and takes its files along."""
+    script = tmp_path / "script.py"
+    script.write_text(f"""
+import importlib, os, signal, sys, tempfile
+sys.path.insert(0, {str(ROOT)!r})
+from tools.blender_module import EXTENSION, start_blender
+bpy = start_blender()
+bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+load = lambda name: importlib.import_module(EXTENSION + ".blender_lodgs." + name)
+load("scenes").import_splats(bpy.context, {str(bundle)!r})
+camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+bpy.context.scene.collection.objects.link(camera)
+bpy.context.scene.camera = camera
+load("engine").use(bpy.context.scene)
+bpy.context.scene.render.resolution_percentage = 5
+bpy.ops.render.render()
+renderer = load("renderer")._renderer
+print("RENDERER", renderer.process.pid, renderer._folder, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+""")
+    cache = {"NUMBA_CACHE_DIR": os.environ.get("NUMBA_CACHE_DIR", str(tmp_path / "numba"))}
+    done = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, env=os.environ | cache, timeout=200
+    )
+    line = next(line for line in done.stdout.splitlines() if line.startswith("RENDERER"))
+    _, pid, folder = line.split(" ", 2)
+    for _ in range(100):
+        if not Path(folder).exists() and not Path(f"/proc/{pid}").exists():
+            break
+        time.sleep(0.1)
+    assert not Path(folder).exists()
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(pid), 0)
