@@ -351,6 +351,11 @@ class RenderSettings(bpy.types.PropertyGroup):
         name="Levels",
         description="Passes that tell which level each pixel shows, and how much of it every level fills",
     )
+    meshes: bpy.props.PointerProperty(
+        name="Meshes",
+        description="Scene that renders the meshes, joined with the splats by depth in the compositor",
+        type=bpy.types.Scene,
+    )
 
 
 CLASSES = (View, TrainingSettings, SplatLevel, SplatScene, RenderSettings)

@@ -8,7 +8,7 @@ import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ...training.scenes.cameras import write_camera
-from .. import engine, scenes, views
+from .. import compositing, engine, scenes, views
 from .reporting import saying_errors
 
 
@@ -21,6 +21,20 @@ class LODGS_OT_use_engine(bpy.types.Operator):
 
     def execute(self, context):
         engine.use(context.scene)
+        return {"FINISHED"}
+
+
+class LODGS_OT_combine_with_meshes(bpy.types.Operator):
+    """Render the meshes with Cycles in a second scene, and join both pictures by depth in the compositor"""
+
+    bl_idname = "lodgs.combine_with_meshes"
+    bl_label = "Combine With Meshes"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @saying_errors
+    def execute(self, context):
+        meshes = compositing.combine_with_meshes(context.scene)
+        self.report({"INFO"}, f"The meshes are rendered by the scene '{meshes.name}'")
         return {"FINISHED"}
 
 
@@ -56,4 +70,4 @@ class LODGS_OT_export_camera(bpy.types.Operator, ExportHelper):
         return {"FINISHED"}
 
 
-CLASSES = (LODGS_OT_use_engine, LODGS_OT_export_camera)
+CLASSES = (LODGS_OT_use_engine, LODGS_OT_combine_with_meshes, LODGS_OT_export_camera)

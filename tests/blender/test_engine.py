@@ -366,3 +366,79 @@ os.kill(os.getpid(), signal.SIGKILL)
     assert not Path(folder).exists()
     with pytest.raises(ProcessLookupError):
         os.kill(int(pid), 0)
+
+
+def flat_wall(y: float, color: tuple[float, float, float]) -> Splats:
+    """Splats side by side in the plane y, opaque from a distance, in COLMAP's axes (y is depth)."""
+    x, z = np.meshgrid(np.linspace(-4, 4, 81), np.linspace(-4, 4, 81))
+    means = np.stack([x.ravel(), np.full(x.size, y), z.ravel()], 1)
+    return Splats(
+        means=means.astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (x.size, 1)),
+        log_scales=np.tile(np.log(np.float32([0.1, 0.001, 0.1])), (x.size, 1)),
+        opacity_logits=np.full(x.size, 10, np.float32),
+        sh=np.tile(((np.float32(color) - 0.5) / 0.28209479177387814), (x.size, 1, 1)).astype(np.float32),
+    )
+
+
+def test_a_cube_of_cycles_stands_in_the_splats(bpy, lodgs, tmp_path):
+    """A red cube, turned, sticks out of a green wall of splats: each pixel shows what analysis says is
+    nearer, but for a seam of a pixel or two."""
+    scene = bpy.context.scene
+    write_bundle(tmp_path / "wall.ply", Bundle("", [Level(1, flat_wall(0.0, (0.1, 0.8, 0.2)))]))
+    lodgs("scenes").import_splats(bpy.context, tmp_path / "wall.ply", upright=False)
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    camera.location, camera.rotation_euler = (0, -6, 0), (np.pi / 2, 0, 0)
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    bpy.ops.mesh.primitive_cube_add(size=2, location=(0.3, 0.4, 0.2), rotation=(0.5, 0.3, 0.7))
+    cube = bpy.context.object
+    material = bpy.data.materials.new("red")
+    material.use_nodes = True
+    nodes = material.node_tree.nodes
+    nodes.clear()
+    emission, output = nodes.new("ShaderNodeEmission"), nodes.new("ShaderNodeOutputMaterial")
+    emission.inputs["Color"].default_value = (1, 0, 0, 1)
+    material.node_tree.links.new(emission.outputs[0], output.inputs["Surface"])
+    cube.data.materials.append(material)
+    scene.render.resolution_x, scene.render.resolution_y = 320, 240
+    assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
+    meshes = scene.lodgs_render.meshes
+    meshes.cycles.samples, meshes.cycles.device = 4, "CPU"
+    scene.render.dither_intensity = 0
+    scene.render.image_settings.color_mode = "RGBA"
+    shown = f12(bpy, tmp_path)
+
+    # a ray through each pixel's centre: where it meets the cube, in the cube's own space; the wall is at 6
+    focal = 320 * 50 / 36
+    x, y = np.meshgrid((np.arange(320) + 0.5 - 160) / focal, (120 - np.arange(240) - 0.5) / focal)
+    directions = np.stack([x, np.ones_like(x), y], 2)
+    to_cube = np.linalg.inv(np.array(cube.matrix_world, float))
+    origin = to_cube @ (*camera.location, 1)
+    local = directions @ to_cube[:3, :3].T
+    first, last = (np.sort([(s - origin[:3]) / local for s in (-1, 1)], axis=0)[i] for i in (0, 1))
+    enters, leaves = first.max(2), last.min(2)
+    red = (enters < leaves) & (enters < 6)
+    assert 0.02 < red.mean() < 0.5
+    assert ((enters < leaves) & (enters > 6)).sum() > 500  # parts of the cube are behind the wall
+    seam = np.zeros_like(red)
+    for dy in range(-2, 3):
+        for dx in range(-2, 3):
+            seam |= np.roll(red, (dy, dx), (0, 1)) != red
+    clear = ~seam
+    assert clear.mean() > 0.9
+    is_red = shown[..., 0] > 0.5
+    np.testing.assert_array_equal(is_red[clear], red[clear])
+    assert np.abs(shown[clear & ~red][:, :3] - (0.1, 0.8, 0.2)).max() < 0.03
+    # pressed again after a change of size, both scenes have it
+    scene.render.resolution_x = 200
+    assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
+    assert meshes.render.resolution_x == 200 and len(bpy.data.scenes) == 2
+
+
+def test_an_artists_compositor_is_left_alone(bpy, lodgs, scene):
+    tree = lodgs("compat").compositor_tree(scene)
+    tree.nodes.new("CompositorNodeBlur")
+    with pytest.raises(RuntimeError, match="has compositor nodes already"):
+        bpy.ops.lodgs.combine_with_meshes()
+    assert len(bpy.data.scenes) == 1
