@@ -38,13 +38,14 @@ class LodgsEngine(bpy.types.RenderEngine):
         size = self.resolution_x, self.resolution_y
         window = border(depsgraph.scene.render, *size)
         try:
-            planes = frame(depsgraph, *size, window, self._wanted)
+            drawn = frame(depsgraph, *size, window, self._wanted)
         except LodgsError as error:
             self.error_set(str(error))
             self.report({"ERROR"}, str(error))  # without it a black picture would be written
             return
-        if planes is None or self.test_break():
+        if drawn is None or self.test_break():
             return
+        planes = drawn.planes
         _, _, width, height = window
         result = self.begin_result(0, 0, width, height, layer=depsgraph.view_layer.name)
         for target in result.layers[0].passes:
@@ -66,7 +67,7 @@ def frame(
     height: int,
     window: tuple[int, int, int, int],
     wanted: renderer.Wanted = lambda share, text: True,
-) -> dict[str, np.ndarray] | None:
+) -> renderer.Frame | None:
     """The splats that a depsgraph shows, as its scene's camera sees them in a picture of this size.
 
     Args:
@@ -74,7 +75,7 @@ def frame(
         wanted: told how far it is; False ends it.
 
     Returns:
-        Planes (H, W) by pass and channel ("Combined.R"), rows from the top; None where it was ended.
+        The picture with the passes that the view layer wants; None where it was ended.
 
     Raises:
         LodgsError: there is no trainer, or the camera cannot be rendered through, or the renderer failed.
@@ -111,6 +112,12 @@ def splat_sets(depsgraph: bpy.types.Depsgraph) -> list[renderer.Set]:
     return found
 
 
+def coded(linear: np.ndarray) -> np.ndarray:
+    """Display-coded (sRGB) values of linear light from 0 on, float32."""
+    curve = 1.055 * linear ** (1 / 2.4) - 0.055
+    return np.where(linear <= 0.0031308, 12.92 * linear, curve).astype(np.float32)
+
+
 def size(render: bpy.types.RenderSettings) -> tuple[int, int]:
     """Width and height of the whole picture in pixels, in Blender's arithmetic."""
     percent = render.resolution_percentage
@@ -140,7 +147,8 @@ def use(scene: bpy.types.Scene) -> None:
 
 CLASSES = (LodgsEngine,)
 
-_NOT_OURS = {"VIEWLAYER_PT_filter", "VIEWLAYER_PT_layer_passes", "RENDER_PT_freestyle", "RENDER_PT_simplify"}
+_NOT_OURS = ("freestyle", "simplify", "gpencil")
+"""Parts of the names of Blender's panels that would promise too much."""
 
 
 def _shared_panels():
@@ -148,7 +156,8 @@ def _shared_panels():
     return [
         panel
         for panel in bpy.types.Panel.__subclasses__()
-        if "BLENDER_RENDER" in getattr(panel, "COMPAT_ENGINES", ()) and panel.__name__ not in _NOT_OURS
+        if "BLENDER_RENDER" in getattr(panel, "COMPAT_ENGINES", ())
+        and not any(part in panel.__name__ for part in _NOT_OURS)
     ]
 
 

@@ -36,6 +36,20 @@ Wanted = Callable[[float, str], bool]
 
 
 @dataclass(frozen=True)
+class Frame:
+    """A picture.
+
+    Attributes:
+        planes: (H, W) float32 by name as ``training.render.picture.Picture.passes``, rows from the top; the
+            photograph's, where one was given, are "Photograph.R", ..., display-coded.
+        psnr: in dB against the photograph; NaN where none was given.
+    """
+
+    planes: dict[str, np.ndarray]
+    psnr: float
+
+
+@dataclass(frozen=True)
 class Set:
     """Splats in the world, for one frame.
 
@@ -98,9 +112,12 @@ class Renderer:
         depth: bool = False,
         levels: bool = False,
         window: tuple[int, int, int, int] | None = None,
-    ) -> dict[str, np.ndarray] | None:
-        """A picture's planes (H, W) by name as ``training.render.picture.Picture.passes``, or None when it
-        was no longer wanted. Arguments as ``training.render.scene.draw``.
+        photograph: Path | None = None,
+    ) -> Frame | None:
+        """A picture, or None when it was no longer wanted.
+
+        Args: as ``training.render.scene.draw``, and
+            photograph: to compare with.
 
         Raises:
             LodgsError: it cannot be drawn, says why.
@@ -113,6 +130,7 @@ class Renderer:
             self._say(
                 frame=frame, out=out.name, sets=named, camera=camera_as_dict(camera, near),
                 background=background, depth=depth, levels=levels, window=window,
+                photograph=str(photograph) if photograph else None,
             )  # fmt: skip
             answer = self._wait(frame, wanted)
             for path in set(old.values()) - set(self._known.values()):
@@ -124,7 +142,7 @@ class Renderer:
             names = answer["passes"]
             planes = wire.read_planes(out, len(names), answer["height"], answer["width"])
             out.unlink(missing_ok=True)
-            return dict(zip(names, planes, strict=True))
+            return Frame(dict(zip(names, planes, strict=True)), answer.get("psnr", float("nan")))
         except OSError as error:
             if self.process.poll() is not None or isinstance(error, BrokenPipeError):
                 raise Stopped from error
@@ -219,7 +237,7 @@ _lock = threading.Lock()
 _used = 0.0
 
 
-def frame(sets: list[Set], camera: Camera, near: float, wanted: Wanted, **options):
+def frame(sets: list[Set], camera: Camera, near: float, wanted: Wanted, **options) -> Frame | None:
     """:meth:`Renderer.frame` by the one renderer; started when there is none, and once again when it dies.
 
     Raises:
@@ -242,6 +260,7 @@ def frame(sets: list[Set], camera: Camera, near: float, wanted: Wanted, **option
                 print(f"LODGS: {words} It is started again.")
             finally:
                 _used = time.monotonic()
+    return None
 
 
 def close() -> None:

@@ -104,6 +104,7 @@ def import_colmap(
         root.lodgs.cameras = cameras
         for camera in scene.cameras:
             thing = _new_camera(camera, extent, photographs)
+            thing.data.lodgs.distorted = camera.name in scene.distorted
             thing.parent = root
             cameras.objects.link(thing)
             if context.scene.camera is None:
@@ -293,11 +294,15 @@ def look_through(context: bpy.types.Context, root: bpy.types.Object, step: int =
     if step == 0 and context.active_object in there:
         current = context.active_object
     index = there.index(current) if current in there else min(-step, 0)
-    chosen = there[(index + step) % len(there)]
-    context.scene.camera = chosen
-    if chosen.data.lodgs.width:
-        match_render(context.scene, chosen.data.lodgs)
-    return chosen
+    return through(context, there[(index + step) % len(there)])
+
+
+def through(context: bpy.types.Context, view: bpy.types.Object) -> bpy.types.Object:
+    """Makes a view the scene's camera, and gives the render its size. Returns the view."""
+    context.scene.camera = view
+    if view.data.lodgs.width:
+        match_render(context.scene, view.data.lodgs)
+    return view
 
 
 def match_render(scene: bpy.types.Scene, camera: Camera | View) -> None:
@@ -369,6 +374,7 @@ def _new_camera(camera: Camera, extent: float, photograph: bool) -> bpy.types.Ob
     data.shift_y = (camera.cy - camera.height / 2) / long / (pixel if wide else 1)
     view = data.lodgs
     view.width, view.height, view.fx, view.fy = camera.width, camera.height, camera.fx, camera.fy
+    view.photograph = str(camera.image) if camera.image else ""
     data.display_size = extent / 20
     data.clip_start, data.clip_end = extent / 1000, extent * 1000
     if photograph and camera.image is not None:

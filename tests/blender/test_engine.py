@@ -20,34 +20,7 @@ TRAINER = os.environ.get("LODGS_TRAINER_PYTHON", "")
 NOTHING = 1e10
 
 
-@pytest.fixture(scope="module", autouse=True)
-def trainer():
-    if not TRAINER:
-        pytest.skip("no trainer; set LODGS_TRAINER_PYTHON")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_renderer(lodgs_module):
-    yield
-    lodgs_module("renderer").close()
-
-
-@pytest.fixture(scope="module")
-def lodgs_module(bpy):
-    import importlib
-
-    from tools.blender_module import EXTENSION
-
-    return lambda name: importlib.import_module(f"{EXTENSION}.blender_lodgs.{name}")
-
-
-@pytest.fixture(autouse=True)
-def kept_renderer(lodgs, monkeypatch, empty_file):
-    """Starting the renderer takes seconds: these tests share one, though each has a new file."""
-    handlers = sys.modules["bpy"].app.handlers.load_pre
-    on_load = lodgs("renderer")._on_load
-    if on_load in handlers:
-        handlers.remove(on_load)
+pytestmark = pytest.mark.usefixtures("renderer")
 
 
 def random_splats(count: int, degree: int = 3, seed: int = 0) -> Splats:
@@ -122,7 +95,8 @@ def passes(bpy, lodgs, **settings):
     scene.view_layers[0].use_pass_z = scene.lodgs_render.use_pass_levels = True
     width, height = engine.size(scene.render)
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    return engine.frame(depsgraph, width, height, engine.border(scene.render, width, height), **settings)
+    drawn = engine.frame(depsgraph, width, height, engine.border(scene.render, width, height), **settings)
+    return drawn and drawn.planes
 
 
 @pytest.mark.parametrize("transparent", [False, True])

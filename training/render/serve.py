@@ -6,11 +6,13 @@ standard input ends, however the other program ended.
 
     {"frame": 7, "out": NAME, "camera": {...}, "near": 0.1, "background": [r, g, b] or null,
      "depth": true, "levels": true, "window": [left, top, width, height] or null,
+     "photograph": PATH or null,
      "sets": [{"file": NAME, "count": N, "matrix": 4x4, "level": 3}, ...]}
     {"cancel": 7}
 
 answer ``progress`` (frame, share), then one of ``frame`` (frame, passes, height, width, seconds; the planes
-are in the file OUT), ``cancelled`` (frame) and ``error`` (frame, what, remedy).
+are in the file OUT), ``cancelled`` (frame) and ``error`` (frame, what, remedy). A photograph is read in the
+frame's size and its planes follow the others, display-coded; ``psnr`` then says how alike both are.
 
 A set is read when its file is first named, and forgotten when a frame does not name it.
 """
@@ -33,9 +35,11 @@ import torch
 
 from .. import VERSION
 from ..errors import LodgsError
+from ..evaluate.metrics import psnr
 from ..rasterize import resolve
 from ..runs.folder import event_line
 from ..scenes.cameras import Camera, camera_from_dict
+from ..scenes.images import load_image
 from . import wire
 from .scene import Placed, SplatSet, draw
 
@@ -120,11 +124,15 @@ class _Server:
             self._cancelled.discard(frame)  # type: ignore[arg-type]
             self.say("cancelled", frame=frame)
             return
-        passes, (height, width) = picture.passes(), picture.alpha.shape
+        passes, (height, width), measured = picture.passes(), picture.alpha.shape, {}
+        if request.get("photograph"):
+            photograph = load_image(Path(request["photograph"]), camera.width, camera.height)
+            passes |= {f"Photograph.{channel}": photograph[..., i] for i, channel in enumerate("RGB")}
+            measured["psnr"] = psnr(torch.from_numpy(picture.image), torch.from_numpy(photograph))
         wire.write_planes(self._folder / Path(request["out"]).name, np.stack(list(passes.values())))
         self.say(
             "frame", frame=frame, passes=list(passes), height=height, width=width,
-            seconds=round(time.perf_counter() - started, 4),
+            seconds=round(time.perf_counter() - started, 4), **measured,
         )  # fmt: skip
 
     def _placed(self, sets: list[dict]) -> list[Placed]:
