@@ -362,6 +362,14 @@ class View(bpy.types.PropertyGroup):
     )
 
 
+def _ellipsoids_changed(self, context) -> None:
+    from . import scenes
+
+    if self.ellipsoids:
+        scenes.offer_ellipsoids(self.id_data)
+    _changed(self, context)
+
+
 class RenderSettings(bpy.types.PropertyGroup):
     """How the engine LODGS renders a Blender scene (``Scene.lodgs_render``)."""
 
@@ -377,6 +385,17 @@ class RenderSettings(bpy.types.PropertyGroup):
     use_pass_levels: bpy.props.BoolProperty(
         name="Levels",
         description="Passes that tell which level each pixel shows, and how much of it every level fills",
+    )
+    ellipsoids: bpy.props.BoolProperty(
+        name="Splats as Ellipsoids",
+        description="Let Cycles and EEVEE render splats as ellipsoids that fade outwards, for shadows and "
+        "reflections. Fine up to some hundred thousand splats",
+        update=_ellipsoids_changed,
+    )
+    draws_ellipsoids: bpy.props.BoolProperty(
+        description="Whether renders of this scene show ellipsoids: LODGS draws true splats instead",
+        get=lambda self: self.ellipsoids and self.id_data.render.engine != "LODGS",
+        options={"HIDDEN"},
     )
     show_comparison: bpy.props.BoolProperty(
         name="Wipe",

@@ -25,6 +25,7 @@ from ..training.scenes.orientation import up_rotation
 from ..training.splats.bundle import Bundle, Facts, Level, read_bundle, read_folder
 from ..training.splats.gaussians import Splats
 from . import objects, selection
+from .nodes import ellipsoids
 
 if TYPE_CHECKING:
     from .properties import View
@@ -267,6 +268,16 @@ def show_only(root: bpy.types.Object, number: int) -> None:
             item.show = True
 
 
+def offer_ellipsoids(scene: bpy.types.Scene) -> None:
+    """Gives every level of a scene's splats the modifier that makes ellipsoids where they are wanted."""
+    for root in roots(scene):
+        for item in root.lodgs.levels:
+            if item.exists:
+                ellipsoids.attach(item.object)
+    if hasattr(scene, "cycles"):
+        scene.cycles.transparent_max_bounces = max(scene.cycles.transparent_max_bounces, ellipsoids.BOUNCES)
+
+
 def views(root: bpy.types.Object) -> list[bpy.types.Object]:
     """The camera objects of a COLMAP scene that are still there, by name."""
     cameras = root.lodgs.cameras
@@ -429,6 +440,9 @@ def _levels_changed(root: bpy.types.Object) -> None:
         settings.single_level = min(settings.single_level, finest)
     settings.active_level = min(settings.active_level, len(settings.levels) - 1)
     selection.attach(root)
+    for scene in root.users_scene:
+        if scene.lodgs_render.ellipsoids:
+            offer_ellipsoids(scene)
 
 
 @bpy.app.handlers.persistent

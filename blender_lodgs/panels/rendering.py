@@ -25,6 +25,10 @@ class LODGS_PT_rendering(bpy.types.Panel):
         layout, scene = self.layout, context.scene
         if scene.render.engine != engine.ID:
             layout.operator("lodgs.use_engine", icon="RENDER_STILL")
+            layout.prop(scene.lodgs_render, "ellipsoids")
+            if scene.lodgs_render.ellipsoids:
+                text = "Slow, without view-dependent colours; fine up to some hundred thousand splats."
+                say(layout, text, "INFO")
             return
         _draw_film(layout, scene)
         _draw_passes(layout, scene, context.view_layer)
