@@ -1,8 +1,8 @@
 """The node group "LODGS Ellipsoids": splats as meshes that Cycles and EEVEE light, reflect and shadow.
 
 Every splat becomes an instance of one sphere, turned and stretched to REACH standard deviations. Its material
-lets through what a Gaussian does: where a ray passes the centre in d standard deviations, alpha is the opacity
-times exp(-d²/2), which is the splat's projection. Colours are those without view dependence.
+has the alpha of a Gaussian: where a ray passes the centre in d standard deviations, the opacity times
+exp(-d²/2), which is the splat's projection. Colours are those without view dependence.
 """
 
 from __future__ import annotations
