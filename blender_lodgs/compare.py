@@ -33,7 +33,8 @@ void main()
   if (abs(place.x - wipe) < line) {
     seen = vec3(1.0);
   }
-  shown = vec4(seen, 1.0);
+  vec3 above = pow((seen + 0.055) / 1.055, vec3(2.4));
+  shown = vec4(mix(seen / 12.92, above, step(vec3(0.04045), seen)), 1.0);
 }
 """
 
@@ -199,7 +200,8 @@ def measure(context: bpy.types.Context, root: bpy.types.Object) -> Measuring:
 
 
 def draw(comparison: Comparison, wipe: float, corners: list[tuple[float, float]], line: float) -> None:
-    """Draws the photograph left of the wipe and the rendered picture right of it into the framebuffer.
+    """Draws the photograph left of the wipe and the rendered picture right of it, in linear light: the
+    framebuffer of a viewport's overlays codes it for the display.
 
     Args:
         wipe: 0 to 1, from the left.
