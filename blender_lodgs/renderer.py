@@ -31,6 +31,9 @@ from . import environment, extension, processes
 IDLE = 300.0
 """Seconds without a frame after which the renderer gives its memory back."""
 
+PATIENCE = 1.0
+"""Seconds that a cancelled frame is waited for."""
+
 Wanted = Callable[[float, str], bool]
 """Told the share that is done, in words too; False ends the frame."""
 
@@ -198,8 +201,8 @@ class Renderer:
         return named
 
     def _wait(self, frame: int, wanted: Wanted) -> dict:
-        """The answer to a frame. What is no longer wanted is cancelled, and waited for."""
-        text, share, cancelled = "Preparing the renderer" if self._fresh else "Rendering", 0.0, False
+        """The answer to a frame. What is no longer wanted is cancelled; its late answer is passed over."""
+        text, share, cancelled = "Preparing the renderer" if self._fresh else "Rendering", 0.0, 0.0
         while True:
             try:
                 answer = self._answers.get(timeout=0.1)
@@ -214,8 +217,10 @@ class Renderer:
                 share, text, self._fresh = answer["share"], "Rendering", False
             elif kind in {"frame", "cancelled", "error"} and of in {frame, None}:
                 return answer
+            if cancelled and time.monotonic() - cancelled > PATIENCE:
+                return {"event": "cancelled"}
             if not wanted(share, text) and not cancelled:
-                cancelled = True
+                cancelled = time.monotonic()
                 self._say(cancel=frame)
 
     def _say(self, **request) -> None:

@@ -110,6 +110,9 @@ class _Server:
         camera, near = camera_from_dict(request["camera"])
         background, window = request.get("background"), request.get("window")
         placed = self._placed(request["sets"])
+        if frame in self._cancelled:
+            self.say("cancelled", frame=frame)
+            return
 
         def wanted(share: float) -> bool:
             self.say("progress", frame=frame, share=round(share, 4))
