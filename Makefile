@@ -41,6 +41,7 @@ lint: setup
 bench: setup
 	$(VENV) tools/bench.py $(if $(BASE),--base $(BASE))
 	$(VENV) tools/bench_blender.py
+	@if [ -x $(BLENDER_5_2) ]; then set -x; $(BLENDER_5_2) tools/bench_blender.py; fi
 
 extension: setup
 	$(VENV) tools/extension.py

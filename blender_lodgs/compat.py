@@ -10,6 +10,26 @@ WIDE_TYPE = (
 """Attribute type for four plain floats: FLOAT4 from Blender 5.2 on, the equally exact FLOAT_COLOR before."""
 
 
+def _native_splats() -> tuple[str, str] | None:
+    for name, kind in bpy.types.PointCloud.bl_rna.properties.items():
+        if isinstance(kind, bpy.types.EnumProperty) and not kind.is_readonly:
+            for item in kind.enum_items:
+                if "SPLAT" in item.identifier.upper():
+                    return name, item.identifier
+    return None
+
+
+NATIVE_SPLATS = _native_splats()
+"""The property of point clouds, and its value, that has Blender draw splats itself; None before 5.3."""
+
+
+def make_native(cloud: bpy.types.PointCloud) -> bool:
+    """Has Blender draw a point cloud as Gaussian splats where it can; whether it does."""
+    if NATIVE_SPLATS:
+        setattr(cloud, *NATIVE_SPLATS)
+    return bool(NATIVE_SPLATS)
+
+
 def new_point_cloud(name: str, count: int) -> bpy.types.PointCloud:
     """A point-cloud datablock of ``count`` points, all at the origin, without users."""
     cloud = bpy.data.pointclouds.new(name)

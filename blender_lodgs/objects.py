@@ -18,6 +18,7 @@ import numpy as np
 from ..training.errors import LodgsError
 from ..training.splats.gaussians import Splats
 from . import compat
+from .nodes import display
 
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi))."""
@@ -102,7 +103,9 @@ def new_splats(name: str, splats: Splats) -> bpy.types.Object:
     # A sphere with the splat's mean size; a faint splat covers less, so that fog does not hide the scene.
     radius = np.exp(splats.log_scales @ np.full(3, 1 / 3, np.float32)) * np.sqrt(opacity)
     write_attribute(cloud, RADIUS, "FLOAT", radius)
-    return _shown(name, cloud, to_bytes(SH_C0 * splats.sh[:, 0] + np.float32(0.5)))
+    thing = _shown(name, cloud, to_bytes(SH_C0 * splats.sh[:, 0] + np.float32(0.5)))
+    display.attach(thing)
+    return thing
 
 
 def read_splats(thing: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> Splats:

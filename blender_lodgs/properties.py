@@ -150,6 +150,24 @@ def _eye_changed(self, context) -> None:
     selection.update_inputs(self.id_data)
 
 
+def _whose_eye_changed(self, context) -> None:
+    from . import selection
+
+    if self.eye == "VIEW" and not self.freeze:  # until a viewport says where it is
+        selection.hold(self.id_data, selection.eye_place(self.id_data, context.scene), self.focal_px)
+    selection.update_inputs(self.id_data)
+    _changed(self, context)
+
+
+def _freeze_changed(self, context) -> None:
+    from . import selection
+
+    if self.freeze and self.eye != "VIEW":  # focal_px is still the moving eye's
+        selection.hold(self.id_data, selection.eye_place(self.id_data, context.scene), self.focal_px)
+    selection.update_inputs(self.id_data)
+    _changed(self, context)
+
+
 def _can_be_eye(self, thing: bpy.types.Object) -> bool:
     return not thing.lodgs.is_root
 
@@ -311,8 +329,31 @@ class SplatScene(bpy.types.PropertyGroup):
                 "Training Cameras",
                 "The mean position of the training cameras: the choice stays put",
             ),
+            (
+                "VIEW",
+                "Viewport",
+                "Your own view, of the 3D viewport that moved last. Renders keep what it saw: choose the "
+                "scene camera for them",
+            ),
         ],
-        update=_changed,
+        update=_whose_eye_changed,
+    )
+    freeze: bpy.props.BoolProperty(
+        name="Freeze",
+        description="Keep the choice of detail as it is now, to look at it from elsewhere",
+        update=_freeze_changed,
+        options=set(),
+    )
+    held_eye: bpy.props.FloatVectorProperty(
+        name="Held Eye",
+        description="Where the eye is held, or the viewport's was last, in the scene's own units",
+        size=3,
+        subtype="XYZ",
+        update=_eye_changed,
+        options={"HIDDEN"},
+    )
+    held_focal: bpy.props.FloatProperty(
+        name="Held Focal Length", default=1000.0, subtype="PIXEL", update=_changed, options={"HIDDEN"}
     )
     eye_object: bpy.props.PointerProperty(
         name="Object",
@@ -328,10 +369,22 @@ class SplatScene(bpy.types.PropertyGroup):
         options={"ANIMATABLE"},
     )
 
-    tell_levels: bpy.props.BoolProperty(
-        name="Colour by Level",
-        description="In Solid shading, show which level is where, in colours from violet (coarse) through "
-        "blue, teal, yellow and red on",
+    tell: bpy.props.EnumProperty(
+        name="Colours",
+        description="What the colours tell in the viewport",
+        items=[
+            ("OWN", "Own", "The splats' own colours"),
+            (
+                "LEVELS",
+                "Levels",
+                "Which level is where: violet (coarse), blue, teal, yellow, red and on",
+            ),
+            (
+                "BANDS",
+                "Distances",
+                "Which level is wanted at which distance from the eye, in the same colours",
+            ),
+        ],
         options=set(),
     )
 
@@ -341,6 +394,38 @@ class SplatScene(bpy.types.PropertyGroup):
     def by_distance(self) -> bool:
         """Whether the levels say at which distances they are to be shown."""
         return self.d_max > 0 or any(item.has_s_min for item in self.levels)
+
+
+class ViewportSettings(bpy.types.PropertyGroup):
+    """How 3D viewports draw splats, on the Blender scene (``Scene.lodgs_viewport``)."""
+
+    splats: bpy.props.BoolProperty(
+        name="Gaussian Splats",
+        description="Draw splats as the photographs show them, not as points. Wireframe shading has none",
+        default=True,
+        update=_changed,
+        options=set(),
+    )
+    budget: bpy.props.IntProperty(
+        name="At Most",
+        description="Most splats that a viewport draws. Where there are more, coarser levels stand in for "
+        "the finest, and of a single level the most visible splats are drawn",
+        default=2_000_000,
+        min=1000,
+        max=16_000_000,
+        step=10_000,
+        options=set(),
+    )
+    moving: bpy.props.FloatProperty(
+        name="While Moving",
+        description="Resolution of the splats while the view moves",
+        default=50.0,
+        min=10.0,
+        max=100.0,
+        precision=0,
+        subtype="PERCENTAGE",
+        options=set(),
+    )
 
 
 class View(bpy.types.PropertyGroup):
@@ -420,7 +505,7 @@ class RenderSettings(bpy.types.PropertyGroup):
     )
 
 
-CLASSES = (View, TrainingSettings, SplatLevel, SplatScene, RenderSettings)
+CLASSES = (View, ViewportSettings, TrainingSettings, SplatLevel, SplatScene, RenderSettings)
 
 
 def register() -> None:
@@ -428,10 +513,12 @@ def register() -> None:
     bpy.types.Object.lodgs = bpy.props.PointerProperty(type=SplatScene)
     bpy.types.Camera.lodgs = bpy.props.PointerProperty(type=View)
     bpy.types.Scene.lodgs_render = bpy.props.PointerProperty(type=RenderSettings)
+    bpy.types.Scene.lodgs_viewport = bpy.props.PointerProperty(type=ViewportSettings)
 
 
 def unregister() -> None:
     """Detach them again."""
     del bpy.types.Scene.lodgs_render
+    del bpy.types.Scene.lodgs_viewport
     del bpy.types.Camera.lodgs
     del bpy.types.Object.lodgs

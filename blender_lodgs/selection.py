@@ -8,15 +8,125 @@ follow ``root.lodgs`` and the scene's camera without any handler.
 
 from __future__ import annotations
 
-import bpy
+from dataclasses import dataclass
 
+import bpy
+import numpy as np
+
+from ..training.lod.rules import band_mask, octree_wanted, octree_weights
 from . import compat
 from .nodes import distance_band as band
 from .nodes import octree_level as octree
-from .nodes.building import EYE, EYE_OBJECT, EYE_POSITION, MATERIAL
+from .nodes.building import EYE, EYE_OBJECT, EYE_POSITION, EYES, MATERIAL
+from .nodes.display import NAME as DISPLAY
 
 NEVER = 1e30
 """A distance beyond every scene, in place of infinity, which driver expressions cannot say."""
+
+
+@dataclass(frozen=True)
+class BandRule:
+    """Splats with near <= distance < far from the eye, all in the splats' space: a level's band (FLoD)."""
+
+    eye: tuple[float, float, float]
+    near: float
+    far: float
+
+    def weights(self, means: np.ndarray, bias: np.ndarray) -> np.ndarray:
+        """(N,) weights of splats at means (N, 3)."""
+        return band_mask(_distances(means, self.eye), np.float32(self.near), np.float32(self.far))
+
+    def bands(self, means: np.ndarray, level: int) -> np.ndarray:
+        """(N,) the band that each lies in, by the level that serves it."""
+        return np.full(len(means), level)
+
+
+@dataclass(frozen=True)
+class OctreeRule:
+    """Levels that add up and fade in, see ``training.lod.rules.octree_weights`` (Octree-GS)."""
+
+    eye: tuple[float, float, float]
+    farthest: float
+    level: int
+    levels: int
+    offset: float
+
+    def weights(self, means: np.ndarray, bias: np.ndarray) -> np.ndarray:
+        """(N,) weights of splats at means (N, 3), with a bias (N,) in levels each."""
+        return octree_weights(self._wanted(means, bias + np.float32(self.offset)), self.level)
+
+    def bands(self, means: np.ndarray, level: int) -> np.ndarray:
+        """(N,) the finest level that is wholly wanted so far away."""
+        return np.floor(self._wanted(means, np.float32(self.offset)))
+
+    def _wanted(self, means: np.ndarray, bias) -> np.ndarray:
+        return octree_wanted(_distances(means, self.eye), bias, np.float32(self.farthest), self.levels)
+
+
+Rule = BandRule | OctreeRule
+
+
+def _distances(means: np.ndarray, eye) -> np.ndarray:
+    away = means - np.float32(eye)
+    return np.sqrt(np.einsum("ij,ij->i", away, away))
+
+
+def rule(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Rule | None:
+    """What the modifier of an evaluated level chooses by, as of the depsgraph; None where all is shown."""
+    modifier = _modifier(evaluated)
+    render = depsgraph.mode == "RENDER"
+    if modifier is None or not (modifier.show_render if render else modifier.show_viewport):
+        return None
+
+    def value(name: str):
+        return compat.get_input(modifier, name)
+
+    whose = EYES[min(max(value(EYE), 0), len(EYES) - 1)]
+    if whose == "TRAINING":
+        eye = tuple(value(EYE_POSITION))
+    else:
+        thing = depsgraph.scene.camera if whose == "CAMERA" else value(EYE_OBJECT)
+        eye = (0.0, 0.0, 0.0)  # as geometry nodes have it without an object
+        if thing is not None:
+            place = thing.evaluated_get(depsgraph).matrix_world.translation
+            eye = tuple(evaluated.matrix_world.inverted_safe() @ place)
+    if modifier.name.startswith(band.NAME):
+        return BandRule(eye, value(band.NEAR), value(band.FAR))
+    return OctreeRule(
+        eye, value(octree.FARTHEST), value(octree.LEVEL), value(octree.LEVELS), value(octree.OFFSET)
+    )
+
+
+def only_chosen(evaluated: bpy.types.Object) -> bool:
+    """Whether an evaluated object shows its own splats as they are, chosen by nothing but :func:`rule`."""
+    return all(
+        modifier.type == "NODES" and modifier.name in {band.NAME, octree.NAME, DISPLAY}
+        for modifier in evaluated.modifiers
+        if modifier.show_viewport
+    )
+
+
+def eye_place(root: bpy.types.Object, scene: bpy.types.Scene) -> tuple[float, float, float]:
+    """Where the chosen eye is, in the splats' space, frozen or not. The viewport's starts at the camera's."""
+    settings = root.lodgs
+    if settings.eye == "TRAINING":
+        return tuple(settings.camera_center)
+    thing = settings.eye_object if settings.eye == "OBJECT" else scene.camera
+    if thing is None:
+        return (0.0, 0.0, 0.0)  # as geometry nodes have it
+    return tuple(root.matrix_world.inverted_safe() @ thing.matrix_world.translation)
+
+
+def hold(root: bpy.types.Object, eye: tuple[float, float, float], focal_px: float) -> None:
+    """Has distances measured from a place in the splats' own space, while they are frozen or the viewport's.
+
+    Nothing happens where that is the case already: setting evaluates the scene anew.
+    """
+    settings = root.lodgs
+    if not np.array_equal(np.float32(eye), np.float32(settings.held_eye)):
+        settings.held_eye = eye
+    if np.float32(focal_px) != np.float32(settings.held_focal):
+        settings.held_focal = focal_px
 
 
 def attach(root: bpy.types.Object) -> None:
@@ -33,7 +143,7 @@ def attach(root: bpy.types.Object) -> None:
 
 
 def update_inputs(root: bpy.types.Object) -> None:
-    """Hands on to the modifiers what cannot be driven: the chosen eye, and each level's material."""
+    """Hands on to the modifiers what cannot be driven: the chosen or held eye, and each level's material."""
     for item in root.lodgs.levels:
         modifier = item.exists and _modifier(item.object)
         if modifier:
@@ -44,8 +154,10 @@ def update_inputs(root: bpy.types.Object) -> None:
             ):
                 if compat.get_input(modifier, name) != value:  # setting evaluates anew
                     compat.set_input(modifier, name, value)
-            if tuple(compat.get_input(modifier, EYE_POSITION)) != tuple(root.lodgs.camera_center):
-                compat.set_input(modifier, EYE_POSITION, root.lodgs.camera_center)
+            held = root.lodgs.freeze or root.lodgs.eye == "VIEW"
+            position = root.lodgs.held_eye if held else root.lodgs.camera_center
+            if tuple(compat.get_input(modifier, EYE_POSITION)) != tuple(position):
+                compat.set_input(modifier, EYE_POSITION, position)
 
 
 def _drive_focal_length(root: bpy.types.Object) -> None:
@@ -103,15 +215,17 @@ def _drive_level(root: bpy.types.Object, index: int, item) -> None:
         )  # fmt: skip
     for path in ("show_viewport", "show_render"):
         drive(f'modifiers["{modifier.name}"].{path}', "mode == 1", "mode")
-    drive(compat.input_path(modifier, EYE), "eye", "eye")
+    drive(compat.input_path(modifier, EYE), "2 if freeze or eye > 2 else eye", "eye", "freeze")
 
+    focal = "(held_focal if freeze or eye == 3 else focal_px)"
+    focals = ("focal_px", "held_focal", "freeze", "eye")
     if by_octree:
         compat.set_input(modifier, octree.LEVEL, number)
         compat.set_input(modifier, octree.LEVELS, root.lodgs.levels[-1].number)
         drive(
             compat.input_path(modifier, octree.FARTHEST),
-            "d_max * focal_px / d_max_focal",
-            "d_max", "focal_px", "d_max_focal",
+            f"d_max * {focal} / d_max_focal",
+            "d_max", "d_max_focal", *focals,
         )  # fmt: skip
         drive(compat.input_path(modifier, octree.OFFSET), "level_offset", "level_offset")
         return
@@ -123,13 +237,13 @@ def _drive_level(root: bpy.types.Object, index: int, item) -> None:
     near, far = compat.input_path(modifier, band.NEAR), compat.input_path(modifier, band.FAR)
     drive(
         near,
-        f"(s_min / gamma * focal_px if {finer:g} <= level_end else 0) if {in_range} else {NEVER:g}",
-        "gamma", "focal_px", "level_start", "level_end", s_min=f"levels[{index}].s_min",
+        f"(s_min / gamma * {focal} if {finer:g} <= level_end else 0) if {in_range} else {NEVER:g}",
+        "gamma", "level_start", "level_end", *focals, s_min=f"levels[{index}].s_min",
     )  # fmt: skip
     drive(
         far,
-        f"s_min / gamma * focal_px if {coarser} >= level_start and {number} <= level_end else {NEVER:g}",
-        "gamma", "focal_px", "level_start", "level_end", s_min=f"levels[{max(index - 1, 0)}].s_min",
+        f"s_min / gamma * {focal} if {coarser} >= level_start and {number} <= level_end else {NEVER:g}",
+        "gamma", "level_start", "level_end", *focals, s_min=f"levels[{max(index - 1, 0)}].s_min",
     )  # fmt: skip
 
 

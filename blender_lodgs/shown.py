@@ -62,7 +62,7 @@ def splat_sets(
 ) -> list[SplatSet]:
     """The visible splat sets, coarse levels first.
 
-    Visibility is the depsgraph's: of its view layer, and of renders or viewports by ``depsgraph.mode``.
+    Visibility is the depsgraph's: that of its view layer, and by ``depsgraph.mode`` of renders or viewports.
 
     Args:
         viewport: leave out what this viewport hides by itself (its local view, its object types).

@@ -1,8 +1,11 @@
-"""Measure import and selection in Blender against the number of splats: part of ``make bench``.
+"""Measure import, selection and viewports in Blender against the number of splats: part of ``make bench``.
 
 Import: a plain PLY of SH degree 3 from file to a level's object, against plyfile reading the same rows.
 Selection: evaluating two levels after the eye moved, against numpy's masks and copies of the same splats.
 Every ratio is of two times from one run.
+Viewport, where this Blender has graphics in background: what the main thread does after a camera move beside
+Blender's own evaluation (the rules, the list of splats onto the graphics card), what the thread beside it
+does (choosing and sorting), and how long all splats take onto the card, from their attributes.
 """
 
 from __future__ import annotations
@@ -65,16 +68,8 @@ def import_seconds(bpy, path: Path) -> float:
 def selection_seconds(bpy, path: Path) -> tuple[float, float]:
     """One evaluation after the eye moved, and numpy's way to the same splats' attributes."""
     splats = load("training.splats.ply").read_ply(path)
-    scenes, level = load("blender_lodgs.scenes"), load("training.splats.bundle").Level
-    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
-    bpy.context.scene.collection.objects.link(camera)
-    bpy.context.scene.camera = camera
-    with scenes._new_scene(bpy.context, "bench") as root:
-        scenes.set_level(root, level(1, splats, S_MIN))
-        scenes.set_level(root, level(2, splats, 0.0))
-    root.lodgs.mode, root.lodgs.level_start = "SELECTIVE", 1
-    bpy.context.view_layer.update()
+    camera = two_levels(bpy, splats)
+    root = load("blender_lodgs.scenes").roots(bpy.context.scene)[0]
 
     def move() -> None:
         camera.location.x += 0.01
@@ -95,6 +90,62 @@ def selection_seconds(bpy, path: Path) -> tuple[float, float]:
     return least(move), least(by_numpy)
 
 
+def two_levels(bpy, splats):
+    """A splat scene of the same splats as two levels, seen by distance, and its camera."""
+    scenes, level = load("blender_lodgs.scenes"), load("training.splats.bundle").Level
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
+    bpy.context.scene.collection.objects.link(camera)
+    bpy.context.scene.camera = camera
+    with scenes._new_scene(bpy.context, "bench") as root:
+        scenes.set_level(root, level(1, splats, S_MIN))
+        scenes.set_level(root, level(2, splats, 0.0))
+    root.lodgs.mode, root.lodgs.level_start = "SELECTIVE", 1
+    bpy.context.view_layer.update()
+    return camera
+
+
+def viewport(bpy, count: int) -> None:
+    """Prints what viewports cost with two levels of half as many splats each."""
+    import gpu
+
+    if not hasattr(gpu, "init"):
+        print("viewport: not measured, this Blender has no graphics in background")
+        return
+    gpu.init()
+    camera = two_levels(bpy, random_splats(count // 2))
+    views, shown = load("blender_lodgs.viewport.views"), load("blender_lodgs.shown")
+    view, main, thread, evaluated, uploaded = views.View(), [], [], [], []
+
+    def sets():
+        return shown.splat_sets(bpy.context.evaluated_depsgraph_get())
+
+    def prepare() -> None:
+        depsgraph, look = bpy.context.evaluated_depsgraph_get(), camera.matrix_world.inverted()
+        views.prepare(view, sets(), depsgraph, look, 10 * count)
+
+    for _ in range(3):
+        views.forget()
+        uploaded.append(least(lambda: views._upload(sets()), 1))
+    uploads = views.uploads
+    for _ in range(10):
+        camera.location.x += 0.1
+        camera.rotation_euler.z += 0.1
+        evaluated.append(least(bpy.context.view_layer.update, 1))
+        asks = least(prepare, 1)
+        thread.append(least(lambda: view.asked[2].result(), 1))
+        main.append(asks + least(prepare, 1))
+    for frame in range(1, 11):
+        bpy.context.scene.frame_set(frame)
+        prepare()
+    print(
+        f"viewport, {count:,} splats, {view.arrangement.count:,} chosen; ms, median of 10 camera moves:\n"
+        f"  main thread {1e3 * np.median(main):.1f} (Blender's evaluation {1e3 * np.median(evaluated):.1f}),"
+        f" thread beside it {1e3 * np.median(thread):.1f}, upload of all {1e3 * min(uploaded):.0f};"
+        f" uploads in 10 camera moves and 10 frames: {views.uploads - uploads}"
+    )
+
+
 def main() -> None:
     bpy = start_blender()
     print(f"Blender {bpy.app.version_string}; seconds, SH degree 3")
@@ -113,6 +164,8 @@ def main() -> None:
                 f" {select:8.4f} {mask:8.4f} {select / mask:6.2f}",
                 flush=True,
             )
+    viewport(bpy, 500_000)
+    sys.stdout.flush()
     os._exit(0)  # Blender 4.5 as a module can hang when Python ends
 
 

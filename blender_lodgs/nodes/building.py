@@ -7,7 +7,7 @@ import bpy
 EYE, EYE_OBJECT, EYE_POSITION = "Measured From", "Eye", "Eye Position"
 MATERIAL = "Material"
 EYES = ("CAMERA", "OBJECT", "TRAINING")
-"""What the input "Measured From" counts; the order of ``SplatScene.eye``."""
+"""What the input "Measured From" counts: the first of ``SplatScene.eye``. "TRAINING" is any fixed place."""
 
 
 class Builder:

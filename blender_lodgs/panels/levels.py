@@ -86,14 +86,15 @@ class LODGS_PT_detail(_Panel):
                 both.prop(settings, "level_start")
                 both.prop(settings, "level_end")
                 column.prop(settings, "gamma", slider=True)
-            column.prop(settings, "eye")
+            row = column.row(align=True)
+            row.prop(settings, "eye")
+            row.prop(settings, "freeze", text="", icon="FREEZE")
             if settings.eye == "OBJECT":
                 column.prop(settings, "eye_object")
             elif settings.eye == "TRAINING":
                 column.prop(settings, "camera_center", text="Position")
-            if context.scene.camera is None:
+            if context.scene.camera is None and settings.eye != "VIEW":
                 layout.label(text="The scene has no camera", icon="ERROR")
-        column.prop(settings, "tell_levels")
         shown, everything = scenes.count_shown(context, root)
         layout.label(text=f"{shown:,} of {everything:,} splats shown")
 

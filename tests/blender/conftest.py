@@ -7,6 +7,7 @@ import os
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tools.blender_module import EXTENSION, start_blender
@@ -37,6 +38,48 @@ def lodgs(bpy):
         return importlib.import_module(f"{EXTENSION}.{room}{name}")
 
     return load
+
+
+@pytest.fixture
+def frame(bpy):
+    """``frame(size, draw)``: what ``draw()`` leaves in float colours, (size, size, 4) linear, row 0 low.
+
+    ``frame(size, draw, before)`` does so in 8 bits coded in sRGB, like a viewport's, that hold
+    ``before``. Tests that draw are skipped where this Blender has no graphics in background.
+    """
+    import gpu
+
+    if not hasattr(gpu, "init"):
+        pytest.skip("no graphics in background before Blender 5.2")
+    try:
+        gpu.init()
+    except Exception as error:
+        pytest.skip(f"no graphics here: {error}")
+
+    def drawn(size, draw, before=None):
+        kind, data = "RGBA32F", np.zeros((size, size, 4), np.float32)
+        if before is not None:
+            kind, data = "SRGB8_A8", before.copy()
+            data[..., :3] = np.where(
+                data[..., :3] <= 0.0031308, 12.92 * data[..., :3], 1.055 * data[..., :3] ** (1 / 2.4) - 0.055
+            )
+        colors = gpu.types.GPUTexture(
+            (size, size), format=kind, data=gpu.types.Buffer("FLOAT", data.size, data.reshape(-1))
+        )
+        depth = gpu.types.GPUTexture((size, size), format="DEPTH_COMPONENT32F")
+        frame = gpu.types.GPUFrameBuffer(depth_slot=depth, color_slots=colors)
+        with frame.bind():
+            frame.clear(depth=1.0)
+            draw()
+            buffer = frame.read_color(0, 0, size, size, 4, 0, "FLOAT")
+        buffer.dimensions = size * size * 4
+        seen = np.array(buffer, np.float32).reshape(size, size, 4)
+        if before is not None:
+            code = seen[..., :3]
+            seen[..., :3] = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+        return seen
+
+    return drawn
 
 
 @pytest.fixture

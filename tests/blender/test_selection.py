@@ -219,14 +219,14 @@ def test_unused_levels_are_not_evaluated(bpy, root):
         assert (item.object.hide_viewport, item.object.hide_render) == (not used, not used)
     root.lodgs.mode = "SINGLE"
     bpy.context.view_layer.update()
-    (modifier,) = root.lodgs.levels[3].object.modifiers
+    modifier = root.lodgs.levels[3].object.modifiers["LODGS Distance Band"]
     assert not modifier.show_viewport and not modifier.show_render
 
 
 def test_drivers_need_no_scripts(bpy, root):
     """Simple expressions are what Blender evaluates with Auto Run Python Scripts off."""
     drivers = [c.driver for t in [root, *root.children] if t.animation_data for c in t.animation_data.drivers]
-    assert len(drivers) == 1 + 7 * len(S_MIN)
+    assert len(drivers) == 1 + 8 * len(S_MIN)
     assert all(driver.is_simple_expression and driver.is_valid for driver in drivers)
 
 

@@ -7,19 +7,12 @@ as it is.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
-
 import bpy
 import gpu
 import numpy as np
 from mathutils import Matrix, Vector
 
-from ..training.lod.colors import level_color
-from . import objects, scenes
-
-if TYPE_CHECKING:
-    from .properties import SplatScene
+from .. import objects
 
 Color = tuple[float, float, float, float]
 
@@ -49,28 +42,6 @@ void main()
 _shader: gpu.types.GPUShader | None = None
 _batches: dict[int, gpu.types.GPUBatch] = {}
 """Points on the graphics card, by their object's ``session_uid``; they stay until the object changes."""
-_handle: Any = None
-
-
-def _draw() -> None:
-    context = bpy.context
-    space, view = context.space_data, context.region_data
-    if space.shading.type != "SOLID" or space.shading.color_type in {"OBJECT", "RANDOM", "SINGLE"}:
-        return
-    things = [
-        (thing, tint)
-        for root in scenes.roots(context.scene)
-        for thing, tint in _things(root.lodgs)
-        if thing is not None and thing.visible_get(view_layer=context.view_layer, viewport=space)
-    ]
-    if things:
-        draw(
-            things,
-            context.evaluated_depsgraph_get(),
-            view.view_matrix,
-            view.window_matrix,
-            context.region.height,
-        )
 
 
 def draw(
@@ -105,13 +76,6 @@ def draw(
     gpu.state.program_point_size_set(False)
     gpu.state.depth_mask_set(False)
     gpu.state.depth_test_set("NONE")
-
-
-def _things(settings: SplatScene) -> Iterator[tuple[bpy.types.Object | None, Color]]:
-    """What a splat scene may show, and in which colour."""
-    yield settings.points, (0, 0, 0, 0)
-    for item in settings.levels:
-        yield item.object, (*level_color(item.number), float(settings.tell_levels))
 
 
 def _upload(cloud: bpy.types.PointCloud) -> gpu.types.GPUBatch:
@@ -156,8 +120,7 @@ def _disc_shader() -> gpu.types.GPUShader:
     return _shader
 
 
-@bpy.app.handlers.persistent
-def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+def changed(depsgraph: bpy.types.Depsgraph) -> None:
     """Forgets what has changed; what was deleted goes with all the rest."""
     if depsgraph.id_type_updated("COLLECTION"):
         _batches.clear()
@@ -167,30 +130,8 @@ def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
                 _batches.pop(update.id.original.session_uid, None)
 
 
-@bpy.app.handlers.persistent
-def _on_load(*_) -> None:
+def forget() -> None:
+    """Frees what is kept between drawings."""
+    global _shader
     _batches.clear()
-
-
-def register() -> None:
-    global _handle
-    if not bpy.app.background:
-        _handle = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW")
-    handlers = bpy.app.handlers
-    for changes in (handlers.depsgraph_update_post, handlers.frame_change_post):
-        changes.append(_on_update)
-    for changes in (handlers.load_post, handlers.undo_post, handlers.redo_post):
-        changes.append(_on_load)
-
-
-def unregister() -> None:
-    global _handle, _shader
-    if _handle is not None:
-        bpy.types.SpaceView3D.draw_handler_remove(_handle, "WINDOW")
-    handlers = bpy.app.handlers
-    for changes in (handlers.depsgraph_update_post, handlers.frame_change_post):
-        changes.remove(_on_update)
-    for changes in (handlers.load_post, handlers.undo_post, handlers.redo_post):
-        changes.remove(_on_load)
-    _batches.clear()
-    _handle = _shader = None
+    _shader = None

@@ -8,30 +8,15 @@ WHITE, RED, GREEN = (255, 255, 255), (255, 0, 0), (0, 255, 0)
 
 
 @pytest.fixture
-def picture(bpy, lodgs):
+def picture(bpy, lodgs, frame):
     """``picture(things)``: (SIZE, SIZE, 4) linear colours seen along -z, 2 units wide; row 0 is below."""
-    import gpu
     from mathutils import Matrix
 
-    if not hasattr(gpu, "init"):
-        pytest.skip("no graphics in background before Blender 5.2")
-    try:
-        gpu.init()
-    except Exception as error:
-        pytest.skip(f"no graphics here: {error}")
     view, projection = Matrix.Translation((0, 0, -5)), Matrix.Diagonal((1, 1, -0.1, 1))
-
-    def draw(things):
-        screen = gpu.types.GPUOffScreen(SIZE, SIZE, format="RGBA32F")
-        with screen.bind():
-            frame = gpu.state.active_framebuffer_get()
-            frame.clear(color=(0, 0, 0, 0), depth=1.0)
-            lodgs("viewport").draw(things, bpy.context.evaluated_depsgraph_get(), view, projection, SIZE)
-            buffer = frame.read_color(0, 0, SIZE, SIZE, 4, 0, "FLOAT")
-        buffer.dimensions = SIZE * SIZE * 4
-        return np.array(buffer, np.float32).reshape(SIZE, SIZE, 4)
-
-    return draw
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    return lambda things: frame(
+        SIZE, lambda: lodgs("viewport.discs").draw(things, depsgraph, view, projection, SIZE)
+    )
 
 
 def _points(bpy, lodgs, positions, colors, radius):

@@ -1,0 +1,62 @@
+"""How the 3D viewport draws splat scenes: in the LODGS tab, and among the viewport's overlays."""
+
+from __future__ import annotations
+
+import bpy
+
+from .. import compat, scenes
+from ..viewport import views
+
+
+class LODGS_PT_viewport(bpy.types.Panel):
+    bl_label = "Viewport"
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "LODGS"
+    bl_order = 4
+
+    @classmethod
+    def poll(cls, context):
+        return bool(scenes.roots(context.scene))
+
+    def draw(self, context):
+        layout, settings = self.layout, context.scene.lodgs_viewport
+        root = scenes.active_root(context)
+        column = layout.column()
+        column.use_property_split = True
+        column.use_property_decorate = False
+        _toggles(column, context)
+        if settings.splats and not compat.NATIVE_SPLATS:
+            column.prop(settings, "budget")
+            column.prop(settings, "moving", slider=True)
+        if root is not None:
+            column.row().prop(root.lodgs, "tell", expand=True)
+        left_out = views.left_out()
+        if settings.splats and left_out:
+            layout.label(text=f"{left_out:,} splats left out to stay within that", icon="INFO")
+
+
+def _toggles(column: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    if not compat.NATIVE_SPLATS:
+        column.prop(context.scene.lodgs_viewport, "splats")
+    root = scenes.active_root(context)
+    if root is not None and root.lodgs.cameras is not None:
+        column.prop(root.lodgs.cameras, "hide_viewport", text="Training Cameras", invert_checkbox=True)
+
+
+def _overlays(self, context):
+    if scenes.roots(context.scene):
+        column = self.layout.column()
+        column.label(text="LODGS")
+        _toggles(column, context)
+
+
+CLASSES = (LODGS_PT_viewport,)
+
+
+def register() -> None:
+    bpy.types.VIEW3D_PT_overlay.append(_overlays)
+
+
+def unregister() -> None:
+    bpy.types.VIEW3D_PT_overlay.remove(_overlays)

@@ -1,0 +1,487 @@
+"""True Gaussians in a framebuffer: the splats on the graphics card, and the shaders that draw them.
+
+What a pixel shows is that of ``docs/rasterizer.md``; splats are blended back to front in half floats, in
+display space as the photographs are, in an offscreen buffer of their own. A splat is hidden where what is
+already drawn lies nearer than its mean. The result is composited into the active framebuffer, which is
+linear, beneath overlays that are there already.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import bpy
+import gpu
+import numpy as np
+from mathutils import Matrix
+
+from ...training.lod.colors import LEVEL_COLORS
+from ...training.lod.selection import BIAS
+from .. import objects
+from .arranging import WIDTH, Arrangement, Pool
+
+MOST_COEFFICIENTS = 15
+"""Coefficients beyond the first: degree 3."""
+
+_FETCH = """
+vec4 texel(sampler2D data, int i) { return texelFetch(data, ivec2(i % WIDTH, i / WIDTH), 0); }
+"""
+_VERTEX = (
+    _FETCH
+    + """
+// Three floats of the stream that coefficient k of all splats lies in, each after the other.
+vec3 coefficient(int k, int splat)
+{
+  int start = ((k - 1) * total + splat) * 3;
+  vec4 a = texel(higher, start / 4);
+  int part = start % 4;
+  if (part == 0) { return a.xyz; }
+  vec4 b = texel(higher, start / 4 + 1);
+  return part == 1 ? a.yzw : part == 2 ? vec3(a.zw, b.x) : vec3(a.w, b.xy);
+}
+
+vec3 seen_color(int splat, vec3 base, vec3 d)
+{
+  vec3 c = 0.5 + 0.28209479177387814 * base;
+  if (degree >= 1) {
+    c += 0.4886025119029199 * (d.z * coefficient(2, splat) - d.y * coefficient(1, splat)
+                               - d.x * coefficient(3, splat));
+  }
+  if (degree >= 2) {
+    vec3 q = d * d;
+    c += 1.0925484305920792 * (d.x * d.y * coefficient(4, splat) - d.y * d.z * coefficient(5, splat)
+                               - d.x * d.z * coefficient(7, splat));
+    c += 0.31539156525252005 * (2.0 * q.z - q.x - q.y) * coefficient(6, splat);
+    c += 0.5462742152960396 * (q.x - q.y) * coefficient(8, splat);
+    if (degree >= 3) {
+      c -= 0.5900435899266435 * (d.y * (3.0 * q.x - q.y) * coefficient(9, splat)
+                                 + d.x * (q.x - 3.0 * q.y) * coefficient(15, splat));
+      c += 2.890611442640554 * d.x * d.y * d.z * coefficient(10, splat);
+      c -= 0.4570457994644658 * (4.0 * q.z - q.x - q.y)
+           * (d.y * coefficient(11, splat) + d.x * coefficient(13, splat));
+      c += 0.3731763325901154 * d.z * (2.0 * q.z - 3.0 * q.x - 3.0 * q.y) * coefficient(12, splat);
+      c += 1.445305721320277 * d.z * (q.x - q.y) * coefficient(14, splat);
+    }
+  }
+  return max(c, 0.0);
+}
+
+void main()
+{
+  gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // outside, unless drawn
+  place = vec2(0.0);
+  color_opacity = vec4(0.0);
+
+  vec4 instance = texel(instances, gl_InstanceID);  // splat, weight, placement, told level
+  int splat = int(instance.x), set = int(instance.z) * 4;
+  vec4 base = texel(bases, splat);
+  float opacity = base.w * instance.y;
+  if (opacity <= 1.0 / 255.0) {
+    return;
+  }
+  vec4 mean = vec4(texel(means, splat).xyz, 1.0);
+  vec4 to_view_x = texel(placements, set), to_view_y = texel(placements, set + 1);
+  vec4 to_view_z = texel(placements, set + 2), eye = texel(placements, set + 3);
+  vec3 position = vec3(dot(to_view_x, mean), dot(to_view_y, mean), dot(to_view_z, mean));
+  vec4 clip = projection * vec4(position, 1.0);
+  if (clip.w <= 0.0 || abs(clip.z) >= clip.w) {
+    return;
+  }
+
+  // The projection's derivative (in pixels) times half the covariance: rotation, then scales.
+  vec3 ndc = clip.xyz / clip.w;
+  vec2 held = clamp(ndc.xy, -1.3, 1.3);
+  mat4 rows = transpose(projection);
+  vec3 by_x = (rows[0].xyz - held.x * rows[3].xyz) * (0.5 * size.x / clip.w);
+  vec3 by_y = (rows[1].xyz - held.y * rows[3].xyz) * (0.5 * size.y / clip.w);
+  vec4 q = texel(quats, splat);  // w, x, y, z
+  vec3 s = texel(scales, splat).xyz;
+  mat3 turn = mat3(
+    1.0 - 2.0 * (q.z * q.z + q.w * q.w), 2.0 * (q.y * q.z + q.x * q.w), 2.0 * (q.y * q.w - q.x * q.z),
+    2.0 * (q.y * q.z - q.x * q.w), 1.0 - 2.0 * (q.y * q.y + q.w * q.w), 2.0 * (q.z * q.w + q.x * q.y),
+    2.0 * (q.y * q.w + q.x * q.z), 2.0 * (q.z * q.w - q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z));
+  mat3 to_view = transpose(mat3(to_view_x.xyz, to_view_y.xyz, to_view_z.xyz));
+  mat3 half_covariance = to_view * turn * mat3(s.x, 0.0, 0.0, 0.0, s.y, 0.0, 0.0, 0.0, s.z);
+  vec3 row_x = by_x * half_covariance, row_y = by_y * half_covariance;
+  float xx = dot(row_x, row_x) + 0.3, xy = dot(row_x, row_y), yy = dot(row_y, row_y) + 0.3;
+
+  // The ellipse where alpha falls to 1/255, along its own axes.
+  float middle = 0.5 * (xx + yy);
+  float apart = length(vec2(0.5 * (xx - yy), xy));
+  vec2 axis = abs(xy) > 1e-6 * middle ? normalize(vec2(xy, middle + apart - xx))
+                                      : (xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0));
+  float longer = sqrt(middle + apart), shorter = sqrt(max(middle - apart, 0.3));
+  float reach = sqrt(2.0 * log(255.0 * opacity));
+  vec2 offset = corner.x * longer * reach * axis + corner.y * shorter * reach * vec2(-axis.y, axis.x);
+  place = corner * reach;
+  gl_Position = vec4(ndc.xy + offset * 2.0 / size, ndc.z, 1.0);
+
+  vec3 color = seen_color(splat, base.xyz, normalize(mean.xyz * eye.w - eye.xyz));
+  if (instance.w > 0.0) {  // in the lightness of its own colour, so that the scene stays readable
+    float lightness = min(dot(color, vec3(1.0 / 3.0)), 1.0);
+    color = (0.35 + 0.65 * lightness) * texelFetch(palette, ivec2(int(instance.w - 1.0) % PALETTE, 0), 0).rgb;
+  }
+  color_opacity = vec4(color, opacity);
+}
+"""
+)
+_FRAGMENT = """
+void main()
+{
+  float alpha = min(0.99, color_opacity.a * exp(-0.5 * dot(place, place)));
+  if (alpha < 1.0 / 255.0) {
+    discard;
+  }
+  drawn = vec4(color_opacity.rgb * alpha, alpha);
+}
+"""
+_SCREEN_VERTEX = """
+void main()
+{
+  at = 0.5 * corner + 0.5;
+  gl_Position = vec4(corner, 0.0, 1.0);
+}
+"""
+_DEPTH_FRAGMENT = """
+void main()
+{
+  gl_FragDepth = texelFetch(depth, ivec2(at * vec2(textureSize(depth, 0))), 0).r;
+  drawn = vec4(0.0);
+}
+"""
+_COMPOSITE_FRAGMENT = """
+vec3 linear(vec3 code)
+{
+  return mix(pow((code + 0.055) / 1.055, vec3(2.4)), code / 12.92, lessThanEqual(code, vec3(0.04045)));
+}
+
+// What a pixel would show without the overlay that covers part of it: what pixels nearby do that have none.
+vec3 without(ivec2 pixel, vec3 otherwise)
+{
+  ivec2 size = textureSize(overlay, 0);
+  for (int away = 2; away <= 8; away *= 2) {
+    for (int i = 0; i < 9; i++) {
+      ivec2 nearby = clamp(pixel + away * ivec2(i % 3 - 1, i / 3 - 1), ivec2(0), size - 1);
+      vec4 there = texelFetch(overlay, nearby, 0);
+      if (there.a == 0.0) {
+        return linear(there.rgb);
+      }
+    }
+  }
+  return otherwise;
+}
+
+// Blender's buffer is linear with a gamma of 2.2, and so is how it lies over the scene; splats lie over it as
+// displayed, d = s + (1 - a) b. What is written does so over black (b = 0) and, in the mean of the channels,
+// over white (b = 1). Overlays are in the buffer already, and so is the background, which has alpha 0: it is
+// faded by the blending, which would fade thin overlays with it, so that those are added again.
+void main()
+{
+  vec4 splats = texture(colors, at);
+  vec3 black = pow(clamp(splats.rgb, 0.0, 1.0), vec3(2.2));
+  vec3 white = pow(clamp(splats.rgb + 1.0 - splats.a, 0.0, 1.0), vec3(2.2));
+  float alpha = 1.0 - dot(white - black, vec3(1.0 / 3.0));
+
+  ivec2 pixel = ivec2(at * vec2(textureSize(overlay, 0)));
+  vec4 there = texelFetch(overlay, pixel, 0);
+  float room = 1.0 - there.a;
+  vec3 again = vec3(0.0);
+  if (there.a > 0.0 && there.a < 1.0) {
+    again = linear(there.rgb);
+    again -= without(pixel, again);
+  }
+  drawn = room * vec4(black + alpha * again, alpha);
+}
+"""
+
+
+@dataclass
+class Uploaded:
+    """Splats on the graphics card, and of them in memory what arranging needs.
+
+    Attributes:
+        pool: see there.
+        starts, counts: where each point cloud's splats begin, and how many they are, in the order given.
+        textures: by the shader's names.
+        degree: of the harmonics, up to 3.
+        total: how many splats.
+    """
+
+    pool: Pool
+    starts: list[int]
+    counts: list[int]
+    textures: dict[str, gpu.types.GPUTexture]
+    degree: int
+    total: int
+
+
+def upload(clouds: Sequence[bpy.types.PointCloud]) -> Uploaded:
+    """Brings the splats of point clouds to the graphics card, as they are, one cloud after the other."""
+    counts = [len(cloud.points) for cloud in clouds]
+    starts = [sum(counts[:i]) for i in range(len(counts))]
+    total = max(sum(counts), 1)
+    most = gpu.capabilities.max_texture_size_get() * WIDTH
+    higher = max((_higher(cloud) for cloud in clouds), default=0)
+    while 3 * higher * total > 4 * most:  # rather fewer harmonics than no splats
+        higher = {15: 8, 8: 3}.get(higher, 0)
+
+    buffers = {name: _Texels(total) for name in ("means", "quats", "scales", "bases")}
+    stream = _Texels(3 * higher * total // 4 + 2)
+    coefficients = stream.floats[: 3 * higher * total].reshape(higher, total, 3)
+    bias = np.zeros(total, np.float32)
+    for cloud, start, count in zip(clouds, starts, counts, strict=True):
+        part = slice(start, start + count)
+        if not count:
+            continue
+        for name, attribute in (("quats", objects.ROTATION), ("bases", objects.BASE)):
+            _read(cloud, attribute, buffers[name].rows[part])
+        for name, attribute in (("means", "position"), ("scales", objects.SCALE)):
+            buffers[name].rows[part, :3] = objects.read_attribute(cloud, attribute)
+        for k in range(min(higher, _higher(cloud))):
+            _read(cloud, objects.SH.format(k + 1), coefficients[k, part])
+        if (column := objects.read_attribute(cloud, BIAS)) is not None:
+            bias[part] = column
+    buffers["means"].rows[:total, 3] = 1
+    pool = Pool(
+        buffers["means"].rows[:total], buffers["scales"].rows[:total], buffers["bases"].rows[:total, 3], bias
+    )
+    textures = {name: texels.texture() for name, texels in (buffers | {"higher": stream}).items()}
+    return Uploaded(pool, starts, counts, textures, round((higher + 1) ** 0.5) - 1, total)
+
+
+def _higher(cloud: bpy.types.PointCloud) -> int:
+    """How many coefficients beyond the first a cloud has, of whole degrees up to 3."""
+    count = 0
+    while count < MOST_COEFFICIENTS and objects.SH.format(count + 1) in cloud.attributes:
+        count += 1
+    return int((count + 1) ** 0.5) ** 2 - 1
+
+
+def _read(cloud: bpy.types.PointCloud, name: str, into: np.ndarray) -> None:
+    """An attribute, straight into contiguous memory."""
+    attribute = cloud.attributes[name]
+    attribute.data.foreach_get(objects.LAYOUTS[attribute.data_type].key, into.reshape(-1))
+
+
+class _Texels:
+    """Memory that numpy fills and a texture is made of, four floats a texel, of at least ``count`` texels.
+
+    Attributes:
+        floats: (rows * WIDTH * 4,) float32.
+        rows: the same as (rows * WIDTH, 4).
+    """
+
+    def __init__(self, count: int) -> None:
+        self.height = -(-count // WIDTH)
+        self.buffer = gpu.types.Buffer("FLOAT", self.height * WIDTH * 4)
+        self.floats = np.frombuffer(self.buffer, np.float32)  # type: ignore[arg-type]
+        self.rows = self.floats.reshape(-1, 4)
+
+    def texture(self) -> gpu.types.GPUTexture:
+        return gpu.types.GPUTexture((WIDTH, self.height), format="RGBA32F", data=self.buffer)
+
+
+def instances_texture(arrangement: Arrangement) -> gpu.types.GPUTexture:
+    """An arrangement's list on the graphics card."""
+    height = len(arrangement.instances) // WIDTH
+    data = gpu.types.Buffer("FLOAT", arrangement.instances.size, arrangement.instances.reshape(-1))
+    return gpu.types.GPUTexture((WIDTH, height), format="RGBA32F", data=data)
+
+
+class Canvas:
+    """The framebuffer that splats are blended in; one for each viewport, made anew for another size.
+
+    It is no ``GPUOffScreen``: making one leaves the framebuffer that is being drawn into unbound.
+    """
+
+    def __init__(self) -> None:
+        self.size = (0, 0)
+        self.colors: gpu.types.GPUTexture | None = None
+        self.frame: gpu.types.GPUFrameBuffer | None = None
+
+    def resize(self, size: tuple[int, int]) -> None:
+        """Makes it (width, height) large."""
+        if size != self.size:
+            self.size, self.colors = size, gpu.types.GPUTexture(size, format="RGBA16F")
+            self._depth = gpu.types.GPUTexture(size, format="DEPTH_COMPONENT32F")
+            self.frame = gpu.types.GPUFrameBuffer(depth_slot=self._depth, color_slots=self.colors)
+
+
+def draw(
+    uploaded: Uploaded,
+    instances: gpu.types.GPUTexture,
+    count: int,
+    worlds: Sequence[np.ndarray],
+    view: Matrix,
+    projection: Matrix,
+    canvas: Canvas,
+    *,
+    resolution: float = 1.0,
+    under_overlays: bool = True,
+) -> None:
+    """Draws splats into the active framebuffer, tested against its depth.
+
+    Args:
+        instances, count: the arrangement's.
+        worlds: each placement's ``matrix_world``, (4, 4) float64.
+        view, projection: from the world to the camera's space, and on to clip space.
+        resolution: of the splats, over that of the framebuffer.
+        under_overlays: leave what the framebuffer shows already on top, where it has alpha; it is coded in
+            sRGB, as a viewport's is.
+    """
+    frame = gpu.state.active_framebuffer_get()
+    _, _, width, height = gpu.state.viewport_get()
+    depth = gpu.types.GPUTexture((width, height), format="R32F", data=frame.read_depth(0, 0, width, height))
+    overlay = _once("nothing", _nothing)
+    if under_overlays:
+        overlay = gpu.types.GPUTexture(
+            (width, height), format="RGBA8", data=frame.read_color(0, 0, width, height, 4, 0, "FLOAT")
+        )
+    placements = _placements(worlds, view, projection)  # a texture is freed with its last name
+    size = max(1, round(width * resolution)), max(1, round(height * resolution))
+    canvas.resize(size)
+    with canvas.frame.bind():  # type: ignore[union-attr]
+        canvas.frame.clear(color=(0, 0, 0, 0), depth=1.0)
+        gpu.state.color_mask_set(False, False, False, False)
+        gpu.state.depth_test_set("ALWAYS")
+        gpu.state.depth_mask_set(True)
+        shader, quad = _program("depth")
+        shader.bind()
+        shader.uniform_sampler("depth", depth)
+        quad.draw(shader)
+        gpu.state.color_mask_set(True, True, True, True)
+        gpu.state.depth_test_set("LESS_EQUAL")
+        gpu.state.depth_mask_set(False)
+        gpu.state.blend_set("ALPHA_PREMULT")
+        shader, quad = _program("splats")
+        shader.bind()
+        for name, texture in uploaded.textures.items():
+            shader.uniform_sampler(name, texture)
+        shader.uniform_sampler("instances", instances)
+        shader.uniform_sampler("placements", placements)
+        shader.uniform_sampler("palette", _palette())
+        shader.uniform_float("projection", projection)
+        shader.uniform_float("size", size)
+        shader.uniform_int("degree", uploaded.degree)
+        shader.uniform_int("total", uploaded.total)
+        quad.draw_instanced(shader, instance_count=count)
+
+    gpu.state.depth_test_set("NONE")
+    gpu.state.blend_set("ALPHA_PREMULT")
+    shader, quad = _program("composite")
+    shader.bind()
+    shader.uniform_sampler("colors", canvas.colors)
+    shader.uniform_sampler("overlay", overlay)
+    quad.draw(shader)
+    gpu.state.blend_set("NONE")
+
+
+def _placements(worlds: Sequence[np.ndarray], view: Matrix, projection: Matrix) -> gpu.types.GPUTexture:
+    """Four texels a placement: three rows that take its splats to the camera's space, and the eye in its own.
+
+    The eye's fourth number is 1; without perspective it is 0, and the rest the direction against the view.
+    """
+    view_matrix = np.array(view, np.float64)
+    perspective = projection[3][3] == 0
+    back = np.linalg.inv(view_matrix)
+    eye = back[:, 3] if perspective else back[:, 2]
+    data = np.zeros((-(-4 * len(worlds) // WIDTH) * WIDTH, 4), np.float32)
+    for number, world in enumerate(worlds):
+        rows = data[4 * number : 4 * number + 4]
+        rows[:3] = (view_matrix @ world)[:3]
+        rows[3, :3] = (np.linalg.pinv(world) @ eye)[:3]
+        rows[3, 3] = perspective
+    buffer = gpu.types.Buffer("FLOAT", data.size, data.reshape(-1))
+    return gpu.types.GPUTexture((WIDTH, len(data) // WIDTH), format="RGBA32F", data=buffer)
+
+
+_kept: dict[str, Any] = {}
+"""Shaders with their quads, and textures that never change, by name; made when they are first needed."""
+
+
+def forget() -> None:
+    """Frees what is kept between drawings."""
+    _kept.clear()
+
+
+def _once(name: str, make: Callable):
+    if name not in _kept:
+        _kept[name] = make()
+    return _kept[name]
+
+
+def _palette() -> gpu.types.GPUTexture:
+    def make() -> gpu.types.GPUTexture:
+        colors = np.ones((len(LEVEL_COLORS), 4), np.float32)
+        colors[:, :3] = LEVEL_COLORS
+        data = gpu.types.Buffer("FLOAT", colors.size, colors.reshape(-1))
+        return gpu.types.GPUTexture((len(LEVEL_COLORS), 1), format="RGBA32F", data=data)
+
+    return _once("palette", make)
+
+
+def _nothing() -> gpu.types.GPUTexture:
+    return gpu.types.GPUTexture((1, 1), format="RGBA8", data=gpu.types.Buffer("FLOAT", 4, [0.0] * 4))
+
+
+def _program(name: str) -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
+    return _once(name, lambda: (_SHADERS[name](), _quad()))
+
+
+def _quad() -> gpu.types.GPUBatch:
+    layout = gpu.types.GPUVertFormat()
+    layout.attr_add(id="corner", comp_type="F32", len=2, fetch_mode="FLOAT")
+    vertices = gpu.types.GPUVertBuf(layout, 4)
+    vertices.attr_fill("corner", np.float32([(-1, -1), (1, -1), (-1, 1), (1, 1)]))
+    return gpu.types.GPUBatch(type="TRI_STRIP", buf=vertices)
+
+
+def _splat_shader() -> gpu.types.GPUShader:
+    info, between = _shader("splats")
+    between.smooth("VEC2", "place")
+    between.flat("VEC4", "color_opacity")
+    names = ("instances", "placements", "means", "quats", "scales", "bases", "higher", "palette")
+    for slot, name in enumerate(names):
+        info.sampler(slot, "FLOAT_2D", name)
+    info.define("WIDTH", str(WIDTH))
+    info.define("PALETTE", str(len(LEVEL_COLORS)))
+    info.push_constant("MAT4", "projection")
+    info.push_constant("VEC2", "size")
+    info.push_constant("INT", "degree")
+    info.push_constant("INT", "total")
+    return _made(info, between, _VERTEX, _FRAGMENT)
+
+
+def _depth_shader() -> gpu.types.GPUShader:
+    info, between = _shader("depth")
+    between.smooth("VEC2", "at")
+    info.sampler(0, "FLOAT_2D", "depth")
+    info.depth_write("ANY")
+    return _made(info, between, _SCREEN_VERTEX, _DEPTH_FRAGMENT)
+
+
+def _composite_shader() -> gpu.types.GPUShader:
+    info, between = _shader("composite")
+    between.smooth("VEC2", "at")
+    info.sampler(0, "FLOAT_2D", "colors")
+    info.sampler(1, "FLOAT_2D", "overlay")
+    return _made(info, between, _SCREEN_VERTEX, _COMPOSITE_FRAGMENT)
+
+
+_SHADERS = {"splats": _splat_shader, "depth": _depth_shader, "composite": _composite_shader}
+
+
+def _shader(name: str) -> tuple[gpu.types.GPUShaderCreateInfo, gpu.types.GPUStageInterfaceInfo]:
+    info = gpu.types.GPUShaderCreateInfo()
+    info.vertex_in(0, "VEC2", "corner")
+    info.fragment_out(0, "VEC4", "drawn")
+    return info, gpu.types.GPUStageInterfaceInfo(f"lodgs_{name}")
+
+
+def _made(info, between, vertex: str, fragment: str) -> gpu.types.GPUShader:
+    info.vertex_out(between)
+    info.vertex_source(vertex)
+    info.fragment_source(fragment)
+    return gpu.shader.create_from_info(info)
