@@ -8,7 +8,7 @@ import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ...training.scenes.cameras import write_camera
-from .. import compositing, engine, scenes, views
+from .. import compositing, engine, quick, scenes, views
 from .reporting import saying_errors
 
 
@@ -35,6 +35,27 @@ class LODGS_OT_combine_with_meshes(bpy.types.Operator):
     def execute(self, context):
         meshes = compositing.combine_with_meshes(context.scene)
         self.report({"INFO"}, f"The meshes are rendered by the scene '{meshes.name}'")
+        return {"FINISHED"}
+
+
+class LODGS_OT_render_quick(bpy.types.Operator):
+    """Draw what the camera sees as the viewport does, on the graphics card: quick, and without a trainer"""
+
+    bl_idname = "lodgs.render_quick"
+    bl_label = "Viewport Quality"
+
+    animation: bpy.props.BoolProperty(
+        name="Animation", description="Draw and save every frame of the range", options={"SKIP_SAVE"}
+    )
+
+    @saying_errors
+    def execute(self, context):
+        if self.animation:
+            count = quick.render_animation(context)
+            self.report({"INFO"}, f"{count} frames saved")
+        else:
+            image = quick.render(context)
+            self.report({"INFO"}, f"Drawn into the image '{image.name}'; the Image Editor shows it")
         return {"FINISHED"}
 
 
@@ -70,4 +91,9 @@ class LODGS_OT_export_camera(bpy.types.Operator, ExportHelper):
         return {"FINISHED"}
 
 
-CLASSES = (LODGS_OT_use_engine, LODGS_OT_combine_with_meshes, LODGS_OT_export_camera)
+CLASSES = (
+    LODGS_OT_use_engine,
+    LODGS_OT_combine_with_meshes,
+    LODGS_OT_render_quick,
+    LODGS_OT_export_camera,
+)

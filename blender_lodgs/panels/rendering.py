@@ -32,6 +32,9 @@ class LODGS_PT_rendering(bpy.types.Panel):
             return
         _draw_film(layout, scene)
         _draw_passes(layout, scene, context.view_layer)
+        row = layout.row(align=True)
+        row.operator("lodgs.render_quick", icon="RENDER_STILL").animation = False
+        row.operator("lodgs.render_quick", icon="RENDER_ANIMATION", text="").animation = True
         column = layout.column(align=True)
         column.operator("lodgs.combine_with_meshes", icon="NODE_COMPOSITING")
         column.operator("lodgs.export_camera", icon="CAMERA_DATA", text="Export Camera…")
@@ -79,6 +82,7 @@ def _draw_film(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
         environment.trainer_python()
     except LodgsError as error:
         draw_environment(layout, error.what)
+        say(layout, "Or draw with the graphics card, as the viewport does:", "INFO")
 
 
 def _draw_passes(layout: bpy.types.UILayout, scene: bpy.types.Scene, layer: bpy.types.ViewLayer) -> None:

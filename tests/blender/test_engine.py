@@ -416,3 +416,22 @@ def test_an_artists_compositor_is_left_alone(bpy, lodgs, scene):
     with pytest.raises(RuntimeError, match="has compositor nodes already"):
         bpy.ops.lodgs.combine_with_meshes()
     assert len(bpy.data.scenes) == 1
+
+
+@pytest.mark.parametrize("transparent", [False, True])
+def test_viewport_quality_is_nearly_the_same(bpy, lodgs, scene, tmp_path, frame, transparent):
+    """``frame`` skips where there are no graphics in background."""
+    scene.render.resolution_percentage = 50
+    scene.render.film_transparent = transparent
+    scene.render.image_settings.color_mode = "RGBA"
+    shown = f12(bpy, tmp_path)
+    scene.frame_end = 2
+    scene.render.filepath = str(tmp_path / "quick_")
+    assert bpy.ops.lodgs.render_quick(animation=True) == {"FINISHED"}
+    files = sorted(tmp_path.glob("quick_*.png"))
+    assert len(files) == 2
+    quick = pixels(bpy, files[1])
+    seen = shown[..., 3:] > 0
+    error = (((quick - shown)[..., :3] * seen).astype(float) ** 2).mean()
+    assert -10 * np.log10(error) > 35
+    np.testing.assert_allclose(quick[..., 3], shown[..., 3], atol=0.03)

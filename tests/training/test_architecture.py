@@ -15,6 +15,7 @@ FOR_BLENDER = [
     "training.lod.rules",
     "training.methods",
     "training.methods.parameters",
+    "training.render.picture",
     "training.render.wire",
     "training.runs.folder",
     "training.runs.job",
