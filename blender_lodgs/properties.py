@@ -381,7 +381,7 @@ class SplatScene(bpy.types.PropertyGroup):
             ),
             (
                 "BANDS",
-                "Distances",
+                "Bands",
                 "Which level is wanted at which distance from the eye, in the same colours",
             ),
         ],

@@ -25,7 +25,8 @@ class LODGS_PT_viewport(bpy.types.Panel):
         column = layout.column()
         column.use_property_split = True
         column.use_property_decorate = False
-        _toggles(column, context)
+        if not compat.NATIVE_SPLATS:
+            column.prop(settings, "splats")
         if settings.splats and not compat.NATIVE_SPLATS:
             column.prop(settings, "budget")
             column.prop(settings, "moving", slider=True)
@@ -36,19 +37,18 @@ class LODGS_PT_viewport(bpy.types.Panel):
             layout.label(text=f"{left_out:,} splats left out to stay within that", icon="INFO")
 
 
-def _toggles(column: bpy.types.UILayout, context: bpy.types.Context) -> None:
+def _overlays(self, context):
+    if not scenes.roots(context.scene):
+        return
+    self.layout.label(text="LODGS")
+    row = self.layout.row()
     if not compat.NATIVE_SPLATS:
-        column.prop(context.scene.lodgs_viewport, "splats")
+        row.prop(context.scene.lodgs_viewport, "splats")
     root = scenes.active_root(context)
     if root is not None and root.lodgs.cameras is not None:
-        column.prop(root.lodgs.cameras, "hide_viewport", text="Training Cameras", invert_checkbox=True)
-
-
-def _overlays(self, context):
-    if scenes.roots(context.scene):
-        column = self.layout.column()
-        column.label(text="LODGS")
-        _toggles(column, context)
+        row.prop(
+            root.lodgs.cameras, "hide_viewport", text="Training Cameras", toggle=True, invert_checkbox=True
+        )
 
 
 CLASSES = (LODGS_PT_viewport,)

@@ -75,15 +75,15 @@ void main()
   color_opacity = vec4(0.0);
 
   vec4 instance = texel(instances, gl_InstanceID);  // splat, weight, placement, told level
-  int splat = int(instance.x), set = int(instance.z) * 4;
+  int splat = int(instance.x), row = int(instance.z) * 4;
   vec4 base = texel(bases, splat);
   float opacity = base.w * instance.y;
   if (opacity <= 1.0 / 255.0) {
     return;
   }
   vec4 mean = vec4(texel(means, splat).xyz, 1.0);
-  vec4 to_view_x = texel(placements, set), to_view_y = texel(placements, set + 1);
-  vec4 to_view_z = texel(placements, set + 2), eye = texel(placements, set + 3);
+  vec4 to_view_x = texel(placements, row), to_view_y = texel(placements, row + 1);
+  vec4 to_view_z = texel(placements, row + 2), eye = texel(placements, row + 3);
   vec3 position = vec3(dot(to_view_x, mean), dot(to_view_y, mean), dot(to_view_z, mean));
   vec4 clip = projection * vec4(position, 1.0);
   if (clip.w <= 0.0 || abs(clip.z) >= clip.w) {
@@ -154,7 +154,7 @@ void main()
 _COMPOSITE_FRAGMENT = """
 vec3 linear(vec3 code)
 {
-  return mix(pow((code + 0.055) / 1.055, vec3(2.4)), code / 12.92, lessThanEqual(code, vec3(0.04045)));
+  return mix(pow((code + 0.055) / 1.055, vec3(2.4)), code / 12.92, step(code, vec3(0.04045)));
 }
 
 // What a pixel would show without the overlay that covers part of it: what pixels nearby do that have none.

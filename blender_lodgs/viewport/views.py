@@ -248,8 +248,7 @@ def _wake() -> float | None:
                 still = view.resolution < 1 and now - view.moved >= STILL
                 if still or (view.asked is not None and view.asked[2].done()):
                     region.tag_redraw()
-                elif view.asked is not None or view.resolution < 1:
-                    waiting = True
+                waiting |= view.asked is not None or view.resolution < 1
     return 0.01 if waiting else None
 
 
