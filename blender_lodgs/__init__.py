@@ -7,9 +7,33 @@ unregistered in reverse.
 
 import bpy
 
-from . import commands, jobs, operators, panels, preferences, properties, scenes, viewport
+from . import (
+    commands,
+    compare,
+    engine,
+    jobs,
+    operators,
+    panels,
+    preferences,
+    properties,
+    renderer,
+    scenes,
+    viewport,
+)
 
-MODULES = (properties, preferences, operators, panels, scenes, viewport, jobs, commands)
+MODULES = (
+    properties,
+    preferences,
+    operators,
+    panels,
+    scenes,
+    viewport,
+    renderer,
+    engine,
+    compare,
+    jobs,
+    commands,
+)
 
 
 def register() -> None:

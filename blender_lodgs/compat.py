@@ -89,3 +89,36 @@ def set_input(modifier: bpy.types.NodesModifier, name: str, value) -> None:
     else:
         modifier[identifier] = value
     modifier.id_data.update_tag()
+
+
+COMPOSITOR_START = (
+    "CompositorNodeRLayers", "CompositorNodeComposite", "CompositorNodeViewer", "NodeGroupOutput",
+    "NodeReroute",
+)  # fmt: skip
+"""Nodes of a compositor tree that nobody has worked on."""
+
+
+def compositor_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
+    """The scene's compositor tree, made where there is none, and in use."""
+    if hasattr(scene, "compositing_node_group"):
+        if scene.compositing_node_group is None:
+            scene.compositing_node_group = bpy.data.node_groups.new(scene.name, "CompositorNodeTree")
+        tree = scene.compositing_node_group
+    else:
+        scene.use_nodes = True
+        tree = scene.node_tree
+    assert tree is not None
+    scene.render.use_compositing = True
+    return tree
+
+
+def compositor_output(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket:
+    """The socket that takes the finished picture, of a node made for it."""
+    if hasattr(bpy.types, "CompositorNodeComposite"):
+        output = tree.nodes.new("CompositorNodeComposite")
+    else:
+        if not any(item.in_out == "OUTPUT" for item in tree.interface.items_tree):
+            tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+        output = tree.nodes.new("NodeGroupOutput")
+    output.location = (600, 0)
+    return output.inputs[0]

@@ -62,7 +62,8 @@ def trainer_python() -> Path:
     if (made_folder() / _READY).exists():
         return _python_of(made_folder())
     raise LodgsError(
-        "Training needs a Python with PyTorch, and none is set up.", "Make an environment in the preferences."
+        "Training and rendering need a Python with PyTorch, and none is set up.",
+        "Make an environment in the preferences.",
     )
 
 

@@ -121,26 +121,39 @@ def read_splats(thing: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None =
     cloud = thing.evaluated_get(depsgraph).data if depsgraph else types
     if depsgraph and not len(cloud.points):  # Blender drops the attributes with the last point
         return read_splats(thing).select(slice(0))
-    means, base = read_attribute(cloud, "position"), read_attribute(cloud, BASE)
-    scale, rotation = read_attribute(cloud, SCALE), read_attribute(cloud, ROTATION)
-    if means is None or base is None or scale is None or rotation is None:
+    splats = splats_of(cloud, read_attribute(cloud, WEIGHT))
+    if splats is None:
         raise LodgsError(f"{thing.name} carries no splats.", "Undo what took its attributes away.")
-
-    if (weight := read_attribute(cloud, WEIGHT)) is not None:
-        base[:, 3] *= weight
-    coefficients = [base[:, :3]]
-    while (vector := read_attribute(cloud, SH.format(len(coefficients)))) is not None:
-        coefficients.append(vector)
-    whole = int(np.sqrt(len(coefficients))) ** 2  # a band that has lost a coefficient is left out
-
-    known = {SH.format(k) for k in range(1, len(coefficients))} | _OWN
-    extras = {
+    known = {a.name for a in cloud.attributes if a.name.startswith("radiance:")} | _OWN
+    splats.extras |= {
         a.name.removeprefix(_EXTRA): column
         for a in cloud.attributes
         if a.name not in known
         and a.name[0] != "."
         and (column := _read_column(cloud, a.name, types)) is not None
     }
+    return splats
+
+
+def splats_of(cloud: bpy.types.PointCloud, weights: np.ndarray | None = None) -> Splats | None:
+    """The splats of a point cloud in the form that files have, without further columns.
+
+    Args:
+        weights: (N,) factors on the opacities; None leaves them as they are.
+
+    Returns:
+        None where the cloud lacks an attribute of splats.
+    """
+    means, base = read_attribute(cloud, "position"), read_attribute(cloud, BASE)
+    scale, rotation = read_attribute(cloud, SCALE), read_attribute(cloud, ROTATION)
+    if means is None or base is None or scale is None or rotation is None:
+        return None
+    if weights is not None:
+        base[:, 3] *= weights
+    coefficients = [base[:, :3]]
+    while (vector := read_attribute(cloud, SH.format(len(coefficients)))) is not None:
+        coefficients.append(vector)
+    whole = int(np.sqrt(len(coefficients))) ** 2  # a band that has lost a coefficient is left out
     tiny = np.float32(1e-30)
     opacity = np.clip(base[:, 3], np.float32(1e-6), np.float32(1 - 1e-6))
     return Splats(
@@ -149,7 +162,6 @@ def read_splats(thing: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None =
         log_scales=_kept(cloud, LOG_SCALE, np.exp, scale, np.log(np.maximum(scale, tiny))),
         opacity_logits=_kept(cloud, OPACITY_LOGIT, _sigmoid, base[:, 3], np.log(opacity / (1 - opacity))),
         sh=np.stack(coefficients[:whole], axis=1),
-        extras=extras,
     )
 
 

@@ -55,6 +55,35 @@ def spawn(command: list[str], log: Path, output: Path) -> subprocess.Popen:
         )
 
 
+def converse(command: list[str], log: Path) -> subprocess.Popen[str]:
+    """Start a program that ends with Blender, in the extension's folder, and speak with it line by line.
+
+    It must end when its standard input does: that happens however Blender ends.
+
+    Args:
+        command: program and arguments.
+        log: file to which its standard error is appended.
+
+    Raises:
+        OSError: the program or the file cannot be opened.
+    """
+    apart: dict[str, Any] = {"start_new_session": True}  # Ctrl-C is for Blender, which may cancel politely
+    if sys.platform == "win32":
+        apart = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
+    with open(log, "ab") as errors:
+        return subprocess.Popen(
+            command,
+            cwd=extension.FOLDER,
+            env=environment(),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+            encoding="utf-8",
+            **apart,
+        )
+
+
 def follow(step: Callable[[], bool]) -> None:
     """Call ``step`` about ten times a second until it returns False.
 

@@ -103,6 +103,20 @@ def _changed(self, context) -> None:
     self.id_data.update_tag()
 
 
+def _redraw(self, context) -> None:
+    from . import processes
+
+    processes.redraw()
+
+
+def _view_chosen(self, context) -> None:
+    from . import scenes
+
+    things = self.cameras.objects if self.cameras else ()
+    if self.active_view < len(things) and things[self.active_view].type == "CAMERA":
+        scenes.through(context, things[self.active_view])
+
+
 def _finest(self) -> int:
     """The finest level that there is; without levels there is no limit yet."""
     return max((item.number for item in self.levels), default=2**31 - 1)
@@ -228,6 +242,9 @@ class SplatScene(bpy.types.PropertyGroup):
     )
     cameras: bpy.props.PointerProperty(
         name="Cameras", description="The cameras of the COLMAP scene", type=bpy.types.Collection
+    )
+    active_view: bpy.props.IntProperty(
+        name="Chosen View", description="Line of the list of views", options=set(), update=_view_chosen
     )
     levels: bpy.props.CollectionProperty(type=SplatLevel)
     active_level: bpy.props.IntProperty(
@@ -418,20 +435,90 @@ class View(bpy.types.PropertyGroup):
     height: bpy.props.IntProperty(name="Height", description="Height of the photograph", subtype="PIXEL")
     fx: bpy.props.FloatProperty(name="Focal Length X", description="In pixels", subtype="PIXEL")
     fy: bpy.props.FloatProperty(name="Focal Length Y", description="In pixels", subtype="PIXEL")
+    photograph: bpy.props.StringProperty(
+        name="Photograph", description="File of the photograph", subtype="FILE_PATH"
+    )
+    distorted: bpy.props.BoolProperty(
+        name="Distorted", description="The lens bends lines in the photograph, which the camera does not show"
+    )
+    psnr: bpy.props.FloatProperty(
+        name="PSNR",
+        description="How alike the splats and the photograph were when last measured, in dB; 0 before",
+    )
 
 
-CLASSES = (View, ViewportSettings, TrainingSettings, SplatLevel, SplatScene)
+def _ellipsoids_changed(self, context) -> None:
+    from . import scenes
+
+    if self.ellipsoids:
+        scenes.offer_ellipsoids(self.id_data)
+    _changed(self, context)
+
+
+class RenderSettings(bpy.types.PropertyGroup):
+    """How the engine LODGS renders a Blender scene (``Scene.lodgs_render``)."""
+
+    background: bpy.props.FloatVectorProperty(
+        name="Background",
+        description="Colour behind the splats, as the display shows it. Splats of photographs are trained "
+        "over black",
+        size=3,
+        min=0.0,
+        max=1.0,
+        subtype="COLOR_GAMMA",
+    )
+    use_pass_levels: bpy.props.BoolProperty(
+        name="Levels",
+        description="Passes that tell which level each pixel shows, and how much of it every level fills",
+    )
+    ellipsoids: bpy.props.BoolProperty(
+        name="Splats as Ellipsoids",
+        description="Let Cycles and EEVEE render splats as ellipsoids that fade outwards, for shadows and "
+        "reflections. Fine up to some hundred thousand splats",
+        update=_ellipsoids_changed,
+    )
+    draws_ellipsoids: bpy.props.BoolProperty(
+        description="Whether renders of this scene show ellipsoids: LODGS draws true splats instead",
+        get=lambda self: self.ellipsoids and self.id_data.render.engine != "LODGS",
+        options={"HIDDEN"},
+    )
+    show_comparison: bpy.props.BoolProperty(
+        name="Wipe",
+        description="Show the photograph over the rendered picture of the view that was compared",
+        update=_redraw,
+        options=set(),
+    )
+    wipe: bpy.props.FloatProperty(
+        name="Photograph",
+        description="How much of the width shows the photograph, from the left; the rest is rendered",
+        default=0.5,
+        min=0.0,
+        max=1.0,
+        subtype="FACTOR",
+        update=_redraw,
+        options=set(),
+    )
+    meshes: bpy.props.PointerProperty(
+        name="Meshes",
+        description="Scene that renders the meshes, joined with the splats by depth in the compositor",
+        type=bpy.types.Scene,
+    )
+
+
+CLASSES = (View, ViewportSettings, TrainingSettings, SplatLevel, SplatScene, RenderSettings)
 
 
 def register() -> None:
     """Attach the groups to Blender's objects, cameras and scenes."""
     bpy.types.Object.lodgs = bpy.props.PointerProperty(type=SplatScene)
     bpy.types.Camera.lodgs = bpy.props.PointerProperty(type=View)
+    bpy.types.Scene.lodgs_render = bpy.props.PointerProperty(type=RenderSettings)
     bpy.types.Scene.lodgs_viewport = bpy.props.PointerProperty(type=ViewportSettings)
 
 
 def unregister() -> None:
     """Detach them again."""
+    del bpy.types.Scene.lodgs_render
     del bpy.types.Scene.lodgs_viewport
     del bpy.types.Camera.lodgs
     del bpy.types.Object.lodgs

@@ -25,6 +25,7 @@ from ..training.scenes.orientation import up_rotation
 from ..training.splats.bundle import Bundle, Facts, Level, read_bundle, read_folder
 from ..training.splats.gaussians import Splats
 from . import objects, selection
+from .nodes import ellipsoids
 
 if TYPE_CHECKING:
     from .properties import View
@@ -104,6 +105,7 @@ def import_colmap(
         root.lodgs.cameras = cameras
         for camera in scene.cameras:
             thing = _new_camera(camera, extent, photographs)
+            thing.data.lodgs.distorted = camera.name in scene.distorted
             thing.parent = root
             cameras.objects.link(thing)
             if context.scene.camera is None:
@@ -269,6 +271,16 @@ def show_only(root: bpy.types.Object, number: int) -> None:
             item.show = True
 
 
+def offer_ellipsoids(scene: bpy.types.Scene) -> None:
+    """Gives every level of a scene's splats the modifier that makes ellipsoids where they are wanted."""
+    for root in roots(scene):
+        for item in root.lodgs.levels:
+            if item.exists:
+                ellipsoids.attach(item.object)
+    if hasattr(scene, "cycles"):
+        scene.cycles.transparent_max_bounces = max(scene.cycles.transparent_max_bounces, ellipsoids.BOUNCES)
+
+
 def views(root: bpy.types.Object) -> list[bpy.types.Object]:
     """The camera objects of a COLMAP scene that are still there, by name."""
     cameras = root.lodgs.cameras
@@ -296,11 +308,15 @@ def look_through(context: bpy.types.Context, root: bpy.types.Object, step: int =
     if step == 0 and context.active_object in there:
         current = context.active_object
     index = there.index(current) if current in there else min(-step, 0)
-    chosen = there[(index + step) % len(there)]
-    context.scene.camera = chosen
-    if chosen.data.lodgs.width:
-        match_render(context.scene, chosen.data.lodgs)
-    return chosen
+    return through(context, there[(index + step) % len(there)])
+
+
+def through(context: bpy.types.Context, view: bpy.types.Object) -> bpy.types.Object:
+    """Makes a view the scene's camera, and gives the render its size. Returns the view."""
+    context.scene.camera = view
+    if view.data.lodgs.width:
+        match_render(context.scene, view.data.lodgs)
+    return view
 
 
 def match_render(scene: bpy.types.Scene, camera: Camera | View) -> None:
@@ -372,6 +388,7 @@ def _new_camera(camera: Camera, extent: float, photograph: bool) -> bpy.types.Ob
     data.shift_y = (camera.cy - camera.height / 2) / long / (pixel if wide else 1)
     view = data.lodgs
     view.width, view.height, view.fx, view.fy = camera.width, camera.height, camera.fx, camera.fy
+    view.photograph = str(camera.image) if camera.image else ""
     data.display_size = extent / 20
     data.clip_start, data.clip_end = extent / 1000, extent * 1000
     if photograph and camera.image is not None:
@@ -426,6 +443,9 @@ def _levels_changed(root: bpy.types.Object) -> None:
         settings.single_level = min(settings.single_level, finest)
     settings.active_level = min(settings.active_level, len(settings.levels) - 1)
     selection.attach(root)
+    for scene in root.users_scene:
+        if scene.lodgs_render.ellipsoids:
+            offer_ellipsoids(scene)
 
 
 @bpy.app.handlers.persistent

@@ -20,21 +20,35 @@ def main(arguments: list[str] | None = None) -> int:
 
     evaluate = commands.add_parser("evaluate", help="measure a finished run on its held-out views")
     evaluate.add_argument("run", type=Path, help="run folder")
-    evaluate.add_argument(
-        "--gamma", type=float, default=1.0, help="screen size threshold in pixels (default 1)"
-    )
-    evaluate.add_argument(
-        "--from", type=int, default=0, dest="start", help="coarsest level of the selective view"
-    )
-    evaluate.add_argument("--to", type=int, default=0, dest="end", help="finest level of the selective view")
-    evaluate.add_argument(
-        "--offset", type=float, default=0.0, help="levels finer or coarser than the distance asks (Octree-GS)"
-    )
+    _add_detail(evaluate)
     evaluate.add_argument("--picture", type=Path, help="PNG to write: the levels side by side from one view")
-
     evaluate.add_argument(
         "--far", action="store_true", help="measure as well how levels do from 2, 4 and 8 times the distance"
     )
+
+    render = commands.add_parser("render", help="draw one view as a PNG, or an EXR with depth and levels")
+    render.add_argument("source", type=Path, help="bundle, folder of levels, any 3DGS PLY, or a run's folder")
+    eye = render.add_mutually_exclusive_group(required=True)
+    eye.add_argument("--camera", type=Path, help="JSON file of a camera, as Blender's LODGS tab writes it")
+    eye.add_argument("--view", metavar="IMAGE", help="name of a photograph that the splats were trained from")
+    render.add_argument("--scene", type=Path, help="COLMAP folder of the photographs, where no run knows it")
+    render.add_argument("--out", type=Path, required=True, help="picture to write: .png or .exr")
+    render.add_argument("--size", type=_size, metavar="WxH", help="pixels; otherwise the camera's own")
+    render.add_argument("--level", type=int, default=0, help="level to draw (otherwise the finest)")
+    by_distance = render.add_argument_group("levels by distance, where one of these is given")
+    _add_detail(by_distance, default=None)
+    render.add_argument(
+        "--background",
+        type=_colour,
+        default=(0.0, 0.0, 0.0),
+        metavar="COLOUR",
+        help="behind the splats: R,G,B from 0 to 1 as a display has them, or transparent (default black)",
+    )
+    render.add_argument("--backend", default="auto", help="auto, cpu, cuda or reference")
+
+    serve = commands.add_parser("serve", help="draw frame after frame for Blender")
+    serve.add_argument("folder", type=Path, help="folder for arrays; removed at the end")
+    serve.add_argument("--backend", default="auto", help="auto, cpu, cuda or reference")
 
     info = commands.add_parser("info", help="say what a bundle or any 3DGS PLY holds")
     info.add_argument("file", type=Path)
@@ -52,6 +66,45 @@ def main(arguments: list[str] | None = None) -> int:
     except LodgsError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+
+
+def _add_detail(parser, default: float | None = 0) -> None:
+    """Options of ``lod.selection.Detail``; those not given are the default."""
+    gamma = 1.0 if default is not None else None
+    parser.add_argument(
+        "--gamma", type=float, default=gamma, help="screen size threshold in pixels (default 1)"
+    )
+    parser.add_argument(
+        "--from", type=int, default=default, dest="start", help="coarsest level of the selective view"
+    )
+    parser.add_argument(
+        "--to", type=int, default=default, dest="end", help="finest level of the selective view"
+    )
+    parser.add_argument(
+        "--offset",
+        type=float,
+        default=default,
+        help="levels finer or coarser than the distance asks (Octree-GS)",
+    )
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise argparse.ArgumentTypeError(f"{text} is not WIDTHxHEIGHT, such as 640x480")
+    return int(width), int(height)
+
+
+def _colour(text: str) -> tuple[float, float, float] | None:
+    if text == "transparent":
+        return None
+    try:
+        red, green, blue = map(float, text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text} is not R,G,B, such as 0,0.5,1, nor transparent") from None
+    if not all(0 <= value <= 1 for value in (red, green, blue)):
+        raise argparse.ArgumentTypeError(f"{text} has a value that is not between 0 and 1")
+    return red, green, blue
 
 
 def _train(chosen: argparse.Namespace) -> int:
@@ -78,6 +131,31 @@ def _evaluate(chosen: argparse.Namespace) -> int:
     detail = Detail(chosen.gamma, chosen.start, chosen.end, chosen.offset)
     print(table(evaluate_run(chosen.run, detail, chosen.picture, chosen.far)))
     return 0
+
+
+def _render(chosen: argparse.Namespace) -> int:
+    from .lod.selection import Detail
+    from .render.command import Source, read_camera, render
+
+    asked = {name: getattr(chosen, name) for name in ("gamma", "start", "end", "offset")}
+    asked = {name: value for name, value in asked.items() if value is not None}
+    if asked and chosen.level:
+        raise LodgsError("--level draws one level, the other options levels by distance.", "Choose one.")
+    source = Source.read(chosen.source)
+    camera, near = read_camera(chosen.camera) if chosen.camera else source.view(chosen.view, chosen.scene)
+    if chosen.size:
+        camera = camera.resized(*chosen.size)
+    render(
+        source, camera, near, chosen.out, level=chosen.level, detail=Detail(**asked) if asked else None,
+        background=chosen.background, backend=chosen.backend,
+    )  # fmt: skip
+    return 0
+
+
+def _serve(chosen: argparse.Namespace) -> int:
+    from .render.serve import serve
+
+    return serve(chosen.folder, chosen.backend, sys.stdin, sys.stdout)
 
 
 def _info(chosen: argparse.Namespace) -> int:
@@ -118,7 +196,10 @@ def _numbers(version: str) -> list[int]:
     return [int(part) for part in version.split("+", maxsplit=1)[0].split(".")[:2] if part.isdigit()]
 
 
-_COMMANDS = {"train": _train, "evaluate": _evaluate, "info": _info, "check": _check}
+_COMMANDS = {
+    "train": _train, "evaluate": _evaluate, "render": _render, "serve": _serve, "info": _info,
+    "check": _check,
+}  # fmt: skip
 
 if __name__ == "__main__":
     code = main()

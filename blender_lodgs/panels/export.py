@@ -12,7 +12,7 @@ class LODGS_PT_export(bpy.types.Panel):
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = "LODGS"
-    bl_order = 5
+    bl_order = 7
 
     @classmethod
     def poll(cls, context):

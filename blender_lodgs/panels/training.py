@@ -90,12 +90,12 @@ def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
     try:
         environment.trainer_python()
     except LodgsError as error:
-        _draw_environment(layout, error.what)
+        draw_environment(layout, error.what)
         return
     layout.operator("lodgs.train", icon="PLAY")
 
 
-def _draw_environment(layout: bpy.types.UILayout, missing: str) -> None:
+def draw_environment(layout: bpy.types.UILayout, missing: str) -> None:
     """The way to a trainer, where there is none: what is missing, a button, and how far it is."""
     making = environment.making
     if making is not None and making.running:

@@ -95,6 +95,24 @@ def fake(tmp_path, monkeypatch):
     return lambda mode="": monkeypatch.setenv("LODGS_FAKE", mode)
 
 
+@pytest.fixture(scope="session")
+def _one_renderer(bpy):
+    """Starting the renderer takes seconds: all tests share one, though each has a new file."""
+    renderer = importlib.import_module(f"{EXTENSION}.blender_lodgs.renderer")
+    bpy.app.handlers.load_pre.remove(renderer._on_load)
+    yield renderer
+    renderer.close()
+    bpy.app.handlers.load_pre.append(renderer._on_load)
+
+
+@pytest.fixture
+def renderer(request):
+    """The module that keeps the real renderer; skipped where $LODGS_TRAINER_PYTHON names none."""
+    if not os.environ.get("LODGS_TRAINER_PYTHON"):
+        pytest.skip("no trainer; set LODGS_TRAINER_PYTHON")
+    return request.getfixturevalue("_one_renderer")
+
+
 def pytest_sessionfinish(session, exitstatus):
     global _exit_status
     _exit_status = int(exitstatus)

@@ -80,7 +80,7 @@ def test_without_a_trainer_one_sentence_and_one_button(root, draw, monkeypatch):
     monkeypatch.delenv("LODGS_TRAINER_PYTHON", raising=False)
     notes = draw()
     assert notes.operators == ["lodgs.make_environment"]
-    assert "Training needs a Python with PyTorch, and none is set up." in notes.texts
+    assert "Training and rendering need a Python with PyTorch, and none is set up." in notes.texts
 
 
 def test_making_the_environment_is_shown_where_it_is_missing(lodgs, root, draw, monkeypatch):

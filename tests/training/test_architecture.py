@@ -15,6 +15,8 @@ FOR_BLENDER = [
     "training.lod.rules",
     "training.methods",
     "training.methods.parameters",
+    "training.render.picture",
+    "training.render.wire",
     "training.runs.folder",
     "training.runs.job",
     "training.scenes.cameras",

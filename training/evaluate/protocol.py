@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -140,14 +139,7 @@ def evaluate_run(
     if not data.test:
         raise LodgsError(f"The run {run} holds out no views to measure on.", "Train with test_every = 8.")
     evaluation, bundle = Evaluation(data, job.backend), read_bundle(folder.bundle)
-    finest = len(bundle.levels)
-    end = detail.end or finest
-    detail = replace(detail, start=detail.start or max(1, end - 2), end=end)
-    if not 1 <= detail.start <= detail.end <= finest or detail.gamma <= 0:
-        raise LodgsError(
-            f"Levels {detail.start} to {detail.end} with gamma {detail.gamma:g} cannot be shown.",
-            f"Choose levels from 1 to {finest}, coarse to fine, and a gamma above 0.",
-        )
+    finest, detail = len(bundle.levels), detail.of(bundle)
     levels = []
     for level in bundle.levels:
         measured = evaluation.measure_set(complete(bundle, level))

@@ -25,14 +25,14 @@ from .sh import C0, degree_of
 
 __all__ = [
     "BACKENDS", "OUTPUTS", "Adam", "Contributions", "Rendering", "Target",
-    "contributions", "device_of", "photometric_loss", "rasterize", "render", "resolve", "warm_up",
+    "contributions", "device_of", "photometric_loss", "rasterize", "render", "resolve", "strips", "warm_up",
 ]  # fmt: skip
 
 BACKENDS = ("cpu", "cuda", "reference")
 """Backends by name; :func:`resolve` says which one ``auto`` is."""
 
 STRIP = 1 << 21
-"""Pixels that :func:`render` draws at a time: a Full HD frame at once, an 8k frame in sixteen strips."""
+"""Pixels that :func:`strips` draws at a time: a Full HD frame at once, an 8k frame in sixteen strips."""
 
 
 def rasterize(
@@ -50,6 +50,7 @@ def rasterize(
     near: float = 0.01,
     antialias: bool = False,
     outputs: Collection[str] = (),
+    features: torch.Tensor | None = None,
     backend: str = "auto",
 ) -> Rendering:
     """Draw splats as a camera sees them; differentiable by every tensor given.
@@ -74,38 +75,55 @@ def rasterize(
             splat gains in area back in opacity, sqrt(det before / det after) (Mip-Splatting, Yu et al. 2024,
             Eq. 10).
         outputs: of :data:`OUTPUTS`, what :class:`Rendering` shall have besides; differentiable, too.
+        features: (N, F) further values of each splat, blended as colours are over zero.
         backend: one of :data:`BACKENDS`, or "auto": cuda for tensors on a GPU, else cpu.
 
     Raises:
         ValueError: for tensors whose shapes do not belong together, or an output that does not exist.
         LodgsError: for a backend that does not exist, or does not work on this computer.
     """
+    return _draw(
+        means, quats, log_scales, opacity_logits, sh, View.of(camera, near), weights=weights,
+        background=background, sh_degree=sh_degree, min_scale=min_scale, antialias=antialias,
+        outputs=outputs, features=features, backend=backend,
+    )  # fmt: skip
+
+
+def _draw(
+    means, quats, log_scales, opacity_logits, sh, view: View, *,
+    weights, background, sh_degree, min_scale, antialias, outputs, features, backend,
+) -> Rendering:  # fmt: skip
+    """:func:`rasterize` of a view, which may be a strip of a camera's."""
     count = len(means)
     _check(means, quats, log_scales, opacity_logits, weights)
     sh = _coefficients(sh)
     degree = _degree(sh, count, sh_degree)
     if not set(outputs) <= set(OUTPUTS):
         raise ValueError(f"outputs can be {', '.join(OUTPUTS)}, not {', '.join(outputs)}")
+    if features is not None and (features.ndim != 2 or len(features) != count):
+        raise ValueError(f"features must have shape ({count}, F), not {tuple(features.shape)}")
     red, green, blue = (float(value) for value in background)
-    view = View.of(camera, near)
-    features = []
+    blended = [] if features is None else [features]
     if "depth" in outputs:
-        features.append(depths(means, view)[:, None])
+        blended.append(depths(means, view)[:, None])
     if "normals" in outputs:
-        features.append(normals(means, quats, log_scales, view))
+        blended.append(normals(means, quats, log_scales, view))
     drawn = _backend(backend, means).rasterize(
         means, quats, log_scales, opacity_logits, sh, weights,
-        torch.cat(features, 1) if features else means.new_zeros(count, 0),
+        torch.cat(blended, 1) if blended else means.new_zeros(count, 0),
         view=view, background=(red, green, blue), degree=degree, min_scale=float(min_scale),
         antialias=bool(antialias), median="median_depth" in outputs, absolute="absgrad2d" in outputs,
     )  # fmt: skip
     rendering = Rendering(
         drawn.image, drawn.alpha, drawn.radii, drawn.grad2d, drawn.tile_counts, drawn.absgrad2d
     )
+    given = 0 if features is None else features.shape[1]
+    if features is not None:
+        rendering.features = drawn.features[..., :given]
     if "depth" in outputs:
         nothing = drawn.alpha == 0
         rendering.depth = torch.where(
-            nothing, 0, drawn.features[..., 0] / drawn.alpha.masked_fill(nothing, 1)
+            nothing, 0, drawn.features[..., given] / drawn.alpha.masked_fill(nothing, 1)
         )
     if "normals" in outputs:
         rendering.normals = drawn.features[..., -3:]
@@ -113,6 +131,49 @@ def rasterize(
         padded = torch.cat([depths(means, view), means.new_zeros(1)])  # -1 is the last
         rendering.median_depth = padded[drawn.median.long()]
     return rendering
+
+
+@torch.no_grad()
+def strips(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    log_scales: torch.Tensor,
+    opacity_logits: torch.Tensor,
+    sh: torch.Tensor,
+    camera: Camera,
+    *,
+    weights: torch.Tensor | None = None,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    sh_degree: int | None = None,
+    min_scale: float = 0.0,
+    near: float = 0.01,
+    antialias: bool = False,
+    outputs: Collection[str] = (),
+    features: torch.Tensor | None = None,
+    window: tuple[int, int, int, int] | None = None,
+    strip: int = STRIP,
+    backend: str = "auto",
+) -> Iterator[tuple[int, Rendering]]:
+    """Draw a picture for eyes strip by strip, from the top: nothing is kept for gradients or between strips.
+
+    Args: as for :func:`rasterize`, and
+        window: left, top, width and height in pixels of the part of the camera's image to draw; None: all.
+        strip: pixels to draw at a time, about.
+
+    Yields:
+        The first row of a strip, and what it shows.
+    """
+    left, above, width, height = window or (0, 0, camera.width, camera.height)
+    whole = replace(View.of(camera, near), width=width)
+    whole = replace(whole, cx=whole.cx - left, cy=whole.cy - above)
+    rows = max(strip // width // 16 * 16, 16)
+    for top in range(0, height, rows):
+        part = replace(whole, cy=whole.cy - top, height=min(rows, height - top))
+        yield top, _draw(
+            means, quats, log_scales, opacity_logits, sh, part, weights=weights, background=background,
+            sh_degree=sh_degree, min_scale=min_scale, antialias=antialias, outputs=outputs,
+            features=features, backend=backend,
+        )  # fmt: skip
 
 
 @torch.no_grad()
@@ -147,25 +208,17 @@ def render(
     """
     if kind not in ("uint8", "float16", "float32"):
         raise ValueError(f'kind can be "uint8", "float16" or "float32", not "{kind}"')
-    _check(means, quats, log_scales, opacity_logits, weights)
-    sh = _coefficients(sh)
-    degree = _degree(sh, len(means), sh_degree)
-    red, green, blue = (float(value) for value in background)
     for camera in cameras:
         picture = np.empty((camera.height, camera.width, 4), kind)
-        whole = View.of(camera, near)
-        rows = max(strip // camera.width // 16 * 16, 16)
-        for top in range(0, camera.height, rows):
-            part = replace(whole, cy=whole.cy - top, height=min(rows, camera.height - top))
-            drawn = _backend(backend, means).rasterize(
-                means, quats, log_scales, opacity_logits, sh, weights, means.new_zeros(len(means), 0),
-                view=part, background=(red, green, blue), degree=degree, min_scale=float(min_scale),
-                antialias=bool(antialias), median=False, absolute=False,
-            )  # fmt: skip
+        for top, drawn in strips(
+            means, quats, log_scales, opacity_logits, sh, camera, weights=weights, background=background,
+            sh_degree=sh_degree, min_scale=min_scale, near=near, antialias=antialias, strip=strip,
+            backend=backend,
+        ):  # fmt: skip
             pixels = torch.cat([drawn.image, drawn.alpha[..., None]], 2)
             if kind == "uint8":
                 pixels = pixels.clamp_(0, 1).mul_(255).round_()
-            picture[top : top + rows] = pixels.cpu().numpy()
+            picture[top : top + len(pixels)] = pixels.cpu().numpy()
         yield picture
 
 

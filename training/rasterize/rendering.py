@@ -91,6 +91,7 @@ class Rendering:
             0 where none does.
         normals: (H, W, 3), on request: Σ w n in camera coordinates, n the unit vector of a splat's shortest
             axis that faces the camera; not normalised.
+        features: (H, W, F), of the features given: Σ w f.
     """
 
     image: torch.Tensor
@@ -102,6 +103,7 @@ class Rendering:
     depth: torch.Tensor | None = None
     median_depth: torch.Tensor | None = None
     normals: torch.Tensor | None = None
+    features: torch.Tensor | None = None
 
 
 @dataclass

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+
+from ..errors import LodgsError
+from ..files import atomic_write
+
+LARGEST = 32768
+"""Pixels on the longest side of an image that is drawn."""
 
 
 @dataclass(frozen=True)
@@ -43,3 +50,86 @@ class Camera:
             self, width=width, height=height,
             fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy,
         )  # fmt: skip
+
+    def within(self, matrix: np.ndarray) -> tuple[Camera, float]:
+        """This view of a world as seen from inside an object in it: pixels stay the same.
+
+        Args:
+            matrix: (4, 4) from the object to the world: rotation, one scale above 0, translation.
+
+        Returns:
+            The camera in the object's coordinates, and how many units of the world one of its units is.
+        """
+        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+        pose = self.world_to_camera @ matrix
+        pose[:3] /= scale
+        return replace(self, world_to_camera=pose), scale
+
+
+def write_camera(path: Path, camera: Camera, near: float) -> None:
+    """Writes a view as JSON: its fields, and the depth at which drawing begins.
+
+    Raises:
+        LodgsError: the file cannot be written.
+    """
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps(camera_as_dict(camera, near), indent=1) + "\n", encoding="utf-8")
+
+
+def camera_as_dict(camera: Camera, near: float) -> dict:
+    """A view as JSON knows it; :func:`camera_from_dict` is the inverse, to the bit."""
+    names = ("name", "width", "height", "fx", "fy", "cx", "cy")
+    values = {name: getattr(camera, name) for name in names}
+    return {**values, "world_to_camera": camera.world_to_camera.tolist(), "near": near}
+
+
+def read_camera(path: Path) -> tuple[Camera, float]:
+    """A view that :func:`write_camera` wrote, or anybody in the same words, and its near depth.
+
+    Raises:
+        LodgsError: the file cannot be read, or describes no camera.
+    """
+    try:
+        values = json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise LodgsError(f"The camera {path} cannot be read: {error}.") from error
+    try:
+        return camera_from_dict(values)
+    except LodgsError as error:
+        raise LodgsError(f"{path}: {error.what}", error.remedy) from error
+
+
+def camera_from_dict(values: dict) -> tuple[Camera, float]:
+    """A view and its near depth (0.01 where it is missing), of ``camera_as_dict``'s keys.
+
+    Raises:
+        LodgsError: a key is missing or impossible.
+    """
+    remedy = "A camera has width, height, fx, fy, cx, cy and world_to_camera (4x4, OpenCV axes)."
+    try:
+        camera = Camera(
+            name=str(values.get("name", "")),
+            width=int(values["width"]), height=int(values["height"]),
+            fx=float(values["fx"]), fy=float(values["fy"]),
+            cx=float(values["cx"]), cy=float(values["cy"]),
+            world_to_camera=np.array(values["world_to_camera"], np.float64),
+        )  # fmt: skip
+        near = float(values.get("near", 0.01))
+    except KeyError as error:
+        raise LodgsError(f"The camera lacks {error}.", remedy) from error
+    except (TypeError, ValueError, AttributeError) as error:
+        raise LodgsError(f"The camera is not valid: {error}.", remedy) from error
+    pose = camera.world_to_camera
+    numbers = [camera.fx, camera.fy, camera.cx, camera.cy, near, *pose.ravel()]
+    if pose.shape != (4, 4) or not np.isfinite(numbers).all():
+        raise LodgsError("The camera's world_to_camera is no 4x4 matrix of numbers.", remedy)
+    if not (0 < camera.width <= LARGEST and 0 < camera.height <= LARGEST):
+        raise LodgsError(
+            f"The camera's image of {camera.width}x{camera.height} pixels cannot be drawn.",
+            f"Choose from 1 to {LARGEST} pixels a side.",
+        )
+    rotation = pose[:3, :3]
+    turns = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
+    if not turns or camera.fx <= 0 or camera.fy <= 0 or near < 0:
+        raise LodgsError("The camera's pose is no rotation, or a length is below 0.", remedy)
+    return camera, near

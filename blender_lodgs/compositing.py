@@ -1,0 +1,93 @@
+"""LODGS' picture of the splats and Cycles' of the meshes as one, joined by depth in the compositor."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..training.errors import LodgsError
+from . import compat, engine, scenes
+
+_COPIED = (
+    "resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y",
+    "use_border", "use_crop_to_border", "border_min_x", "border_max_x", "border_min_y", "border_max_y",
+    "fps", "fps_base",
+)  # fmt: skip
+
+
+def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> bpy.types.Scene:
+    """Lets a scene render with LODGS, and over it or behind it, by depth, its meshes with another engine.
+
+    The meshes are rendered by a second scene that has the same objects without the splats. Called again, it
+    takes over the size, camera and range that the scene has now.
+
+    Returns:
+        The meshes' scene.
+
+    Raises:
+        LodgsError: the scene has a compositor tree of the artist's own, or no splats.
+    """
+    if not scenes.roots(scene):
+        raise LodgsError(f"The scene '{scene.name}' has no splats.", "Import or train some first.")
+    meshes = scene.lodgs_render.meshes
+    if meshes is None:
+        tree = compat.compositor_tree(scene)
+        if any(node.bl_idname not in compat.COMPOSITOR_START for node in tree.nodes):
+            raise LodgsError(
+                "This scene has compositor nodes already.",
+                "Add a Z Combine node with the depth of both pictures; docs/rendering.md shows which.",
+            )
+        meshes = scene.lodgs_render.meshes = bpy.data.scenes.new(f"{scene.name} Meshes")
+        meshes.render.engine = mesh_engine
+        _join(tree, scene, meshes)
+    engine.use(scene)
+    for one in (scene, meshes):
+        one.render.film_transparent = True
+        for layer in one.view_layers:
+            layer.use_pass_z = True
+    _match(scene, meshes)
+    return meshes
+
+
+def _match(scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:
+    """What the meshes' scene has of the scene: everything but the splats."""
+    for name in _COPIED:
+        setattr(meshes.render, name, getattr(scene.render, name))
+    meshes.camera, meshes.world = scene.camera, scene.world
+    meshes.frame_start, meshes.frame_end = scene.frame_start, scene.frame_end
+    meshes.view_settings.view_transform = scene.view_settings.view_transform
+    for kind in ("children", "objects"):
+        there, here = getattr(meshes.collection, kind), getattr(scene.collection, kind)
+        for thing in set(there) - set(here):
+            there.unlink(thing)
+        for thing in set(here) - set(there):
+            there.link(thing)
+    splats = {collection for root in scenes.roots(scene) for collection in root.users_collection}
+    for layer in meshes.view_layers:
+        layer.update()  # a new scene's has no parts yet
+        while parts := [part for part in _parts(layer.layer_collection) if part.collection in splats]:
+            parts[0].exclude = True  # which makes all the parts anew
+
+
+def _parts(part: bpy.types.LayerCollection):
+    """The parts of a view layer below one that are not excluded."""
+    for child in part.children:
+        if not child.exclude:
+            yield child
+            yield from _parts(child)
+
+
+def _join(tree: bpy.types.NodeTree, scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:
+    """The tree: in each pixel the nearer of both scenes' layers, over the other where it is transparent."""
+    tree.nodes.clear()
+    join = tree.nodes.new("CompositorNodeZcombine")
+    join.location = (350, 0)
+    join.inputs["Use Alpha"].default_value = join.inputs["Anti-Alias"].default_value = True
+    for place, one in enumerate((scene, meshes)):
+        one.view_layers[0].use_pass_z = True  # before the node, whose sockets are the layer's passes
+        layers = tree.nodes.new("CompositorNodeRLayers")
+        layers.location = (0, -420 * place)
+        layers.scene, layers.layer = one, one.view_layers[0].name
+        layers.label = one.name
+        tree.links.new(layers.outputs["Image"], join.inputs[2 * place])
+        tree.links.new(layers.outputs["Depth"], join.inputs[2 * place + 1])
+    tree.links.new(join.outputs[0], compat.compositor_output(tree))

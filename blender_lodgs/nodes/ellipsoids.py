@@ -1,0 +1,167 @@
+"""The node group "LODGS Ellipsoids": splats as meshes that Cycles and EEVEE light, reflect and shadow.
+
+Every splat becomes an instance of one sphere, turned and stretched to REACH standard deviations. Its material
+has the alpha of a Gaussian: where a ray passes the centre in d standard deviations, the opacity times
+exp(-d²/2), which is the splat's projection. Colours are those without view dependence.
+"""
+
+from __future__ import annotations
+
+import math
+
+import bpy
+
+from ..objects import COLOR, OPACITY_LOGIT, ROTATION, SCALE, WEIGHT
+from .building import existing
+
+NAME = "LODGS Ellipsoids"
+MATERIAL = "LODGS Ellipsoids"
+ALPHA = "splat_opacity"
+REACH = 3.0
+"""Standard deviations from the middle to the surface, where alpha is 1 % of the opacity."""
+BOUNCES = 512
+"""Transparent surfaces that a ray of Cycles has to pass; its own 8 would leave black holes."""
+
+
+def attach(thing: bpy.types.Object) -> None:
+    """Gives an object of splats this modifier, last of all; it is on where its scene wants ellipsoids."""
+    if NAME in thing.modifiers:
+        return
+    modifier = thing.modifiers.new(NAME, "NODES")
+    assert isinstance(modifier, bpy.types.NodesModifier)
+    modifier.node_group, modifier.show_expanded = ellipsoids(), False
+    modifier.show_viewport = False
+    driver = thing.driver_add(f'modifiers["{NAME}"].show_render').driver
+    driver.type, driver.expression = "SCRIPTED", "wanted"
+    variable = driver.variables.new()
+    variable.name, variable.type = "wanted", "CONTEXT_PROP"
+    target = variable.targets[0]
+    target.context_property, target.data_path = "ACTIVE_SCENE", "lodgs_render.draws_ellipsoids"
+    target.use_fallback_value, target.fallback_value = True, 0.0
+
+
+def ellipsoids() -> bpy.types.GeometryNodeTree:
+    """The group, made on first use."""
+    if group := existing(NAME):
+        return group
+    group = bpy.data.node_groups.new(NAME, "GeometryNodeTree")
+    assert isinstance(group, bpy.types.GeometryNodeTree)
+    group.is_modifier = True
+    for way in ("INPUT", "OUTPUT"):
+        group.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
+
+    def add(kind: str, **settings) -> bpy.types.Node:
+        node = group.nodes.new(kind)
+        for key, value in settings.items():
+            setattr(node, key, value)
+        node.location = (len(group.nodes) * 180, 0)
+        return node
+
+    def link(source: bpy.types.NodeSocket, node: bpy.types.Node, name: str) -> None:
+        group.links.new(source, next(s for s in node.inputs if s.name == name and s.enabled))
+
+    def attribute(name: str, kind: str) -> bpy.types.Node:
+        node = add("GeometryNodeInputNamedAttribute", data_type=kind)
+        node.inputs["Name"].default_value = name
+        return node
+
+    def value(node: bpy.types.Node) -> bpy.types.NodeSocket:
+        return next(s for s in node.outputs if s.name == "Attribute" and s.enabled)
+
+    def math_of(operation: str, *values: bpy.types.NodeSocket | float) -> bpy.types.NodeSocket:
+        node = add("ShaderNodeMath", operation=operation)
+        for socket, given in zip(node.inputs, values, strict=False):
+            if isinstance(given, bpy.types.NodeSocket):
+                group.links.new(given, socket)
+            else:
+                socket.default_value = given
+        return node.outputs["Value"]
+
+    points = add("NodeGroupInput").outputs[0]
+    logit, weight = attribute(OPACITY_LOGIT, "FLOAT"), attribute(WEIGHT, "FLOAT")
+    opacity = math_of(
+        "DIVIDE", 1.0, math_of("ADD", 1.0, math_of("EXPONENT", math_of("MULTIPLY", value(logit), -1.0)))
+    )
+    faded = add("GeometryNodeSwitch", input_type="FLOAT")  # splats without the attribute are there in full
+    link(weight.outputs["Exists"], faded, "Switch")
+    next(s for s in faded.inputs if s.name == "False" and s.enabled).default_value = 1.0
+    link(value(weight), faded, "True")
+    store = add("GeometryNodeStoreNamedAttribute", data_type="FLOAT", domain="POINT")
+    store.inputs["Name"].default_value = ALPHA
+    group.links.new(points, store.inputs["Geometry"])
+    link(math_of("MULTIPLY", opacity, faded.outputs["Output"]), store, "Value")
+
+    sphere = add("GeometryNodeMeshIcoSphere")
+    sphere.inputs["Radius"].default_value, sphere.inputs["Subdivisions"].default_value = 1.0, 3
+    smooth = add("GeometryNodeSetShadeSmooth")
+    link(sphere.outputs["Mesh"], smooth, "Mesh" if "Mesh" in smooth.inputs else "Geometry")
+    material = add("GeometryNodeSetMaterial")
+    link(smooth.outputs[0], material, "Geometry")
+    material.inputs["Material"].default_value = falloff()
+    reach = add("ShaderNodeVectorMath", operation="SCALE")
+    group.links.new(value(attribute(SCALE, "FLOAT_VECTOR")), reach.inputs[0])
+    reach.inputs["Scale"].default_value = REACH
+    stand = add("GeometryNodeInstanceOnPoints")
+    link(store.outputs["Geometry"], stand, "Points")
+    link(material.outputs["Geometry"], stand, "Instance")
+    link(value(attribute(ROTATION, "QUATERNION")), stand, "Rotation")
+    link(reach.outputs["Vector"], stand, "Scale")
+    link(stand.outputs["Instances"], add("NodeGroupOutput"), "Geometry")
+    return group
+
+
+def falloff() -> bpy.types.Material:
+    """The material of the ellipsoids: alpha of a Gaussian, once for each ray that passes.
+
+    On the unit sphere that all ellipsoids are images of, a ray from the direction v that meets the surface at
+    p passes the centre in a distance of sqrt(1 - (p·v)²).
+    """
+    material = bpy.data.materials.get(MATERIAL)
+    if material is not None:
+        return material
+    material = bpy.data.materials.new(MATERIAL)
+    if material.node_tree is None:
+        material.use_nodes = True
+    if hasattr(material, "surface_render_method"):
+        material.surface_render_method = "BLENDED"
+    material.use_backface_culling = False
+    tree = material.node_tree
+    tree.nodes.clear()
+
+    def add(kind: str, **settings) -> bpy.types.Node:
+        node = tree.nodes.new(kind)
+        for key, value in settings.items():
+            setattr(node, key, value)
+        node.location = (len(tree.nodes) * 180, 0)
+        return node
+
+    def join(operation: str, *values: bpy.types.NodeSocket | float, kind: str = "ShaderNodeMath"):
+        node = add(kind, operation=operation)
+        for socket, given in zip(node.inputs, values, strict=False):
+            if isinstance(given, bpy.types.NodeSocket):
+                tree.links.new(given, socket)
+            else:
+                socket.default_value = given
+        return node.outputs["Value" if kind == "ShaderNodeMath" or operation == "DOT_PRODUCT" else "Vector"]
+
+    geometry = add("ShaderNodeNewGeometry")
+    local = add("ShaderNodeVectorTransform", vector_type="VECTOR", convert_from="WORLD", convert_to="OBJECT")
+    tree.links.new(geometry.outputs["Incoming"], local.inputs["Vector"])
+    towards = join("NORMALIZE", local.outputs["Vector"], kind="ShaderNodeVectorMath")
+    place = join("NORMALIZE", add("ShaderNodeTexCoord").outputs["Object"], kind="ShaderNodeVectorMath")
+    cosine = join("DOT_PRODUCT", place, towards, kind="ShaderNodeVectorMath")
+    beside = join("SUBTRACT", 1.0, join("MULTIPLY", cosine, cosine))
+    bell = join("POWER", math.exp(-REACH * REACH / 2), beside)
+    opacity = add("ShaderNodeAttribute", attribute_name=ALPHA, attribute_type="INSTANCER")
+    alpha = join("MINIMUM", join("MULTIPLY", opacity.outputs["Fac"], bell), 0.99)
+    once = join("MULTIPLY", alpha, join("SUBTRACT", 1.0, geometry.outputs["Backfacing"]))
+    color = add("ShaderNodeAttribute", attribute_name=COLOR, attribute_type="INSTANCER")
+    emission, through, mix = (
+        add(kind) for kind in ("ShaderNodeEmission", "ShaderNodeBsdfTransparent", "ShaderNodeMixShader")
+    )
+    tree.links.new(color.outputs["Color"], emission.inputs["Color"])
+    tree.links.new(once, mix.inputs[0])
+    tree.links.new(through.outputs[0], mix.inputs[1])
+    tree.links.new(emission.outputs[0], mix.inputs[2])
+    tree.links.new(mix.outputs[0], add("ShaderNodeOutputMaterial").inputs["Surface"])
+    return material

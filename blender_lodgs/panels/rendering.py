@@ -1,0 +1,96 @@
+"""The Rendering panel of the sidebar, and the engine's own panels among Blender's properties."""
+
+from __future__ import annotations
+
+import bpy
+
+from ...training.errors import LodgsError
+from .. import engine, environment, scenes
+from .training import draw_environment, say
+
+
+class LODGS_PT_rendering(bpy.types.Panel):
+    bl_label = "Rendering"
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "LODGS"
+    bl_order = 5
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context):
+        return bool(scenes.roots(context.scene))
+
+    def draw(self, context):
+        layout, scene = self.layout, context.scene
+        if scene.render.engine != engine.ID:
+            layout.operator("lodgs.use_engine", icon="RENDER_STILL")
+            layout.prop(scene.lodgs_render, "ellipsoids")
+            if scene.lodgs_render.ellipsoids:
+                text = "Slow, without view-dependent colours; fine up to some hundred thousand splats."
+                say(layout, text, "INFO")
+            return
+        _draw_film(layout, scene)
+        _draw_passes(layout, scene, context.view_layer)
+        row = layout.row(align=True)
+        row.operator("lodgs.render_quick", icon="RENDER_STILL").animation = False
+        row.operator("lodgs.render_quick", icon="RENDER_ANIMATION", text="").animation = True
+        column = layout.column(align=True)
+        column.operator("lodgs.combine_with_meshes", icon="NODE_COMPOSITING")
+        column.operator("lodgs.export_camera", icon="CAMERA_DATA", text="Export Camera…")
+
+
+class _Properties(bpy.types.Panel):
+    bl_space_type = "PROPERTIES"
+    bl_region_type = "WINDOW"
+    COMPAT_ENGINES = {engine.ID}
+
+    @classmethod
+    def poll(cls, context):
+        return context.engine in cls.COMPAT_ENGINES
+
+
+class LODGS_RENDER_PT_film(_Properties):
+    bl_label = "Film"
+    bl_context = "render"
+
+    def draw(self, context):
+        _draw_film(self.layout, context.scene)
+
+
+class LODGS_VIEWLAYER_PT_passes(_Properties):
+    bl_label = "Passes"
+    bl_context = "view_layer"
+
+    def draw(self, context):
+        _draw_passes(self.layout, context.scene, context.view_layer)
+
+
+def _draw_film(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
+    column = layout.column()
+    column.use_property_split = True
+    column.use_property_decorate = False
+    column.prop(scene.render, "film_transparent", text="Transparent")
+    row = column.row()
+    row.enabled = not scene.render.film_transparent
+    row.prop(scene.lodgs_render, "background")
+    if scene.view_settings.view_transform != "Standard":
+        name = scene.view_settings.view_transform
+        say(layout, f"{name} changes the colours of the photographs; Standard keeps them.", "INFO")
+        layout.operator("lodgs.use_engine", text="Use Standard", icon="COLOR")
+    try:
+        environment.trainer_python()
+    except LodgsError as error:
+        draw_environment(layout, error.what)
+        say(layout, "Or draw with the graphics card, as the viewport does:", "INFO")
+
+
+def _draw_passes(layout: bpy.types.UILayout, scene: bpy.types.Scene, layer: bpy.types.ViewLayer) -> None:
+    column = layout.column(heading="Passes")
+    column.use_property_split = True
+    column.use_property_decorate = False
+    column.prop(layer, "use_pass_z", text="Depth")
+    column.prop(scene.lodgs_render, "use_pass_levels")
+
+
+CLASSES = (LODGS_PT_rendering, LODGS_RENDER_PT_film, LODGS_VIEWLAYER_PT_passes)

@@ -1,0 +1,437 @@
+"""F12 with the engine LODGS and the real renderer: pixels, passes, animations, and what can go wrong."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from training.splats.bundle import Bundle, Level, write_bundle
+from training.splats.gaussians import Splats
+
+ROOT = Path(__file__).resolve().parents[2]
+TRAINER = os.environ.get("LODGS_TRAINER_PYTHON", "")
+NOTHING = 1e10
+
+
+pytestmark = pytest.mark.usefixtures("renderer")
+
+
+def random_splats(count: int, degree: int = 3, seed: int = 0) -> Splats:
+    rng = np.random.default_rng(seed)
+    return Splats(
+        means=rng.uniform(-0.7, 0.7, (count, 3)).astype(np.float32),
+        quats=rng.normal(size=(count, 4)).astype(np.float32),
+        log_scales=rng.normal(-3, 0.6, (count, 3)).astype(np.float32),
+        opacity_logits=rng.normal(1, 1.5, count).astype(np.float32),
+        sh=(rng.normal(size=(count, (degree + 1) ** 2, 3)) * 0.3).astype(np.float32),
+    )
+
+
+@pytest.fixture
+def bundle(tmp_path) -> Path:
+    path = tmp_path / "bundle.ply"
+    levels = [Level(1, random_splats(150), 0.05), Level(2, random_splats(1500, seed=1), 0.0)]
+    write_bundle(path, Bundle("flod", levels))
+    return path
+
+
+@pytest.fixture
+def scene(bpy, lodgs, bundle):
+    """A bundle, turned and moved and scaled, and a camera before it; LODGS renders it to PNG."""
+    scene = bpy.context.scene
+    root = lodgs("scenes").import_splats(bpy.context, bundle)
+    root.location, root.scale = (1, 2, -0.5), (1.7,) * 3
+    root.rotation_euler = (-1.2, 0.3, 0.4)
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    scene.collection.objects.link(camera)
+    camera.location, camera.rotation_euler = (1.3, -5.5, 0.2), (1.45, 0, 0.02)
+    camera.data.shift_x = 0.03
+    scene.camera = camera
+    lodgs("engine").use(scene)
+    scene.render.dither_intensity = 0
+    scene.render.resolution_x, scene.render.resolution_y = 640, 480
+    return scene
+
+
+def f12(bpy, tmp_path, name="f12.png") -> np.ndarray:
+    """Renders; the file's values (H, W, 4) as they lie in it, rows from the top."""
+    path = tmp_path / name
+    bpy.context.scene.render.filepath = str(path)
+    assert bpy.ops.render.render(write_still=True) == {"FINISHED"}
+    return pixels(bpy, path)
+
+
+def pixels(bpy, path: Path) -> np.ndarray:
+    image = bpy.data.images.load(str(path))
+    image.colorspace_settings.name = "Non-Color"
+    image.alpha_mode = "CHANNEL_PACKED"
+    values = np.empty(image.size[0] * image.size[1] * 4, np.float32)
+    image.pixels.foreach_get(values)
+    values = values.reshape(image.size[1], image.size[0], 4)[::-1]
+    bpy.data.images.remove(image)
+    return values
+
+
+def bytes_of(values: np.ndarray) -> np.ndarray:
+    return np.round(values * 255).astype(np.uint8)
+
+
+def without_blender(bundle: Path, camera: Path, out: Path, *options: str) -> None:
+    """``python -m training render`` of a camera that Blender has written."""
+    command = [TRAINER, "-m", "training", "render", str(bundle), "--camera", str(camera), "--out", str(out)]
+    subprocess.run([*command, *options], cwd=ROOT, check=True)
+
+
+def passes(bpy, lodgs, **settings):
+    """The planes that the engine draws of the scene as it is."""
+    engine, scene = lodgs("engine"), bpy.context.scene
+    scene.view_layers[0].use_pass_z = scene.lodgs_render.use_pass_levels = True
+    width, height = engine.size(scene.render)
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    drawn = engine.frame(depsgraph, width, height, engine.border(scene.render, width, height), **settings)
+    return drawn and drawn.planes
+
+
+@pytest.mark.parametrize("transparent", [False, True])
+def test_f12_is_what_training_render_draws_to_the_bit(bpy, scene, bundle, tmp_path, transparent):
+    scene.render.film_transparent = transparent
+    scene.render.image_settings.color_mode = "RGBA"
+    shown = f12(bpy, tmp_path)
+    camera = tmp_path / "camera.json"
+    assert bpy.ops.lodgs.export_camera(filepath=str(camera)) == {"FINISHED"}
+    options = ["--background", "transparent"] if transparent else []
+    without_blender(bundle, camera, tmp_path / "trainer.png", *options)
+    expected = pixels(bpy, tmp_path / "trainer.png")
+    assert shown.shape == (480, 640, 4) and bytes_of(shown[..., :3]).max() > 200
+    np.testing.assert_array_equal(bytes_of(shown), bytes_of(expected))
+
+
+def test_levels_by_distance_are_what_training_render_chooses(bpy, lodgs, scene, bundle, tmp_path):
+    root = lodgs("scenes").roots(scene)[0]
+    root.lodgs.mode, root.lodgs.gamma = "SELECTIVE", 10
+    shown = f12(bpy, tmp_path)
+    camera = tmp_path / "camera.json"
+    bpy.ops.lodgs.export_camera(filepath=str(camera))
+    without_blender(bundle, camera, tmp_path / "trainer.png", "--gamma", "10", "--from", "1", "--to", "2")
+    np.testing.assert_array_equal(bytes_of(shown), bytes_of(pixels(bpy, tmp_path / "trainer.png")))
+    levels = passes(bpy, lodgs)["Level.X"]
+    assert {1, 2} <= set(np.unique(levels))  # both have their part
+
+
+def test_an_imported_view_is_the_photographs_camera(bpy, lodgs, bundle, tmp_path):
+    """Rendered from Blender's camera, and from COLMAP's own numbers: but for float32, the same."""
+    from training.scenes.cameras import write_camera
+    from training.scenes.colmap import read_scene
+
+    folder = ROOT / "examples" / "lantern_garden"
+    photographed = lodgs("scenes").import_colmap(bpy.context, folder, photographs=False)
+    photographed.lodgs.points.hide_render = True
+    root = lodgs("scenes").import_splats(bpy.context, bundle, upright=False)
+    bpy.context.view_layer.update()
+    root.matrix_world = photographed.matrix_world
+    bpy.context.scene.render.dither_intensity = 0
+    lodgs("engine").use(bpy.context.scene)
+    shown = f12(bpy, tmp_path)
+    view = next(c for c in read_scene(folder).cameras if c.name == bpy.context.scene.camera.name)
+    write_camera(tmp_path / "camera.json", view, bpy.context.scene.camera.data.clip_start)
+    without_blender(bundle, tmp_path / "camera.json", tmp_path / "trainer.png")
+    difference = np.abs(bytes_of(shown).astype(int) - bytes_of(pixels(bpy, tmp_path / "trainer.png")))
+    assert difference.max() <= 1 and (difference > 0).mean() < 0.01
+
+
+def test_depth_and_levels(bpy, lodgs, scene):
+    planes = passes(bpy, lodgs)
+    covered = planes["Level.X"] > 0
+    assert 0.1 < covered.mean() < 0.9
+    depth = planes["Depth.Z"]
+    assert (depth[~covered] == NOTHING).all()
+    assert depth[covered].min() > 1 and depth[covered].max() < 15  # the set is 7.5 away and 5 deep
+    np.testing.assert_array_equal(planes["Level.X"][covered], 2)
+    assert planes["Level 2.X"].max() > 0.9
+    assert planes["Combined.A"].min() == 1
+
+
+def test_border_and_percentage(bpy, scene, tmp_path):
+    whole = f12(bpy, tmp_path)
+    scene.render.use_border = scene.render.use_crop_to_border = True
+    scene.render.border_min_x, scene.render.border_max_x = 0.31, 0.66
+    scene.render.border_min_y, scene.render.border_max_y = 0.2, 0.81
+    cropped = f12(bpy, tmp_path)
+    part = whole[480 - 388 : 480 - 96, 198:422]
+    assert cropped.shape == part.shape == (292, 224, 4)
+    assert np.abs(cropped - part).max() <= 1.001 / 255
+    scene.render.use_crop_to_border = False
+    framed = f12(bpy, tmp_path)
+    assert framed.shape == whole.shape
+    np.testing.assert_array_equal(framed[480 - 388 : 480 - 96, 198:422], cropped)
+    scene.render.use_border, scene.render.resolution_percentage = False, 50
+    small = f12(bpy, tmp_path)
+    assert small.shape == (240, 320, 4)
+    assert np.abs(small - whole.reshape(240, 2, 320, 2, 4).mean((1, 3))).mean() < 0.02
+
+
+def test_background_colour(bpy, scene, tmp_path):
+    scene.lodgs_render.background = (1, 0.5, 0)
+    assert bytes_of(f12(bpy, tmp_path))[0, 0].tolist() == [255, 128, 0, 255]
+
+
+def test_two_sets_and_an_instance(bpy, lodgs, scene, bundle, tmp_path):
+    """A second import and a copy of a collection, each elsewhere: all are in the picture."""
+    alone = passes(bpy, lodgs)["Level.X"] > 0
+    left = lodgs("scenes").import_splats(bpy.context, bundle)
+    left.location = (-1.5, 2, 0)
+    instance = bpy.data.objects.new("instance", None)
+    instance.instance_type = "COLLECTION"
+    instance.instance_collection = left.users_collection[0]
+    instance.location = (5, 0, 0)
+    scene.collection.objects.link(instance)
+    bpy.context.view_layer.update()
+    drawn = passes(bpy, lodgs)["Level.X"] > 0
+    assert len(lodgs("engine").splat_sets(bpy.context.evaluated_depsgraph_get())) == 3
+    assert drawn[:, :150].sum() > alone[:, :150].sum() + 1000
+    assert drawn[:, 500:].sum() > alone[:, 500:].sum() + 1000
+
+
+def test_an_animation_starts_the_renderer_once(bpy, lodgs, scene, tmp_path, monkeypatch):
+    renderer, started = lodgs("renderer"), []
+    renderer.close()
+    converse = lodgs("processes").converse
+    monkeypatch.setattr(
+        lodgs("processes"), "converse", lambda *a: started.append(converse(*a)) or started[-1]
+    )
+    written = []
+    write_set = renderer.wire.write_set
+    monkeypatch.setattr(renderer.wire, "write_set", lambda *a: written.append(a) or write_set(*a))
+    scene.frame_end = 24
+    scene.render.resolution_percentage = 20
+    camera = scene.camera
+    for frame, x in ((1, 0.3), (24, 2.3)):
+        camera.location.x = x
+        camera.keyframe_insert("location", frame=frame)
+    scene.render.filepath = str(tmp_path / "frame_")
+    assert bpy.ops.render.render(animation=True) == {"FINISHED"}
+    frames = sorted(tmp_path.glob("frame_*.png"))
+    assert len(frames) == 24 and len(started) == 1 and len(written) == 1
+    first, middle, last = (pixels(bpy, frames[i]) for i in (0, 12, 23))
+    assert np.abs(first - middle).max() > 0.2 and np.abs(middle - last).max() > 0.2
+    assert started[0].poll() is None
+
+
+def test_what_changes_is_handed_over(bpy, lodgs, scene, tmp_path):
+    before = f12(bpy, tmp_path)
+    cloud = lodgs("scenes").roots(scene)[0].lodgs.levels[1].object.data
+    base = lodgs("objects").read_attribute(cloud, "radiance:base")
+    base[:, :3] = 0
+    lodgs("objects").write_attribute(
+        cloud, "radiance:base", cloud.attributes["radiance:base"].data_type, base
+    )
+    cloud.update_tag()
+    after = f12(bpy, tmp_path)
+    assert np.abs(before - after).mean() > 0.01
+
+
+def test_cancel(bpy, lodgs, scene, monkeypatch):
+    """Asked to stop, it stops soon and without a picture; the renderer is the same and draws on."""
+    passes(bpy, lodgs)
+    process = lodgs("renderer")._renderer.process
+    scene.render.resolution_x, scene.render.resolution_y = 6000, 4500
+    told = []
+
+    def wanted(share, text):
+        told.append((share, text))
+        return not share > 0
+
+    started = time.monotonic()
+    assert passes(bpy, lodgs, wanted=wanted) is None
+    assert told[-1][0] < 0.5, "it went on drawing"
+    assert time.monotonic() - started < 30
+    scene.render.resolution_x, scene.render.resolution_y = 64, 48
+    assert passes(bpy, lodgs)["Combined.R"].shape == (48, 64)
+    assert lodgs("renderer")._renderer.process is process
+
+
+def test_a_killed_renderer_is_started_again(bpy, lodgs, scene, tmp_path, capsys):
+    before = f12(bpy, tmp_path)
+    process = lodgs("renderer")._renderer.process
+    folder = lodgs("renderer")._renderer._folder
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    np.testing.assert_array_equal(f12(bpy, tmp_path), before)
+    assert lodgs("renderer")._renderer.process is not process
+    assert not folder.exists()
+    assert "The renderer was killed (signal 9)" in capsys.readouterr().out
+
+
+def test_a_renderer_that_always_dies_is_told(bpy, lodgs, scene, tmp_path, monkeypatch):
+    lodgs("renderer").close()
+    program = tmp_path / "dies"
+    program.write_text(
+        f'#!/bin/sh\n[ "$3" = serve ] && {{ echo "no luck today" >&2; exit 7; }}\nexec "{TRAINER}" "$@"\n'
+    )
+    program.chmod(0o755)
+    monkeypatch.setenv("LODGS_TRAINER_PYTHON", str(program))
+    scene.render.filepath = str(tmp_path / "none.png")
+    with pytest.raises(RuntimeError, match=r"exit code 7\. no luck today"):
+        bpy.ops.render.render(write_still=True)
+    assert not (tmp_path / "none.png").exists()
+    assert lodgs("renderer")._renderer is None
+
+
+def test_without_a_trainer_it_says_so(bpy, lodgs, scene, tmp_path, monkeypatch):
+    lodgs("renderer").close()
+    monkeypatch.delenv("LODGS_TRAINER_PYTHON")
+    scene.render.filepath = str(tmp_path / "none.png")
+    with pytest.raises(RuntimeError, match="need a Python with PyTorch"):
+        bpy.ops.render.render(write_still=True)
+    assert not (tmp_path / "none.png").exists()
+
+
+def test_other_lenses_are_refused(bpy, scene):
+    scene.camera.data.type = "ORTHO"
+    with pytest.raises(RuntimeError, match="'camera' is ortho"):
+        bpy.ops.render.render()
+
+
+def test_nothing_to_see_is_the_background(bpy, lodgs, scene, tmp_path):
+    for thing in bpy.data.objects:
+        thing.hide_render = thing.type != "CAMERA"
+    lodgs("scenes").roots(scene)[0].lodgs.levels[1].show = False
+    assert f12(bpy, tmp_path)[..., :3].max() == 0
+
+
+def test_no_program_outlives_blender(bundle, tmp_path):
+    """A Blender that renders and is then killed: its renderer ends, and takes its files along."""
+    script = tmp_path / "script.py"
+    script.write_text(f"""
+import importlib, os, signal, sys, tempfile
+sys.path.insert(0, {str(ROOT)!r})
+from tools.blender_module import EXTENSION, start_blender
+bpy = start_blender()
+bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+load = lambda name: importlib.import_module(EXTENSION + ".blender_lodgs." + name)
+load("scenes").import_splats(bpy.context, {str(bundle)!r})
+camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+bpy.context.scene.collection.objects.link(camera)
+bpy.context.scene.camera = camera
+load("engine").use(bpy.context.scene)
+bpy.context.scene.render.resolution_percentage = 5
+bpy.ops.render.render()
+renderer = load("renderer")._renderer
+print("RENDERER", renderer.process.pid, renderer._folder, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+""")
+    cache = {"NUMBA_CACHE_DIR": os.environ.get("NUMBA_CACHE_DIR", str(tmp_path / "numba"))}
+    done = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, env=os.environ | cache, timeout=200
+    )
+    line = next(line for line in done.stdout.splitlines() if line.startswith("RENDERER"))
+    _, pid, folder = line.split(" ", 2)
+    for _ in range(100):
+        if not Path(folder).exists() and not Path(f"/proc/{pid}").exists():
+            break
+        time.sleep(0.1)
+    assert not Path(folder).exists()
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(pid), 0)
+
+
+def flat_wall(y: float, color: tuple[float, float, float]) -> Splats:
+    """Splats side by side in the plane y, opaque from a distance, in COLMAP's axes (y is depth)."""
+    x, z = np.meshgrid(np.linspace(-4, 4, 81), np.linspace(-4, 4, 81))
+    means = np.stack([x.ravel(), np.full(x.size, y), z.ravel()], 1)
+    return Splats(
+        means=means.astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (x.size, 1)),
+        log_scales=np.tile(np.log(np.float32([0.1, 0.001, 0.1])), (x.size, 1)),
+        opacity_logits=np.full(x.size, 10, np.float32),
+        sh=np.tile(((np.float32(color) - 0.5) / 0.28209479177387814), (x.size, 1, 1)).astype(np.float32),
+    )
+
+
+def test_a_cube_of_cycles_stands_in_the_splats(bpy, lodgs, tmp_path):
+    """A red cube, turned, sticks out of a green wall of splats: each pixel shows what analysis says is
+    nearer, but for a seam of a pixel or two."""
+    scene = bpy.context.scene
+    write_bundle(tmp_path / "wall.ply", Bundle("", [Level(1, flat_wall(0.0, (0.1, 0.8, 0.2)))]))
+    lodgs("scenes").import_splats(bpy.context, tmp_path / "wall.ply", upright=False)
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    camera.location, camera.rotation_euler = (0, -6, 0), (np.pi / 2, 0, 0)
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    bpy.ops.mesh.primitive_cube_add(size=2, location=(0.3, 0.4, 0.2), rotation=(0.5, 0.3, 0.7))
+    cube = bpy.context.object
+    material = bpy.data.materials.new("red")
+    material.use_nodes = True
+    nodes = material.node_tree.nodes
+    nodes.clear()
+    emission, output = nodes.new("ShaderNodeEmission"), nodes.new("ShaderNodeOutputMaterial")
+    emission.inputs["Color"].default_value = (1, 0, 0, 1)
+    material.node_tree.links.new(emission.outputs[0], output.inputs["Surface"])
+    cube.data.materials.append(material)
+    scene.render.resolution_x, scene.render.resolution_y = 320, 240
+    assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
+    meshes = scene.lodgs_render.meshes
+    meshes.cycles.samples, meshes.cycles.device = 4, "CPU"
+    scene.render.dither_intensity = 0
+    scene.render.image_settings.color_mode = "RGBA"
+    shown = f12(bpy, tmp_path)
+
+    # a ray through each pixel's centre: where it meets the cube, in the cube's own space; the wall is at 6
+    focal = 320 * 50 / 36
+    x, y = np.meshgrid((np.arange(320) + 0.5 - 160) / focal, (120 - np.arange(240) - 0.5) / focal)
+    directions = np.stack([x, np.ones_like(x), y], 2)
+    to_cube = np.linalg.inv(np.array(cube.matrix_world, float))
+    origin = to_cube @ (*camera.location, 1)
+    local = directions @ to_cube[:3, :3].T
+    first, last = (np.sort([(s - origin[:3]) / local for s in (-1, 1)], axis=0)[i] for i in (0, 1))
+    enters, leaves = first.max(2), last.min(2)
+    red = (enters < leaves) & (enters < 6)
+    assert 0.02 < red.mean() < 0.5
+    assert ((enters < leaves) & (enters > 6)).sum() > 500  # parts of the cube are behind the wall
+    seam = np.zeros_like(red)
+    for dy in range(-2, 3):
+        for dx in range(-2, 3):
+            seam |= np.roll(red, (dy, dx), (0, 1)) != red
+    clear = ~seam
+    assert clear.mean() > 0.9
+    is_red = shown[..., 0] > 0.5
+    np.testing.assert_array_equal(is_red[clear], red[clear])
+    assert np.abs(shown[clear & ~red][:, :3] - (0.1, 0.8, 0.2)).max() < 0.03
+    # pressed again after a change of size, both scenes have it
+    scene.render.resolution_x = 200
+    assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
+    assert meshes.render.resolution_x == 200 and len(bpy.data.scenes) == 2
+
+
+def test_an_artists_compositor_is_left_alone(bpy, lodgs, scene):
+    tree = lodgs("compat").compositor_tree(scene)
+    tree.nodes.new("CompositorNodeBlur")
+    with pytest.raises(RuntimeError, match="has compositor nodes already"):
+        bpy.ops.lodgs.combine_with_meshes()
+    assert len(bpy.data.scenes) == 1
+
+
+@pytest.mark.parametrize("transparent", [False, True])
+def test_viewport_quality_is_nearly_the_same(bpy, lodgs, scene, tmp_path, frame, transparent):
+    """``frame`` skips where there are no graphics in background."""
+    scene.render.resolution_percentage = 50
+    scene.render.film_transparent = transparent
+    scene.render.image_settings.color_mode = "RGBA"
+    shown = f12(bpy, tmp_path)
+    scene.frame_end = 2
+    scene.render.filepath = str(tmp_path / "quick_")
+    assert bpy.ops.lodgs.render_quick(animation=True) == {"FINISHED"}
+    files = sorted(tmp_path.glob("quick_*.png"))
+    assert len(files) == 2
+    quick = pixels(bpy, files[1])
+    seen = shown[..., 3:] > 0
+    error = (((quick - shown)[..., :3] * seen).astype(float) ** 2).mean()
+    assert -10 * np.log10(error) > 35
+    np.testing.assert_allclose(quick[..., 3], shown[..., 3], atol=0.03)

@@ -1,0 +1,128 @@
+"""The command line: a view of a bundle as a picture, and a sentence for what cannot be."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from tests.training.conftest import write_tiny_scene
+from training.__main__ import main
+from training.rasterize import render
+from training.runs.job import Job
+from training.scenes.cameras import camera_as_dict, read_camera, write_camera
+from training.splats.bundle import Bundle, Level, write_bundle
+
+
+@pytest.fixture
+def bundle(make_splats, tmp_path):
+    levels = [Level(1, make_splats(30), 0.2), Level(2, make_splats(60, seed=1), 0.0)]
+    path = tmp_path / "bundle.ply"
+    write_bundle(path, Bundle("flod", levels))
+    return path, levels
+
+
+def pixels(path):
+    with Image.open(path) as file:
+        return np.asarray(file)
+
+
+def expected(splats, camera, near=0.01):
+    columns = (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh)
+    return next(render(*map(torch.from_numpy, columns), [camera], near=near, kind="uint8"))[..., :3]
+
+
+def test_a_camera_survives_its_file(camera, tmp_path):
+    write_camera(tmp_path / "camera.json", camera, 0.25)
+    again, near = read_camera(tmp_path / "camera.json")
+    assert near == 0.25 and camera_as_dict(again, near) == camera_as_dict(camera, near)
+
+
+def test_levels_of_a_bundle(bundle, camera, tmp_path):
+    path, levels = bundle
+    write_camera(tmp_path / "camera.json", camera, 0.01)
+    common = ["render", str(path), "--camera", str(tmp_path / "camera.json"), "--out"]
+    assert main([*common, str(tmp_path / "fine.png")]) == 0
+    assert main([*common, str(tmp_path / "coarse.png"), "--level", "1"]) == 0
+    assert main([*common, str(tmp_path / "far.png"), "--from", "1", "--to", "2", "--gamma", "1e-6"]) == 0
+    fine, coarse = (expected(level.splats, camera) for level in reversed(levels))
+    assert np.abs(fine.astype(int) - coarse).max() > 20
+    np.testing.assert_array_equal(pixels(tmp_path / "fine.png"), fine)
+    np.testing.assert_array_equal(pixels(tmp_path / "coarse.png"), coarse)
+    np.testing.assert_array_equal(pixels(tmp_path / "far.png"), fine)  # finer details than any are wanted
+
+
+def test_a_run_knows_its_views(make_splats, tmp_path):
+    scene = write_tiny_scene(tmp_path / "scene")
+    splats, run = make_splats(40), tmp_path / "run"
+    Job(str(scene), str(run)).write(run / "job.toml")
+    write_bundle(run / "bundle.ply", Bundle("3dgs", [Level(1, splats)]))
+    for source in (run, run / "bundle.ply"):
+        out = tmp_path / "view.png"
+        assert main(["render", str(source), "--view", "03", "--out", str(out)]) == 0
+        assert pixels(out).shape == (48, 64, 3)
+        assert main(["render", str(source), "--view", "03.jpg", "--out", str(out), "--size", "32x24"]) == 0
+        assert pixels(out).shape == (24, 32, 3)
+
+
+def test_transparency(bundle, camera, tmp_path):
+    write_camera(tmp_path / "camera.json", camera, 0.01)
+    command = ["render", str(bundle[0]), "--camera", str(tmp_path / "camera.json"), "--out"]
+    assert main([*command, str(tmp_path / "a.png"), "--background", "transparent"]) == 0
+    assert main([*command, str(tmp_path / "b.png"), "--background", "1,0,0"]) == 0
+    clear, red = pixels(tmp_path / "a.png"), pixels(tmp_path / "b.png")
+    assert clear.shape[2] == 4 and clear[..., 3].min() == 0
+    assert red[clear[..., 3] == 0].tolist()[0] == [255, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--level", "7"], "There is no level 7. Choose from 1 (coarsest) to 2."),
+        (["--from", "2", "--to", "1"], "Levels 2 to 1 with gamma 1 cannot be shown."),
+        (["--gamma", "0"], "cannot be shown"),
+        (["--gamma", "1", "--level", "1"], "Choose one."),
+        (["--out", "a.gif"], "neither .png nor .exr"),
+        (["--backend", "magic"], 'There is no rasterizer backend "magic".'),
+    ],
+)
+def test_mistakes_are_told(bundle, camera, tmp_path, monkeypatch, capsys, options, sentence):
+    monkeypatch.chdir(tmp_path)
+    write_camera(tmp_path / "camera.json", camera, 0.01)
+    common = ["render", str(bundle[0]), "--camera", "camera.json", "--out", "a.png"]
+    assert main([*common, *options]) == 2
+    assert sentence in capsys.readouterr().err
+    assert not list(tmp_path.glob("a.*"))
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"fx": None}, "The camera is not valid"),
+        ({"width": 0}, "0x48 pixels cannot be drawn"),
+        ({"width": 10**6}, "cannot be drawn"),
+        ({"world_to_camera": np.zeros((4, 4)).tolist()}, "pose is no rotation"),
+        ({"world_to_camera": [[1, 0], [0, 1]]}, "no 4x4 matrix"),
+        ({"near": float("nan")}, "no 4x4 matrix of numbers"),
+    ],
+)
+def test_impossible_cameras_are_told(bundle, camera, tmp_path, capsys, change, sentence):
+    file = tmp_path / "camera.json"
+    file.write_text(json.dumps(camera_as_dict(camera, 0.01) | change))
+    assert main(["render", str(bundle[0]), "--camera", str(file), "--out", str(tmp_path / "a.png")]) == 2
+    assert sentence in capsys.readouterr().err
+    file.write_text(json.dumps({"width": 3}))
+    assert main(["render", str(bundle[0]), "--camera", str(file), "--out", str(tmp_path / "a.png")]) == 2
+    assert "lacks 'height'" in capsys.readouterr().err
+
+
+def test_what_has_no_views_says_so(bundle, tmp_path, capsys):
+    out = ["--out", str(tmp_path / "a.png")]
+    assert main(["render", str(bundle[0]), "--view", "a.jpg", *out]) == 2
+    assert "does not know the photographs" in capsys.readouterr().err
+    scene = write_tiny_scene(tmp_path / "scene")
+    assert main(["render", str(bundle[0]), "--view", "a.jpg", "--scene", str(scene), *out]) == 2
+    assert "No photograph is called a.jpg. There are: 00.jpg" in capsys.readouterr().err
+    assert main(["render", str(tmp_path / "no.ply"), "--view", "a.jpg", *out]) == 2
+    assert "There is no" in capsys.readouterr().err

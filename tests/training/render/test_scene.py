@@ -1,0 +1,156 @@
+"""Sets of splats in one picture: their places, colours, depths and levels."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from training.errors import LodgsError
+from training.rasterize import rasterize
+from training.render.picture import NOTHING
+from training.render.scene import Placed, SplatSet, draw, quaternions
+from training.splats.gaussians import Splats
+
+
+def transform(rotation=(0, 0, 0), scale=1.0, translation=(0, 0, 0)) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_euler("xyz", rotation).as_matrix() * scale
+    matrix[:3, 3] = translation
+    return matrix
+
+
+def moved(camera, matrix):
+    """The camera that sees a world moved by a similarity as it saw it before."""
+    pose = camera.world_to_camera @ np.linalg.inv(matrix)
+    scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
+    return replace(camera, world_to_camera=np.diag([scale, scale, scale, 1]) @ pose)
+
+
+def test_it_draws_what_the_rasterizer_draws(make_splats, camera):
+    splats = make_splats(200)
+    weights = np.random.default_rng(1).uniform(size=200).astype(np.float32)
+    picture = draw([Placed(SplatSet(splats, weights))], camera, background=(0.2, 0.5, 0.9))
+    columns = (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh)
+    drawn = rasterize(
+        *map(torch.from_numpy, columns), camera, weights=torch.from_numpy(weights), background=(0.2, 0.5, 0.9)
+    )
+    np.testing.assert_array_equal(picture.image, drawn.image)
+    assert (picture.alpha == 1).all()
+    clear = draw([Placed(SplatSet(splats, weights))], camera, background=None)
+    np.testing.assert_allclose(clear.alpha, drawn.alpha)
+
+
+def test_one_set_looks_the_same_wherever_it_stands(make_splats, camera):
+    placed, matrix = SplatSet(make_splats(200)), transform((0.3, -0.8, 2), 3.0, (5, -2, 7))
+    here = draw([Placed(placed)], camera, depth=True)
+    there = draw([Placed(placed, matrix)], moved(camera, matrix), near=0.03, depth=True)
+    np.testing.assert_allclose(there.image, here.image, atol=2e-5)
+    covered = here.depth < NOTHING
+    assert covered.any()
+    np.testing.assert_allclose(there.depth[covered], 3 * here.depth[covered], rtol=1e-3)
+
+
+def test_sets_in_several_places_keep_their_colours(make_splats, camera):
+    """Drawn in the world, beside an empty corner of it, as in its own coordinates: harmonics turn along."""
+    splats, matrix = SplatSet(make_splats(200)), transform((1, 0.5, -2), 0.5, (1, 2, 3))
+    far = SplatSet(make_splats(1))
+    behind = transform(translation=(0, 0, -1e4))
+    here = draw([Placed(splats)], camera)
+    there = draw([Placed(splats, matrix), Placed(far, behind)], moved(camera, matrix))
+    np.testing.assert_allclose(there.image, here.image, atol=1e-4)
+
+
+def test_two_sets_are_sorted_together(make_splats, camera):
+    """Moved by hand in float64 and drawn as one set; constant colours, which no rotation changes."""
+    first, second = make_splats(100, degree=0), make_splats(100, degree=0, seed=1)
+    matrix = transform((0.4, 1, 0), 1.5, (0.2, 0, 0.3))
+    rotation = Rotation.from_matrix(matrix[:3, :3] / 1.5)
+    by_hand = Splats(
+        means=(second.means @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32),
+        quats=(rotation * Rotation.from_quat(second.quats[:, [1, 2, 3, 0]]))
+        .as_quat()[:, [3, 0, 1, 2]]
+        .astype(np.float32),
+        log_scales=second.log_scales + np.float32(np.log(1.5)),
+        opacity_logits=second.opacity_logits,
+        sh=second.sh,
+    )
+    together = draw([Placed(SplatSet(first)), Placed(SplatSet(second), matrix)], camera)
+    one = draw([Placed(SplatSet(Splats.concatenated([first, by_hand])))], camera)
+    np.testing.assert_allclose(together.image, one.image, atol=1e-4)
+
+
+@pytest.mark.parametrize("matrix", ["stretched", "sheared", "mirrored"])
+def test_a_set_that_is_no_longer_similar_has_the_covariances_of_its_transform(make_splats, matrix):
+    linear = {
+        "stretched": np.diag([3.0, 1, 0.5]),
+        "sheared": np.array([[1, 0.7, 0], [0, 1, 0.2], [0, 0, 1.0]]),
+        "mirrored": np.diag([-1.0, 1, 1]),
+    }[matrix]
+    whole = np.eye(4)
+    whole[:3, :3] = linear
+    splats = make_splats(50)
+    means, quats, log_scales = SplatSet(splats).in_world(whole)
+
+    def covariances(quats, log_scales):
+        axes = Rotation.from_quat(np.asarray(quats, float)[:, [1, 2, 3, 0]]).as_matrix()
+        axes = axes * np.exp(np.asarray(log_scales, float))[:, None]
+        return axes @ axes.transpose(0, 2, 1)
+
+    expected = linear @ covariances(splats.quats, splats.log_scales) @ linear.T
+    np.testing.assert_allclose(covariances(quats, log_scales), expected, rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(means, splats.means @ linear.T, rtol=1e-5)
+
+
+def test_quaternions_are_those_of_the_matrices():
+    turns = Rotation.random(500, random_state=3)
+    found = quaternions(torch.from_numpy(turns.as_matrix())).numpy()
+    angles = (Rotation.from_quat(found[:, [1, 2, 3, 0]]) * turns.inv()).magnitude()
+    assert angles.max() < 1e-6
+
+
+def wall(z: float, color: tuple[float, float, float]) -> Splats:
+    """One opaque splat that fills the picture at a depth."""
+    return Splats(
+        means=np.float32([[0, 0, z]]), quats=np.float32([[1, 0, 0, 0]]),
+        log_scales=np.log(np.float32([[50, 50, 0.01]])), opacity_logits=np.float32([20]),
+        sh=((np.float32(color) - 0.5) / 0.28209479177387814)[None, None].astype(np.float32),
+    )  # fmt: skip
+
+
+def test_depth_and_levels(camera):
+    """A half transparent wall of level 2 before an opaque one of level 3 (alpha is capped at 0.99)."""
+    camera = replace(camera, world_to_camera=np.eye(4))
+    before = Placed(SplatSet(wall(2, (1, 0, 0)), np.float32([0.25])), level=2)
+    behind = Placed(SplatSet(wall(6, (0, 1, 0))), level=3)
+    picture = draw([before, behind], camera, depth=True, levels=True, background=None)
+    center = 24, 32
+    assert picture.depth[center] == pytest.approx(6)
+    assert picture.levels == [2, 3] and picture.level[center] == 3
+    assert picture.masks[:, 24, 32] == pytest.approx([0.25, 0.75 * 0.99], abs=2e-3)
+    thin = draw([before], camera, depth=True, levels=True, background=None)
+    assert thin.depth[center] == pytest.approx(2)  # nothing brings the light to a half: the mean
+    assert thin.level[center] == 2
+    assert thin.alpha[center] == pytest.approx(0.25, abs=1e-3)
+
+
+def test_nothing_to_draw_is_the_background(camera, make_splats):
+    nothing = Placed(SplatSet(make_splats(3).select(slice(0))), level=1)
+    for placed in ([], [nothing]):
+        picture = draw(placed, camera, background=(0.1, 0.2, 0.3), depth=True, levels=True)
+        assert picture.image[5, 5] == pytest.approx((0.1, 0.2, 0.3))
+        assert (picture.depth == NOTHING).all() and (picture.level == 0).all()
+        assert (draw(placed, camera, background=None).alpha == 0).all()
+
+
+def test_it_ends_when_it_is_no_longer_wanted(make_splats, camera, monkeypatch):
+    monkeypatch.setattr("training.render.scene.STRIP", 1)
+    told = []
+    picture = draw([Placed(SplatSet(make_splats(5)))], camera, wanted=lambda share: told.append(share))
+    assert picture is None and told == [pytest.approx(16 / 48)]
+
+
+def test_a_flat_transform_is_refused(make_splats, camera):
+    with pytest.raises(LodgsError, match="scaled to nothing"):
+        draw([Placed(SplatSet(make_splats(5)), np.diag([1.0, 1, 0, 1]))], camera)

@@ -1,0 +1,122 @@
+"""The renderer as another program: what it answers, and how it ends."""
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from training.render import wire
+from training.render.scene import Placed, SplatSet, draw
+from training.scenes.cameras import camera_as_dict
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+class Client:
+    """Starts the renderer and speaks with it."""
+
+    def __init__(self, folder: Path, *options: str) -> None:
+        self.folder = folder
+        folder.mkdir()
+        command = [sys.executable, "-m", "training", "serve", str(folder), *options]
+        self.process = subprocess.Popen(
+            command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+
+    def say(self, **request) -> None:
+        self.say_line(json.dumps(request))
+
+    def say_line(self, line: str) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(line + "\n")
+        self.process.stdin.flush()
+
+    def hear(self, *kinds: str) -> dict:
+        """The next answer of one of these kinds."""
+        assert self.process.stdout is not None
+        while True:
+            event = json.loads(self.process.stdout.readline())
+            if event["event"] in kinds:
+                return event
+
+
+@pytest.fixture
+def client(tmp_path):
+    client = Client(tmp_path / "frames", "--backend", "cpu")
+    yield client
+    client.process.kill()
+    client.process.wait()
+
+
+def request(camera, sets, frame=1, **more) -> dict:
+    return {"frame": frame, "out": "frame", "camera": camera_as_dict(camera, 0.01), "sets": sets, **more}
+
+
+def test_frames_are_what_draw_draws(client, make_splats, camera):
+    hello = client.hear("hello")
+    assert hello["protocol"] == wire.PROTOCOL and hello["backend"] == "cpu"
+    splats, weights = make_splats(80), np.linspace(0, 1, 80, dtype=np.float32)
+    columns = wire.packed(splats, weights)
+    wire.write_set(client.folder / "one", columns)
+    assert wire.holds(client.folder / "one", columns)
+    assert not wire.holds(client.folder / "one", wire.packed(splats, None))
+    matrix = np.diag([2.0, 2, 2, 1])
+    sets = [{"file": "one", "count": 80, "matrix": matrix.tolist(), "level": 4}]
+    for frame in (1, 2):
+        client.say(**request(camera, sets, frame, depth=True, levels=True, background=None))
+        answer = client.hear("frame", "error")
+        assert answer["frame"] == frame
+        planes = wire.read_planes(client.folder / "frame", len(answer["passes"]), 48, 64)
+        picture = draw(
+            [Placed(SplatSet(splats, weights), matrix, 4)], camera, background=None, depth=True, levels=True
+        )
+        expected = picture.passes()
+        assert answer["passes"] == list(expected)
+        for plane, there in zip(expected.values(), planes, strict=True):
+            np.testing.assert_array_equal(plane, there)
+        (client.folder / "one").unlink(missing_ok=True)  # what was read once is not read again
+
+
+def test_mistakes_are_answered_and_survived(client, make_splats, camera):
+    client.hear("hello")
+    client.say_line("no json")
+    assert "not valid" in client.hear("error")["what"]
+    client.say(**request(camera, [{"file": "gone", "count": 3, "matrix": np.eye(4).tolist(), "level": 0}]))
+    assert "could not use what it was given" in client.hear("error")["what"]
+    client.say(**(request(camera, []) | {"camera": {}}))
+    assert client.hear("error")["what"] == "The camera lacks 'width'."
+    client.say(**request(camera, [], 9))
+    assert client.hear("frame", "error")["frame"] == 9
+
+
+def test_a_frame_is_cancelled(client, make_splats, camera):
+    client.hear("hello")
+    wire.write_set(client.folder / "one", wire.packed(make_splats(3000), None))
+    sets = [{"file": "one", "count": 3000, "matrix": np.eye(4).tolist(), "level": 0}]
+    large = camera.resized(8192, 6144)
+    client.say(**request(large, sets, 1))
+    client.hear("progress")
+    client.say(cancel=1)
+    answer = client.hear("frame", "cancelled")
+    assert (answer["event"], answer["frame"]) == ("cancelled", 1)
+    client.say(**request(camera, sets, 2))
+    assert client.hear("frame", "cancelled")["frame"] == 2
+    assert not (client.folder / "frame").stat().st_size > 8 * 4 * 64 * 48
+
+
+def test_it_ends_with_the_program_that_started_it(client, make_splats, camera):
+    """In the middle of a large frame, too; and what it kept on the disk is gone."""
+    client.hear("hello")
+    wire.write_set(client.folder / "one", wire.packed(make_splats(3000), None))
+    sets = [{"file": "one", "count": 3000, "matrix": np.eye(4).tolist(), "level": 0}]
+    client.say(**request(camera.resized(8192, 6144), sets, 1))
+    client.hear("progress")
+    client.process.stdin.close()
+    started = time.monotonic()
+    assert client.process.wait(timeout=10) == 0
+    assert time.monotonic() - started < 5
+    assert not client.folder.exists()

@@ -1,0 +1,123 @@
+"""``python -m training render``: one view of a bundle, of any 3DGS PLY or of a run as a picture file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..errors import LodgsError
+from ..lod.selection import Detail, complete_levels, select_levels
+from ..runs.data import training_data
+from ..runs.folder import RunFolder
+from ..runs.job import Job
+from ..scenes.cameras import Camera, read_camera
+from ..scenes.colmap import read_scene
+from ..splats.bundle import Bundle, read_bundle, read_folder
+from .picture import Picture, write_picture
+from .scene import Placed, SplatSet, draw
+
+
+@dataclass(frozen=True)
+class Source:
+    """What is rendered: levels, and where they were trained, the views that they were trained from.
+
+    Attributes:
+        run: the run that the bundle was found in, or None.
+    """
+
+    bundle: Bundle
+    run: RunFolder | None
+
+    @classmethod
+    def read(cls, path: Path) -> Source:
+        """A run's folder, a bundle, a folder of levels, or any 3DGS PLY.
+
+        Raises:
+            LodgsError: there is nothing of that kind.
+        """
+        path = Path(path)
+        if not path.exists():
+            raise LodgsError(f"There is no {path}.", "Give a bundle, any 3DGS PLY, or a run's folder.")
+        run = RunFolder(path if path.is_dir() else path.parent)
+        if path.is_dir() and run.job.exists():
+            if not run.bundle.exists():
+                raise LodgsError(
+                    f"{path} holds no finished run (no bundle.ply).", "Train it to the end first."
+                )
+            return cls(read_bundle(run.bundle), run)
+        bundle = read_folder(path) if path.is_dir() else read_bundle(path)
+        return cls(bundle, run if run.job.exists() else None)
+
+    def view(self, name: str, scene: Path | None = None) -> tuple[Camera, float]:
+        """A photograph's view in the photograph's own size, and the depth at which drawing begins.
+
+        Args:
+            name: the photograph's name, or its unmistakable end.
+            scene: folder of the COLMAP scene; None: the run's.
+
+        Raises:
+            LodgsError: there is no such photograph, or no scene.
+        """
+        if scene is not None:
+            cameras = read_scene(scene)
+            there, near = cameras.cameras, 0.01 * cameras.median_depth()
+        elif self.run is not None:
+            data = training_data(Job.from_file(self.run.job), self.run)
+            there, near = data.scene.cameras, data.near
+        else:
+            raise LodgsError(
+                "This file does not know the photographs that it was trained from.",
+                "Name their folder with --scene, or give a --camera.",
+            )
+        found = [camera for camera in there if camera.name == name]
+        found = found or [camera for camera in there if Path(camera.name).name == name]
+        found = found or [camera for camera in there if Path(camera.name).stem == name]
+        if len(found) != 1:
+            examples = ", ".join(camera.name for camera in (found or there)[:3])
+            raise LodgsError(
+                f"{'Several photographs are' if found else 'No photograph is'} called {name}.",
+                f"There are: {examples}, ...",
+            )
+        return found[0], near
+
+
+def render(
+    source: Source,
+    camera: Camera,
+    near: float,
+    out: Path,
+    *,
+    level: int = 0,
+    detail: Detail | None = None,
+    background: tuple[float, float, float] | None = (0.0, 0.0, 0.0),
+    backend: str = "auto",
+) -> Picture:
+    """Draws one view into a file: a PNG, or an EXR with depth and levels besides.
+
+    Args:
+        near: depth at which drawing begins.
+        level: the level to draw; 0 is the finest.
+        detail: draw levels by their distance instead.
+        background: display-coded; None leaves it transparent.
+
+    Raises:
+        LodgsError: there is no such level or detail, or the file cannot be written.
+    """
+    bundle = source.bundle
+    if out.suffix.lower() not in (".png", ".exr"):
+        raise LodgsError(f"{out.name} is neither .png nor .exr.", "Choose one of these endings.")
+    if detail is not None:
+        shown = select_levels(bundle, camera.center, min(camera.fx, camera.fy), detail.of(bundle))
+    else:
+        shown = complete_levels(bundle, level or bundle.levels[-1].number)
+    placed = [Placed(SplatSet(x.splats, x.weights, backend), level=x.number) for x in shown]
+    everything = out.suffix.lower() == ".exr"
+    picture = draw(
+        placed, camera, near=near, background=background, depth=everything, levels=everything, backend=backend
+    )
+    assert picture is not None
+    write_picture(out, picture)
+    return picture
+
+
+__all__ = ["Source", "read_camera", "render"]

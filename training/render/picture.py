@@ -1,0 +1,156 @@
+"""A rendered picture, in the colours of the display or in linear light, as PNG and multilayer EXR."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import LodgsError
+from ..files import atomic_write
+
+NOTHING = 1e10
+"""Depth where a pixel shows nothing, as Blender's renderers say it."""
+
+_CLEAR = 0.02
+"""Part of an 8-bit step that linear colours keep from the borders between two 8-bit values."""
+
+
+@dataclass
+class Picture:
+    """What a camera sees.
+
+    Attributes:
+        image: (H, W, 3) float32, display-coded (sRGB) colours over the background; over black, and so
+            multiplied by alpha, where that is transparent. Not clamped above.
+        alpha: (H, W) float32; ones unless the background is transparent.
+        depth: (H, W) float32 along the camera's z axis in world units: of the splat that brings the light
+            let through to a half, or where none does the mean of all; NOTHING where there is none. Empty
+            where the pass was not drawn.
+        levels: number of each of the masks.
+        masks: (L, H, W) float32, how much of a pixel each level fills.
+    """
+
+    image: np.ndarray
+    alpha: np.ndarray
+    depth: np.ndarray
+    levels: list[int]
+    masks: np.ndarray
+
+    @classmethod
+    def empty(
+        cls,
+        width: int,
+        height: int,
+        background: tuple[float, float, float] | None,
+        depth: bool = False,
+        levels: list[int] | None = None,
+    ) -> Picture:
+        """A picture of nothing but the background."""
+        shape = height, width
+        image = np.empty((*shape, 3), np.float32)
+        image[:] = background or (0.0, 0.0, 0.0)
+        return cls(
+            image=image,
+            alpha=np.full(shape, 0.0 if background is None else 1.0, np.float32),
+            depth=np.full(shape if depth else (0, 0), NOTHING, np.float32),
+            levels=levels or [],
+            masks=np.zeros((len(levels or []), *shape), np.float32),
+        )
+
+    @property
+    def level(self) -> np.ndarray:
+        """(H, W) float32, the number of the level that fills most of a pixel; 0 where nothing does."""
+        if not self.levels:
+            return np.zeros(self.alpha.shape, np.float32)
+        most = np.array(self.levels, np.float32)[self.masks.argmax(0)]
+        return np.where(self.masks.max(0) > 0, most, np.float32(0))
+
+    def eight_bit(self) -> np.ndarray:
+        """(H, W, 3) uint8, or (H, W, 4) where something is transparent; colours not multiplied by alpha."""
+        codes = np.concatenate([self._straight(), self.alpha[..., None]], 2).astype(np.float64)
+        codes = np.floor(codes.clip(0, 1) * 255 + 0.5).astype(np.uint8)
+        return codes[..., :3] if (self.alpha == 1).all() else codes
+
+    def linear(self) -> np.ndarray:
+        """(H, W, 4) float32, colours in linear light multiplied by alpha, and alpha.
+
+        The colours under the alpha are decoded, as a display transform will code them. They are first moved
+        away, by 0.02 of an 8-bit step at most, from where rounding to 8 bits turns over: so whoever codes
+        them again has the 8 bits of :meth:`eight_bit`, however exact their arithmetic is.
+        """
+        codes = self._straight().astype(np.float64) * 255
+        rest = codes - np.floor(codes) - 0.5
+        codes += np.where(rest >= 0, np.maximum(_CLEAR - rest, 0), np.minimum(-_CLEAR - rest, 0))
+        linear = linear_of((codes / 255).clip(0)) * self.alpha[..., None]
+        return np.concatenate([linear.astype(np.float32), self.alpha[..., None]], 2)
+
+    def passes(self) -> dict[str, np.ndarray]:
+        """Planes (H, W) by name as Blender calls them: Combined.R to .A, Depth.Z, Level.X, Level 1.X, ..."""
+        combined = self.linear()
+        planes = {f"Combined.{channel}": combined[..., i] for i, channel in enumerate("RGBA")}
+        if self.depth.size:
+            planes["Depth.Z"] = self.depth
+        if self.levels:
+            planes["Level.X"] = self.level
+            planes |= {f"Level {n}.X": mask for n, mask in zip(self.levels, self.masks, strict=True) if n}
+        return planes
+
+    def _straight(self) -> np.ndarray:
+        """Colours (H, W, 3) not multiplied by alpha, float32."""
+        alpha = self.alpha[..., None]
+        return np.divide(self.image, alpha, out=np.zeros_like(self.image), where=alpha > 0)
+
+
+def linear_of(coded: np.ndarray) -> np.ndarray:
+    """Linear light of display-coded values from 0 on (IEC 61966-2-1, its curve continued above 1)."""
+    return np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
+
+
+def write_picture(path: Path, picture: Picture) -> None:
+    """Writes a PNG, or a multilayer EXR with every pass, by the file's ending.
+
+    Raises:
+        LodgsError: another ending, or the file cannot be written.
+    """
+    writers = {".png": _write_png, ".exr": _write_exr}
+    writer = writers.get(path.suffix.lower())
+    if writer is None:
+        raise LodgsError(f"{path.name} is neither .png nor .exr.", "Choose one of these endings.")
+    with atomic_write(path) as temporary:
+        writer(temporary, picture)
+
+
+def _write_png(path: Path, picture: Picture) -> None:
+    """PNG by hand (https://www.w3.org/TR/png-3/): Pillow's corrupts memory once pycolmap is loaded."""
+    codes = picture.eight_bit()
+    height, width, channels = codes.shape
+    # the filter "up": each row less the one above, which packs smooth pictures well
+    lines = np.empty((height, 1 + width * channels), np.uint8)
+    lines[:, 0] = 2
+    rows = codes.reshape(height, -1)
+    lines[0, 1:], lines[1:, 1:] = rows[0], rows[1:] - rows[:-1]
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = struct.pack(">IIBBBBB", width, height, 8, {3: 2, 4: 6}[channels], 0, 0, 0)
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", head)
+        + chunk(b"sRGB", b"\0")
+        + chunk(b"IDAT", zlib.compress(lines.tobytes(), 6))
+        + chunk(b"IEND", b"")
+    )
+
+
+def _write_exr(path: Path, picture: Picture) -> None:
+    import OpenEXR
+
+    planes = {f"LODGS.{name}": np.ascontiguousarray(plane) for name, plane in picture.passes().items()}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, planes) as file:
+        file.write(str(path))

@@ -1,0 +1,79 @@
+"""What Blender and the renderer hand each other beside lines of JSON: arrays in files. numpy only.
+
+A set of splats is one file of float32, column after column: means, quats, log-scales, opacity logits,
+weights, coefficients. A frame is one file of float32, plane after plane, rows from the top. Who writes a file
+finishes it before the line that names it is sent, and never changes it afterwards; both sides read by mapping
+it into memory.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..splats.gaussians import Splats
+
+PROTOCOL = 1
+"""Version of what is said; both sides come from one installation, so any other one is refused."""
+
+_WIDTHS = (3, 4, 3, 1, 1)
+
+
+def packed(splats: Splats, weights: np.ndarray | None) -> list[np.ndarray]:
+    """The columns of a set in the order of its file, float32; weights of None are ones."""
+    ones = np.ones(len(splats), np.float32) if weights is None else weights
+    columns = (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, ones, splats.sh)
+    return [np.ascontiguousarray(column, np.float32).reshape(-1) for column in columns]
+
+
+def write_set(path: Path, columns: list[np.ndarray]) -> None:
+    """Writes what :func:`packed` returned."""
+    with open(path, "wb") as file:
+        for column in columns:
+            file.write(column.data)
+
+
+def holds(path: Path, columns: list[np.ndarray]) -> bool:
+    """Whether a file has just these columns in it."""
+    if sum(column.nbytes for column in columns) != path.stat().st_size:
+        return False
+    begin = 0
+    there = _mapped(path)
+    for column in columns:
+        if not np.array_equal(there[begin : begin + len(column)].view(np.int32), column.view(np.int32)):
+            return False
+        begin += len(column)
+    return True
+
+
+def read_set(path: Path, count: int) -> tuple[Splats, np.ndarray]:
+    """A set's splats and weights.
+
+    Raises:
+        ValueError: the file is not one of ``count`` splats.
+    """
+    values = np.array(_mapped(path))
+    parts, begin = [], 0
+    for width in _WIDTHS:
+        parts.append(values[begin : begin + count * width].reshape(count, width))
+        begin += count * width
+    means, quats, log_scales, logits, weights = parts
+    sh = values[begin:].reshape(count, -1, 3)
+    return Splats(means, quats, log_scales, logits[:, 0], sh), weights[:, 0]
+
+
+def write_planes(path: Path, planes: np.ndarray) -> None:
+    """Writes a frame, (planes, H, W)."""
+    with open(path, "wb") as file:
+        file.write(np.ascontiguousarray(planes, np.float32).data)
+
+
+def read_planes(path: Path, planes: int, height: int, width: int) -> np.ndarray:
+    """A frame, (planes, H, W) float32; ValueError where the file is not one of this size."""
+    return np.array(_mapped(path)).reshape(planes, height, width)
+
+
+def _mapped(path: Path) -> np.ndarray:
+    """A file's numbers, as they lie in the system's cache."""
+    return np.memmap(path, np.float32, "r") if path.stat().st_size else np.empty(0, np.float32)
