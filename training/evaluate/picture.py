@@ -12,6 +12,7 @@ from ..files import atomic_write
 from ..lod.colors import level_color
 from ..lod.selection import Detail, complete, select
 from ..scenes.cameras import Camera
+from ..scenes.images import write_png
 from ..splats.bundle import Bundle
 from ..splats.gaussians import Splats
 from .metrics import psnr
@@ -72,4 +73,4 @@ def _write_sheet(
         sheet.paste(Image.fromarray(pixels), (x, y + caption))
         draw.text((x + 6, y + 3), name, fill=(230, 230, 230), font=font)
     with atomic_write(path) as temporary:
-        sheet.save(temporary, format="PNG")
+        write_png(temporary, np.asarray(sheet))

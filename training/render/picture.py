@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +9,7 @@ import numpy as np
 
 from ..errors import LodgsError
 from ..files import atomic_write
+from ..scenes.images import write_png
 
 NOTHING = 1e10
 """Depth where a pixel shows nothing, as Blender's renderers say it."""
@@ -116,35 +115,12 @@ def write_picture(path: Path, picture: Picture) -> None:
     Raises:
         LodgsError: another ending, or the file cannot be written.
     """
-    writers = {".png": _write_png, ".exr": _write_exr}
+    writers = {".png": lambda to, shown: write_png(to, shown.eight_bit()), ".exr": _write_exr}
     writer = writers.get(path.suffix.lower())
     if writer is None:
         raise LodgsError(f"{path.name} is neither .png nor .exr.", "Choose one of these endings.")
     with atomic_write(path) as temporary:
         writer(temporary, picture)
-
-
-def _write_png(path: Path, picture: Picture) -> None:
-    """PNG by hand (https://www.w3.org/TR/png-3/): Pillow's corrupts memory once pycolmap is loaded."""
-    codes = picture.eight_bit()
-    height, width, channels = codes.shape
-    # the filter "up": each row less the one above, which packs smooth pictures well
-    lines = np.empty((height, 1 + width * channels), np.uint8)
-    lines[:, 0] = 2
-    rows = codes.reshape(height, -1)
-    lines[0, 1:], lines[1:, 1:] = rows[0], rows[1:] - rows[:-1]
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    head = struct.pack(">IIBBBBB", width, height, 8, {3: 2, 4: 6}[channels], 0, 0, 0)
-    path.write_bytes(
-        b"\x89PNG\r\n\x1a\n"
-        + chunk(b"IHDR", head)
-        + chunk(b"sRGB", b"\0")
-        + chunk(b"IDAT", zlib.compress(lines.tobytes(), 6))
-        + chunk(b"IEND", b"")
-    )
 
 
 def _write_exr(path: Path, picture: Picture) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -233,3 +234,28 @@ def _area_average(pixels: np.ndarray, size: int, axis: int) -> np.ndarray:
         part = (edges - below).reshape(-1, *[1] * (pixels.ndim - 1))
         mean = np.diff(total[below] * (1 - part) + total[below + 1] * part, axis=0) * (size / old)
     return np.moveaxis(mean, 0, axis)
+
+
+def write_png(path: Path, codes: np.ndarray) -> None:
+    """Writes (H, W, 3) or (H, W, 4) uint8, display-coded, colours not multiplied by alpha.
+
+    By hand (https://www.w3.org/TR/png-3/): Pillow's corrupts memory once pycolmap is loaded.
+    """
+    height, width, channels = codes.shape
+    # the filter "up": each row less the one above, which packs smooth pictures well
+    lines = np.empty((height, 1 + width * channels), np.uint8)
+    lines[:, 0] = 2
+    rows = codes.reshape(height, -1)
+    lines[0, 1:], lines[1:, 1:] = rows[0], rows[1:] - rows[:-1]
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = struct.pack(">IIBBBBB", width, height, 8, {3: 2, 4: 6}[channels], 0, 0, 0)
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", head)
+        + chunk(b"sRGB", b"\0")
+        + chunk(b"IDAT", zlib.compress(lines.tobytes(), 6))
+        + chunk(b"IEND", b"")
+    )
