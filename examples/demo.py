@@ -20,6 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from tools.blender_module import EXTENSION, start_blender  # noqa: E402
+from training.methods.parameters import preset  # noqa: E402
 from training.runs.folder import RunFolder  # noqa: E402
 
 
@@ -46,7 +47,7 @@ def main() -> int:
         ["train", "--scene", str(chosen.scene), "--method", chosen.method, "--preset", "draft",
          "--image-scale", str(chosen.image_scale), "--out", str(run.path),
          "--blend", str(out / "scene.blend"), "--export", str(out / "bundle.ply"),
-         "--set", "max_splats=60000",  # keeps the demo within minutes on two cores
+         "--set", f"max_splats={preset(chosen.method, 'draft').max_splats // 2}",  # minutes on two cores
          *(word for setting in chosen.set for word in ("--set", setting))]
     )  # fmt: skip
     if code:

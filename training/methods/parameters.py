@@ -105,6 +105,8 @@ class FlodParameters(Parameters):
 class OctreeParameters(Parameters):
     """Parameters of Octree-GS with explicit anchors. The defaults are the draft's."""
 
+    max_splats: int = 180_000
+    """Most splats of all levels together, which add up; FLoD's five levels are over 300,000."""
     levels: int = 0
     """Number of levels (Octree-GS: K); 0 takes it from the range of distances (Eq. 3)."""
     nearest: float = 0.05
