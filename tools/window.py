@@ -36,9 +36,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="tour the extension in a real Blender window")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "window")
     parser.add_argument("--scene", type=Path, default=ROOT / "examples" / "lantern_garden")
-    parser.add_argument(
-        "--draft", action="store_true", help="train the whole draft, in minutes: for pictures to show"
-    )
+    parser.add_argument("--long", action="store_true", help="train for some minutes: for pictures to show")
     chosen = parser.parse_args()
     blender, x_server, camera = find_programs()
     archive = extension.build(ROOT / "dist")
@@ -54,7 +52,7 @@ def main() -> int:
         "scene": str(chosen.scene.resolve()),
         "out": str(out),
         "run": str(out / "run"),
-        "draft": chosen.draft,
+        "long": chosen.long,
         "camera": [camera, "-window", "root"],
     }
     with display(x_server) as os.environ["DISPLAY"]:
@@ -123,16 +121,18 @@ def tour(blender: str, plan: dict, log: Path) -> str:
             run = RunFolder(plan["run"])
             if run.state() == "running":  # the trainer outlives Blender
                 run.request_cancel()
-    end = facts(Path(plan["out"]))[-1:]
-    if end != ["passed"]:
-        return end[0] if end else f"Blender ended before the tour: see {log.name}."
+    end = "".join(facts(Path(plan["out"]))[-1:])
+    if end.startswith("failed"):
+        return end
+    if end != "passed":
+        return f"Blender ended before the tour did: see {log.name}."
     if "Traceback" in log.read_text(errors="replace"):
         return f"There was an error by the way: see {log.name}."
     return ""
 
 
 def facts(out: Path) -> list[str]:
-    """What the tour has found so far, a line a step; the last is "passed" or says what went wrong."""
+    """What the tour has found so far, a line a step; the last is "passed", or "failed" with why."""
     written = out / "facts.txt"
     return written.read_text(encoding="utf-8").splitlines() if written.exists() else []
 
