@@ -98,8 +98,11 @@ def follow(step: Callable[[], bool]) -> None:
 
 
 def redraw() -> None:
-    """Draw the panels that show a program's progress anew, soon."""
+    """Draw the panels that show a program's progress anew, soon; viewports beside them keep their picture."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
-            if area.type in {"VIEW_3D", "PREFERENCES"}:
+            if area.type == "PREFERENCES":
                 area.tag_redraw()
+            for region in area.regions if area.type == "VIEW_3D" else ():
+                if region.type == "UI":
+                    region.tag_redraw()

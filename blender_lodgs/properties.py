@@ -104,9 +104,9 @@ def _changed(self, context) -> None:
 
 
 def _redraw(self, context) -> None:
-    from . import processes
+    from . import compare
 
-    processes.redraw()
+    compare.redraw()
 
 
 def _view_chosen(self, context) -> None:
