@@ -127,16 +127,8 @@ def show(context: bpy.types.Context, root: bpy.types.Object, view: bpy.types.Obj
     scenes.through(context, view)
     shown = found
     context.scene.lodgs_render.show_comparison = True
-    redraw()
+    processes.redraw()
     return found
-
-
-def redraw() -> None:
-    """Draw the viewports anew, soon: they show the comparison."""
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "VIEW_3D":
-                area.tag_redraw()
 
 
 def worst(root: bpy.types.Object) -> bpy.types.Object:

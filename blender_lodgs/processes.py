@@ -98,11 +98,8 @@ def follow(step: Callable[[], bool]) -> None:
 
 
 def redraw() -> None:
-    """Draw the panels that show a program's progress anew, soon; viewports beside them keep their picture."""
+    """Draw the panels that show a program's progress anew, soon."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
-            if area.type == "PREFERENCES":
+            if area.type in {"VIEW_3D", "PREFERENCES"}:
                 area.tag_redraw()
-            for region in area.regions if area.type == "VIEW_3D" else ():
-                if region.type == "UI":
-                    region.tag_redraw()

@@ -104,9 +104,9 @@ def _changed(self, context) -> None:
 
 
 def _redraw(self, context) -> None:
-    from . import compare
+    from . import processes
 
-    compare.redraw()
+    processes.redraw()
 
 
 def _view_chosen(self, context) -> None:
