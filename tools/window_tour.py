@@ -223,7 +223,7 @@ def compare(root: bpy.types.Object) -> Steps:
     bpy.context.scene.lodgs_render.wipe = 0.2
     yield from settle()
     wiped.append(take("compare-wiped"))
-    assert changed(*wiped) > 0.02, "The wipe moves nothing."
+    assert changed(*wiped, by=0.02) > 0.02, "The wipe moves nothing."
 
 
 def overlays() -> Steps:
@@ -344,12 +344,12 @@ def pixels(path: Path) -> np.ndarray:
     return values.reshape(height, width, 4)[::-1, :, :3]
 
 
-def changed(before: np.ndarray, after: np.ndarray) -> float:
-    """The share of the viewport's pixels that differ clearly between two pictures of the screen."""
+def changed(before: np.ndarray, after: np.ndarray, by: float = 0.1) -> float:
+    """The share of the viewport's pixels that differ by more than this between two pictures of the screen."""
     part = region()
     top = before.shape[0] - part.y - part.height
     clear = slice(top, top + part.height), slice(part.x, part.x + part.width)
-    return float((np.abs(before[clear] - after[clear]).max(axis=2) > 0.1).mean())
+    return float((np.abs(before[clear] - after[clear]).max(axis=2) > by).mean())
 
 
 def alike(picture: np.ndarray, photograph: np.ndarray) -> float:
