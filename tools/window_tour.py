@@ -102,8 +102,8 @@ def train(root: bpy.types.Object) -> Steps:
     yield from until(
         lambda: not watch.running or len(watch.levels) == watch.progress.get("levels", 0) - 1, 900
     )
-    yield from settle()
     assert watch.running and root.lodgs.levels, f"Levels do not come one by one: {watch.problem}"
+    yield from settle()
     take("training", f"level {len(root.lodgs.levels)} is there while level {watch.progress['level']} trains")
     yield from until(lambda: not watch.running, 1200)
     yield from settle()
