@@ -6,7 +6,7 @@ METHOD ?= flod
 PYTEST := -m pytest
 export LODGS_TRAINER_PYTHON := $(CURDIR)/$(VENV)
 
-.PHONY: help setup demo test test-5.0 lint bench extension interop clean
+.PHONY: help setup demo test test-5.0 lint bench extension window interop clean
 
 help:
 	@echo "make setup      environments from pinned packages (needs Python 3.11; 3.13 for Blender 5.2's tests)"
@@ -15,6 +15,7 @@ help:
 	@echo "make lint       style and types"
 	@echo "make bench      how fast it is, as ratios from one run"
 	@echo "make extension  dist/lodgs-VERSION.zip, checked by Blender"
+	@echo "make window     a tour in a real Blender window, with pictures (needs Blender, Xvfb, ImageMagick)"
 	@echo "make interop    other programs read our files (needs Node)"
 
 setup:
@@ -45,6 +46,9 @@ bench: setup
 
 extension: setup
 	$(VENV) tools/extension.py
+
+window: setup
+	$(VENV) tools/window.py $(if $(LONG),--long)
 
 interop: setup
 	$(VENV) tools/interop.py

@@ -316,6 +316,10 @@ def through(context: bpy.types.Context, view: bpy.types.Object) -> bpy.types.Obj
     context.scene.camera = view
     if view.data.lodgs.width:
         match_render(context.scene, view.data.lodgs)
+    for root in roots(context.scene):
+        line = root.lodgs.cameras.objects.find(view.name) if root.lodgs.cameras else -1
+        if line >= 0 and line != root.lodgs.active_view:  # the list of views goes along
+            root.lodgs.active_view = line
     return view
 
 

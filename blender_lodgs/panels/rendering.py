@@ -32,9 +32,15 @@ class LODGS_PT_rendering(bpy.types.Panel):
             return
         _draw_film(layout, scene)
         _draw_passes(layout, scene, context.view_layer)
-        row = layout.row(align=True)
-        row.operator("lodgs.render_quick", icon="RENDER_STILL").animation = False
-        row.operator("lodgs.render_quick", icon="RENDER_ANIMATION", text="").animation = True
+        column = layout.column(align=True)
+        for name, text, icon in (
+            ("render.render", "Render Image", "RENDER_STILL"),
+            ("lodgs.render_quick", "Viewport Quality", "RESTRICT_VIEW_OFF"),
+        ):
+            row = column.row(align=True)
+            row.operator_context = "INVOKE_DEFAULT"  # with progress, beside which one works on
+            row.operator(name, text=text, icon=icon).animation = False
+            row.operator(name, text="", icon="RENDER_ANIMATION").animation = True
         column = layout.column(align=True)
         column.operator("lodgs.combine_with_meshes", icon="NODE_COMPOSITING")
         column.operator("lodgs.export_camera", icon="CAMERA_DATA", text="Export Camera…")

@@ -117,6 +117,12 @@ def test_a_click_in_the_list_looks_through(bpy, lodgs, root):
     assert bpy.context.scene.camera == root.lodgs.cameras.objects[7]
 
 
+def test_the_list_goes_along_with_the_arrows(bpy, lodgs, root):
+    for step in (1, 1, -1, -1, -1):
+        assert bpy.ops.lodgs.look_through(step=step) == {"FINISHED"}
+        assert root.lodgs.cameras.objects[root.lodgs.active_view] == bpy.context.scene.camera
+
+
 def test_the_list_sorts_the_worst_first(bpy, lodgs, root):
     things = root.lodgs.cameras.objects
     for index, psnr in ((3, 12.0), (5, 10.0), (9, 30.0)):

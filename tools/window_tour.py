@@ -1,0 +1,388 @@
+"""The tour of ``make window``, inside Blender: what an artist does, checked and photographed step by step.
+
+``tools/window.py`` starts it and says where everything is. A timer takes the steps of :func:`tour`, so that
+Blender draws, listens and trains between them.
+"""
+# pyright: reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import bpy
+import numpy as np
+from mathutils import Matrix, Vector
+
+LODGS = "bl_ext.user_default.lodgs"
+PLAN = json.loads(sys.argv[-1])
+OUT = Path(PLAN["out"])
+TRAINING = {
+    "levels": 3, "steps": (60, 90, 250), "densify_until": (0.5,) * 3, "densify_interval": (20,) * 3,
+    "max_splats": 20_000, "budget_ratio": 0.35, "footprint": 8.0, "sh_interval": 100,
+}  # fmt: skip
+"""What makes a tiny job of FLoD's draft."""
+LONGER = {"steps": (150, 250, 300, 450, 1000), "max_splats": 60_000}
+"""What makes half of it: minutes."""
+
+Steps = Iterator[float]
+"""Seconds to wait before each further step."""
+
+
+def tour() -> Steps:
+    """Everything in order. An assertion that fails ends the tour with its sentence."""
+    yield from preferences()
+    root = yield from bring_in()
+    yield from train(root)
+    yield from levels(root)
+    yield from distances(root)
+    yield from orbit(root)
+    yield from freeze(root)
+    yield from render(root)
+    yield from compare(root)
+    yield from overlays()
+
+
+def preferences() -> Steps:
+    assert LODGS in bpy.context.preferences.addons, "The extension is not enabled."
+    area = viewport()[0]
+    area.type = "PREFERENCES"
+    bpy.context.preferences.active_section = "ADDONS"
+    bpy.context.window_manager.addon_search = "LODGS"
+    press("preferences.addon_expand", module=LODGS)
+    press("lodgs.check_environment")
+    yield from settle()
+    report = module("environment").report
+    assert report.ok, f"No trainer: {report.problems}"
+    take("preferences", report.versions["torch"])
+    area.type = "VIEW_3D"
+    yield 0.5
+    for name in ("Cube", "Light", "Camera"):  # as the guide says: the first photograph's is the camera
+        bpy.data.objects.remove(bpy.data.objects[name])
+    open_panels()
+    space: bpy.types.SpaceView3D = viewport()[0].spaces.active  # type: ignore[assignment]
+    space.show_region_ui = True
+    yield 1.0
+    region("UI").active_panel_category = "LODGS"
+    yield from settle()
+    take("tab")
+
+
+def bring_in() -> Iterator[float]:
+    press("lodgs.import_colmap", directory=PLAN["scene"])
+    root = module("scenes").active_root(bpy.context)
+    views = module("scenes").views(root)
+    photographs = list(Path(PLAN["scene"], "images").iterdir())
+    assert len(views) == len(photographs), f"{len(views)} of {len(photographs)} cameras came."
+    assert len(root.lodgs.points.data.points), "No points came."
+    look_at(views[0].matrix_world @ Vector((1.0, 0, -2)), back=11)
+    yield from settle()
+    take("import", f"{len(views)} cameras, {len(root.lodgs.points.data.points):,} points")
+    press("lodgs.look_through")
+    looks = viewport()[1]
+    looks.view_perspective = "CAMERA"
+    looks.view_camera_zoom, looks.view_camera_offset = 10, (0.12, 0)  # left of the sidebar
+    yield from settle()
+    assert viewport()[1].view_perspective == "CAMERA"
+    take("look-through", bpy.context.scene.camera.name)
+    return root
+
+
+def train(root: bpy.types.Object) -> Steps:
+    jobs = module("jobs")
+    watch = jobs.start(root, PLAN["run"], LONGER if PLAN["long"] else TRAINING)
+    jobs.follow(watch)
+    yield from until(
+        lambda: not watch.running or len(watch.levels) == watch.progress.get("levels", 0) - 1, 900
+    )
+    assert watch.running and root.lodgs.levels, f"Levels do not come one by one: {watch.problem}"
+    yield from settle()
+    take("training", f"level {len(root.lodgs.levels)} is there while level {watch.progress['level']} trains")
+    yield from until(lambda: not watch.running, 1200)
+    yield from settle()
+    assert watch.state == "done", watch.problem or watch.message
+    assert len(root.lodgs.levels) == watch.progress["levels"], "Not all levels came."
+    counts = [len(item.object.data.points) for item in root.lodgs.levels]
+    assert counts[-1] > counts[0], f"The finest level should have more splats: {counts}"
+    take("trained", f"{len(counts)} levels of {', '.join(f'{n:,}' for n in counts)} splats")
+
+
+def levels(root: bpy.types.Object) -> Steps:
+    root.lodgs.cameras.hide_viewport = True
+    settings = bpy.context.scene.lodgs_viewport
+    pictures = {}
+    finest = len(root.lodgs.levels)
+    for number in (1, finest):
+        press("lodgs.show_only_level", level=number)
+        yield from settle()
+        shown, _ = module("scenes").count_shown(bpy.context, root)
+        assert shown == len(root.lodgs.levels[number - 1].object.data.points), f"{shown} splats are shown."
+        pictures[number] = take(f"level-{number}", f"{shown:,} splats")
+    assert changed(pictures[1], pictures[finest]) > 0.2, "Level 1 looks like the finest level."
+    settings.splats = False
+    yield from settle()
+    points = take("points")
+    settings.splats = True
+    yield from settle()
+    again = take("splats")
+    assert changed(points, again) > 0.2, "Points look like splats."
+    assert changed(pictures[finest], again) < 0.01, "The same splats look different the second time."
+
+
+def distances(root: bpy.types.Object) -> Steps:
+    root.lodgs.mode, root.lodgs.gamma = "SELECTIVE", 2.0
+    scroll(20)
+    yield from settle()
+    shown, everything = module("scenes").count_shown(bpy.context, root)
+    assert 0 < shown < everything, f"{shown} of {everything} splats are shown by distance."
+    take("by-distance", f"{shown:,} of {everything:,} splats")
+    root.lodgs.tell = "LEVELS"
+    yield from settle()
+    take("by-distance-levels")
+    root.lodgs.tell = "OWN"
+
+
+def orbit(root: bpy.types.Object) -> Steps:
+    root.lodgs.eye = "VIEW"
+    leave_camera()
+    for angle in (-15, 25, 25):
+        press("view3d.view_orbit", angle=math.radians(angle), type="ORBITRIGHT")
+        yield from settle()
+        yield from settle()
+        eye = viewport()[1].view_matrix.inverted().translation
+        away = (root.matrix_world @ Vector(root.lodgs.held_eye) - eye).length
+        assert away < 1e-3, f"The viewport's eye is {away:.3f} from the view's."
+        shown, _ = module("scenes").count_shown(bpy.context, root)
+        take("orbit", f"{shown:,} splats")
+
+
+def freeze(root: bpy.types.Object) -> Steps:
+    root.lodgs.freeze, root.lodgs.tell = True, "BANDS"
+    held, shown = tuple(root.lodgs.held_eye), module("scenes").count_shown(bpy.context, root)
+    press("view3d.view_orbit", angle=math.radians(40), type="ORBITUP")
+    viewport()[1].view_distance = 40
+    yield from settle()
+    yield from settle()
+    assert tuple(root.lodgs.held_eye) == held, "A frozen eye moved."
+    assert module("scenes").count_shown(bpy.context, root) == shown, "A frozen choice changed."
+    take("freeze", f"{shown[0]:,} splats")
+    root.lodgs.freeze, root.lodgs.tell, root.lodgs.eye = False, "OWN", "CAMERA"
+
+
+def render(root: bpy.types.Object) -> Steps:
+    scene = bpy.context.scene
+    press("lodgs.look_through", step=1)
+    viewport()[1].view_perspective = "CAMERA"
+    chosen = root.lodgs.cameras.objects[root.lodgs.active_view]
+    assert chosen == scene.camera == module("scenes").views(root)[1], "The list shows another view."
+    press("lodgs.use_engine")
+    scroll(60)
+    yield from settle()
+    take("rendering")
+    area = viewport()[0]
+    bpy.context.preferences.view.render_display_type = "AREA"  # this display has no window manager
+    done = []
+    ended = (bpy.app.handlers.render_complete, bpy.app.handlers.render_cancel)
+    for handlers, word in zip(ended, ("complete", "cancelled"), strict=True):
+        handlers.append(lambda *_, word=word: done.append(word))
+    press("render.render")
+    yield from until(lambda: bool(done), 300)
+    yield from settle()
+    assert done == ["complete"], "F12 was cancelled."
+    file = OUT / "f12.png"
+    bpy.data.images["Render Result"].save_render(str(file))
+    photograph = Path(bpy.path.abspath(scene.camera.data.lodgs.photograph))
+    psnr = alike(pixels(file), pixels(photograph))
+    assert psnr > 14, f"F12 gives nothing like the photograph: {psnr:.1f} dB."
+    take("f12", f"{psnr:.1f} dB against the photograph")
+    area.type = "VIEW_3D"
+    yield 0.5
+
+
+def compare(root: bpy.types.Object) -> Steps:
+    module_ = module("compare")
+    bpy.context.scene.lodgs_viewport.splats = False  # each view measured is drawn, slowly by software
+    press("lodgs.measure_views")
+    yield from until(lambda: not module_.measuring.running, 600)
+    assert not module_.measuring.problem, module_.measuring.problem
+    assert module_.measuring.done == len(module("scenes").views(root))
+    bpy.context.scene.lodgs_viewport.splats = True
+    press("lodgs.compare_view", worst=True)
+    scroll(60)
+    yield from settle()
+    least = min(view.data.lodgs.psnr for view in module("scenes").views(root))
+    assert module_.shown.psnr == least > 10, f"The worst view has {module_.shown.psnr:.1f} dB."
+    wiped = [take("compare", f"{bpy.context.scene.camera.name}: {module_.shown.psnr:.1f} dB")]
+    bpy.context.scene.lodgs_render.wipe = 0.2
+    yield from settle()
+    wiped.append(take("compare-wiped"))
+    assert changed(*wiped, by=0.02) > 0.02, "The wipe moves nothing."
+
+
+def overlays() -> Steps:
+    press("wm.call_panel", name="VIEW3D_PT_overlay", keep_open=True)
+    yield from settle()
+    take("overlays")
+
+
+# -- hands and eyes ----------------------------------------------------------------------------------------
+
+
+def module(name: str):
+    """A module of the installed extension."""
+    return importlib.import_module(f"{LODGS}.blender_lodgs.{name}")
+
+
+def viewport() -> tuple[bpy.types.Area, bpy.types.RegionView3D]:
+    """The 3D viewport and what it looks through."""
+    for area in bpy.context.window_manager.windows[0].screen.areas:
+        if area.type == "VIEW_3D":
+            return area, area.spaces.active.region_3d
+    raise AssertionError("There is no 3D viewport.")
+
+
+def region(kind: str = "WINDOW") -> bpy.types.Region:
+    return next(part for part in viewport()[0].regions if part.type == kind)
+
+
+def press(operator: str, **settings) -> None:
+    """What a button does. Errors that Blender would show become the tour's."""
+    group, name = operator.split(".")
+    window = bpy.context.window_manager.windows[0]
+    area = next((area for area in window.screen.areas if area.type == "VIEW_3D"), window.screen.areas[0])
+    part = next(part for part in area.regions if part.type == "WINDOW")
+    with bpy.context.temp_override(window=window, area=area, region=part):
+        way = "EXEC_DEFAULT" if group == "lodgs" else "INVOKE_DEFAULT"
+        getattr(getattr(bpy.ops, group), name)(way, **settings)
+
+
+def open_panels() -> None:
+    """Panels that begin closed begin open here: the pictures are to show them."""
+    for module_ in (module("panels.rendering"), module("panels.compare")):
+        for panel in module_.CLASSES:
+            if "DEFAULT_CLOSED" in getattr(panel, "bl_options", ()):
+                bpy.utils.unregister_class(panel)
+                panel.bl_options = set()
+                bpy.utils.register_class(panel)
+
+
+def scroll(times: int) -> None:
+    """Turn the mouse wheel over the sidebar, from its top on downwards."""
+    with bpy.context.temp_override(
+        window=bpy.context.window_manager.windows[0], area=viewport()[0], region=region("UI")
+    ):
+        for _ in range(100):
+            bpy.ops.view2d.scroll_up(deltay=40)
+        for _ in range(times):
+            bpy.ops.view2d.scroll_down(deltay=40)
+
+
+def look_at(place: Vector, back: float) -> None:
+    """Look at a place in the world from some way off, in the direction in which one looks already."""
+    looks = viewport()[1]
+    looks.view_location, looks.view_distance = place, back
+
+
+def leave_camera() -> None:
+    """Go on from the camera's place with a view of one's own that turns about what is in its middle."""
+    camera, looks = bpy.context.scene.camera, viewport()[1]
+    pose: Matrix = camera.matrix_world.normalized()
+    looks.view_perspective = "PERSP"
+    looks.view_rotation = pose.to_quaternion()
+    looks.view_distance = 3.0
+    looks.view_location = pose @ Vector((0, 0, -3.0))
+
+
+def settle() -> Steps:
+    """Wait until the picture is complete: sorted splats in full resolution, and what follows the view."""
+    for _ in range(2):
+        yield 0.6
+        redraw()
+
+
+def redraw() -> None:
+    with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
+        bpy.ops.wm.redraw_timer(type="DRAW_WIN_SWAP", iterations=1)
+
+
+def until(condition: Callable[[], bool], seconds: float) -> Steps:
+    """Wait for something that comes by itself."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, f"Nothing came in {seconds:.0f} seconds."
+        yield 0.2
+
+
+taken: list[str] = []
+
+
+def take(name: str, fact: str = "") -> np.ndarray:
+    """Photograph the screen; return the picture as (H, W, 3) float32 with rows from the top."""
+    taken.append(name)
+    title = f"{len(taken):02}-{name}"
+    path = OUT / f"{title}.png"
+    redraw()
+    subprocess.run([*PLAN["camera"], str(path)], check=True)
+    say(f"{title}: {fact}" if fact else title)
+    return pixels(path)
+
+
+def pixels(path: Path) -> np.ndarray:
+    """A picture file as (H, W, 3) float32 with rows from the top, as the display shows it."""
+    image = bpy.data.images.load(str(path))
+    width, height = image.size
+    values = np.empty(width * height * 4, np.float32)
+    image.pixels.foreach_get(values)
+    bpy.data.images.remove(image)
+    return values.reshape(height, width, 4)[::-1, :, :3]
+
+
+def changed(before: np.ndarray, after: np.ndarray, by: float = 0.1) -> float:
+    """The share of the viewport's pixels that differ by more than this between two pictures of the screen."""
+    part = region()
+    top = before.shape[0] - part.y - part.height
+    clear = slice(top, top + part.height), slice(part.x, part.x + part.width)
+    return float((np.abs(before[clear] - after[clear]).max(axis=2) > by).mean())
+
+
+def alike(picture: np.ndarray, photograph: np.ndarray) -> float:
+    """PSNR in dB."""
+    assert picture.shape == photograph.shape, f"{picture.shape} is not the photograph's {photograph.shape}."
+    return -10 * math.log10(float(np.square(picture - photograph).mean()) + 1e-12)
+
+
+def say(line: str) -> None:
+    with open(OUT / "facts.txt", "a", encoding="utf-8") as facts:
+        facts.write(f"{line}\n")
+
+
+def start() -> None:
+    """Take the tour, then close Blender. The last line of facts.txt says how it ended."""
+    bpy.context.preferences.view.show_splash = False
+    bpy.context.preferences.view.smooth_view = 0
+    bpy.context.preferences.use_preferences_save = False
+    steps = tour()
+
+    def step() -> float | None:
+        try:
+            return next(steps)
+        except StopIteration:
+            say("passed")
+        except Exception as error:
+            traceback.print_exc()
+            say(f"failed after {taken[-1] if taken else 'the start'}: {error or type(error).__name__}")
+        with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
+            bpy.ops.wm.quit_blender()
+        return None
+
+    bpy.app.timers.register(step, first_interval=3.0)
+
+
+start()
