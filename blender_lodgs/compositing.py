@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
 import bpy
 
 from ..training.errors import LodgsError
@@ -46,6 +50,58 @@ def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> 
             layer.use_pass_z = True
     _match(scene, meshes)
     return meshes
+
+
+def render_mesh_depth(scene: bpy.types.Scene, frames: Sequence[int]) -> list[Path]:
+    """Renders the depth of a scene's meshes with Cycles, a multilayer EXR a frame, and has them hold out.
+
+    The files lie in a folder beside the .blend, or in Blender's temporary one before that is saved. The ray
+    goes through each pixel's centre, where splats are looked at as well.
+
+    Raises:
+        LodgsError: the scene has no camera, or the files cannot be written.
+    """
+    if scene.camera is None:
+        raise LodgsError("The scene has no camera.", "Add one, or look through one of the views.")
+    manager = bpy.context.window_manager
+    name = bpy.path.clean_name(scene.name)
+    if bpy.data.filepath:
+        pattern = f"//{Path(bpy.data.filepath).stem}_depth/{name}_####.exr"
+    else:
+        pattern = str(Path(bpy.app.tempdir or tempfile.gettempdir()) / "depth" / f"{name}_####.exr")
+    paths = [engine.at_frame(pattern, scene, frame) for frame in frames]
+    meshes = bpy.data.scenes.new(f"{scene.name} Depth")
+    manager.progress_begin(0, len(paths))
+    try:
+        _match(scene, meshes)
+        _only_depth(meshes)
+        for done, (frame, path) in enumerate(zip(frames, paths, strict=True)):
+            meshes.frame_set(frame)
+            meshes.render.filepath = str(path)
+            bpy.ops.render.render(scene=meshes.name, write_still=True)
+            manager.progress_update(done)
+    except RuntimeError as error:
+        raise LodgsError(
+            f"The depth of the meshes could not be rendered: {error}", "Choose another folder for the .blend."
+        ) from error
+    finally:
+        manager.progress_end()
+        bpy.data.scenes.remove(meshes)
+    scene.lodgs_render.holdout = pattern
+    return paths
+
+
+def _only_depth(scene: bpy.types.Scene) -> None:
+    """Has a scene render one ray a pixel, and into multilayer EXRs."""
+    render, settings = scene.render, scene.cycles
+    render.engine = "CYCLES"
+    render.use_compositing = render.use_sequencer = render.use_motion_blur = False
+    compat.multilayer_exr(render.image_settings)
+    for layer in scene.view_layers:
+        layer.use_pass_z, layer.use_pass_combined = True, False
+    settings.samples, settings.max_bounces = 1, 0
+    settings.use_denoising = settings.use_adaptive_sampling = False
+    settings.pixel_filter_type, settings.filter_width = "BOX", 0.01
 
 
 def _match(scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,9 @@ from ..scenes.images import write_png
 NOTHING = 1e10
 """Depth where a pixel shows nothing, as Blender's renderers say it."""
 
+_DEPTH = re.compile(r"(.*\.)?depth(\.[a-z])?|z|v", re.IGNORECASE)
+"""Names of channels that hold a depth: a layer's Depth.Z or Depth.V, or a file's own Z or V."""
+
 _CLEAR = 0.02
 """Part of an 8-bit step that linear colours keep from the borders between two 8-bit values."""
 
@@ -25,7 +29,7 @@ class Picture:
     Attributes:
         image: (H, W, 3) float32, display-coded (sRGB) colours over the background; over black, and so
             multiplied by alpha, where that is transparent. Not clamped above.
-        alpha: (H, W) float32; ones unless the background is transparent.
+        alpha: (H, W) float32; ones unless the background is transparent, or held out.
         depth: (H, W) float32 along the camera's z axis in world units: of the splat that brings the light
             let through to a half, or where none does the mean of all; NOTHING where there is none. Empty
             where the pass was not drawn.
@@ -121,6 +125,49 @@ def write_picture(path: Path, picture: Picture) -> None:
         raise LodgsError(f"{path.name} is neither .png nor .exr.", "Choose one of these endings.")
     with atomic_write(path) as temporary:
         writer(temporary, picture)
+
+
+def read_depth(path: Path, width: int, height: int, window: tuple[int, int, int, int] | None) -> np.ndarray:
+    """The Depth pass of an EXR as Blender's renderers and its compositor write it, (H, W) float32.
+
+    Of several layers' depths the nearest counts in each pixel.
+
+    Args:
+        width, height: of the whole picture; an EXR of the window alone is taken as well.
+        window: left, top, width and height of the part that is wanted; None: all.
+
+    Raises:
+        LodgsError: it cannot be read, has no depth, or is of another size.
+    """
+    import OpenEXR
+
+    if not path.exists():
+        raise LodgsError(f"There is no mesh depth {path}.", "Render it, or take the holdout away.")
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            parts = [(part.name(), part.channels) for part in file.parts]
+            found = [
+                np.asarray(channel.pixels, np.float32)
+                for part, channels in parts
+                for name, channel in channels.items()
+                if _DEPTH.fullmatch(name) and (len(name) > 1 or len(parts) == 1 or _DEPTH.fullmatch(part))
+            ]
+    except (RuntimeError, OSError, ValueError) as error:
+        raise LodgsError(f"{path.name} cannot be read as an EXR: {error}.", "Render it anew.") from error
+    if not found or any(plane.shape != found[0].shape for plane in found):
+        raise LodgsError(
+            f"{path.name} has no Depth pass.", "Tick Depth among its view layer's passes and render it anew."
+        )
+    depth = np.nan_to_num(np.fmin.reduce(found), nan=NOTHING, posinf=NOTHING)  # half floats have no 1e10
+    left, top, across, up = window or (0, 0, width, height)
+    if depth.shape == (height, width):
+        return depth[top : top + up, left : left + across]
+    if depth.shape == (up, across):
+        return depth
+    raise LodgsError(
+        f"{path.name} has {depth.shape[1]}x{depth.shape[0]} pixels, the picture {width}x{height}.",
+        "Render the meshes' depth in the picture's size.",
+    )
 
 
 def _write_exr(path: Path, picture: Picture) -> None:

@@ -13,7 +13,16 @@ import torch
 
 from tests.training.rasterize.scenes import CONTRIBUTING, SCENES, contributed, drawn_and_differentiated, scene
 from training.errors import LodgsError
-from training.rasterize import OUTPUTS, Target, contributions, cpu, photometric_loss, rasterize, render, strips
+from training.rasterize import (
+    OUTPUTS,
+    Target,
+    contributions,
+    cpu,
+    photometric_loss,
+    rasterize,
+    render,
+    strips,
+)
 from training.rasterize.cpu.bin import TILE, bin_splats
 from training.rasterize.cpu.compile import Buffers, in_parallel, numba, set_threads, threads
 from training.rasterize.cpu.fastmath import exp2
@@ -371,7 +380,7 @@ def test_pictures_for_eyes_are_what_training_sees(backend, make_splats, odd_came
     splats = [t.float() for t in make_splats(150).values()]
     options = {"background": (0.9, 0.2, 0.4), "sh_degree": 1, "min_scale": 0.01, "backend": backend}
     cameras = [odd_camera, axis_camera]
-    for camera, whole, strips, small, half in zip(
+    for camera, whole, parts, small, half in zip(
         cameras,
         render(*splats, cameras, **options),
         render(*splats, cameras, strip=1, **options),
@@ -382,7 +391,7 @@ def test_pictures_for_eyes_are_what_training_sees(backend, make_splats, odd_came
         drawn = rasterize(*splats, camera, **options)
         expected = torch.cat([drawn.image, drawn.alpha[..., None]], 2).numpy()
         np.testing.assert_array_equal(whole, expected)
-        np.testing.assert_allclose(strips, expected, atol=2e-5)
+        np.testing.assert_allclose(parts, expected, atol=2e-5)
         assert small.dtype == np.uint8 and half.dtype == np.float16
         np.testing.assert_array_equal(small, np.round(expected.clip(0, 1) * 255))
         np.testing.assert_allclose(half, expected, atol=2e-3)

@@ -78,7 +78,12 @@ def rasterize(
         limit = limit.to(torch.float32).clamp_max(torch.finfo(torch.float32).max).contiguous()
     settings = *lens_of(view), view.width, view.height, degree, f32(min_scale), antialias
     planes, alpha, blended = _Rasterize.apply(
-        *tensors, settings, view, np.array(background, np.float32), None if limit is None else limit.numpy(), aside
+        *tensors,
+        settings,
+        view,
+        np.array(background, np.float32),
+        None if limit is None else limit.numpy(),
+        aside,
     )
     return Drawn(
         image=planes.permute(1, 2, 0), alpha=alpha, radii=aside.radii, grad2d=aside.grad2d,
