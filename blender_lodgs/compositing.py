@@ -18,11 +18,16 @@ _COPIED = (
 )  # fmt: skip
 
 
+NEARER, OVER = _JOINS = "CompositorNodeZcombine", "CompositorNodeAlphaOver"
+
+
 def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> bpy.types.Scene:
     """Lets a scene render with LODGS, and over it or behind it, by depth, its meshes with another engine.
 
+    Where the meshes hold out, depth is dealt with and the splats are simply over them.
+
     The meshes are rendered by a second scene that has the same objects without the splats. Called again, it
-    takes over the size, camera and range that the scene has now.
+    takes over the size, camera, range and holdout that the scene has now.
 
     Returns:
         The meshes' scene.
@@ -33,16 +38,20 @@ def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> 
     if not scenes.roots(scene):
         raise LodgsError(f"The scene '{scene.name}' has no splats.", "Import or train some first.")
     meshes = scene.lodgs_render.meshes
+    tree = compat.compositor_tree(scene)
+    kinds = {node.bl_idname for node in tree.nodes}
+    ours = kinds <= {*compat.COMPOSITOR_START, *_JOINS}
+    join = OVER if scene.lodgs_render.holdout else NEARER
     if meshes is None:
-        tree = compat.compositor_tree(scene)
-        if any(node.bl_idname not in compat.COMPOSITOR_START for node in tree.nodes):
+        if not ours:
             raise LodgsError(
                 "This scene has compositor nodes already.",
                 "Add a Z Combine node with the depth of both pictures; docs/rendering.md shows which.",
             )
         meshes = scene.lodgs_render.meshes = bpy.data.scenes.new(f"{scene.name} Meshes")
         meshes.render.engine = mesh_engine
-        _join(tree, scene, meshes)
+    if ours and join not in kinds:
+        _join(tree, join, scene, meshes)
     engine.use(scene)
     for one in (scene, meshes):
         one.render.film_transparent = True
@@ -88,6 +97,8 @@ def render_mesh_depth(scene: bpy.types.Scene, frames: Sequence[int]) -> list[Pat
         manager.progress_end()
         bpy.data.scenes.remove(meshes)
     scene.lodgs_render.holdout = pattern
+    if scene.lodgs_render.meshes is not None:
+        combine_with_meshes(scene)
     return paths
 
 
@@ -132,18 +143,22 @@ def _parts(part: bpy.types.LayerCollection):
             yield from _parts(child)
 
 
-def _join(tree: bpy.types.NodeTree, scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:
-    """The tree: in each pixel the nearer of both scenes' layers, over the other where it is transparent."""
+def _join(tree: bpy.types.NodeTree, kind: str, scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:
+    """The tree: in each pixel the nearer of both scenes' layers, over the other where it is transparent; or
+    the first scene's over the other's."""
     tree.nodes.clear()
-    join = tree.nodes.new("CompositorNodeZcombine")
+    join, by_depth = tree.nodes.new(kind), kind == NEARER
     join.location = (350, 0)
-    join.inputs["Use Alpha"].default_value = join.inputs["Anti-Alias"].default_value = True
+    if by_depth:
+        join.inputs["Use Alpha"].default_value = join.inputs["Anti-Alias"].default_value = True
+    pictures = [socket for socket in join.inputs if socket.type == "RGBA"]
     for place, one in enumerate((scene, meshes)):
         one.view_layers[0].use_pass_z = True  # before the node, whose sockets are the layer's passes
         layers = tree.nodes.new("CompositorNodeRLayers")
         layers.location = (0, -420 * place)
         layers.scene, layers.layer = one, one.view_layers[0].name
         layers.label = one.name
-        tree.links.new(layers.outputs["Image"], join.inputs[2 * place])
-        tree.links.new(layers.outputs["Depth"], join.inputs[2 * place + 1])
+        tree.links.new(layers.outputs["Image"], pictures[place if by_depth else 1 - place])
+        if by_depth:
+            tree.links.new(layers.outputs["Depth"], join.inputs[2 * place + 1])
     tree.links.new(join.outputs[0], compat.compositor_output(tree))

@@ -475,6 +475,7 @@ def test_a_cube_holds_out_the_splats_behind_it(bpy, lodgs, fog_and_wall, tmp_pat
     scene.render.use_border = False
 
     assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
+    assert joins(lodgs, scene) == ["CompositorNodeAlphaOver"]
     meshes = scene.lodgs_render.meshes
     meshes.cycles.samples, meshes.cycles.device = 4, "CPU"
     both = f12(bpy, tmp_path, "both.png")
@@ -484,6 +485,18 @@ def test_a_cube_holds_out_the_splats_behind_it(bpy, lodgs, fog_and_wall, tmp_pat
     np.testing.assert_allclose(srgb_to_linear(both[inside][:, :3]), over, atol=0.02)
     outside = ~covered & ~edge(covered, 2)
     np.testing.assert_allclose(both[outside], free[outside], atol=0.02)
+    scene.lodgs_render.holdout = ""
+    assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
+    assert joins(lodgs, scene) == ["CompositorNodeZcombine"]
+    assert bpy.ops.lodgs.render_mesh_depth() == {"FINISHED"}
+    assert joins(lodgs, scene) == ["CompositorNodeAlphaOver"]
+    assert bpy.data.scenes[:] == [scene, meshes]
+
+
+def joins(lodgs, scene) -> list[str]:
+    """The compositor's nodes that join two pictures."""
+    nodes = lodgs("compat").compositor_tree(scene).nodes
+    return [node.bl_idname for node in nodes if node.bl_idname.endswith(("Zcombine", "AlphaOver"))]
 
 
 def srgb_to_linear(coded: np.ndarray) -> np.ndarray:

@@ -116,15 +116,9 @@ def render(
     placed = [Placed(SplatSet(x.splats, x.weights, backend), level=x.number) for x in shown]
     everything = out.suffix.lower() == ".exr"
     picture = draw(
-        placed,
-        camera,
-        near=near,
-        background=background,
-        depth=everything,
-        levels=everything,
-        limit=limit,
+        placed, camera, near=near, background=background, depth=everything, levels=everything, limit=limit,
         backend=backend,
-    )
+    )  # fmt: skip
     assert picture is not None
     write_picture(out, picture)
     return picture

@@ -77,14 +77,8 @@ def rasterize(
     if limit is not None:  # the kernels know no infinity
         limit = limit.to(torch.float32).clamp_max(torch.finfo(torch.float32).max).contiguous()
     settings = *lens_of(view), view.width, view.height, degree, f32(min_scale), antialias
-    planes, alpha, blended = _Rasterize.apply(
-        *tensors,
-        settings,
-        view,
-        np.array(background, np.float32),
-        None if limit is None else limit.numpy(),
-        aside,
-    )
+    behind, most = np.array(background, np.float32), None if limit is None else limit.numpy()
+    planes, alpha, blended = _Rasterize.apply(*tensors, settings, view, behind, most, aside)
     return Drawn(
         image=planes.permute(1, 2, 0), alpha=alpha, radii=aside.radii, grad2d=aside.grad2d,
         tile_counts=aside.tile_counts, absgrad2d=aside.absgrad2d, features=blended.permute(1, 2, 0),

@@ -67,19 +67,9 @@ def alpha_of(log2_alpha):
 
 @kernel(FAST)
 def blend_forward(
-    begin,
-    end,
-    projected,
-    splat,
-    tile_start,
-    tiles_x,
-    background,
-    limit,
-    image,
-    transmittance,
-    walked,
-    reached,
-):
+    begin, end, projected, splat, tile_start, tiles_x, background, limit,
+    image, transmittance, walked, reached,
+):  # fmt: skip
     """Fill image (3, H, W), transmittance (H, W), the pairs walked in each tile until all was dark, and the
     rows reached by each of those pairs, (P, 2) uint8.
 
