@@ -85,9 +85,10 @@ def render_mesh_depth(scene: bpy.types.Scene, frames: Sequence[int]) -> list[Pat
         _match(scene, meshes)
         _only_depth(meshes)
         for done, (frame, path) in enumerate(zip(frames, paths, strict=True)):
-            meshes.frame_set(frame)
-            meshes.render.filepath = str(path)
-            bpy.ops.render.render(scene=meshes.name, write_still=True)
+            # as an animation: a still of a scene in no window shows the frame of another
+            meshes.frame_start = meshes.frame_end = frame
+            meshes.render.filepath = str(path.parent / Path(pattern).name)
+            bpy.ops.render.render(scene=meshes.name, animation=True)
             manager.progress_update(done)
     except RuntimeError as error:
         raise LodgsError(
