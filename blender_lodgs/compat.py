@@ -91,6 +91,13 @@ def set_input(modifier: bpy.types.NodesModifier, name: str, value) -> None:
     modifier.id_data.update_tag()
 
 
+def multilayer_exr(settings: bpy.types.ImageFormatSettings) -> None:
+    """Has pictures saved as multilayer EXRs, in whole floats."""
+    if hasattr(settings, "media_type"):
+        settings.media_type = "MULTI_LAYER_IMAGE"
+    settings.file_format, settings.color_depth = "OPEN_EXR_MULTILAYER", "32"
+
+
 COMPOSITOR_START = (
     "CompositorNodeRLayers", "CompositorNodeComposite", "CompositorNodeViewer", "NodeGroupOutput",
     "NodeReroute",

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
 import bpy
 
 from ..training.errors import LodgsError
@@ -14,11 +18,16 @@ _COPIED = (
 )  # fmt: skip
 
 
+NEARER, OVER = _JOINS = "CompositorNodeZcombine", "CompositorNodeAlphaOver"
+
+
 def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> bpy.types.Scene:
     """Lets a scene render with LODGS, and over it or behind it, by depth, its meshes with another engine.
 
+    Where the meshes hold out, depth is dealt with and the splats are simply over them.
+
     The meshes are rendered by a second scene that has the same objects without the splats. Called again, it
-    takes over the size, camera and range that the scene has now.
+    takes over the size, camera, range and holdout that the scene has now.
 
     Returns:
         The meshes' scene.
@@ -29,16 +38,20 @@ def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> 
     if not scenes.roots(scene):
         raise LodgsError(f"The scene '{scene.name}' has no splats.", "Import or train some first.")
     meshes = scene.lodgs_render.meshes
+    tree = compat.compositor_tree(scene)
+    kinds = {node.bl_idname for node in tree.nodes}
+    ours = kinds <= {*compat.COMPOSITOR_START, *_JOINS}
+    join = OVER if scene.lodgs_render.holdout else NEARER
     if meshes is None:
-        tree = compat.compositor_tree(scene)
-        if any(node.bl_idname not in compat.COMPOSITOR_START for node in tree.nodes):
+        if not ours:
             raise LodgsError(
                 "This scene has compositor nodes already.",
                 "Add a Z Combine node with the depth of both pictures; docs/rendering.md shows which.",
             )
         meshes = scene.lodgs_render.meshes = bpy.data.scenes.new(f"{scene.name} Meshes")
         meshes.render.engine = mesh_engine
-        _join(tree, scene, meshes)
+    if ours and join not in kinds:
+        _join(tree, join, scene, meshes)
     engine.use(scene)
     for one in (scene, meshes):
         one.render.film_transparent = True
@@ -46,6 +59,61 @@ def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> 
             layer.use_pass_z = True
     _match(scene, meshes)
     return meshes
+
+
+def render_mesh_depth(scene: bpy.types.Scene, frames: Sequence[int]) -> list[Path]:
+    """Renders the depth of a scene's meshes with Cycles, a multilayer EXR a frame, and has them hold out.
+
+    The files lie in a folder beside the .blend, or in Blender's temporary one before that is saved. The ray
+    goes through each pixel's centre, where splats are looked at as well.
+
+    Raises:
+        LodgsError: the scene has no camera, or the files cannot be written.
+    """
+    if scene.camera is None:
+        raise LodgsError("The scene has no camera.", "Add one, or look through one of the views.")
+    manager = bpy.context.window_manager
+    name = bpy.path.clean_name(scene.name)
+    if bpy.data.filepath:
+        pattern = f"//{Path(bpy.data.filepath).stem}_depth/{name}_####.exr"
+    else:
+        pattern = str(Path(bpy.app.tempdir or tempfile.gettempdir()) / "depth" / f"{name}_####.exr")
+    paths = [engine.at_frame(pattern, scene, frame) for frame in frames]
+    meshes = bpy.data.scenes.new(f"{scene.name} Depth")
+    manager.progress_begin(0, len(paths))
+    try:
+        _match(scene, meshes)
+        _only_depth(meshes)
+        for done, (frame, path) in enumerate(zip(frames, paths, strict=True)):
+            # as an animation: a still of a scene in no window shows the frame of another
+            meshes.frame_start = meshes.frame_end = frame
+            meshes.render.filepath = str(path.parent / Path(pattern).name)
+            bpy.ops.render.render(scene=meshes.name, animation=True)
+            manager.progress_update(done)
+    except RuntimeError as error:
+        raise LodgsError(
+            f"The depth of the meshes could not be rendered: {error}", "Choose another folder for the .blend."
+        ) from error
+    finally:
+        manager.progress_end()
+        bpy.data.scenes.remove(meshes)
+    scene.lodgs_render.holdout = pattern
+    if scene.lodgs_render.meshes is not None:
+        combine_with_meshes(scene)
+    return paths
+
+
+def _only_depth(scene: bpy.types.Scene) -> None:
+    """Has a scene render one ray a pixel, and into multilayer EXRs."""
+    render, settings = scene.render, scene.cycles
+    render.engine = "CYCLES"
+    render.use_compositing = render.use_sequencer = render.use_motion_blur = False
+    compat.multilayer_exr(render.image_settings)
+    for layer in scene.view_layers:
+        layer.use_pass_z, layer.use_pass_combined = True, False
+    settings.samples, settings.max_bounces = 1, 0
+    settings.use_denoising = settings.use_adaptive_sampling = False
+    settings.pixel_filter_type, settings.filter_width = "BOX", 0.01
 
 
 def _match(scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:
@@ -76,18 +144,22 @@ def _parts(part: bpy.types.LayerCollection):
             yield from _parts(child)
 
 
-def _join(tree: bpy.types.NodeTree, scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:
-    """The tree: in each pixel the nearer of both scenes' layers, over the other where it is transparent."""
+def _join(tree: bpy.types.NodeTree, kind: str, scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:
+    """The tree: in each pixel the nearer of both scenes' layers, over the other where it is transparent; or
+    the first scene's over the other's."""
     tree.nodes.clear()
-    join = tree.nodes.new("CompositorNodeZcombine")
+    join, by_depth = tree.nodes.new(kind), kind == NEARER
     join.location = (350, 0)
-    join.inputs["Use Alpha"].default_value = join.inputs["Anti-Alias"].default_value = True
+    if by_depth:
+        join.inputs["Use Alpha"].default_value = join.inputs["Anti-Alias"].default_value = True
+    pictures = [socket for socket in join.inputs if socket.type == "RGBA"]
     for place, one in enumerate((scene, meshes)):
         one.view_layers[0].use_pass_z = True  # before the node, whose sockets are the layer's passes
         layers = tree.nodes.new("CompositorNodeRLayers")
         layers.location = (0, -420 * place)
         layers.scene, layers.layer = one, one.view_layers[0].name
         layers.label = one.name
-        tree.links.new(layers.outputs["Image"], join.inputs[2 * place])
-        tree.links.new(layers.outputs["Depth"], join.inputs[2 * place + 1])
+        tree.links.new(layers.outputs["Image"], pictures[place if by_depth else 1 - place])
+        if by_depth:
+            tree.links.new(layers.outputs["Depth"], join.inputs[2 * place + 1])
     tree.links.new(join.outputs[0], compat.compositor_output(tree))

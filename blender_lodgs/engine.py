@@ -6,6 +6,9 @@ which the compositor joins with this one by depth.
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import bpy
 import numpy as np
 
@@ -78,7 +81,8 @@ def frame(
         The picture with the passes that the view layer wants; None where it was ended.
 
     Raises:
-        LodgsError: there is no trainer, or the camera cannot be rendered through, or the renderer failed.
+        LodgsError: there is no trainer, or the camera cannot be rendered through, or the depth that holds
+            out is missing, or the renderer failed.
     """
     scene, layer = depsgraph.scene, depsgraph.view_layer
     if scene.camera is None:
@@ -95,7 +99,35 @@ def frame(
         depth=layer.use_pass_z,
         levels=settings.use_pass_levels,
         window=(left, height - bottom - up, across, up),
+        holdout=holdout_file(scene, scene.frame_current),
     )
+
+
+def holdout_file(scene: bpy.types.Scene, frame: int) -> Path | None:
+    """The file with the depth of the meshes in a frame; None where nothing is to be held out.
+
+    Raises:
+        LodgsError: it does not exist.
+    """
+    if not scene.lodgs_render.holdout:
+        return None
+    path = at_frame(scene.lodgs_render.holdout, scene.original, frame)
+    if not path.is_file():
+        raise LodgsError(
+            f"The depth of the meshes in frame {frame} is missing: {path}.",
+            "Press Render Mesh Depth (for all frames, the button beside it), or clear Hold Out.",
+        )
+    return path
+
+
+def at_frame(pattern: str, scene: bpy.types.Scene, frame: int) -> Path:
+    """A path with the frame's number in the place of the last # characters of its name, as Blender counts."""
+    path = Path(bpy.path.abspath(pattern, library=scene.library))
+
+    def number(found: re.Match) -> str:
+        return "-" * (frame < 0) + str(abs(frame)).zfill(len(found[0]))
+
+    return path.with_name(re.sub(r"#+(?=[^#]*$)", number, path.name))
 
 
 def splat_sets(depsgraph: bpy.types.Depsgraph) -> list[renderer.Set]:

@@ -482,6 +482,13 @@ class RenderSettings(bpy.types.PropertyGroup):
         get=lambda self: self.ellipsoids and self.id_data.render.engine != "LODGS",
         options={"HIDDEN"},
     )
+    holdout: bpy.props.StringProperty(
+        name="Hold Out",
+        description="OpenEXR files with the Depth pass of the meshes, #### for the frame's number: splats "
+        "behind that depth are left out, and the film is transparent there",
+        subtype="FILE_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
+    )
     show_comparison: bpy.props.BoolProperty(
         name="Wipe",
         description="Show the photograph over the rendered picture of the view that was compared",

@@ -116,11 +116,13 @@ class Renderer:
         levels: bool = False,
         window: tuple[int, int, int, int] | None = None,
         photograph: Path | None = None,
+        holdout: Path | None = None,
     ) -> Frame | None:
         """A picture, or None when it was no longer wanted.
 
         Args: as ``training.render.scene.draw``, and
             photograph: to compare with.
+            holdout: EXR with the depth of what hides splats.
 
         Raises:
             LodgsError: it cannot be drawn, says why.
@@ -133,7 +135,7 @@ class Renderer:
             self._say(
                 frame=frame, out=out.name, sets=named, camera=camera_as_dict(camera, near),
                 background=background, depth=depth, levels=levels, window=window,
-                photograph=str(photograph) if photograph else None,
+                photograph=str(photograph) if photograph else None, holdout=str(holdout) if holdout else None,
             )  # fmt: skip
             answer = self._wait(frame, wanted)
             for path in set(old.values()) - set(self._known.values()):

@@ -191,7 +191,7 @@ def work(step: Step) -> tuple[int, float]:
     def spy(kernel, total, grain, *args):
         in_parallel(kernel, total, grain, *args)
         if kernel is cpu.blend_forward:
-            projected, splat, tile_start, tiles_x, _, _, transmittance, walked, _ = args
+            projected, splat, tile_start, tiles_x, _, _, _, transmittance, walked, _ = args
             lanes, blends = np.zeros((2, len(walked)), np.int64)
             rest = projected, splat, tile_start, tiles_x, walked, len(transmittance), lanes, blends
             in_parallel(count_work, total, grain, *rest)

@@ -44,6 +44,12 @@ def main(arguments: list[str] | None = None) -> int:
         metavar="COLOUR",
         help="behind the splats: R,G,B from 0 to 1 as a display has them, or transparent (default black)",
     )
+    render.add_argument(
+        "--holdout",
+        type=Path,
+        metavar="DEPTH.exr",
+        help="leave out what lies behind this Depth pass of meshes",
+    )
     render.add_argument("--backend", default="auto", help="auto, cpu, cuda or reference")
 
     serve = commands.add_parser("serve", help="draw frame after frame for Blender")
@@ -147,7 +153,7 @@ def _render(chosen: argparse.Namespace) -> int:
         camera = camera.resized(*chosen.size)
     render(
         source, camera, near, chosen.out, level=chosen.level, detail=Detail(**asked) if asked else None,
-        background=chosen.background, backend=chosen.backend,
+        background=chosen.background, holdout=chosen.holdout, backend=chosen.backend,
     )  # fmt: skip
     return 0
 

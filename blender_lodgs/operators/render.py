@@ -38,6 +38,34 @@ class LODGS_OT_combine_with_meshes(bpy.types.Operator):
         return {"FINISHED"}
 
 
+class LODGS_OT_render_mesh_depth(bpy.types.Operator):
+    """Render how far the meshes are with Cycles, and have them hold out the splats behind them"""
+
+    bl_idname = "lodgs.render_mesh_depth"
+    bl_label = "Render Mesh Depth"
+    bl_options = {"REGISTER", "UNDO"}
+
+    animation: bpy.props.BoolProperty(
+        name="Animation", description="Render the depth of every frame of the range", options={"SKIP_SAVE"}
+    )
+
+    @classmethod
+    def description(cls, context, properties):
+        return f"{cls.__doc__}, in every frame of the range" if properties.animation else cls.__doc__
+
+    @saying_errors
+    def execute(self, context):
+        scene = context.scene
+        frames = [scene.frame_current]
+        if self.animation:
+            frames = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
+        paths = compositing.render_mesh_depth(scene, frames)
+        where = f"in {paths[0].parent}" + ("" if bpy.data.filepath else ", until Blender is closed")
+        count = "1 depth" if len(paths) == 1 else f"{len(paths)} depths"
+        self.report({"INFO"}, f"{count} of meshes {where}")
+        return {"FINISHED"}
+
+
 class LODGS_OT_render_quick(bpy.types.Operator):
     """Draw what the camera sees as the viewport does, on the graphics card: quick, and without a trainer"""
 
@@ -94,6 +122,7 @@ class LODGS_OT_export_camera(bpy.types.Operator, ExportHelper):
 CLASSES = (
     LODGS_OT_use_engine,
     LODGS_OT_combine_with_meshes,
+    LODGS_OT_render_mesh_depth,
     LODGS_OT_render_quick,
     LODGS_OT_export_camera,
 )

@@ -41,6 +41,7 @@ class LODGS_PT_rendering(bpy.types.Panel):
             row.operator_context = "INVOKE_DEFAULT"  # with progress, beside which one works on
             row.operator(name, text=text, icon=icon).animation = False
             row.operator(name, text="", icon="RENDER_ANIMATION").animation = True
+        _draw_holdout(layout, scene)
         column = layout.column(align=True)
         column.operator("lodgs.combine_with_meshes", icon="NODE_COMPOSITING")
         column.operator("lodgs.export_camera", icon="CAMERA_DATA", text="Export Camera…")
@@ -97,6 +98,16 @@ def _draw_passes(layout: bpy.types.UILayout, scene: bpy.types.Scene, layer: bpy.
     column.use_property_decorate = False
     column.prop(layer, "use_pass_z", text="Depth")
     column.prop(scene.lodgs_render, "use_pass_levels")
+
+
+def _draw_holdout(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
+    column = layout.column(align=True)
+    column.use_property_split = True
+    column.use_property_decorate = False
+    column.prop(scene.lodgs_render, "holdout")
+    row = column.row(align=True)
+    row.operator("lodgs.render_mesh_depth", icon="RENDER_STILL").animation = False
+    row.operator("lodgs.render_mesh_depth", icon="RENDER_ANIMATION", text="").animation = True
 
 
 CLASSES = (LODGS_PT_rendering, LODGS_RENDER_PT_film, LODGS_VIEWLAYER_PT_passes)

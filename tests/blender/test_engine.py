@@ -342,7 +342,7 @@ os.kill(os.getpid(), signal.SIGKILL)
         os.kill(int(pid), 0)
 
 
-def flat_wall(y: float, color: tuple[float, float, float]) -> Splats:
+def flat_wall(y: float, color: tuple[float, float, float], logit: float = 10.0) -> Splats:
     """Splats side by side in the plane y, opaque from a distance, in COLMAP's axes (y is depth)."""
     x, z = np.meshgrid(np.linspace(-4, 4, 81), np.linspace(-4, 4, 81))
     means = np.stack([x.ravel(), np.full(x.size, y), z.ravel()], 1)
@@ -350,17 +350,19 @@ def flat_wall(y: float, color: tuple[float, float, float]) -> Splats:
         means=means.astype(np.float32),
         quats=np.tile(np.float32([1, 0, 0, 0]), (x.size, 1)),
         log_scales=np.tile(np.log(np.float32([0.1, 0.001, 0.1])), (x.size, 1)),
-        opacity_logits=np.full(x.size, 10, np.float32),
+        opacity_logits=np.full(x.size, logit, np.float32),
         sh=np.tile(((np.float32(color) - 0.5) / 0.28209479177387814), (x.size, 1, 1)).astype(np.float32),
     )
 
 
-def test_a_cube_of_cycles_stands_in_the_splats(bpy, lodgs, tmp_path):
-    """A red cube, turned, sticks out of a green wall of splats: each pixel shows what analysis says is
-    nearer, but for a seam of a pixel or two."""
+def import_wall(bpy, lodgs, path: Path, *wall):
+    write_bundle(path, Bundle("", [Level(1, flat_wall(*wall))]))
+    return lodgs("scenes").import_splats(bpy.context, path, upright=False)
+
+
+def add_red_cube(bpy):
+    """A red cube, turned, six units before a camera of 320x240 pixels."""
     scene = bpy.context.scene
-    write_bundle(tmp_path / "wall.ply", Bundle("", [Level(1, flat_wall(0.0, (0.1, 0.8, 0.2)))]))
-    lodgs("scenes").import_splats(bpy.context, tmp_path / "wall.ply", upright=False)
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     camera.location, camera.rotation_euler = (0, -6, 0), (np.pi / 2, 0, 0)
     scene.collection.objects.link(camera)
@@ -376,30 +378,40 @@ def test_a_cube_of_cycles_stands_in_the_splats(bpy, lodgs, tmp_path):
     material.node_tree.links.new(emission.outputs[0], output.inputs["Surface"])
     cube.data.materials.append(material)
     scene.render.resolution_x, scene.render.resolution_y = 320, 240
-    assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
-    meshes = scene.lodgs_render.meshes
-    meshes.cycles.samples, meshes.cycles.device = 4, "CPU"
     scene.render.dither_intensity = 0
     scene.render.image_settings.color_mode = "RGBA"
-    shown = f12(bpy, tmp_path)
+    return cube
 
-    # a ray through each pixel's centre: where it meets the cube, in the cube's own space; the wall is at 6
+
+def depths_of(cube, eye=(0, -6, 0)) -> tuple[np.ndarray, np.ndarray]:
+    """Where the ray through each pixel's centre enters and leaves the cube, along the camera's axis: worked
+    out in the cube's own space. It meets the cube where it enters before it leaves."""
     focal = 320 * 50 / 36
     x, y = np.meshgrid((np.arange(320) + 0.5 - 160) / focal, (120 - np.arange(240) - 0.5) / focal)
     directions = np.stack([x, np.ones_like(x), y], 2)
     to_cube = np.linalg.inv(np.array(cube.matrix_world, float))
-    origin = to_cube @ (*camera.location, 1)
+    origin = to_cube @ (*eye, 1)
     local = directions @ to_cube[:3, :3].T
     first, last = (np.sort([(s - origin[:3]) / local for s in (-1, 1)], axis=0)[i] for i in (0, 1))
-    enters, leaves = first.max(2), last.min(2)
-    red = (enters < leaves) & (enters < 6)
+    return first.max(2), last.min(2)
+
+
+def test_a_cube_of_cycles_stands_in_the_splats(bpy, lodgs, tmp_path):
+    """A red cube, turned, sticks out of a green wall of splats: each pixel shows what analysis says is
+    nearer, but for a seam of a pixel or two."""
+    scene = bpy.context.scene
+    import_wall(bpy, lodgs, tmp_path / "wall.ply", 0.0, (0.1, 0.8, 0.2))
+    cube = add_red_cube(bpy)
+    assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
+    meshes = scene.lodgs_render.meshes
+    meshes.cycles.samples, meshes.cycles.device = 4, "CPU"
+    shown = f12(bpy, tmp_path)
+
+    enters, leaves = depths_of(cube)
+    red = (enters < leaves) & (enters < 6)  # the wall is at 6
     assert 0.02 < red.mean() < 0.5
     assert ((enters < leaves) & (enters > 6)).sum() > 500  # parts of the cube are behind the wall
-    seam = np.zeros_like(red)
-    for dy in range(-2, 3):
-        for dx in range(-2, 3):
-            seam |= np.roll(red, (dy, dx), (0, 1)) != red
-    clear = ~seam
+    clear = ~edge(red, 2)
     assert clear.mean() > 0.9
     is_red = shown[..., 0] > 0.5
     np.testing.assert_array_equal(is_red[clear], red[clear])
@@ -408,6 +420,133 @@ def test_a_cube_of_cycles_stands_in_the_splats(bpy, lodgs, tmp_path):
     scene.render.resolution_x = 200
     assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
     assert meshes.render.resolution_x == 200 and len(bpy.data.scenes) == 2
+
+
+def edge(mask: np.ndarray, reach: int) -> np.ndarray:
+    """Pixels that have one of the other kind within reach."""
+    found = np.zeros_like(mask)
+    for dy in range(-reach, reach + 1):
+        for dx in range(-reach, reach + 1):
+            found |= np.roll(mask, (dy, dx), (0, 1)) != mask
+    return found
+
+
+@pytest.fixture
+def fog_and_wall(bpy, lodgs, tmp_path):
+    """Thin blue fog at 3 before a red cube, and behind it, at 9, a green wall; the wall and the cube."""
+    cube = add_red_cube(bpy)
+    import_wall(bpy, lodgs, tmp_path / "fog.ply", -3.0, (0.1, 0.2, 0.8), -3.0)
+    wall = import_wall(bpy, lodgs, tmp_path / "wall.ply", 3.0, (0.1, 0.8, 0.2))
+    lodgs("engine").use(bpy.context.scene)
+    bpy.context.scene.render.film_transparent = True
+    return wall, cube
+
+
+def test_a_cube_holds_out_the_splats_behind_it(bpy, lodgs, fog_and_wall, tmp_path):
+    """In every pixel whose centre the cube covers there is the fog alone, with its own alpha; in every other
+    one fog and wall. Combined with the meshes, fog lies over the cube."""
+    scene, (wall, cube) = bpy.context.scene, fog_and_wall
+    free = f12(bpy, tmp_path, "free.png")
+    wall.lodgs.levels[0].show = False
+    fog = f12(bpy, tmp_path, "fog.png")
+    wall.lodgs.levels[0].show = True
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "garden.blend"))
+    assert bpy.ops.lodgs.render_mesh_depth() == {"FINISHED"}
+    assert scene.lodgs_render.holdout == "//garden_depth/Scene_####.exr" and len(bpy.data.scenes) == 1
+    assert (tmp_path / "garden_depth" / "Scene_0001.exr").exists()
+    held = f12(bpy, tmp_path, "held.png")
+
+    enters, leaves = depths_of(cube)
+    covered = enters < leaves
+    assert 0.05 < covered.mean() < 0.5
+    assert fog[..., 3].min() > 0.15 and fog[..., 3].max() < 0.45 and free[..., 3].min() > 0.95
+    same_to_the_pixel(held[..., 3] < 0.5, covered)
+    clear = ~edge(covered, 1)
+    np.testing.assert_array_equal(held[covered & clear], fog[covered & clear])
+    np.testing.assert_array_equal(held[~covered & clear], free[~covered & clear])
+    planes = passes(bpy, lodgs)
+    np.testing.assert_allclose(planes["Depth.Z"][covered & clear], 3, atol=1e-4)
+    np.testing.assert_allclose(planes["Depth.Z"][~covered & clear], 9, atol=1e-4)
+
+    scene.render.use_border = True  # a part of the picture takes a part of the depth
+    scene.render.border_min_x, scene.render.border_max_x = 0.25, 0.75
+    scene.render.border_min_y, scene.render.border_max_y = 0.1, 0.6
+    part = f12(bpy, tmp_path, "part.png")
+    assert np.abs(part[96:216, 80:240] - held[96:216, 80:240]).max() <= 1.001 / 255
+    scene.render.use_border = False
+
+    assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
+    assert joins(lodgs, scene) == ["CompositorNodeAlphaOver"]
+    meshes = scene.lodgs_render.meshes
+    meshes.cycles.samples, meshes.cycles.use_denoising = 4, False
+    both = f12(bpy, tmp_path, "both.png")
+    inside = covered & ~edge(covered, 2)
+    alpha = fog[inside][:, 3:]
+    over = srgb_to_linear(fog[inside][:, :3]) * alpha + (1 - alpha) * np.float32([1, 0, 0])
+    np.testing.assert_allclose(srgb_to_linear(both[inside][:, :3]), over, atol=0.02)
+    outside = ~covered & ~edge(covered, 2)
+    np.testing.assert_allclose(both[outside], free[outside], atol=0.02)
+    scene.lodgs_render.holdout = ""
+    assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
+    assert joins(lodgs, scene) == ["CompositorNodeZcombine"]
+    assert bpy.ops.lodgs.render_mesh_depth() == {"FINISHED"}
+    assert joins(lodgs, scene) == ["CompositorNodeAlphaOver"]
+    assert bpy.data.scenes[:] == [scene, meshes]
+
+
+def same_to_the_pixel(found: np.ndarray, expected: np.ndarray) -> None:
+    """But for a pixel or two whose centre lies on the very edge."""
+    differ = found != expected
+    assert differ.sum() <= 3 and not (differ & ~edge(expected, 1)).any()
+
+
+def joins(lodgs, scene) -> list[str]:
+    """The compositor's nodes that join two pictures."""
+    nodes = lodgs("compat").compositor_tree(scene).nodes
+    return [node.bl_idname for node in nodes if node.bl_idname.endswith(("Zcombine", "AlphaOver"))]
+
+
+def srgb_to_linear(coded: np.ndarray) -> np.ndarray:
+    return np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
+
+
+def test_a_moving_cube_holds_out_frame_by_frame(bpy, lodgs, fog_and_wall, tmp_path):
+    """Before the file is saved, in the temporary folder; a frame without its depth is no picture."""
+    scene, (_, cube) = bpy.context.scene, fog_and_wall
+    for frame, x in ((1, -1.0), (3, 1.0)):
+        cube.location.x = x
+        cube.keyframe_insert("location", frame=frame)
+    scene.frame_start, scene.frame_end, scene.frame_step = 1, 3, 2
+    assert bpy.ops.lodgs.render_mesh_depth(animation=True) == {"FINISHED"}
+    assert scene.frame_current == 1
+    for frame in (1, 3):
+        scene.frame_set(frame)
+        enters, leaves = depths_of(cube)
+        held = f12(bpy, tmp_path, f"{frame}.png")
+        same_to_the_pixel(held[..., 3] < 0.5, enters < leaves)
+    scene.frame_set(2)
+    scene.render.filepath = str(tmp_path / "none.png")
+    with pytest.raises(RuntimeError, match=r"meshes in frame 2 is missing: .*Scene_0002\.exr"):
+        bpy.ops.render.render(write_still=True)
+    assert not (tmp_path / "none.png").exists()
+    scene.frame_set(3)
+    scene.render.resolution_x = 100
+    with pytest.raises(RuntimeError, match=r"has 320x240 pixels, the picture 100x240"):
+        bpy.ops.render.render(write_still=True)
+    assert not (tmp_path / "none.png").exists()
+    scene.lodgs_render.holdout = ""
+    assert f12(bpy, tmp_path, "none.png")[..., 3].min() > 0.95
+
+
+@pytest.mark.parametrize(
+    ("pattern", "frame", "name"),
+    [("/d/a_####.exr", 7, "a_0007.exr"), ("/d/##a#.exr", 12, "##a12.exr"), ("/d/a.exr", 3, "a.exr"),
+     ("/d/a_####.exr", -7, "a_-0007.exr"), ("/d##/a_##.exr", 123, "a_123.exr")],
+)  # fmt: skip
+def test_frames_have_their_numbers(bpy, lodgs, pattern, frame, name):
+    scene = bpy.context.scene
+    path = lodgs("engine").at_frame(pattern, scene, frame)
+    assert path.name == name and str(path.parent) == pattern.rpartition("/")[0]
 
 
 def test_an_artists_compositor_is_left_alone(bpy, lodgs, scene):

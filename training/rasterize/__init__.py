@@ -51,6 +51,7 @@ def rasterize(
     antialias: bool = False,
     outputs: Collection[str] = (),
     features: torch.Tensor | None = None,
+    limit: torch.Tensor | None = None,
     backend: str = "auto",
 ) -> Rendering:
     """Draw splats as a camera sees them; differentiable by every tensor given.
@@ -76,22 +77,26 @@ def rasterize(
             Eq. 10).
         outputs: of :data:`OUTPUTS`, what :class:`Rendering` shall have besides; differentiable, too.
         features: (N, F) further values of each splat, blended as colours are over zero.
+        limit: (H, W), for each pixel a depth along the camera's z axis, in world units: splats whose means
+            lie beyond it have no part in the pixel, whatever is asked for. For pictures only: without
+            gradients.
         backend: one of :data:`BACKENDS`, or "auto": cuda for tensors on a GPU, else cpu.
 
     Raises:
-        ValueError: for tensors whose shapes do not belong together, or an output that does not exist.
+        ValueError: for tensors whose shapes do not belong together, an output that does not exist, or a limit
+            where gradients are wanted.
         LodgsError: for a backend that does not exist, or does not work on this computer.
     """
     return _draw(
         means, quats, log_scales, opacity_logits, sh, View.of(camera, near), weights=weights,
         background=background, sh_degree=sh_degree, min_scale=min_scale, antialias=antialias,
-        outputs=outputs, features=features, backend=backend,
+        outputs=outputs, features=features, limit=limit, backend=backend,
     )  # fmt: skip
 
 
 def _draw(
     means, quats, log_scales, opacity_logits, sh, view: View, *,
-    weights, background, sh_degree, min_scale, antialias, outputs, features, backend,
+    weights, background, sh_degree, min_scale, antialias, outputs, features, limit, backend,
 ) -> Rendering:  # fmt: skip
     """:func:`rasterize` of a view, which may be a strip of a camera's."""
     count = len(means)
@@ -102,6 +107,13 @@ def _draw(
         raise ValueError(f"outputs can be {', '.join(OUTPUTS)}, not {', '.join(outputs)}")
     if features is not None and (features.ndim != 2 or len(features) != count):
         raise ValueError(f"features must have shape ({count}, F), not {tuple(features.shape)}")
+    if limit is not None:
+        if limit.shape != (view.height, view.width):
+            wanted = view.height, view.width
+            raise ValueError(f"limit must have shape {wanted}, not {tuple(limit.shape)}")
+        leaves = means, quats, log_scales, opacity_logits, sh, weights, features
+        if torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in leaves):
+            raise ValueError("a limit is for pictures: it has no gradients")
     red, green, blue = (float(value) for value in background)
     blended = [] if features is None else [features]
     if "depth" in outputs:
@@ -113,6 +125,7 @@ def _draw(
         torch.cat(blended, 1) if blended else means.new_zeros(count, 0),
         view=view, background=(red, green, blue), degree=degree, min_scale=float(min_scale),
         antialias=bool(antialias), median="median_depth" in outputs, absolute="absgrad2d" in outputs,
+        limit=limit,
     )  # fmt: skip
     rendering = Rendering(
         drawn.image, drawn.alpha, drawn.radii, drawn.grad2d, drawn.tile_counts, drawn.absgrad2d
@@ -150,6 +163,7 @@ def strips(
     antialias: bool = False,
     outputs: Collection[str] = (),
     features: torch.Tensor | None = None,
+    limit: torch.Tensor | None = None,
     window: tuple[int, int, int, int] | None = None,
     strip: int = STRIP,
     backend: str = "auto",
@@ -157,6 +171,7 @@ def strips(
     """Draw a picture for eyes strip by strip, from the top: nothing is kept for gradients or between strips.
 
     Args: as for :func:`rasterize`, and
+        limit: of the window's pixels.
         window: left, top, width and height in pixels of the part of the camera's image to draw; None: all.
         strip: pixels to draw at a time, about.
 
@@ -166,13 +181,15 @@ def strips(
     left, above, width, height = window or (0, 0, camera.width, camera.height)
     whole = replace(View.of(camera, near), width=width)
     whole = replace(whole, cx=whole.cx - left, cy=whole.cy - above)
+    if limit is not None and limit.shape != (height, width):
+        raise ValueError(f"limit must have shape {(height, width)}, not {tuple(limit.shape)}")
     rows = max(strip // width // 16 * 16, 16)
     for top in range(0, height, rows):
         part = replace(whole, cy=whole.cy - top, height=min(rows, height - top))
         yield top, _draw(
             means, quats, log_scales, opacity_logits, sh, part, weights=weights, background=background,
             sh_degree=sh_degree, min_scale=min_scale, antialias=antialias, outputs=outputs,
-            features=features, backend=backend,
+            features=features, limit=None if limit is None else limit[top : top + rows], backend=backend,
         )  # fmt: skip
 
 

@@ -80,6 +80,7 @@ def rasterize(
     antialias: bool,
     median: bool,
     absolute: bool,
+    limit: torch.Tensor | None,
 ) -> Drawn:
     """See :func:`training.rasterize.rasterize`. Tensors are float32 on one GPU; ValueError otherwise."""
     gsplat = _gsplat()
@@ -91,14 +92,20 @@ def rasterize(
     towards = means[splats.which] - torch.as_tensor(view.eye).to(means)
     colours = (gsplat.spherical_harmonics(degree, towards, sh[splats.which]) + 0.5).clamp_min(0)
     gradients = torch.zeros(2, len(means), 2, device=means.device)  # signed and absolute
-    image, alpha, blended = _Blend.apply(
-        splats.mean2d, splats.conic, splats.opacity, colours, features[splats.which],
-        means.new_tensor(background), splats.which, tiles, view, gradients, absolute,
-    )  # fmt: skip
+    behind = means.new_tensor(background)
+    if limit is None:
+        image, alpha, blended = _Blend.apply(
+            splats.mean2d, splats.conic, splats.opacity, colours, features[splats.which],
+            behind, splats.which, tiles, view, gradients, absolute,
+        )  # fmt: skip
+    else:
+        image, alpha, blended = blend_limited(
+            splats, tiles, view, limit.to(means), colours, features[splats.which], behind
+        )
     return Drawn(
         image=image, alpha=alpha, radii=splats.radii, grad2d=gradients[0], tile_counts=tiles.counts,
         absgrad2d=gradients[1] if absolute else None, features=blended,
-        median=median_splat(splats, tiles, view) if median else None,
+        median=median_splat(splats, tiles, view, limit) if median else None,
     )  # fmt: skip
 
 
@@ -147,6 +154,7 @@ class Visible(NamedTuple):
         mean2d: (n, 2) in pixels.
         conic: (n, 3), xx, xy and yy of the inverse covariance.
         opacity: (n,).
+        depth: (n,) along the camera's z axis.
         covariance, determinant: as the reference's ``Ellipses``.
         radii: (N,) float32 of all splats, as ``Rendering.radii``.
     """
@@ -155,6 +163,7 @@ class Visible(NamedTuple):
     mean2d: torch.Tensor
     conic: torch.Tensor
     opacity: torch.Tensor
+    depth: torch.Tensor
     covariance: tuple[torch.Tensor, ...]
     determinant: torch.Tensor
     radii: torch.Tensor
@@ -172,7 +181,8 @@ class Visible(NamedTuple):
         determinant = seen.determinant[some]
         conic = torch.stack([yy, -xy, xx], 1) / determinant[:, None]
         which, mean2d, opacity = seen.drawn[some], seen.mean2d[some], seen.opacity[some]
-        return cls(which, mean2d, conic, opacity, covariance, determinant, seen.radii)
+        depth = seen.depth[some]
+        return cls(which, mean2d, conic, opacity, depth, covariance, determinant, seen.radii)
 
 
 class Tiles(NamedTuple):
@@ -270,9 +280,12 @@ class _Blend(torch.autograd.Function):
 
 
 def walk(
-    splats: Visible, tiles: Tiles, view: View
+    splats: Visible, tiles: Tiles, view: View, limit: torch.Tensor | None = None
 ) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]]:
     """Blends in plain torch what gsplat does not tell: some splats of every tile at a time, front to back.
+
+    Args:
+        limit: (H, W), the depth beyond which a pixel takes no splats; None: there is none.
 
     Yields:
         the tiles concerned (t,), the rows of ``splats`` that come next in each (t, k), their weights in the
@@ -286,6 +299,9 @@ def walk(
     x = tile[:, None] % across * TILE + pixel % TILE + 0.5
     y = tile[:, None] // across * TILE + pixel // TILE + 0.5
     before = ((x < view.width) & (y < view.height)).to(splats.mean2d)  # no light comes from beyond the border
+    if limit is not None:
+        edge = torch.nn.functional.pad(limit, (0, across * TILE - view.width, 0, down * TILE - view.height))
+        limit = edge.view(down, TILE, across, TILE).transpose(1, 2).reshape(down * across, TILE * TILE)
     done = 0
     while len(tile := ((counts > done) & (before > TRANSMITTANCE_MIN).any(1)).nonzero()[:, 0]):
         step = min(max(WALK // (TILE * TILE * len(tile)), 1), int(counts.max()) - done)
@@ -297,6 +313,8 @@ def walk(
         distance = a[:, None] * dx * dx + 2 * b[:, None] * dx * dy + c[:, None] * dy * dy
         alpha = (splats.opacity[splat][:, None] * torch.exp(-0.5 * distance)).clamp_max(ALPHA_MAX)
         alpha = torch.where((alpha >= ALPHA_MIN) & there[:, None], alpha, 0)
+        if limit is not None:
+            alpha = torch.where(splats.depth[splat][:, None] <= limit[tile][..., None], alpha, 0)
         light = torch.cat([before[tile, :, None], 1 - alpha], 2).cumprod(2)
         behind = light[..., 1:]
         yield tile, splat, torch.where(behind > TRANSMITTANCE_MIN, alpha * light[..., :-1], 0), behind
@@ -305,13 +323,36 @@ def walk(
 
 
 @torch.no_grad()
-def median_splat(splats: Visible, tiles: Tiles, view: View) -> torch.Tensor:
+def blend_limited(
+    splats: Visible, tiles: Tiles, view: View, limit: torch.Tensor,
+    colours: torch.Tensor, features: torch.Tensor, background: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
+    """Image, alpha and blended features of what lies before a depth, which gsplat's kernels cannot draw."""
+    values = torch.cat([colours, features, torch.ones_like(colours[:, :1])], 1)  # Σ w · 1 is alpha
+    sums = values.new_zeros(tiles.counts.numel(), TILE * TILE, values.shape[1])
+    for tile, splat, weight, _ in walk(splats, tiles, view, limit):
+        sums[tile] += weight @ values[splat]
+    blended = _as_picture(sums, tiles, view)
+    alpha = blended[..., -1]
+    return blended[..., :3] + (1 - alpha)[..., None] * background, alpha, blended[..., 3:-1]
+
+
+@torch.no_grad()
+def median_splat(
+    splats: Visible, tiles: Tiles, view: View, limit: torch.Tensor | None = None
+) -> torch.Tensor:
     """(H, W) int32: the splat that brings a pixel's transmittance to a half or below, -1 where none does."""
     down, across = tiles.counts.shape
     found = torch.full((down * across, TILE * TILE), -1, dtype=torch.int32, device=splats.which.device)
-    for tile, splat, weight, behind in walk(splats, tiles, view):
+    for tile, splat, weight, behind in walk(splats, tiles, view, limit):
         here = (behind <= 0.5) & (weight > 0)
         first = splats.which[splat].gather(1, here.int().argmax(2)).int()
         found[tile] = torch.where((found[tile] < 0) & here.any(2), first, found[tile])
-    rows = found.view(down, across, TILE, TILE).transpose(1, 2).reshape(down * TILE, across * TILE)
-    return rows[: view.height, : view.width].contiguous()
+    return _as_picture(found[..., None], tiles, view)[..., 0].contiguous()
+
+
+def _as_picture(pixels: torch.Tensor, tiles: Tiles, view: View) -> torch.Tensor:
+    """(H, W, K) of what tiles have in their pixels, (tiles, 256, K)."""
+    down, across = tiles.counts.shape
+    rows = pixels.view(down, across, TILE, TILE, -1).transpose(1, 2)
+    return rows.reshape(down * TILE, across * TILE, -1)[: view.height, : view.width]

@@ -34,6 +34,7 @@ def rasterize(
     antialias: bool,
     median: bool,
     absolute: bool,
+    limit: torch.Tensor | None,
 ) -> Drawn:
     """See :func:`training.rasterize.rasterize`."""
     kind = {"dtype": means.dtype, "device": means.device}
@@ -58,11 +59,13 @@ def rasterize(
 
     order = seen.depth.argsort(stable=True)
     offsets = pixel_offsets(mean2d[order], view)
-    weight, transmittance = blend(offsets, xx[order], xy[order], yy[order], opacity[order])
+    hidden = None if limit is None else seen.depth[order][:, None, None] > limit
+    weight, transmittance = blend(offsets, xx[order], xy[order], yy[order], opacity[order], hidden)
     image = torch.einsum("nhw,nc->hwc", weight, colour[order])
     image = image + transmittance[..., None] * torch.tensor(background, **kind)
     if absolute:  # features have no part in absgrad2d, so their gradient takes a way of its own
-        weight, _ = blend(pixel_offsets(mean2d[order], view), xx[order], xy[order], yy[order], opacity[order])
+        offsets_again = pixel_offsets(mean2d[order], view)
+        weight, _ = blend(offsets_again, xx[order], xy[order], yy[order], opacity[order], hidden)
     blended = torch.einsum("nhw,nc->hwc", weight, features[drawn[order]])
     if absgrad2d is not None and mean2d.requires_grad:
         for axis, offset in enumerate(offsets):
@@ -215,19 +218,25 @@ def contributions(means, quats, log_scales, opacity_logits, weights, *, view, mi
     drawn = rasterize(
         means, quats, log_scales, opacity_logits, sh, weights, features,
         view=view, background=(0.0, 0.0, 0.0), degree=0, min_scale=min_scale, antialias=antialias,
-        median=False, absolute=False,
+        median=False, absolute=False, limit=None,
     )  # fmt: skip
     shares = drawn.features.flatten(0, 1)  # a feature of each splat's own: its weight in every pixel
     return shares.amax(0).float(), shares.sum(0).float(), (shares > 0).sum(0), drawn.radii
 
 
-def blend(offsets, xx, xy, yy, opacity) -> tuple[torch.Tensor, torch.Tensor]:
-    """Weights alpha T (N, H, W) of splats given front to back, and the T (H, W) left behind the last."""
+def blend(offsets, xx, xy, yy, opacity, hidden=None) -> tuple[torch.Tensor, torch.Tensor]:
+    """Weights alpha T (N, H, W) of splats given front to back, and the T (H, W) left behind the last.
+
+    Args:
+        hidden: (N, H, W) bool, where a splat is not drawn; None: nowhere.
+    """
     dx, dy = offsets
     xx, xy, yy = xx[:, None, None], xy[:, None, None], yy[:, None, None]
     distance = (yy * dx**2 - 2 * xy * dx * dy + xx * dy**2) / (xx * yy - xy**2)
     alpha = (opacity[:, None, None] * torch.exp(-0.5 * distance)).clamp_max(ALPHA_MAX)
     alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0)
+    if hidden is not None:
+        alpha = alpha.masked_fill(hidden, 0)
 
     behind = torch.cumprod(1 - alpha, 0)
     before = torch.cat([torch.ones_like(behind[:1]), behind[:-1]]) if len(behind) else behind

@@ -13,7 +13,7 @@ from ..runs.job import Job
 from ..scenes.cameras import Camera, read_camera
 from ..scenes.colmap import read_scene
 from ..splats.bundle import Bundle, read_bundle, read_folder
-from .picture import Picture, write_picture
+from .picture import Picture, read_depth, write_picture
 from .scene import Placed, SplatSet, draw
 
 
@@ -90,6 +90,7 @@ def render(
     level: int = 0,
     detail: Detail | None = None,
     background: tuple[float, float, float] | None = (0.0, 0.0, 0.0),
+    holdout: Path | None = None,
     backend: str = "auto",
 ) -> Picture:
     """Draws one view into a file: a PNG, or an EXR with depth and levels besides.
@@ -99,13 +100,15 @@ def render(
         level: the level to draw; 0 is the finest.
         detail: draw levels by their distance instead.
         background: display-coded; None leaves it transparent.
+        holdout: an EXR with the depth of what hides splats, as :func:`.picture.read_depth` reads it.
 
     Raises:
-        LodgsError: there is no such level or detail, or the file cannot be written.
+        LodgsError: there is no such level or detail, the holdout is not one, or the file cannot be written.
     """
     bundle = source.bundle
     if out.suffix.lower() not in (".png", ".exr"):
         raise LodgsError(f"{out.name} is neither .png nor .exr.", "Choose one of these endings.")
+    limit = None if holdout is None else read_depth(holdout, camera.width, camera.height, None)
     if detail is not None:
         shown = select_levels(bundle, camera.center, min(camera.fx, camera.fy), detail.of(bundle))
     else:
@@ -113,8 +116,9 @@ def render(
     placed = [Placed(SplatSet(x.splats, x.weights, backend), level=x.number) for x in shown]
     everything = out.suffix.lower() == ".exr"
     picture = draw(
-        placed, camera, near=near, background=background, depth=everything, levels=everything, backend=backend
-    )
+        placed, camera, near=near, background=background, depth=everything, levels=everything, limit=limit,
+        backend=backend,
+    )  # fmt: skip
     assert picture is not None
     write_picture(out, picture)
     return picture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,9 @@ from ..scenes.images import write_png
 NOTHING = 1e10
 """Depth where a pixel shows nothing, as Blender's renderers say it."""
 
+_DEPTH = re.compile(r"(.*\.)?depth(\.[a-z])?|z|v", re.IGNORECASE)
+"""Names of channels that hold a depth: a layer's Depth.Z or Depth.V, or a file's own Z or V."""
+
 _CLEAR = 0.02
 """Part of an 8-bit step that linear colours keep from the borders between two 8-bit values."""
 
@@ -25,7 +29,7 @@ class Picture:
     Attributes:
         image: (H, W, 3) float32, display-coded (sRGB) colours over the background; over black, and so
             multiplied by alpha, where that is transparent. Not clamped above.
-        alpha: (H, W) float32; ones unless the background is transparent.
+        alpha: (H, W) float32; ones unless the background is transparent, or held out.
         depth: (H, W) float32 along the camera's z axis in world units: of the splat that brings the light
             let through to a half, or where none does the mean of all; NOTHING where there is none. Empty
             where the pass was not drawn.
@@ -77,15 +81,13 @@ class Picture:
     def linear(self) -> np.ndarray:
         """(H, W, 4) float32, colours in linear light multiplied by alpha, and alpha.
 
-        The colours under the alpha are decoded, as a display transform will code them. They are first moved
-        away, by 0.02 of an 8-bit step at most, from where rounding to 8 bits turns over: so whoever codes
-        them again has the 8 bits of :meth:`eight_bit`, however exact their arithmetic is.
+        The colours under the alpha are decoded, as a display transform will code them. They and the alpha are
+        first moved away, by 0.02 of an 8-bit step at most, from where rounding to 8 bits turns over: so whoever
+        codes them again has the 8 bits of :meth:`eight_bit`, however exact their arithmetic is.
         """
-        codes = self._straight().astype(np.float64) * 255
-        rest = codes - np.floor(codes) - 0.5
-        codes += np.where(rest >= 0, np.maximum(_CLEAR - rest, 0), np.minimum(-_CLEAR - rest, 0))
-        linear = linear_of((codes / 255).clip(0)) * self.alpha[..., None]
-        return np.concatenate([linear.astype(np.float32), self.alpha[..., None]], 2)
+        alpha = _clear(self.alpha[..., None].astype(np.float64)).clip(0, 1)
+        linear = linear_of(_clear(self._straight().astype(np.float64)).clip(0)) * alpha
+        return np.concatenate([linear, alpha], 2).astype(np.float32)
 
     def passes(self) -> dict[str, np.ndarray]:
         """Planes (H, W) by name as Blender calls them: Combined.R to .A, Depth.Z, Level.X, Level 1.X, ..."""
@@ -102,6 +104,13 @@ class Picture:
         """Colours (H, W, 3) not multiplied by alpha, float32."""
         alpha = self.alpha[..., None]
         return np.divide(self.image, alpha, out=np.zeros_like(self.image), where=alpha > 0)
+
+
+def _clear(values: np.ndarray) -> np.ndarray:
+    """Values in [0, 1], moved off the borders between two 8-bit ones; those that are 0 or 1 stay."""
+    codes = values * 255
+    rest = codes - np.floor(codes) - 0.5
+    return (codes + np.where(rest >= 0, np.maximum(_CLEAR - rest, 0), np.minimum(-_CLEAR - rest, 0))) / 255
 
 
 def linear_of(coded: np.ndarray) -> np.ndarray:
@@ -121,6 +130,49 @@ def write_picture(path: Path, picture: Picture) -> None:
         raise LodgsError(f"{path.name} is neither .png nor .exr.", "Choose one of these endings.")
     with atomic_write(path) as temporary:
         writer(temporary, picture)
+
+
+def read_depth(path: Path, width: int, height: int, window: tuple[int, int, int, int] | None) -> np.ndarray:
+    """The Depth pass of an EXR as Blender's renderers and its compositor write it, (H, W) float32.
+
+    Of several layers' depths the nearest counts in each pixel.
+
+    Args:
+        width, height: of the whole picture; an EXR of the window alone is taken as well.
+        window: left, top, width and height of the part that is wanted; None: all.
+
+    Raises:
+        LodgsError: it cannot be read, has no depth, or is of another size.
+    """
+    import OpenEXR
+
+    if not path.exists():
+        raise LodgsError(f"There is no mesh depth {path}.", "Render it, or take the holdout away.")
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            parts = [(part.name(), part.channels) for part in file.parts]
+            found = [
+                np.asarray(channel.pixels, np.float32)
+                for part, channels in parts
+                for name, channel in channels.items()
+                if _DEPTH.fullmatch(name) and (len(name) > 1 or len(parts) == 1 or _DEPTH.fullmatch(part))
+            ]
+    except (RuntimeError, OSError, ValueError) as error:
+        raise LodgsError(f"{path.name} cannot be read as an EXR: {error}.", "Render it anew.") from error
+    if not found or any(plane.shape != found[0].shape for plane in found):
+        raise LodgsError(
+            f"{path.name} has no Depth pass.", "Tick Depth among its view layer's passes and render it anew."
+        )
+    depth = np.nan_to_num(np.fmin.reduce(found), nan=NOTHING, posinf=NOTHING)  # half floats have no 1e10
+    left, top, across, up = window or (0, 0, width, height)
+    if depth.shape == (height, width):
+        return depth[top : top + up, left : left + across]
+    if depth.shape == (up, across):
+        return depth
+    raise LodgsError(
+        f"{path.name} has {depth.shape[1]}x{depth.shape[0]} pixels, the picture {width}x{height}.",
+        "Render the meshes' depth in the picture's size.",
+    )
 
 
 def _write_exr(path: Path, picture: Picture) -> None:

@@ -105,6 +105,7 @@ def draw(
     depth: bool = False,
     levels: bool = False,
     window: tuple[int, int, int, int] | None = None,
+    limit: np.ndarray | None = None,
     backend: str = "auto",
     wanted: Callable[[float], bool] = lambda share: True,
 ) -> Picture | None:
@@ -119,6 +120,8 @@ def draw(
         depth: draw the pass as well.
         levels: as well, how much of each pixel every level fills.
         window: left, top, width and height in pixels of the part of the camera's image to draw; None: all.
+        limit: (H, W) of the window, depths of meshes along the camera's z axis in the world, NOTHING where
+            there are none: what lies behind is held out, the background as well.
         backend: rasterizer.
         wanted: told the share that is done from time to time; False ends it.
 
@@ -135,6 +138,10 @@ def draw(
     width, height = window[2:] if window else (camera.width, camera.height)
     numbers = sorted({one.level for one in placed}) if levels else []
     picture = Picture.empty(width, height, background, depth, numbers)
+    behind = background or (0.0, 0.0, 0.0)
+    if limit is not None:  # the background, too, is behind meshes: drawn over black, it is added elsewhere
+        picture.image[limit < NOTHING], picture.alpha[limit < NOTHING] = 0, 0
+        behind = 0.0, 0.0, 0.0
     some = [one for one in placed if len(one.splats)]
     if not some:
         return picture
@@ -142,14 +149,16 @@ def draw(
         columns, weights, camera, near, unit = _in_one_frame(some, camera, near)
         features = _membership(some, picture) if levels else None
         for top, drawn in strips(
-            *columns, camera, weights=weights, background=background or (0.0, 0.0, 0.0), near=near,
+            *columns, camera, weights=weights, background=behind, near=near,
             outputs=("depth", "median_depth") if depth else (), features=features, window=window,
+            limit=None if limit is None else torch.from_numpy(limit / unit).to(columns[0]),
             strip=STRIP, backend=backend,
         ):  # fmt: skip
             rows = slice(top, top + len(drawn.alpha))
-            picture.image[rows] = drawn.image.cpu().numpy()
-            if background is None:
-                picture.alpha[rows] = drawn.alpha.cpu().numpy()
+            alpha = drawn.alpha.cpu().numpy()
+            kept = 0 if limit is None else (1 - alpha)[..., None] * picture.image[rows]
+            picture.image[rows] = drawn.image.cpu().numpy() + kept
+            picture.alpha[rows] = np.maximum(picture.alpha[rows], alpha)
             if depth:
                 assert drawn.depth is not None and drawn.median_depth is not None
                 seen = torch.where(drawn.median_depth > 0, drawn.median_depth, drawn.depth) * unit

@@ -6,13 +6,14 @@ standard input ends, however the other program ended.
 
     {"frame": 7, "out": NAME, "camera": {...}, "near": 0.1, "background": [r, g, b] or null,
      "depth": true, "levels": true, "window": [left, top, width, height] or null,
-     "photograph": PATH or null,
+     "photograph": PATH or null, "holdout": PATH or null,
      "sets": [{"file": NAME, "count": N, "matrix": 4x4, "level": 3}, ...]}
     {"cancel": 7}
 
 answer ``progress`` (frame, share), then one of ``frame`` (frame, passes, height, width, seconds; the planes
 are in the file OUT), ``cancelled`` (frame) and ``error`` (frame, what, remedy). A photograph is read in the
-frame's size and its planes follow the others, display-coded; ``psnr`` then says how alike both are.
+frame's size and its planes follow the others, display-coded; ``psnr`` then says how alike both are. A holdout
+is an EXR with the depth of what hides splats, of the camera's size or the window's.
 
 A set is read when its file is first named, and forgotten when a frame does not name it.
 """
@@ -41,6 +42,7 @@ from ..runs.folder import event_line
 from ..scenes.cameras import Camera, camera_from_dict
 from ..scenes.images import load_image
 from . import wire
+from .picture import read_depth
 from .scene import Placed, SplatSet, draw
 
 
@@ -108,7 +110,9 @@ class _Server:
     def _answer(self, request: dict, frame: int | None) -> None:
         started = time.perf_counter()
         camera, near = camera_from_dict(request["camera"])
-        background, window = request.get("background"), request.get("window")
+        background, holdout = request.get("background"), request.get("holdout")
+        window = _window(request["window"], camera) if request.get("window") else None
+        limit = read_depth(Path(holdout), camera.width, camera.height, window) if holdout else None
         placed = self._placed(request["sets"])
         if frame in self._cancelled:
             self.say("cancelled", frame=frame)
@@ -121,7 +125,7 @@ class _Server:
         picture = draw(
             placed, camera, near=near, background=tuple(background) if background else None,
             depth=bool(request.get("depth")), levels=bool(request.get("levels")),
-            window=_window(window, camera) if window else None, backend=self._backend, wanted=wanted,
+            window=window, limit=limit, backend=self._backend, wanted=wanted,
         )  # fmt: skip
         if picture is None or frame in self._cancelled:
             self._cancelled.discard(frame)  # type: ignore[arg-type]

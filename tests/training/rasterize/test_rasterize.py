@@ -13,7 +13,16 @@ import torch
 
 from tests.training.rasterize.scenes import CONTRIBUTING, SCENES, contributed, drawn_and_differentiated, scene
 from training.errors import LodgsError
-from training.rasterize import OUTPUTS, Target, contributions, cpu, photometric_loss, rasterize, render
+from training.rasterize import (
+    OUTPUTS,
+    Target,
+    contributions,
+    cpu,
+    photometric_loss,
+    rasterize,
+    render,
+    strips,
+)
 from training.rasterize.cpu.bin import TILE, bin_splats
 from training.rasterize.cpu.compile import Buffers, in_parallel, numba, set_threads, threads
 from training.rasterize.cpu.fastmath import exp2
@@ -163,6 +172,94 @@ def test_what_is_empty_has_no_depth(backend, axis_camera):
     assert all(t.grad is None or t.grad.isfinite().all() for t in splats)
 
 
+def test_a_limit_leaves_out_what_lies_behind_it(backend, axis_camera):
+    """Worked by hand: splats at 2 and at 4, a limit of 3 on the left half and none on the right."""
+    splats = [t.detach() for t in isotropic([4.0, 2.0], 0.3, [0.9, 0.5], [[1.0, 0.0, 0.2], [0.0, 1.0, 0.2]])]
+    limit = torch.full((32, 32), 1e10)
+    limit[:, :16] = 3
+    options = {"background": (0.0, 0.0, 0.5), "outputs": ("depth", "median_depth"), "backend": backend}
+    drawn = rasterize(*splats, axis_camera, features=torch.eye(2), limit=limit, **options)
+    far, near = (
+        opacity * np.exp(-squared_distance() / (2 * ((40 * 0.3 / z) ** 2 + 0.3)))
+        for opacity, z in ((0.9, 4), (0.5, 2))
+    )
+    far[far < 1 / 255] = near[near < 1 / 255] = 0
+    far[:, :16] = 0
+    weights = (1 - near) * far, near
+    alpha = sum(weights)
+    np.testing.assert_allclose(drawn.image[..., 0], weights[0], atol=5e-6)
+    np.testing.assert_allclose(drawn.image[..., 1], near, atol=5e-6)
+    np.testing.assert_allclose(drawn.image[..., 2], 0.2 * alpha + 0.5 * (1 - alpha), atol=5e-6)
+    np.testing.assert_allclose(drawn.alpha, alpha, atol=5e-6)
+    np.testing.assert_allclose(drawn.features, np.stack(weights, 2), atol=5e-6)
+    some = alpha > 0
+    expected = (weights[0] * 4 + near * 2)[some] / alpha[some]
+    np.testing.assert_allclose(drawn.depth[some], expected, rtol=1e-5)
+    assert drawn.median_depth[16, 14:18].tolist() == [0, 0, 4, 4]  # the first leaves more than a half
+    limit[:] = 1  # before everything
+    empty = rasterize(*splats, axis_camera, limit=limit, **options)
+    assert empty.alpha.max() == 0 and empty.median_depth.max() == 0
+    assert torch.equal(empty.image, torch.tensor([0.0, 0.0, 0.5]).expand(32, 32, 3))
+
+
+@pytest.mark.parametrize("name", ["degree 3", "antialiased", "needles", "screen-filling", "caps", "crowd"])
+def test_limits_agree_with_the_reference(name, fake_card, make_splats, odd_camera):
+    """A depth of its own in every pixel: relative L2 at most 5e-4, median depths but for rounding."""
+    splats, options = scene(name, make_splats)
+    random = torch.Generator().manual_seed(2)
+    limit = 2 + 2 * torch.rand(50, 75, generator=random).double()
+    limit[::3] = 1e10
+    features = torch.rand(len(splats["means"]), 4, generator=random).double()
+    options |= {"background": (0.1, 0.5, 0.3), "outputs": ("depth", "median_depth", "normals")}
+    exact = rasterize(
+        *splats.values(), odd_camera, features=features, limit=limit, backend="reference", **options
+    )
+    free = rasterize(*splats.values(), odd_camera, backend="reference", **options)
+    assert (free.alpha - exact.alpha).abs().mean() > 0.01
+    for backend in ("cpu", "cuda"):
+        found = rasterize(
+            *(t.float() for t in splats.values()), odd_camera, features=features.float(), limit=limit.float(),
+            backend=backend, **options,
+        )  # fmt: skip
+        for output in ("image", "alpha", "depth", "normals", "features"):
+            value, truth = getattr(found, output).double(), getattr(exact, output)
+            assert (value - truth).norm() <= 5e-4 * truth.norm(), f"{backend} {output}"
+        same = (found.median_depth - exact.median_depth).abs() < 1e-4
+        assert same.float().mean() > 0.999, backend
+
+
+def test_limits_of_strips_and_windows(backend, make_splats, odd_camera):
+    """Are those of the whole; an infinite one is none."""
+    splats = [t.float() for t in make_splats(150).values()]
+    limit = 2 + 2 * torch.rand(50, 75, generator=torch.Generator().manual_seed(3))
+    options = {"outputs": ("median_depth",), "backend": backend}
+    whole = rasterize(*splats, odd_camera, limit=limit, **options)
+    for left, top, width, height in ((0, 0, 75, 50), (20, 7, 41, 36)):
+        inside = slice(top, top + height), slice(left, left + width)
+        window = {"window": (left, top, width, height), "limit": limit[inside]}
+        parts = [drawn for _, drawn in strips(*splats, odd_camera, strip=1, **window, **options)]
+        assert len(parts) > 2
+        for output in ("image", "alpha", "median_depth"):
+            found = torch.cat([getattr(part, output) for part in parts])
+            torch.testing.assert_close(found, getattr(whole, output)[inside], atol=2e-5, rtol=1e-4)
+    free = rasterize(*splats, odd_camera, **options)
+    boundless = rasterize(*splats, odd_camera, limit=torch.full((50, 75), math.inf), **options)
+    for output in ("image", "alpha", "median_depth"):
+        one, other = getattr(boundless, output), getattr(free, output)
+        if backend == "cuda":  # its limited pictures have the definition's cap
+            torch.testing.assert_close(one, other, atol=0.01, rtol=1e-4)
+        else:
+            assert torch.equal(one, other)
+
+
+def test_a_limit_is_for_pictures(backend, make_splats, odd_camera):
+    splats = [t.float().requires_grad_() for t in make_splats(5).values()]
+    with pytest.raises(ValueError, match="it has no gradients"):
+        rasterize(*splats, odd_camera, limit=torch.ones(50, 75), backend=backend)
+    with pytest.raises(ValueError, match=r"limit must have shape \(50, 75\)"):
+        next(strips(*splats, odd_camera, limit=torch.ones(75, 50), backend=backend))
+
+
 def test_median_depths_agree_with_the_reference(make_splats, odd_camera):
     """Pixel for pixel, but for those where rounding decides which splat reaches the half."""
     splats = make_splats(300)
@@ -283,7 +380,7 @@ def test_pictures_for_eyes_are_what_training_sees(backend, make_splats, odd_came
     splats = [t.float() for t in make_splats(150).values()]
     options = {"background": (0.9, 0.2, 0.4), "sh_degree": 1, "min_scale": 0.01, "backend": backend}
     cameras = [odd_camera, axis_camera]
-    for camera, whole, strips, small, half in zip(
+    for camera, whole, parts, small, half in zip(
         cameras,
         render(*splats, cameras, **options),
         render(*splats, cameras, strip=1, **options),
@@ -294,7 +391,7 @@ def test_pictures_for_eyes_are_what_training_sees(backend, make_splats, odd_came
         drawn = rasterize(*splats, camera, **options)
         expected = torch.cat([drawn.image, drawn.alpha[..., None]], 2).numpy()
         np.testing.assert_array_equal(whole, expected)
-        np.testing.assert_allclose(strips, expected, atol=2e-5)
+        np.testing.assert_allclose(parts, expected, atol=2e-5)
         assert small.dtype == np.uint8 and half.dtype == np.float16
         np.testing.assert_array_equal(small, np.round(expected.clip(0, 1) * 255))
         np.testing.assert_allclose(half, expected, atol=2e-3)

@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import OpenEXR
 import pytest
 import torch
 from PIL import Image
@@ -76,6 +77,21 @@ def test_transparency(bundle, camera, tmp_path):
     assert red[clear[..., 3] == 0].tolist()[0] == [255, 0, 0]
 
 
+def test_a_holdout(bundle, camera, tmp_path):
+    """Nothing is drawn before the left half's depth of 0.5, all before the right half's."""
+    write_camera(tmp_path / "camera.json", camera, 0.01)
+    depth = np.full((48, 64), 1e10, np.float32)
+    depth[:, :32] = 0.5
+    OpenEXR.File({"type": OpenEXR.scanlineimage}, {"View.Depth.Z": depth}).write(str(tmp_path / "depth.exr"))
+    common = ["render", str(bundle[0]), "--camera", str(tmp_path / "camera.json"), "--out"]
+    assert main([*common, str(tmp_path / "a.png")]) == 0
+    assert main([*common, str(tmp_path / "b.png"), "--holdout", str(tmp_path / "depth.exr")]) == 0
+    free, held = pixels(tmp_path / "a.png"), pixels(tmp_path / "b.png")
+    assert free[:, :32].max() > 100 and held[:, :32].max() == 0
+    np.testing.assert_array_equal(held[:, 32:, :3], free[:, 32:])
+    assert (held[:, 32:, 3] == 255).all()
+
+
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
@@ -84,6 +100,7 @@ def test_transparency(bundle, camera, tmp_path):
         (["--gamma", "0"], "cannot be shown"),
         (["--gamma", "1", "--level", "1"], "Choose one."),
         (["--out", "a.gif"], "neither .png nor .exr"),
+        (["--holdout", "gone.exr"], "There is no mesh depth gone.exr."),
         (["--backend", "magic"], 'There is no rasterizer backend "magic".'),
     ],
 )

@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from training.errors import LodgsError
-from training.render.picture import Picture, write_picture
+from training.render.picture import NOTHING, Picture, read_depth, write_picture
 
 
 def picture(image, alpha=None, **passes) -> Picture:
@@ -66,6 +66,54 @@ def test_an_exr_has_every_pass(tmp_path):
     np.testing.assert_array_equal(planes["LODGS.Level 5.X"], masks[1])
     assert planes["LODGS.Level.X"][0, 0] == 0
     assert set(np.unique(planes["LODGS.Level.X"])) == {0, 2, 5}
+
+
+def write_exr(path, *parts):
+    """Parts: a name and the planes by channel of each."""
+    header = {"type": OpenEXR.scanlineimage}
+    made = [OpenEXR.Part(header | {"name": name}, planes) for name, planes in parts]
+    OpenEXR.File(made).write(str(path))
+    return path
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        lambda z, other: [("", {"ViewLayer.Depth.Z": z, "ViewLayer.Normal.Z": other})],
+        lambda z, other: [("", {"Depth.V": z, "ViewLayer.Combined.Z": other})],
+        lambda z, other: [("", {"Z": z, "R": other})],
+        lambda z, other: [("", {"A.Depth.Z": z, "B.Depth.Z": z + 1})],
+        lambda z, other: [("ViewLayer.Normal", {"Z": other}), ("ViewLayer.Depth", {"Z": z})],
+        lambda z, other: [("a", {"L.Normal.Z": other}), ("b", {"L.Depth.Z": z})],
+    ],
+)
+def test_a_depth_is_found_by_its_channel(tmp_path, parts):
+    z = np.random.default_rng(3).uniform(1, 9, (6, 4)).astype(np.float32)
+    path = write_exr(tmp_path / "a.exr", *parts(z, np.zeros_like(z)))
+    np.testing.assert_array_equal(read_depth(path, 4, 6, None), z)
+    np.testing.assert_array_equal(read_depth(path, 4, 6, (1, 2, 3, 4)), z[2:6, 1:4])
+    np.testing.assert_array_equal(read_depth(path, 40, 60, (7, 8, 4, 6)), z)  # of the window alone
+
+
+def test_halfs_have_nothing_as_infinity(tmp_path):
+    path = write_exr(tmp_path / "a.exr", ("", {"Depth.Z": np.float16([[2, np.inf, np.nan]])}))
+    np.testing.assert_array_equal(read_depth(path, 3, 1, None), np.float32([[2, NOTHING, NOTHING]]))
+
+
+def test_what_is_no_depth_is_told(tmp_path):
+    plane = np.ones((6, 4), np.float32)
+    (tmp_path / "text.exr").write_text("no picture")
+    for path, sentence in (
+        (tmp_path / "gone.exr", "There is no mesh depth"),
+        (tmp_path / "text.exr", "cannot be read as an EXR"),
+        (
+            write_exr(tmp_path / "rgb.exr", ("", {"L.Combined.R": plane, "L.Normal.Z": plane})),
+            "no Depth pass",
+        ),
+        (write_exr(tmp_path / "small.exr", ("", {"Z": plane})), "has 4x6 pixels, the picture 40x60"),
+    ):
+        with pytest.raises(LodgsError, match=sentence):
+            read_depth(path, 40, 60, (0, 0, 30, 30))
 
 
 def test_other_endings_are_refused(tmp_path):

@@ -135,6 +135,42 @@ def test_depth_and_levels(camera):
     assert thin.alpha[center] == pytest.approx(0.25, abs=1e-3)
 
 
+@pytest.mark.parametrize("background", [None, (0.2, 0.4, 1.0)])
+@pytest.mark.parametrize("scale", [1.0, 0.01])
+def test_meshes_hold_out_what_is_behind_them(camera, background, scale):
+    """A red wall of alpha a quarter at 2, a green one at 6, a mesh at 3 on the left, a nearer one below. One
+    scale brings the walls to their places from a space of other units."""
+    camera = replace(camera, world_to_camera=np.eye(4))
+    limit = np.full((48, 64), NOTHING, np.float32)
+    limit[:, :32], limit[40:] = 3, 1
+    matrix = np.diag([scale, scale, scale, 1])
+
+    def placed(z, color, weight):
+        splats = wall(z / scale, color)
+        splats.log_scales -= np.float32(np.log(scale))
+        return Placed(SplatSet(splats, np.float32([weight])), matrix, level=int(z))
+
+    both = [placed(2, (1, 0, 0), 0.25), placed(6, (0, 1, 0), 1)]
+    picture = draw(both, camera, limit=limit, background=background, depth=True, levels=True)
+    behind = (0, 0, 0) if background is None else background
+    full = 0.25, 0.75 * 0.99
+    left, right, below = (24, 31), (24, 32), (40, 32)
+    np.testing.assert_allclose(picture.image[left], (0.25, 0, 0), atol=2e-3)
+    np.testing.assert_allclose(
+        picture.image[right], np.array([*full, 0]) + np.multiply(0.0075, behind), atol=2e-3
+    )
+    assert (picture.image[below] == 0).all() and picture.depth[below] == np.float32(NOTHING)
+    at_right = pytest.approx(0.9925, abs=1e-3) if background is None else 1
+    assert (picture.alpha[left], picture.alpha[right]) == (pytest.approx(0.25, abs=2e-3), at_right)
+    assert picture.alpha[below] == 0
+    assert picture.depth[left] == pytest.approx(2) and picture.depth[right] == pytest.approx(6)
+    assert picture.masks[:, 24, 31] == pytest.approx([0.25, 0], abs=2e-3)
+    window = draw(both, camera, limit=limit[10:44, 20:50], window=(20, 10, 30, 34), background=background)
+    np.testing.assert_allclose(window.image, picture.image[10:44, 20:50], atol=1e-6)
+    nothing = draw([], camera, limit=limit, background=background)
+    assert nothing.alpha[left] == 0 and nothing.alpha[24, 40] == (background is not None)
+
+
 def test_nothing_to_draw_is_the_background(camera, make_splats):
     nothing = Placed(SplatSet(make_splats(3).select(slice(0))), level=1)
     for placed in ([], [nothing]):

@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 
 from training.render import wire
@@ -79,6 +80,26 @@ def test_frames_are_what_draw_draws(client, make_splats, camera):
         for plane, there in zip(expected.values(), planes, strict=True):
             np.testing.assert_array_equal(plane, there)
         (client.folder / "one").unlink(missing_ok=True)  # what was read once is not read again
+
+
+def test_a_holdout_is_read_and_told_where_it_cannot_be(client, make_splats, camera, tmp_path):
+    client.hear("hello")
+    splats = make_splats(80)
+    wire.write_set(client.folder / "one", wire.packed(splats, None))
+    sets = [{"file": "one", "count": 80, "matrix": np.eye(4).tolist(), "level": 0}]
+    depth = np.full((48, 64), 4, np.float32)
+    OpenEXR.File({"type": OpenEXR.scanlineimage}, {"L.Depth.Z": depth}).write(str(tmp_path / "depth.exr"))
+    told = {"holdout": str(tmp_path / "depth.exr"), "window": [10, 5, 30, 40], "background": None}
+    client.say(**request(camera, sets, **told))
+    answer = client.hear("frame", "error")
+    planes = wire.read_planes(client.folder / "frame", len(answer["passes"]), 40, 30)
+    placed, window = [Placed(SplatSet(splats))], (10, 5, 30, 40)
+    expected = draw(placed, camera, background=None, window=window, limit=depth[5:45, 10:40])
+    free = draw(placed, camera, background=None, window=window)
+    np.testing.assert_array_equal(planes[3], expected.alpha)
+    assert np.abs(free.alpha - expected.alpha).mean() > 0.01
+    client.say(**request(camera, sets, 2, holdout=str(tmp_path / "gone.exr")))
+    assert "There is no mesh depth" in client.hear("frame", "error")["what"]
 
 
 def test_mistakes_are_answered_and_survived(client, make_splats, camera):

@@ -54,6 +54,7 @@ def rasterize(
     antialias: bool,
     median: bool,
     absolute: bool,
+    limit: torch.Tensor | None,
 ) -> Drawn:
     """See :func:`training.rasterize.rasterize`. Tensors are float32 on the CPU; ValueError otherwise.
 
@@ -73,10 +74,11 @@ def rasterize(
         median=torch.full((view.height, view.width), -1, dtype=torch.int32) if median else None,
         tile_counts=torch.empty(-(-view.height // TILE), -(-view.width // TILE), dtype=torch.int64),
     )
+    if limit is not None:  # the kernels know no infinity
+        limit = limit.to(torch.float32).clamp_max(torch.finfo(torch.float32).max).contiguous()
     settings = *lens_of(view), view.width, view.height, degree, f32(min_scale), antialias
-    planes, alpha, blended = _Rasterize.apply(
-        *tensors, settings, view, np.array(background, np.float32), aside
-    )
+    behind, most = np.array(background, np.float32), None if limit is None else limit.numpy()
+    planes, alpha, blended = _Rasterize.apply(*tensors, settings, view, behind, most, aside)
     return Drawn(
         image=planes.permute(1, 2, 0), alpha=alpha, radii=aside.radii, grad2d=aside.grad2d,
         tile_counts=aside.tile_counts, absgrad2d=aside.absgrad2d, features=blended.permute(1, 2, 0),
@@ -117,7 +119,7 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @serialised
     def forward(
-        ctx, means, quats, log_scales, logits, sh, weights, features, settings, view, background, aside
+        ctx, means, quats, log_scales, logits, sh, weights, features, settings, view, background, limit, aside
     ):
         tensors = [tensor.contiguous() for tensor in (means, quats, log_scales, logits, sh, weights)]
         splats = [tensor.detach().numpy() for tensor in tensors]
@@ -135,12 +137,12 @@ class _Rasterize(torch.autograd.Function):
         for coloured, image in zip(passes, images, strict=True):
             behind = background if coloured is projected else np.zeros_like(background)
             in_parallel(
-                blend_forward, counts.size, TILES, coloured, *tiles, behind, image, transmittance, walked,
-                reached,
+                blend_forward, counts.size, TILES, coloured, *tiles, behind, limit, image, transmittance,
+                walked, reached,
             )  # fmt: skip
         if aside.median is not None:
             median = aside.median.numpy()
-            in_parallel(blend_median, counts.size, TILES, projected, *tiles, walked, median)
+            in_parallel(blend_median, counts.size, TILES, projected, *tiles, walked, limit, median)
             median[median >= 0] = some[median[median >= 0]]
         ctx.save_for_backward(*tensors)
         ctx.rest = (
@@ -204,7 +206,7 @@ class _Rasterize(torch.autograd.Function):
             some, passes[0], *of_pairs, pair_sums,
             *(gradient.numpy() for gradient in gradients), aside.grad2d.numpy(),
         )  # fmt: skip
-        return *gradients, torch.from_numpy(by_features[:, : len(by_blended)]), None, None, None, None
+        return *gradients, torch.from_numpy(by_features[:, : len(by_blended)]), *(None,) * 5
 
 
 def _as_colours(features: np.ndarray, projected: np.ndarray) -> list[np.ndarray]:

@@ -20,6 +20,7 @@ from .project import (
     CONIC_XX,
     CONIC_XY,
     CONIC_YY,
+    DEPTH,
     G_BLUE,
     G_DX,
     G_DXDX,
@@ -66,16 +67,19 @@ def alpha_of(log2_alpha):
 
 @kernel(FAST)
 def blend_forward(
-    begin, end, projected, splat, tile_start, tiles_x, background, image, transmittance, walked, reached
-):
+    begin, end, projected, splat, tile_start, tiles_x, background, limit,
+    image, transmittance, walked, reached,
+):  # fmt: skip
     """Fill image (3, H, W), transmittance (H, W), the pairs walked in each tile until all was dark, and the
     rows reached by each of those pairs, (P, 2) uint8.
 
     A lane's T turns negative when its pixel is finished (and is so from the start outside the image):
-    whatever follows then fails the test against T_MIN, and |T| stays.
+    whatever follows then fails the test against T_MIN, and |T| stays. So it is with the first splat that lies
+    deeper than the pixel's ``limit`` (H, W). Where that is None, Numba compiles a kernel without it.
     """
     height, width = transmittance.shape
-    state = np.empty((16, 64), np.float32)  # a row: 16 lanes each of T, red, green, blue
+    # a row: 16 lanes each of T, red, green, blue, and of the limits
+    state = np.empty((16, 64 if limit is None else 80), np.float32)
     for tile in range(begin, end):
         x0, y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
         rows, columns = min(TILE, height - y0), min(TILE, width - x0)
@@ -85,6 +89,10 @@ def blend_forward(
                 state[r, j] = ONE if r < rows and j < columns else -ONE
             for j in range(16, 64):
                 state[r, j] = ZERO
+            if limit is not None:
+                for j in range(16):
+                    inside = r < rows and j < columns
+                    state[r, 64 + j] = limit[y0 + r, x0 + j] if inside else ZERO
 
         pair = tile_start[tile]
         lit = 1
@@ -95,6 +103,7 @@ def blend_forward(
                 row = projected[splat[pair]]
                 xx, xy, yy, log2_opacity = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY], row[LOG2_OPACITY]
                 red, green, blue = row[RED], row[GREEN], row[BLUE]
+                depth = row[DEPTH]
                 offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
                 for r in range(int(reached[pair, 0]), int(reached[pair, 1])):
                     dy = f32(r) + offset_y
@@ -107,6 +116,8 @@ def blend_forward(
                         t = lanes[j]
                         t_behind = t - alpha * t
                         takes = t_behind > T_MIN
+                        if limit is not None:
+                            takes = takes and depth <= lanes[64 + j]
                         w = alpha * t if takes else ZERO
                         lanes[j] = t_behind if takes else -abs(t)
                         lanes[16 + j] += w * red
@@ -128,17 +139,25 @@ def blend_forward(
 
 
 @kernel(FAST)
-def blend_median(begin, end, projected, splat, tile_start, tiles_x, walked, median):
-    """Fill median (H, W): the splat that brings a pixel's T to a half or below; others stay."""
+def blend_median(begin, end, projected, splat, tile_start, tiles_x, walked, limit, median):
+    """Fill median (H, W): the splat that brings a pixel's T to a half or below; others stay.
+
+    None is looked for beyond ``limit`` (H, W), which may be None.
+    """
     height, width = median.shape
     state = np.empty(256, np.float32)
     chosen = np.empty(256, np.int32)
+    limits = np.empty(256, np.float32)
     for tile in range(begin, end):
         x0, y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
         rows, columns = min(TILE, height - y0), min(TILE, width - x0)
         left, top = f32(x0) + HALF, f32(y0) + HALF
         state[:] = ONE
         chosen[:] = -1
+        if limit is not None:
+            for r in range(rows):
+                for j in range(columns):
+                    limits[16 * r + j] = limit[y0 + r, x0 + j]
         for pair in range(tile_start[tile], tile_start[tile] + walked[tile]):
             row = projected[splat[pair]]
             first, last = rows_of_strip(row, left, SPAN, top, rows)
@@ -154,7 +173,10 @@ def blend_median(begin, end, projected, splat, tile_start, tiles_x, walked, medi
                     t = state[16 * r + j]
                     behind = t - alpha * t
                     state[16 * r + j] = behind
-                    chosen[16 * r + j] = splat[pair] if t > HALF and behind <= HALF else chosen[16 * r + j]
+                    reaches = t > HALF and behind <= HALF
+                    if limit is not None:
+                        reaches = reaches and row[DEPTH] <= limits[16 * r + j]
+                    chosen[16 * r + j] = splat[pair] if reaches else chosen[16 * r + j]
         for r in range(rows):
             for j in range(columns):
                 if chosen[16 * r + j] >= 0:

@@ -27,6 +27,8 @@ HALF_WIDTH, HALF_HEIGHT = 9, 10
 SLOPE, RISE, X_OF_TOP = 11, 12, 13
 """At dx from the mean that ellipse lies between dy = SLOPE dx ± RISE sqrt(1 − (dx / HALF_WIDTH)²); its
 greatest dy, HALF_HEIGHT, is at dx = X_OF_TOP."""
+DEPTH = 14
+"""Along the camera's z axis."""
 COLUMNS = 16
 """A row is one cache line of 64 bytes."""
 
@@ -208,6 +210,7 @@ def project_forward(
             green += basis[k] * sh[i, k, 1]
             blue += basis[k] * sh[i, k, 2]
         row[RED], row[GREEN], row[BLUE] = max(red, ZERO), max(green, ZERO), max(blue, ZERO)
+        row[DEPTH] = z
 
 
 @kernel(FAST)
