@@ -81,9 +81,9 @@ class Picture:
     def linear(self) -> np.ndarray:
         """(H, W, 4) float32, colours in linear light multiplied by alpha, and alpha.
 
-        The colours under the alpha are decoded, as a display transform will code them. They and the alpha are
-        first moved away, by 0.02 of an 8-bit step at most, from where rounding to 8 bits turns over: so whoever
-        codes them again has the 8 bits of :meth:`eight_bit`, however exact their arithmetic is.
+        The colours under the alpha are decoded, as a display transform will code them. They and the alpha
+        are first moved away, by 0.02 of an 8-bit step at most, from where rounding to 8 bits turns over: so
+        whoever codes them again has the 8 bits of :meth:`eight_bit`, however exact their arithmetic is.
         """
         alpha = _clear(self.alpha[..., None].astype(np.float64)).clip(0, 1)
         linear = linear_of(_clear(self._straight().astype(np.float64)).clip(0)) * alpha
