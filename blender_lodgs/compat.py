@@ -119,6 +119,16 @@ def compositor_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
     return tree
 
 
+def to_straight(tree: bpy.types.NodeTree) -> bpy.types.Node:
+    """A new node that divides colours by their alpha."""
+    node = tree.nodes.new("CompositorNodePremulKey")
+    if hasattr(node, "mapping"):
+        node.mapping = "PREMUL_TO_STRAIGHT"
+    else:
+        node.inputs["Type"].default_value = "To Straight"
+    return node
+
+
 def compositor_output(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket:
     """The socket that takes the finished picture, of a node made for it."""
     if hasattr(bpy.types, "CompositorNodeComposite"):

@@ -40,7 +40,7 @@ def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> 
     meshes = scene.lodgs_render.meshes
     tree = compat.compositor_tree(scene)
     kinds = {node.bl_idname for node in tree.nodes}
-    ours = kinds <= {*compat.COMPOSITOR_START, *_JOINS}
+    ours = kinds <= {*compat.COMPOSITOR_START, *_JOINS, "CompositorNodePremulKey"}
     join = OVER if scene.lodgs_render.holdout else NEARER
     if meshes is None:
         if not ours:
@@ -149,7 +149,7 @@ def _join(tree: bpy.types.NodeTree, kind: str, scene: bpy.types.Scene, meshes: b
     the first scene's over the other's."""
     tree.nodes.clear()
     join, by_depth = tree.nodes.new(kind), kind == NEARER
-    join.location = (350, 0)
+    join.location = (400, 0)
     if by_depth:
         join.inputs["Use Alpha"].default_value = join.inputs["Anti-Alias"].default_value = True
     pictures = [socket for socket in join.inputs if socket.type == "RGBA"]
@@ -159,7 +159,12 @@ def _join(tree: bpy.types.NodeTree, kind: str, scene: bpy.types.Scene, meshes: b
         layers.location = (0, -420 * place)
         layers.scene, layers.layer = one, one.view_layers[0].name
         layers.label = one.name
-        tree.links.new(layers.outputs["Image"], pictures[place if by_depth else 1 - place])
-        if by_depth:
+        if by_depth:  # Z Combine multiplies by alpha, which pictures are already
+            straight = compat.to_straight(tree)
+            straight.location = (180, -420 * place)
+            tree.links.new(layers.outputs["Image"], straight.inputs["Image"])
+            tree.links.new(straight.outputs["Image"], pictures[place])
             tree.links.new(layers.outputs["Depth"], join.inputs[2 * place + 1])
+        else:
+            tree.links.new(layers.outputs["Image"], pictures[1 - place])
     tree.links.new(join.outputs[0], compat.compositor_output(tree))

@@ -489,6 +489,9 @@ def test_a_cube_holds_out_the_splats_behind_it(bpy, lodgs, fog_and_wall, tmp_pat
     scene.lodgs_render.holdout = ""
     assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
     assert joins(lodgs, scene) == ["CompositorNodeZcombine"]
+    wall.lodgs.levels[0].show = False
+    nearer = f12(bpy, tmp_path, "nearer.png")
+    np.testing.assert_allclose(srgb_to_linear(nearer[inside][:, :3]), over, atol=0.02)
     assert bpy.ops.lodgs.render_mesh_depth() == {"FINISHED"}
     assert joins(lodgs, scene) == ["CompositorNodeAlphaOver"]
     assert bpy.data.scenes[:] == [scene, meshes]
