@@ -115,9 +115,9 @@ class OctreeParameters(Parameters):
     """Quantile that counts as the largest (Octree-GS: d_max), from where on level 1 alone is drawn."""
     coarser_levels: int = 3
     """Levels before those of Eq. 3, for views from farther away than any photograph."""
-    footprint: float = 1.7
+    footprint: float = 2.0
     """Pixels that the voxel of a level covers where the level is just wanted; sets the voxels' size."""
-    spread: float = 16.0
+    spread: float = 13.0
     """Voxels of its level that a splat's largest standard deviation may span; wider ones move to a coarser
     level."""
     visible_share: float = 0.0

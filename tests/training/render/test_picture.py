@@ -36,8 +36,8 @@ def test_colours_are_decoded_under_their_alpha():
     alpha = np.full((1, 2), 0.5, np.float32)
     shown = picture(np.array([[[0.25, 0.1, 0], [0.5, 0.5, 0.5]]]), alpha)
     linear = shown.linear()
-    assert coded(linear[0, 0, 0] / 0.5) == pytest.approx(0.5, abs=1e-4)
-    assert linear[0, 1] == pytest.approx((0.5, 0.5, 0.5, 0.5), abs=1e-4)
+    assert coded(linear[0, 0, 0] / linear[0, 0, 3]) == pytest.approx(0.5, abs=1e-4)
+    assert linear[0, 1] == pytest.approx((0.5, 0.5, 0.5, 0.5), abs=0.03 / 255)
     assert shown.eight_bit()[0, 0].tolist() == [128, 51, 0, 128]
 
 

@@ -96,7 +96,7 @@ def test_a_holdout_is_read_and_told_where_it_cannot_be(client, make_splats, came
     placed, window = [Placed(SplatSet(splats))], (10, 5, 30, 40)
     expected = draw(placed, camera, background=None, window=window, limit=depth[5:45, 10:40])
     free = draw(placed, camera, background=None, window=window)
-    np.testing.assert_array_equal(planes[3], expected.alpha)
+    np.testing.assert_array_equal(planes[3], expected.linear()[..., 3])
     assert np.abs(free.alpha - expected.alpha).mean() > 0.01
     client.say(**request(camera, sets, 2, holdout=str(tmp_path / "gone.exr")))
     assert "There is no mesh depth" in client.hear("frame", "error")["what"]
