@@ -138,9 +138,8 @@ def import_splats(context: bpy.types.Context, path: Path | str, *, upright: bool
     bundle = read_folder(path) if path.is_dir() else read_bundle(path)
     with _new_scene(context, path.stem) as root:
         if upright:
-            root.rotation_mode = "QUATERNION"
             rows = bundle.meta.get("up_rotation", ((1, 0, 0), (0, 0, 1), (0, -1, 0)))
-            root.rotation_quaternion = Matrix(rows).to_quaternion()
+            root.rotation_euler = Matrix(rows).to_euler()
         for level in bundle.levels:
             _put_level(root, level)
         set_bundle_facts(root, bundle)
