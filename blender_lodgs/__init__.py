@@ -24,8 +24,8 @@ from . import (
 MODULES = (
     properties,
     preferences,
-    operators,
-    panels,
+    *operators.MODULES,
+    *panels.MODULES,
     scenes,
     viewport,
     renderer,

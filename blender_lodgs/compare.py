@@ -17,7 +17,7 @@ from bpy_extras.view3d_utils import location_3d_to_region_2d
 from gpu_extras.batch import batch_for_shader
 
 from ..training.errors import LodgsError
-from . import engine, processes, renderer, scenes, views
+from . import cameras, engine, processes, renderer, scenes
 
 _VERTEX = """
 void main()
@@ -98,7 +98,7 @@ def compare(
     try:
         depsgraph = context.evaluated_depsgraph_get()
         pixel = max(1.0, facts.fy / facts.fx), max(1.0, facts.fx / facts.fy)
-        camera, near = views.view_of(view.evaluated_get(depsgraph), depsgraph, width, height, pixel)
+        camera, near = cameras.view_of(view.evaluated_get(depsgraph), depsgraph, width, height, pixel)
         drawn = renderer.frame(
             engine.splat_sets(depsgraph), camera, near, wanted, background=(0.0, 0.0, 0.0),
             photograph=Path(bpy.path.abspath(facts.photograph)),

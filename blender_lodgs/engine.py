@@ -14,7 +14,7 @@ import numpy as np
 
 from ..training.errors import LodgsError
 from . import objects, renderer, scenes, shown
-from .views import view_of
+from .cameras import view_of
 
 ID = "LODGS"
 LEVEL, LEVEL_MASK, DEPTH, COMBINED = "Level", "Level {}", "Depth", "Combined"

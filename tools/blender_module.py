@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
 import os
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -30,4 +32,6 @@ def start_blender():
 
     bpy.context.preferences.use_preferences_save = False
     addon_utils.enable(EXTENSION, default_set=True, handle_error=fail)  # type: ignore[arg-type]
+    for folder in (resources, bpy.app.tempdir):  # the module leaves its temporary folder behind
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return bpy

@@ -141,7 +141,8 @@ def _evaluate(chosen: argparse.Namespace) -> int:
 
 def _render(chosen: argparse.Namespace) -> int:
     from .lod.selection import Detail
-    from .render.command import Source, read_camera, render
+    from .render.command import Source, render
+    from .scenes.cameras import read_camera
 
     asked = {name: getattr(chosen, name) for name in ("gamma", "start", "end", "offset")}
     asked = {name: value for name, value in asked.items() if value is not None}

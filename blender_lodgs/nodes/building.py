@@ -10,7 +10,40 @@ EYES = ("CAMERA", "OBJECT", "TRAINING")
 """What the input "Measured From" counts: the first of ``SplatScene.eye``. "TRAINING" is any fixed place."""
 
 
-class Builder:
+class Nodes:
+    """Nodes of a tree, each to the right of all others.
+
+    Attributes:
+        tree: a group's or a material's.
+    """
+
+    def __init__(self, tree: bpy.types.NodeTree) -> None:
+        self.tree = tree
+
+    def add(self, kind: str, **settings) -> bpy.types.Node:
+        """A node to the right of all others."""
+        node = self.tree.nodes.new(kind)
+        for key, value in settings.items():
+            setattr(node, key, value)
+        node.location = (len(self.tree.nodes) * 180, 0)
+        return node
+
+    def link(self, source: bpy.types.NodeSocket, node: bpy.types.Node, name: str) -> None:
+        """Links to the node's visible input of that name; several have the same in some node types."""
+        self.tree.links.new(source, next(s for s in node.inputs if s.name == name and s.enabled))
+
+    def math(self, operation: str, *values: bpy.types.NodeSocket | float) -> bpy.types.NodeSocket:
+        """The result of a Math node on sockets and numbers."""
+        node = self.add("ShaderNodeMath", operation=operation)
+        for socket, value in zip(node.inputs, values, strict=False):
+            if isinstance(value, bpy.types.NodeSocket):
+                self.tree.links.new(value, socket)
+            else:
+                socket.default_value = value
+        return node.outputs["Value"]
+
+
+class Builder(Nodes):
     """A new modifier group, built node by node from left to right.
 
     Its inputs are the geometry, those given, and whom distances are measured from. Distances are taken in the
@@ -25,42 +58,16 @@ class Builder:
     """
 
     def __init__(self, name: str, sockets: dict[str, str]) -> None:
-        group = bpy.data.node_groups.new(name, "GeometryNodeTree")
-        assert isinstance(group, bpy.types.GeometryNodeTree)
-        group.is_modifier = True
+        super().__init__(_group(name))
         shared = {
             EYE: "NodeSocketInt",
             EYE_OBJECT: "NodeSocketObject",
             EYE_POSITION: "NodeSocketVector",
             MATERIAL: "NodeSocketMaterial",
         }
-        for socket, kind in ({"Geometry": "NodeSocketGeometry"} | sockets | shared).items():
-            group.interface.new_socket(socket, in_out="INPUT", socket_type=kind)
-        group.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
-        self.group = group
+        for socket, kind in (sockets | shared).items():
+            self.tree.interface.new_socket(socket, in_out="INPUT", socket_type=kind)
         self.inputs = self.add("NodeGroupInput").outputs
-
-    def add(self, kind: str, **settings) -> bpy.types.Node:
-        """A node to the right of all others."""
-        node = self.group.nodes.new(kind)
-        for key, value in settings.items():
-            setattr(node, key, value)
-        node.location = (len(self.group.nodes) * 180, 0)
-        return node
-
-    def link(self, source: bpy.types.NodeSocket, node: bpy.types.Node, name: str) -> None:
-        """Links to the node's visible input of that name; several have the same in some node types."""
-        self.group.links.new(source, next(s for s in node.inputs if s.name == name and s.enabled))
-
-    def math(self, operation: str, *values: bpy.types.NodeSocket | float) -> bpy.types.NodeSocket:
-        """The result of a Math node on sockets and numbers."""
-        node = self.add("ShaderNodeMath", operation=operation)
-        for socket, value in zip(node.inputs, values, strict=False):
-            if isinstance(value, bpy.types.NodeSocket):
-                self.group.links.new(value, socket)
-            else:
-                socket.default_value = value
-        return node.outputs["Value"]
 
     def distance(self) -> bpy.types.NodeSocket:
         """How far each point is from the eye."""
@@ -77,8 +84,8 @@ class Builder:
             self.link(source, eye, str(index))
         position = self.add("GeometryNodeInputPosition")
         distance = self.add("ShaderNodeVectorMath", operation="DISTANCE")
-        self.group.links.new(position.outputs["Position"], distance.inputs[0])
-        self.group.links.new(eye.outputs["Output"], distance.inputs[1])
+        self.tree.links.new(position.outputs["Position"], distance.inputs[0])
+        self.tree.links.new(eye.outputs["Output"], distance.inputs[1])
         return distance.outputs["Value"]
 
     def compare(
@@ -106,10 +113,44 @@ class Builder:
         self.link(geometry, material, "Geometry")
         self.link(self.inputs[MATERIAL], material, "Material")
         self.link(material.outputs["Geometry"], self.add("NodeGroupOutput"), "Geometry")
-        return self.group
+        return self.tree  # type: ignore[return-value]
 
 
 def existing(name: str) -> bpy.types.GeometryNodeTree | None:
     """The group of that name that this file has already."""
     group = bpy.data.node_groups.get(name)
     return group if isinstance(group, bpy.types.GeometryNodeTree) else None
+
+
+def plain_group(name: str) -> Nodes:
+    """A new modifier group that has geometry in and out, and nothing else yet."""
+    return Nodes(_group(name))
+
+
+def _group(name: str) -> bpy.types.GeometryNodeTree:
+    group = bpy.data.node_groups.new(name, "GeometryNodeTree")
+    assert isinstance(group, bpy.types.GeometryNodeTree)
+    group.is_modifier = True
+    for way in ("INPUT", "OUTPUT"):
+        group.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
+    return group
+
+
+def switched(thing: bpy.types.Object, group: bpy.types.GeometryNodeTree, where: str, by: str) -> None:
+    """A new modifier with a group, which is on only in one place and where the active scene says so.
+
+    Args:
+        where: "show_viewport" or "show_render"; it is off in the other.
+        by: data path of a property of scenes. Without this extension it is off.
+    """
+    modifier = thing.modifiers.new(group.name, "NODES")
+    assert isinstance(modifier, bpy.types.NodesModifier)
+    modifier.node_group, modifier.show_expanded = group, False
+    modifier.show_viewport = modifier.show_render = False
+    driver = thing.driver_add(f'modifiers["{modifier.name}"].{where}').driver
+    driver.type, driver.expression = "SCRIPTED", "on"
+    variable = driver.variables.new()
+    variable.name, variable.type = "on", "CONTEXT_PROP"
+    target = variable.targets[0]
+    target.context_property, target.data_path = "ACTIVE_SCENE", by
+    target.use_fallback_value, target.fallback_value = True, 0.0

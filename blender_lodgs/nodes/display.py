@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from .. import compat
-from .building import existing
+from .building import existing, plain_group, switched
 
 NAME = "LODGS Display"
 
@@ -14,20 +14,12 @@ def display() -> bpy.types.GeometryNodeTree:
     """The group, made on first use: points of radius 0, so that Blender's own balls hide no splats."""
     if group := existing(NAME):
         return group
-    group = bpy.data.node_groups.new(NAME, "GeometryNodeTree")
-    assert isinstance(group, bpy.types.GeometryNodeTree)
-    group.is_modifier = True
-    for way in ("INPUT", "OUTPUT"):
-        group.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
-    source, radius, end = (
-        group.nodes.new(kind) for kind in ("NodeGroupInput", "GeometryNodeSetPointRadius", "NodeGroupOutput")
-    )
+    build = plain_group(NAME)
+    source, radius = build.add("NodeGroupInput"), build.add("GeometryNodeSetPointRadius")
     radius.inputs["Radius"].default_value = 0.0
-    group.links.new(source.outputs[0], radius.inputs["Points"])
-    group.links.new(radius.outputs["Points"], end.inputs[0])
-    for x, node in enumerate((source, radius, end)):
-        node.location = (x * 180, 0)
-    return group
+    build.link(source.outputs[0], radius, "Points")
+    build.link(radius.outputs["Points"], build.add("NodeGroupOutput"), "Geometry")
+    return build.tree  # type: ignore[return-value]
 
 
 def attach(thing: bpy.types.Object) -> None:
@@ -35,15 +27,5 @@ def attach(thing: bpy.types.Object) -> None:
 
     Where Blender draws them as such by itself, there is nothing to hide.
     """
-    if compat.make_native(thing.data):
-        return
-    modifier = thing.modifiers.new(NAME, "NODES")
-    assert isinstance(modifier, bpy.types.NodesModifier)
-    modifier.node_group, modifier.show_expanded, modifier.show_render = display(), False, False
-    driver = thing.driver_add(f'modifiers["{NAME}"].show_viewport').driver
-    driver.type, driver.expression = "SCRIPTED", "splats"
-    variable = driver.variables.new()
-    variable.name, variable.type = "splats", "CONTEXT_PROP"
-    target = variable.targets[0]
-    target.context_property, target.data_path = "ACTIVE_SCENE", "lodgs_viewport.splats"
-    target.use_fallback_value, target.fallback_value = True, 0.0  # without this extension, points
+    if not compat.make_native(thing.data):
+        switched(thing, display(), "show_viewport", "lodgs_viewport.splats")

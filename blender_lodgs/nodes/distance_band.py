@@ -20,5 +20,5 @@ def distance_band() -> bpy.types.GeometryNodeTree:
     for name, operation, socket in zip(
         (NEAR, FAR), ("GREATER_EQUAL", "LESS_THAN"), within.inputs, strict=False
     ):
-        build.group.links.new(build.compare(operation, distance, build.inputs[name]), socket)
+        build.tree.links.new(build.compare(operation, distance, build.inputs[name]), socket)
     return build.finish(build.keep(build.inputs["Geometry"], within.outputs["Boolean"]))

@@ -12,7 +12,7 @@ import math
 import bpy
 
 from ..objects import COLOR, OPACITY_LOGIT, ROTATION, SCALE, WEIGHT
-from .building import existing
+from .building import Nodes, existing, plain_group, switched
 
 NAME = "LODGS Ellipsoids"
 MATERIAL = "LODGS Ellipsoids"
@@ -25,40 +25,16 @@ BOUNCES = 512
 
 def attach(thing: bpy.types.Object) -> None:
     """Gives an object of splats this modifier, last of all; it is on where its scene wants ellipsoids."""
-    if NAME in thing.modifiers:
-        return
-    modifier = thing.modifiers.new(NAME, "NODES")
-    assert isinstance(modifier, bpy.types.NodesModifier)
-    modifier.node_group, modifier.show_expanded = ellipsoids(), False
-    modifier.show_viewport = False
-    driver = thing.driver_add(f'modifiers["{NAME}"].show_render').driver
-    driver.type, driver.expression = "SCRIPTED", "wanted"
-    variable = driver.variables.new()
-    variable.name, variable.type = "wanted", "CONTEXT_PROP"
-    target = variable.targets[0]
-    target.context_property, target.data_path = "ACTIVE_SCENE", "lodgs_render.draws_ellipsoids"
-    target.use_fallback_value, target.fallback_value = True, 0.0
+    if NAME not in thing.modifiers:
+        switched(thing, ellipsoids(), "show_render", "lodgs_render.draws_ellipsoids")
 
 
 def ellipsoids() -> bpy.types.GeometryNodeTree:
     """The group, made on first use."""
     if group := existing(NAME):
         return group
-    group = bpy.data.node_groups.new(NAME, "GeometryNodeTree")
-    assert isinstance(group, bpy.types.GeometryNodeTree)
-    group.is_modifier = True
-    for way in ("INPUT", "OUTPUT"):
-        group.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
-
-    def add(kind: str, **settings) -> bpy.types.Node:
-        node = group.nodes.new(kind)
-        for key, value in settings.items():
-            setattr(node, key, value)
-        node.location = (len(group.nodes) * 180, 0)
-        return node
-
-    def link(source: bpy.types.NodeSocket, node: bpy.types.Node, name: str) -> None:
-        group.links.new(source, next(s for s in node.inputs if s.name == name and s.enabled))
+    build = plain_group(NAME)
+    add, link, math_of = build.add, build.link, build.math
 
     def attribute(name: str, kind: str) -> bpy.types.Node:
         node = add("GeometryNodeInputNamedAttribute", data_type=kind)
@@ -67,15 +43,6 @@ def ellipsoids() -> bpy.types.GeometryNodeTree:
 
     def value(node: bpy.types.Node) -> bpy.types.NodeSocket:
         return next(s for s in node.outputs if s.name == "Attribute" and s.enabled)
-
-    def math_of(operation: str, *values: bpy.types.NodeSocket | float) -> bpy.types.NodeSocket:
-        node = add("ShaderNodeMath", operation=operation)
-        for socket, given in zip(node.inputs, values, strict=False):
-            if isinstance(given, bpy.types.NodeSocket):
-                group.links.new(given, socket)
-            else:
-                socket.default_value = given
-        return node.outputs["Value"]
 
     points = add("NodeGroupInput").outputs[0]
     logit, weight = attribute(OPACITY_LOGIT, "FLOAT"), attribute(WEIGHT, "FLOAT")
@@ -88,7 +55,7 @@ def ellipsoids() -> bpy.types.GeometryNodeTree:
     link(value(weight), faded, "True")
     store = add("GeometryNodeStoreNamedAttribute", data_type="FLOAT", domain="POINT")
     store.inputs["Name"].default_value = ALPHA
-    group.links.new(points, store.inputs["Geometry"])
+    link(points, store, "Geometry")
     link(math_of("MULTIPLY", opacity, faded.outputs["Output"]), store, "Value")
 
     sphere = add("GeometryNodeMeshIcoSphere")
@@ -99,7 +66,7 @@ def ellipsoids() -> bpy.types.GeometryNodeTree:
     link(smooth.outputs[0], material, "Geometry")
     material.inputs["Material"].default_value = falloff()
     reach = add("ShaderNodeVectorMath", operation="SCALE")
-    group.links.new(value(attribute(SCALE, "FLOAT_VECTOR")), reach.inputs[0])
+    build.tree.links.new(value(attribute(SCALE, "FLOAT_VECTOR")), reach.inputs[0])
     reach.inputs["Scale"].default_value = REACH
     stand = add("GeometryNodeInstanceOnPoints")
     link(store.outputs["Geometry"], stand, "Points")
@@ -107,7 +74,7 @@ def ellipsoids() -> bpy.types.GeometryNodeTree:
     link(value(attribute(ROTATION, "QUATERNION")), stand, "Rotation")
     link(reach.outputs["Vector"], stand, "Scale")
     link(stand.outputs["Instances"], add("NodeGroupOutput"), "Geometry")
-    return group
+    return build.tree  # type: ignore[return-value]
 
 
 def falloff() -> bpy.types.Material:
@@ -128,12 +95,7 @@ def falloff() -> bpy.types.Material:
     tree = material.node_tree
     tree.nodes.clear()
 
-    def add(kind: str, **settings) -> bpy.types.Node:
-        node = tree.nodes.new(kind)
-        for key, value in settings.items():
-            setattr(node, key, value)
-        node.location = (len(tree.nodes) * 180, 0)
-        return node
+    add = Nodes(tree).add
 
     def join(operation: str, *values: bpy.types.NodeSocket | float, kind: str = "ShaderNodeMath"):
         node = add(kind, operation=operation)

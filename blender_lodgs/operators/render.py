@@ -8,7 +8,7 @@ import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ...training.scenes.cameras import write_camera
-from .. import compositing, engine, quick, scenes, views
+from .. import cameras, compositing, engine, quick, scenes
 from .reporting import saying_errors
 
 
@@ -110,7 +110,7 @@ class LODGS_OT_export_camera(bpy.types.Operator, ExportHelper):
     @saying_errors
     def execute(self, context):
         width, height = engine.size(context.scene.render)
-        camera, near = views.view_from(
+        camera, near = cameras.view_from(
             scenes.active_root(context), context.evaluated_depsgraph_get(), width, height
         )
         path = Path(bpy.path.abspath(self.filepath))

@@ -10,7 +10,7 @@ from ..lod.selection import Detail, complete_levels, select_levels
 from ..runs.data import training_data
 from ..runs.folder import RunFolder
 from ..runs.job import Job
-from ..scenes.cameras import Camera, read_camera
+from ..scenes.cameras import Camera
 from ..scenes.colmap import read_scene
 from ..splats.bundle import Bundle, read_bundle, read_folder
 from .picture import Picture, read_depth, write_picture
@@ -122,6 +122,3 @@ def render(
     assert picture is not None
     write_picture(out, picture)
     return picture
-
-
-__all__ = ["Source", "read_camera", "render"]

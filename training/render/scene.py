@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch.nn.functional import normalize
 
 from ..errors import LodgsError
@@ -70,7 +71,8 @@ class SplatSet:
         else:
             turned, lengths, _ = torch.linalg.svd(axes)
             turned = turned * torch.linalg.det(turned).sign()[:, None, None]
-        return means, quaternions(turned).float(), lengths.log().float()
+        quats = Rotation.from_matrix(turned.cpu().numpy()).as_quat()[:, [3, 0, 1, 2]]
+        return means, torch.from_numpy(quats).to(means), lengths.log().float()
 
     def colours(self, matrix: np.ndarray, eye: np.ndarray) -> torch.Tensor:
         """Colours (N, 3) that an eye in the world sees: harmonics turn, shrink and lean with the set."""
@@ -182,28 +184,6 @@ def similarity(matrix: np.ndarray) -> bool:
     square = linear.T @ linear
     scale = np.trace(square) / 3
     return np.linalg.det(linear) > 0 and bool(np.abs(square / scale - np.eye(3)).max() < 1e-5)
-
-
-def quaternions(rotations: torch.Tensor) -> torch.Tensor:
-    """Unit quaternions wxyz (N, 4) of rotation matrices (N, 3, 3).
-
-    Of the four ways to divide, each splat takes the one with the largest divisor.
-    """
-    m = rotations
-    a, b, c = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
-    xy, xz, yz = m[:, 0, 1], m[:, 0, 2], m[:, 1, 2]
-    yx, zx, zy = m[:, 1, 0], m[:, 2, 0], m[:, 2, 1]
-    rows = torch.stack(
-        [
-            torch.stack([1 + a + b + c, zy - yz, xz - zx, yx - xy], 1),
-            torch.stack([zy - yz, 1 + a - b - c, xy + yx, xz + zx], 1),
-            torch.stack([xz - zx, xy + yx, 1 - a + b - c, yz + zy], 1),
-            torch.stack([yx - xy, xz + zx, yz + zy, 1 - a - b + c], 1),
-        ],
-        1,
-    )
-    best = rows.diagonal(dim1=1, dim2=2).argmax(1)
-    return normalize(rows[torch.arange(len(m), device=m.device), best], dim=1)
 
 
 def _in_one_frame(

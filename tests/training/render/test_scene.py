@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from training.errors import LodgsError
 from training.rasterize import rasterize
 from training.render.picture import NOTHING
-from training.render.scene import Placed, SplatSet, draw, quaternions
+from training.render.scene import Placed, SplatSet, draw
 from training.splats.gaussians import Splats
 
 
@@ -101,13 +101,6 @@ def test_a_set_that_is_no_longer_similar_has_the_covariances_of_its_transform(ma
     expected = linear @ covariances(splats.quats, splats.log_scales) @ linear.T
     np.testing.assert_allclose(covariances(quats, log_scales), expected, rtol=1e-3, atol=1e-6)
     np.testing.assert_allclose(means, splats.means @ linear.T, rtol=1e-5)
-
-
-def test_quaternions_are_those_of_the_matrices():
-    turns = Rotation.random(500, random_state=3)
-    found = quaternions(torch.from_numpy(turns.as_matrix())).numpy()
-    angles = (Rotation.from_quat(found[:, [1, 2, 3, 0]]) * turns.inv()).magnitude()
-    assert angles.max() < 1e-6
 
 
 def wall(z: float, color: tuple[float, float, float]) -> Splats:
