@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import bpy
@@ -61,46 +61,51 @@ def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> 
     return meshes
 
 
-def render_mesh_depth(scene: bpy.types.Scene, frames: Sequence[int]) -> list[Path]:
+def render_mesh_depth(scene: bpy.types.Scene, frames: Iterable[int]) -> Iterator[Path]:
     """Renders the depth of a scene's meshes with Cycles, a multilayer EXR a frame, and has them hold out.
 
-    The files lie in a folder beside the .blend, or in Blender's temporary one before that is saved. The ray
-    goes through each pixel's centre, where splats are looked at as well.
+    The ray goes through each pixel's centre, where splats are looked at as well.
+
+    Yields:
+        Each frame's file (:func:`depth_files`), when it is written. Meshes hold out after the last one.
 
     Raises:
         LodgsError: the scene has no camera, or the files cannot be written.
     """
     if scene.camera is None:
         raise LodgsError("The scene has no camera.", "Add one, or look through one of the views.")
-    manager = bpy.context.window_manager
-    name = bpy.path.clean_name(scene.name)
-    if bpy.data.filepath:
-        pattern = f"//{Path(bpy.data.filepath).stem}_depth/{name}_####.exr"
-    else:
-        pattern = str(Path(bpy.app.tempdir or tempfile.gettempdir()) / "depth" / f"{name}_####.exr")
-    paths = [engine.at_frame(pattern, scene, frame) for frame in frames]
+    pattern = depth_files(scene)
     meshes = bpy.data.scenes.new(f"{scene.name} Depth")
-    manager.progress_begin(0, len(paths))
     try:
         _match(scene, meshes)
         _only_depth(meshes)
-        for done, (frame, path) in enumerate(zip(frames, paths, strict=True)):
+        for frame in frames:
+            path = engine.at_frame(str(pattern), scene, frame)
             # as an animation: a still of a scene in no window shows the frame of another
             meshes.frame_start = meshes.frame_end = frame
-            meshes.render.filepath = str(path.parent / Path(pattern).name)
+            meshes.render.filepath = str(path.parent / pattern.name)
             bpy.ops.render.render(scene=meshes.name, animation=True)
-            manager.progress_update(done)
+            yield path
     except RuntimeError as error:
         raise LodgsError(
             f"The depth of the meshes could not be rendered: {error}", "Choose another folder for the .blend."
         ) from error
     finally:
-        manager.progress_end()
         bpy.data.scenes.remove(meshes)
-    scene.lodgs_render.holdout = pattern
+    scene.lodgs_render.holdout = bpy.path.relpath(str(pattern)) if bpy.data.filepath else str(pattern)
     if scene.lodgs_render.meshes is not None:
         combine_with_meshes(scene)
-    return paths
+
+
+def depth_files(scene: bpy.types.Scene) -> Path:
+    """The files of :func:`render_mesh_depth`, #### for the frame.
+
+    They lie in a folder beside the .blend, or in Blender's temporary one before that is saved.
+    """
+    name = f"{bpy.path.clean_name(scene.name)}_####.exr"
+    if bpy.data.filepath:
+        return Path(bpy.path.abspath("//")) / f"{Path(bpy.data.filepath).stem}_depth" / name
+    return Path(bpy.app.tempdir or tempfile.gettempdir()) / "depth" / name
 
 
 def _only_depth(scene: bpy.types.Scene) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
 import bpy
 import gpu
 import numpy as np
@@ -44,28 +47,27 @@ def render(context: bpy.types.Context) -> bpy.types.Image:
     return image
 
 
-def render_animation(context: bpy.types.Context) -> int:
-    """Draws every frame of the scene's range and saves it as the output settings say; returns how many.
+def render_animation(context: bpy.types.Context, frames: Iterable[int]) -> Iterator[Path]:
+    """Draws frames of the scene one by one, and saves each as the output settings say.
+
+    Yields:
+        The file of each frame, when it is written. The scene returns to its frame at the end.
 
     Raises:
         LodgsError: as :func:`render`, or a file cannot be written.
     """
     scene, before = context.scene, context.scene.frame_current
-    frames = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
-    context.window_manager.progress_begin(0, len(frames))
     try:
-        for done, frame in enumerate(frames):
+        for frame in frames:
             scene.frame_set(frame)
             path = scene.render.frame_path(frame=frame)
             try:
                 render(context).save_render(path, scene=scene)
             except RuntimeError as error:
                 raise LodgsError(f"{path} could not be written.", "Choose another output folder.") from error
-            context.window_manager.progress_update(done)
+            yield Path(path)
     finally:
-        context.window_manager.progress_end()
         scene.frame_set(before)
-    return len(frames)
 
 
 def picture(context: bpy.types.Context) -> Picture:

@@ -46,6 +46,7 @@ def tour() -> Steps:
     yield from orbit(root)
     yield from freeze(root)
     yield from render(root)
+    yield from draw_frames()
     yield from compare(root)
     yield from overlays()
 
@@ -206,6 +207,18 @@ def render(root: bpy.types.Object) -> Steps:
     yield 0.5
 
 
+def draw_frames() -> Steps:
+    """In Viewport Quality, while Blender goes on listening."""
+    scene = bpy.context.scene
+    scene.frame_start, scene.frame_end, scene.render.filepath = 1, 3, str(OUT / "frames" / "####.png")
+    press("lodgs.render_quick", way="INVOKE_DEFAULT", animation=True)
+    assert not any((OUT / "frames").glob("*.png")), "Blender waits for the frames."
+    yield from until(lambda: (OUT / "frames" / "0002.png").exists(), 300)
+    take("frames")
+    yield from until(lambda: (OUT / "frames" / "0003.png").exists(), 300)
+    yield from settle()
+
+
 def compare(root: bpy.types.Object) -> Steps:
     module_ = module("compare")
     bpy.context.scene.lodgs_viewport.splats = False  # each view measured is drawn, slowly by software
@@ -252,14 +265,14 @@ def region(kind: str = "WINDOW") -> bpy.types.Region:
     return next(part for part in viewport()[0].regions if part.type == kind)
 
 
-def press(operator: str, **settings) -> None:
+def press(operator: str, way: str = "", **settings) -> None:
     """What a button does. Errors that Blender would show become the tour's."""
     group, name = operator.split(".")
     window = bpy.context.window_manager.windows[0]
     area = next((area for area in window.screen.areas if area.type == "VIEW_3D"), window.screen.areas[0])
     part = next(part for part in area.regions if part.type == "WINDOW")
     with bpy.context.temp_override(window=window, area=area, region=part):
-        way = "EXEC_DEFAULT" if group == "lodgs" else "INVOKE_DEFAULT"
+        way = way or ("EXEC_DEFAULT" if group == "lodgs" else "INVOKE_DEFAULT")
         getattr(getattr(bpy.ops, group), name)(way, **settings)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bpy
 
+from ...training.lod.rules import FADE
 from ...training.lod.selection import BIAS
 from ..objects import WEIGHT
 from .building import Builder, existing
@@ -35,8 +36,9 @@ def octree_level() -> bpy.types.GeometryNodeTree:
     wanted = build.math("ADD", wanted, build.inputs[OFFSET])
     wanted = build.math("MINIMUM", wanted, build.math("SUBTRACT", build.inputs[LEVELS], 1.0))
     wanted = build.math("ADD", build.math("MAXIMUM", wanted, 0.0), 1.0)
-    left = build.math("ADD", build.math("SUBTRACT", wanted, build.inputs[LEVEL]), 1.0)
-    weight = build.math("MINIMUM", build.math("MAXIMUM", left, 0.0), 1.0)
+    left = build.math("SUBTRACT", wanted, build.inputs[LEVEL])
+    weight = build.math("MULTIPLY_ADD", left, 1 / FADE, 0.5 / FADE + 0.5)
+    weight = build.math("MINIMUM", build.math("MAXIMUM", weight, 0.0), 1.0)
 
     store = build.add("GeometryNodeStoreNamedAttribute", data_type="FLOAT", domain="POINT")
     store.inputs["Name"].default_value = WEIGHT

@@ -9,6 +9,7 @@ from bpy_extras.io_utils import ExportHelper
 
 from ...training.scenes.cameras import write_camera
 from .. import cameras, compositing, engine, quick, scenes
+from .frames import FrameByFrame
 from .reporting import saying_errors
 
 
@@ -38,53 +39,46 @@ class LODGS_OT_combine_with_meshes(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LODGS_OT_render_mesh_depth(bpy.types.Operator):
+class LODGS_OT_render_mesh_depth(FrameByFrame, bpy.types.Operator):
     """Render how far the meshes are with Cycles, and have them hold out the splats behind them"""
 
     bl_idname = "lodgs.render_mesh_depth"
     bl_label = "Render Mesh Depth"
     bl_options = {"REGISTER", "UNDO"}
 
-    animation: bpy.props.BoolProperty(
-        name="Animation", description="Render the depth of every frame of the range", options={"SKIP_SAVE"}
-    )
-
     @classmethod
     def description(cls, context, properties):
         return f"{cls.__doc__}, in every frame of the range" if properties.animation else cls.__doc__
 
-    @saying_errors
-    def execute(self, context):
-        scene = context.scene
-        frames = [scene.frame_current]
-        if self.animation:
-            frames = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
-        paths = compositing.render_mesh_depth(scene, frames)
-        where = f"in {paths[0].parent}" + ("" if bpy.data.filepath else ", until Blender is closed")
-        count = "1 depth" if len(paths) == 1 else f"{len(paths)} depths"
-        self.report({"INFO"}, f"{count} of meshes {where}")
-        return {"FINISHED"}
+    def work(self, context):
+        return compositing.render_mesh_depth(context.scene, self.frames(context))
+
+    def done(self, count):
+        where = f"in {compositing.depth_files(bpy.context.scene).parent}"
+        where += "" if bpy.data.filepath else ", until Blender is closed"
+        return f"{'1 depth' if count == 1 else f'{count} depths'} of meshes {where}"
 
 
-class LODGS_OT_render_quick(bpy.types.Operator):
+class LODGS_OT_render_quick(FrameByFrame, bpy.types.Operator):
     """Draw what the camera sees as the viewport does, on the graphics card: quick, and without a trainer"""
 
     bl_idname = "lodgs.render_quick"
     bl_label = "Viewport Quality"
 
-    animation: bpy.props.BoolProperty(
-        name="Animation", description="Draw and save every frame of the range", options={"SKIP_SAVE"}
-    )
+    @classmethod
+    def description(cls, context, properties):
+        return f"{cls.__doc__}; saves every frame of the range" if properties.animation else cls.__doc__
 
-    @saying_errors
-    def execute(self, context):
+    def work(self, context):
         if self.animation:
-            count = quick.render_animation(context)
-            self.report({"INFO"}, f"{count} frames saved")
+            yield from quick.render_animation(context, self.frames(context))
         else:
-            image = quick.render(context)
-            self.report({"INFO"}, f"Drawn into the image '{image.name}'; the Image Editor shows it")
-        return {"FINISHED"}
+            yield quick.render(context)
+
+    def done(self, count):
+        if self.animation:
+            return f"{'1 frame' if count == 1 else f'{count} frames'} saved"
+        return f"Drawn into the image '{quick.IMAGE}'; the Image Editor shows it"
 
 
 class LODGS_OT_export_camera(bpy.types.Operator, ExportHelper):

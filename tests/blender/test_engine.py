@@ -497,6 +497,16 @@ def test_a_cube_holds_out_the_splats_behind_it(bpy, lodgs, fog_and_wall, tmp_pat
     assert bpy.data.scenes[:] == [scene, meshes]
 
 
+def test_depth_stopped_after_a_frame_leaves_the_scene_as_it_was(bpy, lodgs, fog_and_wall, tmp_path):
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "garden.blend"))
+    scene = bpy.context.scene
+    work = lodgs("compositing").render_mesh_depth(scene, range(1, 4))
+    first = next(work)
+    assert first.exists() and len(bpy.data.scenes) == 2
+    work.close()
+    assert bpy.data.scenes[:] == [scene] and scene.lodgs_render.holdout == ""
+
+
 def same_to_the_pixel(found: np.ndarray, expected: np.ndarray) -> None:
     """But for a pixel or two whose centre lies on the very edge."""
     differ = found != expected

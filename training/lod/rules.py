@@ -11,6 +11,9 @@ from math import inf
 
 import numpy as np
 
+FADE = 0.5
+"""Over how many levels of what is wanted a level of an octree fades in."""
+
 
 def flod_s_min(s_min_1: float, rho: float, levels: int) -> list[float]:
     """FLoD's 3D scale constraint of each level (FLoD, Eq. 3): s_min_1 * rho**(1 - l), and 0 at the last.
@@ -79,16 +82,17 @@ def octree_wanted(distances, bias, d_max: float, levels: int):
 
 
 def octree_weights(wanted, level):
-    """Weights (N,) of splats of a level: 1 below the wanted level, the fraction that is left at it, 0 above.
+    """Weights (N,) of splats of a level: 1 below the wanted level, part of it near that, 0 above.
 
-    Levels add up, and level 1 is always there. Octree-GS, Sec. 4.1: piecewise linear from level to level; in
-    training it is rounded, which is where this is at least one half.
+    Levels add up, and level 1 is always there. Octree-GS, Sec. 4.1: piecewise linear in the wanted level. The
+    paper rounds it in training, which is where this is at least one half; a level fades in over FADE levels
+    around that place (1 in the paper: then up to half a level more is drawn than training knew).
 
     Args:
         wanted: (N,) of :func:`octree_wanted`.
         level: (N,) or a number, 1 is the coarsest.
     """
-    return (wanted - level + 1).clip(0, 1)
+    return ((wanted - level + 0.5) / FADE + 0.5).clip(0, 1)
 
 
 def _log2(values):

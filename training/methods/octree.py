@@ -14,7 +14,7 @@ from ..errors import LodgsError
 from ..lod import octree
 from ..lod.rules import octree_wanted, octree_weights
 from ..lod.selection import BIAS
-from ..rasterize import Rendering, Target, device_of, photometric_loss, rasterize
+from ..rasterize import Rendering, Target, contributions, device_of, photometric_loss, rasterize
 from ..rasterize.features import rotation_matrices
 from ..scenes.cameras import Camera
 from ..splats.bundle import Level
@@ -81,6 +81,8 @@ class Method(Interface):
         self._optimise(step)
         if growing and (step + 1) % p.grow_interval == 0:
             self._grow_and_prune(step)
+        if growing and step + 1 >= p.grow_until * p.steps:
+            self._review(step)
         if (step + 1) % p.grow_interval == 0 or step + 1 == self.steps:
             self._settle()
         return float(loss.detach()), rendering.image.detach(), target
@@ -146,22 +148,25 @@ class Method(Interface):
         distances *= self.tree.focal_px / min(camera.fx, camera.fy)
         return octree_wanted(distances, self.model.columns["bias"], self.tree.d_max, self.levels)
 
+    def _shrinks(self) -> list[int]:
+        """How many times smaller photographs are made at most, in powers of two from 1."""
+        side = min(min(camera.width, camera.height) for camera in self.data.train)
+        most = min(self.levels - 1, int(np.log2(max(side / SMALLEST, 1)))) if self.parameters.far_share else 0
+        return [2**i for i in range(most + 1)]
+
     def _shrink(self, step: int) -> int:
         """How many times smaller a step's photograph is made: what one as many times farther away sees.
 
         Levels that finer ones have not joined yet see what they would be wanted for; later some steps do, so
         that levels learn to stand alone that no photograph is far enough away for. Not in the paper.
         """
-        side = min(min(camera.width, camera.height) for camera in self.data.train)
-        most = min(self.levels - 1, int(np.log2(max(side / SMALLEST, 1))))
-        if most == 0 or self.parameters.far_share == 0:
-            return 1
+        shrinks = self._shrinks()
         if step < self.joins[-1]:
-            return 2 ** min(self.levels - self.level_at(step), most)
+            return shrinks[min(self.levels - self.level_at(step), len(shrinks) - 1)]
         rng = np.random.default_rng([self.seed, step, 3])
-        if rng.random() >= self.parameters.far_share:
+        if len(shrinks) == 1 or rng.random() >= self.parameters.far_share:
             return 1
-        return 2 ** int(rng.integers(1, most + 1))
+        return shrinks[int(rng.integers(1, len(shrinks)))]
 
     # -- anchors ---------------------------------------------------------------------------------------
 
@@ -245,6 +250,32 @@ class Method(Interface):
             raise LodgsError(
                 f"No splat is left at step {step + 1}.", "Lower 'min_opacity', or choose another preset."
             )
+
+    @torch.no_grad()
+    def _review(self, step: int) -> None:
+        """Anchors go of which no view, near or far, sees much, by their largest blending weight (RadSplat).
+
+        Not in the paper.
+        """
+        newest, level = self.level_at(step), self.model.columns["level"]
+        largest = torch.zeros(len(self.model), device=self.device)
+        for view in range(len(self.data.train)):
+            for shrink in self._shrinks():
+                camera = self.data.camera(view, shrink)
+                weights = octree_weights(self._wanted(camera).clip(1, newest), level) >= 0.5
+                torch.maximum(largest, self._largest(camera, view, weights.float()), out=largest)
+        self.model.keep((largest >= self.parameters.least_weight) | (level > newest))
+
+    def _largest(self, camera: Camera, view: int, weights: torch.Tensor) -> torch.Tensor:
+        """Each anchor's largest blending weight (N,) in a training view."""
+        names = "means", "quats", "log_scales", "opacity_logits"
+        return contributions(
+            *(self.model[name] for name in names),
+            cameras=[camera],
+            weights=weights,
+            near=self.data.near,
+            backend=self.backend,
+        ).largest
 
     def _settle(self) -> None:
         """Splats that have become too wide for their level move to the coarser one that they fit.

@@ -17,7 +17,7 @@ from torch.nn.functional import normalize
 
 from ..lod.rules import octree_weights
 from ..lod.selection import BIAS
-from ..rasterize import Adam, Rendering, rasterize
+from ..rasterize import Adam, Rendering, contributions, rasterize
 from ..rasterize import sh as harmonics
 from ..scenes.cameras import Camera
 from ..splats.bundle import Level
@@ -29,6 +29,8 @@ from .parameters import NeuralOctreeParameters
 
 HIDDEN = 32
 """Width of each network's one hidden layer."""
+LOOKS, FAINT = 11, 0.1
+"""Opacity, three scales, a quaternion and a colour, before their activations; the opacity to begin with."""
 MARGIN = 1.3
 """Anchors are decoded that lie within so many times the image's half width and height."""
 
@@ -135,14 +137,15 @@ class Method(octree.Method):
         places = model["means"][anchors].detach()
         eye = torch.as_tensor(camera.center).to(places)
         seen = torch.cat([model["features"][anchors], normalize(places - eye, dim=1)], 1)
-        opacity = self.networks.opacity(seen).tanh()
+        own = model["looks"][anchors] if p.direct else seen.new_zeros(1, 1, LOOKS)
+        opacity = (self.networks.opacity(seen) + own[..., 0]).tanh()
         index, which = torch.nonzero(opacity.detach() > 0).unbind(1)
 
-        looks = self.networks.covariance(seen).view(-1, p.offsets, 7)[index, which]
+        looks = (self.networks.covariance(seen).view(-1, p.offsets, 7) + own[..., 1:8])[index, which]
         appearance = self.networks.appearance
         appearance = appearance.mean(0) if view is None else appearance[view]
         lit = torch.cat([seen, appearance.expand(len(seen), -1)], 1)
-        colors = self.networks.color(lit).sigmoid().view(-1, p.offsets, 3)[index, which]
+        colors = (self.networks.color(lit).view(-1, p.offsets, 3) + own[..., 8:]).sigmoid()[index, which]
         anchor = anchors[index]
         extents = model["log_scales"][anchor].exp()
         return Gaussians(
@@ -169,9 +172,13 @@ class Method(octree.Method):
 
     def _rasterize(self, g: Gaussians, camera: Camera, weights: torch.Tensor | None) -> Rendering:
         return rasterize(
-            g.means, g.quats, g.scales.clamp_min(1e-12).log(), g.opacities.clamp(1e-6, 1 - 1e-6).logit(),
-            g.colors, camera, weights=weights, near=self.data.near, backend=self.backend,
-        )  # fmt: skip
+            *_shapes(g), g.colors, camera, weights=weights, near=self.data.near, backend=self.backend
+        )
+
+    def _largest(self, camera: Camera, view: int, weights: torch.Tensor) -> torch.Tensor:
+        g = self.decode(camera, self._visible(camera, weights), view)
+        found = contributions(*_shapes(g), [camera], near=self.data.near, backend=self.backend).largest
+        return torch.zeros_like(weights).scatter_reduce_(0, g.anchor, found, "amax")
 
     def _visible(self, camera: Camera, weights: torch.Tensor) -> torch.Tensor:
         """The anchors (indices) of weight above 0 whose Gaussians may be in the image."""
@@ -193,10 +200,19 @@ class Method(octree.Method):
         p, count = self.parameters, len(points)
         rows = self._anchors(torch.from_numpy(points).float(), torch.from_numpy(level))
         rows["log_scales"] = self._log_spacing(points, level, columns=6)
+        if p.direct:
+            rows["looks"][..., 8:] = torch.from_numpy(colors / 255.0).clamp(0.01, 0.99).logit()[:, None]
         rows = {name: row.to(self.device) for name, row in rows.items()}
         columns = self._columns(count)
         columns["level"] += torch.from_numpy(level).to(self.device)
-        lr = {"means": 0.0, "features": p.lr_features, "offsets": p.lr_offsets, "log_scales": p.lr_scales}
+        lr: dict[str, float | torch.Tensor] = {
+            "means": 0.0,
+            "features": p.lr_features,
+            "offsets": p.lr_offsets,
+            "log_scales": p.lr_scales,
+        }
+        if p.direct:
+            lr["looks"] = p.lr_looks * torch.tensor([2.0] + [1.0] * 3 + [0.2] * 4 + [1.0] * 3)
         return Model(rows, lr, columns)
 
     def _columns(self, count: int) -> dict[str, torch.Tensor]:
@@ -212,12 +228,16 @@ class Method(octree.Method):
         size = self.tree.voxel * 2 ** (1 - level.double()[:, None])
         origin = torch.from_numpy(self.tree.origin).to(size)
         means = (((places.double() - origin) / size).floor() + 0.5) * size + origin
-        return {
+        rows = {
             "means": means.float(),
             "features": torch.zeros(count, p.features, device=places.device),
             "offsets": torch.zeros(count, p.offsets, 3, device=places.device),
             "log_scales": size.log().float().expand(-1, 6).clone(),
         }
+        if p.direct:
+            rows["looks"] = torch.zeros(count, p.offsets, LOOKS, device=places.device)
+            rows["looks"][..., 0], rows["looks"][..., 4] = FAINT, 1
+        return rows
 
     def _remember(self, rendering: Rendering) -> None:
         columns, drawn = self.model.columns, self._drawn
@@ -266,6 +286,8 @@ class Method(octree.Method):
         extents = model["log_scales"][source, :3].exp()
         rows = self._anchors(model["means"][source] + model["offsets"][source, which] * extents, level)
         rows["features"] = model["features"][source].clone()
+        if self.parameters.direct:
+            rows["looks"][..., 1:] = model["looks"][source, which, None, 1:]
         return rows | {"level": level, "bias": model.columns["bias"][source]}
 
     # -- baking ----------------------------------------------------------------------------------------
@@ -334,3 +356,9 @@ class Method(octree.Method):
         """The anchors (indices) that a view draws, with all levels joined."""
         weights = octree_weights(self._wanted(camera), self.model.columns["level"])
         return self._visible(camera, (weights >= 0.5).float())
+
+
+def _shapes(g: Gaussians) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Means, quats, log_scales and opacity_logits, as the rasterizer takes them."""
+    opacities = g.opacities.clamp(1e-6, 1 - 1e-6)
+    return g.means, g.quats, g.scales.clamp_min(1e-12).log(), opacities.logit()

@@ -132,6 +132,9 @@ class OctreeParameters(Parameters):
     """Steps between two growings."""
     grow_until: float = 0.55
     """Share of the steps after which anchors are no longer added or removed."""
+    least_weight: float = 0.05
+    """Anchors whose largest blending weight in any training view is below this go when growing ends; 0 keeps
+    all. Not in the paper, but in RadSplat."""
     candidates: int = 2
     """Places that each splat with a large gradient proposes in a growing."""
     grow_harder: float = 0.2
@@ -162,6 +165,9 @@ class NeuralOctreeParameters(OctreeParameters):
     """Gaussians of an anchor (Octree-GS: 10)."""
     features: int = 32
     """Length of an anchor's feature."""
+    direct: bool = True
+    """Whether each Gaussian has looks of its own too, which those of the networks are added to. Not in the
+    paper; short schedules need it."""
     appearance: int = 0
     """Length of each view's appearance, for photographs in changing light; 0: all are alike."""
     volume_weight: float = 0.01
@@ -170,6 +176,8 @@ class NeuralOctreeParameters(OctreeParameters):
     lr_offsets: float = 1e-2
     """Learning rate of the Gaussians' offsets, which are in units of their anchor's extent."""
     lr_offsets_final: float = 1e-4
+    lr_looks: float = 1e-2
+    """Learning rate of Gaussians' own scales and colours; opacities take twice, quaternions a fifth of it."""
     lr_network: float = 2e-3
     """Learning rate of the opacity's network; the covariance's has twice, the colour's four times as much."""
     lr_network_final: float = 0.01
@@ -226,6 +234,7 @@ _OCTREE_PAPER = replace(
     max_splats=5_000_000,
     far_share=0.0,
     full_share=0.0,
+    least_weight=0.0,
     candidates=1,
 )
 _FLOD_PRESETS = {"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER}
@@ -247,6 +256,8 @@ _PRESETS = {
             grad_threshold=2e-4,
             far_share=0.0,
             full_share=0.0,
+            least_weight=0.0,
+            direct=False,
         ),
     },
     "octree": {"draft": _OCTREE, "standard": _OCTREE_STANDARD, "paper": _OCTREE_PAPER},

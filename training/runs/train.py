@@ -87,7 +87,7 @@ def _train(job: Job, folder: RunFolder, events: Events) -> int:
     )  # fmt: skip
     events("status", message="Reading the scene")
     data = training_data(job, folder, events)
-    events("status", message="Preparing the kernels (some minutes the first time on a computer)")
+    events("status", message="Preparing the kernels (the first time on a computer up to a minute)")
     torch.set_num_threads(1)  # torch's thread pool beside the kernels' slows both
     _keep_freed_memory()
     backend = resolve(job.backend)

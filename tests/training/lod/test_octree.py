@@ -22,10 +22,10 @@ def test_the_wanted_level_rises_by_one_with_every_half_of_the_distance():
 
 
 def test_a_level_fades_in_while_the_one_before_it_is_whole():
-    wanted = np.array([1.0, 2.0, 2.25, 2.5, 3.0])
-    assert octree_weights(wanted, 1).tolist() == [1, 1, 1, 1, 1]
-    assert octree_weights(wanted, 2).tolist() == [0, 1, 1, 1, 1]
-    assert octree_weights(wanted, 3).tolist() == [0, 0, 0.25, 0.5, 1]
+    wanted = np.array([1.0, 2.0, 2.25, 2.5, 2.625, 2.75, 3.0])
+    assert octree_weights(wanted, 1).tolist() == [1, 1, 1, 1, 1, 1, 1]
+    assert octree_weights(wanted, 2).tolist() == [0, 1, 1, 1, 1, 1, 1]
+    assert octree_weights(wanted, 3).tolist() == [0, 0, 0, 0.5, 0.75, 1, 1]
     assert (octree_weights(wanted, 3) >= 0.5).tolist() == (np.round(wanted + 1e-9) >= 3).tolist()
 
 

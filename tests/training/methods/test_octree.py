@@ -6,8 +6,10 @@ import torch
 
 from training.errors import LodgsError
 from training.methods.data import TrainingData
+from training.methods.model import NAMES
 from training.methods.octree import Method
 from training.methods.parameters import override, preset
+from training.rasterize import rasterize
 from training.scenes.colmap import read_scene
 
 
@@ -147,6 +149,35 @@ def test_what_stays_faint_is_removed_and_what_was_not_seen_stays(data):
     octree.model.columns["seen"] += 1
     with pytest.raises(LodgsError, match="No splat is left"):
         octree._grow_and_prune(20)
+
+
+@pytest.mark.parametrize("far_share", [0.0, 0.1])
+def test_what_no_view_sees_much_of_goes(data, far_share, monkeypatch):
+    """Blending weights by another way: drawn as features, one column a splat. Coarse splats, which finer ones
+    hide from near, count for what they give from afar."""
+    monkeypatch.setattr("training.methods.octree.SMALLEST", 12)
+    octree = make(data, far_share=far_share, least_weight=0.3)
+    octree.model["opacity_logits"].data.fill_(2.0)
+    model, level, largest = octree.model, octree.model.columns["level"], torch.zeros(len(octree.model))
+    for view in range(len(data.train)):
+        for shrink in (1, 2, 4) if far_share else (1,):
+            camera = data.camera(view, shrink)
+            distances = (model["means"].detach() - torch.as_tensor(camera.center)).norm(dim=1)
+            distances *= octree.tree.focal_px / camera.fx
+            wanted = (octree.tree.d_max / distances).log2().clip(0, 3) + 1
+            drawn = (level <= (wanted + 0.5)).float()
+            tensors = [model[name].detach() for name in NAMES]
+            for column in range(0, len(model), 100):
+                one = torch.eye(len(model))[:, column : column + 100].contiguous()
+                blended = rasterize(*tensors, camera, weights=drawn, near=data.near, features=one).features
+                here = largest[column : column + 100]
+                torch.maximum(here, blended.amax((0, 1)), out=here)
+    clear = (largest - 0.3).abs() > 1e-3
+    means = model["means"].detach().clone()
+    octree._review(39)
+    stayed = (means[:, None] == octree.model["means"].detach()[None]).all(2).any(1)
+    assert torch.equal(stayed[clear], (largest > 0.3)[clear])
+    assert 0.1 < stayed.float().mean() < 0.9
 
 
 def test_what_is_too_wide_for_its_level_moves_to_the_coarser_one_that_it_fits(data):

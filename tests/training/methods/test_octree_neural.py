@@ -23,7 +23,7 @@ def make(data, **values) -> Method:
     }  # fmt: skip
     method = Method(data, override(preset("octree_neural", "draft"), values), seed=0, backend="cpu")
     rng = torch.Generator().manual_seed(1)
-    for name in ("features", "offsets"):  # as if trained
+    for name in set(method.model.adam.tensors) & {"features", "offsets", "looks"}:  # as if trained
         method.model[name].data.copy_(torch.randn(method.model[name].shape, generator=rng))
     return method
 
@@ -35,9 +35,10 @@ def test_an_anchor_stands_in_the_middle_of_its_voxel(data):
     np.testing.assert_allclose(cells % 1, 0.5, atol=1e-4)
 
 
-def test_decoding_is_the_papers(data):
-    """One anchor by hand in float64: Scaffold-GS, Sec. 3.2, Gaussian by Gaussian."""
-    method, camera = make(data), data.train[2]
+@pytest.mark.parametrize("direct", [False, True])
+def test_decoding_is_the_papers(data, direct):
+    """One anchor by hand in float64: Scaffold-GS, Sec. 3.2, Gaussian by Gaussian; and its own looks added."""
+    method, camera = make(data, direct=direct), data.train[2]
     counts = method.decode(camera, torch.arange(len(method.model))).anchor.bincount()
     anchor = int((counts == 2).nonzero()[0])
     g = method.decode(camera, torch.tensor([anchor]))
@@ -52,14 +53,15 @@ def test_decoding_is_the_papers(data):
                               for x in (net[0], net[2]))  # fmt: skip
         return w2 @ np.maximum(w1 @ inputs + b1, 0) + b2
 
-    opacity = np.tanh(network(method.networks.opacity))
+    own = model.get("looks", np.zeros((4, 11)))
+    opacity = np.tanh(network(method.networks.opacity) + own[:, 0])
     shown = np.flatnonzero(opacity > 0)
     assert len(shown) == 2 and g.which.tolist() == shown.tolist()
-    looks = network(method.networks.covariance).reshape(4, 7)[shown]
+    looks = (network(method.networks.covariance).reshape(4, 7) + own[:, 1:8])[shown]
     extents = np.exp(model["log_scales"])
     for name, expected in {
         "opacities": opacity[shown],
-        "colors": 1 / (1 + np.exp(-network(method.networks.color).reshape(4, 3)[shown])),
+        "colors": 1 / (1 + np.exp(-(network(method.networks.color).reshape(4, 3) + own[:, 8:])[shown])),
         "means": model["means"] + model["offsets"][shown] * extents[:3],
         "scales": extents[3:] / (1 + np.exp(-looks[:, :3])),
         "quats": looks[:, 3:],

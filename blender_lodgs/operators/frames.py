@@ -1,0 +1,80 @@
+"""Operators that work through frames: with progress, and in a window Escape stops them between two."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import bpy
+
+from .reporting import saying_errors
+
+
+class FrameByFrame:
+    """What such an operator inherits; ``animation`` says whether there is more than one frame."""
+
+    animation: bpy.props.BoolProperty(options={"HIDDEN", "SKIP_SAVE"})
+
+    def frames(self, context: bpy.types.Context) -> range:
+        """The frame that is shown, or all of the scene's range."""
+        scene = context.scene
+        if self.animation:
+            return range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
+        return range(scene.frame_current, scene.frame_current + 1)
+
+    def work(self, context: bpy.types.Context) -> Iterator[object]:
+        """Does one frame after the other and yields after each; closed early, it leaves things tidy.
+
+        Raises:
+            LodgsError: a frame is not possible.
+        """
+        raise NotImplementedError
+
+    def done(self, count: int) -> str:
+        """What to tell after so many frames."""
+        raise NotImplementedError
+
+    @saying_errors
+    def execute(self, context):
+        self.report({"INFO"}, self.done(sum(1 for _ in self.work(context))))
+        return {"FINISHED"}
+
+    def invoke(self, context, event):
+        if not self.animation or bpy.app.background:
+            return self.execute(context)
+        manager = context.window_manager
+        self._todo, self._done = self.work(context), 0
+        self._timer = manager.event_timer_add(0.01, window=context.window)
+        manager.modal_handler_add(self)
+        manager.progress_begin(0, len(self.frames(context)))
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context, event):
+        if event.type == "ESC":
+            return self._finish(context, {"CANCELLED"}, f"Stopped. {self.done(self._done)}")
+        if event.type == "TIMER":
+            return self._next(context)
+        return {"RUNNING_MODAL"}
+
+    def _next(self, context):
+        result = self._one(context)
+        if result == {"RUNNING_MODAL"}:
+            self._done += 1
+            text = f"Frame {self._done} of {len(self.frames(context))}; Esc stops"
+            context.window_manager.progress_update(self._done)
+            context.workspace.status_text_set(text)
+            return result
+        said = self.done(self._done) if result == {"FINISHED"} else ""
+        return self._finish(context, result, said)
+
+    @saying_errors
+    def _one(self, context):
+        return {"FINISHED"} if next(self._todo, StopIteration) is StopIteration else {"RUNNING_MODAL"}
+
+    def _finish(self, context, result: set[str], said: str) -> set[str]:
+        self._todo.close()
+        context.window_manager.event_timer_remove(self._timer)
+        context.window_manager.progress_end()
+        context.workspace.status_text_set(None)
+        if said:
+            self.report({"INFO"}, said)
+        return result
