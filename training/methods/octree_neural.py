@@ -137,11 +137,12 @@ class Method(octree.Method):
         places = model["means"][anchors].detach()
         eye = torch.as_tensor(camera.center).to(places)
         seen = torch.cat([model["features"][anchors], normalize(places - eye, dim=1)], 1)
+        still = seen if p.view_shapes else torch.cat([seen[:, :-3], torch.zeros_like(seen[:, -3:])], 1)
         own = model["looks"][anchors] if p.direct else seen.new_zeros(1, 1, LOOKS)
-        opacity = (self.networks.opacity(seen) + own[..., 0]).tanh()
+        opacity = (self.networks.opacity(still) + own[..., 0]).tanh()
         index, which = torch.nonzero(opacity.detach() > 0).unbind(1)
 
-        looks = (self.networks.covariance(seen).view(-1, p.offsets, 7) + own[..., 1:8])[index, which]
+        looks = (self.networks.covariance(still).view(-1, p.offsets, 7) + own[..., 1:8])[index, which]
         appearance = self.networks.appearance
         appearance = appearance.mean(0) if view is None else appearance[view]
         lit = torch.cat([seen, appearance.expand(len(seen), -1)], 1)

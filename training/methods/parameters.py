@@ -168,6 +168,9 @@ class NeuralOctreeParameters(OctreeParameters):
     direct: bool = True
     """Whether each Gaussian has looks of its own too, which those of the networks are added to. Not in the
     paper; short schedules need it."""
+    view_shapes: bool = False
+    """Whether opacity and covariance change with the direction of view, as in the paper. They then learn the
+    photographs by heart where these are few, and baking cannot carry it."""
     appearance: int = 0
     """Length of each view's appearance, for photographs in changing light; 0: all are alike."""
     volume_weight: float = 0.01
@@ -258,6 +261,7 @@ _PRESETS = {
             full_share=0.0,
             least_weight=0.0,
             direct=False,
+            view_shapes=True,
         ),
     },
     "octree": {"draft": _OCTREE, "standard": _OCTREE_STANDARD, "paper": _OCTREE_PAPER},

@@ -19,7 +19,8 @@ def data(tiny_scene) -> TrainingData:
 def make(data, **values) -> Method:
     values = {
         "levels": 3, "coarser_levels": 0, "nearest": 0.0, "farthest": 1.0, "footprint": 12.0, "steps": 40,
-        "offsets": 4, "features": 8, "far_share": 0.0, "full_share": 0.0, "sh_degree": 2, **values,
+        "offsets": 4, "features": 8, "far_share": 0.0, "full_share": 0.0, "sh_degree": 2, "view_shapes": True,
+        **values,
     }  # fmt: skip
     method = Method(data, override(preset("octree_neural", "draft"), values), seed=0, backend="cpu")
     rng = torch.Generator().manual_seed(1)
@@ -35,10 +36,13 @@ def test_an_anchor_stands_in_the_middle_of_its_voxel(data):
     np.testing.assert_allclose(cells % 1, 0.5, atol=1e-4)
 
 
-@pytest.mark.parametrize("direct", [False, True])
-def test_decoding_is_the_papers(data, direct):
-    """One anchor by hand in float64: Scaffold-GS, Sec. 3.2, Gaussian by Gaussian; and its own looks added."""
-    method, camera = make(data, direct=direct), data.train[2]
+@pytest.mark.parametrize("changes", [{"direct": False}, {}, {"view_shapes": False}])
+def test_decoding_is_the_papers(data, changes):
+    """One anchor by hand in float64: Scaffold-GS, Sec. 3.2, Gaussian by Gaussian.
+
+    Its own looks are added; shapes that do not change with the view see no direction.
+    """
+    method, camera = make(data, **changes), data.train[2]
     counts = method.decode(camera, torch.arange(len(method.model))).anchor.bincount()
     anchor = int((counts == 2).nonzero()[0])
     g = method.decode(camera, torch.tensor([anchor]))
@@ -47,8 +51,9 @@ def test_decoding_is_the_papers(data, direct):
     direction = model["means"] - camera.center
     direction /= np.linalg.norm(direction)
     inputs = np.concatenate([model["features"], direction])
+    still = np.concatenate([model["features"], direction * method.parameters.view_shapes])
 
-    def network(net):
+    def network(net, inputs=still):
         (w1, b1), (w2, b2) = ((x.weight.detach().double().numpy(), x.bias.detach().double().numpy())
                               for x in (net[0], net[2]))  # fmt: skip
         return w2 @ np.maximum(w1 @ inputs + b1, 0) + b2
@@ -58,10 +63,12 @@ def test_decoding_is_the_papers(data, direct):
     shown = np.flatnonzero(opacity > 0)
     assert len(shown) == 2 and g.which.tolist() == shown.tolist()
     looks = (network(method.networks.covariance).reshape(4, 7) + own[:, 1:8])[shown]
+    colors = (network(method.networks.color, inputs).reshape(4, 3) + own[:, 8:])[shown]
     extents = np.exp(model["log_scales"])
     for name, expected in {
         "opacities": opacity[shown],
-        "colors": 1 / (1 + np.exp(-(network(method.networks.color).reshape(4, 3) + own[:, 8:])[shown])),
+        "colors": 1
+        / (1 + np.exp(-(network(method.networks.color, inputs).reshape(4, 3) + own[:, 8:])[shown])),
         "means": model["means"] + model["offsets"][shown] * extents[:3],
         "scales": extents[3:] / (1 + np.exp(-looks[:, :3])),
         "quats": looks[:, 3:],
