@@ -139,7 +139,7 @@ class OctreeParameters(Parameters):
     """Places that each splat with a large gradient proposes in a growing."""
     grow_harder: float = 0.2
     """The gradient's threshold is 2 to this power higher from level to level (Octree-GS: beta)."""
-    bias_rate: float = 0.01
+    bias_rate: float = 0.0025
     """What a level's bias gains in a growing where the gradient is a quarter of the threshold or more."""
     far_share: float = 0.1
     """Share of the steps that see a photograph made smaller, as from 2, 4, ... times the distance; if it is
@@ -161,6 +161,9 @@ class NeuralOctreeParameters(OctreeParameters):
     ``max_splats`` is of Gaussians, ``lr_scales`` of the anchors' extents; harmonics are those of baking.
     """
 
+    grad_threshold: float = 5e-5
+    footprint: float = 1.0
+    least_weight: float = 0.02
     offsets: int = 5
     """Gaussians of an anchor (Octree-GS: 10)."""
     features: int = 32
@@ -238,6 +241,7 @@ _OCTREE_PAPER = replace(
     far_share=0.0,
     full_share=0.0,
     least_weight=0.0,
+    bias_rate=0.01,
     candidates=1,
 )
 _FLOD_PRESETS = {"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER}
@@ -260,6 +264,7 @@ _PRESETS = {
             far_share=0.0,
             full_share=0.0,
             least_weight=0.0,
+            bias_rate=0.01,
             direct=False,
             view_shapes=True,
         ),
