@@ -81,7 +81,7 @@ class Method(Interface):
         self._optimise(step)
         if growing and (step + 1) % p.grow_interval == 0:
             self._grow_and_prune(step)
-        if growing and step + 1 >= p.grow_until * p.steps:
+        if growing and step + 1 >= p.grow_until * p.steps and p.least_weight:
             self._review(step)
         if (step + 1) % p.grow_interval == 0 or step + 1 == self.steps:
             self._settle()
@@ -246,10 +246,7 @@ class Method(Interface):
         model.append({name: row[free] for name, row in rows.items()})
         model.forget()
         model.columns["opacity_sum"].zero_()
-        if not len(model):
-            raise LodgsError(
-                f"No splat is left at step {step + 1}.", "Lower 'min_opacity', or choose another preset."
-            )
+        self._some_left(step, "min_opacity")
 
     @torch.no_grad()
     def _review(self, step: int) -> None:
@@ -265,6 +262,13 @@ class Method(Interface):
                 weights = octree_weights(self._wanted(camera).clip(1, newest), level) >= 0.5
                 torch.maximum(largest, self._largest(camera, view, weights.float()), out=largest)
         self.model.keep((largest >= self.parameters.least_weight) | (level > newest))
+        self._some_left(step, "least_weight")
+
+    def _some_left(self, step: int, limit: str) -> None:
+        if not len(self.model):
+            raise LodgsError(
+                f"No splat is left at step {step + 1}.", f"Lower '{limit}', or choose another preset."
+            )
 
     def _largest(self, camera: Camera, view: int, weights: torch.Tensor) -> torch.Tensor:
         """Each anchor's largest blending weight (N,) in a training view."""

@@ -180,6 +180,11 @@ def test_what_no_view_sees_much_of_goes(data, far_share, monkeypatch):
     assert 0.1 < stayed.float().mean() < 0.9
 
 
+def test_an_impossible_least_weight_says_so(data):
+    with pytest.raises(LodgsError, match=r"No splat is left at step 40.*'least_weight'"):
+        make(data, least_weight=1.5)._review(39)
+
+
 def test_what_is_too_wide_for_its_level_moves_to_the_coarser_one_that_it_fits(data):
     octree = make(data, spread=2.0)
     octree.model.columns["level"][:] = 4
