@@ -276,8 +276,9 @@ def offer_ellipsoids(scene: bpy.types.Scene) -> None:
         for item in root.lodgs.levels:
             if item.exists:
                 ellipsoids.attach(item.object)
-    if hasattr(scene, "cycles"):
-        scene.cycles.transparent_max_bounces = max(scene.cycles.transparent_max_bounces, ellipsoids.BOUNCES)
+    cycles = getattr(scene, "cycles", None)
+    for limit in ("transparent_max_bounces", "min_transparent_bounces") if cycles else ():
+        setattr(cycles, limit, max(getattr(cycles, limit), ellipsoids.BOUNCES))
 
 
 def views(root: bpy.types.Object) -> list[bpy.types.Object]:

@@ -66,6 +66,24 @@ def test_cycles_sees_what_the_rasterizer_draws(bpy, lodgs, scene, renderer, tmp_
     np.testing.assert_allclose(cycles[seen][:, :3], 0.7, atol=0.02)
 
 
+def test_rays_go_on_through_many_ellipsoids(bpy, lodgs, scene, tmp_path):
+    """Thirty faint splats one behind the other, one ray a pixel: in the middle 1 - (1 - 0.1)^30 of them is
+    left, without noise. Cycles' own settings end most rays on the way."""
+    row = np.zeros((30, 3))
+    row[:, 1] = np.arange(30) * 0.1
+    many = splats(
+        means=row, quats=np.tile([1.0, 0, 0, 0], (30, 1)), log_scales=np.log(np.full((30, 3), 3.0)),
+        opacity_logits=np.full(30, np.log(0.1 / 0.9)), sh=np.zeros((30, 1, 3)),
+    )  # fmt: skip
+    from training.splats.bundle import Level
+
+    lodgs("scenes").set_level(bpy.data.objects["one"], Level(1, many, 0.0))
+    scene.camera.location.y = -30
+    scene.lodgs_render.ellipsoids, scene.cycles.samples = True, 1
+    alpha = rendered(bpy, tmp_path / "cycles.png")[22:26, 30:34, 3]
+    np.testing.assert_allclose(alpha, 1 - 0.9**30, atol=0.02)
+
+
 def test_they_are_there_only_where_they_are_wanted(bpy, lodgs, scene):
     thing = bpy.data.objects["one level 1"]
     scene.lodgs_render.ellipsoids = True
