@@ -22,8 +22,8 @@ REACH = 3.0
 BOUNCES = 512
 """Transparent surfaces that a ray of Cycles has to pass.
 
-With its own limit, 8, it would leave black holes; ended by chance before that, it leaves noise, and the samples
-that remove it cost far more time than going on.
+With its own limit, 8, it would leave black holes; ended by chance before that, it leaves noise, and the
+samples that remove it cost far more time than going on.
 """
 
 
