@@ -85,7 +85,8 @@ def falloff() -> bpy.types.Material:
     """The material of the ellipsoids: alpha of a Gaussian, once for each ray that passes.
 
     On the unit sphere that all ellipsoids are images of, a ray from the direction v that meets the surface at
-    p passes the centre in a distance of sqrt(1 - (p·v)²).
+    p passes the centre in a distance of sqrt(1 - (p·v)²). It counts where it enters; if it began inside,
+    where it leaves, as long as the centre was before it.
     """
     material = bpy.data.materials.get(MATERIAL)
     if material is not None:
@@ -108,7 +109,8 @@ def falloff() -> bpy.types.Material:
                 tree.links.new(given, socket)
             else:
                 socket.default_value = given
-        return node.outputs["Value" if kind == "ShaderNodeMath" or operation == "DOT_PRODUCT" else "Vector"]
+        single = kind == "ShaderNodeMath" or operation in ("DOT_PRODUCT", "LENGTH")
+        return node.outputs["Value" if single else "Vector"]
 
     geometry = add("ShaderNodeNewGeometry")
     local = add("ShaderNodeVectorTransform", vector_type="VECTOR", convert_from="WORLD", convert_to="OBJECT")
@@ -120,7 +122,14 @@ def falloff() -> bpy.types.Material:
     bell = join("POWER", math.exp(-REACH * REACH / 2), beside)
     opacity = add("ShaderNodeAttribute", attribute_name=ALPHA, attribute_type="INSTANCER")
     alpha = join("MINIMUM", join("MULTIPLY", opacity.outputs["Fac"], bell), 0.99)
-    once = join("MULTIPLY", alpha, join("SUBTRACT", 1.0, geometry.outputs["Backfacing"]))
+    stretch = join("LENGTH", local.outputs["Vector"], kind="ShaderNodeVectorMath")
+    way = join("MULTIPLY", add("ShaderNodeLightPath").outputs["Ray Length"], stretch)
+    half = join("ABSOLUTE", cosine)
+    began_inside = join("LESS_THAN", way, join("MULTIPLY", half, 2.0))
+    past_centre = join("GREATER_THAN", way, half)
+    leaves = join("MULTIPLY", geometry.outputs["Backfacing"], join("MULTIPLY", began_inside, past_centre))
+    enters = join("SUBTRACT", 1.0, geometry.outputs["Backfacing"])
+    once = join("MULTIPLY", alpha, join("ADD", enters, leaves))
     color = add("ShaderNodeAttribute", attribute_name=COLOR, attribute_type="INSTANCER")
     emission, through, mix = (
         add(kind) for kind in ("ShaderNodeEmission", "ShaderNodeBsdfTransparent", "ShaderNodeMixShader")

@@ -66,6 +66,25 @@ def test_cycles_sees_what_the_rasterizer_draws(bpy, lodgs, scene, renderer, tmp_
     np.testing.assert_allclose(cycles[seen][:, :3], 0.7, atol=0.02)
 
 
+@pytest.mark.parametrize(("ahead", "seen"), [(1.0, True), (-1.0, False)])
+def test_a_splat_around_the_camera_is_seen_if_its_middle_is_before_it(
+    bpy, lodgs, scene, tmp_path, ahead, seen
+):
+    """Round, 2 wide: a ray that passes its middle in the distance d sees exp(-d²/8) of its opacity."""
+    from training.splats.bundle import Level
+
+    one = splats(means=[[0, -5 + ahead, 0]], quats=[[1, 0, 0, 0]], log_scales=np.log([[2.0, 2.0, 2.0]]))
+    lodgs("scenes").set_level(bpy.data.objects["one"], Level(1, one, 0.0))
+    scene.lodgs_render.ellipsoids = True
+    alpha = rendered(bpy, tmp_path / "cycles.png")[..., 3]
+    x, y = np.meshgrid(np.arange(64) - 31.5, np.arange(48) - 23.5)
+    size = scene.camera.data.sensor_width / scene.camera.data.lens / 64
+    tangent = np.hypot(x, y) * size  # of the angle at which a ray passes the middle
+    distance = ahead * tangent / np.hypot(1, tangent)
+    expected = np.exp(-(distance**2) / 8) / (1 + np.exp(-1.5)) if seen else np.zeros((48, 64))
+    np.testing.assert_allclose(alpha, expected, atol=0.015)
+
+
 def test_rays_go_on_through_many_ellipsoids(bpy, lodgs, scene, tmp_path):
     """Thirty faint splats one behind the other, one ray a pixel: in the middle 1 - (1 - 0.1)^30 of them is
     left, without noise. Cycles' own settings end most rays on the way."""
