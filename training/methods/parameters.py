@@ -132,7 +132,7 @@ class OctreeParameters(Parameters):
     """Steps between two growings."""
     grow_until: float = 0.55
     """Share of the steps after which anchors are no longer added or removed."""
-    least_weight: float = 0.02
+    least_weight: float = 0.05
     """Anchors whose largest blending weight in any training view is below this go when growing ends; 0 keeps
     all. Not in the paper, but in RadSplat."""
     candidates: int = 2
@@ -163,6 +163,7 @@ class NeuralOctreeParameters(OctreeParameters):
 
     grad_threshold: float = 5e-5
     footprint: float = 1.0
+    least_weight: float = 0.02
     offsets: int = 5
     """Gaussians of an anchor (Octree-GS: 10)."""
     features: int = 32
