@@ -56,19 +56,19 @@ def test_what_lies_at_the_depth_is_so_many_times_as_far(camera):
         assert np.allclose((back.world_to_camera @ target)[:2], 0)
 
 
-def test_the_rule_of_the_paper_on_a_whole_bundle(bundle):
-    eye, focal = np.array([0.5, 0, -9.0]), 80.0
+def test_the_rule_on_a_whole_bundle(bundle):
+    eye, focal = np.array([0.5, 0, -7.0]), 80.0
     chosen, weights = select(bundle, eye, focal, Detail(offset=0.25))
     assert weights is not None
     expected = []
-    for level in bundle.levels:  # splat by splat: L* = log2(d_max / d) + offset, the fraction at the last
+    for level in bundle.levels:  # splat by splat: L* = log2(d_max / d) + offset, rounded in half a level
         for mean in level.splats.means:
             distance = np.linalg.norm(mean - eye) * 100 / focal
             wanted = min(max(np.log2(32 / distance) + 0.25, 0), 2)
-            weight = min(max(wanted + 2 - level.number, 0), 1)
+            weight = min(max(2 * (wanted + 1 - level.number + 0.5) + 0.5, 0), 1)
             if weight > 0:
                 expected.append((*mean, weight))
-    assert len(expected) > 300
+    assert len(expected) > 300 and sum(0 < weight < 1 for *_, weight in expected) > 50
     np.testing.assert_allclose(np.column_stack([chosen.means, weights]), expected, atol=1e-5)
 
 
