@@ -204,8 +204,8 @@ def test_colours_tell_levels_and_distances(bpy, lodgs):
         result = arranging.arrange(pool, arranging.Request((placement,), (0, 0, 1), 10**6))
         index, weight, _, told = result.instances[: result.count].T
         index = index.astype(int)
-        assert result.count == (wanted > 1).sum()
-        assert np.allclose(weight, np.clip(wanted - 1, 0, 1)[index], atol=1e-4)
+        assert result.count == (wanted > 1.25).sum()
+        assert np.allclose(weight, np.clip(2 * wanted - 2.5, 0, 1)[index], atol=1e-4)
         assert np.array_equal(told, truth[index])
 
 
