@@ -36,9 +36,9 @@ def main() -> int:
     chosen = parser.parse_args()
     started = time.monotonic()
     out: Path = chosen.out
-    run = RunFolder(out / "run")
+    run = RunFolder(out / chosen.method)
     if run.state() == "done":  # an interrupted demo is resumed, a finished one is made anew
-        shutil.rmtree(out)
+        shutil.rmtree(run.path)
     os.environ.setdefault("LODGS_TRAINER_PYTHON", sys.executable)
 
     start_blender()
