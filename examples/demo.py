@@ -20,14 +20,14 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from tools.blender_module import EXTENSION, start_blender  # noqa: E402
-from training.methods.parameters import preset  # noqa: E402
+from training.methods.parameters import METHODS, preset  # noqa: E402
 from training.runs.folder import RunFolder  # noqa: E402
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description="train the example scene and show its levels")
     parser.add_argument("--scene", type=Path, default=ROOT / "examples" / "lantern_garden")
-    parser.add_argument("--method", default="flod")
+    parser.add_argument("--method", choices=list(METHODS), default="flod")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "demo")
     parser.add_argument("--image-scale", type=float, default=1.0)
     parser.add_argument(

@@ -254,14 +254,14 @@ class Method(Interface):
 
         Not in the paper.
         """
-        newest, level = self.level_at(step), self.model.columns["level"]
+        unjoined = self.model.columns["level"] > self.level_at(step)
         largest = torch.zeros(len(self.model), device=self.device)
         for view in range(len(self.data.train)):
             for shrink in self._shrinks():
                 camera = self.data.camera(view, shrink)
-                weights = octree_weights(self._wanted(camera).clip(1, newest), level) >= 0.5
-                torch.maximum(largest, self._largest(camera, view, weights.float()), out=largest)
-        self.model.keep((largest >= self.parameters.least_weight) | (level > newest))
+                weights = self._weights(camera, step, whole=False)
+                torch.maximum(largest, self._largest(camera, view, weights), out=largest)
+        self.model.keep((largest >= self.parameters.least_weight) | unjoined)
         self._some_left(step, "least_weight")
 
     def _some_left(self, step: int, limit: str) -> None:
