@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from ..scenes.cameras import Camera
     from ..splats.bundle import Level
     from .data import TrainingData
-    from .model import Model
     from .parameters import Parameters
 
 MODULES = {"flod": "flod", "3dgs": "flod", "octree": "octree", "octree_neural": "octree_neural"}
@@ -30,11 +29,10 @@ class Method(Protocol):
         cumulative: whether a level only holds what it adds to the coarser ones.
         steps: number of steps of the whole run.
         levels: number of levels.
-        model: the splats as they are now.
+        splats: how many there are now.
     """
 
     cumulative: bool
-    model: Model
 
     def __init__(self, data: TrainingData, parameters: Parameters, seed: int, backend: str) -> None: ...
 
@@ -43,6 +41,9 @@ class Method(Protocol):
 
     @property
     def levels(self) -> int: ...
+
+    @property
+    def splats(self) -> int: ...
 
     def level_at(self, step: int) -> int:
         """The finest level (1-based) that a step trains."""

@@ -63,6 +63,10 @@ class Method(Interface):
     def levels(self) -> int:
         return self.parameters.levels
 
+    @property
+    def splats(self) -> int:
+        return len(self.model)
+
     def level_at(self, step: int) -> int:
         return bisect_right(self._ends, step) + 1
 

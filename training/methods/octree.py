@@ -53,6 +53,7 @@ class Method(Interface):
         if len(chosen) > p.max_splats:
             chosen = np.sort(np.random.default_rng(seed).choice(chosen, p.max_splats, replace=False))
         self.model = self._first_model(points[chosen], colors[chosen], level[chosen])
+        self._rates = dict(self.model.adam.lr)
 
     # -- what the loop asks of every method ------------------------------------------------------------
 
@@ -63,6 +64,10 @@ class Method(Interface):
     @property
     def levels(self) -> int:
         return self.tree.levels
+
+    @property
+    def splats(self) -> int:
+        return len(self.model)
 
     def level_at(self, step: int) -> int:
         return sum(step >= join for join in self.joins)
@@ -211,7 +216,15 @@ class Method(Interface):
         opacity = self.model["opacity_logits"].detach().sigmoid()
         self.model.columns["opacity_sum"] += torch.where(rendering.radii > 0, opacity, 0)
 
+    def _fall(self, step: int) -> float:
+        """What is left of learning rates at a step: they fall from when growing ends. Not in the paper."""
+        p = self.parameters
+        share = (step / self.steps - p.grow_until) / (1 - p.grow_until)
+        return p.lr_end ** max(share, 0.0)
+
     def _optimise(self, step: int) -> None:
+        fall = self._fall(step)
+        self.model.adam.lr = {name: rate * fall for name, rate in self._rates.items()}
         self.model.adam.lr["means"] = means_rate(self.parameters, step / self.steps, self.data.extent)
         self.model.adam.step()
         self.model.adam.zero_grad()
@@ -228,7 +241,8 @@ class Method(Interface):
         gradient, level = model.mean_gradient(), columns["level"]
         gradient = gradient.view(len(model), -1)  # of each of an anchor's Gaussians
         harder = 2**p.grow_harder
-        threshold = (p.grad_threshold * self.data.threshold_scale * harder ** (level - 1))[:, None]
+        rising = harder ** (level - 1 - p.coarser_levels).clamp_min(0)
+        threshold = (p.grad_threshold * self.data.threshold_scale * rising)[:, None]
         target = level[:, None].expand_as(gradient)
         if step >= p.coarse_share * p.steps:
             target = target + (gradient >= threshold * harder)
@@ -255,13 +269,15 @@ class Method(Interface):
         Not in the paper.
         """
         unjoined = self.model.columns["level"] > self.level_at(step)
-        largest = torch.zeros(len(self.model), device=self.device)
+        largest = torch.zeros_like(self.model.columns["seen"])
         for view in range(len(self.data.train)):
             for shrink in self._shrinks():
                 camera = self.data.camera(view, shrink)
                 weights = self._weights(camera, step, whole=False)
                 torch.maximum(largest, self._largest(camera, view, weights), out=largest)
-        self.model.keep((largest >= self.parameters.least_weight) | unjoined)
+        poor = (largest < self.parameters.least_weight).view(len(self.model), -1) & ~unjoined[:, None]
+        self._silence(poor)
+        self.model.keep(~poor.all(1))
         self._some_left(step, "least_weight")
 
     def _some_left(self, step: int, limit: str) -> None:
@@ -270,8 +286,11 @@ class Method(Interface):
                 f"No splat is left at step {step + 1}.", f"Lower '{limit}', or choose another preset."
             )
 
+    def _silence(self, splats: torch.Tensor) -> None:
+        """Of anchors that stay, those Gaussians (N, n) are no longer drawn."""
+
     def _largest(self, camera: Camera, view: int, weights: torch.Tensor) -> torch.Tensor:
-        """Each anchor's largest blending weight (N,) in a training view."""
+        """The largest blending weight of each splat, shaped as ``seen``, in a training view."""
         names = "means", "quats", "log_scales", "opacity_logits"
         return contributions(
             *(self.model[name] for name in names),

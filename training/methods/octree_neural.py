@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import hypot, log
 
 import numpy as np
 import torch
@@ -29,10 +30,11 @@ from .parameters import NeuralOctreeParameters
 
 HIDDEN = 32
 """Width of each network's one hidden layer."""
-LOOKS, FAINT = 11, 0.1
-"""Opacity, three scales, a quaternion and a colour, before their activations; the opacity to begin with."""
-MARGIN = 1.3
-"""Anchors are decoded that lie within so many times the image's half width and height."""
+LOOKS, FAINT, SILENT = 11, 0.1, -30.0
+"""Opacity, three scales, a quaternion and a colour, before their activations; the opacity to begin with,
+and the logit of one that is never drawn again."""
+SIGMAS = 3.5
+"""Standard deviations that a Gaussian may reach into the image from outside."""
 
 
 @dataclass
@@ -80,8 +82,11 @@ class Method(octree.Method):
     def __init__(
         self, data: TrainingData, parameters: NeuralOctreeParameters, seed: int, backend: str
     ) -> None:
-        super().__init__(data, parameters, seed, backend)
         p = parameters
+        places = np.random.default_rng(seed).uniform(-0.5, 0.5, (p.offsets, 3))
+        self._spread = torch.from_numpy(places).float()
+        """Where in their voxel new anchors' Gaussians begin if they have looks of their own."""
+        super().__init__(data, parameters, seed, backend)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.networks = Networks(p.features, p.offsets, p.appearance, len(data.train)).to(self.device)
@@ -89,6 +94,12 @@ class Method(octree.Method):
         self._networks_adam = Adam(names, dict.fromkeys(names, 0.0))
 
     # -- what the loop asks of every method ------------------------------------------------------------
+
+    @property
+    def splats(self) -> int:
+        if not self.parameters.direct:
+            return len(self.model) * self.parameters.offsets
+        return int((self.model["looks"][..., 0] > SILENT / 2).sum())
 
     def levels_after(self, step: int) -> list[Level]:
         if step + 1 not in (self.joins[-1], self.steps):
@@ -139,8 +150,10 @@ class Method(octree.Method):
         seen = torch.cat([model["features"][anchors], normalize(places - eye, dim=1)], 1)
         still = seen if p.view_shapes else torch.cat([seen[:, :-3], torch.zeros_like(seen[:, -3:])], 1)
         own = model["looks"][anchors] if p.direct else seen.new_zeros(1, 1, LOOKS)
-        opacity = (self.networks.opacity(still) + own[..., 0]).tanh()
-        index, which = torch.nonzero(opacity.detach() > 0).unbind(1)
+        opacity = self.networks.opacity(still) + own[..., 0]
+        # tanh as in the paper: Gaussians below 0 are not drawn, and so never learn again
+        opacity, least = (opacity.sigmoid(), 1 / 255) if p.direct else (opacity.tanh(), 0.0)
+        index, which = torch.nonzero(opacity.detach() > least).unbind(1)
 
         looks = (self.networks.covariance(still).view(-1, p.offsets, 7) + own[..., 1:8])[index, which]
         appearance = self.networks.appearance
@@ -179,17 +192,30 @@ class Method(octree.Method):
     def _largest(self, camera: Camera, view: int, weights: torch.Tensor) -> torch.Tensor:
         g = self.decode(camera, self._visible(camera, weights), view)
         found = contributions(*_shapes(g), [camera], near=self.data.near, backend=self.backend).largest
-        return torch.zeros_like(weights).scatter_reduce_(0, g.anchor, found, "amax")
+        largest = torch.zeros(len(weights), self.parameters.offsets, device=self.device)
+        largest[g.anchor, g.which] = found
+        return largest
+
+    def _silence(self, splats: torch.Tensor) -> None:
+        if self.parameters.direct:
+            self.model["looks"][..., 0][splats] = SILENT
 
     def _visible(self, camera: Camera, weights: torch.Tensor) -> torch.Tensor:
         """The anchors (indices) of weight above 0 whose Gaussians may be in the image."""
-        means = self.model["means"].detach()
+        model = self.model
+        means, extents = model["means"].detach(), model["log_scales"].detach().exp()
+        reach = (model["offsets"].detach() * extents[:, None, :3]).norm(dim=2).amax(1)
+        reach = reach + SIGMAS * extents[:, 3:].amax(1)
         pose = torch.as_tensor(camera.world_to_camera).to(means)
         x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
-        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-        beside = (u - camera.width / 2).abs() > MARGIN * camera.width / 2
-        beyond = (v - camera.height / 2).abs() > MARGIN * camera.height / 2
-        return torch.nonzero((weights > 0) & (z > self.data.near) & ~beside & ~beyond)[:, 0]
+        seen = (weights > 0) & (z + reach > self.data.near)
+        for focal, middle, size, across in (
+            (camera.fx, camera.cx, camera.width, x), (camera.fy, camera.cy, camera.height, y),
+        ):  # fmt: skip
+            # inside of the two planes through the eye and the image's edges
+            seen &= focal * across + middle * z > -reach * hypot(focal, middle)
+            seen &= focal * across + (middle - size) * z < reach * hypot(focal, middle - size)
+        return torch.nonzero(seen)[:, 0]
 
     def _regularised(self, loss: torch.Tensor, rendering: Rendering) -> torch.Tensor:
         scales = self._drawn.scales / self.data.median_depth
@@ -213,7 +239,7 @@ class Method(octree.Method):
             "log_scales": p.lr_scales,
         }
         if p.direct:
-            lr["looks"] = p.lr_looks * torch.tensor([2.0] + [1.0] * 3 + [0.2] * 4 + [1.0] * 3)
+            lr["looks"] = p.lr_looks * torch.tensor([5.0] + [1.0] * 3 + [0.2] * 4 + [1.0] * 3)
         return Model(rows, lr, columns)
 
     def _columns(self, count: int) -> dict[str, torch.Tensor]:
@@ -237,7 +263,8 @@ class Method(octree.Method):
         }
         if p.direct:
             rows["looks"] = torch.zeros(count, p.offsets, LOOKS, device=places.device)
-            rows["looks"][..., 0], rows["looks"][..., 4] = FAINT, 1
+            rows["looks"][..., 0], rows["looks"][..., 4] = log(FAINT / (1 - FAINT)), 1
+            rows["offsets"] += self._spread.to(places)
         return rows
 
     def _remember(self, rendering: Rendering) -> None:
@@ -251,6 +278,8 @@ class Method(octree.Method):
 
     def _optimise(self, step: int) -> None:
         p, share = self.parameters, step / self.steps
+        fall = self._fall(step)
+        self.model.adam.lr = {name: rate * fall for name, rate in self._rates.items()}
         self.model.adam.lr["offsets"] = p.lr_offsets ** (1 - share) * p.lr_offsets_final**share
         self.model.adam.step()
         self.model.adam.zero_grad()
@@ -324,7 +353,8 @@ class Method(octree.Method):
             basis: list = [None] * terms
             harmonics.basis(x, y, z, p.sh_degree, basis)
             values = torch.stack(basis, 1)
-            weighted = values * g.opacities[:, None]
+            seen = contributions(*_shapes(g), [camera], near=self.data.near, backend=self.backend)
+            weighted = values * (seen.largest + 1e-3 * g.opacities)[:, None]
             products[g.anchor, g.which] += weighted[:, :, None] * values[:, None]
             colors[g.anchor, g.which] += weighted[:, :, None] * (g.colors - 0.5)[:, None]
             here = median_view[g.anchor] == view
@@ -337,7 +367,7 @@ class Method(octree.Method):
         held = torch.full((terms,), p.bake_ridge, device=self.device)
         held[0] = 1e-3 * p.bake_ridge
         products += held.diag() * (products[:, :1, :1] / SH_C0**2)
-        fitted = torch.linalg.solve(products, colors)
+        fitted = torch.linalg.solve(products.double(), colors.double()).float()
         anchor = torch.nonzero(kept)[:, 0]
         log_scales = scales[kept].clamp_min(1e-12).log()
         level = self._fitting(columns["level"][anchor], log_scales)

@@ -107,6 +107,8 @@ class OctreeParameters(Parameters):
 
     max_splats: int = 180_000
     """Most splats of all levels together, which add up; FLoD's five levels are over 300,000."""
+    grad_threshold: float = 5e-5
+    lr_sh: float = 5e-3
     levels: int = 0
     """Number of levels (Octree-GS: K); 0 takes it from the range of distances (Eq. 3)."""
     nearest: float = 0.05
@@ -115,7 +117,7 @@ class OctreeParameters(Parameters):
     """Quantile that counts as the largest (Octree-GS: d_max), from where on level 1 alone is drawn."""
     coarser_levels: int = 3
     """Levels before those of Eq. 3, for views from farther away than any photograph."""
-    footprint: float = 2.0
+    footprint: float = 1.4
     """Pixels that the voxel of a level covers where the level is just wanted; sets the voxels' size."""
     spread: float = 13.0
     """Voxels of its level that a splat's largest standard deviation may span; wider ones move to a coarser
@@ -132,20 +134,24 @@ class OctreeParameters(Parameters):
     """Steps between two growings."""
     grow_until: float = 0.55
     """Share of the steps after which anchors are no longer added or removed."""
-    least_weight: float = 0.05
+    least_weight: float = 0.03
     """Anchors whose largest blending weight in any training view is below this go when growing ends; 0 keeps
     all. Not in the paper, but in RadSplat."""
     candidates: int = 2
     """Places that each splat with a large gradient proposes in a growing."""
     grow_harder: float = 0.2
-    """The gradient's threshold is 2 to this power higher from level to level (Octree-GS: beta)."""
+    """The gradient's threshold is 2 to this power higher from level to level (Octree-GS: beta), counted from
+    the first level after ``coarser_levels``."""
     bias_rate: float = 0.0025
     """What a level's bias gains in a growing where the gradient is a quarter of the threshold or more."""
     far_share: float = 0.1
     """Share of the steps that see a photograph made smaller, as from 2, 4, ... times the distance; if it is
     not 0, so do all steps before the finest level has joined."""
-    full_share: float = 0.1
+    full_share: float = 0.4
     """Share of the other steps that draw every level wherever it is, as a view at full detail does."""
+    lr_end: float = 0.1
+    """What is left of the learning rates at the end: they fall from when growing ends; 1 leaves them, as in
+    the paper. Positions have a rule of their own."""
     volume_weight: float = 0.0
     """Weight of the mean of the splats' volumes in the loss, lengths in median depths."""
 
@@ -161,8 +167,7 @@ class NeuralOctreeParameters(OctreeParameters):
     ``max_splats`` is of Gaussians, ``lr_scales`` of the anchors' extents; harmonics are those of baking.
     """
 
-    grad_threshold: float = 5e-5
-    footprint: float = 1.0
+    footprint: float = 2.0
     least_weight: float = 0.02
     offsets: int = 5
     """Gaussians of an anchor (Octree-GS: 10)."""
@@ -189,7 +194,7 @@ class NeuralOctreeParameters(OctreeParameters):
     lr_network_final: float = 0.01
     """What is left of the rates of opacity, colour and appearance at the end, as a share."""
     lr_appearance: float = 5e-2
-    bake_ridge: float = 0.01
+    bake_ridge: float = 0.001
     """How firmly baking holds the higher harmonics to zero."""
 
 
@@ -227,6 +232,7 @@ _OCTREE_STANDARD = replace(
     lr_means=1.6e-4,
     lr_means_final=1.6e-6,
     lr_scales=5e-3,
+    lr_sh=2.5e-3,
     grow_interval=100,
 )
 _OCTREE_PAPER = replace(
@@ -241,6 +247,7 @@ _OCTREE_PAPER = replace(
     far_share=0.0,
     full_share=0.0,
     least_weight=0.0,
+    lr_end=1.0,
     bias_rate=0.01,
     candidates=1,
 )
@@ -264,6 +271,7 @@ _PRESETS = {
             far_share=0.0,
             full_share=0.0,
             least_weight=0.0,
+            lr_end=1.0,
             bias_rate=0.01,
             direct=False,
             view_shapes=True,

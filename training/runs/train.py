@@ -173,7 +173,7 @@ class _Run:
         speed = (self.step - self._started_step) / max(time.monotonic() - self._started, 1e-6)
         self.events(
             "progress", stage=f"level {level} of {levels}", level=level, levels=levels,
-            step=self.step, of=of, loss=round(loss, 5), psnr=round(quality, 2), splats=len(self.method.model),
+            step=self.step, of=of, loss=round(loss, 5), psnr=round(quality, 2), splats=self.method.splats,
             steps_per_s=round(speed, 2), eta_s=round((of - self.step) / speed, 1),
         )  # fmt: skip
         if time.monotonic() - self._started > 10:  # the speed of about the last ten seconds

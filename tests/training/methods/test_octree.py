@@ -110,20 +110,34 @@ def test_new_anchors_lie_in_free_voxels_of_their_own_or_the_next_level(data):
     assert (octree.model.columns["bias"][:count] == octree.parameters.bias_rate).all()
 
 
-def test_the_thresholds_rise_from_level_to_level(data):
-    """tau 2^(beta (l - 1)), Sec. 4.2: below a level's nothing grows, below the next one's it stays."""
+@pytest.mark.parametrize(("coarser", "times"), [(0, 4), (1, 2), (2, 1)])
+def test_the_thresholds_rise_from_level_to_level(data, coarser, times):
+    """tau 2^(beta (l - 1)), Sec. 4.2: below a level's nothing grows, below the next one's it stays.
+
+    Levels for views from farther away than any photograph do not count.
+    """
     for factor, expected in ((0.99, None), (1.01, 0), (2.01, 1)):
         octree = make(
-            data, steps=400, footprint=6.0, coarse_share=0.0, grow_harder=1.0, min_opacity=0.0, max_splats=999
-        )
+            data, steps=400, footprint=6.0, coarse_share=0.0, grow_harder=1.0, min_opacity=0.0,
+            max_splats=999, levels=4, coarser_levels=coarser,
+        )  # fmt: skip
         count, level = len(octree.model), octree.model.columns["level"]
-        some = level == 2
-        threshold = octree.parameters.grad_threshold * data.threshold_scale * 2
+        some = level == 3
+        threshold = octree.parameters.grad_threshold * data.threshold_scale * times
         octree.model.columns["seen"] += 1
         octree.model.columns["gradient_sum"] += threshold * factor * some
         octree._grow_and_prune(200)
         grown = octree.model.columns["level"][count:]
-        assert set(grown.tolist()) == (set() if expected is None else {2.0 + expected})
+        assert set(grown.tolist()) == (set() if expected is None else {3.0 + expected})
+
+
+def test_learning_rates_fall_once_growing_has_ended(data):
+    octree = make(data, steps=100, grow_until=0.6, lr_end=0.01, coarse_share=0.0)
+    for step, share in ((0, 1.0), (60, 1.0), (80, 0.1), (100, 0.01)):  # of 40 steps, in equal factors
+        octree._optimise(step)
+        p, lr = octree.parameters, octree.model.adam.lr
+        assert lr["log_scales"] == pytest.approx(p.lr_scales * share)
+        torch.testing.assert_close(lr["sh"][:2, 0], torch.tensor([p.lr_sh, p.lr_sh / 20]) * share)
 
 
 def test_no_level_grows_into_the_next_before_all_have_joined(data):

@@ -1,13 +1,15 @@
 """Octree-GS with neural anchors: decoding as the papers say, baking against the networks themselves."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from training.methods.data import TrainingData
-from training.methods.octree_neural import Method
+from training.methods.octree_neural import Method, _shapes
 from training.methods.parameters import override, preset
-from training.rasterize import rasterize
+from training.rasterize import contributions, rasterize
 from training.scenes.colmap import read_scene
 
 
@@ -40,9 +42,13 @@ def test_an_anchor_stands_in_the_middle_of_its_voxel(data):
 def test_decoding_is_the_papers(data, changes):
     """One anchor by hand in float64: Scaffold-GS, Sec. 3.2, Gaussian by Gaussian.
 
-    Its own looks are added; shapes that do not change with the view see no direction.
+    Its own looks are added, and then opacity is a sigmoid; shapes that do not change with the view see no
+    direction.
     """
     method, camera = make(data, **changes), data.train[2]
+    direct = method.parameters.direct
+    if direct:
+        method.model["looks"].data[:, 1::2, 0] = -30
     counts = method.decode(camera, torch.arange(len(method.model))).anchor.bincount()
     anchor = int((counts == 2).nonzero()[0])
     g = method.decode(camera, torch.tensor([anchor]))
@@ -59,8 +65,9 @@ def test_decoding_is_the_papers(data, changes):
         return w2 @ np.maximum(w1 @ inputs + b1, 0) + b2
 
     own = model.get("looks", np.zeros((4, 11)))
-    opacity = np.tanh(network(method.networks.opacity) + own[:, 0])
-    shown = np.flatnonzero(opacity > 0)
+    logit = network(method.networks.opacity) + own[:, 0]
+    opacity = 1 / (1 + np.exp(-logit)) if direct else np.tanh(logit)
+    shown = np.flatnonzero(opacity > (1 / 255 if direct else 0))
     assert len(shown) == 2 and g.which.tolist() == shown.tolist()
     looks = (network(method.networks.covariance).reshape(4, 7) + own[:, 1:8])[shown]
     colors = (network(method.networks.color, inputs).reshape(4, 3) + own[:, 8:])[shown]
@@ -73,6 +80,43 @@ def test_decoding_is_the_papers(data, changes):
         "quats": looks[:, 3:],
     }.items():
         np.testing.assert_allclose(getattr(g, name).detach().numpy(), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_anchors_beside_the_image_whose_gaussians_reach_into_it_are_drawn(data):
+    method = make(data)
+    method.model["log_scales"].data -= 2
+    everything = torch.arange(len(method.model))
+    beside = 0
+    for camera in data.train:
+        camera = replace(camera, fx=8 * camera.fx, fy=8 * camera.fy)  # a narrow view
+        visible = method._visible(camera, torch.ones(len(method.model)))
+        with torch.no_grad():
+            all_of_it = method._rasterize(method.decode(camera, everything), camera, None).image
+            drawn = method._rasterize(method.decode(camera, visible), camera, None).image
+        assert (drawn - all_of_it).abs().max() < 1e-5
+        local = method.model["means"][visible].detach().numpy() @ camera.world_to_camera[:3, :3].T
+        x, _, z = (local + camera.world_to_camera[:3, 3]).T
+        beside += np.sum((np.abs(camera.fx * x / z) > 0.6 * camera.width) | (z < 0))
+        assert len(visible) < len(everything)
+    assert beside > 0
+
+
+def test_a_gaussian_that_no_view_sees_much_of_is_never_drawn_again(data):
+    """By hand: the largest blending weight of each, one by one, by the reference of the rasterizer."""
+    method = make(data, least_weight=0.1)
+    for level in range(len(method.joins)):
+        method.joins[level] = 0
+    largest = torch.zeros_like(method.model.columns["seen"])
+    for view, camera in enumerate(data.train):
+        g = method.decode(camera, method._drawn_by(camera), view)
+        found = contributions(*_shapes(g), [camera], near=data.near, backend="reference").largest
+        largest[g.anchor, g.which] = torch.maximum(largest[g.anchor, g.which], found)
+    stay = (largest >= 0.1).any(1)
+    assert 0 < stay.sum() < len(stay)
+    method._review(39)
+    alive = method.model["looks"][..., 0].detach() > -20
+    assert torch.equal(alive, largest[stay] >= 0.1) and not alive.all()
+    assert method.splats == alive.sum()
 
 
 def draw(splats, camera, data):
@@ -167,4 +211,4 @@ def test_new_anchors_come_where_steep_gaussians_are(data):
     assert len(added) > 0
     grown = method.tree.keys(added, method.model.columns["level"][count:].long().numpy())
     assert set(grown) <= set(keys)
-    assert (method.model["offsets"][count:] == 0).all()
+    assert (method.model["offsets"][count:] == method._spread).all()
