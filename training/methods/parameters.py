@@ -117,7 +117,7 @@ class OctreeParameters(Parameters):
     """Quantile that counts as the largest (Octree-GS: d_max), from where on level 1 alone is drawn."""
     coarser_levels: int = 3
     """Levels before those of Eq. 3, for views from farther away than any photograph."""
-    footprint: float = 1.4
+    footprint: float = 1.0
     """Pixels that the voxel of a level covers where the level is just wanted; sets the voxels' size."""
     spread: float = 13.0
     """Voxels of its level that a splat's largest standard deviation may span; wider ones move to a coarser
@@ -126,7 +126,7 @@ class OctreeParameters(Parameters):
     """Anchors that fewer than this share of the views want are dropped; those that none wants always are."""
     steps: int = 4300
     """Training steps."""
-    coarse_share: float = 0.25
+    coarse_share: float = 0.15
     """Share of the steps in which levels join one by one; then anchors also grow into the next level."""
     coarse_factor: float = 1.5
     """How many times longer a level trains alone than the next one (Octree-GS: 1/omega)."""
@@ -134,8 +134,8 @@ class OctreeParameters(Parameters):
     """Steps between two growings."""
     grow_until: float = 0.55
     """Share of the steps after which anchors are no longer added or removed."""
-    least_weight: float = 0.03
-    """Anchors whose largest blending weight in any training view is below this go when growing ends; 0 keeps
+    least_weight: float = 0.025
+    """Splats whose largest blending weight in any training view is below this go when growing ends; 0 keeps
     all. Not in the paper, but in RadSplat."""
     candidates: int = 2
     """Places that each splat with a large gradient proposes in a growing."""
@@ -168,6 +168,7 @@ class NeuralOctreeParameters(OctreeParameters):
     """
 
     footprint: float = 2.0
+    coarse_share: float = 0.25
     least_weight: float = 0.02
     offsets: int = 5
     """Gaussians of an anchor (Octree-GS: 10)."""
@@ -233,13 +234,13 @@ _OCTREE_STANDARD = replace(
     lr_means_final=1.6e-6,
     lr_scales=5e-3,
     lr_sh=2.5e-3,
+    coarse_share=0.25,
     grow_interval=100,
 )
 _OCTREE_PAPER = replace(
     _OCTREE_STANDARD,
     steps=40_000,
     coarser_levels=0,
-    footprint=1.0,
     spread=1e9,
     grow_until=0.625,
     grad_threshold=2e-4,
