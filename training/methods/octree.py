@@ -25,6 +25,8 @@ from .parameters import OctreeParameters
 
 SMALLEST = 32
 """Pixels that the shorter side of a photograph made smaller has at least."""
+FAINT = float(np.log(0.1 / 0.9))
+"""Logit of the opacity that new splats have at most, so that pictures do not change when they come."""
 
 
 class Method(Interface):
@@ -86,7 +88,8 @@ class Method(Interface):
         self._optimise(step)
         if growing and (step + 1) % p.grow_interval == 0:
             self._grow_and_prune(step)
-        if growing and step + 1 >= p.grow_until * p.steps and p.least_weight:
+        grown = growing and step + 1 >= p.grow_until * p.steps
+        if p.least_weight and (grown or step + 1 == p.steps):
             self._review(step)
         if (step + 1) % p.grow_interval == 0 or step + 1 == self.steps:
             self._settle()
@@ -264,7 +267,7 @@ class Method(Interface):
 
     @torch.no_grad()
     def _review(self, step: int) -> None:
-        """Anchors go of which no view, near or far, sees much, by their largest blending weight (RadSplat).
+        """Splats go of which no view, near or far, sees much, by their largest blending weight (RadSplat).
 
         Not in the paper.
         """
@@ -326,7 +329,7 @@ class Method(Interface):
     def _children(
         self, source: torch.Tensor, which: torch.Tensor, level: torch.Tensor, rng: np.random.Generator
     ) -> dict[str, torch.Tensor]:
-        """Rows that anchors propose: a splat's likeness at places drawn from itself, smaller than it.
+        """Rows that anchors propose: a splat's likeness at places drawn from itself, smaller and faint.
 
         Args:
             source, which: (C,) the anchors, and which of their Gaussians has the large gradient.
@@ -338,6 +341,7 @@ class Method(Interface):
         local *= rows["log_scales"].exp()
         rows["means"] += torch.einsum("nij,nj->ni", rotation_matrices(rows["quats"]), local)
         rows["log_scales"] -= float(np.log(1.6))
+        rows["opacity_logits"].clamp_max_(FAINT)
         return rows | {"level": level, "bias": self.model.columns["bias"][source]}
 
     def _free(self, means: torch.Tensor, level: torch.Tensor) -> torch.Tensor:

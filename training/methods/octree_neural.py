@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import hypot, log
+from math import hypot
 
 import numpy as np
 import torch
@@ -30,9 +30,9 @@ from .parameters import NeuralOctreeParameters
 
 HIDDEN = 32
 """Width of each network's one hidden layer."""
-LOOKS, FAINT, SILENT = 11, 0.1, -30.0
-"""Opacity, three scales, a quaternion and a colour, before their activations; the opacity to begin with,
-and the logit of one that is never drawn again."""
+LOOKS, SILENT = 11, -30.0
+"""Opacity, three scales, a quaternion and a colour, before their activations; the opacity of one that is
+never drawn again."""
 SIGMAS = 3.5
 """Standard deviations that a Gaussian may reach into the image from outside."""
 
@@ -263,7 +263,7 @@ class Method(octree.Method):
         }
         if p.direct:
             rows["looks"] = torch.zeros(count, p.offsets, LOOKS, device=places.device)
-            rows["looks"][..., 0], rows["looks"][..., 4] = log(FAINT / (1 - FAINT)), 1
+            rows["looks"][..., 0], rows["looks"][..., 4] = octree.FAINT, 1
             rows["offsets"] += self._spread.to(places)
         return rows
 

@@ -108,6 +108,7 @@ class OctreeParameters(Parameters):
     max_splats: int = 180_000
     """Most splats of all levels together, which add up; FLoD's five levels are over 300,000."""
     grad_threshold: float = 5e-5
+    lr_means: float = 4e-4
     lr_sh: float = 5e-3
     levels: int = 0
     """Number of levels (Octree-GS: K); 0 takes it from the range of distances (Eq. 3)."""
@@ -126,7 +127,7 @@ class OctreeParameters(Parameters):
     """Anchors that fewer than this share of the views want are dropped; those that none wants always are."""
     steps: int = 4300
     """Training steps."""
-    coarse_share: float = 0.15
+    coarse_share: float = 0.25
     """Share of the steps in which levels join one by one; then anchors also grow into the next level."""
     coarse_factor: float = 1.5
     """How many times longer a level trains alone than the next one (Octree-GS: 1/omega)."""
@@ -134,9 +135,9 @@ class OctreeParameters(Parameters):
     """Steps between two growings."""
     grow_until: float = 0.55
     """Share of the steps after which anchors are no longer added or removed."""
-    least_weight: float = 0.025
-    """Splats whose largest blending weight in any training view is below this go when growing ends; 0 keeps
-    all. Not in the paper, but in RadSplat."""
+    least_weight: float = 0.02
+    """Splats whose largest blending weight in any training view is below this go when growing ends and once
+    more at the end; 0 keeps all. Not in the paper, but in RadSplat."""
     candidates: int = 2
     """Places that each splat with a large gradient proposes in a growing."""
     grow_harder: float = 0.2
@@ -144,7 +145,7 @@ class OctreeParameters(Parameters):
     the first level after ``coarser_levels``."""
     bias_rate: float = 0.0025
     """What a level's bias gains in a growing where the gradient is a quarter of the threshold or more."""
-    far_share: float = 0.1
+    far_share: float = 0.05
     """Share of the steps that see a photograph made smaller, as from 2, 4, ... times the distance; if it is
     not 0, so do all steps before the finest level has joined."""
     full_share: float = 0.4
@@ -168,8 +169,7 @@ class NeuralOctreeParameters(OctreeParameters):
     """
 
     footprint: float = 2.0
-    coarse_share: float = 0.25
-    least_weight: float = 0.02
+    far_share: float = 0.1
     offsets: int = 5
     """Gaussians of an anchor (Octree-GS: 10)."""
     features: int = 32
@@ -234,7 +234,6 @@ _OCTREE_STANDARD = replace(
     lr_means_final=1.6e-6,
     lr_scales=5e-3,
     lr_sh=2.5e-3,
-    coarse_share=0.25,
     grow_interval=100,
 )
 _OCTREE_PAPER = replace(

@@ -110,6 +110,19 @@ def test_new_anchors_lie_in_free_voxels_of_their_own_or_the_next_level(data):
     assert (octree.model.columns["bias"][:count] == octree.parameters.bias_rate).all()
 
 
+def test_new_anchors_begin_faint_so_that_pictures_hardly_change(data):
+    octree = make(data, steps=400, footprint=6.0, max_splats=10_000, min_opacity=0.0)
+    octree.model["opacity_logits"].data[::2] = 3.0
+    octree.model["opacity_logits"].data[1::2] = -4.0
+    count = len(octree.model)
+    octree.model.columns["seen"] += 1
+    octree.model.columns["gradient_sum"] += 1
+    octree._grow_and_prune(200)
+    opacity = octree.model["opacity_logits"].detach().sigmoid()
+    assert set(opacity[count:].numpy().round(3)) == {np.float32(0.1), np.float32(0.018)}
+    assert opacity[:count].max() > 0.9
+
+
 @pytest.mark.parametrize(("coarser", "times"), [(0, 4), (1, 2), (2, 1)])
 def test_the_thresholds_rise_from_level_to_level(data, coarser, times):
     """tau 2^(beta (l - 1)), Sec. 4.2: below a level's nothing grows, below the next one's it stays.
