@@ -170,6 +170,7 @@ class NeuralOctreeParameters(OctreeParameters):
 
     footprint: float = 2.0
     far_share: float = 0.1
+    full_share: float = 0.1
     offsets: int = 5
     """Gaussians of an anchor (Octree-GS: 10)."""
     features: int = 32
