@@ -219,15 +219,15 @@ class Method(Interface):
         opacity = self.model["opacity_logits"].detach().sigmoid()
         self.model.columns["opacity_sum"] += torch.where(rendering.radii > 0, opacity, 0)
 
-    def _fall(self, step: int) -> float:
-        """What is left of learning rates at a step: they fall from when growing ends. Not in the paper."""
+    def _fallen_rates(self, step: int) -> dict:
+        """Learning rates at a step, by name: they fall from when growing ends. Not in the paper."""
         p = self.parameters
-        share = (step / self.steps - p.grow_until) / (1 - p.grow_until)
-        return p.lr_end ** max(share, 0.0)
+        after = step / self.steps - p.grow_until
+        fall = p.lr_end ** (after / (1 - p.grow_until)) if after > 0 else 1.0
+        return {name: rate * fall for name, rate in self._rates.items()}
 
     def _optimise(self, step: int) -> None:
-        fall = self._fall(step)
-        self.model.adam.lr = {name: rate * fall for name, rate in self._rates.items()}
+        self.model.adam.lr = self._fallen_rates(step)
         self.model.adam.lr["means"] = means_rate(self.parameters, step / self.steps, self.data.extent)
         self.model.adam.step()
         self.model.adam.zero_grad()

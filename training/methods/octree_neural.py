@@ -278,8 +278,7 @@ class Method(octree.Method):
 
     def _optimise(self, step: int) -> None:
         p, share = self.parameters, step / self.steps
-        fall = self._fall(step)
-        self.model.adam.lr = {name: rate * fall for name, rate in self._rates.items()}
+        self.model.adam.lr = self._fallen_rates(step)
         self.model.adam.lr["offsets"] = p.lr_offsets ** (1 - share) * p.lr_offsets_final**share
         self.model.adam.step()
         self.model.adam.zero_grad()
@@ -327,8 +326,9 @@ class Method(octree.Method):
         """The anchors' Gaussians without networks, with the level and bias of their anchors.
 
         Opacity and covariance are those of the median, by distance, of the training views that draw the
-        anchor; the colour is the spherical harmonics that fit best, in least squares weighted by opacity,
-        what the networks say in all of those views. Gaussians of no opacity in the median view are left out.
+        anchor; the colour is the spherical harmonics that fit best, in least squares weighted by how much
+        of the Gaussian is seen, what the networks say in all of those views. Gaussians of no opacity in the
+        median view are left out.
         """
         p, count = self.parameters, len(self.model)
         places, columns, terms = self.model["means"], self.model.columns, harmonics.coefficients(p.sh_degree)
@@ -354,6 +354,7 @@ class Method(octree.Method):
             harmonics.basis(x, y, z, p.sh_degree, basis)
             values = torch.stack(basis, 1)
             seen = contributions(*_shapes(g), [camera], near=self.data.near, backend=self.backend)
+            # what is hidden in every view has a colour too
             weighted = values * (seen.largest + 1e-3 * g.opacities)[:, None]
             products[g.anchor, g.which] += weighted[:, :, None] * values[:, None]
             colors[g.anchor, g.which] += weighted[:, :, None] * (g.colors - 0.5)[:, None]

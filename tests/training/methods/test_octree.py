@@ -153,6 +153,20 @@ def test_learning_rates_fall_once_growing_has_ended(data):
         torch.testing.assert_close(lr["sh"][:2, 0], torch.tensor([p.lr_sh, p.lr_sh / 20]) * share)
 
 
+def test_learning_rates_stay_where_growing_lasts_to_the_end(data):
+    octree = make(data, steps=100, grow_until=1.0, lr_end=0.01)
+    octree._optimise(99)
+    assert octree.model.adam.lr["log_scales"] == octree.parameters.lr_scales
+
+
+def test_what_no_view_sees_is_looked_for_when_growing_ends_and_at_the_end(data, monkeypatch):
+    octree, reviewed = make(data, steps=12, grow_until=0.5, grow_interval=3), []
+    monkeypatch.setattr(octree, "_review", reviewed.append)
+    for step in range(12):
+        octree.train_step(step)
+    assert reviewed == [5, 11]
+
+
 def test_no_level_grows_into_the_next_before_all_have_joined(data):
     octree = make(data, steps=400, footprint=6.0, coarse_share=0.9, max_splats=10_000, min_opacity=0.0)
     count, levels = len(octree.model), octree.model.columns["level"].clone()

@@ -102,10 +102,9 @@ def test_anchors_beside_the_image_whose_gaussians_reach_into_it_are_drawn(data):
 
 
 def test_a_gaussian_that_no_view_sees_much_of_is_never_drawn_again(data):
-    """By hand: the largest blending weight of each, one by one, by the reference of the rasterizer."""
+    """Against the largest blending weights of another rasterizer, the reference."""
     method = make(data, least_weight=0.1)
-    for level in range(len(method.joins)):
-        method.joins[level] = 0
+    method.joins = [0] * len(method.joins)
     largest = torch.zeros_like(method.model.columns["seen"])
     for view, camera in enumerate(data.train):
         g = method.decode(camera, method._drawn_by(camera), view)
@@ -211,4 +210,6 @@ def test_new_anchors_come_where_steep_gaussians_are(data):
     assert len(added) > 0
     grown = method.tree.keys(added, method.model.columns["level"][count:].long().numpy())
     assert set(grown) <= set(keys)
-    assert (method.model["offsets"][count:] == method._spread).all()
+    apart = method.model["offsets"][count:].detach()
+    assert (apart.abs() <= 0.5).all()  # in their voxel, no two in one place
+    assert all(len(places.unique(dim=0)) == 4 for places in apart)
