@@ -15,7 +15,7 @@ help:
 	@echo "make lint       style and types"
 	@echo "make bench      how fast it is, as ratios from one run"
 	@echo "make extension  dist/lodgs-VERSION.zip, checked by Blender"
-	@echo "make window     a tour in a real Blender window, with pictures (needs Blender, Xvfb, ImageMagick)"
+	@echo "make window     a tour in a real Blender window, with pictures (METHOD=flod; needs Blender, Xvfb, ImageMagick)"
 	@echo "make interop    other programs read our files (needs Node)"
 
 setup:
@@ -48,7 +48,7 @@ extension: setup
 	$(VENV) tools/extension.py
 
 window: setup
-	$(VENV) tools/window.py $(if $(LONG),--long)
+	$(VENV) tools/window.py --method $(METHOD) $(if $(LONG),--long)
 
 interop: setup
 	$(VENV) tools/interop.py

@@ -25,6 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from tools import extension  # noqa: E402
+from training.methods.parameters import METHODS  # noqa: E402
 from training.runs.folder import RunFolder  # noqa: E402
 
 SIZE = (1280, 800)
@@ -36,6 +37,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="tour the extension in a real Blender window")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "window")
     parser.add_argument("--scene", type=Path, default=ROOT / "examples" / "lantern_garden")
+    with_levels = [method for method in METHODS if method != "3dgs"]
+    parser.add_argument("--method", choices=with_levels, default="flod")
     parser.add_argument("--long", action="store_true", help="train for some minutes: for pictures to show")
     chosen = parser.parse_args()
     blender, x_server, camera = find_programs()
@@ -52,6 +55,7 @@ def main() -> int:
         "scene": str(chosen.scene.resolve()),
         "out": str(out),
         "run": str(out / "run"),
+        "method": chosen.method,
         "long": chosen.long,
         "camera": [camera, "-window", "root"],
     }

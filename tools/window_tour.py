@@ -24,12 +24,16 @@ from mathutils import Matrix, Vector
 LODGS = "bl_ext.user_default.lodgs"
 PLAN = json.loads(sys.argv[-1])
 OUT = Path(PLAN["out"])
-TRAINING = {
+METHOD = PLAN["method"]
+OCTREE = METHOD.startswith("octree")
+_TINY = {"max_splats": 20_000, "sh_interval": 100}
+_OF_FLOD = {
     "levels": 3, "steps": (60, 90, 250), "densify_until": (0.5,) * 3, "densify_interval": (20,) * 3,
-    "max_splats": 20_000, "budget_ratio": 0.35, "footprint": 8.0, "sh_interval": 100,
+    "budget_ratio": 0.35, "footprint": 8.0,
 }  # fmt: skip
-"""What makes a tiny job of FLoD's draft."""
-LONGER = {"steps": (150, 250, 300, 450, 1000), "max_splats": 60_000}
+TRAINING = _TINY | ({"steps": 1000} if OCTREE else _OF_FLOD)
+"""What makes a tiny job of the method's draft."""
+LONGER = {"steps": 3000 if OCTREE else (150, 250, 300, 450, 1000), "max_splats": 60_000}
 """What makes half of it: minutes."""
 
 Steps = Iterator[float]
@@ -98,19 +102,29 @@ def bring_in() -> Iterator[float]:
 
 def train(root: bpy.types.Object) -> Steps:
     jobs = module("jobs")
+    root.lodgs.training.method = METHOD
     watch = jobs.start(root, PLAN["run"], LONGER if PLAN["long"] else TRAINING)
     jobs.follow(watch)
-    yield from until(
-        lambda: not watch.running or len(watch.levels) == watch.progress.get("levels", 0) - 1, 900
-    )
-    assert watch.running and root.lodgs.levels, f"Levels do not come one by one: {watch.problem}"
+
+    def early() -> bool:  # all levels of an octree come together, those of others one by one
+        return 0 < len(watch.levels) == watch.progress["levels"] - (not OCTREE)
+
+    yield from until(lambda: not watch.running or early(), 900)
+    assert watch.running and root.lodgs.levels, f"No level comes while others train: {watch.problem}"
     yield from settle()
     take("training", f"level {len(root.lodgs.levels)} is there while level {watch.progress['level']} trains")
+    press("lodgs.cancel_training")
+    yield from until(lambda: not watch.running, 120)
+    yield from settle()
+    assert (watch.state, watch.problem) == ("cancelled", ""), watch.problem
+    take("cancelled", watch.message)
+    press("lodgs.resume_training")
+    watch = jobs.watch_of(root)
     yield from until(lambda: not watch.running, 1200)
     yield from settle()
     assert watch.state == "done", watch.problem or watch.message
     assert len(root.lodgs.levels) == watch.progress["levels"], "Not all levels came."
-    counts = [len(item.object.data.points) for item in root.lodgs.levels]
+    counts = drawn(root)
     assert counts[-1] > counts[0], f"The finest level should have more splats: {counts}"
     take("trained", f"{len(counts)} levels of {', '.join(f'{n:,}' for n in counts)} splats")
 
@@ -124,7 +138,7 @@ def levels(root: bpy.types.Object) -> Steps:
         press("lodgs.show_only_level", level=number)
         yield from settle()
         shown, _ = module("scenes").count_shown(bpy.context, root)
-        assert shown == len(root.lodgs.levels[number - 1].object.data.points), f"{shown} splats are shown."
+        assert shown == drawn(root)[number - 1], f"{shown} splats are shown."
         pictures[number] = take(f"level-{number}", f"{shown:,} splats")
     assert changed(pictures[1], pictures[finest]) > 0.2, "Level 1 looks like the finest level."
     settings.splats = False
@@ -138,7 +152,11 @@ def levels(root: bpy.types.Object) -> Steps:
 
 
 def distances(root: bpy.types.Object) -> Steps:
-    root.lodgs.mode, root.lodgs.gamma = "SELECTIVE", 2.0
+    root.lodgs.mode = "SELECTIVE"
+    if OCTREE:
+        root.lodgs.level_offset = -1.0
+    else:
+        root.lodgs.gamma = 2.0
     scroll(20)
     yield from settle()
     shown, everything = module("scenes").count_shown(bpy.context, root)
@@ -243,6 +261,12 @@ def overlays() -> Steps:
     press("wm.call_panel", name="VIEW3D_PT_overlay", keep_open=True)
     yield from settle()
     take("overlays")
+
+
+def drawn(root: bpy.types.Object) -> list[int]:
+    """How many splats each level shows alone; those of an octree add up."""
+    counts = np.array([len(item.object.data.points) for item in root.lodgs.levels])
+    return (counts.cumsum() if OCTREE else counts).tolist()
 
 
 # -- hands and eyes ----------------------------------------------------------------------------------------

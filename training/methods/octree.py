@@ -52,8 +52,8 @@ class Method(Interface):
         level = octree.anchors(points, self.tree)
         chosen = np.flatnonzero(level > 0)
         chosen = chosen[self._worth_having(points[chosen], level[chosen])]
-        if len(chosen) > p.max_splats:
-            chosen = np.sort(np.random.default_rng(seed).choice(chosen, p.max_splats, replace=False))
+        if len(chosen) > self._room():
+            chosen = np.sort(np.random.default_rng(seed).choice(chosen, self._room(), replace=False))
         self.model = self._first_model(points[chosen], colors[chosen], level[chosen])
         self._rates = dict(self.model.adam.lr)
 
@@ -92,7 +92,7 @@ class Method(Interface):
         if p.least_weight and (grown or step + 1 == p.steps):
             self._review(step)
         if (step + 1) % p.grow_interval == 0 or step + 1 == self.steps:
-            self._settle()
+            self._settle(step)
         return float(loss.detach()), rendering.image.detach(), target
 
     def levels_after(self, step: int) -> list[Level]:
@@ -248,10 +248,10 @@ class Method(Interface):
         threshold = (p.grad_threshold * self.data.threshold_scale * rising)[:, None]
         target = level[:, None].expand_as(gradient)
         if step >= p.coarse_share * p.steps:
-            target = target + (gradient >= threshold * harder)
+            target = (target + (gradient >= threshold * harder)).clamp_max(self.levels)
             columns["bias"] += p.bias_rate * (gradient >= 0.25 * threshold).any(1)
 
-        source, which = torch.nonzero((gradient >= threshold) & (target <= self.levels)).unbind(1)
+        source, which = torch.nonzero(gradient >= threshold).unbind(1)
         order = torch.argsort(gradient[source, which], descending=True, stable=True)
         source, which = source[order], which[order]
         rng = np.random.default_rng([self.seed, step, 1])
@@ -303,19 +303,27 @@ class Method(Interface):
             backend=self.backend,
         ).largest
 
-    def _settle(self) -> None:
-        """Splats that have become too wide for their level move to the coarser one that they fit.
+    def _settle(self, step: int) -> None:
+        """Splats that have become too wide or too narrow for their level move to one that they fit.
 
-        From far away they are seen long after their level is no longer wanted. Not in the paper.
+        Wide ones would be seen from farther away than their level is drawn, narrow ones would be drawn from
+        where they are not seen. Not in the paper.
         """
         columns = self.model.columns
-        columns["level"] = self._fitting(columns["level"], self.model["log_scales"].detach())
+        log_scales = self.model["log_scales"].detach()
+        columns["level"] = self._fitting(columns["level"], log_scales, self.level_at(step))
 
-    def _fitting(self, level: torch.Tensor, log_scales: torch.Tensor) -> torch.Tensor:
-        """The finest level (N,), at most the given one, for splats whose scales have these logs (N, 3)."""
-        widest = log_scales.amax(1) / float(np.log(2))
-        fitting = (1 + float(np.log2(self.parameters.spread * self.tree.voxel)) - widest).floor()
-        return torch.minimum(level, fitting.clamp_min(1))
+    def _fitting(self, level: torch.Tensor, log_scales: torch.Tensor, newest: int) -> torch.Tensor:
+        """The level nearest to the given one (N,) for splats whose scales have these logs (N, 3).
+
+        Narrow ones move to ``newest`` at most, and to the first level that photographs want at most: so
+        photographs are drawn as before.
+        """
+        p, pixel = self.parameters, self.tree.d_max / self.tree.focal_px  # at level 1's distance
+        width = log_scales.amax(1).sub(float(np.log(pixel))) / float(np.log(2))
+        finer, coarser = (1 + torch.tensor(limit).log2() - width for limit in (p.narrowest, p.widest))
+        level = torch.maximum(level, finer.ceil().clamp_max(min(newest, p.coarser_levels + 1)))
+        return torch.minimum(level, coarser.floor().clamp_min(1))
 
     def _room(self) -> int:
         """Most anchors."""

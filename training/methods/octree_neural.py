@@ -297,7 +297,7 @@ class Method(octree.Method):
         super()._grow_and_prune(step)
         self.model.columns["anchor_seen"].zero_()
 
-    def _settle(self) -> None:
+    def _settle(self, step: int) -> None:
         """Nothing: an anchor's level is its voxel's; that of its Gaussians is found when they are baked."""
 
     def _room(self) -> int:
@@ -371,7 +371,7 @@ class Method(octree.Method):
         fitted = torch.linalg.solve(products.double(), colors.double()).float()
         anchor = torch.nonzero(kept)[:, 0]
         log_scales = scales[kept].clamp_min(1e-12).log()
-        level = self._fitting(columns["level"][anchor], log_scales)
+        level = self._fitting(columns["level"][anchor], log_scales, self.levels)
         return Splats(
             means=means[kept].cpu().numpy(),
             quats=quats[kept].cpu().numpy(),

@@ -120,9 +120,11 @@ class OctreeParameters(Parameters):
     """Levels before those of Eq. 3, for views from farther away than any photograph."""
     footprint: float = 1.0
     """Pixels that the voxel of a level covers where the level is just wanted; sets the voxels' size."""
-    spread: float = 13.0
-    """Voxels of its level that a splat's largest standard deviation may span; wider ones move to a coarser
-    level."""
+    narrowest: float = 1.0
+    """Pixels that a splat's largest standard deviation covers at least where its level is just wanted;
+    narrower splats move to a finer level, up to the first one after ``coarser_levels``."""
+    widest: float = 26.0
+    """Pixels that it covers at most; wider splats move to a coarser level."""
     visible_share: float = 0.0
     """Anchors that fewer than this share of the views want are dropped; those that none wants always are."""
     steps: int = 4300
@@ -241,7 +243,8 @@ _OCTREE_PAPER = replace(
     _OCTREE_STANDARD,
     steps=40_000,
     coarser_levels=0,
-    spread=1e9,
+    narrowest=0.0,
+    widest=1e9,
     grow_until=0.625,
     grad_threshold=2e-4,
     max_splats=5_000_000,
@@ -266,7 +269,8 @@ _PRESETS = {
             grow_interval=100,
             coarser_levels=0,
             footprint=1.0,
-            spread=1e9,
+            narrowest=0.0,
+            widest=1e9,
             grow_until=0.625,
             grad_threshold=2e-4,
             far_share=0.0,

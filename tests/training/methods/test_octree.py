@@ -110,6 +110,17 @@ def test_new_anchors_lie_in_free_voxels_of_their_own_or_the_next_level(data):
     assert (octree.model.columns["bias"][:count] == octree.parameters.bias_rate).all()
 
 
+def test_steep_splats_of_the_finest_level_grow_in_it(data):
+    octree = make(data, steps=400, coarse_share=0.0, max_splats=10_000, min_opacity=0.0)
+    octree.model.columns["level"][:] = 4
+    count = len(octree.model)
+    octree.model.columns["seen"] += 1
+    octree.model.columns["gradient_sum"] += 1
+    octree._grow_and_prune(200)
+    assert len(octree.model) > count
+    assert (octree.model.columns["level"][count:] == 4).all()
+
+
 def test_new_anchors_begin_faint_so_that_pictures_hardly_change(data):
     octree = make(data, steps=400, footprint=6.0, max_splats=10_000, min_opacity=0.0)
     octree.model["opacity_logits"].data[::2] = 3.0
@@ -226,15 +237,32 @@ def test_an_impossible_least_weight_says_so(data):
         make(data, least_weight=1.5)._review(39)
 
 
-def test_what_is_too_wide_for_its_level_moves_to_the_coarser_one_that_it_fits(data):
-    octree = make(data, spread=2.0)
-    octree.model.columns["level"][:] = 4
-    octree.model.columns["level"][3] = 2
-    voxels = torch.tensor([1 / 8, 1 / 3, 1.1, 1 / 8])  # of level 1; those of level 4 are an eighth of it
-    octree.model["log_scales"].detach()[:4] = (2 * octree.tree.voxel * voxels).log()[:, None] - torch.tensor(
+@pytest.mark.parametrize(("coarser", "finest"), [(3, 4), (1, 2)])
+def test_what_is_too_narrow_moves_finer_up_to_the_first_level_that_photographs_want(data, coarser, finest):
+    octree = make(data, narrowest=0.5, widest=8.0, coarse_share=0.5, coarser_levels=coarser)
+    level = octree.model.columns["level"]
+    level[:], level[1], level[3] = 1, 2, 4
+    pixel = octree.tree.d_max / octree.tree.focal_px  # where level 1 is just wanted; level 4's is an eighth
+    widths = torch.tensor([0.5 / 4 * 1.01, 0.5 / 4 * 0.99, 0.51, 0.01])
+    octree.model["log_scales"].detach()[:4] = (pixel * widths).log()[:, None] - torch.tensor(
         [1.0, 0.001, 3.0]  # only the widest counts
     )
-    octree._settle()
+    for step, newest in ((octree.joins[-1] - 1, 3), (octree.joins[-1], 4)):
+        octree._settle(step)
+        fitting = [min(3, finest), min(newest, finest), 1, 4]
+        assert octree.model.columns["level"][:4].tolist() == fitting
+
+
+def test_what_is_too_wide_for_its_level_moves_to_the_coarser_one_that_it_fits(data):
+    octree = make(data, narrowest=0.0, widest=2.0)
+    octree.model.columns["level"][:] = 4
+    octree.model.columns["level"][3] = 2
+    pixel = octree.tree.d_max / octree.tree.focal_px  # where level 1 is just wanted; level 4's is an eighth
+    widths = torch.tensor([1 / 8, 1 / 3, 1.1, 1 / 8])
+    octree.model["log_scales"].detach()[:4] = (2 * pixel * widths).log()[:, None] - torch.tensor(
+        [1.0, 0.001, 3.0]  # only the widest counts
+    )
+    octree._settle(0)
     assert octree.model.columns["level"][:4].tolist() == [4, 2, 1, 2]
 
 

@@ -38,6 +38,11 @@ def test_an_anchor_stands_in_the_middle_of_its_voxel(data):
     np.testing.assert_allclose(cells % 1, 0.5, atol=1e-4)
 
 
+def test_there_are_no_more_gaussians_than_asked_for_from_the_start(data):
+    assert len(make(data).model) > 10
+    assert len(make(data, max_splats=43, offsets=4).model) == 10
+
+
 @pytest.mark.parametrize("changes", [{"direct": False}, {}, {"view_shapes": False}])
 def test_decoding_is_the_papers(data, changes):
     """One anchor by hand in float64: Scaffold-GS, Sec. 3.2, Gaussian by Gaussian.
@@ -203,7 +208,7 @@ def test_new_anchors_come_where_steep_gaussians_are(data):
     columns["seen"] += 1
     columns["gradient_sum"][:, 1] += 1  # one of each anchor's four
     places = method.model["means"] + method.model["offsets"][:, 1] * method.model["log_scales"].exp()[:, :3]
-    level = (columns["level"] + 1).clamp_max(99)
+    level = (columns["level"] + 1).clamp_max(method.levels)
     keys = method.tree.keys(places.detach().double().numpy(), level.long().numpy())
     method._grow_and_prune(200)
     added = method.model["means"][count:].detach().double().numpy()
