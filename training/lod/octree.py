@@ -12,7 +12,10 @@ from math import floor, log2
 
 import numpy as np
 
+from ..errors import LodgsError
 from ..scenes.cameras import Camera
+
+MOST_LEVELS = 12
 
 
 @dataclass(frozen=True)
@@ -77,12 +80,19 @@ def build(
         focal_px: focal length in pixels to which distances are scaled.
         footprint: pixels that a level's voxel covers at d_max / 2^(l - 1), where the level is just wanted.
         quantiles: of the distances between views and what they see: d_min and d_max.
-        levels: how many; 0 for floor(log2(d_max / d_min)) + 1 (Eq. 3) and ``coarser``.
+        levels: how many; 0 for floor(log2(d_max / d_min)) + 1 (Eq. 3) and ``coarser``, MOST_LEVELS at most.
         coarser: how many levels of those lie beyond d_max.
+
+    Raises:
+        LodgsError: if no view sees a point.
     """
     distances = np.concatenate(view_distances(points, cameras, focal_px))
+    if not len(distances):
+        raise LodgsError(
+            "No training view sees any of the scene's points.", "Check that both are of one model."
+        )
     d_min, d_max = np.quantile(distances, quantiles)
-    levels = levels or floor(log2(d_max / d_min)) + 1 + coarser
+    levels = levels or min(floor(log2(d_max / d_min)) + 1 + coarser, MOST_LEVELS)
     coarser = min(coarser, levels - 1)
     d_max = float(d_max) * 2**coarser
     return Octree(levels, d_max, focal_px, footprint * d_max / focal_px, points.min(axis=0) - 1e-6)

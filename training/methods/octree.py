@@ -16,6 +16,7 @@ from ..lod.rules import octree_wanted, octree_weights
 from ..lod.selection import BIAS
 from ..rasterize import Rendering, Target, contributions, device_of, photometric_loss, rasterize
 from ..rasterize.features import rotation_matrices
+from ..rasterize.rendering import ALPHA_MIN
 from ..scenes.cameras import Camera
 from ..splats.bundle import Level
 from . import Method as Interface
@@ -52,6 +53,10 @@ class Method(Interface):
         level = octree.anchors(points, self.tree)
         chosen = np.flatnonzero(level > 0)
         chosen = chosen[self._worth_having(points[chosen], level[chosen])]
+        if not len(chosen):
+            raise LodgsError(
+                "No point of the scene is wanted by enough views.", "Lower 'visible_share' to keep more."
+            )
         if len(chosen) > self._room():
             chosen = np.sort(np.random.default_rng(seed).choice(chosen, self._room(), replace=False))
         self.model = self._first_model(points[chosen], colors[chosen], level[chosen])
@@ -83,7 +88,7 @@ class Method(Interface):
         self._regularised(loss, rendering).backward()
         growing = step < p.grow_until * p.steps
         if growing and (shrink == 1 or step < self.joins[-1]):
-            rendering.grad2d /= shrink  # the gradients of smaller pictures are larger
+            rendering.grad2d /= shrink  # as TrainingData.threshold_scale has it for smaller photographs
             self._remember(rendering)
         self._optimise(step)
         if growing and (step + 1) % p.grow_interval == 0:
@@ -309,20 +314,26 @@ class Method(Interface):
         Wide ones would be seen from farther away than their level is drawn, narrow ones would be drawn from
         where they are not seen. Not in the paper.
         """
-        columns = self.model.columns
-        log_scales = self.model["log_scales"].detach()
-        columns["level"] = self._fitting(columns["level"], log_scales, self.level_at(step))
+        columns, newest = self.model.columns, self.level_at(step)
+        means, log_scales = self.model["means"].detach(), self.model["log_scales"].detach()
+        columns["level"] = self._fitting(columns["level"], means, log_scales, newest)
 
-    def _fitting(self, level: torch.Tensor, log_scales: torch.Tensor, newest: int) -> torch.Tensor:
-        """The level nearest to the given one (N,) for splats whose scales have these logs (N, 3).
+    def _fitting(
+        self, level: torch.Tensor, means: torch.Tensor, log_scales: torch.Tensor, newest: int
+    ) -> torch.Tensor:
+        """The level (N,) nearest to the given one for splats at places (N, 3), with logs of scales (N, 3).
 
-        Narrow ones move to ``newest`` at most, and to the first level that photographs want at most: so
-        photographs are drawn as before.
+        Narrow ones move to ``newest`` at most, and to a level that photographs want there: so these are drawn
+        as before.
         """
         p, pixel = self.parameters, self.tree.d_max / self.tree.focal_px  # at level 1's distance
         width = log_scales.amax(1).sub(float(np.log(pixel))) / float(np.log(2))
         finer, coarser = (1 + torch.tensor(limit).log2() - width for limit in (p.narrowest, p.widest))
-        level = torch.maximum(level, finer.ceil().clamp_max(min(newest, p.coarser_levels + 1)))
+        finer = torch.maximum(level, finer.ceil().clamp_max(min(newest, p.coarser_levels + 1)))
+        narrow = torch.nonzero(finer > level)[:, 0]
+        wanted = self._worth_having(means[narrow].double().cpu().numpy(), finer[narrow].cpu().numpy())
+        narrow = narrow[torch.from_numpy(wanted).to(narrow.device)]
+        level = level.index_copy(0, narrow, finer[narrow])
         return torch.minimum(level, coarser.floor().clamp_min(1))
 
     def _room(self) -> int:
@@ -330,9 +341,10 @@ class Method(Interface):
         return self.parameters.max_splats
 
     def _faint(self) -> torch.Tensor:
-        """Anchors (N,) whose opacity was too low on average in the views that drew them."""
-        columns = self.model.columns
-        return columns["opacity_sum"] < self.parameters.min_opacity * columns["seen"]
+        """Anchors (N,) whose opacity was too low on average in the views that drew them, or is for any."""
+        columns, opacity = self.model.columns, self.model["opacity_logits"].detach().sigmoid()
+        low = columns["opacity_sum"] < self.parameters.min_opacity * columns["seen"]
+        return low | (opacity < min(self.parameters.min_opacity, ALPHA_MIN))
 
     def _children(
         self, source: torch.Tensor, which: torch.Tensor, level: torch.Tensor, rng: np.random.Generator

@@ -20,6 +20,7 @@ from ..lod.rules import octree_weights
 from ..lod.selection import BIAS
 from ..rasterize import Adam, Rendering, contributions, rasterize
 from ..rasterize import sh as harmonics
+from ..rasterize.rendering import ALPHA_MIN
 from ..scenes.cameras import Camera
 from ..splats.bundle import Level
 from ..splats.gaussians import Splats
@@ -35,6 +36,8 @@ LOOKS, SILENT = 11, -30.0
 never drawn again."""
 SIGMAS = 3.5
 """Standard deviations that a Gaussian may reach into the image from outside."""
+SOLVED_AT_ONCE = 100_000
+"""Gaussians whose colours baking fits together: a few hundred megabytes."""
 
 
 @dataclass
@@ -152,7 +155,7 @@ class Method(octree.Method):
         own = model["looks"][anchors] if p.direct else seen.new_zeros(1, 1, LOOKS)
         opacity = self.networks.opacity(still) + own[..., 0]
         # tanh as in the paper: Gaussians below 0 are not drawn, and so never learn again
-        opacity, least = (opacity.sigmoid(), 1 / 255) if p.direct else (opacity.tanh(), 0.0)
+        opacity, least = (opacity.sigmoid(), ALPHA_MIN) if p.direct else (opacity.tanh(), 0.0)
         index, which = torch.nonzero(opacity.detach() > least).unbind(1)
 
         looks = (self.networks.covariance(still).view(-1, p.offsets, 7) + own[..., 1:8])[index, which]
@@ -174,7 +177,8 @@ class Method(octree.Method):
 
     def _draw(self, camera: Camera, weights: torch.Tensor, step: int) -> Rendering:
         view = self.data.training_view(step, self.seed)
-        self._drawn = self.decode(camera, self._visible(camera, weights), view)
+        self._shown = self._visible(camera, weights)
+        self._drawn = self.decode(camera, self._shown, view)
         return self._rasterize(self._drawn, camera, None)
 
     def picture(self, camera: Camera) -> torch.Tensor:
@@ -274,7 +278,7 @@ class Method(octree.Method):
         columns["gradient_sum"].view(-1)[flat] += rendering.grad2d.norm(dim=1)[seen]
         columns["seen"].view(-1)[flat] += 1
         columns["opacity_sum"].index_add_(0, drawn.anchor, drawn.opacities.detach())
-        columns["anchor_seen"][drawn.anchor.unique()] += 1
+        columns["anchor_seen"][self._shown] += 1
 
     def _optimise(self, step: int) -> None:
         p, share = self.parameters, step / self.steps
@@ -323,12 +327,12 @@ class Method(octree.Method):
 
     @torch.no_grad()
     def bake(self) -> Splats:
-        """The anchors' Gaussians without networks, with the level and bias of their anchors.
+        """The anchors' Gaussians without networks, with their anchor's bias and a level that they fit.
 
         Opacity and covariance are those of the median, by distance, of the training views that draw the
         anchor; the colour is the spherical harmonics that fit best, in least squares weighted by how much
-        of the Gaussian is seen, what the networks say in all of those views. Gaussians of no opacity in the
-        median view are left out.
+        of the Gaussian is seen, what the networks say in all of those views, with the mean appearance.
+        Gaussians of no opacity in the median view are left out.
         """
         p, count = self.parameters, len(self.model)
         places, columns, terms = self.model["means"], self.model.columns, harmonics.coefficients(p.sh_degree)
@@ -348,7 +352,7 @@ class Method(octree.Method):
         opacities = zeros(p.offsets)
         products, colors = zeros(p.offsets, terms, terms), zeros(p.offsets, terms, 3)
         for view, camera in enumerate(self.data.train):
-            g = self.decode(camera, torch.nonzero(~distances[view].isnan())[:, 0], view)
+            g = self.decode(camera, torch.nonzero(~distances[view].isnan())[:, 0])
             x, y, z = normalize(g.means - torch.as_tensor(camera.center).to(places), dim=1).unbind(1)
             basis: list = [None] * terms
             harmonics.basis(x, y, z, p.sh_degree, basis)
@@ -363,21 +367,23 @@ class Method(octree.Method):
             means[at], quats[at], scales[at] = g.means[here], g.quats[here], g.scales[here]
             opacities[at] = g.opacities[here]
         kept = opacities > 0
-        products, colors = products[kept], colors[kept]
+        anchor, which = torch.nonzero(kept).unbind(1)
         # few directions leave the higher harmonics open: they are held to zero
-        held = torch.full((terms,), p.bake_ridge, device=self.device)
-        held[0] = 1e-3 * p.bake_ridge
-        products += held.diag() * (products[:, :1, :1] / SH_C0**2)
-        fitted = torch.linalg.solve(products.double(), colors.double()).float()
-        anchor = torch.nonzero(kept)[:, 0]
+        held = torch.full((terms,), p.bake_ridge, device=self.device).double()
+        held[0] *= 1e-3
+        fitted = []
+        for some in torch.arange(len(anchor), device=self.device).split(SOLVED_AT_ONCE):
+            product = products[anchor[some], which[some]].double()
+            product += held.diag() * (product[:, :1, :1] / SH_C0**2)
+            fitted.append(torch.linalg.solve(product, colors[anchor[some], which[some]].double()).float())
         log_scales = scales[kept].clamp_min(1e-12).log()
-        level = self._fitting(columns["level"][anchor], log_scales, self.levels)
+        level = self._fitting(columns["level"][anchor], means[kept], log_scales, self.levels)
         return Splats(
             means=means[kept].cpu().numpy(),
             quats=quats[kept].cpu().numpy(),
             log_scales=log_scales.cpu().numpy(),
             opacity_logits=opacities[kept].clamp(1e-6, 1 - 1e-6).logit().cpu().numpy(),
-            sh=fitted.cpu().numpy(),
+            sh=torch.cat(fitted).cpu().numpy(),
             extras={
                 "lod_level": level.cpu().numpy().astype(np.uint8),
                 BIAS: columns["bias"][anchor].cpu().numpy(),

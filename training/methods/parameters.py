@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from math import inf, isfinite
 
 from ..errors import LodgsError
+from ..lod.octree import MOST_LEVELS
 
 PRESETS = {
     "draft": "Minutes on two processor cores: a first look",
@@ -120,7 +122,7 @@ class OctreeParameters(Parameters):
     """Levels before those of Eq. 3, for views from farther away than any photograph."""
     footprint: float = 1.0
     """Pixels that the voxel of a level covers where the level is just wanted; sets the voxels' size."""
-    narrowest: float = 1.0
+    narrowest: float = 0.8
     """Pixels that a splat's largest standard deviation covers at least where its level is just wanted;
     narrower splats move to a finer level, up to the first one after ``coarser_levels``."""
     widest: float = 26.0
@@ -136,7 +138,7 @@ class OctreeParameters(Parameters):
     grow_interval: int = 50
     """Steps between two growings."""
     grow_until: float = 0.55
-    """Share of the steps after which anchors are no longer added or removed."""
+    """Share of the steps after which anchors are no longer added, nor removed but at the end."""
     least_weight: float = 0.02
     """Splats whose largest blending weight in any training view is below this go when growing ends and once
     more at the end; 0 keeps all. Not in the paper, but in RadSplat."""
@@ -167,12 +169,15 @@ class OctreeParameters(Parameters):
 class NeuralOctreeParameters(OctreeParameters):
     """Parameters of Octree-GS with neural anchors. The defaults are the draft's.
 
-    ``max_splats`` is of Gaussians, ``lr_scales`` of the anchors' extents; harmonics are those of baking.
+    ``max_splats`` is of Gaussians, ``min_opacity`` of the sum over an anchor's Gaussians, ``lr_scales`` of
+    the anchors' extents; harmonics are those of baking. Without use here: ``candidates``, ``sh_interval`` and
+    the learning rates of means, quaternions, opacities and harmonics.
     """
 
     footprint: float = 2.0
     far_share: float = 0.1
     full_share: float = 0.1
+    least_weight: float = 0.03
     offsets: int = 5
     """Gaussians of an anchor (Octree-GS: 10)."""
     features: int = 32
@@ -192,7 +197,8 @@ class NeuralOctreeParameters(OctreeParameters):
     """Learning rate of the Gaussians' offsets, which are in units of their anchor's extent."""
     lr_offsets_final: float = 1e-4
     lr_looks: float = 1e-2
-    """Learning rate of Gaussians' own scales and colours; opacities take twice, quaternions a fifth of it."""
+    """Learning rate of Gaussians' own scales and colours; opacities take five times, quaternions a
+    fifth of it."""
     lr_network: float = 2e-3
     """Learning rate of the opacity's network; the covariance's has twice, the colour's four times as much."""
     lr_network_final: float = 0.01
@@ -201,6 +207,20 @@ class NeuralOctreeParameters(OctreeParameters):
     bake_ridge: float = 0.001
     """How firmly baking holds the higher harmonics to zero."""
 
+
+_MOST = {"sh_degree": 3} | dict.fromkeys(
+    (
+        "min_opacity", "ssim_weight", "densify_until", "budget_ratio", "nearest", "farthest", "visible_share",
+        "coarse_share", "grow_until", "least_weight", "far_share", "full_share", "lr_end", "lr_network_final",
+    ),
+    1,
+)  # fmt: skip
+"""Largest possible values."""
+_ABOVE_ZERO = {
+    "max_splats", "steps", "rho", "densify_interval", "budget_ratio", "footprint", "widest", "coarse_factor",
+    "grow_interval", "candidates", "offsets",
+}  # fmt: skip
+"""What cannot be 0."""
 
 _DRAFT = FlodParameters()
 _STANDARD = replace(
@@ -324,8 +344,10 @@ def override(parameters: Parameters, values: dict) -> Parameters:
         )
     before = parameters.levels
     levels = values.get("levels", before)
-    if levels != before and (not isinstance(levels, int) or not 1 <= levels <= 12):
-        raise LodgsError(f"levels = {levels!r} is not possible.", "Give a whole number from 1 to 12.")
+    if levels != before and (not isinstance(levels, int) or not 1 <= levels <= MOST_LEVELS):
+        raise LodgsError(
+            f"levels = {levels!r} is not possible.", f"Give a whole number from 1 to {MOST_LEVELS}."
+        )
     changed = {}
     for name, kind in kinds.items():
         value = values.get(name, getattr(parameters, name))
@@ -335,15 +357,34 @@ def override(parameters: Parameters, values: dict) -> Parameters:
             changed[name] = _per_level(name, value, levels, given=name in values)
         else:
             changed[name] = _number(name, value, kind)
+    _together(changed)
     return replace(parameters, **changed)
 
 
 def _number(name: str, value, kind: type):
-    valid = isinstance(value, int) or (kind is float and isinstance(value, float))
-    if not valid or isinstance(value, bool) or value < 0:
+    valid = isinstance(value, int) or (kind is float and isinstance(value, float) and isfinite(value))
+    most = _MOST.get(name, inf)
+    least_fails = valid and (value < 0 or (value == 0 and name in _ABOVE_ZERO))
+    if not valid or isinstance(value, bool) or least_fails or value > most:
         wanted = "a whole number" if kind is int else "a number"
-        raise LodgsError(f"{name} = {value!r} is not possible.", f"Give {wanted} of at least 0.")
+        least = "above 0" if name in _ABOVE_ZERO else "of at least 0"
+        limit = f" and at most {most}" if most < inf else ""
+        raise LodgsError(f"{name} = {value!r} is not possible.", f"Give {wanted} {least}{limit}.")
     return kind(value)
+
+
+def _together(values: dict) -> None:
+    """What values must be beside each other."""
+    if values.get("nearest", 0.0) >= values.get("farthest", 1.0):
+        raise LodgsError(
+            f"nearest = {values['nearest']} is not possible with farthest = {values['farthest']}.",
+            "Give a smaller number.",
+        )
+    if values["max_splats"] < values.get("offsets", 1):
+        raise LodgsError(
+            f"max_splats = {values['max_splats']} is less than one anchor's {values['offsets']} Gaussians.",
+            "Give a larger number.",
+        )
 
 
 def _yes_or_no(name: str, value) -> bool:

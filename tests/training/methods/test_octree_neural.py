@@ -123,6 +123,20 @@ def test_a_gaussian_that_no_view_sees_much_of_is_never_drawn_again(data):
     assert method.splats == alive.sum()
 
 
+def test_anchors_of_which_nothing_is_drawn_are_removed(data):
+    method = make(data, grad_threshold=1e9)
+    method.model["looks"].data[:5, :, 0] = -30
+    camera = data.train[data.training_view(0, 0)]
+    rendering = method._draw(camera, torch.ones(len(method.model)), 0)
+    rendering.grad2d = torch.zeros(len(rendering.radii), 2)
+    unseen = 5 - int((method._shown < 5).sum())
+    before = len(method.model)
+    method._remember(rendering)
+    method._grow_and_prune(20)
+    assert unseen < 5
+    assert len(method.model) == before - 5 + unseen
+
+
 def draw(splats, camera, data):
     columns = (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh)
     return rasterize(*map(torch.from_numpy, columns), camera=camera, near=data.near).image
@@ -136,11 +150,15 @@ def ever_drawn(method: Method) -> torch.Tensor:
 def blind(method: Method, *names: str) -> None:
     """Networks that do not look at the direction."""
     for name in names:
-        getattr(method.networks, name)[0].weight.data[:, -3:] = 0
+        features = method.parameters.features
+        getattr(method.networks, name)[0].weight.data[:, features : features + 3] = 0
 
 
-def test_baking_loses_nothing_where_nothing_depends_on_the_view(data):
-    method = make(data)
+@pytest.mark.parametrize("appearance", [0, 2])
+def test_baking_loses_nothing_where_nothing_depends_on_the_view(data, appearance):
+    """Nor is the light of single photographs taken for what the direction does."""
+    method = make(data, appearance=appearance)
+    method.networks.appearance.data.normal_(generator=torch.Generator().manual_seed(2))
     blind(method, "opacity", "covariance", "color")
     baked = method.bake()
     for camera in (data.train[0], data.test[0]):

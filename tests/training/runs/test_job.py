@@ -72,6 +72,29 @@ def test_mistakes_are_named(tmp_path, text, said):
         Job.from_file(write(tmp_path / "job.toml", text))
 
 
+@pytest.mark.parametrize(
+    ("method", "values", "said"),
+    [
+        ("flod", "densify_until = 1.5", "densify_until = 1.5 .* at most 1"),
+        ("flod", "densify_interval = 0", "densify_interval = 0 .* above 0"),
+        ("3dgs", "sh_degree = 4", "sh_degree = 4 .* at most 3"),
+        ("octree", "widest = inf", "widest = inf"),
+        ("octree", "lr_means = nan", "lr_means = nan"),
+        ("octree", "nearest = 0.5\nfarthest = 0.5", "nearest = 0.5 .* farthest = 0.5"),
+        ("octree", "coarse_share = 2", "coarse_share = 2 .* at most 1"),
+        ("octree", "coarse_factor = 0", "coarse_factor = 0 .* above 0"),
+        ("octree", "grow_interval = 0", "grow_interval = 0 .* above 0"),
+        ("octree", "max_splats = 0", "max_splats = 0 .* above 0"),
+        ("octree_neural", "offsets = 0", "offsets = 0 .* above 0"),
+        ("octree_neural", "max_splats = 4", "max_splats = 4 .* 5 Gaussians"),
+    ],
+)
+def test_impossible_parameters_are_named_before_training(tmp_path, method, values, said):
+    text = f'scene = "a"\nout = "b"\nmethod = "{method}"\n[parameters]\n{values}\n'
+    with pytest.raises(LodgsError, match=said):
+        Job.from_file(write(tmp_path / "job.toml", text))
+
+
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(LodgsError, match=r"absent\.toml"):
         Job.from_file(tmp_path / "absent.toml")
