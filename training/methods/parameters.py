@@ -175,7 +175,6 @@ class NeuralOctreeParameters(OctreeParameters):
     """
 
     footprint: float = 2.0
-    far_share: float = 0.1
     full_share: float = 0.1
     least_weight: float = 0.03
     offsets: int = 5
