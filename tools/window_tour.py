@@ -28,7 +28,7 @@ METHOD = PLAN["method"]
 OCTREE = METHOD.startswith("octree")
 _TINY = {"max_splats": 20_000, "sh_interval": 100}
 _OF_FLOD = {
-    "levels": 3, "steps": (60, 90, 250), "densify_until": (0.5,) * 3, "densify_interval": (20,) * 3,
+    "levels": 3, "steps": (60, 90, 800), "densify_until": (0.5,) * 3, "densify_interval": (20,) * 3,
     "budget_ratio": 0.35, "footprint": 8.0,
 }  # fmt: skip
 TRAINING = _TINY | ({"steps": 1000} if OCTREE else _OF_FLOD)
@@ -116,7 +116,7 @@ def train(root: bpy.types.Object) -> Steps:
     press("lodgs.cancel_training")
     yield from until(lambda: not watch.running, 120)
     yield from settle()
-    assert (watch.state, watch.problem) == ("cancelled", ""), watch.problem
+    assert watch.state == "cancelled", watch.problem or f"Not cancelled: {watch.message}."
     take("cancelled", watch.message)
     press("lodgs.resume_training")
     watch = jobs.watch_of(root)

@@ -53,10 +53,6 @@ class Method(Interface):
         level = octree.anchors(points, self.tree)
         chosen = np.flatnonzero(level > 0)
         chosen = chosen[self._worth_having(points[chosen], level[chosen])]
-        if not len(chosen):
-            raise LodgsError(
-                "No point of the scene is wanted by enough views.", "Lower 'visible_share' to keep more."
-            )
         if len(chosen) > self._room():
             chosen = np.sort(np.random.default_rng(seed).choice(chosen, self._room(), replace=False))
         self.model = self._first_model(points[chosen], colors[chosen], level[chosen])

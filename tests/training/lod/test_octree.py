@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from training.errors import LodgsError
 from training.lod import octree
 from training.lod.rules import octree_wanted, octree_weights
 from training.scenes.cameras import Camera
@@ -51,6 +52,17 @@ def test_distances_are_of_what_a_view_sees_and_in_one_focal_length():
     near, long = octree.view_distances(points, [camera(0.0), camera(0.0, focal=200.0)], 100.0)
     assert near.tolist() == [4.0, 5.0]  # behind, and outside the image, count for nothing
     assert long.tolist() == [2.0]  # twice the focal length, half as far; the second point is outside
+
+
+def test_a_view_in_the_midst_of_points_does_not_make_levels_without_end():
+    points = np.array([[0, 0, 1e-6], [0, 0, 9.0]])
+    tree = octree.build(points, [camera(0.0)], focal_px=100.0, footprint=2.0, quantiles=(0, 1), coarser=3)
+    assert (tree.levels, tree.d_max) == (octree.MOST_LEVELS, 8 * 9.0)  # log2 has room for 23; the coarse stay
+
+
+def test_views_that_see_no_point_are_told():
+    with pytest.raises(LodgsError, match="No training view sees"):
+        octree.build(np.array([[0, 0, -1.0]]), [camera(0.0)], focal_px=100.0, footprint=2.0)
 
 
 def test_levels_follow_from_the_range_of_distances():

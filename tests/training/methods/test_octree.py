@@ -278,6 +278,16 @@ def test_what_is_too_narrow_moves_finer_up_to_the_first_level_that_photographs_w
         assert octree.model.columns["level"][:4].tolist() == fitting
 
 
+def test_what_is_too_narrow_stays_where_no_photograph_wants_a_finer_level(data):
+    octree = make(data, narrowest=0.5, coarse_share=0.0, coarser_levels=3)
+    level, means = octree.model.columns["level"], octree.model["means"].data
+    level[:2] = 1
+    octree.model["log_scales"].data[:2] = -20.0
+    means[0] = torch.from_numpy(data.train[0].center) + 3 * octree.tree.d_max
+    octree._settle(octree.joins[-1])
+    assert octree.model.columns["level"][:2].tolist() == [1, 4]
+
+
 def test_what_is_too_wide_for_its_level_moves_to_the_coarser_one_that_it_fits(data):
     octree = make(data, narrowest=0.0, widest=2.0)
     octree.model.columns["level"][:] = 4
