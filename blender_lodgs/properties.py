@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bpy
 
+from ..training.lod.octree import MOST_LEVELS
 from ..training.methods.parameters import METHODS, PRESETS
 
 
@@ -49,7 +50,7 @@ class TrainingSettings(bpy.types.PropertyGroup):
         "in the scene ask for",
         default=0,
         min=0,
-        max=12,
+        max=MOST_LEVELS,
     )
     footprint: bpy.props.FloatProperty(
         name="Coarsest Detail",

@@ -16,6 +16,7 @@ from ..errors import LodgsError
 from ..scenes.cameras import Camera
 
 MOST_LEVELS = 12
+"""Levels that a job may ask for, or get from its distances: a bundle's header has no room for many more."""
 
 
 @dataclass(frozen=True)

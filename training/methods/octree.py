@@ -319,8 +319,8 @@ class Method(Interface):
     ) -> torch.Tensor:
         """The level (N,) nearest to the given one for splats at places (N, 3), with logs of scales (N, 3).
 
-        Narrow ones move to ``newest`` at most, and to a level that photographs want there: so these are drawn
-        as before.
+        Narrow ones move to ``newest`` at most, to the first level that photographs want at most, and only
+        where one does want it: so hardly a photograph is drawn otherwise.
         """
         p, pixel = self.parameters, self.tree.d_max / self.tree.focal_px  # at level 1's distance
         width = log_scales.amax(1).sub(float(np.log(pixel))) / float(np.log(2))

@@ -57,7 +57,7 @@ def test_distances_are_of_what_a_view_sees_and_in_one_focal_length():
 def test_a_view_in_the_midst_of_points_does_not_make_levels_without_end():
     points = np.array([[0, 0, 1e-6], [0, 0, 9.0]])
     tree = octree.build(points, [camera(0.0)], focal_px=100.0, footprint=2.0, quantiles=(0, 1), coarser=3)
-    assert (tree.levels, tree.d_max) == (octree.MOST_LEVELS, 8 * 9.0)  # log2 has room for 23; the coarse stay
+    assert (tree.levels, tree.d_max) == (12, 8 * 9.0)  # log2 has room for 23; the coarse stay
 
 
 def test_views_that_see_no_point_are_told():
