@@ -1,18 +1,23 @@
-# The front door. `make demo` and `make test` set up what they need by themselves.
+# The front door. Whatever it opens sets up what it needs by itself.
 PYTHON ?= python3
 VENV := .venv/bin/python
 BLENDER_5_2 := .venv-blender-5.2/bin/python
 METHOD ?= flod
-PYTEST := -m pytest
+# One worker a core. Kernels are compiled once, into the user's cache.
+PYTEST := -m pytest -n auto
+quick test test-5.0: export OMP_NUM_THREADS := 1  # torch's threads would come on top of the workers
 export LODGS_TRAINER_PYTHON := $(CURDIR)/$(VENV)
 
-.PHONY: help setup demo test test-5.0 lint bench extension window interop clean
+.PHONY: help setup demo check quick test test-5.0 lint docs tables bench extension window interop clean
 
 help:
 	@echo "make setup      environments from pinned packages (needs Python 3.11; 3.13 for Blender 5.2's tests)"
 	@echo "make demo       import, train, select, measure and export the example scene (METHOD=flod)"
+	@echo "make check      style, types and the quick tests: about a minute, for every few minutes"
 	@echo "make test       all tests, in Blender 4.5 and, with Python 3.13, in Blender 5.2"
 	@echo "make lint       style and types"
+	@echo "make docs       build/api: the trainer's functions and classes, from their docstrings"
+	@echo "make tables     docs/parameters.md and controls.md, from what methods and rules declare"
 	@echo "make bench      how fast it is, as ratios from one run"
 	@echo "make extension  dist/lodgs-VERSION.zip, checked by Blender"
 	@echo "make window     a tour in a real Blender window, with pictures (METHOD=flod; needs Blender, Xvfb, ImageMagick)"
@@ -24,6 +29,12 @@ setup:
 
 demo: setup
 	@$(VENV) examples/demo.py --method $(METHOD)
+
+check: setup
+	@$(MAKE) --no-print-directory --jobs=2 lint quick
+
+quick: setup
+	$(VENV) $(PYTEST) -q -m "not slow and not blender"
 
 test: setup
 	$(VENV) $(PYTEST) tests/training
@@ -38,6 +49,12 @@ lint: setup
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/pyright
+
+docs: setup
+	$(VENV) -m pdoc --docformat google --output-directory build/api training
+
+tables: setup
+	$(VENV) tools/tables.py
 
 bench: setup
 	$(VENV) tools/bench.py $(if $(BASE),--base $(BASE))

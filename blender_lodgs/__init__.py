@@ -7,29 +7,23 @@ unregistered in reverse.
 
 import bpy
 
-from . import (
-    commands,
-    compare,
-    engine,
-    jobs,
-    operators,
-    panels,
-    preferences,
-    properties,
-    renderer,
-    scenes,
-    viewport,
-)
+from . import commands, operators, panels, viewport
+from .data import older_files, properties, scenes, updates
+from .render import compare, engine, renderer
+from .runs import jobs
+from .viewport import wipe
 
 MODULES = (
     properties,
-    preferences,
+    updates,
     *operators.MODULES,
     *panels.MODULES,
+    older_files,
     scenes,
     viewport,
     renderer,
     engine,
+    wipe,
     compare,
     jobs,
     commands,

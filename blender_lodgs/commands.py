@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import argparse
-import json
 import signal
 import sys
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import bpy
 
 from ..training.errors import LodgsError
-from ..training.methods.parameters import METHODS, PRESETS
+from ..training.methods.describe import describe_method, describe_methods
+from ..training.runs.options import add_options, job_from
 from ..training.splats.bundle import describe, write_bundle
-from . import environment, jobs, scenes
-from .panels.training import duration, level_line
+from . import extension
+from .data import scenes
+from .runs import environment, jobs
+from .runs.watch import Watch
+from .runs.words import duration, level_line
 
 DONE, CRASHED, BAD_INPUT, CANCELLED = 0, 1, 2, 3
 """Exit codes, as the trainer's own."""
@@ -28,14 +32,14 @@ def main(arguments: list[str]) -> int:
         arguments: what follows ``blender --command lodgs``.
 
     Returns:
-        An exit code. Mistakes are told on standard error in a sentence.
+        An exit code. Errors of the user are a sentence on standard error.
     """
     try:
-        chosen = _parser().parse_args(arguments)
+        args = _parser().parse_args(arguments)
     except SystemExit as stop:  # argparse has printed its help or the mistake
         return int(stop.code or 0)
     try:
-        return chosen.command(chosen)
+        return args.command(args)
     except LodgsError as error:
         _print(f"error: {error}")
         return BAD_INPUT
@@ -55,24 +59,13 @@ def _parser() -> argparse.ArgumentParser:
 
     train = commands.add_parser("train", help="photographs to splats: import, train, save, export")
     train.set_defaults(command=_train)
-    train.add_argument("--scene", type=Path, required=True, help="folder of the COLMAP scene")
-    train.add_argument("--out", type=Path, required=True, help="run folder; goes on with what is there")
-    train.add_argument("--method", choices=list(METHODS), default="flod")
-    train.add_argument("--preset", choices=list(PRESETS), default="draft")
-    train.add_argument("--image-scale", type=_share, default=0.5, help="training images over photographs")
-    train.add_argument(
-        "--test-every", type=_count, default=8, help="hold out every n-th view; 0 holds out none"
-    )
-    train.add_argument("--seed", type=_count, default=0)
-    train.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="a parameter of the method; repeatable",
-    )
+    add_options(train)
     train.add_argument("--blend", type=Path, help=".blend file to save, with the levels and their selection")
     train.add_argument("--export", type=Path, help="bundle to write")
+
+    methods = commands.add_parser("methods", help="say which methods there are, or what one can be told")
+    methods.set_defaults(command=_methods)
+    methods.add_argument("name", nargs="?", metavar="NAME", help="method whose parameters to list")
 
     convert = commands.add_parser("import", help="a COLMAP folder, a bundle or any 3DGS PLY to a .blend")
     convert.set_defaults(command=_import)
@@ -91,22 +84,20 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _train(chosen: argparse.Namespace) -> int:
-    parameters = dict(_assignment(text) for text in chosen.set)
+def _train(args: argparse.Namespace) -> int:
+    job = job_from(args)
+    if job.backend == "auto":
+        job = replace(job, backend=extension.preferences().backend)
     _empty_file()
-    root = scenes.import_colmap(bpy.context, chosen.scene.resolve(), warn=lambda m: _print(f"warning: {m}"))
-    settings = root.lodgs.training
-    settings.method, settings.preset = chosen.method, chosen.preset
-    settings.image_scale, settings.test_every = chosen.image_scale, chosen.test_every
-    settings.seed = chosen.seed
-
-    watch = jobs.start_or_resume(root, str(chosen.out.resolve()), parameters)
+    root = scenes.import_colmap(bpy.context, Path(job.scene), warn=lambda m: _print(f"warning: {m}"))
+    jobs.show(root.lodgs.training, job)  # when the .blend is opened
+    watch = jobs.start_or_resume(root, job)
     with _interrupts():
         jobs.follow(watch, _Bar())
     for warning in watch.warnings:
         _print(f"warning: {warning}")
-    if chosen.blend:
-        _save(chosen.blend)
+    if args.blend:
+        _save(args.blend)
     if watch.problem:
         _print(f"error: {watch.problem}")
         if watch.state == "failed":
@@ -116,59 +107,41 @@ def _train(chosen: argparse.Namespace) -> int:
     if watch.state == "cancelled":
         _print("Cancelled. The same command goes on from here.")
         return CANCELLED
-    if chosen.export:
-        write_bundle(chosen.export, scenes.read_levels(root))
+    if args.export:
+        write_bundle(args.export, scenes.read_levels(root))
     return DONE
 
 
-def _import(chosen: argparse.Namespace) -> int:
+def _methods(args: argparse.Namespace) -> int:
+    print(describe_method(args.name) if args.name else describe_methods())
+    return DONE
+
+
+def _import(args: argparse.Namespace) -> int:
     _empty_file()
-    if chosen.source.is_dir():
-        scenes.import_colmap(bpy.context, chosen.source.resolve(), warn=lambda m: _print(f"warning: {m}"))
+    if args.source.is_dir():
+        scenes.import_colmap(bpy.context, args.source.resolve(), warn=lambda m: _print(f"warning: {m}"))
     else:
-        scenes.import_splats(bpy.context, chosen.source.resolve())
-    _save(chosen.blend)
+        scenes.import_splats(bpy.context, args.source.resolve(), warn=lambda m: _print(f"warning: {m}"))
+    _save(args.blend)
     return DONE
 
 
-def _export(chosen: argparse.Namespace) -> int:
-    if not chosen.blend.is_file():
-        raise LodgsError(f"There is no file {chosen.blend}.")
-    bpy.ops.wm.open_mainfile(filepath=str(chosen.blend.resolve()))
-    found = [root for root in bpy.data.objects if root.lodgs.is_root and chosen.root in {None, root.name}]
+def _export(args: argparse.Namespace) -> int:
+    if not args.blend.is_file():
+        raise LodgsError(f"There is no file {args.blend}.")
+    bpy.ops.wm.open_mainfile(filepath=str(args.blend.resolve()))
+    found = [root for root in bpy.data.objects if root.lodgs.is_root and args.root in {None, root.name}]
     if len(found) != 1:
         names = ", ".join(root.name for root in bpy.data.objects if root.lodgs.is_root) or "none"
-        raise LodgsError(f"{chosen.blend} holds {len(found)} such scenes.", f"Name one with --root: {names}.")
-    write_bundle(chosen.bundle, scenes.read_levels(found[0]))
+        raise LodgsError(f"{args.blend} holds {len(found)} such scenes.", f"Name one with --root: {names}.")
+    write_bundle(args.bundle, scenes.read_levels(found[0]))
     return DONE
 
 
-def _info(chosen: argparse.Namespace) -> int:
-    print(describe(chosen.file))
+def _info(args: argparse.Namespace) -> int:
+    print(describe(args.file))
     return DONE
-
-
-def _share(text: str) -> float:
-    if not 0.01 <= float(text) <= 1:
-        raise argparse.ArgumentTypeError(f"{text} is not between 0.01 and 1")
-    return float(text)
-
-
-def _count(text: str) -> int:
-    if not 0 <= int(text) < 2**31:
-        raise argparse.ArgumentTypeError(f"{text} is not between 0 and {2**31 - 1}")
-    return int(text)
-
-
-def _assignment(text: str) -> tuple[str, object]:
-    """``name=value`` with a value as JSON has it: a number, a list of numbers."""
-    name, equals, value = text.partition("=")
-    try:
-        if not equals:
-            raise ValueError
-        return name.strip(), json.loads(value)
-    except ValueError:
-        raise LodgsError(f"--set {text} is not NAME=VALUE.", "For example: --set max_splats=50000") from None
 
 
 def _empty_file() -> None:
@@ -193,7 +166,7 @@ class _Bar:
     def __init__(self) -> None:
         self._message, self._levels, self._terminal = "", set(), sys.stderr.isatty()
 
-    def __call__(self, watch: jobs.Watch) -> None:
+    def __call__(self, watch: Watch) -> None:
         for number in sorted(watch.levels.keys() - self._levels):
             self._levels.add(number)
             self._line(level_line(watch.levels[number]))

@@ -139,3 +139,12 @@ def compositor_output(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket:
         output = tree.nodes.new("NodeGroupOutput")
     output.location = (600, 0)
     return output.inputs[0]
+
+
+def stored_properties(owner: bpy.types.ID, name: str):
+    """What a file stores of a property group of an ID, like a dict (also what no property of today reads);
+    None where that is nothing."""
+    if hasattr(owner, "bl_system_properties_get"):  # from 5.0 on they are no custom properties
+        properties = owner.bl_system_properties_get()
+        return None if properties is None else properties.get(name)
+    return owner.get(name)

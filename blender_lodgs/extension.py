@@ -1,14 +1,11 @@
-"""What Blender knows of this extension: its name, its folders and its preferences."""
+"""What Blender knows of this extension: its name, its folders, its preferences, and its panels on screen."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Protocol, cast
 
 import bpy
-
-if TYPE_CHECKING:
-    from .preferences import LodgsPreferences
 
 FOLDER = Path(__file__).resolve().parent.parent
 """The extension's folder: the trainer runs in it, because ``training`` lies there."""
@@ -17,11 +14,31 @@ ID = (__package__ or "").rpartition(".")[0]
 """The module name, such as ``bl_ext.user_default.lodgs``."""
 
 
+class Settings(Protocol):
+    """What the preferences hold.
+
+    Attributes:
+        python: path of the trainer's Python; empty for the environment that the extension makes.
+        backend: name of the rasterizer's backend, or "auto".
+    """
+
+    python: str
+    backend: str
+
+
 def user_folder(name: str = "") -> Path:
     """A folder of this extension's own in Blender's user folder (nothing is written beside the code)."""
     return Path(bpy.utils.extension_path_user(ID, path=name))
 
 
-def preferences() -> LodgsPreferences:
+def preferences() -> Settings:
     """The extension's preferences."""
-    return bpy.context.preferences.addons[ID].preferences  # type: ignore[return-value]
+    return cast(Settings, bpy.context.preferences.addons[ID].preferences)
+
+
+def redraw() -> None:
+    """Has the panels of the extension drawn anew, soon."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type in {"VIEW_3D", "PREFERENCES"}:
+                area.tag_redraw()

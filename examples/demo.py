@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from tools.blender_module import EXTENSION, start_blender  # noqa: E402
-from training.methods.parameters import METHODS, preset  # noqa: E402
+from training.methods import METHODS  # noqa: E402
 from training.runs.folder import RunFolder  # noqa: E402
 
 
@@ -37,6 +37,7 @@ def main() -> int:
     started = time.monotonic()
     out: Path = chosen.out
     run = RunFolder(out / chosen.method)
+    draft = METHODS[chosen.method].preset("draft")
     if run.state() == "done":  # an interrupted demo is resumed, a finished one is made anew
         shutil.rmtree(run.path)
     os.environ.setdefault("LODGS_TRAINER_PYTHON", sys.executable)
@@ -47,7 +48,7 @@ def main() -> int:
         ["train", "--scene", str(chosen.scene), "--method", chosen.method, "--preset", "draft",
          "--image-scale", str(chosen.image_scale), "--out", str(run.path),
          "--blend", str(out / "scene.blend"), "--export", str(out / "bundle.ply"),
-         "--set", f"max_splats={preset(chosen.method, 'draft').max_splats // 2}",  # minutes on two cores
+         "--set", f"max_splats={draft.max_splats // 2}",  # minutes on two cores
          *(word for setting in chosen.set for word in ("--set", setting))]
     )  # fmt: skip
     if code:
@@ -68,11 +69,18 @@ def main() -> int:
     report = {"scene": str(chosen.scene), "method": chosen.method, "levels": measured["levels"]}
     if measured["selective"]:
         per_view = measured["selective"][0]
-        report["selective"] = {("splats_drawn" if k == "splats" else k): v for k, v in per_view.items()}
+        report["selective"] = _drawn(per_view)
+    if "curve" in measured:
+        report["curve"] = [_drawn(row) for row in measured["curve"]]
     (out / "report.json").write_text(json.dumps(report, indent=1))
     print(f"{time.monotonic() - started:.0f} seconds. In {os.path.relpath(out)}: scene.blend, bundle.ply,")
     print("levels.png (the levels side by side), report.json")
     return 0
+
+
+def _drawn(row: dict) -> dict:
+    """A measured row with a plain name for the number of splats in the image."""
+    return {("splats_drawn" if name == "drawn" else name): value for name, value in row.items()}
 
 
 if __name__ == "__main__":

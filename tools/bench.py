@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import numpy as np
 import torch
 
-from training.rasterize import Adam, Target, cpu, photometric_loss, rasterize, render, resolve
+from training.rasterize import Adam, Gaussians, Target, cpu, photometric_loss, rasterize, render, resolve
 from training.rasterize.cpu import adam
 from training.rasterize.cpu.bin import LOG2_ALPHA_MIN
 from training.rasterize.cpu.blend import CAP, SPAN, T_MIN
@@ -49,7 +49,7 @@ FUNCTIONS = {"bin": (cpu, "bin_splats"), "loss": (cpu, "loss_and_gradient"), "ad
 STAGES = ("project", "bin", "blend", "loss", "blend_backward", "project_backward", "adam")
 
 
-def synthetic_splats(count: int, seed: int = 0) -> dict[str, torch.Tensor]:
+def synthetic_splats(count: int, seed: int = 0) -> Gaussians:
     """Random splats in a frustum, of log-normal anisotropic scales: about 46 blends a pixel at any count."""
     random = np.random.default_rng(seed)
     z = random.uniform(2, 10, count)
@@ -67,7 +67,7 @@ def synthetic_splats(count: int, seed: int = 0) -> dict[str, torch.Tensor]:
         "opacity_logits": opacity_logits,
         "sh": sh,
     }
-    return {name: torch.tensor(array, dtype=torch.float32) for name, array in arrays.items()}
+    return Gaussians(**{name: torch.tensor(array, dtype=torch.float32) for name, array in arrays.items()})
 
 
 def synthetic_camera(width: int, height: int) -> Camera:
@@ -78,16 +78,14 @@ class Step:
     """A full training step on the synthetic scene."""
 
     def __init__(self, count: int, width: int, height: int, device: str = "cpu") -> None:
-        self.splats: dict[str, Any] = {
-            name: tensor.to(device).requires_grad_() for name, tensor in synthetic_splats(count).items()
-        }
+        self.splats = synthetic_splats(count).map(lambda tensor: tensor.to(device).requires_grad_())
         self.camera = synthetic_camera(width, height)
         self.target = Target(np.random.default_rng(1).random((height, width, 3), dtype=np.float32))
-        self.adam = Adam(self.splats, dict.fromkeys(self.splats, 1e-7))
+        self.adam = Adam(vars(self.splats), dict.fromkeys(vars(self.splats), 1e-7))
 
     def __call__(self) -> None:
         self.adam.zero_grad()
-        drawn = rasterize(**self.splats, camera=self.camera)
+        drawn = rasterize(self.splats, self.camera)
         photometric_loss(drawn.image, self.target).backward()
         self.adam.step()
 
@@ -200,7 +198,7 @@ def work(step: Step) -> tuple[int, float]:
     cpu.in_parallel = spy
     try:
         with torch.no_grad():
-            rasterize(**step.splats, camera=step.camera)
+            rasterize(step.splats, step.camera)
     finally:
         cpu.in_parallel = in_parallel
     return seen["lanes"], seen["blends"]
@@ -280,14 +278,14 @@ def least(function: Callable[[], object], seconds: float) -> float:
 def further(seconds: float) -> dict:
     """What is not a training step: forward only, weights, threads, the first compilation."""
     found: dict[str, Any] = {}
-    splats, camera = dict[str, Any](synthetic_splats(200_000)), synthetic_camera(960, 540)
-    found["forward_ms"] = least(lambda: next(render(**splats, cameras=[camera])), seconds)
+    splats, camera = synthetic_splats(200_000), synthetic_camera(960, 540)
+    found["forward_ms"] = least(lambda: next(render(splats, [camera])), seconds)
 
     weights = torch.from_numpy((np.random.default_rng(2).random(200_000) > 0.7).astype(np.float32))
-    kept = {name: tensor[weights > 0] for name, tensor in splats.items()}
+    kept = splats.select(weights > 0)
 
-    def draw(some: dict, **options) -> Callable:
-        return lambda: next(render(**some, cameras=[camera], **options))
+    def draw(some: Gaussians, **options) -> Callable:
+        return lambda: next(render(some, [camera], **options))
 
     some, removed = draw(splats, weights=weights), draw(kept)
     turns = [[least(drawn, 1e-3) for drawn in (some, removed)] for _ in range(40)]  # noise hits both alike

@@ -59,8 +59,10 @@ def import_seconds(bpy, path: Path) -> float:
     """From file to an object in the scene, display colours included."""
 
     def once() -> None:
-        thing = load("blender_lodgs.objects").new_splats("bench", load("training.splats.ply").read_ply(path))
-        bpy.data.pointclouds.remove(thing.data)
+        obj = load("blender_lodgs.data.objects").new_splats(
+            "bench", load("training.splats.ply").read_ply(path)
+        )
+        bpy.data.pointclouds.remove(obj.data)
 
     return least(once)
 
@@ -69,21 +71,23 @@ def selection_seconds(bpy, path: Path) -> tuple[float, float]:
     """One evaluation after the eye moved, and numpy's way to the same splats' attributes."""
     splats = load("training.splats.ply").read_ply(path)
     camera = two_levels(bpy, splats)
-    root = load("blender_lodgs.scenes").roots(bpy.context.scene)[0]
+    root = load("blender_lodgs.data.scenes").roots(bpy.context.scene)[0]
 
     def move() -> None:
         camera.location.x += 0.01
         bpy.context.view_layer.update()
 
-    bands = load("training.lod.rules").flod_bands(
-        [S_MIN, 0.0], root.lodgs.focal_px, root.lodgs.gamma, root.lodgs.level_start, root.lodgs.level_end
-    )
+    rule = load("training.lod.rule").rules()["bands"]
+    controls, levels = root.lodgs.bands, [(1, {"s_min": S_MIN}), (2, {"s_min": 0.0})]
+    values = {control.name: getattr(controls, control.name) for control in rule.controls}
+    facts = [load("training.lod.rule").facts_of(rule, {}, levels, number) for number in (1, 2)]
+    bands = [rule.band(root.lodgs.focal_px, each, values) for each in facts]
     arrays = (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh)
 
     def by_numpy() -> None:
         distances = np.linalg.norm(splats.means, axis=1)
         for near, far in bands:
-            chosen = load("training.lod.rules").band_mask(distances, near, far)
+            chosen = (distances >= near) & (distances < far)
             for array in arrays:
                 array[chosen]
 
@@ -92,15 +96,16 @@ def selection_seconds(bpy, path: Path) -> tuple[float, float]:
 
 def two_levels(bpy, splats):
     """A splat scene of the same splats as two levels, seen by distance, and its camera."""
-    scenes, level = load("blender_lodgs.scenes"), load("training.splats.bundle").Level
+    scenes, bundle = load("blender_lodgs.data.scenes"), load("training.splats.bundle")
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
     bpy.context.scene.collection.objects.link(camera)
     bpy.context.scene.camera = camera
     with scenes._new_scene(bpy.context, "bench") as root:
-        scenes.set_level(root, level(1, splats, S_MIN))
-        scenes.set_level(root, level(2, splats, 0.0))
-    root.lodgs.mode, root.lodgs.level_start = "SELECTIVE", 1
+        scenes.set_bundle_facts(root, bundle.Bundle("flod", [], "bands"))
+        scenes.set_level(root, bundle.Level(1, splats, {"s_min": S_MIN}))
+        scenes.set_level(root, bundle.Level(2, splats, {"s_min": 0.0}))
+    root.lodgs.mode = "SELECTIVE"
     bpy.context.view_layer.update()
     return camera
 
@@ -114,18 +119,18 @@ def viewport(bpy, count: int) -> None:
         return
     gpu.init()
     camera = two_levels(bpy, random_splats(count // 2))
-    views, shown = load("blender_lodgs.viewport.views"), load("blender_lodgs.shown")
-    view, main, thread, evaluated, uploaded = views.View(), [], [], [], []
+    views, shown = load("blender_lodgs.viewport.views"), load("blender_lodgs.data.shown")
+    view, main, thread, evaluated, uploaded = views.ViewState(), [], [], [], []
 
     def sets():
-        return shown.splat_sets(bpy.context.evaluated_depsgraph_get())
+        return shown.splat_instances(bpy.context.evaluated_depsgraph_get())
 
     def prepare() -> None:
         depsgraph, look = bpy.context.evaluated_depsgraph_get(), camera.matrix_world.inverted()
         views.prepare(view, sets(), depsgraph, look, 10 * count)
 
     for _ in range(3):
-        views.forget()
+        views.clear()
         uploaded.append(least(lambda: views._upload(sets()), 1))
     uploads = views.uploads
     for _ in range(10):
@@ -133,7 +138,7 @@ def viewport(bpy, count: int) -> None:
         camera.rotation_euler.z += 0.1
         evaluated.append(least(bpy.context.view_layer.update, 1))
         asks = least(prepare, 1)
-        thread.append(least(lambda: view.asked[2].result(), 1))
+        thread.append(least(lambda: view.pending[2].result(), 1))
         main.append(asks + least(prepare, 1))
     for frame in range(1, 11):
         bpy.context.scene.frame_set(frame)

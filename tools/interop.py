@@ -77,8 +77,8 @@ def random_bundle() -> Bundle:
         extras = {"decay": normal(count), "label": random.integers(0, 200, count).astype(np.uint8)}
         sh = 0.3 * normal(count, 16, 3)
         splats = Splats(normal(count, 3), normal(count, 4), normal(count, 3) - 3, normal(count), sh, extras)
-        levels.append(Level(number, splats, s_min=0.2 * 4.0 ** (1 - number) if number < 5 else 0.0))
-    return Bundle("flod", levels, {"gamma": 1.0, "focal_px": 600.0})
+        levels.append(Level(number, splats, {"s_min": 0.2 * 4.0 ** (1 - number) if number < 5 else 0.0}))
+    return Bundle("flod", levels, "bands", meta={"focal_px": 600.0})
 
 
 def checks(bundle: Bundle):

@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from tools import extension  # noqa: E402
-from training.methods.parameters import METHODS  # noqa: E402
+from training.methods import METHODS  # noqa: E402
 from training.runs.folder import RunFolder  # noqa: E402
 
 SIZE = (1280, 800)
@@ -37,8 +37,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="tour the extension in a real Blender window")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "window")
     parser.add_argument("--scene", type=Path, default=ROOT / "examples" / "lantern_garden")
-    with_levels = [method for method in METHODS if method != "3dgs"]
-    parser.add_argument("--method", choices=with_levels, default="flod")
+    with_detail = [name for name, method in METHODS.items() if method.rule]
+    parser.add_argument("--method", choices=with_detail, default="flod")
     parser.add_argument("--long", action="store_true", help="train for some minutes: for pictures to show")
     chosen = parser.parse_args()
     blender, x_server, camera = find_programs()

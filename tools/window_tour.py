@@ -25,15 +25,14 @@ LODGS = "bl_ext.user_default.lodgs"
 PLAN = json.loads(sys.argv[-1])
 OUT = Path(PLAN["out"])
 METHOD = PLAN["method"]
-OCTREE = METHOD.startswith("octree")
-_TINY = {"max_splats": 20_000, "sh_interval": 100}
-_OF_FLOD = {
+TINY = {"max_splats": 20_000, "sh_interval": 100, "steps": 1000}
+TINY_BY_LEVEL = {
     "levels": 3, "steps": (60, 90, 800), "densify_until": (0.5,) * 3, "densify_interval": (20,) * 3,
     "budget_ratio": 0.35, "footprint": 8.0,
 }  # fmt: skip
-TRAINING = _TINY | ({"steps": 1000} if OCTREE else _OF_FLOD)
-"""What makes a tiny job of the method's draft."""
-LONGER = {"steps": 3000 if OCTREE else (150, 250, 300, 450, 1000), "max_splats": 60_000}
+"""What makes a tiny job of a method's draft; of one that trains its levels one after the other."""
+LONGER = {"max_splats": 60_000, "steps": 3000}
+LONGER_BY_LEVEL = {"steps": (150, 250, 300, 450, 1000)}
 """What makes half of it: minutes."""
 
 Steps = Iterator[float]
@@ -64,7 +63,7 @@ def preferences() -> Steps:
     press("preferences.addon_expand", module=LODGS)
     press("lodgs.check_environment")
     yield from settle()
-    report = module("environment").report
+    report = module("runs.environment").report
     assert report.ok, f"No trainer: {report.problems}"
     take("preferences", report.versions["torch"])
     area.type = "VIEW_3D"
@@ -82,8 +81,8 @@ def preferences() -> Steps:
 
 def bring_in() -> Iterator[float]:
     press("lodgs.import_colmap", directory=PLAN["scene"])
-    root = module("scenes").active_root(bpy.context)
-    views = module("scenes").views(root)
+    root = module("data.scenes").active_root(bpy.context)
+    views = module("data.photographs").views(root)
     photographs = list(Path(PLAN["scene"], "images").iterdir())
     assert len(views) == len(photographs), f"{len(views)} of {len(photographs)} cameras came."
     assert len(root.lodgs.points.data.points), "No points came."
@@ -101,31 +100,33 @@ def bring_in() -> Iterator[float]:
 
 
 def train(root: bpy.types.Object) -> Steps:
-    jobs = module("jobs")
+    jobs = module("runs.jobs")
     root.lodgs.training.method = METHOD
-    watch = jobs.start(root, PLAN["run"], LONGER if PLAN["long"] else TRAINING)
+    watch = jobs.start(root, PLAN["run"], job())
     jobs.follow(watch)
 
-    def early() -> bool:  # all levels of an octree come together, those of others one by one
-        return 0 < len(watch.levels) == watch.progress["levels"] - (not OCTREE)
+    def early() -> bool:  # all levels but the last are there, or all
+        return bool(watch.progress) and len(watch.levels) >= watch.progress["levels"] - 1
 
     yield from until(lambda: not watch.running or early(), 900)
-    assert watch.running and root.lodgs.levels, f"No level comes while others train: {watch.problem}"
+    assert watch.running, f"No level comes while others train: {watch.problem}"
     yield from settle()
-    take("training", f"level {len(root.lodgs.levels)} is there while level {watch.progress['level']} trains")
+    take(
+        "training", f"{len(root.lodgs.levels)} of {watch.progress['levels']} levels are there while it trains"
+    )
     press("lodgs.cancel_training")
     yield from until(lambda: not watch.running, 120)
     yield from settle()
     assert watch.state == "cancelled", watch.problem or f"Not cancelled: {watch.message}."
     take("cancelled", watch.message)
     press("lodgs.resume_training")
-    watch = jobs.watch_of(root)
+    watch = module("runs.watch").watch_of(root)
     yield from until(lambda: not watch.running, 1200)
     yield from settle()
     assert watch.state == "done", watch.problem or watch.message
     assert len(root.lodgs.levels) == watch.progress["levels"], "Not all levels came."
     counts = drawn(root)
-    assert counts[-1] > counts[0], f"The finest level should have more splats: {counts}"
+    assert counts == sorted(set(counts)), f"Finer levels should have more splats: {counts}"
     take("trained", f"{len(counts)} levels of {', '.join(f'{n:,}' for n in counts)} splats")
 
 
@@ -134,13 +135,14 @@ def levels(root: bpy.types.Object) -> Steps:
     settings = bpy.context.scene.lodgs_viewport
     pictures = {}
     finest = len(root.lodgs.levels)
-    for number in (1, finest):
+    for number in sorted({1, finest}):
         press("lodgs.show_only_level", level=number)
         yield from settle()
-        shown, _ = module("scenes").count_shown(bpy.context, root)
+        shown, _ = module("data.scenes").count_shown(bpy.context, root)
         assert shown == drawn(root)[number - 1], f"{shown} splats are shown."
         pictures[number] = take(f"level-{number}", f"{shown:,} splats")
-    assert changed(pictures[1], pictures[finest]) > 0.2, "Level 1 looks like the finest level."
+    if finest > 1:
+        assert changed(pictures[1], pictures[finest]) > 0.2, "Level 1 looks like the finest level."
     settings.splats = False
     yield from settle()
     points = take("points")
@@ -152,16 +154,29 @@ def levels(root: bpy.types.Object) -> Steps:
 
 
 def distances(root: bpy.types.Object) -> Steps:
+    """As the rule begins, then coarser by itself until a quarter fewer splats are shown."""
+    count_shown = module("data.scenes").count_shown
+    controls, levels = root.lodgs.controls, [item.number for item in root.lodgs.levels]
+    rule = training("lod.rule").find_rule(root.lodgs.rule)
     root.lodgs.mode = "SELECTIVE"
-    if OCTREE:
-        root.lodgs.level_offset = -1.0
-    else:
-        root.lodgs.gamma = 2.0
     scroll(20)
     yield from settle()
-    shown, everything = module("scenes").count_shown(bpy.context, root)
-    assert 0 < shown < everything, f"{shown} of {everything} splats are shown by distance."
-    take("by-distance", f"{shown:,} of {everything:,} splats")
+    begun, everything = count_shown(bpy.context, root)
+    assert 0 < begun <= everything, f"{begun} of {everything} splats are shown by distance."
+    take("by-distance", f"{begun:,} of {everything:,} splats")
+    shown = begun
+    while shown > 0.75 * begun:
+        values = rule.coarser(
+            {control.name: getattr(controls, control.name) for control in rule.controls}, levels
+        )
+        assert values, f"{shown} of {begun} splats are shown, and nothing is coarser."
+        for name, value in values.items():
+            setattr(controls, name, value)
+        bpy.context.view_layer.update()
+        shown, _ = count_shown(bpy.context, root)
+    yield from settle()
+    assert shown, "Coarser is nothing at all."
+    take("by-distance-coarser", f"{shown:,} of {everything:,} splats")
     root.lodgs.tell = "LEVELS"
     yield from settle()
     take("by-distance-levels")
@@ -178,19 +193,19 @@ def orbit(root: bpy.types.Object) -> Steps:
         eye = viewport()[1].view_matrix.inverted().translation
         away = (root.matrix_world @ Vector(root.lodgs.held_eye) - eye).length
         assert away < 1e-3, f"The viewport's eye is {away:.3f} from the view's."
-        shown, _ = module("scenes").count_shown(bpy.context, root)
+        shown, _ = module("data.scenes").count_shown(bpy.context, root)
         take("orbit", f"{shown:,} splats")
 
 
 def freeze(root: bpy.types.Object) -> Steps:
     root.lodgs.freeze, root.lodgs.tell = True, "BANDS"
-    held, shown = tuple(root.lodgs.held_eye), module("scenes").count_shown(bpy.context, root)
+    held, shown = tuple(root.lodgs.held_eye), module("data.scenes").count_shown(bpy.context, root)
     press("view3d.view_orbit", angle=math.radians(40), type="ORBITUP")
     viewport()[1].view_distance = 40
     yield from settle()
     yield from settle()
     assert tuple(root.lodgs.held_eye) == held, "A frozen eye moved."
-    assert module("scenes").count_shown(bpy.context, root) == shown, "A frozen choice changed."
+    assert module("data.scenes").count_shown(bpy.context, root) == shown, "A frozen choice changed."
     take("freeze", f"{shown[0]:,} splats")
     root.lodgs.freeze, root.lodgs.tell, root.lodgs.eye = False, "OWN", "CAMERA"
 
@@ -200,7 +215,7 @@ def render(root: bpy.types.Object) -> Steps:
     press("lodgs.look_through", step=1)
     viewport()[1].view_perspective = "CAMERA"
     chosen = root.lodgs.cameras.objects[root.lodgs.active_view]
-    assert chosen == scene.camera == module("scenes").views(root)[1], "The list shows another view."
+    assert chosen == scene.camera == module("data.photographs").views(root)[1], "The list shows another view."
     press("lodgs.use_engine")
     scroll(60)
     yield from settle()
@@ -238,19 +253,20 @@ def draw_frames() -> Steps:
 
 
 def compare(root: bpy.types.Object) -> Steps:
-    module_ = module("compare")
+    module_ = module("render.compare")
     bpy.context.scene.lodgs_viewport.splats = False  # each view measured is drawn, slowly by software
     press("lodgs.measure_views")
-    yield from until(lambda: not module_.measuring.running, 600)
-    assert not module_.measuring.problem, module_.measuring.problem
-    assert module_.measuring.done == len(module("scenes").views(root))
+    yield from until(lambda: not module_.measurement.running, 600)
+    assert not module_.measurement.problem, module_.measurement.problem
+    assert module_.measurement.done == len(module("data.photographs").views(root))
     bpy.context.scene.lodgs_viewport.splats = True
     press("lodgs.compare_view", worst=True)
     scroll(60)
     yield from settle()
-    least = min(view.data.lodgs.psnr for view in module("scenes").views(root))
-    assert module_.shown.psnr == least > 10, f"The worst view has {module_.shown.psnr:.1f} dB."
-    wiped = [take("compare", f"{bpy.context.scene.camera.name}: {module_.shown.psnr:.1f} dB")]
+    least = min(view.data.lodgs.psnr for view in module("data.photographs").views(root))
+    psnr = module("viewport.wipe").comparison.psnr
+    assert psnr == least > 10, f"The worst view has {psnr:.1f} dB."
+    wiped = [take("compare", f"{bpy.context.scene.camera.name}: {psnr:.1f} dB")]
     bpy.context.scene.lodgs_render.wipe = 0.2
     yield from settle()
     wiped.append(take("compare-wiped"))
@@ -266,7 +282,16 @@ def overlays() -> Steps:
 def drawn(root: bpy.types.Object) -> list[int]:
     """How many splats each level shows alone; those of an octree add up."""
     counts = np.array([len(item.object.data.points) for item in root.lodgs.levels])
-    return (counts.cumsum() if OCTREE else counts).tolist()
+    return (counts.cumsum() if root.lodgs.cumulative else counts).tolist()
+
+
+def job() -> dict:
+    """What the tour trains with, beside the method's draft."""
+    parameters = training("methods").method_info(METHOD).parameters()
+    changes = LONGER if PLAN["long"] else TINY
+    if isinstance(parameters.steps, tuple):
+        changes = changes | (LONGER_BY_LEVEL if PLAN["long"] else TINY_BY_LEVEL)
+    return changes
 
 
 # -- hands and eyes ----------------------------------------------------------------------------------------
@@ -275,6 +300,11 @@ def drawn(root: bpy.types.Object) -> list[int]:
 def module(name: str):
     """A module of the installed extension."""
     return importlib.import_module(f"{LODGS}.blender_lodgs.{name}")
+
+
+def training(name: str):
+    """A module of what it shares with the trainer."""
+    return importlib.import_module(f"{LODGS}.training.{name}")
 
 
 def viewport() -> tuple[bpy.types.Area, bpy.types.RegionView3D]:

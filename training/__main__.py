@@ -1,26 +1,74 @@
-"""The trainer's command line: ``python -m training --help``, run from the folder that holds ``training``."""
+"""The trainer's command line: ``lodgs --help``, or ``python -m training --help`` beside ``training``."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import os
+import re
 import sys
+import tomllib
+from importlib import metadata
 from pathlib import Path
+from typing import NoReturn
 
+from . import VERSION
 from .errors import LodgsError
+
+PROGRAM = "lodgs" if __package__ == "lodgs" else "python -m training"
+_INSTALL = "Install the packages of requirements/trainer.txt."
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m training", description=__doc__)
-    commands = parser.add_subparsers(dest="command", required=True)
+    """Runs one command.
 
-    train = commands.add_parser("train", help="run a job, or resume the run that it began")
-    train.add_argument("job", type=Path, help="job file (TOML or JSON); a run's own job.toml resumes it")
+    Args:
+        arguments: what follows the program's name; None for those of this process.
+
+    Returns:
+        An exit code: 0 done, 1 crash, 2 bad input, 3 cancelled. Mistakes are told in a sentence.
+    """
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments == ["check"]:  # answers in any Python of this version, with the standard library alone
+        return _check()
+    try:
+        chosen = _parser().parse_args(arguments)
+        code = _COMMANDS[chosen.command](chosen)
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:  # whoever read our output has seen enough
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+        return 0
+    except LodgsError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except ModuleNotFoundError:
+        if not (problems := _environment()["problems"]):
+            raise
+        print(f"error: {problems[0]} {_INSTALL}", file=sys.stderr)
+        return 2
+
+
+def _parser() -> argparse.ArgumentParser:
+    from .runs.options import add_options
+
+    parser = argparse.ArgumentParser(prog=PROGRAM, description="Gaussian splats with levels of detail.")
+    parser.add_argument("--version", action="version", version=f"lodgs {VERSION}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    train = commands.add_parser(
+        "train",
+        help="photographs to splats, or resume the run that the same command began",
+        description="Says what happens as JSON, one event a line.",
+    )
+    add_options(train)
+
+    methods = commands.add_parser("methods", help="say which methods there are, or what one can be told")
+    methods.add_argument("name", nargs="?", metavar="NAME", help="method whose parameters to list")
 
     evaluate = commands.add_parser("evaluate", help="measure a finished run on its held-out views")
     evaluate.add_argument("run", type=Path, help="run folder")
-    _add_detail(evaluate)
+    _add_controls(evaluate)
     evaluate.add_argument("--picture", type=Path, help="PNG to write: the levels side by side from one view")
     evaluate.add_argument(
         "--far", action="store_true", help="measure as well how levels do from 2, 4 and 8 times the distance"
@@ -35,8 +83,10 @@ def main(arguments: list[str] | None = None) -> int:
     render.add_argument("--out", type=Path, required=True, help="picture to write: .png or .exr")
     render.add_argument("--size", type=_size, metavar="WxH", help="pixels; otherwise the camera's own")
     render.add_argument("--level", type=int, default=0, help="level to draw (otherwise the finest)")
-    by_distance = render.add_argument_group("levels by distance, where one of these is given")
-    _add_detail(by_distance, default=None)
+    render.add_argument(
+        "--by-distance", action="store_true", help="draw levels by distance; so does any of these:"
+    )
+    _add_controls(render)
     render.add_argument(
         "--background",
         type=_colour,
@@ -61,37 +111,28 @@ def main(arguments: list[str] | None = None) -> int:
 
     commands.add_parser("check", help="say as JSON whether this Python can train")
 
-    chosen = parser.parse_args(arguments)
-    try:
-        code = _COMMANDS[chosen.command](chosen)
-        sys.stdout.flush()
-        return code
-    except BrokenPipeError:  # whoever read our output has seen enough
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
-        return 0
-    except LodgsError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return parser
 
 
-def _add_detail(parser, default: float | None = 0) -> None:
-    """Options of ``lod.selection.Detail``; those not given are the default."""
-    gamma = 1.0 if default is not None else None
-    parser.add_argument(
-        "--gamma", type=float, default=gamma, help="screen size threshold in pixels (default 1)"
-    )
-    parser.add_argument(
-        "--from", type=int, default=default, dest="start", help="coarsest level of the selective view"
-    )
-    parser.add_argument(
-        "--to", type=int, default=default, dest="end", help="finest level of the selective view"
-    )
-    parser.add_argument(
-        "--offset",
-        type=float,
-        default=default,
-        help="levels finer or coarser than the distance asks (Octree-GS)",
-    )
+def _add_controls(parser: argparse.ArgumentParser) -> None:
+    """An option for each control that any rule has."""
+    from .lod.rule import every_control
+
+    group = parser.add_argument_group("levels by distance, as their method's rule has it")
+    for control in every_control().values():
+        default = "" if control.follows else f" (default {control.default:g})"
+        group.add_argument(
+            f"--{control.name.replace('_', '-')}", type=int if control.whole else float, metavar="N",
+            help=control.about.replace("%", "%%") + default,
+        )  # fmt: skip
+
+
+def _controls(chosen: argparse.Namespace) -> dict[str, float]:
+    """The controls that were given, by name."""
+    from .lod.rule import every_control
+
+    asked = {name: getattr(chosen, name) for name in every_control()}
+    return {name: value for name, value in asked.items() if value is not None}
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -115,13 +156,13 @@ def _colour(text: str) -> tuple[float, float, float] | None:
 
 def _train(chosen: argparse.Namespace) -> int:
     from .runs.folder import event_line
-    from .runs.job import Job
+    from .runs.options import job_from
 
     try:
-        job = Job.from_file(chosen.job)
+        job = job_from(chosen)
         problems = _environment()["problems"]
         if problems:
-            raise LodgsError(problems[0], "Install the packages of requirements/trainer.txt.")
+            raise LodgsError(problems[0], _INSTALL)
     except LodgsError as error:
         print(event_line("error", what=error.what, remedy=error.remedy), flush=True)
         return 2
@@ -130,33 +171,46 @@ def _train(chosen: argparse.Namespace) -> int:
     return train(job, sys.stdout)
 
 
-def _evaluate(chosen: argparse.Namespace) -> int:
-    from .evaluate.protocol import evaluate_run, table
-    from .lod.selection import Detail
+def _methods(chosen: argparse.Namespace) -> int:
+    from .methods.describe import describe_method, describe_methods
 
-    detail = Detail(chosen.gamma, chosen.start, chosen.end, chosen.offset)
-    print(table(evaluate_run(chosen.run, detail, chosen.picture, chosen.far)))
+    print(describe_method(chosen.name) if chosen.name else describe_methods())
+    return 0
+
+
+def _evaluate(chosen: argparse.Namespace) -> int:
+    from .runs.measure import evaluate_run, table
+
+    print(table(evaluate_run(chosen.run, _controls(chosen), chosen.picture, chosen.far)))
     return 0
 
 
 def _render(chosen: argparse.Namespace) -> int:
-    from .lod.selection import Detail
+    from .lod.rule import find_rule
+    from .lod.selection import unknown_rule
     from .render.command import Source, render
     from .scenes.cameras import read_camera
 
-    asked = {name: getattr(chosen, name) for name in ("gamma", "start", "end", "offset")}
-    asked = {name: value for name, value in asked.items() if value is not None}
-    if asked and chosen.level:
+    given = _controls(chosen)
+    if (given or chosen.by_distance) and chosen.level:
         raise LodgsError("--level draws one level, the other options levels by distance.", "Choose one.")
-    source = Source.read(chosen.source)
+    source = Source.read(chosen.source, _warn)
     camera, near = read_camera(chosen.camera) if chosen.camera else source.view(chosen.view, chosen.scene)
     if chosen.size:
         camera = camera.resized(*chosen.size)
+    by_distance = given if given or chosen.by_distance else None
+    rule = source.bundle.rule
+    if rule and find_rule(rule) is None and by_distance is None and not chosen.level:
+        _warn(" ".join(unknown_rule(rule)))
     render(
-        source, camera, near, chosen.out, level=chosen.level, detail=Detail(**asked) if asked else None,
+        source, camera, near, chosen.out, level=chosen.level, given=by_distance,
         background=chosen.background, holdout=chosen.holdout, backend=chosen.backend,
     )  # fmt: skip
     return 0
+
+
+def _warn(message: str) -> None:
+    print(f"warning: {message}", file=sys.stderr)
 
 
 def _serve(chosen: argparse.Namespace) -> int:
@@ -172,7 +226,7 @@ def _info(chosen: argparse.Namespace) -> int:
     return 0
 
 
-def _check(_: argparse.Namespace) -> int:
+def _check() -> int:
     found = _environment()
     print(json.dumps(found))
     return 0 if found["ok"] else 2
@@ -180,15 +234,9 @@ def _check(_: argparse.Namespace) -> int:
 
 def _environment() -> dict:
     """Versions of what training needs, and one sentence for each thing that is missing or too old."""
-    from importlib import metadata
-
-    from . import VERSION
-
     found: dict = {"lodgs": VERSION, "python": sys.version.split()[0], "executable": sys.executable}
     problems = []
-    minimum = {"torch": "2.4", "numba": "0.60", "numpy": "1.26", "scipy": "1.11", "pycolmap": "3.11",
-               "plyfile": "1.0", "pillow": "10.0", "OpenEXR": "3.3", "torchmetrics": "1.4"}  # fmt: skip
-    for package, oldest in minimum.items():
+    for package, oldest in _requirements():
         try:
             found[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
@@ -199,17 +247,38 @@ def _environment() -> dict:
     return {**found, "ok": not problems, "problems": problems}
 
 
+def _requirements() -> list[tuple[str, str]]:
+    """Name and oldest version of each package that training needs: from pyproject.toml, as pip has them."""
+    project = Path(__file__).resolve().parents[1] / "pyproject.toml"
+    if project.is_file():  # a checkout or the extension
+        wanted = tomllib.loads(project.read_text(encoding="utf-8"))["project"]["dependencies"]
+    else:
+        wanted = [line for line in metadata.requires("lodgs") or () if "extra ==" not in line]
+    found = (re.match(r"([\w-]+)>=([\d.]+)", line) for line in wanted)
+    return [(entry[1], entry[2]) for entry in found if entry]
+
+
 def _numbers(version: str) -> list[int]:
     return [int(part) for part in version.split("+", maxsplit=1)[0].split(".")[:2] if part.isdigit()]
 
 
 _COMMANDS = {
-    "train": _train, "evaluate": _evaluate, "render": _render, "serve": _serve, "info": _info,
-    "check": _check,
-}  # fmt: skip
+    "train": _train,
+    "methods": _methods,
+    "evaluate": _evaluate,
+    "render": _render,
+    "serve": _serve,
+    "info": _info,
+}
 
-if __name__ == "__main__":
+
+def run() -> NoReturn:
+    """The command ``lodgs``: ends the process with :func:`main`'s code."""
     code = main()
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)  # native thread pools can hang a normal exit
+
+
+if __name__ == "__main__":
+    run()

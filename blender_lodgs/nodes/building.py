@@ -1,13 +1,13 @@
-"""What the groups have in common: how they are built, and how far a point is from the eye."""
+"""How node groups are built: nodes from left to right, and formulas that read as formulas."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import bpy
 
-EYE, EYE_OBJECT, EYE_POSITION = "Measured From", "Eye", "Eye Position"
-MATERIAL = "Material"
-EYES = ("CAMERA", "OBJECT", "TRAINING")
-"""What the input "Measured From" counts: the first of ``SplatScene.eye``. "TRAINING" is any fixed place."""
+VERSION = "lodgs_version"
+"""Custom property of our groups: a group of another version, from an older file, is made anew."""
 
 
 class Nodes:
@@ -42,112 +42,124 @@ class Nodes:
                 socket.default_value = value
         return node.outputs["Value"]
 
+    def field(self, socket: bpy.types.NodeSocket) -> Field:
+        """A socket to calculate with."""
+        return Field(self, socket)
 
-class Builder(Nodes):
-    """A new modifier group, built node by node from left to right.
 
-    Its inputs are the geometry, those given, and whom distances are measured from. Distances are taken in the
-    local space of the modifier's object, that is in the splats' own world, whatever the transforms of the
-    object and its parents. "Measured From" is an index into EYES: the scene's active camera, the object
-    "Eye", or the point "Eye Position" in local space. Blender drops a point cloud's material when points go;
-    "Material" gives it back.
+class Field:
+    """A number, or one for each point, to calculate with: operators and methods add Math nodes.
 
-    Args:
-        name: of the group.
-        sockets: names and types of further inputs.
+    Comparisons give 1 where they hold, else 0.
     """
 
-    def __init__(self, name: str, sockets: dict[str, str]) -> None:
-        super().__init__(_group(name))
-        shared = {
-            EYE: "NodeSocketInt",
-            EYE_OBJECT: "NodeSocketObject",
-            EYE_POSITION: "NodeSocketVector",
-            MATERIAL: "NodeSocketMaterial",
-        }
-        for socket, kind in (sockets | shared).items():
-            self.tree.interface.new_socket(socket, in_out="INPUT", socket_type=kind)
-        self.inputs = self.add("NodeGroupInput").outputs
+    def __init__(self, nodes: Nodes, socket: bpy.types.NodeSocket) -> None:
+        self.nodes, self.socket = nodes, socket
 
-    def distance(self) -> bpy.types.NodeSocket:
-        """How far each point is from the eye."""
-        camera = self.add("GeometryNodeInputActiveCamera")
-        seen_from = []
-        for thing in (camera.outputs["Active Camera"], self.inputs[EYE_OBJECT]):
-            info = self.add("GeometryNodeObjectInfo", transform_space="RELATIVE")
-            self.link(thing, info, "Object")
-            seen_from.append(info.outputs["Location"])
-        eye = self.add("GeometryNodeIndexSwitch", data_type="VECTOR")
-        eye.index_switch_items.new()
-        self.link(self.inputs[EYE], eye, "Index")
-        for index, source in enumerate((*seen_from, self.inputs[EYE_POSITION])):
-            self.link(source, eye, str(index))
-        position = self.add("GeometryNodeInputPosition")
-        distance = self.add("ShaderNodeVectorMath", operation="DISTANCE")
-        self.tree.links.new(position.outputs["Position"], distance.inputs[0])
-        self.tree.links.new(eye.outputs["Output"], distance.inputs[1])
-        return distance.outputs["Value"]
+    def _math(self, operation: str, *values: Field | float) -> Field:
+        plain = (value.socket if isinstance(value, Field) else value for value in values)
+        return Field(self.nodes, self.nodes.math(operation, *plain))
 
-    def compare(
-        self, operation: str, a: bpy.types.NodeSocket, b: bpy.types.NodeSocket | float
-    ) -> bpy.types.NodeSocket:
-        """Where a number compares so with another."""
-        node = self.add("FunctionNodeCompare", data_type="FLOAT", operation=operation)
-        self.link(a, node, "A")
-        if isinstance(b, bpy.types.NodeSocket):
-            self.link(b, node, "B")
-        else:
-            next(s for s in node.inputs if s.name == "B" and s.enabled).default_value = b
-        return node.outputs["Result"]
+    def __add__(self, other: Field | float) -> Field:
+        return self._math("ADD", self, other)
 
-    def keep(self, geometry: bpy.types.NodeSocket, where: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-        """The points where a field is true."""
-        node = self.add("GeometryNodeSeparateGeometry", domain="POINT")
-        self.link(geometry, node, "Geometry")
-        self.link(where, node, "Selection")
-        return node.outputs["Selection"]
+    def __sub__(self, other: Field | float) -> Field:
+        return self._math("SUBTRACT", self, other)
 
-    def finish(self, geometry: bpy.types.NodeSocket) -> bpy.types.GeometryNodeTree:
-        """Give the geometry its material back, and out."""
-        material = self.add("GeometryNodeSetMaterial")
-        self.link(geometry, material, "Geometry")
-        self.link(self.inputs[MATERIAL], material, "Material")
-        self.link(material.outputs["Geometry"], self.add("NodeGroupOutput"), "Geometry")
-        return self.tree  # type: ignore[return-value]
+    def __rsub__(self, other: float) -> Field:
+        return self._math("SUBTRACT", other, self)
+
+    def __mul__(self, other: Field | float) -> Field:
+        return self._math("MULTIPLY", self, other)
+
+    def __truediv__(self, other: Field | float) -> Field:
+        return self._math("DIVIDE", self, other)
+
+    def __rtruediv__(self, other: float) -> Field:
+        return self._math("DIVIDE", other, self)
+
+    def __gt__(self, other: Field | float) -> Field:
+        return self._math("GREATER_THAN", self, other)
+
+    def __lt__(self, other: Field | float) -> Field:
+        return self._math("LESS_THAN", self, other)
+
+    def __ge__(self, other: Field | float) -> Field:
+        return 1.0 - (self < other)
+
+    def __le__(self, other: Field | float) -> Field:
+        return 1.0 - (self > other)
+
+    def __and__(self, other: Field) -> Field:
+        return self * other
+
+    def maximum(self, other: Field | float) -> Field:
+        return self._math("MAXIMUM", self, other)
+
+    def minimum(self, other: Field | float) -> Field:
+        return self._math("MINIMUM", self, other)
+
+    def clip(self, low: Field | float, high: Field | float) -> Field:
+        return self.maximum(low).minimum(high)
+
+    def log2(self) -> Field:
+        return self._math("LOGARITHM", self, 2.0)
+
+    def log(self) -> Field:
+        return self._math("LOGARITHM", self, 2.718281828459045)
+
+    def exp(self) -> Field:
+        return self._math("EXPONENT", self)
+
+    def sqrt(self) -> Field:
+        return self._math("SQRT", self)
+
+    def where(self, yes: Field | float, no: Field | float) -> Field:
+        """``yes`` where this is 1, ``no`` where it is 0; the other side may be anything, infinite too."""
+        node = self.nodes.add("GeometryNodeSwitch", input_type="FLOAT")
+        self.nodes.link(self.socket, node, "Switch")
+        for name, value in (("True", yes), ("False", no)):
+            if isinstance(value, Field):
+                self.nodes.link(value.socket, node, name)
+            else:
+                next(s for s in node.inputs if s.name == name and s.enabled).default_value = value
+        return Field(self.nodes, next(s for s in node.outputs if s.enabled))
 
 
-def existing(name: str) -> bpy.types.GeometryNodeTree | None:
-    """The group of that name that this file has already."""
-    group = bpy.data.node_groups.get(name)
-    return group if isinstance(group, bpy.types.GeometryNodeTree) else None
+def group(name: str, version: int, build: Callable[[Nodes], None]) -> bpy.types.GeometryNodeTree:
+    """The modifier group of that name, made where this file has none of this version.
 
-
-def plain_group(name: str) -> Nodes:
-    """A new modifier group that has geometry in and out, and nothing else yet."""
-    return Nodes(_group(name))
-
-
-def _group(name: str) -> bpy.types.GeometryNodeTree:
-    group = bpy.data.node_groups.new(name, "GeometryNodeTree")
-    assert isinstance(group, bpy.types.GeometryNodeTree)
-    group.is_modifier = True
+    Args:
+        build: adds the nodes to a group that has geometry in and out, and nothing else yet. An older group
+            of that name is renamed: sockets of the new one may differ, so its users are to be given it anew.
+    """
+    there = bpy.data.node_groups.get(name)
+    if isinstance(there, bpy.types.GeometryNodeTree) and there.get(VERSION) == version:
+        return there
+    if there is not None:
+        there.name = f"{name} (older)"
+    tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
+    assert isinstance(tree, bpy.types.GeometryNodeTree)
+    tree.is_modifier = True
+    tree[VERSION] = version
     for way in ("INPUT", "OUTPUT"):
-        group.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
-    return group
+        tree.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
+    build(Nodes(tree))
+    return tree
 
 
-def switched(thing: bpy.types.Object, group: bpy.types.GeometryNodeTree, where: str, by: str) -> None:
+def switched(obj: bpy.types.Object, group: bpy.types.GeometryNodeTree, where: str, by: str) -> None:
     """A new modifier with a group, which is on only in one place and where the active scene says so.
 
     Args:
         where: "show_viewport" or "show_render"; it is off in the other.
         by: data path of a property of scenes. Without this extension it is off.
     """
-    modifier = thing.modifiers.new(group.name, "NODES")
+    modifier = obj.modifiers.new(group.name, "NODES")
     assert isinstance(modifier, bpy.types.NodesModifier)
     modifier.node_group, modifier.show_expanded = group, False
     modifier.show_viewport = modifier.show_render = False
-    driver = thing.driver_add(f'modifiers["{modifier.name}"].{where}').driver
+    driver = obj.driver_add(f'modifiers["{modifier.name}"].{where}').driver
     driver.type, driver.expression = "SCRIPTED", "on"
     variable = driver.variables.new()
     variable.name, variable.type = "on", "CONTEXT_PROP"

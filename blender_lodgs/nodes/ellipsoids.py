@@ -11,8 +11,8 @@ import math
 
 import bpy
 
-from ..objects import COLOR, OPACITY_LOGIT, ROTATION, SCALE, WEIGHT
-from .building import Nodes, existing, plain_group, switched
+from ..attributes import COLOR, OPACITY_LOGIT, ROTATION, SCALE, WEIGHT
+from .building import Nodes, group, switched
 
 NAME = "LODGS Ellipsoids"
 MATERIAL = "LODGS Ellipsoids"
@@ -27,18 +27,19 @@ samples that remove it cost far more time than going on.
 """
 
 
-def attach(thing: bpy.types.Object) -> None:
+def attach(obj: bpy.types.Object) -> None:
     """Gives an object of splats this modifier, last of all; it is on where its scene wants ellipsoids."""
-    if NAME not in thing.modifiers:
-        switched(thing, ellipsoids(), "show_render", "lodgs_render.draws_ellipsoids")
+    if NAME not in obj.modifiers:
+        switched(obj, ellipsoids(), "show_render", "lodgs_render.draws_ellipsoids")
 
 
 def ellipsoids() -> bpy.types.GeometryNodeTree:
-    """The group, made on first use."""
-    if group := existing(NAME):
-        return group
-    build = plain_group(NAME)
-    add, link, math_of = build.add, build.link, build.math
+    """The group."""
+    return group(NAME, 1, _build)
+
+
+def _build(nodes: Nodes) -> None:
+    add, link = nodes.add, nodes.link
 
     def attribute(name: str, kind: str) -> bpy.types.Node:
         node = add("GeometryNodeInputNamedAttribute", data_type=kind)
@@ -50,17 +51,13 @@ def ellipsoids() -> bpy.types.GeometryNodeTree:
 
     points = add("NodeGroupInput").outputs[0]
     logit, weight = attribute(OPACITY_LOGIT, "FLOAT"), attribute(WEIGHT, "FLOAT")
-    opacity = math_of(
-        "DIVIDE", 1.0, math_of("ADD", 1.0, math_of("EXPONENT", math_of("MULTIPLY", value(logit), -1.0)))
-    )
-    faded = add("GeometryNodeSwitch", input_type="FLOAT")  # splats without the attribute are there in full
-    link(weight.outputs["Exists"], faded, "Switch")
-    next(s for s in faded.inputs if s.name == "False" and s.enabled).default_value = 1.0
-    link(value(weight), faded, "True")
+    opacity = 1.0 / ((nodes.field(value(logit)) * -1.0).exp() + 1.0)
+    # splats without the attribute are there in full
+    faded = nodes.field(weight.outputs["Exists"]).where(nodes.field(value(weight)), 1.0)
     store = add("GeometryNodeStoreNamedAttribute", data_type="FLOAT", domain="POINT")
     store.inputs["Name"].default_value = ALPHA
     link(points, store, "Geometry")
-    link(math_of("MULTIPLY", opacity, faded.outputs["Output"]), store, "Value")
+    link((opacity * faded).socket, store, "Value")
 
     sphere = add("GeometryNodeMeshIcoSphere")
     sphere.inputs["Radius"].default_value, sphere.inputs["Subdivisions"].default_value = 1.0, 3
@@ -70,7 +67,7 @@ def ellipsoids() -> bpy.types.GeometryNodeTree:
     link(smooth.outputs[0], material, "Geometry")
     material.inputs["Material"].default_value = falloff()
     reach = add("ShaderNodeVectorMath", operation="SCALE")
-    build.tree.links.new(value(attribute(SCALE, "FLOAT_VECTOR")), reach.inputs[0])
+    nodes.tree.links.new(value(attribute(SCALE, "FLOAT_VECTOR")), reach.inputs[0])
     reach.inputs["Scale"].default_value = REACH
     stand = add("GeometryNodeInstanceOnPoints")
     link(store.outputs["Geometry"], stand, "Points")
@@ -78,7 +75,6 @@ def ellipsoids() -> bpy.types.GeometryNodeTree:
     link(value(attribute(ROTATION, "QUATERNION")), stand, "Rotation")
     link(reach.outputs["Vector"], stand, "Scale")
     link(stand.outputs["Instances"], add("NodeGroupOutput"), "Geometry")
-    return build.tree  # type: ignore[return-value]
 
 
 def falloff() -> bpy.types.Material:

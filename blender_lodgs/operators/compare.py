@@ -5,17 +5,19 @@ from __future__ import annotations
 import bpy
 
 from ...training.errors import LodgsError
-from .. import compare, processes, scenes
-from .reporting import saying_errors
+from ..data import photographs, scenes
+from ..render import compare
+from ..runs import processes
+from .parts import report_errors
 
 
 class _OnViews:
-    """What the operators below share: they act on the views of the active splat scene."""
+    """An operator that acts on the views of the active splat scene."""
 
     @classmethod
     def poll(cls, context):
-        root = scenes.active_root(context)
-        if root is None or not scenes.views(root) or not any(item.exists for item in root.lodgs.levels):
+        root = scenes.root_with_levels(context)
+        if root is None or not photographs.views(root):
             cls.poll_message_set("Select a splat scene that has levels and photographs")
             return False
         return True
@@ -27,12 +29,12 @@ class LODGS_OT_measure_views(_OnViews, bpy.types.Operator):
     bl_idname = "lodgs.measure_views"
     bl_label = "Measure"
 
-    @saying_errors
+    @report_errors
     def execute(self, context):
-        measuring = compare.measure(context, scenes.active_root(context))
-        processes.follow(measuring.step)
-        if measuring.problem:
-            self.report({"ERROR"}, measuring.problem)
+        measurement = compare.measure(context, scenes.active_root(context))
+        processes.follow(measurement.step)
+        if measurement.problem:
+            self.report({"ERROR"}, measurement.problem)
             return {"CANCELLED"}
         return {"FINISHED"}
 
@@ -45,10 +47,10 @@ class LODGS_OT_cancel_measuring(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        return compare.measuring is not None and compare.measuring.running
+        return compare.measurement is not None and compare.measurement.running
 
     def execute(self, context):
-        compare.measuring.cancel()
+        compare.measurement.cancel()
         return {"FINISHED"}
 
 
@@ -64,11 +66,11 @@ class LODGS_OT_compare_view(_OnViews, bpy.types.Operator):
         options={"SKIP_SAVE"},
     )
 
-    @saying_errors
+    @report_errors
     def execute(self, context):
         root = scenes.active_root(context)
         view = compare.worst(root) if self.worst else context.scene.camera
-        if view not in scenes.views(root):
+        if view not in photographs.views(root):
             raise LodgsError("The scene's camera is none of the views.", "Choose one in the list.")
         found = compare.show(context, root, view)
         if context.region_data is not None:

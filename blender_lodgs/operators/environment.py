@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import bpy
 
-from .. import environment, processes
-from .reporting import saying_errors
+from ..runs import environment, processes
+from .parts import report_errors
 
 
 class LODGS_OT_make_environment(bpy.types.Operator):
@@ -14,12 +14,12 @@ class LODGS_OT_make_environment(bpy.types.Operator):
     bl_description = "Download PyTorch and what else training needs into a folder of its own"
     bl_options = {"INTERNAL"}
 
-    @saying_errors
+    @report_errors
     def execute(self, context: bpy.types.Context):
-        making = environment.make()
-        processes.follow(making.step)
-        if making.problem:
-            self.report({"ERROR"}, making.problem)
+        setup = environment.make()
+        processes.follow(setup.step)
+        if setup.problem:
+            self.report({"ERROR"}, setup.problem)
             return {"CANCELLED"}
         return {"FINISHED"}
 
@@ -32,11 +32,11 @@ class LODGS_OT_cancel_environment(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return environment.making is not None and environment.making.running
+        return environment.setup is not None and environment.setup.running
 
     def execute(self, context: bpy.types.Context):
-        if environment.making is not None:
-            environment.making.cancel()
+        if environment.setup is not None:
+            environment.setup.cancel()
         return {"FINISHED"}
 
 
@@ -46,7 +46,7 @@ class LODGS_OT_check_environment(bpy.types.Operator):
     bl_description = "Say what the trainer's Python lacks, if anything"
     bl_options = {"INTERNAL"}
 
-    @saying_errors
+    @report_errors
     def execute(self, context: bpy.types.Context):
         report = environment.check_now()
         if not report.ok:

@@ -9,24 +9,13 @@ from bpy_extras.io_utils import ExportHelper
 
 from ...training.errors import LodgsError
 from ...training.splats.bundle import write_bundle, write_folder
+from ...training.splats.dialects import comments_of
 from ...training.splats.ply import write_ply
-from .. import scenes
-from .reporting import saying_errors
+from ..data import scenes, selection
+from .parts import OnLevels, report_errors
 
 
-class _OfLevels:
-    """Operators that need levels say so."""
-
-    @classmethod
-    def poll(cls, context):
-        root = scenes.active_root(context)
-        if root is None or not any(item.exists for item in root.lodgs.levels):
-            cls.poll_message_set("Select a splat scene that has levels")
-            return False
-        return True
-
-
-class _Export(_OfLevels, ExportHelper):
+class _Export(OnLevels, ExportHelper):
     """What exports to one PLY have in common: a name after the scene, and the browser's overwrite check."""
 
     filename_ext = ".ply"
@@ -62,7 +51,7 @@ class LODGS_OT_export_bundle(_Export, bpy.types.Operator):
         ],
     )
 
-    @saying_errors
+    @report_errors
     def execute(self, context):
         bundle = scenes.read_levels(scenes.active_root(context))
         write_bundle(self._path(), bundle, self.order)
@@ -93,19 +82,19 @@ class LODGS_OT_export_plain(_Export, bpy.types.Operator):
         if self.source == "LEVEL":
             self.layout.prop(self, "level")
 
-    @saying_errors
+    @report_errors
     def execute(self, context):
         root = scenes.active_root(context)
         if self.source == "LEVEL":
             splats = scenes.read_level(root, self.level)
         else:
             splats = scenes.shown_splats(context, root)
-        write_ply(self._path(), splats)
+        write_ply(self._path(), splats, comments_of(selection.read_json(root.lodgs.meta)))
         self.report({"INFO"}, f"{len(splats):,} splats written to {self._path()}")
         return {"FINISHED"}
 
 
-class LODGS_OT_export_folder(_OfLevels, bpy.types.Operator):
+class LODGS_OT_export_folder(OnLevels, bpy.types.Operator):
     """Export every level as its own file; splat-transform makes streamed levels for the web of them"""
 
     bl_idname = "lodgs.export_folder"
@@ -125,7 +114,7 @@ class LODGS_OT_export_folder(_OfLevels, bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    @saying_errors
+    @report_errors
     def execute(self, context):
         folder = Path(bpy.path.abspath(self.directory))
         if not self.replace and any(folder.glob("lod*.ply")):

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import bpy
 
-from .reporting import saying_errors
+from .parts import report_errors
 
 
 class FrameByFrame:
@@ -30,10 +30,10 @@ class FrameByFrame:
         raise NotImplementedError
 
     def done(self, count: int) -> str:
-        """What to tell after so many frames."""
+        """The report after so many frames."""
         raise NotImplementedError
 
-    @saying_errors
+    @report_errors
     def execute(self, context):
         self.report({"INFO"}, self.done(sum(1 for _ in self.work(context))))
         return {"FINISHED"}
@@ -42,7 +42,7 @@ class FrameByFrame:
         if not self.animation or bpy.app.background:
             return self.execute(context)
         manager = context.window_manager
-        self._todo, self._done = self.work(context), 0
+        self._work, self._done = self.work(context), 0
         self._timer = manager.event_timer_add(0.01, window=context.window)
         manager.modal_handler_add(self)
         manager.progress_begin(0, len(self.frames(context)))
@@ -63,18 +63,18 @@ class FrameByFrame:
             context.window_manager.progress_update(self._done)
             context.workspace.status_text_set(text)
             return result
-        said = self.done(self._done) if result == {"FINISHED"} else ""
-        return self._finish(context, result, said)
+        message = self.done(self._done) if result == {"FINISHED"} else ""
+        return self._finish(context, result, message)
 
-    @saying_errors
+    @report_errors
     def _one(self, context):
-        return {"FINISHED"} if next(self._todo, StopIteration) is StopIteration else {"RUNNING_MODAL"}
+        return {"FINISHED"} if next(self._work, StopIteration) is StopIteration else {"RUNNING_MODAL"}
 
-    def _finish(self, context, result: set[str], said: str) -> set[str]:
-        self._todo.close()
+    def _finish(self, context, result: set[str], message: str) -> set[str]:
+        self._work.close()
         context.window_manager.event_timer_remove(self._timer)
         context.window_manager.progress_end()
         context.workspace.status_text_set(None)
-        if said:
-            self.report({"INFO"}, said)
+        if message:
+            self.report({"INFO"}, message)
         return result

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import bpy
 
-from .. import scenes
-from .reporting import saying_errors
+from ..data import scenes
+from .parts import report_errors
 
 
 class LODGS_OT_import_colmap(bpy.types.Operator):
@@ -36,7 +36,7 @@ class LODGS_OT_import_colmap(bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    @saying_errors
+    @report_errors
     def execute(self, context):
         scenes.import_colmap(
             context,

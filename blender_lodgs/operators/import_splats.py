@@ -6,8 +6,8 @@ from pathlib import Path
 
 import bpy
 
-from .. import scenes
-from .reporting import saying_errors
+from ..data import scenes
+from .parts import report_errors
 
 
 class LODGS_OT_import_splats(bpy.types.Operator):
@@ -37,11 +37,16 @@ class LODGS_OT_import_splats(bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    @saying_errors
+    @report_errors
     def execute(self, context):
         paths = [Path(self.directory, file.name) for file in self.files if file.name]
         for path in paths or [Path(self.filepath)]:
-            scenes.import_splats(context, bpy.path.abspath(str(path)), upright=self.upright)
+            scenes.import_splats(
+                context,
+                bpy.path.abspath(str(path)),
+                upright=self.upright,
+                warn=lambda message: self.report({"WARNING"}, message),
+            )
         return {"FINISHED"}
 
 

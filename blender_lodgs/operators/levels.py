@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import bpy
 
-from .. import scenes
+from ..data import scenes
+from .parts import OnScene
 
 
-class LODGS_OT_show_only_level(bpy.types.Operator):
+class LODGS_OT_show_only_level(OnScene, bpy.types.Operator):
     """Show this level everywhere; where levels add up, with all coarser ones"""
 
     bl_idname = "lodgs.show_only_level"
@@ -15,10 +16,6 @@ class LODGS_OT_show_only_level(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     level: bpy.props.IntProperty(name="Level", description="1 is the coarsest", default=1, min=1)
-
-    @classmethod
-    def poll(cls, context):
-        return scenes.active_root(context) is not None
 
     def execute(self, context):
         scenes.show_only(scenes.active_root(context), self.level)

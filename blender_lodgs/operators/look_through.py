@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import bpy
 
-from .. import scenes
-from .reporting import saying_errors
+from ..data import photographs, scenes
+from .parts import report_errors
 
 
 class LODGS_OT_look_through(bpy.types.Operator):
@@ -24,11 +24,11 @@ class LODGS_OT_look_through(bpy.types.Operator):
     @classmethod
     def poll(cls, context):
         root = scenes.active_root(context)
-        return root is not None and bool(scenes.views(root))
+        return root is not None and bool(photographs.views(root))
 
-    @saying_errors
+    @report_errors
     def execute(self, context):
-        scenes.look_through(context, scenes.active_root(context), self.step)
+        photographs.look_through(context, scenes.active_root(context), self.step)
         if context.region_data is not None:
             context.region_data.view_perspective = "CAMERA"
         return {"FINISHED"}

@@ -8,9 +8,10 @@ import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ...training.scenes.cameras import write_camera
-from .. import cameras, compositing, engine, quick, scenes
+from ..data import scenes
+from ..render import cameras, compositing, engine, quick
 from .frames import FrameByFrame
-from .reporting import saying_errors
+from .parts import report_errors
 
 
 class LODGS_OT_use_engine(bpy.types.Operator):
@@ -32,7 +33,7 @@ class LODGS_OT_combine_with_meshes(bpy.types.Operator):
     bl_label = "Combine With Meshes"
     bl_options = {"REGISTER", "UNDO"}
 
-    @saying_errors
+    @report_errors
     def execute(self, context):
         meshes = compositing.combine_with_meshes(context.scene)
         self.report({"INFO"}, f"The meshes are rendered by the scene '{meshes.name}'")
@@ -101,7 +102,7 @@ class LODGS_OT_export_camera(bpy.types.Operator, ExportHelper):
         self.filepath = f"{bpy.path.clean_name(context.scene.camera.name)}.json"
         return super().invoke(context, event)
 
-    @saying_errors
+    @report_errors
     def execute(self, context):
         width, height = engine.size(context.scene.render)
         camera, near = cameras.view_from(

@@ -4,30 +4,13 @@ from __future__ import annotations
 
 import bpy
 
-from ...training.errors import LodgsError
-from .. import jobs, scenes
-from .reporting import saying_errors
+from ..data import scenes
+from ..runs import jobs
+from ..runs.watch import Watch
+from .parts import OnScene, report_errors
 
 
-class _OnRoot:
-    """What the operators below share: they act on the active scene root."""
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if scenes.active_root(context) is None:
-            cls.poll_message_set("Select a splat scene, or import a COLMAP folder first")  # type: ignore[attr-defined]
-            return False
-        return True
-
-
-def _root(context: bpy.types.Context) -> bpy.types.Object:
-    root = scenes.active_root(context)
-    if root is None:
-        raise LodgsError("No splat scene is selected.", "Select one, or import a COLMAP folder first.")
-    return root
-
-
-def _follow(operator: bpy.types.Operator, watch: jobs.Watch):
+def _follow(operator: bpy.types.Operator, watch: Watch):
     """Follow a run: to its end in background, from now on in a window."""
     jobs.follow(watch)
     if watch.problem:
@@ -35,7 +18,7 @@ def _follow(operator: bpy.types.Operator, watch: jobs.Watch):
     return {"FINISHED"} if watch.state in {"running", "done"} else {"CANCELLED"}
 
 
-class LODGS_OT_train(_OnRoot, bpy.types.Operator):
+class LODGS_OT_train(OnScene, bpy.types.Operator):
     bl_idname = "lodgs.train"
     bl_label = "Train"
     bl_description = "Train splats with levels of detail from the scene's photographs, while you work on"
@@ -48,34 +31,34 @@ class LODGS_OT_train(_OnRoot, bpy.types.Operator):
         options={"SKIP_SAVE", "PATH_SUPPORTS_BLEND_RELATIVE"},
     )
 
-    @saying_errors
+    @report_errors
     def execute(self, context):
-        return _follow(self, jobs.start(_root(context), self.folder))
+        return _follow(self, jobs.start(scenes.active_root(context), self.folder))
 
 
-class LODGS_OT_resume_training(_OnRoot, bpy.types.Operator):
+class LODGS_OT_resume_training(OnScene, bpy.types.Operator):
     bl_idname = "lodgs.resume_training"
     bl_label = "Resume"
     bl_description = "Go on with the run where it stopped, with the settings that it began with"
     bl_options = {"UNDO"}
 
-    @saying_errors
+    @report_errors
     def execute(self, context):
-        return _follow(self, jobs.resume(_root(context)))
+        return _follow(self, jobs.resume(scenes.active_root(context)))
 
 
-class LODGS_OT_cancel_training(_OnRoot, bpy.types.Operator):
+class LODGS_OT_cancel_training(OnScene, bpy.types.Operator):
     bl_idname = "lodgs.cancel_training"
     bl_label = "Cancel"
     bl_description = "Ask the trainer to save and stop, so that it can be resumed; again: end it at once"
 
-    @saying_errors
+    @report_errors
     def execute(self, context):
-        jobs.cancel(_root(context))
+        jobs.cancel(scenes.active_root(context))
         return {"FINISHED"}
 
 
-class LODGS_OT_open_run(_OnRoot, bpy.types.Operator):
+class LODGS_OT_open_run(OnScene, bpy.types.Operator):
     bl_idname = "lodgs.open_run"
     bl_label = "Open Run"
     bl_description = "Load the levels of a run folder, and follow the run if it is at work"
@@ -91,14 +74,14 @@ class LODGS_OT_open_run(_OnRoot, bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    @saying_errors
+    @report_errors
     def execute(self, context):
-        watch = jobs.attach(_root(context), self.directory)
+        watch = jobs.attach(scenes.active_root(context), self.directory)
         jobs.follow(watch)
         return {"FINISHED"}
 
 
-class LODGS_OT_show_log(_OnRoot, bpy.types.Operator):
+class LODGS_OT_show_log(OnScene, bpy.types.Operator):
     bl_idname = "lodgs.show_log"
     bl_label = "Show Log"
     bl_description = "Show the end of the trainer's log; a text block keeps it"
@@ -109,9 +92,9 @@ class LODGS_OT_show_log(_OnRoot, bpy.types.Operator):
             return context.window_manager.invoke_popup(self, width=900)
         return result
 
-    @saying_errors
+    @report_errors
     def execute(self, context):
-        jobs.log_text(_root(context))
+        jobs.log_text(scenes.active_root(context))
         return {"FINISHED"}
 
     def draw(self, context):

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import bpy
 
-from .. import objects, scenes
+from ...training.lod.rule import find_rule
+from ...training.lod.selection import unknown_rule
+from ..data import objects, scenes, selection
+from .parts import LevelsPanel, say
 
 
 def _columns(row: bpy.types.UILayout, *texts: str) -> None:
@@ -20,7 +23,7 @@ class LODGS_UL_levels(bpy.types.UIList):
         row = layout.row(align=True)
         row.prop(item, "show", text="", icon="HIDE_OFF" if item.show else "HIDE_ON", emboss=False)
         cloud = item.object.data
-        detail = f"{item.s_min:.2g}" if item.has_s_min else ""
+        detail = " ".join(f"{value:.2g}" for value in selection.read_facts(item.facts).values())
         _columns(row, str(item.number), f"{len(cloud.points):,}", f"{objects.megabytes(cloud):.1f}", detail)
         alone = data.mode == "SINGLE" and data.single_level == item.number
         only = row.operator(
@@ -32,27 +35,17 @@ class LODGS_UL_levels(bpy.types.UIList):
         return [self.bitflag_filter_item * item.exists for item in getattr(data, propname)], []
 
 
-class _Panel(bpy.types.Panel):
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = "LODGS"
-
-    @classmethod
-    def poll(cls, context):
-        root = scenes.active_root(context)
-        return root is not None and any(item.exists for item in root.lodgs.levels)
-
-
-class LODGS_PT_levels(_Panel):
+class LODGS_PT_levels(LevelsPanel):
     bl_label = "Levels"
     bl_order = 2
 
     def draw(self, context):
         settings = scenes.active_root(context).lodgs
+        rule = find_rule(settings.rule)
         row = self.layout.row(align=True)
         row.label(text="", icon="BLANK1")
         _columns(row, "Level", "Adds" if settings.cumulative else "Splats", "MB",
-                 "" if settings.cumulative else "Detail")  # fmt: skip
+                 "Detail" if rule and rule.level_facts else "")  # fmt: skip
         row.label(text="", icon="BLANK1")
         rows = min(max(len(settings.levels), 3), 10)
         self.layout.template_list(
@@ -60,32 +53,31 @@ class LODGS_PT_levels(_Panel):
         )
 
 
-class LODGS_PT_detail(_Panel):
+class LODGS_PT_detail(LevelsPanel):
     bl_label = "Detail"
     bl_order = 3
 
     def draw(self, context):
         root = scenes.active_root(context)
         settings, layout = root.lodgs, self.layout
-        by_distance = settings.by_distance
+        rule = find_rule(settings.rule)
         row = layout.row()
-        row.enabled = by_distance
+        row.enabled = rule is not None
         row.prop(settings, "mode", expand=True)
-        if not by_distance:
-            layout.label(text="These levels are not made for distances", icon="INFO")
+        if rule is None:
+            what, remedy = unknown_rule(settings.rule)
+            say(layout, f"{what} {remedy}" if settings.rule else what, "INFO")
+        elif rule.always and settings.mode == "SINGLE":
+            text = "These splats are made to be shown By Distance: all of them together are too opaque."
+            say(layout, text, "INFO")
 
         column = layout.column()
         column.use_property_split = True
         if settings.mode == "SINGLE":
             column.prop(settings, "single_level")
         else:
-            if settings.d_max > 0:
-                column.prop(settings, "level_offset", slider=True)
-            else:
-                both = column.column(align=True)
-                both.prop(settings, "level_start")
-                both.prop(settings, "level_end")
-                column.prop(settings, "gamma", slider=True)
+            for control in rule.controls if rule else ():
+                column.prop(settings.controls, control.name, slider=control.soft is not None)
             row = column.row(align=True)
             row.prop(settings, "eye")
             row.prop(settings, "freeze", text="", icon="FREEZE")

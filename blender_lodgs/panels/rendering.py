@@ -5,15 +5,14 @@ from __future__ import annotations
 import bpy
 
 from ...training.errors import LodgsError
-from .. import engine, environment, scenes
-from .training import draw_environment, say
+from ..data import scenes
+from ..render import engine
+from ..runs import environment
+from .parts import Panel, draw_environment, say, split_column
 
 
-class LODGS_PT_rendering(bpy.types.Panel):
+class LODGS_PT_rendering(Panel):
     bl_label = "Rendering"
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = "LODGS"
     bl_order = 5
     bl_options = {"DEFAULT_CLOSED"}
 
@@ -74,9 +73,7 @@ class LODGS_VIEWLAYER_PT_passes(_Properties):
 
 
 def _draw_film(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
-    column = layout.column()
-    column.use_property_split = True
-    column.use_property_decorate = False
+    column = split_column(layout)
     column.prop(scene.render, "film_transparent", text="Transparent")
     row = column.row()
     row.enabled = not scene.render.film_transparent
@@ -93,17 +90,13 @@ def _draw_film(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
 
 
 def _draw_passes(layout: bpy.types.UILayout, scene: bpy.types.Scene, layer: bpy.types.ViewLayer) -> None:
-    column = layout.column(heading="Passes")
-    column.use_property_split = True
-    column.use_property_decorate = False
+    column = split_column(layout, heading="Passes")
     column.prop(layer, "use_pass_z", text="Depth")
     column.prop(scene.lodgs_render, "use_pass_levels")
 
 
 def _draw_holdout(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
-    column = layout.column(align=True)
-    column.use_property_split = True
-    column.use_property_decorate = False
+    column = split_column(layout, align=True)
     column.prop(scene.lodgs_render, "holdout")
     row = column.row(align=True)
     row.operator("lodgs.render_mesh_depth", icon="RENDER_STILL").animation = False

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import bpy
+from ..data import photographs, scenes
+from .parts import Panel, split_column
 
-from .. import scenes
 
-
-class LODGS_PT_scene(bpy.types.Panel):
+class LODGS_PT_scene(Panel):
     bl_label = "Scene"
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = "LODGS"
     bl_order = 0
 
     def draw(self, context):
@@ -24,9 +20,7 @@ class LODGS_PT_scene(bpy.types.Panel):
             if scenes.roots(context.scene):
                 layout.label(text="Select one of the splat scenes", icon="INFO")
             return
-        column = layout.column()
-        column.use_property_split = True
-        column.use_property_decorate = False
+        column = split_column(layout)
         column.prop(root, "name", text="Name")
         if root.lodgs.scene_folder:
             column.prop(root.lodgs, "scene_folder", text="Photographs")
@@ -34,12 +28,12 @@ class LODGS_PT_scene(bpy.types.Panel):
         for name, part in (("Cameras", root.lodgs.cameras), ("Points", root.lodgs.points)):
             if part is not None:
                 row.prop(part, "hide_viewport", text=name, toggle=True, invert_checkbox=True)
-        there = scenes.views(root)
-        if there:
+        views = photographs.views(root)
+        if views:
             row = layout.row(align=True)
             row.operator("lodgs.look_through", text="", icon="TRIA_LEFT").step = -1
             camera = context.scene.camera
-            name = camera.name if camera in there else "Look Through"
+            name = camera.name if camera in views else "Look Through"
             row.operator("lodgs.look_through", text=name, icon="OUTLINER_DATA_CAMERA").step = 0
             row.operator("lodgs.look_through", text="", icon="TRIA_RIGHT").step = 1
 

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import bpy
 
-from .. import compat, scenes
+from .. import compat
+from ..data import scenes
 from ..viewport import views
+from .parts import Panel, split_column
 
 
-class LODGS_PT_viewport(bpy.types.Panel):
+class LODGS_PT_viewport(Panel):
     bl_label = "Viewport"
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = "LODGS"
     bl_order = 4
 
     @classmethod
@@ -22,16 +21,16 @@ class LODGS_PT_viewport(bpy.types.Panel):
     def draw(self, context):
         layout, settings = self.layout, context.scene.lodgs_viewport
         root = scenes.active_root(context)
-        column = layout.column()
-        column.use_property_split = True
-        column.use_property_decorate = False
+        column = split_column(layout)
         if not compat.NATIVE_SPLATS:
             column.prop(settings, "splats")
         if settings.splats and not compat.NATIVE_SPLATS:
             column.prop(settings, "budget")
             column.prop(settings, "moving", slider=True)
         if root is not None:
-            column.row().prop(root.lodgs, "tell", expand=True)
+            row = column.row()
+            row.active = len(root.lodgs.levels) != 1  # one level has one colour
+            row.prop(root.lodgs, "tell", expand=True)
         left_out = views.left_out()
         if settings.splats and left_out:
             layout.label(text=f"{left_out:,} splats left out to stay within that", icon="INFO")

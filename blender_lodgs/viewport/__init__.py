@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any
 import bpy
 
 from ...training.lod.colors import level_color
-from .. import compat, scenes
+from .. import compat
+from ..data import scenes
 from . import discs, eye, splats, views
 
 if TYPE_CHECKING:
-    from ..properties import SplatScene
+    from ..data.properties import SplatScene
 
 _handle: Any = None
 
@@ -31,18 +32,18 @@ def draws_splats(scene: bpy.types.Scene) -> bool:
 def _draw() -> None:
     context = bpy.context
     space, region, view = context.space_data, context.region, context.region_data
-    eye.drawn(region, context.scene, view)
+    eye.on_draw(region, context.scene, view)
     with_splats = draws_splats(context.scene) and space.shading.type != "WIREFRAME"
     if space.shading.type == "SOLID" and space.shading.color_type not in {"OBJECT", "RANDOM", "SINGLE"}:
-        things = [
-            (thing, tint)
+        points = [
+            (obj, tint)
             for root in scenes.roots(context.scene)
-            for thing, tint in _points(root.lodgs, levels=not with_splats)
-            if thing is not None and thing.visible_get(view_layer=context.view_layer, viewport=space)
+            for obj, tint in _points(root.lodgs, levels=not with_splats)
+            if obj is not None and obj.visible_get(view_layer=context.view_layer, viewport=space)
         ]
-        if things:
+        if points:
             depsgraph = context.evaluated_depsgraph_get()
-            discs.draw(things, depsgraph, view.view_matrix, view.window_matrix, region.height)
+            discs.draw(points, depsgraph, view.view_matrix, view.window_matrix, region.height)
     if with_splats:
         try:
             views.draw(context)
@@ -68,15 +69,15 @@ def _points(
 
 @bpy.app.handlers.persistent
 def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    discs.changed(depsgraph)
-    views.changed(depsgraph)
+    discs.on_update(depsgraph)
+    views.on_update(depsgraph)
 
 
 @bpy.app.handlers.persistent
 def _on_load(*_) -> None:
-    discs.forget()
-    views.forget()
-    eye.forget()
+    discs.clear()
+    views.clear()
+    eye.clear()
 
 
 def register() -> None:
@@ -100,6 +101,6 @@ def unregister() -> None:
     for changes in (handlers.load_post, handlers.undo_post, handlers.redo_post):
         changes.remove(_on_load)
     _on_load()
-    splats.forget()
+    splats.clear()
     views.stop()
     _handle = None

@@ -7,12 +7,14 @@ list depends on where the eye is and in which direction the view looks.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..selection import BandRule, Rule
+from ...training.lod.rule import OPACITY
+from ..data.selection import Choice
 
 WIDTH = 8192
 """Texels in a row of every texture that holds one texel for each of many splats."""
@@ -26,13 +28,13 @@ class Pool:
         means: (N, 4) float32 in their objects' space, the fourth number is 1.
         scales: (N, 4) float32 standard deviations; the fourth number is unused.
         opacities: (N,) float32 in [0, 1].
-        bias: (N,) float32 in levels (Octree-GS).
+        columns: (N,) float32 by name: what rules need to know of splats; zeros where an object lacks one.
     """
 
     means: np.ndarray
     scales: np.ndarray
     opacities: np.ndarray
-    bias: np.ndarray
+    columns: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -42,9 +44,8 @@ class Placement:
     Attributes:
         matrix: the set's ``matrix_world``, (4, 4) float64 as bytes, so that placements compare.
         level: 1 is the coarsest; 0 for splats that are no level.
-        rule: what weights its splats; None: all 1.
-        scene: of which splat scene it is a level, a number; sets of different scenes never make room.
-        replaces: whether a level stands in the coarser one's place, rather than adding to it.
+        choice: what weights its splats; None: all 1.
+        scene: of which splat scene it is a level, a number.
         tell: what its colours tell, see ``SplatScene.tell``.
     """
 
@@ -52,9 +53,8 @@ class Placement:
     count: int
     matrix: bytes
     level: int
-    rule: Rule | None
+    choice: Choice | None
     scene: int
-    replaces: bool
     tell: str
 
     @property
@@ -100,13 +100,13 @@ class Arrangement:
 def arrange(pool: Pool, request: Request) -> Arrangement:
     """The splats to draw for a request, from back to front."""
     chosen, left_out = within_budget(pool, request.placements, request.budget)
-    depths, told = [], []
+    depths, color_levels = [], []
     backward = np.append(request.backward, 0.0)
     for placement, (index, _) in zip(request.placements, chosen, strict=True):
         means = pool.means[placement.first : placement.first + placement.count]
         depth = means @ (backward @ placement.world).astype(np.float32)  # grows towards the eye
         depths.append(depth if len(index) == len(depth) else depth[index])
-        told.append(_told(placement, means, index))
+        color_levels.append(_color_levels(placement, means, index))
     depth = np.concatenate(depths) if depths else np.zeros(0, np.float32)
     order = np.argsort(depth)
 
@@ -120,7 +120,7 @@ def arrange(pool: Pool, request: Request) -> Arrangement:
             ],
             [weight for _, weight in chosen],
             [np.full(len(index), number) for number, (index, _) in enumerate(chosen)],
-            told,
+            color_levels,
         )
         for column, values in enumerate(columns):
             instances[:count, column] = np.concatenate(values)[order]
@@ -132,55 +132,55 @@ def within_budget(
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], int]:
     """Each placement's splats that are drawn, as their places in it and their weights; and how many are not.
 
-    Where there are more than the budget, the finest levels go first. A level that replaces coarser ones goes
-    as a whole, and the next coarser one takes its place; of levels that add up, and of what is the last of
-    its scene, the most visible splats stay.
+    Where there are more than the budget, the scene that draws the most takes the next coarser choice of its
+    rule, again and again. Where no rule can give way any more, the least visible splats go: of levels that
+    add up first those of the finest.
     """
-    chosen = [_choose(pool, placement) for placement in placements]
-    wanted = sum(len(index) for index, _ in chosen)
     placements = list(placements)
-
-    def excess() -> int:
-        return sum(len(index) for index, _ in chosen) - budget
-
-    while excess() > 0:
-        some = [i for i, (index, _) in enumerate(chosen) if len(index)]
-        scenes: dict[int, int] = {}
-        for i in some:
-            scenes[placements[i].scene] = scenes.get(placements[i].scene, 0) + 1
-        several = [i for i in some if scenes[placements[i].scene] > 1]
-        if not several:
-            _thin(pool, placements, chosen, some, budget)
-            break
-        finest = max(several, key=lambda i: placements[i].level)
-        if not placements[finest].replaces and len(chosen[finest][0]) > excess():
-            _thin(pool, placements, chosen, [finest], len(chosen[finest][0]) - excess())
-            break
-        chosen[finest] = (chosen[finest][0][:0], chosen[finest][1][:0])
-        rule = placements[finest].rule
-        if placements[finest].replaces and isinstance(rule, BandRule):
-            coarser = max(
-                (i for i in several if placements[i].scene == placements[finest].scene and i != finest),
-                key=lambda i: placements[i].level,
-            )
-            behind = placements[coarser].rule
-            if isinstance(behind, BandRule):
-                placements[coarser] = replace(placements[coarser], rule=replace(behind, near=rule.near))
-                chosen[coarser] = _choose(pool, placements[coarser])
-    return chosen, max(0, wanted - sum(len(index) for index, _ in chosen))
+    chosen = [_choose(pool, placement) for placement in placements]
+    wanted = total = sum(len(index) for index, _ in chosen)
+    givers = {placement.scene for placement in placements if placement.choice is not None}
+    while total > budget and givers:
+        drawn = dict.fromkeys(givers, 0)
+        for placement, (index, _) in zip(placements, chosen, strict=True):
+            if placement.scene in drawn:
+                drawn[placement.scene] += len(index)
+        scene = max(drawn, key=lambda each: drawn[each])
+        levels = sorted({placement.level for placement in placements if placement.scene == scene})
+        for i, placement in enumerate(placements):
+            if placement.scene == scene and placement.choice is not None:
+                coarser = placement.choice.coarser(levels)
+                if coarser is None:
+                    givers.discard(scene)
+                    break
+                placements[i] = replace(placement, choice=coarser)
+                chosen[i] = _choose(pool, placements[i])
+        total = sum(len(index) for index, _ in chosen)
+    while total > budget:
+        of_scene = Counter(p.scene for p, (index, _) in zip(placements, chosen, strict=True) if len(index))
+        adding = [
+            i for i, placement in enumerate(placements)
+            if len(chosen[i][0]) and of_scene[placement.scene] > 1
+        ]  # fmt: skip
+        which = [max(adding, key=lambda i: placements[i].level)] if adding else range(len(placements))
+        here = sum(len(chosen[i][0]) for i in which)
+        _thin(pool, placements, chosen, which, max(here - (total - budget), 0))
+        total = sum(len(index) for index, _ in chosen)
+    return chosen, wanted - sum(len(index) for index, _ in chosen)
 
 
 def _choose(pool: Pool, placement: Placement) -> tuple[np.ndarray, np.ndarray]:
     """The splats of a placement whose weight is not 0, and their weights."""
     part = slice(placement.first, placement.first + placement.count)
-    if placement.rule is None:
+    if placement.choice is None:
         return np.arange(placement.count, dtype=np.int32), np.ones(placement.count, np.float32)
-    weights = placement.rule.weights(pool.means[part, :3], pool.bias[part])
+    columns = {name: column[part] for name, column in pool.columns.items()} | {OPACITY: pool.opacities[part]}
+    weights = placement.choice.weights(pool.means[part, :3], columns)
     index = np.flatnonzero(weights)
     return index, weights[index].astype(np.float32)
 
 
-def _thin(pool: Pool, placements, chosen, which: list[int], keep: int) -> None:
+def _thin(pool: Pool, placements, chosen, which: Sequence[int], keep: int) -> None:
     """Leaves the ``keep`` most visible splats of those placements: opacity times area."""
     visible = []
     for i in which:
@@ -190,7 +190,8 @@ def _thin(pool: Pool, placements, chosen, which: list[int], keep: int) -> None:
         visible.append(pool.opacities[place] * weight * np.einsum("ij,ij->i", scales, scales))
     everything = np.concatenate(visible)
     stays = np.zeros(len(everything), bool)
-    stays[np.argpartition(everything, len(everything) - keep)[len(everything) - keep :]] = True
+    if keep:
+        stays[np.argpartition(everything, len(everything) - keep)[len(everything) - keep :]] = True
     start = 0
     for i, part in zip(which, visible, strict=True):
         mine = stays[start : start + len(part)]
@@ -198,8 +199,8 @@ def _thin(pool: Pool, placements, chosen, which: list[int], keep: int) -> None:
         start += len(part)
 
 
-def _told(placement: Placement, means: np.ndarray, index: np.ndarray) -> np.ndarray:
+def _color_levels(placement: Placement, means: np.ndarray, index: np.ndarray) -> np.ndarray:
     """Which level's colour each splat gets."""
-    if placement.tell == "BANDS" and placement.rule is not None:
-        return placement.rule.bands(means[index, :3], placement.level).astype(np.float32)
+    if placement.tell == "BANDS" and placement.choice is not None:
+        return placement.choice.wanted_level(means[index, :3]).astype(np.float32)
     return np.full(len(index), placement.level if placement.tell != "OWN" else 0, np.float32)

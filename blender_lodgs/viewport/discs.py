@@ -12,7 +12,7 @@ import gpu
 import numpy as np
 from mathutils import Matrix, Vector
 
-from .. import objects
+from .. import attributes
 
 Color = tuple[float, float, float, float]
 
@@ -45,7 +45,7 @@ _batches: dict[int, gpu.types.GPUBatch] = {}
 
 
 def draw(
-    things: list[tuple[bpy.types.Object, Color]],
+    objects: list[tuple[bpy.types.Object, Color]],
     depsgraph: bpy.types.Depsgraph,
     view: Matrix,
     projection: Matrix,
@@ -54,7 +54,7 @@ def draw(
     """Draws point clouds as their modifiers leave them into the active framebuffer, tested against its depth.
 
     Args:
-        things: objects, each with the colour (sRGB) in which to show it; alpha 0 is each point's own.
+        objects: point clouds, each with the colour (sRGB) in which to show it; alpha 0 is each point's own.
         view, projection: from the world to the camera's space, and on to clip space.
         height: of the framebuffer in pixels.
     """
@@ -63,12 +63,12 @@ def draw(
     gpu.state.depth_test_set("LESS_EQUAL")
     gpu.state.depth_mask_set(True)
     gpu.state.program_point_size_set(True)
-    for thing, tint in things:
-        batch = _batches.get(thing.session_uid)
+    for obj, tint in objects:
+        batch = _batches.get(obj.session_uid)
         if batch is None:
-            batch = _batches[thing.session_uid] = _upload(thing.evaluated_get(depsgraph).data)
-        scale = thing.matrix_world.median_scale
-        shader.uniform_float("model_view_projection", projection @ view @ thing.matrix_world)
+            batch = _batches[obj.session_uid] = _upload(obj.evaluated_get(depsgraph).data)
+        scale = obj.matrix_world.median_scale
+        shader.uniform_float("model_view_projection", projection @ view @ obj.matrix_world)
         shader.uniform_float("toward", projection @ Vector((0, 0, scale, 0)))
         shader.uniform_float("tint", tint)
         shader.uniform_float("pixels", abs(projection[1][1]) * scale * height)
@@ -83,8 +83,8 @@ def _upload(cloud: bpy.types.PointCloud) -> gpu.types.GPUBatch:
     count = len(cloud.points)
     color_radius = np.ones((count, 4), np.float32)
     colors, radii = (
-        objects.read_attribute(cloud, objects.COLOR),
-        objects.read_attribute(cloud, objects.RADIUS),
+        attributes.read_attribute(cloud, attributes.COLOR),
+        attributes.read_attribute(cloud, attributes.RADIUS),
     )
     if colors is not None:
         color_radius[:, :3] = colors[:, :3]
@@ -95,7 +95,7 @@ def _upload(cloud: bpy.types.PointCloud) -> gpu.types.GPUBatch:
     layout.attr_add(id="color_radius", comp_type="F32", len=4, fetch_mode="FLOAT")
     vertices = gpu.types.GPUVertBuf(layout, count)
     if count:
-        vertices.attr_fill("position", objects.read_attribute(cloud, "position"))
+        vertices.attr_fill("position", attributes.read_attribute(cloud, "position"))
         vertices.attr_fill("color_radius", color_radius)
     return gpu.types.GPUBatch(type="POINTS", buf=vertices)
 
@@ -120,8 +120,8 @@ def _disc_shader() -> gpu.types.GPUShader:
     return _shader
 
 
-def changed(depsgraph: bpy.types.Depsgraph) -> None:
-    """Forgets what has changed; what was deleted goes with all the rest."""
+def on_update(depsgraph: bpy.types.Depsgraph) -> None:
+    """Frees what has changed; what was deleted goes with all the rest."""
     if depsgraph.id_type_updated("COLLECTION"):
         _batches.clear()
     elif _batches:
@@ -130,7 +130,7 @@ def changed(depsgraph: bpy.types.Depsgraph) -> None:
                 _batches.pop(update.id.original.session_uid, None)
 
 
-def forget() -> None:
+def clear() -> None:
     """Frees what is kept between drawings."""
     global _shader
     _batches.clear()

@@ -1,8 +1,8 @@
 """The eye that is the viewport's own view: distances follow whoever orbits.
 
-No driver sees a viewport's view. Drawing tells this module where it looks from, and a timer hands the view
-that moved last to the splat scenes whose eye is the viewport, some times a second: what draws may not change
-what it draws.
+No driver sees a viewport's view. Drawing reports here where it looks from, and a timer hands the view that
+moved last to the splat scenes whose eye is the viewport, some times a second: what draws may not change what
+it draws.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import bpy
 from mathutils import Matrix, Vector
 
-from .. import scenes, selection
+from ..data import scenes, selection
 
 Place = tuple[float, float, float]
 
@@ -41,22 +41,22 @@ def place(view: Matrix, projection: Matrix, width: int, distance: float) -> tupl
     return eye, focal
 
 
-def drawn(region: bpy.types.Region, scene: bpy.types.Scene, looks: bpy.types.RegionView3D) -> None:
+def on_draw(region: bpy.types.Region, scene: bpy.types.Scene, view: bpy.types.RegionView3D) -> None:
     """A viewport is being drawn; where its view has moved it is the eye from now on."""
     global _newest
     if not any(_follows(root) for root in scenes.roots(scene)):
         _last.clear()
         return
-    seen = looks.window_matrix @ looks.view_matrix
+    matrix = view.window_matrix @ view.view_matrix
     key = region.as_pointer()
-    if key in _last and _last[key] == seen:
+    if key in _last and _last[key] == matrix:
         return
     first = bool(_last) and key not in _last
-    _last[key] = seen
+    _last[key] = matrix
     if first:  # a viewport that was only just opened has not moved
         return
     _newest = (
-        scene.name, *place(looks.view_matrix, looks.window_matrix, region.width, looks.view_distance)
+        scene.name, *place(view.view_matrix, view.window_matrix, region.width, view.view_distance)
     )  # fmt: skip
     if not bpy.app.timers.is_registered(_hand_on):
         bpy.app.timers.register(_hand_on, first_interval=PAUSE)
@@ -80,7 +80,7 @@ def _hand_on() -> None:
         follow(scene, *newest[1:])
 
 
-def forget() -> None:
+def clear() -> None:
     """Forgets all views."""
     global _newest
     _last.clear()

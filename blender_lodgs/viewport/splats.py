@@ -18,8 +18,8 @@ import numpy as np
 from mathutils import Matrix
 
 from ...training.lod.colors import LEVEL_COLORS
-from ...training.lod.selection import BIAS
-from .. import objects
+from ...training.lod.rule import OPACITY, rules
+from .. import attributes
 from .arranging import WIDTH, Arrangement, Pool
 
 MOST_COEFFICIENTS = 15
@@ -74,7 +74,7 @@ void main()
   place = vec2(0.0);
   color_opacity = vec4(0.0);
 
-  vec4 instance = texel(instances, gl_InstanceID);  // splat, weight, placement, told level
+  vec4 instance = texel(instances, gl_InstanceID);  // splat, weight, placement, level whose colour it gets
   int splat = int(instance.x), row = int(instance.z) * 4;
   vec4 base = texel(bases, splat);
   float opacity = base.w * instance.y;
@@ -230,22 +230,27 @@ def upload(clouds: Sequence[bpy.types.PointCloud]) -> Uploaded:
     buffers = {name: _Texels(total) for name in ("means", "quats", "scales", "bases")}
     stream = _Texels(3 * higher * total // 4 + 2)
     coefficients = stream.floats[: 3 * higher * total].reshape(higher, total, 3)
-    bias = np.zeros(total, np.float32)
+    names = {name for rule in rules().values() for name in rule.columns} - {OPACITY}
+    columns = {name: np.zeros(total, np.float32) for name in names}
     for cloud, start, count in zip(clouds, starts, counts, strict=True):
         part = slice(start, start + count)
         if not count:
             continue
-        for name, attribute in (("quats", objects.ROTATION), ("bases", objects.BASE)):
+        for name, attribute in (("quats", attributes.ROTATION), ("bases", attributes.BASE)):
             _read(cloud, attribute, buffers[name].rows[part])
-        for name, attribute in (("means", "position"), ("scales", objects.SCALE)):
-            buffers[name].rows[part, :3] = objects.read_attribute(cloud, attribute)
+        for name, attribute in (("means", "position"), ("scales", attributes.SCALE)):
+            buffers[name].rows[part, :3] = attributes.read_attribute(cloud, attribute)
         for k in range(min(higher, _higher(cloud))):
-            _read(cloud, objects.SH.format(k + 1), coefficients[k, part])
-        if (column := objects.read_attribute(cloud, BIAS)) is not None:
-            bias[part] = column
+            _read(cloud, attributes.SH.format(k + 1), coefficients[k, part])
+        for name, values in columns.items():
+            if (column := attributes.read_attribute(cloud, name)) is not None:
+                values[part] = column
     buffers["means"].rows[:total, 3] = 1
     pool = Pool(
-        buffers["means"].rows[:total], buffers["scales"].rows[:total], buffers["bases"].rows[:total, 3], bias
+        buffers["means"].rows[:total],
+        buffers["scales"].rows[:total],
+        buffers["bases"].rows[:total, 3],
+        columns,
     )
     textures = {name: texels.texture() for name, texels in (buffers | {"higher": stream}).items()}
     return Uploaded(pool, starts, counts, textures, round((higher + 1) ** 0.5) - 1, total)
@@ -254,7 +259,7 @@ def upload(clouds: Sequence[bpy.types.PointCloud]) -> Uploaded:
 def _higher(cloud: bpy.types.PointCloud) -> int:
     """How many coefficients beyond the first a cloud has, of whole degrees up to 3."""
     count = 0
-    while count < MOST_COEFFICIENTS and objects.SH.format(count + 1) in cloud.attributes:
+    while count < MOST_COEFFICIENTS and attributes.SH.format(count + 1) in cloud.attributes:
         count += 1
     return int((count + 1) ** 0.5) ** 2 - 1
 
@@ -262,7 +267,7 @@ def _higher(cloud: bpy.types.PointCloud) -> int:
 def _read(cloud: bpy.types.PointCloud, name: str, into: np.ndarray) -> None:
     """An attribute, straight into contiguous memory."""
     attribute = cloud.attributes[name]
-    attribute.data.foreach_get(objects.LAYOUTS[attribute.data_type].key, into.reshape(-1))
+    attribute.data.foreach_get(attributes.LAYOUTS[attribute.data_type].key, into.reshape(-1))
 
 
 class _Texels:
@@ -401,7 +406,7 @@ _kept: dict[str, Any] = {}
 """Shaders with their quads, and textures that never change, by name; made when they are first needed."""
 
 
-def forget() -> None:
+def clear() -> None:
     """Frees what is kept between drawings."""
     _kept.clear()
 

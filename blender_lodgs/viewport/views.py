@@ -1,7 +1,7 @@
 """What each viewport shows of the splats, kept between drawings.
 
 Splats are uploaded once, and anew only when the points of an object themselves have changed: distances and
-fading come from the modifiers' settings (``selection.rule``), so neither time nor view brings an upload. An
+fading come from the modifiers' settings (``selection.choice``), so neither time nor view brings an upload. An
 object with other modifiers is uploaded as they leave it, whenever they do so anew. Which splats are drawn in
 which order is found in a thread when the view turns or the choice changes; until then the last order stays.
 """
@@ -16,7 +16,7 @@ import bpy
 import gpu
 from mathutils import Matrix
 
-from .. import scenes, selection, shown
+from ..data import scenes, selection, shown
 from . import splats
 from .arranging import Arrangement, Placement, Request, arrange
 
@@ -28,13 +28,13 @@ uploads = 0
 
 
 @dataclass
-class View:
+class ViewState:
     """What one viewport shows.
 
     Attributes:
         uploaded, arrangement, instances: what is drawn, which belong together.
-        asked: the arrangement that is being found, and of which splats.
-        seen: what the view looked through when it was last drawn.
+        pending: the arrangement that is being computed, and of which splats.
+        matrix: from the world to clip space when it was last drawn.
         moved: when it last moved.
     """
 
@@ -42,13 +42,13 @@ class View:
     uploaded: splats.Uploaded | None = None
     arrangement: Arrangement | None = None
     instances: gpu.types.GPUTexture | None = None
-    asked: tuple[splats.Uploaded, Request, Future[Arrangement]] | None = None
-    seen: Matrix | None = None
+    pending: tuple[splats.Uploaded, Request, Future[Arrangement]] | None = None
+    matrix: Matrix | None = None
     moved: float = 0.0
     resolution: float = 1.0
 
 
-_views: dict[int, View] = {}
+_views: dict[int, ViewState] = {}
 _thread: ThreadPoolExecutor | None = None
 
 _uploaded: splats.Uploaded | None = None
@@ -61,19 +61,20 @@ _stale: set[int] = set()
 def draw(context: bpy.types.Context) -> None:
     """Draws all visible splats into the viewport that is being drawn."""
     space, region, region_data = context.space_data, context.region, context.region_data
-    view = _views.setdefault(region.as_pointer(), View())
-    sets = shown.splat_sets(context.evaluated_depsgraph_get(), space)
-    now, looks = time.monotonic(), region_data.window_matrix @ region_data.view_matrix
-    if view.seen is not None and view.seen != looks:
+    view = _views.setdefault(region.as_pointer(), ViewState())
+    instances = shown.splat_instances(context.evaluated_depsgraph_get(), space)
+    now, matrix = time.monotonic(), region_data.window_matrix @ region_data.view_matrix
+    if view.matrix is not None and view.matrix != matrix:
         view.moved = now
-    view.seen = looks
+    view.matrix = matrix
     settings = context.scene.lodgs_viewport
     view.resolution = settings.moving / 100 if now - view.moved < STILL else 1.0
-    draw_sets(
-        view, sets, context.evaluated_depsgraph_get(), region_data.view_matrix, region_data.window_matrix,
-        settings.budget, under_overlays=space.overlay.show_overlays and not _shows_photograph(context),
+    draw_splats(
+        view, instances, context.evaluated_depsgraph_get(),
+        region_data.view_matrix, region_data.window_matrix, settings.budget,
+        under_overlays=space.overlay.show_overlays and not _shows_photograph(context),
     )  # fmt: skip
-    if view.asked is not None or view.resolution < 1:
+    if view.pending is not None or view.resolution < 1:
         _wake_later()
 
 
@@ -89,9 +90,9 @@ def _shows_photograph(context: bpy.types.Context) -> bool:
     )
 
 
-def draw_sets(
-    view: View,
-    sets: list[shown.SplatSet],
+def draw_splats(
+    view: ViewState,
+    instances: list[shown.SplatInstance],
     depsgraph: bpy.types.Depsgraph,
     view_matrix: Matrix,
     projection: Matrix,
@@ -100,7 +101,7 @@ def draw_sets(
     under_overlays: bool = True,
     wait: bool = False,
 ) -> None:
-    """Draws splat sets into the active framebuffer.
+    """Draws splat instances into the active framebuffer.
 
     Args:
         view: what was drawn there last; changed.
@@ -108,14 +109,14 @@ def draw_sets(
         budget, wait: see :func:`prepare`.
         under_overlays: see ``splats.draw``.
     """
-    wanted = prepare(view, sets, depsgraph, view_matrix, budget, wait)
+    request = prepare(view, instances, depsgraph, view_matrix, budget, wait)
     if view.uploaded is None or view.arrangement is None or view.instances is None:
         return
     if not view.arrangement.count:
         return
     placements = view.arrangement.request.placements
-    if _alike(placements, wanted.placements):  # what moves, moves at once; its order follows
-        placements = wanted.placements
+    if _alike(placements, request.placements):  # what moves, moves at once; its order follows
+        placements = request.placements
     splats.draw(
         view.uploaded, view.instances, view.arrangement.count, [placement.world for placement in placements],
         view_matrix, projection, view.canvas, resolution=view.resolution, under_overlays=under_overlays,
@@ -123,8 +124,8 @@ def draw_sets(
 
 
 def prepare(
-    view: View,
-    sets: list[shown.SplatSet],
+    view: ViewState,
+    instances: list[shown.SplatInstance],
     depsgraph: bpy.types.Depsgraph,
     view_matrix: Matrix,
     budget: int,
@@ -139,11 +140,11 @@ def prepare(
     Returns:
         What is to be drawn, which ``view.arrangement`` may not answer yet.
     """
-    if not sets:
-        view.uploaded = view.arrangement = view.instances = view.asked = None
+    if not instances:
+        view.uploaded = view.arrangement = view.instances = view.pending = None
         return Request((), (0.0, 0.0, 1.0), budget)
-    uploaded = _upload(sets)
-    request = Request(_placements(sets, uploaded, depsgraph), tuple(view_matrix[2][:3]), budget)
+    uploaded = _upload(instances)
+    request = Request(_placements(instances, uploaded, depsgraph), tuple(view_matrix[2][:3]), budget)
     _arrange(view, uploaded, request, wait)
     return request
 
@@ -153,19 +154,19 @@ def left_out() -> int:
     return max((view.arrangement.left_out for view in _views.values() if view.arrangement), default=0)
 
 
-def _key(thing: shown.SplatSet) -> int:
-    """Whose splats are uploaded for a set: the object's own, or what its modifiers make of them."""
-    plain = selection.only_chosen(thing.evaluated)
-    return (thing.object.data if plain else thing.object).session_uid
+def _key(instance: shown.SplatInstance) -> int:
+    """Whose splats are uploaded for an instance: the object's own, or what its modifiers make of them."""
+    plain = selection.only_chosen(instance.evaluated)
+    return (instance.object.data if plain else instance.object).session_uid
 
 
-def _upload(sets: list[shown.SplatSet]) -> splats.Uploaded:
-    """The splats of all sets on the graphics card; they go there only where some have changed."""
+def _upload(instances: list[shown.SplatInstance]) -> splats.Uploaded:
+    """The splats of all instances on the graphics card; they go there only where some have changed."""
     global _uploaded, _keys, uploads
     clouds: dict[int, bpy.types.PointCloud] = {}
-    for thing in sets:
-        plain = selection.only_chosen(thing.evaluated)
-        clouds.setdefault(_key(thing), thing.object.data if plain else thing.evaluated.data)
+    for instance in instances:
+        plain = selection.only_chosen(instance.evaluated)
+        clouds.setdefault(_key(instance), instance.object.data if plain else instance.evaluated.data)
     missing = not clouds.keys() <= set(_keys)
     if _uploaded is None or missing or _stale & clouds.keys():
         # A level that is hidden just now stays: artists step through levels.
@@ -178,56 +179,55 @@ def _upload(sets: list[shown.SplatSet]) -> splats.Uploaded:
 
 
 def _placements(
-    sets: list[shown.SplatSet],
+    instances: list[shown.SplatInstance],
     uploaded: splats.Uploaded,
     depsgraph: bpy.types.Depsgraph,
 ) -> tuple[Placement, ...]:
     roots = {item.object: root for root in scenes.roots(depsgraph.scene) for item in root.lodgs.levels}
     found = []
-    for thing in sets:
-        number = _keys.index(_key(thing))
-        plain, root = selection.only_chosen(thing.evaluated), roots.get(thing.object)
+    for instance in instances:
+        number = _keys.index(_key(instance))
+        plain, root = selection.only_chosen(instance.evaluated), roots.get(instance.object)
         found.append(
             Placement(
                 first=uploaded.starts[number],
                 count=uploaded.counts[number],
-                matrix=thing.matrix_world.tobytes(),
-                level=thing.level,
-                rule=selection.rule(thing.evaluated, depsgraph) if plain else None,
-                scene=(root or thing.object).session_uid,
-                replaces=root is not None and not root.lodgs.cumulative,
+                matrix=instance.matrix_world.tobytes(),
+                level=instance.level,
+                choice=selection.choice(instance.evaluated, depsgraph) if plain else None,
+                scene=(root or instance.object).session_uid,
                 tell=root.lodgs.tell if root else "OWN",
             )
         )
     return tuple(found)
 
 
-def _arrange(view: View, uploaded: splats.Uploaded, request: Request, wait: bool) -> None:
+def _arrange(view: ViewState, uploaded: splats.Uploaded, request: Request, wait: bool) -> None:
     """Takes over an arrangement that has been found, and asks for another where one is wanted."""
     global _thread
-    if view.asked is not None and (wait or view.asked[2].done()):
-        of, _, found = view.asked
-        view.asked = None
+    if view.pending is not None and (wait or view.pending[2].done()):
+        of, _, found = view.pending
+        view.pending = None
         _take(view, of, found.result())
     current = view.arrangement is not None and view.uploaded is uploaded
-    if (current and view.arrangement.request == request) or view.asked is not None:
+    if (current and view.arrangement.request == request) or view.pending is not None:
         return
     if _thread is None:
         _thread = ThreadPoolExecutor(1, "lodgs-order")
-    view.asked = (uploaded, request, _thread.submit(arrange, uploaded.pool, request))
+    view.pending = (uploaded, request, _thread.submit(arrange, uploaded.pool, request))
     if wait:
-        _, _, found = view.asked
-        view.asked = None
+        _, _, found = view.pending
+        view.pending = None
         _take(view, uploaded, found.result())
 
 
-def _take(view: View, uploaded: splats.Uploaded, arrangement: Arrangement) -> None:
+def _take(view: ViewState, uploaded: splats.Uploaded, arrangement: Arrangement) -> None:
     view.uploaded, view.arrangement = uploaded, arrangement
     view.instances = splats.instances_texture(arrangement)
 
 
 def _alike(one: tuple[Placement, ...], other: tuple[Placement, ...]) -> bool:
-    """Whether placements are the same sets, wherever they stand."""
+    """Whether placements are of the same splats, wherever they stand."""
     return [(p.first, p.count, p.level) for p in one] == [(p.first, p.count, p.level) for p in other]
 
 
@@ -246,20 +246,20 @@ def _wake() -> float | None:
                 if view is None:
                     continue
                 still = view.resolution < 1 and now - view.moved >= STILL
-                if still or (view.asked is not None and view.asked[2].done()):
+                if still or (view.pending is not None and view.pending[2].done()):
                     region.tag_redraw()
-                waiting |= view.asked is not None or view.resolution < 1
+                waiting |= view.pending is not None or view.resolution < 1
     return 0.01 if waiting else None
 
 
-def changed(depsgraph: bpy.types.Depsgraph) -> None:
+def on_update(depsgraph: bpy.types.Depsgraph) -> None:
     """Notes whose points have changed since they were uploaded."""
     for update in depsgraph.updates:
         if update.is_updated_geometry:
             _stale.add(update.id.original.session_uid)
 
 
-def forget() -> None:
+def clear() -> None:
     """Frees everything that is kept between drawings."""
     global _uploaded, _keys
     _views.clear()

@@ -15,6 +15,12 @@ from tools.blender_module import EXTENSION, start_blender
 _exit_status: int | None = None
 
 
+def pytest_collection_modifyitems(items):
+    for item in items:
+        if item.path.is_relative_to(Path(__file__).parent):
+            item.add_marker("blender")
+
+
 @pytest.fixture(scope="session")
 def bpy():
     """The module; tests that need it are skipped where it is not installed."""
@@ -31,7 +37,7 @@ def empty_file(bpy):
 
 @pytest.fixture
 def lodgs(bpy):
-    """``lodgs("scenes")`` is the extension's ``blender_lodgs.scenes``; ``lodgs("training.errors")`` too."""
+    """``lodgs("data.scenes")``, ``lodgs("training.errors")``: modules of the extension's two packages."""
 
     def load(name: str):
         room = "" if name.startswith("training") else "blender_lodgs."
@@ -98,7 +104,7 @@ def fake(tmp_path, monkeypatch):
 @pytest.fixture(scope="session")
 def _one_renderer(bpy):
     """Starting the renderer takes seconds: all tests share one, though each has a new file."""
-    renderer = importlib.import_module(f"{EXTENSION}.blender_lodgs.renderer")
+    renderer = importlib.import_module(f"{EXTENSION}.blender_lodgs.render.renderer")
     bpy.app.handlers.load_pre.remove(renderer._on_load)
     yield renderer
     renderer.close()

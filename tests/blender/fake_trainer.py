@@ -17,12 +17,14 @@ import os
 import signal
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 sys.path.insert(0, os.getcwd())
 
 import numpy as np
 
+from training.methods import METHODS
 from training.runs.folder import PROTOCOL, Events, RunFolder
 from training.runs.job import Job
 from training.splats.bundle import Bundle, Level, write_bundle
@@ -50,6 +52,7 @@ def main() -> int:
         problems = ["The package torch is missing in here."] if mode == "no_torch" else []
         print(json.dumps({"torch": "2.13.0", "ok": not problems, "problems": problems}))
         return 2 if problems else 0
+    METHODS["flod"] = replace(METHODS["flod"], from_base=True)  # as tests of bases have it
     job = Job.from_file(Path(sys.argv[4]))
     folder = RunFolder(job.out)
     if mode == "mute":
@@ -84,11 +87,12 @@ def run(mode: str, job: Job, folder: RunFolder, say: Events) -> int:
     levels = []
     for number, count in COUNTS.items():
         path = folder.levels_folder / f"level_{number}.ply"
-        levels.append(Level(number, splats(count), 0.1 if number == 1 else 0.0))
+        levels.append(Level(number, splats(count), {"s_min": 0.1 if number == 1 else 0.0}))
         write_ply(path, levels[-1].splats)
         say(
-            "level", level=number, path=f"levels/{path.name}", splats=count, s_min=levels[-1].s_min, psnr=20.0
-        )
+            "level", level=number, path=f"levels/{path.name}", splats=count, psnr=20.0,
+            facts=levels[-1].facts, rule="bands", scene_facts={}, cumulative=False, meta={},
+        )  # fmt: skip
         if mode == "killed":
             os.kill(os.getpid(), signal.SIGKILL)
         if mode == "crash":
@@ -97,8 +101,8 @@ def run(mode: str, job: Job, folder: RunFolder, say: Events) -> int:
             print("garbage {on stdout")
             with folder.events_file.open("ab") as file:
                 file.write(b'not json\n{"no": "event"}\n[1, 2]\n\xff\xfe\n')
-    meta = {"camera_center": [1.0, 2.0, 3.0], "focal_px": 100.0, "gamma": 2.0}
-    write_bundle(folder.bundle, Bundle(job.method, levels, meta))
+    meta = {"camera_center": [1.0, 2.0, 3.0], "focal_px": 100.0}
+    write_bundle(folder.bundle, Bundle(job.method, levels, "bands", {}, {"gamma": 2.0}, meta=meta))
     say("done", bundle=folder.bundle.name, seconds=1.0)
     return 0
 

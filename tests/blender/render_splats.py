@@ -12,7 +12,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from training.rasterize import rasterize
+from training.rasterize import Gaussians, rasterize
 from training.scenes.cameras import Camera
 
 given = np.load(sys.argv[1])
@@ -20,5 +20,5 @@ camera = Camera("view", *map(int, given["size"]), *map(float, given["intrinsics"
 names = ("means", "quats", "log_scales", "opacity_logits", "sh")
 tensors = [torch.tensor(given[name], dtype=torch.float32) for name in names]
 weights = torch.tensor(given["weights"], dtype=torch.float32) if "weights" in given else None
-drawn = rasterize(*tensors, camera, weights=weights, near=float(given["near"]), backend="cpu")
+drawn = rasterize(Gaussians(*tensors), camera, weights=weights, near=float(given["near"]), backend="cpu")
 np.save(sys.argv[2], drawn.image.numpy())

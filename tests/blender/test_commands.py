@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
@@ -37,15 +38,38 @@ def test_train_saves_and_exports(bpy, lodgs, lodgs_command, fake, tmp_path, capf
     counts = [element.count for element in plyfile.PlyData.read(str(bundle)).elements][:2]
     assert sorted(counts) == sorted(COUNTS.values())
     bpy.ops.wm.open_mainfile(filepath=str(blend))
-    (root,) = [thing for thing in bpy.data.objects if thing.lodgs.is_root]
+    (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
     assert {i.number: len(i.object.data.points) for i in root.lodgs.levels} == COUNTS
-    assert [thing for thing in root.children if thing.type == "CAMERA"]
+    assert [obj for obj in root.children if obj.type == "CAMERA"]
 
     other = tmp_path / "again.ply"
     assert lodgs_command("export", blend, other) == 0
     assert other.read_bytes() == bundle.read_bytes()
     assert lodgs_command("info", bundle) == 0
     assert "20" in capfd.readouterr().out
+
+
+def test_train_from_a_base_is_what_the_panel_then_shows(
+    bpy, lodgs, lodgs_command, fake, tmp_path, monkeypatch
+):
+    methods = lodgs("training.methods").METHODS
+    monkeypatch.setitem(methods, "flod", replace(methods["flod"], from_base=True))
+    fake()
+    assert lodgs_command("train", "--scene", SCENE, "--out", tmp_path / "first") == 0
+    train = ("train", "--scene", SCENE, "--out", tmp_path / "second", "--base", tmp_path / "first")
+    train = (*train, "--set", "max_splats=500")
+    fake("killed")
+    assert lodgs_command(*train) == 1
+    fake()
+    assert lodgs_command(*train, "--blend", tmp_path / "out.blend") == 0, "resumed"
+    written = lodgs("training.runs.job").Job.from_file(tmp_path / "second" / "job.toml")
+    assert written.base == str(tmp_path / "first")
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "out.blend"))
+    (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
+    settings = root.lodgs.training
+    assert (settings.start_from, settings.parameters.max_splats) == ("FILE", 500)
+    panels = lodgs("runs.jobs").make_job(root, tmp_path / "second", {})
+    assert panels.resolved() == written, "the panel asks for the same"
 
 
 def test_a_stopped_run_is_gone_on_with(lodgs_command, fake, tmp_path, capfd):
@@ -66,6 +90,16 @@ def test_a_stopped_run_is_gone_on_with(lodgs_command, fake, tmp_path, capfd):
     assert lodgs_command(*train, "--export", tmp_path / "bundle.ply") == 0  # finished: loaded
     assert (tmp_path / "bundle.ply").exists()
     assert lodgs_command(*train, "--seed", 5) == 2
+    (tmp_path / "bundle.ply").unlink()
+    assert lodgs_command("train", tmp_path / "run" / "job.toml", "--export", tmp_path / "bundle.ply") == 0
+    assert (tmp_path / "bundle.ply").exists()
+
+
+def test_train_has_the_trainers_options(lodgs, lodgs_command, capfd):
+    assert lodgs_command("train", "--help") == 0
+    said = capfd.readouterr().out
+    names = {field.name for field in fields(lodgs("training.runs.job").Job)} - {"parameters"}
+    assert all(f"--{name.replace('_', '-')} " in said for name in names | {"set", "blend", "export"})
 
 
 @pytest.mark.parametrize(
@@ -73,9 +107,10 @@ def test_a_stopped_run_is_gone_on_with(lodgs_command, fake, tmp_path, capfd):
     [
         (["train", "--scene", "nowhere", "--out", "run"], "nowhere"),
         (["train", "--scene", SCENE, "--out", "run", "--set", "levels"], "--set levels is not NAME=VALUE"),
+        (["train", "--out", "run"], "--scene DIR"),
         (["train", "--scene", SCENE, "--out", "run", "--set", "wings=2"], "unknown parameter 'wings'"),
         (["train", "--scene", SCENE, "--out", "run", "--method", "magic"], "magic"),
-        (["train", "--scene", SCENE, "--out", "run", "--image-scale", "7"], "7 is not between"),
+        (["train", "--scene", SCENE, "--out", "run", "--image-scale", "7"], "image_scale = 7"),
         (["train", "--scene", SCENE, "--out", "run", "--seed", "-1"], "-1 is not between"),
         (["train", "--scene", SCENE, "--out", "run", "--test-every", "1"], "test_every"),
         (["import", "nothing.ply", "--blend", "x.blend"], "nothing.ply"),
@@ -104,7 +139,7 @@ def test_help_is_no_mistake(lodgs_command, capfd):
 def test_import_makes_a_blend(bpy, lodgs_command, tmp_path):
     assert lodgs_command("import", SCENE, "--blend", tmp_path / "scene.blend") == 0
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "scene.blend"))
-    assert [thing for thing in bpy.data.objects if thing.lodgs.is_root]
+    assert [obj for obj in bpy.data.objects if obj.lodgs.is_root]
 
 
 COMMAND = """

@@ -52,7 +52,7 @@ def test_zip_holds_what_it_needs_and_nothing_else(archive):
         for p in (REPOSITORY / r).rglob("*.py")
     }
     others = {"__init__.py", "blender_manifest.toml", "LICENSE"}
-    others |= {"requirements/trainer.txt", "requirements/cuda.txt"}
+    others |= {"pyproject.toml", "requirements/trainer.txt", "requirements/cuda.txt"}
     wheels = set(tomllib.loads((REPOSITORY / "blender_manifest.toml").read_text())["wheels"])
     assert {n for n in names if not n.endswith("/")} == code | others | {w.removeprefix("./") for w in wheels}
 
@@ -61,6 +61,7 @@ def test_version_is_the_same_everywhere():
     from training import VERSION
 
     assert tomllib.loads((REPOSITORY / "blender_manifest.toml").read_text())["version"] == VERSION
+    assert f"\nversion: {VERSION}\n" in (REPOSITORY / "CITATION.cff").read_text(encoding="utf-8")
 
 
 def test_zip_installs_and_imports(archive, tmp_path):

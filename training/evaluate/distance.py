@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
-from ..lod.selection import Detail, complete, select
+from ..lod.rule import Values
+from ..lod.selection import complete, rule_of, select, settings
 from ..scenes.cameras import Camera
 from ..splats.bundle import Bundle
+from ..splats.gaussians import Splats
 from .metrics import psnr
-from .protocol import Evaluation
+from .views import Evaluation
 
 FACTORS = (1, 2, 4, 8)
 FRAMES = 120
@@ -24,20 +27,32 @@ def pulled_back(camera: Camera, factor: float, depth: float) -> Camera:
     return replace(camera, world_to_camera=pose)
 
 
-def farther(evaluation: Evaluation, bundle: Bundle, detail: Detail) -> list[dict]:
+def full_detail(bundle: Bundle, camera: Camera) -> tuple[Splats, np.ndarray | None]:
+    """All that there is, with the weights it keeps however far the camera is then pulled back.
+
+    Those are 1, but for rules whose weights always count: there they are those that the camera sees where it
+    stands, as splats without them are not what was trained.
+    """
+    if rule_of(bundle).always:
+        return select(bundle, camera.center, camera.focal, settings(bundle, {}))
+    return complete(bundle, bundle.levels[-1]), None
+
+
+def farther(evaluation: Evaluation, bundle: Bundle, values: Values) -> list[dict]:
     """Held-out views, pulled back: splats drawn by distance and at full detail, and how alike they look.
 
     Returns:
         For each of FACTORS ``factor``, ``drawn`` and ``drawn_full`` (splats in the image), and ``psnr`` of
         the picture by distance against that of full detail, means over views.
     """
-    everything, rows = complete(bundle, bundle.levels[-1]), []
+    rows = []
     for factor in FACTORS:
         found = []
         for camera in evaluation.cameras:
             view = pulled_back(camera, factor, evaluation.data.median_depth)
-            full = evaluation.render(everything, view)
-            chosen, weights = select(bundle, view.center, min(view.fx, view.fy), detail)
+            everything, fixed = full_detail(bundle, camera)
+            full = evaluation.render(everything, view, fixed)
+            chosen, weights = select(bundle, view.center, view.focal, values)
             some = evaluation.render(chosen, view, weights)
             counts = [int((rendering.radii > 0).sum()) for rendering in (some, full)]
             found.append((*counts, psnr(some.image.cpu(), full.image.cpu())))
@@ -53,30 +68,34 @@ def farther(evaluation: Evaluation, bundle: Bundle, detail: Detail) -> list[dict
     return rows
 
 
-def jumps(evaluation: Evaluation, bundle: Bundle, detail: Detail, camera: Camera) -> dict:
+def jumps(evaluation: Evaluation, bundle: Bundle, values: Values, camera: Camera) -> dict:
     """How much more neighbouring frames differ on the way out than with all splats in all frames.
 
     The camera is pulled back from 1 to 8 times its distance in FRAMES equal factors. A jump is the mean
     absolute difference of two neighbouring frames over that of the same two at full detail.
 
     Returns:
-        ``faded`` and ``hard``: the largest jump with levels fading, and with levels switched on and off.
+        The largest jump, by what it is of: ``by distance``; where the rule's levels fade, ``faded`` and
+        ``hard``, with levels switched on and off.
     """
-    everything = complete(bundle, bundle.levels[-1])
+    everything, fixed = full_detail(bundle, camera)
     views = [
         pulled_back(camera, factor, evaluation.data.median_depth)
         for factor in np.geomspace(FACTORS[0], FACTORS[-1], FRAMES)
     ]
 
-    def differences(pictures: list[np.ndarray]) -> np.ndarray:
+    def differences(pictures: Iterable[np.ndarray]) -> np.ndarray:
         return np.array([np.abs(b - a).mean() for a, b in pairwise(pictures)])
 
-    def by_distance(view: Camera, fade: bool) -> np.ndarray:
-        chosen, weights = select(bundle, view.center, min(view.fx, view.fy), replace(detail, fade=fade))
-        return evaluation.draw(chosen, view, weights).numpy()
+    def largest(values: Values) -> float:
+        chosen = (select(bundle, view.center, view.focal, values) for view in views)
+        pictures = (
+            evaluation.draw(splats, view, weights).numpy()
+            for view, (splats, weights) in zip(views, chosen, strict=True)
+        )
+        return round(float((differences(pictures) / still).max()), 3)
 
-    still = differences([evaluation.draw(everything, view).numpy() for view in views])
-    return {
-        name: round(float((differences([by_distance(view, fade) for view in views]) / still).max()), 3)
-        for name, fade in (("faded", True), ("hard", False))
-    }
+    still = differences(evaluation.draw(everything, view, fixed).numpy() for view in views)
+    if any(control.name == "fade" for control in rule_of(bundle).controls):
+        return {"faded": largest({**values, "fade": 1}), "hard": largest({**values, "fade": 0})}
+    return {"by distance": largest(values)}

@@ -10,24 +10,23 @@ import torch
 
 from ..files import atomic_write
 from ..lod.colors import level_color
-from ..lod.selection import Detail, complete, select
+from ..lod.rule import Values, find_rule
+from ..lod.selection import complete, select
 from ..scenes.cameras import Camera
 from ..scenes.images import write_png
 from ..splats.bundle import Bundle
-from ..splats.gaussians import Splats
+from ..splats.gaussians import SH_C0, Splats
 from .metrics import psnr
-from .protocol import Evaluation
-
-SH_C0 = 0.28209479177387814
+from .views import Evaluation
 
 
-def level_picture(path: Path, bundle: Bundle, evaluation: Evaluation, camera: Camera, detail: Detail) -> None:
+def level_picture(path: Path, bundle: Bundle, evaluation: Evaluation, camera: Camera, values: Values) -> None:
     """Writes a PNG: levels coarse to fine, the selective view, its levels in colours, the photograph.
 
     Args:
         path: file to write.
         camera: a held-out view.
-        detail: of the selective view.
+        values: of the rule's controls, for what is chosen by distance; without use where there is no rule.
     """
     target = evaluation.target(camera)
 
@@ -35,11 +34,18 @@ def level_picture(path: Path, bundle: Bundle, evaluation: Evaluation, camera: Ca
         image = evaluation.draw(splats, camera, weights)
         return f"{name}   {len(splats):,} splats   {psnr(image, target):.1f} dB", image
 
-    tiles = [tile(f"level {level.number}", complete(bundle, level)) for level in bundle.levels]
-    if len(bundle.levels) > 1:
-        view = (camera.center, min(camera.fx, camera.fy), detail)
-        name = "by distance" if bundle.cumulative else f"levels {detail.start} to {detail.end}"
-        tiles.append(tile(name, *select(bundle, *view)))
+    rule = find_rule(bundle.rule)
+    tiles = []
+    if rule is None or not rule.always:
+        tiles = [tile(f"level {level.number}", complete(bundle, level)) for level in bundle.levels]
+    if rule and rule.sweep:
+        name, steps = rule.sweep
+        for step in steps:
+            shown = select(bundle, camera.center, camera.focal, {**values, name: step})
+            tiles.append(tile(f"{name} = {step:g}", *shown))
+    elif rule:
+        view = (camera.center, camera.focal, values)
+        tiles.append(tile("by distance", *select(bundle, *view)))
         colored, weights = select(_in_level_colors(bundle), *view)
         tiles.append(("which level where", evaluation.draw(colored, camera, weights)))
     tiles.append(("photograph", target))

@@ -1,1 +1,1 @@
-"""Level-of-detail rules: which splats a camera sees, as a weight in [0, 1] on each splat's opacity."""
+"""Level of detail: which splats an eye sees, as a weight in [0, 1] on the opacity of each."""

@@ -2,51 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..errors import LodgsError
 from ..splats.bundle import Bundle, Level
 from ..splats.gaussians import Splats
-from .rules import band_mask, flod_bands, octree_wanted, octree_weights
-
-BIAS = "lod_bias"
-"""Column of each splat's bias, in levels (Octree-GS)."""
-
-
-@dataclass(frozen=True)
-class Detail:
-    """How much detail is wanted.
-
-    Attributes:
-        gamma: pixels that the smallest detail of a level may cover before a finer one is due (FLoD).
-        start, end: coarsest and finest level in use; 0 for the third finest and the finest (FLoD).
-        offset: levels finer, or below 0 coarser, than the distance asks for (Octree-GS).
-        fade: whether levels fade in, or are there at once from the middle on (Octree-GS).
-    """
-
-    gamma: float = 1.0
-    start: int = 0
-    end: int = 0
-    offset: float = 0.0
-    fade: bool = True
-
-    def of(self, bundle: Bundle) -> Detail:
-        """The same with the levels in use named.
-
-        Raises:
-            LodgsError: the bundle has no such levels, or gamma is not above 0.
-        """
-        finest = len(bundle.levels)
-        end = self.end or finest
-        start = self.start or max(1, end - 2)
-        if not 1 <= start <= end <= finest or not self.gamma > 0:
-            raise LodgsError(
-                f"Levels {start} to {end} with gamma {self.gamma:g} cannot be shown.",
-                f"Choose levels from 1 to {finest}, coarse to fine, and a gamma above 0.",
-            )
-        return replace(self, start=start, end=end)
+from .rule import OPACITY, Rule, Values, facts_of, find_rule
 
 
 @dataclass
@@ -64,26 +27,81 @@ class Shown:
     weights: np.ndarray | None = None
 
 
+def rule_of(bundle: Bundle) -> Rule:
+    """The rule that a bundle's levels are chosen by.
+
+    Raises:
+        LodgsError: they are not made for distances, or this version does not know the rule.
+    """
+    rule = find_rule(bundle.rule)
+    if rule is None:
+        raise LodgsError(*unknown_rule(bundle.rule))
+    return rule
+
+
+def unknown_rule(name: str) -> tuple[str, str]:
+    """What to say, and what to do about it, where there is no such rule."""
+    if not name:
+        return "These levels are not made for distances.", "Show one of them with --level, or the finest."
+    return (
+        f"These levels are chosen by the rule '{name}', which this version does not know.",
+        "Update LODGS; until then the finest level is shown.",
+    )
+
+
+def settings(bundle: Bundle, given: Values) -> Values:
+    """A value for every control of a bundle's rule: those given, else the bundle's own, else the rule's.
+
+    Raises:
+        LodgsError: as :func:`rule_of`, the rule has no such control, a value is not possible, or no level is
+            left in use.
+    """
+    return rule_of(bundle).settings(given, [level.number for level in bundle.levels], bundle.controls)
+
+
 def select(
-    bundle: Bundle, eye: np.ndarray, focal_px: float, detail: Detail
+    bundle: Bundle, eye: np.ndarray, focal_px: float, values: Values
 ) -> tuple[Splats, np.ndarray | None]:
-    """The splats of a bundle that an eye is shown, and their weights (None: all 1), by the method's rule.
+    """The splats of a bundle that an eye is shown by its rule, and their weights (None: all 1).
 
     Args:
         eye: (3,) world position that distances are measured from.
-        focal_px: focal length in pixels of the image that is looked at.
+        focal_px: focal length in pixels of the image that is looked at (``Camera.focal``).
+        values: of the rule's controls, see :func:`settings`.
+
+    Raises:
+        LodgsError: as :func:`rule_of`, or the rule's facts are incomplete.
     """
-    shown = select_levels(bundle, eye, focal_px, detail)
-    weights = [one.weights for one in shown if one.weights is not None]
-    return Splats.concatenated([one.splats for one in shown]), np.concatenate(weights) if weights else None
+    shown = select_levels(bundle, eye, focal_px, values)
+    splats = Splats.concatenated([one.splats for one in shown])
+    if all(one.weights is None for one in shown):
+        return splats, None
+    ones = [np.ones(len(one.splats), np.float32) if one.weights is None else one.weights for one in shown]
+    return splats, np.concatenate(ones)
 
 
-def select_levels(bundle: Bundle, eye: np.ndarray, focal_px: float, detail: Detail) -> list[Shown]:
-    """The same level by level, coarse to fine."""
-    eye = np.asarray(eye, np.float32)
-    if bundle.cumulative and "d_max" in bundle.meta:
-        return _select_octree(bundle, eye, focal_px, detail)
-    return _select_flod(bundle, eye, focal_px, detail)
+def select_levels(bundle: Bundle, eye: np.ndarray, focal_px: float, values: Values) -> list[Shown]:
+    """The same level by level, coarse to fine; levels of which nothing is shown have no splats."""
+    rule, shown = rule_of(bundle), []
+    scene, levels = bundle.facts, [(level.number, level.facts) for level in bundle.levels]
+    for level in bundle.levels:
+        splats = level.splats
+        columns = _columns(rule, splats)
+        facts = facts_of(rule, scene, levels, level.number)
+        weights = rule.weights(splats.means, np.asarray(eye, np.float32), focal_px, columns, facts, values)
+        some = weights > 0
+        weights = weights[some]
+        shown.append(Shown(level.number, splats.select(some), None if (weights == 1).all() else weights))
+    return shown
+
+
+def _columns(rule: Rule, splats: Splats) -> dict[str, np.ndarray]:
+    """What a rule needs to know of splats."""
+    columns = {name: splats.extras.get(name, np.zeros(len(splats), np.float32)) for name in rule.columns}
+    if OPACITY in columns:
+        with np.errstate(over="ignore"):
+            columns[OPACITY] = 1 / (1 + np.exp(-splats.opacity_logits))
+    return columns
 
 
 def complete_levels(bundle: Bundle, number: int) -> list[Shown]:
@@ -97,42 +115,9 @@ def complete_levels(bundle: Bundle, number: int) -> list[Shown]:
         raise LodgsError(
             f"There is no level {number}.", f"Choose from {numbers[0]} (coarsest) to {numbers[-1]}."
         )
-    return [
-        Shown(level.number, level.splats)
-        for level in bundle.levels
-        if level.number == number or (bundle.cumulative and level.number < number)
-    ]
+    return [Shown(level.number, level.splats) for level in bundle.upto(number)]
 
 
 def complete(bundle: Bundle, level: Level) -> Splats:
-    """All that is drawn at a level: the level, and where levels add up the coarser ones with it."""
-    if not bundle.cumulative:
-        return level.splats
-    return Splats.concatenated([x.splats for x in bundle.levels if x.number <= level.number])
-
-
-def _select_flod(bundle: Bundle, eye: np.ndarray, focal_px: float, detail: Detail) -> list[Shown]:
-    """FLoD's selective rendering (FLoD, Eq. 7)."""
-    end = detail.end or len(bundle.levels)
-    start = detail.start or max(1, end - 2)
-    bands = flod_bands([level.s_min or 0.0 for level in bundle.levels], focal_px, detail.gamma, start, end)
-    chosen = []
-    for level, (near, far) in zip(bundle.levels, bands, strict=True):
-        if start <= level.number <= end:
-            distances = np.linalg.norm(level.splats.means - eye, axis=1)
-            chosen.append(Shown(level.number, level.splats.select(band_mask(distances, near, far))))
-    return chosen
-
-
-def _select_octree(bundle: Bundle, eye: np.ndarray, focal_px: float, detail: Detail) -> list[Shown]:
-    chosen = []
-    levels = bundle.levels[-1].number
-    for level in bundle.levels:
-        distances = np.linalg.norm(level.splats.means - eye, axis=1) * (bundle.meta["focal_px"] / focal_px)
-        bias = level.splats.extras.get(BIAS, np.zeros(1, np.float32)) + np.float32(detail.offset)
-        wanted = octree_wanted(distances, bias, bundle.meta["d_max"], levels)
-        weight = octree_weights(wanted, level.number).astype(np.float32)
-        weight = weight if detail.fade else (weight >= 0.5).astype(np.float32)
-        some = weight > 0
-        chosen.append(Shown(level.number, level.splats.select(some), weight[some]))
-    return chosen
+    """All that is drawn at a level, as one set of splats."""
+    return Splats.concatenated([each.splats for each in bundle.upto(level.number)])

@@ -1,93 +1,77 @@
-"""The papers' methods behind one interface. Importing this package needs no torch; making a method does."""
+"""The papers' methods behind one interface, a folder each. Importing this package needs no torch; making a
+method does.
+
+A folder's ``__init__.py`` declares the method (``METHOD``, a `MethodInfo`; no torch), its ``train.py`` holds
+the class ``Method``, which derives from ``methods.method.Method``. Folders are found, not listed.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import replace
 from importlib import import_module
-from typing import TYPE_CHECKING, Protocol
+from pkgutil import iter_modules
+from typing import TYPE_CHECKING
+
+from ..errors import LodgsError
+from .info import PRESETS, MethodInfo
+from .parameters import Parameters, override
 
 if TYPE_CHECKING:
-    import numpy as np
-    import torch
-
-    from ..rasterize import Target
-    from ..scenes.cameras import Camera
-    from ..splats.bundle import Level
+    from ..splats.gaussians import Splats
     from .data import TrainingData
-    from .parameters import Parameters
+    from .method import Method
 
-MODULES = {"flod": "flod", "3dgs": "flod", "octree": "octree", "octree_neural": "octree_neural"}
-"""The module of each method; its class is called ``Method``."""
+__all__ = ["METHODS", "PRESETS", "MethodInfo", "create", "found", "method_info", "parameters_of"]
 
 
-class Method(Protocol):
-    """One run of a method, step by step: what the loop asks of it.
+def found() -> dict[str, MethodInfo]:
+    """The methods whose folders lie in this package, by name, in the order of their numbers."""
+    folders = [f"{__name__}.{module.name}" for module in iter_modules(__path__) if module.ispkg]
+    methods = [replace(import_module(folder).METHOD, package=folder) for folder in folders]
+    return {method.name: method for method in sorted(methods, key=lambda method: method.number)}
 
-    Every random choice is drawn from (seed, step), so that a resumed run repeats an unbroken one.
 
-    Attributes:
-        cumulative: whether a level only holds what it adds to the coarser ones.
-        steps: number of steps of the whole run.
-        levels: number of levels.
-        splats: how many there are now.
+METHODS = found()
+"""Every method, by name."""
+
+
+def method_info(name: str) -> MethodInfo:
+    """What a method says of itself.
+
+    Raises:
+        LodgsError: there is no such method.
     """
-
-    cumulative: bool
-
-    def __init__(self, data: TrainingData, parameters: Parameters, seed: int, backend: str) -> None: ...
-
-    @property
-    def steps(self) -> int: ...
-
-    @property
-    def levels(self) -> int: ...
-
-    @property
-    def splats(self) -> int: ...
-
-    def level_at(self, step: int) -> int:
-        """The finest level (1-based) that a step trains."""
-        ...
-
-    def train_step(self, step: int) -> tuple[float, torch.Tensor, Target]:
-        """Makes one step; the first has number 0. Returns the loss, the image (H, W, 3) and its target."""
-        ...
-
-    def levels_after(self, step: int) -> list[Level]:
-        """The levels to hand over after a step, finished or newer than before, coarse to fine."""
-        ...
-
-    def meta(self) -> dict:
-        """What a bundle records of this run: all that choosing levels by distance needs."""
-        ...
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """What levels do not hold of the model, to go on with it or to draw it; empty where they hold all."""
-        return {}
-
-    def load_arrays(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Takes the model from what ``arrays`` gave."""
-        raise NotImplementedError("the levels hold all")
-
-    def picture(self, camera: Camera) -> torch.Tensor:
-        """What the model itself shows a camera, (H, W, 3); asked only where ``arrays`` gives some."""
-        raise NotImplementedError("the levels hold all")
-
-    def state_dict(self) -> dict:
-        """Everything that the next step depends on, as tensors and numbers."""
-        ...
-
-    def load_state_dict(self, state: dict) -> None:
-        """Continues from what ``state_dict`` gave."""
-        ...
+    if name not in METHODS:
+        raise LodgsError(f"There is no method '{name}'.", f"Choose one of: {', '.join(METHODS)}.")
+    return METHODS[name]
 
 
-def create(name: str, data: TrainingData, parameters: Parameters, seed: int, backend: str) -> Method:
+def parameters_of(method: str, preset: str, changes: dict) -> Parameters:
+    """The parameters that a method is trained with: a preset's, with changes by name.
+
+    Raises:
+        LodgsError: there is no such method or preset, or a change is not possible.
+    """
+    return override(method_info(method).preset(preset), changes)
+
+
+def create(
+    name: str,
+    data: TrainingData,
+    parameters: Parameters,
+    seed: int,
+    backend: str,
+    base: Splats | None = None,
+) -> Method:
     """The method of a job, ready for its first step.
 
     Args:
-        name: a key of ``parameters.METHODS``.
+        name: a key of METHODS.
         backend: the rasterizer's; the tensors live where it draws (``rasterize.device_of``).
+        base: splats to begin with instead of the scene's points, where the method can (``from_base``).
+
+    Raises:
+        LodgsError: the scene has too few points, or no view sees any.
     """
-    module = import_module(f".{MODULES[name]}", __package__)
-    return module.Method(data, parameters, seed, backend)
+    method = import_module(f"{method_info(name).package}.train").Method
+    return method(data, parameters, seed, backend, base)

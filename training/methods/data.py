@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -17,6 +18,23 @@ IMAGE_MEMORY = 2 << 30
 
 TARGET_BYTES = 36
 """Bytes a pixel of ground truth: the photograph and its two local moments, float32."""
+
+
+@dataclass(frozen=True)
+class TrainingView:
+    """What a step compares its picture with.
+
+    Attributes:
+        index: of the training view.
+        camera: the view, at the size of the target.
+        target: the photograph, ready for the loss.
+        shrink: how many times smaller than training size it is.
+    """
+
+    index: int
+    camera: Camera
+    target: Target
+    shrink: int = 1
 
 
 class TrainingData:
@@ -63,8 +81,8 @@ class TrainingData:
 
     @cached_property
     def focal(self) -> float:
-        """Focal length in pixels: the training views' median of min(fx, fy)."""
-        return float(np.median([min(camera.fx, camera.fy) for camera in self.train]))
+        """Focal length in pixels: the training views' median."""
+        return float(np.median([camera.focal for camera in self.train]))
 
     @property
     def near(self) -> float:
@@ -90,6 +108,10 @@ class TrainingData:
         """The photograph at the camera's size, (H, W, 3) float32, display-coded, 0 to 1."""
         assert camera.image is not None
         return load_image(camera.image, camera.width, camera.height, exposure=self.exposure)
+
+    def view(self, index: int, shrink: int = 1) -> TrainingView:
+        """A training view by index, its image ``shrink`` times smaller."""
+        return TrainingView(index, self.camera(index, shrink), self.target(index, shrink), shrink)
 
     def camera(self, view: int, shrink: int = 1) -> Camera:
         """A training view, its image ``shrink`` times smaller: what one as far away would see."""

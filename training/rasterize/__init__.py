@@ -12,19 +12,22 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
+from typing import Any
 
 import numpy as np
 import torch
 
 from ..errors import LodgsError
 from ..scenes.cameras import Camera
+from ..splats.gaussians import SH_C0
 from .adam import Adam
 from .features import depths, normals
-from .rendering import OUTPUTS, Contributions, Rendering, Target, View
-from .sh import C0, degree_of
+from .gaussians import Gaussians
+from .rendering import OUTPUTS, Contributions, Rendering, Settings, Target, View
+from .sh import degree_of
 
 __all__ = [
-    "BACKENDS", "OUTPUTS", "Adam", "Contributions", "Rendering", "Target",
+    "BACKENDS", "OUTPUTS", "Adam", "Contributions", "Gaussians", "Rendering", "Target",
     "contributions", "device_of", "photometric_loss", "rasterize", "render", "resolve", "strips", "warm_up",
 ]  # fmt: skip
 
@@ -36,11 +39,7 @@ STRIP = 1 << 21
 
 
 def rasterize(
-    means: torch.Tensor,
-    quats: torch.Tensor,
-    log_scales: torch.Tensor,
-    opacity_logits: torch.Tensor,
-    sh: torch.Tensor,
+    gaussians: Gaussians,
     camera: Camera,
     *,
     weights: torch.Tensor | None = None,
@@ -52,25 +51,22 @@ def rasterize(
     outputs: Collection[str] = (),
     features: torch.Tensor | None = None,
     limit: torch.Tensor | None = None,
+    window: tuple[int, int, int, int] | None = None,
     backend: str = "auto",
 ) -> Rendering:
-    """Draw splats as a camera sees them; differentiable by every tensor given.
+    """Draw N Gaussians as a camera sees them; differentiable by every tensor given.
 
     Projection, alpha and blending are those of 3D Gaussian Splatting (Kerbl et al. 2023); the constants are
     in :mod:`.rendering`. The view direction's part of the gradient reaches the means.
 
     Args:
-        means: (N, 3) in the world.
-        quats: (N, 4) rotations wxyz, of any length but zero.
-        log_scales: (N, 3); the standard deviations are exp(log_scales) + min_scale, in world units.
-        opacity_logits: (N,); the opacity is sigmoid(opacity_logits) times the weight.
-        sh: (N, (d+1)², 3) spherical-harmonics coefficients; the colour is 0.5 + Σ c·Y, at least 0. Or (N, 3)
-            colours, the same from everywhere, at least 0 as well.
+        gaussians: in the world.
         camera: the view; any pinhole, any principal point.
-        weights: (N,) in [0, 1], or None for ones. A splat of weight 0 is dropped before projection.
+        weights: (N,) in [0, 1] on the opacities, or None for ones. A splat of weight 0 is dropped before
+            projection.
         background: colour behind everything.
         sh_degree: use the coefficients up to this degree only (the others get a gradient of zero); None: all.
-        min_scale: lower bound of every scale, in world units (FLoD, Eq. 4).
+        min_scale: added to every standard deviation, and so its lower bound, in world units (FLoD, Eq. 4).
         near: a splat is drawn where its mean lies deeper than this, in world units.
         antialias: instead of 3DGS's dilation, filter with :data:`.rendering.MIP_VARIANCE` and give what a
             splat gains in area back in opacity, sqrt(det before / det after) (Mip-Splatting, Yu et al. 2024,
@@ -80,6 +76,7 @@ def rasterize(
         limit: (H, W), for each pixel a depth along the camera's z axis, in world units: splats whose means
             lie beyond it have no part in the pixel, whatever is asked for. For pictures only: without
             gradients.
+        window: left, top, width and height in pixels of the part of the camera's image to draw; None: all.
         backend: one of :data:`BACKENDS`, or "auto": cuda for tensors on a GPU, else cpu.
 
     Raises:
@@ -87,46 +84,32 @@ def rasterize(
             where gradients are wanted.
         LodgsError: for a backend that does not exist, or does not work on this computer.
     """
-    return _draw(
-        means, quats, log_scales, opacity_logits, sh, View.of(camera, near), weights=weights,
-        background=background, sh_degree=sh_degree, min_scale=min_scale, antialias=antialias,
-        outputs=outputs, features=features, limit=limit, backend=backend,
-    )  # fmt: skip
-
-
-def _draw(
-    means, quats, log_scales, opacity_logits, sh, view: View, *,
-    weights, background, sh_degree, min_scale, antialias, outputs, features, limit, backend,
-) -> Rendering:  # fmt: skip
-    """:func:`rasterize` of a view, which may be a strip of a camera's."""
-    count = len(means)
-    _check(means, quats, log_scales, opacity_logits, weights)
-    sh = _coefficients(sh)
-    degree = _degree(sh, count, sh_degree)
+    count, means, view = len(gaussians), gaussians.means, View.of(camera, near, window)
+    _check_weights(weights, count)
+    gaussians = replace(gaussians, sh=_coefficients(gaussians.sh))
     if not set(outputs) <= set(OUTPUTS):
         raise ValueError(f"outputs can be {', '.join(OUTPUTS)}, not {', '.join(outputs)}")
     if features is not None and (features.ndim != 2 or len(features) != count):
         raise ValueError(f"features must have shape ({count}, F), not {tuple(features.shape)}")
     if limit is not None:
         if limit.shape != (view.height, view.width):
-            wanted = view.height, view.width
-            raise ValueError(f"limit must have shape {wanted}, not {tuple(limit.shape)}")
-        leaves = means, quats, log_scales, opacity_logits, sh, weights, features
+            raise ValueError(f"limit must have shape {(view.height, view.width)}, not {tuple(limit.shape)}")
+        leaves = *vars(gaussians).values(), weights, features
         if torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in leaves):
             raise ValueError("a limit is for pictures: it has no gradients")
-    red, green, blue = (float(value) for value in background)
     blended = [] if features is None else [features]
     if "depth" in outputs:
         blended.append(depths(means, view)[:, None])
     if "normals" in outputs:
-        blended.append(normals(means, quats, log_scales, view))
-    drawn = _backend(backend, means).rasterize(
-        means, quats, log_scales, opacity_logits, sh, weights,
-        torch.cat(blended, 1) if blended else means.new_zeros(count, 0),
-        view=view, background=(red, green, blue), degree=degree, min_scale=float(min_scale),
-        antialias=bool(antialias), median="median_depth" in outputs, absolute="absgrad2d" in outputs,
-        limit=limit,
+        blended.append(normals(gaussians, view))
+    red, green, blue = (float(value) for value in background)
+    settings = Settings(
+        view, float(min_scale), bool(antialias), (red, green, blue), _degree(gaussians.sh, sh_degree),
+        median="median_depth" in outputs, absolute="absgrad2d" in outputs, limit=limit,
     )  # fmt: skip
+    drawn = _backend(backend, means).rasterize(
+        gaussians, weights, torch.cat(blended, 1) if blended else means.new_zeros(count, 0), settings
+    )
     rendering = Rendering(
         drawn.image, drawn.alpha, drawn.radii, drawn.grad2d, drawn.tile_counts, drawn.absgrad2d
     )
@@ -148,92 +131,62 @@ def _draw(
 
 @torch.no_grad()
 def strips(
-    means: torch.Tensor,
-    quats: torch.Tensor,
-    log_scales: torch.Tensor,
-    opacity_logits: torch.Tensor,
-    sh: torch.Tensor,
+    gaussians: Gaussians,
     camera: Camera,
     *,
-    weights: torch.Tensor | None = None,
-    background: Sequence[float] = (0.0, 0.0, 0.0),
-    sh_degree: int | None = None,
-    min_scale: float = 0.0,
-    near: float = 0.01,
-    antialias: bool = False,
-    outputs: Collection[str] = (),
-    features: torch.Tensor | None = None,
     limit: torch.Tensor | None = None,
     window: tuple[int, int, int, int] | None = None,
     strip: int = STRIP,
-    backend: str = "auto",
+    **options: Any,
 ) -> Iterator[tuple[int, Rendering]]:
-    """Draw a picture for eyes strip by strip, from the top: nothing is kept for gradients or between strips.
+    """Draw a picture strip by strip, from the top: nothing is kept for gradients or between strips.
 
-    Args: as for :func:`rasterize`, and
+    Args:
         limit: of the window's pixels.
-        window: left, top, width and height in pixels of the part of the camera's image to draw; None: all.
         strip: pixels to draw at a time, about.
+        gaussians, camera, window, options: as for :func:`rasterize`.
 
     Yields:
-        The first row of a strip, and what it shows.
+        The first row of a strip in the window, and what it shows.
     """
     left, above, width, height = window or (0, 0, camera.width, camera.height)
-    whole = replace(View.of(camera, near), width=width)
-    whole = replace(whole, cx=whole.cx - left, cy=whole.cy - above)
     if limit is not None and limit.shape != (height, width):
         raise ValueError(f"limit must have shape {(height, width)}, not {tuple(limit.shape)}")
     rows = max(strip // width // 16 * 16, 16)
     for top in range(0, height, rows):
-        part = replace(whole, cy=whole.cy - top, height=min(rows, height - top))
-        yield top, _draw(
-            means, quats, log_scales, opacity_logits, sh, part, weights=weights, background=background,
-            sh_degree=sh_degree, min_scale=min_scale, antialias=antialias, outputs=outputs,
-            features=features, limit=None if limit is None else limit[top : top + rows], backend=backend,
-        )  # fmt: skip
+        part = left, above + top, width, min(rows, height - top)
+        hidden = None if limit is None else limit[top : top + rows]
+        yield top, rasterize(gaussians, camera, limit=hidden, window=part, **options)
 
 
 @torch.no_grad()
 def render(
-    means: torch.Tensor,
-    quats: torch.Tensor,
-    log_scales: torch.Tensor,
-    opacity_logits: torch.Tensor,
-    sh: torch.Tensor,
+    gaussians: Gaussians,
     cameras: Iterable[Camera],
     *,
-    weights: torch.Tensor | None = None,
-    background: Sequence[float] = (0.0, 0.0, 0.0),
-    sh_degree: int | None = None,
-    min_scale: float = 0.0,
-    near: float = 0.01,
-    antialias: bool = False,
-    kind: str = "float32",
+    dtype: str = "float32",
     strip: int = STRIP,
-    backend: str = "auto",
+    **options: Any,
 ) -> Iterator[np.ndarray]:
-    """Draw pictures for eyes, one camera after the other: nothing is kept for gradients.
+    """Draw pictures, one camera after the other: nothing is kept for gradients.
 
     Large images are drawn in strips, so that beyond the picture itself little memory is used.
 
-    Args: as for :func:`rasterize`, and
-        kind: "uint8" (colours clamped to 0 to 1, rounded), "float16" or "float32".
+    Args:
+        dtype: "uint8" (colours clamped to 0 to 1, rounded), "float16" or "float32".
         strip: pixels to draw at a time, about.
+        gaussians, options: as for :func:`rasterize`.
 
     Yields:
-        (H, W, 4) of this kind: the colour over the background, and alpha.
+        (H, W, 4) of this type: the colour over the background, and alpha.
     """
-    if kind not in ("uint8", "float16", "float32"):
-        raise ValueError(f'kind can be "uint8", "float16" or "float32", not "{kind}"')
+    if dtype not in ("uint8", "float16", "float32"):
+        raise ValueError(f'dtype can be "uint8", "float16" or "float32", not "{dtype}"')
     for camera in cameras:
-        picture = np.empty((camera.height, camera.width, 4), kind)
-        for top, drawn in strips(
-            means, quats, log_scales, opacity_logits, sh, camera, weights=weights, background=background,
-            sh_degree=sh_degree, min_scale=min_scale, near=near, antialias=antialias, strip=strip,
-            backend=backend,
-        ):  # fmt: skip
+        picture = np.empty((camera.height, camera.width, 4), dtype)
+        for top, drawn in strips(gaussians, camera, strip=strip, **options):
             pixels = torch.cat([drawn.image, drawn.alpha[..., None]], 2)
-            if kind == "uint8":
+            if dtype == "uint8":
                 pixels = pixels.clamp_(0, 1).mul_(255).round_()
             picture[top : top + len(pixels)] = pixels.cpu().numpy()
         yield picture
@@ -241,10 +194,7 @@ def render(
 
 @torch.no_grad()
 def contributions(
-    means: torch.Tensor,
-    quats: torch.Tensor,
-    log_scales: torch.Tensor,
-    opacity_logits: torch.Tensor,
+    gaussians: Gaussians,
     cameras: Iterable[Camera],
     *,
     weights: torch.Tensor | None = None,
@@ -255,18 +205,16 @@ def contributions(
 ) -> Contributions:
     """What each splat gives to the pixels of some views; no picture is kept, nothing is differentiated.
 
-    Args: as for :func:`rasterize`, which draws the same splats with the same weights in a pixel.
+    Args: as for :func:`rasterize`, which draws the same splats with the same weights in a pixel. Colours do
+    not matter.
     """
-    _check(means, quats, log_scales, opacity_logits, weights)
-    of = {"dtype": torch.float32, "device": means.device}
-    count = len(means)
-    largest, total, radius = (torch.zeros(count, **of) for _ in range(3))
-    pixels, views = (torch.zeros(count, dtype=torch.int64, device=means.device) for _ in range(2))
+    count, device = len(gaussians), gaussians.means.device
+    _check_weights(weights, count)
+    largest, total, radius = (torch.zeros(count, dtype=torch.float32, device=device) for _ in range(3))
+    pixels, views = (torch.zeros(count, dtype=torch.int64, device=device) for _ in range(2))
     for camera in cameras:
-        found = _backend(backend, means).contributions(
-            means, quats, log_scales, opacity_logits, weights,
-            view=View.of(camera, near), min_scale=float(min_scale), antialias=bool(antialias),
-        )  # fmt: skip
+        settings = Settings(View.of(camera, near), float(min_scale), bool(antialias))
+        found = _backend(backend, gaussians.means).contributions(gaussians, weights, settings)
         largest = torch.maximum(largest, found[0])
         total += found[1]
         pixels += found[2]
@@ -275,32 +223,22 @@ def contributions(
     return Contributions(largest, total, pixels, views, radius)
 
 
-def _check(means, quats, log_scales, opacity_logits, weights) -> None:
-    """ValueError unless all are of as many splats."""
-    count = len(means)
-    for name, tensor, columns in (
-        ("means", means, 3), ("quats", quats, 4), ("log_scales", log_scales, 3),
-    ):  # fmt: skip
-        if tensor.shape != (count, columns):
-            raise ValueError(f"{name} must have shape ({count}, {columns}), not {tuple(tensor.shape)}")
-    for name, tensor in (("opacity_logits", opacity_logits), ("weights", weights)):
-        if tensor is not None and tensor.shape != (count,):
-            raise ValueError(f"{name} must have shape ({count},), not {tuple(tensor.shape)}")
+def _check_weights(weights: torch.Tensor | None, count: int) -> None:
+    if weights is not None and weights.shape != (count,):
+        raise ValueError(f"weights must have shape ({count},), not {tuple(weights.shape)}")
 
 
 def _coefficients(sh: torch.Tensor) -> torch.Tensor:
     """Plain colours (N, 3) as the coefficients (N, 1, 3) that give them; coefficients as they are."""
-    return ((sh - 0.5) / C0)[:, None] if sh.ndim == 2 else sh
+    return ((sh - 0.5) / SH_C0)[:, None] if sh.ndim == 2 else sh
 
 
-def _degree(sh: torch.Tensor, count: int, wanted: int | None) -> int:
-    """The degree to draw with; ValueError unless sh is of ``count`` splats and of that degree at least."""
-    if sh.ndim != 3 or sh.shape[0] != count or sh.shape[2] != 3:
-        raise ValueError(f"sh must be ({count}, coefficients, 3) or ({count}, 3), not {tuple(sh.shape)}")
+def _degree(sh: torch.Tensor, active: int | None) -> int:
+    """The degree to draw with; ValueError unless sh (N, K, 3) is of that degree at least."""
     degree = degree_of(sh.shape[1])
-    if wanted is not None and wanted > degree:
-        raise ValueError(f"sh has degree {degree}, sh_degree asks for {wanted}")
-    return degree if wanted is None else wanted
+    if active is not None and active > degree:
+        raise ValueError(f"sh has degree {degree}, sh_degree asks for {active}")
+    return degree if active is None else active
 
 
 def photometric_loss(
@@ -371,16 +309,13 @@ def warm_up(backend: str = "auto") -> None:
 
 
 def _step(backend: str) -> None:
-    one = {
-        "means": [[0.0, 0.0, 1.0]], "quats": [[1.0, 0.0, 0.0, 0.0]], "log_scales": [[0.0] * 3],
-        "opacity_logits": [0.0], "sh": [[[0.0] * 3]],
-    }  # fmt: skip
+    one = [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0, 0.0]], [[0.0] * 3], [0.0], [[[0.0] * 3]]
     device = device_of(backend)
-    tensors = {name: torch.tensor(v, device=device, requires_grad=True) for name, v in one.items()}
+    gaussians = Gaussians(*(torch.tensor(values, device=device, requires_grad=True) for values in one))
     camera = Camera("", 16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
-    drawn = rasterize(*tensors.values(), camera, backend=backend)  # pyright: ignore[reportCallIssue]
+    drawn = rasterize(gaussians, camera, backend=backend)
     photometric_loss(drawn.image, Target(torch.zeros(16, 16, 3)), backend=backend).backward()
-    Adam(tensors, dict.fromkeys(tensors, 0.0)).step()
+    Adam(vars(gaussians), dict.fromkeys(vars(gaussians), 0.0)).step()
 
 
 def _backend(name: str, tensor: torch.Tensor):

@@ -23,8 +23,9 @@ from typing import Any, NamedTuple
 import torch
 
 from ..errors import LodgsError
+from .gaussians import Gaussians
 from .reference import ellipses, loss_to, meets_tile, moments, squared_reach
-from .rendering import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Drawn, Target, View
+from .rendering import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Drawn, Settings, Target, View
 
 DEVICE = "cuda"
 TILE = 16
@@ -65,38 +66,23 @@ def problem() -> LodgsError | None:
 
 
 def rasterize(
-    means: torch.Tensor,
-    quats: torch.Tensor,
-    log_scales: torch.Tensor,
-    opacity_logits: torch.Tensor,
-    sh: torch.Tensor,
-    weights: torch.Tensor | None,
-    features: torch.Tensor,
-    *,
-    view: View,
-    background: tuple[float, float, float],
-    degree: int,
-    min_scale: float,
-    antialias: bool,
-    median: bool,
-    absolute: bool,
-    limit: torch.Tensor | None,
+    gaussians: Gaussians, weights: torch.Tensor | None, features: torch.Tensor, settings: Settings
 ) -> Drawn:
     """See :func:`training.rasterize.rasterize`. Tensors are float32 on one GPU; ValueError otherwise."""
     gsplat = _gsplat()
-    _check(sh, features)
-    splats = Visible.of(
-        means, quats, log_scales, opacity_logits, weights, view=view, min_scale=min_scale, antialias=antialias
-    )
+    _check(features)
+    means, view, limit = gaussians.means, settings.view, settings.limit
+    splats = Visible.of(gaussians, weights, settings)
     tiles = Tiles.of(splats, view)
     towards = means[splats.which] - torch.as_tensor(view.eye).to(means)
-    colours = (gsplat.spherical_harmonics(degree, towards, sh[splats.which]) + 0.5).clamp_min(0)
+    colours = gsplat.spherical_harmonics(settings.degree, towards, gaussians.sh[splats.which])
+    colours = (colours + 0.5).clamp_min(0)
     gradients = torch.zeros(2, len(means), 2, device=means.device)  # signed and absolute
-    behind = means.new_tensor(background)
+    behind = means.new_tensor(settings.background)
     if limit is None:
         image, alpha, blended = _Blend.apply(
             splats.mean2d, splats.conic, splats.opacity, colours, features[splats.which],
-            behind, splats.which, tiles, view, gradients, absolute,
+            behind, splats.which, tiles, view, gradients, settings.absolute,
         )  # fmt: skip
     else:
         image, alpha, blended = blend_limited(
@@ -104,19 +90,19 @@ def rasterize(
         )
     return Drawn(
         image=image, alpha=alpha, radii=splats.radii, grad2d=gradients[0], tile_counts=tiles.counts,
-        absgrad2d=gradients[1] if absolute else None, features=blended,
-        median=median_splat(splats, tiles, view, limit) if median else None,
+        absgrad2d=gradients[1] if settings.absolute else None, features=blended,
+        median=median_splat(splats, tiles, view, limit) if settings.median else None,
     )  # fmt: skip
 
 
 @torch.no_grad()
-def contributions(means, quats, log_scales, opacity_logits, weights, *, view, min_scale, antialias):
+def contributions(
+    gaussians: Gaussians, weights: torch.Tensor | None, settings: Settings
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """See :func:`training.rasterize.contributions`: of one view, the largest, the sum, pixels and radii."""
-    splats = Visible.of(
-        means, quats, log_scales, opacity_logits, weights, view=view, min_scale=min_scale, antialias=antialias
-    )
-    largest, total = means.new_zeros(2, len(means))
-    pixels = torch.zeros(len(means), dtype=torch.int64, device=means.device)
+    splats, view = Visible.of(gaussians, weights, settings), settings.view
+    largest, total = gaussians.means.new_zeros(2, len(gaussians))
+    pixels = torch.zeros(len(gaussians), dtype=torch.int64, device=largest.device)
     for _, splat, weight, _ in walk(splats, Tiles.of(splats, view), view):
         splat = splats.which[splat].flatten()
         largest.scatter_reduce_(0, splat, weight.amax(1).flatten(), "amax")
@@ -169,12 +155,14 @@ class Visible(NamedTuple):
     radii: torch.Tensor
 
     @classmethod
-    def of(cls, means, quats, log_scales, opacity_logits, weights, *, view, min_scale, antialias) -> Visible:
-        _check(means, quats, log_scales, opacity_logits, weights)
-        seen = ellipses(
-            means, quats, log_scales, opacity_logits, weights,
-            view=view, min_scale=min_scale, antialias=antialias,
-        )  # fmt: skip
+    def of(cls, gaussians: Gaussians, weights: torch.Tensor | None, settings: Settings) -> Visible:
+        """The splats that meet an image; ``weights`` (N,) as in ``rasterize``, or None.
+
+        Raises:
+            ValueError: tensors that are not float32 or not on the GPU.
+        """
+        _check(*vars(gaussians).values(), weights)
+        seen = ellipses(gaussians, weights, settings)
         inside = seen.inside.nonzero()[:, 0]
         some = inside[seen.depth[inside].argsort(stable=True)]
         xx, xy, yy = covariance = tuple(values[some] for values in seen.covariance)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch.nn.functional import normalize
 
+from .gaussians import Gaussians
 from .rendering import View
 
 
@@ -13,9 +14,10 @@ def depths(means: torch.Tensor, view: View) -> torch.Tensor:
     return means @ torch.as_tensor(view.rotation[2]).to(means) + float(view.translation[2])
 
 
-def normals(means: torch.Tensor, quats: torch.Tensor, log_scales: torch.Tensor, view: View) -> torch.Tensor:
+def normals(gaussians: Gaussians, view: View) -> torch.Tensor:
     """Each splat's shortest axis (N, 3), unit length, in camera coordinates, turned towards the camera."""
-    shortest = log_scales.detach().argmin(dim=1)
+    means, quats = gaussians.means, gaussians.quats
+    shortest = gaussians.log_scales.detach().argmin(dim=1)
     axis = rotation_matrices(quats)[torch.arange(len(quats), device=quats.device), :, shortest]
     with torch.no_grad():
         away = (axis * (means - torch.as_tensor(view.eye).to(means))).sum(1, keepdim=True) > 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+import numpy as np
 import torch
 from torch.nn.functional import logsigmoid
 
@@ -27,17 +28,15 @@ def pixel_spacing(
         near: a camera sees what lies deeper than this, in world units,
         margin: and within its image widened by this share of its size on every side.
     """
-    spacing = torch.full_like(means[:, 0], torch.inf)
+    points = means.double().cpu().numpy()
+    spacing = np.full(len(points), np.inf)
     for camera in cameras:
-        pose = torch.as_tensor(camera.world_to_camera).to(means)
-        x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
-        across, down = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-        seen = (z > near) & (across.sub(camera.width / 2).abs() < (0.5 + margin) * camera.width)
-        seen &= down.sub(camera.height / 2).abs() < (0.5 + margin) * camera.height
-        finest = z / max(camera.fx, camera.fy)
-        spacing = torch.where(seen, torch.minimum(spacing, finest), spacing)
-    known = spacing.isfinite()
-    return torch.where(known, spacing, spacing[known].max() if known.any() else 0.0)
+        seen = camera.sees(points, near, margin)
+        finest = camera.view_space(points)[seen, 2] / max(camera.fx, camera.fy)
+        spacing[seen] = np.minimum(spacing[seen], finest)
+    known = np.isfinite(spacing)
+    spacing[~known] = spacing[known].max() if known.any() else 0.0
+    return torch.from_numpy(spacing).to(means)
 
 
 def smoothed(

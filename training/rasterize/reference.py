@@ -6,6 +6,7 @@ to 6, every splat against every pixel: memory grows with their product, so this 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -13,37 +14,32 @@ from torch.nn.functional import conv2d, normalize
 
 from . import sh as harmonics
 from .features import rotation_matrices
-from .rendering import ALPHA_MAX, ALPHA_MIN, DILATION, MIP_VARIANCE, TRANSMITTANCE_MIN, Drawn, Target, View
+from .gaussians import Gaussians
+from .rendering import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    DILATION,
+    MIP_VARIANCE,
+    TRANSMITTANCE_MIN,
+    Drawn,
+    Settings,
+    Target,
+    View,
+)
 
 Moments = tuple[torch.Tensor, torch.Tensor]
 
 
 def rasterize(
-    means: torch.Tensor,
-    quats: torch.Tensor,
-    log_scales: torch.Tensor,
-    opacity_logits: torch.Tensor,
-    sh: torch.Tensor,
-    weights: torch.Tensor | None,
-    features: torch.Tensor,
-    *,
-    view: View,
-    background: tuple[float, float, float],
-    degree: int,
-    min_scale: float,
-    antialias: bool,
-    median: bool,
-    absolute: bool,
-    limit: torch.Tensor | None,
+    gaussians: Gaussians, weights: torch.Tensor | None, features: torch.Tensor, settings: Settings
 ) -> Drawn:
     """See :func:`training.rasterize.rasterize`."""
+    means, view = gaussians.means, settings.view
     kind = {"dtype": means.dtype, "device": means.device}
-    seen = ellipses(
-        means, quats, log_scales, opacity_logits, weights, view=view, min_scale=min_scale, antialias=antialias
-    )
+    seen = ellipses(gaussians, weights, settings)
     drawn, mean2d, (xx, xy, yy), opacity = seen.drawn, seen.mean2d, seen.covariance, seen.opacity
     grad2d = torch.zeros(len(means), 2, dtype=torch.float32, device=means.device)
-    absgrad2d = torch.zeros_like(grad2d) if absolute else None
+    absgrad2d = torch.zeros_like(grad2d) if settings.absolute else None
     to_ndc = torch.tensor([view.width / 2, view.height / 2], **kind)
 
     def keep_gradient(gradient: torch.Tensor) -> None:
@@ -52,18 +48,20 @@ def rasterize(
     if mean2d.requires_grad:
         mean2d.register_hook(keep_gradient)
 
-    values: list = [None] * harmonics.coefficients(degree)
+    values: list = [None] * harmonics.coefficients(settings.degree)
     x, y, z = normalize(means[drawn] - torch.as_tensor(view.eye, **kind), dim=1).unbind(1)
-    harmonics.basis(x, y, z, degree, values)
-    colour = (torch.stack(values, 1)[:, :, None] * sh[drawn, : len(values)]).sum(1).add(0.5).clamp_min(0)
+    harmonics.basis(x, y, z, settings.degree, values)
+    colour = (
+        (torch.stack(values, 1)[:, :, None] * gaussians.sh[drawn, : len(values)]).sum(1).add(0.5).clamp_min(0)
+    )
 
     order = seen.depth.argsort(stable=True)
     offsets = pixel_offsets(mean2d[order], view)
-    hidden = None if limit is None else seen.depth[order][:, None, None] > limit
+    hidden = None if settings.limit is None else seen.depth[order][:, None, None] > settings.limit
     weight, transmittance = blend(offsets, xx[order], xy[order], yy[order], opacity[order], hidden)
     image = torch.einsum("nhw,nc->hwc", weight, colour[order])
-    image = image + transmittance[..., None] * torch.tensor(background, **kind)
-    if absolute:  # features have no part in absgrad2d, so their gradient takes a way of its own
+    image = image + transmittance[..., None] * torch.tensor(settings.background, **kind)
+    if settings.absolute:  # features have no part in absgrad2d, so their gradient takes a way of its own
         offsets_again = pixel_offsets(mean2d[order], view)
         weight, _ = blend(offsets_again, xx[order], xy[order], yy[order], opacity[order], hidden)
     blended = torch.einsum("nhw,nc->hwc", weight, features[drawn[order]])
@@ -76,7 +74,7 @@ def rasterize(
             offset.register_hook(keep_absolute)
     counts = tile_counts(seen, view)
     middle = None
-    if median:
+    if settings.median:
         left = 1 - weight.detach().cumsum(0)  # the transmittance, as Σ w = 1 - T
         past = (left <= 0.5).to(torch.int32)
         splats = torch.cat([drawn[order], drawn.new_tensor([-1])])
@@ -107,24 +105,25 @@ class Ellipses(NamedTuple):
     radii: torch.Tensor
 
 
-def ellipses(means, quats, log_scales, opacity_logits, weights, *, view, min_scale, antialias) -> Ellipses:
+def ellipses(gaussians: Gaussians, weights: torch.Tensor | None, settings: Settings) -> Ellipses:
     """Which splats a camera sees, and where: differentiable in all but what is inside."""
+    means, view = gaussians.means, settings.view
     rotation, translation = (
         torch.as_tensor(v, dtype=means.dtype, device=means.device) for v in (view.rotation, view.translation)
     )
-    opacity = torch.sigmoid(opacity_logits) if weights is None else torch.sigmoid(opacity_logits) * weights
+    opacity = torch.sigmoid(gaussians.opacity_logits)
+    opacity = opacity if weights is None else opacity * weights
     with torch.no_grad():
         depth = means @ rotation[2] + translation[2]
         drawn = ((depth > view.near) & (opacity > ALPHA_MIN)).nonzero()[:, 0]
     position = means[drawn] @ rotation.T + translation
     opacity = opacity[drawn]
-    half_covariance = (
-        rotation @ rotation_matrices(quats[drawn]) * (log_scales[drawn].exp() + min_scale)[:, None]
-    )
+    scales = gaussians.log_scales[drawn].exp() + settings.min_scale
+    half_covariance = rotation @ rotation_matrices(gaussians.quats[drawn]) * scales[:, None]
     mean2d, covariance, determinant, area = project(
-        position, half_covariance, view, MIP_VARIANCE if antialias else DILATION
+        position, half_covariance, view, MIP_VARIANCE if settings.antialias else DILATION
     )
-    if antialias:
+    if settings.antialias:
         opacity = opacity * area
     with torch.no_grad():
         xx, xy, yy = covariance
@@ -212,14 +211,13 @@ def meets_tile(offset, conic, determinant, reach) -> torch.Tensor:
     return least <= reach
 
 
-def contributions(means, quats, log_scales, opacity_logits, weights, *, view, min_scale, antialias):
-    """See :func:`training.rasterize.contributions`, for one view."""
-    sh, features = means.new_zeros(len(means), 1, 3), torch.eye(len(means)).to(means)
-    drawn = rasterize(
-        means, quats, log_scales, opacity_logits, sh, weights, features,
-        view=view, background=(0.0, 0.0, 0.0), degree=0, min_scale=min_scale, antialias=antialias,
-        median=False, absolute=False, limit=None,
-    )  # fmt: skip
+def contributions(
+    gaussians: Gaussians, weights: torch.Tensor | None, settings: Settings
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """See :func:`training.rasterize.contributions`: of one view, the largest, the sum, pixels and radii."""
+    count, means = len(gaussians), gaussians.means
+    gaussians = replace(gaussians, sh=means.new_zeros(count, 1, 3))
+    drawn = rasterize(gaussians, weights, torch.eye(count).to(means), settings)
     shares = drawn.features.flatten(0, 1)  # a feature of each splat's own: its weight in every pixel
     return shares.amax(0).float(), shares.sum(0).float(), (shares > 0).sum(0), drawn.radii
 

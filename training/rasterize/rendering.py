@@ -51,23 +51,44 @@ class View:
     near: float
 
     @classmethod
-    def of(cls, camera: Camera, near: float) -> View:
+    def of(cls, camera: Camera, near: float, window: tuple[int, int, int, int] | None = None) -> View:
+        """The whole image, or the part of it that a window (left, top, width, height) shows."""
+        left, top, width, height = window or (0, 0, camera.width, camera.height)
         margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / camera.fx
         margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / camera.fy
         return cls(
-            width=camera.width,
-            height=camera.height,
+            width=width,
+            height=height,
             rotation=camera.world_to_camera[:3, :3],
             translation=camera.world_to_camera[:3, 3],
             eye=camera.center,
             fx=camera.fx,
             fy=camera.fy,
-            cx=camera.cx,
-            cy=camera.cy,
+            cx=camera.cx - left,
+            cy=camera.cy - top,
             x_limits=(-camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x),
             y_limits=(-camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y),
             near=near,
         )
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a backend is told besides tensors of splats; see :func:`training.rasterize.rasterize`.
+
+    Attributes:
+        degree: of the harmonics to draw with.
+        median, absolute: whether ``Drawn.median`` and ``Drawn.absgrad2d`` are wanted.
+    """
+
+    view: View
+    min_scale: float
+    antialias: bool
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    degree: int = 0
+    median: bool = False
+    absolute: bool = False
+    limit: torch.Tensor | None = None
 
 
 @dataclass

@@ -1,12 +1,13 @@
-"""Real spherical harmonics of degree 0 to 4, with the signs and the order of 3DGS. No imports.
+"""Real spherical harmonics of degree 0 to 4, with the signs and the order of 3DGS. No torch, no Numba.
 
 The same functions serve torch (``out`` is a list that receives tensors) and Numba (``out`` is an array that
 receives numbers), so that every backend has one basis.
 """
 
+from ..splats.gaussians import SH_C0
+
 MAX_DEGREE = 4
 
-C0 = 0.28209479177387814
 C1 = 0.4886025119029199
 C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
@@ -31,7 +32,7 @@ def degree_of(count: int) -> int:
 
 def basis(x, y, z, degree, out):
     """Write the (degree+1)² basis values for the unit direction (x, y, z) to ``out``."""
-    out[0] = C0 + 0.0 * x
+    out[0] = SH_C0 + 0.0 * x
     if degree >= 1:
         out[1] = -C1 * y
         out[2] = C1 * z

@@ -1,1 +1,1 @@
-"""Pictures of splats for eyes: one view as a file (``render``), or frame after frame (``serve``)."""
+"""Pictures of splats: one view as a file (``render``), or frame after frame (``serve``)."""

@@ -6,15 +6,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import LodgsError
-from ..lod.selection import Detail, complete_levels, select_levels
+from ..lod.rule import Values, find_rule
+from ..lod.selection import complete_levels, select_levels, settings
 from ..runs.data import training_data
 from ..runs.folder import RunFolder
 from ..runs.job import Job
 from ..scenes.cameras import Camera
 from ..scenes.colmap import read_scene
 from ..splats.bundle import Bundle, read_bundle, read_folder
+from ..splats.dialects import Warn, silent
 from .picture import Picture, read_depth, write_picture
-from .scene import Placed, SplatSet, draw
+from .scene import Instance, SplatSet, draw
 
 
 @dataclass(frozen=True)
@@ -29,8 +31,11 @@ class Source:
     run: RunFolder | None
 
     @classmethod
-    def read(cls, path: Path) -> Source:
+    def read(cls, path: Path, warn: Warn = silent) -> Source:
         """A run's folder, a bundle, a folder of levels, or any 3DGS PLY.
+
+        Args:
+            warn: receives a sentence for each thing that is drawn otherwise than its maker shows it.
 
         Raises:
             LodgsError: there is nothing of that kind.
@@ -44,8 +49,8 @@ class Source:
                 raise LodgsError(
                     f"{path} holds no finished run (no bundle.ply).", "Train it to the end first."
                 )
-            return cls(read_bundle(run.bundle), run)
-        bundle = read_folder(path) if path.is_dir() else read_bundle(path)
+            return cls(read_bundle(run.bundle, warn), run)
+        bundle = (read_folder if path.is_dir() else read_bundle)(path, warn)
         return cls(bundle, run if run.job.exists() else None)
 
     def view(self, name: str, scene: Path | None = None) -> tuple[Camera, float]:
@@ -88,7 +93,7 @@ def render(
     out: Path,
     *,
     level: int = 0,
-    detail: Detail | None = None,
+    given: Values | None = None,
     background: tuple[float, float, float] | None = (0.0, 0.0, 0.0),
     holdout: Path | None = None,
     backend: str = "auto",
@@ -98,25 +103,26 @@ def render(
     Args:
         near: depth at which drawing begins.
         level: the level to draw; 0 is the finest.
-        detail: draw levels by their distance instead.
+        given: controls of the bundle's rule by name: draw levels by their distance instead.
         background: display-coded; None leaves it transparent.
         holdout: an EXR with the depth of what hides splats, as :func:`.picture.read_depth` reads it.
 
     Raises:
-        LodgsError: there is no such level or detail, the holdout is not one, or the file cannot be written.
+        LodgsError: there is no such level or control, the holdout is not one, or the file cannot be written.
     """
     bundle = source.bundle
     if out.suffix.lower() not in (".png", ".exr"):
         raise LodgsError(f"{out.name} is neither .png nor .exr.", "Choose one of these endings.")
     limit = None if holdout is None else read_depth(holdout, camera.width, camera.height, None)
-    if detail is not None:
-        shown = select_levels(bundle, camera.center, min(camera.fx, camera.fy), detail.of(bundle))
+    rule = find_rule(bundle.rule)
+    if given is not None or (rule is not None and rule.always and not level):
+        shown = select_levels(bundle, camera.center, camera.focal, settings(bundle, given or {}))
     else:
         shown = complete_levels(bundle, level or bundle.levels[-1].number)
-    placed = [Placed(SplatSet(x.splats, x.weights, backend), level=x.number) for x in shown]
+    instances = [Instance(SplatSet(x.splats, x.weights, backend), level=x.number) for x in shown]
     everything = out.suffix.lower() == ".exr"
     picture = draw(
-        placed, camera, near=near, background=background, depth=everything, levels=everything, limit=limit,
+        instances, camera, near=near, background=background, depth=everything, levels=everything, limit=limit,
         backend=backend,
     )  # fmt: skip
     assert picture is not None

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import LodgsError
 from ..files import atomic_write
+from ..scenes.color import linear_from_srgb
 from ..scenes.images import write_png
 
 NOTHING = 1e10
@@ -86,7 +87,7 @@ class Picture:
         whoever codes them again has the 8 bits of :meth:`eight_bit`, however exact their arithmetic is.
         """
         alpha = _clear(self.alpha[..., None].astype(np.float64)).clip(0, 1)
-        linear = linear_of(_clear(self._straight().astype(np.float64)).clip(0)) * alpha
+        linear = linear_from_srgb(_clear(self._straight().astype(np.float64)).clip(0)) * alpha
         return np.concatenate([linear, alpha], 2).astype(np.float32)
 
     def passes(self) -> dict[str, np.ndarray]:
@@ -111,11 +112,6 @@ def _clear(values: np.ndarray) -> np.ndarray:
     codes = values * 255
     rest = codes - np.floor(codes) - 0.5
     return (codes + np.where(rest >= 0, np.maximum(_CLEAR - rest, 0), np.minimum(-_CLEAR - rest, 0))) / 255
-
-
-def linear_of(coded: np.ndarray) -> np.ndarray:
-    """Linear light of display-coded values from 0 on (IEC 61966-2-1, its curve continued above 1)."""
-    return np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
 
 
 def write_picture(path: Path, picture: Picture) -> None:

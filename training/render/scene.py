@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
-from torch.nn.functional import normalize
+from torch.nn.functional import normalize, pad
 
 from ..errors import LodgsError
-from ..rasterize import device_of, strips
+from ..rasterize import Gaussians, device_of, strips
 from ..rasterize.features import rotation_matrices
 from ..rasterize.sh import basis, degree_of
 from ..scenes.cameras import Camera
@@ -19,12 +19,10 @@ from ..splats.gaussians import Splats
 from .picture import NOTHING, Picture
 
 STRIP = 1 << 20
-"""Pixels drawn between two looks at whether the picture is still wanted."""
+"""Pixels drawn between two calls of ``progress``."""
 
 FLAT = 1e6
 """A transform that stretches one direction so many times as much as another is refused."""
-
-Columns = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 class SplatSet:
@@ -34,37 +32,35 @@ class SplatSet:
         splats: in the set's own coordinates.
         weights: (N,) on the opacities; None: ones.
         backend: rasterizer.
+
+    Attributes:
+        gaussians, weights: the same, on the backend's device.
     """
 
     def __init__(self, splats: Splats, weights: np.ndarray | None = None, backend: str = "auto") -> None:
         device = device_of(backend)
-
-        def tensor(column: np.ndarray) -> torch.Tensor:
-            return torch.from_numpy(np.ascontiguousarray(column, np.float32)).to(device)
-
-        self.means, self.quats, self.log_scales, self.opacity_logits, self.sh = map(
-            tensor,
-            (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh),
-        )
-        self.weights = tensor(np.ones(len(splats), np.float32) if weights is None else weights)
-        self._there: tuple[bytes, tuple[torch.Tensor, torch.Tensor, torch.Tensor]] | None = None
+        self.gaussians = Gaussians.of(splats, device)
+        weights = np.ones(len(splats), np.float32) if weights is None else weights
+        self.weights = torch.as_tensor(weights, dtype=torch.float32, device=device)
+        self._in_world: tuple[bytes, Gaussians] | None = None
 
     def __len__(self) -> int:
-        return len(self.means)
+        return len(self.gaussians)
 
-    def in_world(self, matrix: np.ndarray) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Means, quats and log-scales where a transform (4, 4) puts them, any affine one."""
+    def in_world(self, matrix: np.ndarray) -> Gaussians:
+        """The splats where a transform (4, 4) puts them, any affine one; their harmonics stay the set's."""
         key = matrix.tobytes()
-        if self._there is None or self._there[0] != key:
-            self._there = key, self._moved(torch.from_numpy(matrix))
-        return self._there[1]
+        if self._in_world is None or self._in_world[0] != key:
+            self._in_world = key, self._transformed(torch.from_numpy(matrix))
+        return self._in_world[1]
 
-    def _moved(self, matrix: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        matrix = matrix.to(self.means.device)
+    def _transformed(self, matrix: torch.Tensor) -> Gaussians:
+        own = self.gaussians
+        matrix = matrix.to(own.means.device)
         linear = matrix[:3, :3]
-        means = (self.means.double() @ linear.T + matrix[:3, 3]).float()
+        means = (own.means.double() @ linear.T + matrix[:3, 3]).float()
         # an ellipsoid's axes A = L Q diag(s) stay no axes where L is no similarity: those of A Aᵀ are
-        axes = linear @ rotation_matrices(self.quats.double()) * self.log_scales.double().exp()[:, None]
+        axes = linear @ rotation_matrices(own.quats.double()) * own.log_scales.double().exp()[:, None]
         if similarity(matrix.cpu().numpy()):
             lengths = axes.norm(dim=1).clamp_min(1e-30)
             turned = axes / lengths[:, None]
@@ -72,20 +68,23 @@ class SplatSet:
             turned, lengths, _ = torch.linalg.svd(axes)
             turned = turned * torch.linalg.det(turned).sign()[:, None, None]
         quats = Rotation.from_matrix(turned.cpu().numpy()).as_quat()[:, [3, 0, 1, 2]]
-        return means, torch.from_numpy(quats).to(means), lengths.log().float()
+        return replace(
+            own, means=means, quats=torch.from_numpy(quats).to(means), log_scales=lengths.log().float()
+        )
 
     def colours(self, matrix: np.ndarray, eye: np.ndarray) -> torch.Tensor:
         """Colours (N, 3) that an eye in the world sees: harmonics turn, shrink and lean with the set."""
         own = np.linalg.solve(matrix, np.append(eye, 1.0))[:3]
-        directions = normalize(self.means - torch.as_tensor(own).to(self.means), dim=1)
-        values: list = [None] * self.sh.shape[1]
+        means, sh = self.gaussians.means, self.gaussians.sh
+        directions = normalize(means - torch.as_tensor(own).to(means), dim=1)
+        values: list = [None] * sh.shape[1]
         x, y, z = directions.unbind(1)
         basis(x, y, z, degree_of(len(values)), values)
-        return (0.5 + torch.einsum("kn,nkc->nc", torch.stack(values), self.sh)).clamp_min(0)
+        return (0.5 + torch.einsum("kn,nkc->nc", torch.stack(values), sh)).clamp_min(0)
 
 
 @dataclass
-class Placed:
+class Instance:
     """A set of splats in the world.
 
     Attributes:
@@ -99,7 +98,7 @@ class Placed:
 
 
 def draw(
-    placed: Sequence[Placed],
+    instances: Sequence[Instance],
     camera: Camera,
     *,
     near: float = 0.01,
@@ -109,7 +108,7 @@ def draw(
     window: tuple[int, int, int, int] | None = None,
     limit: np.ndarray | None = None,
     backend: str = "auto",
-    wanted: Callable[[float], bool] = lambda share: True,
+    progress: Callable[[float], bool] = lambda share: True,
 ) -> Picture | None:
     """What a camera sees of splats, all sets sorted together.
 
@@ -125,35 +124,35 @@ def draw(
         limit: (H, W) of the window, depths of meshes along the camera's z axis in the world, NOTHING where
             there are none: what lies behind is held out, the background as well.
         backend: rasterizer.
-        wanted: told the share that is done from time to time; False ends it.
+        progress: called with the share that is done; drawing is cancelled where it returns False.
 
     Returns:
-        The picture, or None where it was no longer wanted.
+        The picture, or None where it was cancelled.
 
     Raises:
         LodgsError: a set's transform is flat, or there is not enough memory.
     """
-    for one in placed:
+    for one in instances:
         linear = one.matrix[:3, :3]
         if not np.isfinite(one.matrix).all() or np.linalg.cond(linear) > FLAT or not linear.any():
             raise LodgsError("A set of splats is scaled to nothing.", "Give its object a scale above 0.")
     width, height = window[2:] if window else (camera.width, camera.height)
-    numbers = sorted({one.level for one in placed}) if levels else []
+    numbers = sorted({one.level for one in instances}) if levels else []
     picture = Picture.empty(width, height, background, depth, numbers)
     behind = background or (0.0, 0.0, 0.0)
     if limit is not None:  # the background, too, is behind meshes: drawn over black, it is added elsewhere
         picture.image[limit < NOTHING], picture.alpha[limit < NOTHING] = 0, 0
         behind = 0.0, 0.0, 0.0
-    some = [one for one in placed if len(one.splats)]
-    if not some:
+    instances = [one for one in instances if len(one.splats)]
+    if not instances:
         return picture
     try:
-        columns, weights, camera, near, unit = _in_one_frame(some, camera, near)
-        features = _membership(some, picture) if levels else None
+        gaussians, weights, camera, near, unit = _in_one_frame(instances, camera, near)
+        features = _membership(instances, picture) if levels else None
         for top, drawn in strips(
-            *columns, camera, weights=weights, background=behind, near=near,
+            gaussians, camera, weights=weights, background=behind, near=near,
             outputs=("depth", "median_depth") if depth else (), features=features, window=window,
-            limit=None if limit is None else torch.from_numpy(limit / unit).to(columns[0]),
+            limit=None if limit is None else torch.from_numpy(limit / unit).to(gaussians.means),
             strip=STRIP, backend=backend,
         ):  # fmt: skip
             rows = slice(top, top + len(drawn.alpha))
@@ -167,11 +166,11 @@ def draw(
                 picture.depth[rows] = torch.where(drawn.alpha > 0, seen, NOTHING).cpu().numpy()
             if drawn.features is not None:
                 picture.masks[:, rows] = drawn.features.permute(2, 0, 1).cpu().numpy()
-            if not wanted((top + len(drawn.alpha)) / height):
+            if not progress((top + len(drawn.alpha)) / height):
                 return None
     except (MemoryError, torch.cuda.OutOfMemoryError) as error:
         raise LodgsError(
-            f"There is not enough memory to draw {sum(len(x.splats) for x in some):,} splats "
+            f"There is not enough memory to draw {sum(len(x.splats) for x in instances):,} splats "
             f"at {width}x{height}.",
             "Render a coarser level or a smaller picture.",
         ) from error
@@ -187,32 +186,32 @@ def similarity(matrix: np.ndarray) -> bool:
 
 
 def _in_one_frame(
-    placed: list[Placed], camera: Camera, near: float
-) -> tuple[Columns, torch.Tensor, Camera, float, float]:
-    """Columns and weights of all sets in one frame; the camera and its near depth in that frame, and how
+    instances: list[Instance], camera: Camera, near: float
+) -> tuple[Gaussians, torch.Tensor, Camera, float, float]:
+    """Splats and weights of all sets in one frame; the camera and its near depth in that frame, and how
     many units of the world one of its units is."""
-    first = placed[0].matrix
-    together = similarity(first) and all(np.array_equal(one.matrix, first) for one in placed)
-    sets = [one.splats for one in placed]
+    first = instances[0].matrix
+    together = similarity(first) and all(np.array_equal(one.matrix, first) for one in instances)
+    sets = [one.splats for one in instances]
     weights = torch.cat([one.weights for one in sets])
-    logits = torch.cat([one.opacity_logits for one in sets])
     if together:
         camera, unit = camera.within(first)
-        shape = [torch.cat([getattr(one, name) for one in sets]) for name in ("means", "quats", "log_scales")]
-        most = max(one.sh.shape[1] for one in sets)
-        colours = torch.cat(
-            [torch.nn.functional.pad(one.sh, (0, 0, 0, most - one.sh.shape[1])) for one in sets]
-        )
-        return (*shape, logits, colours), weights, camera, near / unit, unit  # type: ignore[return-value]
-    there = [one.splats.in_world(one.matrix) for one in placed]
-    shape = [torch.cat(column) for column in zip(*there, strict=True)]
-    colours = torch.cat([one.splats.colours(one.matrix, camera.center) for one in placed])
-    return (*shape, logits, colours), weights, camera, near, 1.0  # type: ignore[return-value]
+        most = max(one.gaussians.sh.shape[1] for one in sets)
+        padded = [
+            replace(one.gaussians, sh=pad(one.gaussians.sh, (0, 0, 0, most - one.gaussians.sh.shape[1])))
+            for one in sets
+        ]
+        return Gaussians.concatenated(padded), weights, camera, near / unit, unit
+    there = [
+        replace(one.splats.in_world(one.matrix), sh=one.splats.colours(one.matrix, camera.center))
+        for one in instances
+    ]
+    return Gaussians.concatenated(there), weights, camera, near, 1.0
 
 
-def _membership(placed: list[Placed], picture: Picture) -> torch.Tensor:
+def _membership(instances: list[Instance], picture: Picture) -> torch.Tensor:
     """(N, L) with 1 where a splat is of a level of the picture's."""
-    device = placed[0].splats.means.device
+    device = instances[0].splats.weights.device
     levels = torch.tensor(picture.levels, device=device)
-    of = torch.cat([torch.full((len(one.splats),), one.level, device=device) for one in placed])
+    of = torch.cat([torch.full((len(one.splats),), one.level, device=device) for one in instances])
     return (of[:, None] == levels).float()

@@ -43,7 +43,7 @@ from ..scenes.cameras import Camera, camera_from_dict
 from ..scenes.images import load_image
 from . import wire
 from .picture import read_depth
-from .scene import Placed, SplatSet, draw
+from .scene import Instance, SplatSet, draw
 
 
 def serve(folder: Path, backend: str, requests: IO[str], answers: IO[str]) -> int:
@@ -75,7 +75,7 @@ class _Server:
             self._end()
 
     def listen(self, requests: IO[str]) -> None:
-        """In a thread of its own, so that a frame in the making hears that it is no longer wanted."""
+        """In a thread of its own, so that a frame that is being drawn can be cancelled."""
         try:
             for line in requests:
                 try:
@@ -113,19 +113,19 @@ class _Server:
         background, holdout = request.get("background"), request.get("holdout")
         window = _window(request["window"], camera) if request.get("window") else None
         limit = read_depth(Path(holdout), camera.width, camera.height, window) if holdout else None
-        placed = self._placed(request["sets"])
+        instances = self._instances(request["sets"])
         if frame in self._cancelled:
             self.say("cancelled", frame=frame)
             return
 
-        def wanted(share: float) -> bool:
+        def progress(share: float) -> bool:
             self.say("progress", frame=frame, share=round(share, 4))
             return frame not in self._cancelled
 
         picture = draw(
-            placed, camera, near=near, background=tuple(background) if background else None,
+            instances, camera, near=near, background=tuple(background) if background else None,
             depth=bool(request.get("depth")), levels=bool(request.get("levels")),
-            window=window, limit=limit, backend=self._backend, wanted=wanted,
+            window=window, limit=limit, backend=self._backend, progress=progress,
         )  # fmt: skip
         if picture is None or frame in self._cancelled:
             self._cancelled.discard(frame)  # type: ignore[arg-type]
@@ -142,9 +142,9 @@ class _Server:
             seconds=round(time.perf_counter() - started, 4), **measured,
         )  # fmt: skip
 
-    def _placed(self, sets: list[dict]) -> list[Placed]:
+    def _instances(self, sets: list[dict]) -> list[Instance]:
         """The sets of a frame; those of the last frame that are named again stay as they are."""
-        kept, placed = {}, []
+        kept, instances = {}, []
         for one in sets:
             name = Path(one["file"]).name
             if name not in kept:
@@ -152,9 +152,9 @@ class _Server:
                     *wire.read_set(self._folder / name, int(one["count"])), self._backend
                 )
             matrix = np.array(one["matrix"], np.float64).reshape(4, 4)
-            placed.append(Placed(kept[name], matrix, int(one["level"])))
+            instances.append(Instance(kept[name], matrix, int(one["level"])))
         self._sets = kept
-        return placed
+        return instances
 
     def _end(self) -> None:
         """Clean up and go, whatever the other threads are at."""

@@ -1,0 +1,1 @@
+"""A run: its job, its folder, what it says, and the loop that trains it."""

@@ -184,6 +184,7 @@ class Events:
         self._file.flush()
 
     def close(self) -> None:
+        """Closes the file; nothing can be said after it."""
         self._file.close()
 
 

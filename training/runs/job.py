@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import tomllib
 from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
 
 from ..errors import LodgsError
 from ..files import atomic_write
-from ..methods.parameters import METHODS, PRESETS, Parameters, override, preset
-
-__all__ = ["BACKENDS", "METHODS", "PRESETS", "Job"]
+from ..methods import METHODS, method_info, parameters_of
+from ..methods.parameters import Parameters
 
 BACKENDS = ("auto", "cpu", "cuda", "reference")
 
@@ -23,7 +23,9 @@ class Job:
     Attributes:
         scene: folder of the COLMAP scene.
         out: the run's folder; made if it does not exist.
-        method, preset: names from METHODS and PRESETS.
+        method, preset: names from ``training.methods``, METHODS and PRESETS.
+        base: a run, a bundle or a PLY of splats to begin with instead of the scene's points, for methods that
+            can; "" for none.
         seed: makes two runs of one job equal to the bit on one machine, but not with the cuda backend.
         backend: rasterizer, one of BACKENDS; auto is cuda where that works, else cpu. A run may go on with
             another one.
@@ -31,13 +33,14 @@ class Job:
         test_every: every n-th view by name is held out to measure quality; 0 trains on all.
         exposure: stops added to linear (EXR) images before they are trained on.
         model, images: the COLMAP model's and the photographs' folder where they are not found by themselves.
-        parameters: changes to the preset's parameters by name (``training.methods.parameters``).
+        parameters: changes to the preset's parameters by name.
     """
 
     scene: str
     out: str
     method: str = "flod"
     preset: str = "draft"
+    base: str = ""
     seed: int = 0
     backend: str = "auto"
     image_scale: float = 0.5
@@ -67,6 +70,10 @@ class Job:
             ) from error
         if not isinstance(values, dict):
             raise LodgsError(f"The job file {path} holds no table of keys.")
+        method, parameters = values.get("method", cls.method), values.get("parameters")
+        if isinstance(method, str) and method in METHODS and isinstance(parameters, dict):
+            retired = METHODS[method].retired
+            values["parameters"] = {k: value for k, value in parameters.items() if k not in retired}
         return cls.from_dict(values, folder=path.parent)
 
     @classmethod
@@ -86,7 +93,7 @@ class Job:
             if not values.get(key):
                 raise LodgsError(f"The job does not say '{key}'.", f'Add a line: {key} = "..."')
         values = dict(values)
-        for key in ("scene", "out", "model", "images"):
+        for key in ("scene", "out", "base", "model", "images"):
             if not isinstance(values.get(key, ""), str):
                 raise LodgsError(f"{key} = {values[key]!r} is not a path.", "Give it in quotation marks.")
             if values.get(key):
@@ -114,11 +121,20 @@ class Job:
             )
         if not isinstance(self.parameters, dict):
             raise LodgsError("parameters is not a table.", "Write them below a line [parameters].")
+        if self.base and not method_info(self.method).from_base:
+            raise LodgsError(
+                f"The method '{self.method}' cannot begin with the splats of another run.",
+                "Leave out 'base', or choose another method.",
+            )
         self.resolved_parameters()
 
     def resolved_parameters(self) -> Parameters:
         """The preset's parameters with this job's changes."""
-        return override(preset(self.method, self.preset), self.parameters)
+        return self._parameters
+
+    @cached_property
+    def _parameters(self) -> Parameters:
+        return parameters_of(self.method, self.preset, self.parameters)
 
     def resolved(self) -> Job:
         """The same job with every parameter written out, so that a later version repeats it unchanged."""

@@ -11,7 +11,7 @@ import sys
 import time
 import traceback
 from contextlib import contextmanager, suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import IO
 
 import numpy as np
@@ -20,15 +20,18 @@ import torch
 from .. import VERSION
 from ..errors import LodgsError
 from ..evaluate.metrics import psnr
-from ..evaluate.protocol import Evaluation
+from ..evaluate.views import Evaluation
 from ..files import atomic_write
-from ..lod.selection import complete
-from ..methods import create
+from ..lod.rule import find_rule
+from ..lod.selection import settings
+from ..methods import METHODS, create
 from ..methods.data import TrainingData
+from ..methods.method import Method
 from ..rasterize import cuda, device_of, resolve, warm_up
 from ..scenes.orientation import up_rotation
 from ..splats.bundle import Bundle, Level, write_bundle
 from ..splats.ply import read_ply, write_ply
+from .base import read_base
 from .data import training_data
 from .folder import PROTOCOL, Events, RunFolder, event_line
 from .job import Job
@@ -113,11 +116,27 @@ class _Run:
     def __init__(self, job: Job, backend: str, folder: RunFolder, events: Events, data: TrainingData) -> None:
         self.job, self.folder, self.events, self.data = job, folder, events, data
         self.evaluation = Evaluation(data, backend)
-        self.method = create(job.method, data, job.resolved_parameters(), job.seed, backend)
+        self._backend = backend
+        self.method = self._fresh_method()
         self._device = device_of(backend)
         self.step = 0
         self.levels: list[dict] = []
         self._resume()
+
+    def _fresh_method(self) -> Method:
+        """The job's method before its first step."""
+        job, data, base = self.job, self.data, None
+        if job.base:
+            base = read_base(job.base, self._warn)
+            if not any(camera.sees(base.means, near=data.near).any() for camera in data.train):
+                raise LodgsError(
+                    f"No training view sees a splat of {job.base}.",
+                    "Choose splats that were made from these photographs, in the same coordinates.",
+                )
+        return create(job.method, data, job.resolved_parameters(), job.seed, self._backend, base)
+
+    def _warn(self, message: str) -> None:
+        self.events("warning", message=message)
 
     def to_the_end(self, stopped: list) -> bool:
         """Trains until all levels are finished (True), or until asked to stop, which saves (False)."""
@@ -151,22 +170,36 @@ class _Run:
     def write_bundle(self) -> None:
         """All levels, as they were written one by one, in one file."""
         levels = [
-            Level(record["level"], read_ply(self.folder.path / record["path"]), record["s_min"])
+            Level(record["level"], read_ply(self.folder.path / record["path"]), record["facts"])
             for record in self.levels
         ]
         up = up_rotation(self.data.scene.cameras).round(6)
         meta = {**self.method.meta(), "up_rotation": up, "seed": self.job.seed}
-        bundle = Bundle(self.job.method, levels, meta, self.method.cumulative)
+        bundle = replace(self._without_splats(), levels=levels, meta=meta)
         if arrays := self.method.arrays():
             with atomic_write(self.folder.model) as temporary, open(temporary, "wb") as file:
                 np.savez(file, **arrays)
             if self.evaluation.cameras:
                 before = self.evaluation.measure_pictures(self.method.picture)["psnr"]
-                after = self.evaluation.measure_by_distance(bundle)["psnr"]
+                after = self.evaluation.measure_by_distance(bundle, settings(bundle, {}))["psnr"]
                 meta |= {"neural_psnr": before, "baked_psnr": after}
                 message = f"Held-out views: {before:.2f} dB with networks, {after:.2f} dB baked for Blender."
-                self.events("warning", message=message)
+                self._warn(message)
         write_bundle(self.folder.bundle, bundle)
+
+    def _without_splats(self) -> Bundle:
+        """What the method says of its levels, as a bundle that has none yet."""
+        info, method = METHODS[self.job.method], self.method
+        rule = find_rule(info.rule)
+        return Bundle(
+            self.job.method,
+            [],
+            info.rule,
+            method.facts(),
+            {},
+            rule is not None and rule.cumulative,
+            method.meta(),
+        )
 
     def _tell_progress(self, level: int, loss: float, quality: float) -> None:
         of, levels = self.method.steps, self.method.levels
@@ -181,8 +214,8 @@ class _Run:
 
     def _write_levels(self, levels: list[Level]) -> None:
         """Hands levels over: a file and an event each. A level that came before is replaced."""
-        method, known = self.method, {record["level"]: record for record in self.levels}
-        bundle = Bundle(self.job.method, levels, cumulative=method.cumulative)
+        known = {record["level"]: record for record in self.levels}
+        bundle = replace(self._without_splats(), levels=levels)
         for place, level in enumerate(levels, 1):
             path = self.folder.levels_folder / f"level_{level.number}.ply"
             write_ply(path, level.splats)
@@ -190,14 +223,14 @@ class _Run:
                 "level": level.number,
                 "path": f"levels/{path.name}",
                 "splats": len(level.splats),
-                "s_min": level.s_min,
+                "facts": level.facts,
             }
-            quality = self.evaluation.measure_set(complete(bundle, level)) if self.evaluation.cameras else {}
-            facts = {"cumulative": method.cumulative, "meta": method.meta()}
+            quality = self.evaluation.measure_level(bundle, level) if self.evaluation.cameras else {}
             self.events(
-                "level",
-                **{**quality, **record, **facts, "again": level.number in known, "more": place < len(levels)},
-            )
+                "level", **(quality | record), rule=bundle.rule, scene_facts=bundle.facts,
+                cumulative=bundle.cumulative, meta=bundle.meta, again=level.number in known,
+                more=place < len(levels),
+            )  # fmt: skip
             known[level.number] = record
         self.levels = [known[number] for number in sorted(known)]
 
@@ -218,7 +251,9 @@ class _Run:
                 state = torch.load(path, map_location=self._device, weights_only=True)
                 self.method.load_state_dict(state["method"])
             except Exception as error:
-                print(f"passing over the checkpoint {path}: {error}", file=sys.stderr)
+                print(f"passing over the checkpoint {path}: {error!r}", file=sys.stderr)
+                self._warn(f"The checkpoint {path.name} cannot be read; what it held is trained again.")
+                self.method = self._fresh_method()  # it may have taken part of it
                 continue
             self.step, self.levels = state["step"], state["levels"]
             self.events("status", message=f"Going on from step {self.step} of {self.method.steps}")
@@ -228,7 +263,7 @@ class _Run:
 def _keep_job(job: Job, folder: RunFolder) -> None:
     """Writes the job into the run; a run folder keeps to the job that it began with, but for the backend."""
     if folder.job.exists():
-        before = asdict(Job.from_file(folder.job))
+        before = asdict(Job.from_file(folder.job).resolved())
         changed = [key for key, value in asdict(job).items() if key != "backend" and before[key] != value]
         if changed:
             raise LodgsError(

@@ -43,6 +43,38 @@ class Camera:
         rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
         return -rotation.T @ translation
 
+    @property
+    def focal(self) -> float:
+        """The shorter focal length in pixels: the one that levels of detail are chosen by."""
+        return float(min(self.fx, self.fy))
+
+    def view_space(self, points: np.ndarray) -> np.ndarray:
+        """World points (P, 3) in the camera's axes, (P, 3) float64."""
+        return points @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where world points (P, 3) are in the image, as COLMAP's PINHOLE model has it.
+
+        Returns:
+            (P, 2) float64 pixels, x to the right and y down from the image's corner, without meaning where
+            the depth is not above 0; and depths (P,) along the camera's z axis, in world units.
+        """
+        x, y, z = self.view_space(points).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=1), z
+
+    def sees(self, points: np.ndarray, near: float = 0.0, margin: float = 0.0) -> np.ndarray:
+        """Which world points (P, 3) are in the image, (P,) bool.
+
+        Args:
+            near: only what lies deeper than this, in world units.
+            margin: widen the image by this share of its size on every side.
+        """
+        (u, v), depth = (columns.T for columns in self.project(points))
+        across, down = margin * self.width, margin * self.height
+        inside = (u >= -across) & (u < self.width + across) & (v >= -down) & (v < self.height + down)
+        return inside & (depth > near)
+
     def resized(self, width: int, height: int) -> Camera:
         """The same view with another pixel grid; intrinsics scale with it."""
         sx, sy = width / self.width, height / self.height

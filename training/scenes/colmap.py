@@ -17,6 +17,7 @@ import numpy as np
 from ..errors import LodgsError
 from .cameras import Camera
 from .images import image_size
+from .orientation import up_rotation
 
 _DAMAGED = "Copy the model again, or write it anew with COLMAP's model_converter."
 
@@ -121,13 +122,22 @@ class Scene:
         train = [camera for i, camera in enumerate(self.cameras) if i % test_every]
         return train, self.cameras[::test_every]
 
+    @property
+    def center(self) -> np.ndarray:
+        """The mean of the cameras' eyes, (3,) float64."""
+        return np.array([camera.center for camera in self.cameras]).mean(axis=0)
+
+    def up_rotation(self) -> np.ndarray:
+        """Rotation from this world to a z-up world, (3, 3) float64, see ``orientation.up_rotation``."""
+        return up_rotation(self.cameras)
+
     def extent(self) -> float:
         """1.1 x the largest distance of a camera from the cameras' mean, in COLMAP units (as 3DGS has it).
 
         Where all cameras stand in one place, that is nothing to measure by: then the median depth.
         """
         centers = np.array([camera.center for camera in self.cameras])
-        radius = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+        radius = float(np.linalg.norm(centers - self.center, axis=1).max())
         return 1.1 * radius if radius > 0 else self.median_depth()
 
     def median_depth(self) -> float:
@@ -142,12 +152,9 @@ class Scene:
         points = self.points[:: max(1, len(self.points) // 50_000)].astype(np.float64)
         medians = []
         for camera in self.cameras:
-            local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-            x, y, z = local[local[:, 2] > 0].T
-            u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-            seen = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-            if seen.any():
-                medians.append(np.median(z[seen]))
+            depths = camera.view_space(points)[camera.sees(points), 2]
+            if len(depths):
+                medians.append(np.median(depths))
         if not medians:
             raise LodgsError(f"No camera of {self.model} sees a point.", "Reconstruct the scene with points.")
         return float(np.median(medians))

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LodgsError
+from .color import srgb_from_linear
 
 # JPEG markers that carry the size: every start of frame, which excludes DHT (C4), JPG (C8) and DAC (CC).
 _START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -167,14 +168,8 @@ def load_image(path: Path, width: int, height: int, exposure: float = 0.0) -> np
         ) from error
     pixels = _area_average(_area_average(pixels, height, 0), width, 1)
     if is_exr:
-        pixels = srgb_coded(pixels * 2.0**exposure)
+        pixels = srgb_from_linear(np.clip(pixels * 2.0**exposure, 0.0, 1.0))
     return np.clip(pixels, 0.0, 1.0).astype(np.float32)
-
-
-def srgb_coded(linear: np.ndarray) -> np.ndarray:
-    """Linear light to display-coded values, clipped to [0, 1] (IEC 61966-2-1)."""
-    linear = np.clip(linear, 0.0, 1.0)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def _pillow_pixels(path: Path) -> np.ndarray:

@@ -73,9 +73,10 @@ def _undistort_into(target: Path, scene: Scene) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix="undistorting-") as work:
         request["work"] = work
+        package = Path(__file__).resolve().parents[1]  # training, or lodgs where pip has installed it
         child = subprocess.run(
-            [sys.executable, "-m", "training.scenes.undistort"],
-            cwd=Path(__file__).resolve().parents[2],
+            [sys.executable, "-m", f"{package.name}.scenes.undistort"],
+            cwd=package.parent,
             input=json.dumps(request),
             capture_output=True,
             encoding="utf-8",

@@ -2,7 +2,7 @@
 
 ``docs/bundle.md`` specifies both. Constraints that a method applies outside the parameters (FLoD's s_min, the
 filters of Mip-Splatting and LODGE) are part of the scales and opacities handed over here: ``log_scales`` are
-final, and ``s_min`` is a record of how they came about.
+final, and what facts say of them is a record of how they came about.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import hashlib
 import json
 import re
 import shlex
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,10 +20,22 @@ import numpy as np
 
 from ..errors import LodgsError
 from ..files import atomic_write
+from .dialects import Warn, as_3dgs, comments_of, meta_of, silent
 from .gaussians import Splats
-from .ply import Element, columns_of, columns_of_extras, read_elements, read_ply, splats_from, write_elements
+from .ply import (
+    Columns,
+    Element,
+    columns_of,
+    columns_of_extras,
+    read_elements,
+    read_ply,
+    splats_from,
+    write_elements,
+)
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+MOST_LEVELS = 12
+"""Levels that a job may ask for, or get from its scene: a header has no room for many more."""
 ORDERS = ("finest_first", "stream")
 _TAG = "lodsplat "
 # Some viewers search the whole header for these words, so no comment may hold one.
@@ -30,9 +43,9 @@ _FORBIDDEN = ("packed_", "f_rest_", "end_header", "element chunk")
 # Some viewers read no further than 10 KB to find the end of the header.
 _MAX_COMMENTS = 2560
 # What readers rely on of meta.
-_META_SHAPES = {
-    "camera_center": (3,), "up_rotation": (3, 3), "gamma": (), "focal_px": (), "d_max": (),
-}  # fmt: skip
+_META_SHAPES = {"camera_center": (3,), "up_rotation": (3, 3)}
+# What reading JSON of others' making raises where something in it is missing, of another type or too deep.
+_CONTRADICTIONS = (ValueError, KeyError, TypeError, AttributeError, RecursionError)
 
 
 @dataclass
@@ -42,13 +55,18 @@ class Level:
     Attributes:
         number: 1 is the coarsest.
         splats: the level's splats with final scales and opacities.
-        s_min: the smallest standard deviation that training allowed, in scene units (FLoD, Eq. 3); None where
-            the method has none.
+        facts: numbers of this level by name that its rule needs, such as FLoD's ``s_min``.
     """
 
     number: int
     splats: Splats
-    s_min: float | None = None
+    facts: dict[str, float] = field(default_factory=dict)
+
+
+NO_SPLATS = Splats(
+    np.zeros((0, 3), np.float32), np.zeros((0, 4), np.float32), np.zeros((0, 3), np.float32),
+    np.zeros(0, np.float32), np.zeros((0, 1, 3), np.float32),
+)  # fmt: skip
 
 
 @dataclass
@@ -58,29 +76,31 @@ class Bundle:
     Attributes:
         method: the name of the method that made them ("flod", "3dgs", ...; "" when unknown).
         levels: in ascending number, all of one SH degree.
-        meta: further facts, of types that JSON knows (numpy scalars and arrays are converted).
+        rule: the name of the rule that chooses them by distance (``training.lod.rule``); "" for none.
+        facts: numbers of the scene by name that the rule needs.
+        controls: values of the rule's controls to begin with, by name.
         cumulative: False when each level replaces the others; True when each level only holds what it adds to
             the coarser ones, so that level n is drawn as levels 1 to n together.
+        meta: what else is known, of types that JSON knows (numpy scalars and arrays are converted).
+        tables: further tables by name, of columns (rows,) by name that PLY has types for.
     """
 
     method: str
     levels: list[Level]
-    meta: dict = field(default_factory=dict)
+    rule: str = ""
+    facts: dict[str, float] = field(default_factory=dict)
+    controls: dict[str, float] = field(default_factory=dict)
     cumulative: bool = False
-
-
-@dataclass(frozen=True)
-class Facts:
-    """What a file says of its levels, without their splats; attributes as in `Bundle`.
-
-    Attributes:
-        numbers: the levels' numbers in ascending order.
-    """
-
-    method: str
-    numbers: list[int]
     meta: dict = field(default_factory=dict)
-    cumulative: bool = False
+    tables: dict[str, Columns] = field(default_factory=dict)
+
+    def upto(self, number: int) -> list[Level]:
+        """The levels that are drawn at a level: it, and where levels add up the coarser ones before it."""
+        return [
+            level
+            for level in self.levels
+            if level.number == number or (self.cumulative and level.number < number)
+        ]
 
 
 def write_bundle(path: str | Path, bundle: Bundle, order: str = "finest_first") -> None:
@@ -91,7 +111,8 @@ def write_bundle(path: str | Path, bundle: Bundle, order: str = "finest_first") 
     fine, in either order.
 
     Raises:
-        LodgsError: the file cannot be written, or the bundle is not one (see `Bundle`), or meta is too long.
+        LodgsError: the file cannot be written, or the bundle is not one (see `Bundle`), or what is said
+            beside the levels is too long.
     """
     if order not in ORDERS:
         raise ValueError(f"order is {order!r}, not one of {ORDERS}")
@@ -111,67 +132,79 @@ def write_bundle(path: str | Path, bundle: Bundle, order: str = "finest_first") 
         for lod, level in levels
         if (columns := columns_of_extras(level.splats))
     }
-    comments = [_comment(_head(bundle, order=order, cumulative=bundle.cumulative))]
+    tables = {name: Element(f"lod_{name}", [columns]) for name, columns in bundle.tables.items()}
+    comments = [_comment(_head(bundle, order=order))]
     offset = 0
     for i, (lod, level) in enumerate(levels):
         element = elements[0 if bundle.cumulative else i]
-        facts = _facts(lod, level) | {"element": element.name, "offset": offset}
+        line = _level_line(lod, level) | {"element": element.name, "offset": offset}
         if lod in extras:
-            facts["extras"] = extras[lod].name
-        comments.append(_comment(facts))
+            line["extras"] = extras[lod].name
+        comments.append(_comment(line))
         offset += len(level.splats) * element.dtype.itemsize
+    comments += [_comment({"table": name, "element": table.name}) for name, table in tables.items()]
     comments.append(_comment({"meta": bundle.meta}))
     if sum(len(comment) + 9 for comment in comments) > _MAX_COMMENTS:
         raise LodgsError(
-            f"The facts beside the levels of {path} take more than {_MAX_COMMENTS} bytes of header.",
+            f"What {path} would say beside its levels takes more than {_MAX_COMMENTS} bytes of header.",
             "Keep meta to a few numbers and names.",
         )
-    write_elements(path, [*elements, *extras.values()], comments)
+    everything = [*elements, *extras.values(), *tables.values()]
+    write_elements(path, everything, comments + comments_of(bundle.meta))
 
 
-def read_bundle(path: str | Path) -> Bundle:
+def read_bundle(path: str | Path, warn: Warn = silent) -> Bundle:
     """Read a bundle as it was written, bit for bit; any other 3DGS PLY reads as one level of unknown method.
 
-    Elements and comments that are not ours are passed over.
+    Elements and comments that are not ours are passed over. Version 1, which names no rule, is read as well.
+
+    Args:
+        warn: as for `read_ply`.
 
     Raises:
         LodgsError: not a PLY of splats, cut short, from a newer version, or a header that contradicts itself.
     """
     elements, comments = read_elements(path)
-    head, facts = _parse(comments, path)
-    if head is None:
-        return Bundle("", [Level(1, splats_from(elements["vertex"], path))])
+    bundle, lines = _parse(comments, path)
+    if bundle is None:
+        splats = as_3dgs(splats_from(elements["vertex"], path), path, warn)
+        return Bundle("", [Level(1, splats)], meta=meta_of(comments, path, warn))
     try:
-        levels = []
         begin = dict.fromkeys(elements, 0)
-        for fact in facts:
-            if "level" not in fact:
+        for line in lines:
+            if "table" in line:
+                rows = elements[line["element"]]
+                bundle.tables[line["table"]] = {name: np.array(rows[name]) for name in rows.dtype.names or ()}
+            if "level" not in line:
                 continue
-            name, count = fact["element"], fact["count"]
+            name, count = line["element"], line["count"]
             rows = elements[name][begin[name] : begin[name] + count]
             begin[name] += count
             splats = splats_from(rows, path)
-            extras = elements[fact["extras"]] if "extras" in fact else None
+            extras = elements[line["extras"]] if "extras" in line else None
             if len(rows) != count or (extras is not None and len(extras) != count):
-                raise ValueError(f"level {fact['level']} should have {count} splats")
+                raise ValueError(f"level {line['level']} should have {count} splats")
             if extras is not None:
                 splats.extras |= {column: np.array(extras[column]) for column in extras.dtype.names or ()}
-            levels.append(_level(fact, splats))
-        levels.sort(key=lambda level: level.number)
-        return Bundle(head.method, levels, head.meta, head.cumulative)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+            next(level for level in bundle.levels if level.number == line["level"]).splats = splats
+        for name in {line["element"] for line in lines if "level" in line}:
+            if begin[name] != len(elements[name]):
+                raise ValueError(f"{name} has more splats than its levels")
+        return bundle
+    except _CONTRADICTIONS as error:
         raise _contradiction(path, error) from error
 
 
-def read_facts(path: str | Path) -> Facts:
-    """What a bundle says of its levels, in the time that its header takes: splats stay in the file.
+def read_head(path: str | Path) -> Bundle:
+    """What a bundle says of its levels, in the time that its header takes: the levels are without splats.
 
     Any other 3DGS PLY is one level of unknown method.
 
     Raises:
         LodgsError: as `read_bundle`.
     """
-    return _parse(read_elements(path)[1], path)[0] or Facts("", [1])
+    comments = read_elements(path)[1]
+    return _parse(comments, path)[0] or Bundle("", [Level(1, NO_SPLATS)], meta=meta_of(comments, path))
 
 
 def write_folder(folder: str | Path, bundle: Bundle) -> str:
@@ -184,9 +217,14 @@ def write_folder(folder: str | Path, bundle: Bundle) -> str:
         The command line that makes streamed LOD for the web of the folder with splat-transform.
 
     Raises:
-        LodgsError: as `write_bundle`.
+        LodgsError: as `write_bundle`, or the bundle has tables, which have no place there.
     """
     _check(bundle)
+    if bundle.tables:
+        raise LodgsError(
+            f"Levels of the method '{bundle.method}' cannot be a folder: it has no place for their tables.",
+            "Export a bundle.",
+        )
     folder = Path(folder)
     first = columns_of_extras(bundle.levels[0].splats)
     shared = {
@@ -201,18 +239,16 @@ def write_folder(folder: str | Path, bundle: Bundle) -> str:
         for lod, level in enumerate(reversed(bundle.levels)):
             path = folder / f"lod{lod}.ply"
             temporary = stack.enter_context(atomic_write(path))
-            drawn = [
-                x for x in bundle.levels if x is level or (bundle.cumulative and x.number < level.number)
-            ]
+            drawn = bundle.upto(level.number)
             parts = [
                 columns_of(x.splats) | {name: x.splats.extras[name] for name in sorted(shared)} for x in drawn
             ]
             element = Element("vertex", parts)
-            write_elements(temporary, [element])
+            write_elements(temporary, [element], comments_of(bundle.meta))
             with open(temporary, "rb") as file:
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
             manifest["levels"].append(
-                _facts(lod, level)
+                _level_line(lod, level)
                 | {
                     "file": path.name,
                     "count": element.count,
@@ -228,8 +264,13 @@ def write_folder(folder: str | Path, bundle: Bundle) -> str:
     return shlex.join([*command, str(folder / "web" / "lod-meta.json")])
 
 
-def read_folder(folder: str | Path) -> Bundle:
+def read_folder(folder: str | Path, warn: Warn = silent) -> Bundle:
     """Read a folder of levels: by its ``manifest.json``, or any one series ``lodN.ply`` or ``NAME_lodN.ply``.
+
+    Where levels add up, each is what its file has after the rows of the next coarser one.
+
+    Args:
+        warn: as for `read_ply`.
 
     Raises:
         LodgsError: no levels, several series, or a file that cannot be read.
@@ -239,14 +280,19 @@ def read_folder(folder: str | Path) -> Bundle:
     if manifest_file.exists():
         try:
             manifest = json.loads(manifest_file.read_bytes())
-            _check_version(manifest, manifest_file)
-            facts = sorted(manifest["levels"], key=lambda fact: fact["level"])
-            levels = [_level(fact, read_ply(folder / Path(fact["file"]).name)) for fact in facts]
-            if not levels:
-                raise ValueError("no levels")
-            _check_meta(manifest["meta"])
-            return Bundle(manifest["method"], levels, manifest["meta"])
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            bundle = _bundle(manifest, manifest["levels"], manifest["meta"], manifest_file)
+            lines = sorted(manifest["levels"], key=lambda line: line["level"])
+            begin = 0
+            for level, line in zip(bundle.levels, lines, strict=True):
+                file = folder / Path(line["file"]).name
+                level.splats = splats_from(read_elements(file)[0]["vertex"], file)  # ours: every row counts
+                if bundle.cumulative:
+                    if not begin <= line["count"] == len(level.splats):
+                        raise ValueError(f"level {level.number} should have {line['count']} splats")
+                    level.splats = level.splats.select(slice(begin, None))
+                    begin = line["count"]
+            return bundle
+        except _CONTRADICTIONS as error:
             raise _contradiction(manifest_file, error) from error
     series: dict[str, list[tuple[int, Path]]] = {}
     for file in folder.glob("*.ply"):
@@ -257,8 +303,9 @@ def read_folder(folder: str | Path) -> Bundle:
             f"{folder} has {len(series) or 'no'} series of levels (lod0.ply, lod1.ply, ...).",
             "Choose a folder with one series, or a single PLY.",
         )
-    coarse_first = sorted(next(iter(series.values())), reverse=True)
-    return Bundle("", [Level(i, read_ply(file)) for i, (_, file) in enumerate(coarse_first, 1)])
+    coarse_first = [file for _, file in sorted(next(iter(series.values())), reverse=True)]
+    levels = [Level(i, read_ply(file, warn)) for i, file in enumerate(coarse_first, 1)]
+    return Bundle("", levels, meta=read_head(coarse_first[-1]).meta)
 
 
 def describe(path: str | Path) -> str:
@@ -267,24 +314,33 @@ def describe(path: str | Path) -> str:
     Raises:
         LodgsError: as `read_bundle` and `read_folder`.
     """
-    bundle = read_folder(path) if Path(path).is_dir() else read_bundle(path)
+    warnings: list[str] = []
+    bundle = (read_folder if Path(path).is_dir() else read_bundle)(path, warnings.append)
     splats = [level.splats for level in bundle.levels]
     low, high = (", ".join(f"{x:.4g}" for x in corner) for corner in _bounds(splats))
+    names = sorted({name for level in bundle.levels for name in level.facts})
     lines = [
         f"{path}: {bundle.method or 'plain 3DGS PLY'}, {len(splats)} level{'s'[: len(splats) > 1]}, "
         f"{'each adding to the coarser ones' if bundle.cumulative else 'each complete'}, "
         f"SH degree {splats[0].sh_degree}",
+        f"chosen by the rule {bundle.rule}" if bundle.rule else "not made for distances",
         f"bounds  ({low}) to ({high})",
-        f"{'level':>5}  {'splats':>10}  {'MB':>8}  {'s_min':>10}  extras",
+        f"{'level':>5}  {'splats':>10}  {'MB':>8}  {''.join(f'{name:>10}  ' for name in names)}extras",
     ]
     for level in bundle.levels:
         columns = columns_of(level.splats) | columns_of_extras(level.splats)
         size = Element("", [columns]).size / 1e6
-        s_min = "-" if level.s_min is None else f"{level.s_min:.6g}"
+        facts = "".join(
+            f"{level.facts[name]:>10.6g}  " if name in level.facts else f"{'-':>10}  " for name in names
+        )
         extras = ", ".join(level.splats.extras) or "-"
-        lines.append(f"{level.number:>5}  {len(level.splats):>10,}  {size:>8.2f}  {s_min:>10}  {extras}")
-    lines += [f"{name}: {json.dumps(value)}" for name, value in bundle.meta.items()]
-    return "\n".join(lines)
+        lines.append(f"{level.number:>5}  {len(level.splats):>10,}  {size:>8.2f}  {facts}{extras}")
+    for name, table in bundle.tables.items():
+        rows = len(next(iter(table.values()), ()))
+        lines.append(f"table {name}: {rows:,} rows of {', '.join(table)}")
+    said = {**bundle.facts, **bundle.controls, **bundle.meta}
+    lines += [f"{name}: {json.dumps(value, default=_plain)}" for name, value in said.items()]
+    return "\n".join([*lines, *warnings])
 
 
 def _check(bundle: Bundle) -> None:
@@ -300,46 +356,98 @@ def _check(bundle: Bundle) -> None:
 
 
 def _head(bundle: Bundle, **further) -> dict:
-    return {"v": FORMAT_VERSION, "method": bundle.method, "sh": bundle.levels[0].splats.sh_degree, **further}
+    return {
+        "v": FORMAT_VERSION, "method": bundle.method, "rule": bundle.rule, "facts": bundle.facts,
+        "controls": bundle.controls, "cumulative": bundle.cumulative,
+        "sh": bundle.levels[0].splats.sh_degree, **further,
+    }  # fmt: skip
 
 
-def _facts(lod: int, level: Level) -> dict:
-    return {"level": level.number, "lod": lod, "count": len(level.splats), "s_min": level.s_min}
+def _level_line(lod: int, level: Level) -> dict:
+    line = {"level": level.number, "lod": lod, "count": len(level.splats)}
+    return line | {"facts": level.facts} if level.facts else line
 
 
-def _level(facts: dict, splats: Splats) -> Level:
-    s_min = facts["s_min"]
-    return Level(int(facts["level"]), splats, None if s_min is None else float(s_min))
-
-
-def _parse(comments: list[str], path: str | Path) -> tuple[Facts | None, list[dict]]:
-    """The facts in a PLY's comments, as a whole and one by one; None and none where it is no bundle."""
+def _parse(comments: list[str], path: str | Path) -> tuple[Bundle | None, list[dict]]:
+    """What a PLY's comments say: a bundle without splats, and line by line; None where it is no bundle."""
     ours = [comment[len(_TAG) :] for comment in comments if comment.startswith(_TAG)]
     if not ours:
         return None, []
     try:
-        head, *facts = [json.loads(text) for text in ours]
-        _check_version(head, path)
-        numbers = sorted(int(fact["level"]) for fact in facts if "level" in fact)
-        if not numbers:
-            raise ValueError("no levels")
-        meta = next((fact["meta"] for fact in facts if "meta" in fact), {})
-        _check_meta(meta)
-        return Facts(head["method"], numbers, meta, head["cumulative"]), facts
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        head, *lines = [json.loads(text) for text in ours]
+        meta = next((line["meta"] for line in lines if "meta" in line), {})
+        return _bundle(head, [line for line in lines if "level" in line], meta, path), lines
+    except _CONTRADICTIONS as error:
         raise _contradiction(path, error) from error
 
 
-def _check_version(head: dict, path: str | Path) -> None:
+def _bundle(head: dict, lines: list[dict], meta: dict, path: str | Path) -> Bundle:
+    """A bundle without splats, of what a header or a manifest says; raises what a contradiction raises."""
     if head["v"] > FORMAT_VERSION:
         raise LodgsError(f"{path} is a bundle of the newer version {head['v']}.", "Update LODGS to read it.")
-
-
-def _check_meta(meta: dict) -> None:
-    """ValueError or TypeError where a fact that readers rely on is not as many numbers as it should be."""
+    if not isinstance(meta, dict):
+        raise TypeError("meta is no object")
     for name, shape in _META_SHAPES.items():
-        if name in meta and np.asarray(meta[name], np.float64).shape != shape:
-            raise ValueError(f"{name} is not of shape {shape}")
+        if name in meta:
+            values = np.asarray(meta[name])
+            if values.shape != shape or values.dtype.kind not in "if" or not np.isfinite(values).all():
+                raise ValueError(f"{name} is not {shape} numbers")
+    if head["v"] == 1:
+        head, lines = _from_v1(head, lines, meta)
+    for line in lines:
+        if type(line["level"]) is not int or not 1 <= line["level"] < 2**15:
+            raise ValueError(f"{line['level']!r} is no level's number")
+    if not isinstance(head["rule"], str) or not isinstance(head["cumulative"], bool):
+        raise TypeError("rule is no text, or cumulative neither true nor false")
+    levels = [Level(line["level"], NO_SPLATS, _numbers(line.get("facts", {}))) for line in lines]
+    if not levels:
+        raise ValueError("no levels")
+    levels.sort(key=lambda level: level.number)
+    if len({level.number for level in levels}) < len(levels):
+        raise ValueError("a level is there twice")
+    return Bundle(
+        str(head["method"]), levels, head["rule"], _numbers(head["facts"]), _numbers(head["controls"]),
+        head["cumulative"], meta,
+    )  # fmt: skip
+
+
+def rule_of_v1(
+    meta: dict, s_min: Sequence[float | None], cumulative: bool
+) -> tuple[str, dict, dict, list[dict]]:
+    """What version 1 of bundles and .blend files leave to be concluded.
+
+    Args:
+        meta: of the bundle.
+        s_min: of each level, as version 1 has it.
+
+    Returns:
+        The rule, its facts of the scene, its controls, and its facts of each level.
+
+    Raises:
+        KeyError, TypeError, ValueError: meta is incomplete.
+    """
+    if cumulative and "d_max" in meta:
+        facts = {"d_max": float(meta["d_max"]), "d_max_focal": float(meta["focal_px"])}
+        return "octree", facts, {}, [{} for _ in s_min]
+    if len(s_min) > 1 and all(value is not None for value in s_min):
+        controls = {"gamma": float(meta["gamma"])} if "gamma" in meta else {}
+        return "bands", {}, controls, [{"s_min": value} for value in s_min]
+    return "", {}, {}, [{} for _ in s_min]
+
+
+def _from_v1(head: dict, lines: list[dict], meta: dict) -> tuple[dict, list[dict]]:
+    """Head and lines of version 1 as those of version 2."""
+    cumulative = head.get("cumulative", "d_max" in meta)  # a folder's head does not say it
+    rule, facts, controls, levels = rule_of_v1(meta, [line["s_min"] for line in lines], cumulative)
+    now = {"rule": rule, "facts": facts, "controls": controls, "cumulative": cumulative}
+    return head | now, [line | {"facts": each} for line, each in zip(lines, levels, strict=True)]
+
+
+def _numbers(values: dict) -> dict[str, float]:
+    """Facts as they are; ValueError or TypeError where one is no finite number."""
+    if not all(isinstance(value, int | float) and np.isfinite(value) for value in values.values()):
+        raise ValueError("a fact is no number")
+    return dict(values)
 
 
 def _contradiction(path: str | Path, error: Exception) -> LodgsError:

@@ -6,6 +6,9 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 
+SH_C0 = 0.28209479177387814
+"""The harmonic of degree 0, sqrt(1 / 4π): a base colour is 0.5 + SH_C0 · sh[:, 0]."""
+
 
 @dataclass
 class Splats:
@@ -33,6 +36,7 @@ class Splats:
 
     @property
     def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 4."""
         return int(np.sqrt(self.sh.shape[1])) - 1
 
     def select(self, index) -> Splats:

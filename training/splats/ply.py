@@ -17,6 +17,7 @@ from plyfile import PlyData, PlyListProperty, PlyParseError
 
 from ..errors import LodgsError
 from ..files import atomic_write
+from .dialects import Warn, as_3dgs, meta_of, refuse, silent
 from .gaussians import Splats
 
 NORMALS = ("nx", "ny", "nz")
@@ -51,6 +52,7 @@ class Element:
 
     @property
     def count(self) -> int:
+        """Rows of the element, of all its parts."""
         return sum(len(next(iter(part.values()))) for part in self.parts)
 
     @property
@@ -59,27 +61,35 @@ class Element:
         return self.count * self.dtype.itemsize
 
 
-def read_ply(path: str | Path) -> Splats:
+def read_ply(path: str | Path, warn: Warn = silent) -> Splats:
     """Read the element ``vertex`` of any 3DGS PLY.
 
     Ascii, little- or big-endian, SH degree 0 to 4, columns in any order and of any scalar type. Missing
-    normals are fine; normals that are all zero, as 3DGS writes them, are dropped. Every other column survives
-    in ``extras`` with its name and type. A bundle reads as its ``vertex``, the finest level by default.
+    normals are fine; normals that are all zero, as 3DGS writes them, are dropped. Columns of dialects are
+    worked into the others (`dialects.as_3dgs`); every other column survives in ``extras`` with its name and
+    type. A bundle reads as its ``vertex``, the finest level by default.
+
+    Args:
+        warn: receives a sentence for each thing that was left out or is shown otherwise than by its maker.
 
     Raises:
-        LodgsError: not a PLY, cut short, or without the columns of splats.
+        LodgsError: not a PLY, cut short, without the columns of splats, or of a dialect that cannot be read.
     """
-    elements, _ = read_elements(path)
-    return splats_from(elements["vertex"], path)
+    elements, comments = read_elements(path)
+    meta_of(comments, path, warn)
+    return as_3dgs(splats_from(elements["vertex"], path), path, warn)
 
 
-def write_ply(path: str | Path, splats: Splats) -> None:
+def write_ply(path: str | Path, splats: Splats, comments: Sequence[str] = ()) -> None:
     """Write splats as one binary little-endian ``vertex``, extras behind the 3DGS columns.
+
+    Args:
+        comments: for the header, such as `dialects.comments_of` a bundle's meta.
 
     Raises:
         LodgsError: the file cannot be written, or an extra has a name or a type that PLY does not know.
     """
-    write_elements(path, [Element("vertex", [columns_of(splats) | columns_of_extras(splats)])])
+    write_elements(path, [Element("vertex", [columns_of(splats) | columns_of_extras(splats)])], comments)
 
 
 def columns_of(splats: Splats) -> Columns:
@@ -141,7 +151,7 @@ def read_elements(path: str | Path) -> tuple[dict[str, np.ndarray], list[str]]:
     """Elements of a PLY as structured rows (memory-mapped when binary), and its comments in order.
 
     Raises:
-        LodgsError: not a PLY, no ``vertex`` of splats, or cut short.
+        LodgsError: not a PLY, no ``vertex`` of splats, a dialect that cannot be read, or cut short.
     """
     path = Path(path)
     _check_header(path)
@@ -149,8 +159,7 @@ def read_elements(path: str | Path) -> tuple[dict[str, np.ndarray], list[str]]:
         data = PlyData.read(str(path))
     except (PlyParseError, ValueError, MemoryError) as error:
         raise LodgsError(f"{path} is damaged: {error}.", "Export or copy it again.") from error
-    comments = data.comments + [comment for element in data.elements for comment in element.comments]
-    return {element.name: element.data for element in data.elements}, comments
+    return {element.name: element.data for element in data.elements}, _comments(data)
 
 
 def write_elements(path: str | Path, elements: Iterable[Element], comments: Sequence[str] = ()) -> None:
@@ -224,6 +233,7 @@ def _check_header(path: Path) -> None:
     vertex = header["vertex"]
     if any(isinstance(column, PlyListProperty) for column in vertex.properties):
         raise LodgsError(f"{path} has lists in its vertices.", "Choose a .ply of Gaussian splats.")
+    refuse([column.name for column in vertex.properties], _comments(header), path)
     splats_from(vertex.data, path)
     lists = any(
         isinstance(column, PlyListProperty) for element in header.elements for column in element.properties
@@ -237,6 +247,10 @@ def _check_header(path: Path) -> None:
             f"{path} is cut short: {promised - size} of its {promised} bytes are missing.",
             "Export or copy it again.",
         )
+
+
+def _comments(data: PlyData) -> list[str]:
+    return data.comments + [comment for element in data.elements for comment in element.comments]
 
 
 def _empty_splats(count: int, degree: int) -> Splats:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from training.evaluate.distance import farther, jumps, pulled_back
-from training.evaluate.protocol import Evaluation
-from training.lod.selection import Detail, complete, select
+from training.evaluate.views import Evaluation
+from training.lod.selection import complete, select, settings
 from training.scenes.cameras import Camera
 from training.splats.bundle import Bundle, Level
 from training.splats.gaussians import Splats
@@ -29,7 +29,7 @@ def splats(count: int, seed: int, size: float, bias: float = 0.0) -> Splats:
 def bundle() -> Bundle:
     """Full detail up to a distance of 8, level 1 alone from 32 on."""
     levels = [Level(1, splats(60, 1, 0.3)), Level(2, splats(200, 2, 0.1)), Level(3, splats(800, 3, 0.05))]
-    return Bundle("octree", levels, {"d_max": 32.0, "focal_px": 100.0}, cumulative=True)
+    return Bundle("octree", levels, "octree", {"d_max": 32.0, "d_max_focal": 100.0}, cumulative=True)
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def test_what_lies_at_the_depth_is_so_many_times_as_far(camera):
 
 def test_the_rule_on_a_whole_bundle(bundle):
     eye, focal = np.array([0.5, 0, -7.0]), 80.0
-    chosen, weights = select(bundle, eye, focal, Detail(offset=0.25))
+    chosen, weights = select(bundle, eye, focal, settings(bundle, {"offset": 0.25}))
     assert weights is not None
     expected = []
     for level in bundle.levels:  # splat by splat: L* = log2(d_max / d) + offset, rounded in half a level
@@ -78,8 +78,9 @@ def test_a_level_comes_with_all_coarser_ones_only_where_they_add_up(bundle):
     assert len(complete(apart, apart.levels[1])) == 200
 
 
+@pytest.mark.slow
 def test_fewer_splats_are_drawn_from_farther_away(bundle, evaluation):
-    rows = farther(evaluation, bundle, Detail())
+    rows = farther(evaluation, bundle, settings(bundle, {}))
     assert [row["factor"] for row in rows] == [1, 2, 4, 8]
     drawn = [row["drawn"] for row in rows]
     assert drawn[0] == rows[0]["drawn_full"] and np.isinf(rows[0]["psnr"])
@@ -88,5 +89,5 @@ def test_fewer_splats_are_drawn_from_farther_away(bundle, evaluation):
 
 
 def test_fading_takes_the_jumps_away(bundle, evaluation, camera):
-    found = jumps(evaluation, bundle, Detail(), camera)
+    found = jumps(evaluation, bundle, settings(bundle, {}), camera)
     assert found["faded"] < found["hard"]

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from training.evaluate.metrics import psnr, ssim, to_8_bit
-from training.lod.selection import Detail, select
+from training.lod.selection import select, settings
 from training.splats.bundle import Bundle, Level
 from training.splats.gaussians import Splats
 
@@ -47,7 +47,8 @@ def random_splats(count: int, seed: int) -> Splats:
 @pytest.mark.parametrize("start, end", [(3, 5), (2, 3), (4, 4), (1, 5)])
 def test_the_selective_view_is_the_papers_inequality(start, end):
     s_min = [0.4, 0.1, 0.025, 0.00625, 0.0]
-    bundle = Bundle("flod", [Level(n, random_splats(200, n), s_min[n - 1]) for n in range(1, 6)])
+    levels = [Level(n, random_splats(200, n), {"s_min": s_min[n - 1]}) for n in range(1, 6)]
+    bundle = Bundle("flod", levels, "bands")
     eye, focal, gamma = np.array([1.0, 2, 3]), 900.0, 1.5
     expected = []
     for number in range(start, end + 1):  # Eq. 7, splat by splat
@@ -57,7 +58,8 @@ def test_the_selective_view_is_the_papers_inequality(start, end):
             far = math.inf if number == start else s_min[number - 2] / gamma * focal
             if near <= distance < far:
                 expected.append(mean)
-    chosen, weights = select(bundle, eye, focal, Detail(gamma, start, end))
+    values = settings(bundle, {"gamma": gamma, "first": start, "last": end})
+    chosen, weights = select(bundle, eye, focal, values)
     assert weights is None
     np.testing.assert_array_equal(chosen.means, np.array(expected, np.float32).reshape(-1, 3))
     assert len(chosen.sh) == len(chosen.means)

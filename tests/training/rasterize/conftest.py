@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from training.rasterize import BACKENDS
+from training.rasterize import BACKENDS, Gaussians
 from training.scenes.cameras import Camera
 
-NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
 
-
-def random_splats(count: int, seed: int = 0, coefficients: int = 16) -> dict[str, torch.Tensor]:
+def random_splats(count: int, seed: int = 0, coefficients: int = 16) -> Gaussians:
     """Splats in front of ``odd_camera``, of many sizes and opacities, float64."""
     random = np.random.default_rng(seed)
     means = random.uniform((-1, -1, 2), (1, 1, 4), (count, 3))
@@ -23,7 +21,7 @@ def random_splats(count: int, seed: int = 0, coefficients: int = 16) -> dict[str
         "opacity_logits": random.normal(0, 2, count),
         "sh": random.normal(0, 0.4, (count, coefficients, 3)),
     }
-    return {name: torch.from_numpy(array).float().double() for name, array in arrays.items()}
+    return Gaussians(**{name: torch.from_numpy(array).float().double() for name, array in arrays.items()})
 
 
 @pytest.fixture

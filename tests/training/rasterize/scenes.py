@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from training.rasterize import OUTPUTS, contributions, rasterize
+from training.rasterize import OUTPUTS, Gaussians, contributions, rasterize
 
 SCENES = [
     "degree 0", "degree 1", "degree 2", "degree 3", "degree 4", "active degree",
@@ -17,27 +17,27 @@ def scene(name, make_splats):
     if name.startswith("degree"):
         return make_splats(250, coefficients=(int(name[-1]) + 1) ** 2), {}
     splats = make_splats({"one": 1, "crowd": 3000}.get(name, 250), seed=len(name))
-    count = len(splats["means"])
+    count = len(splats)
     random = np.random.default_rng(9)
     if name.startswith("antialiased"):
-        splats["log_scales"] -= 1
-        splats["log_scales"][::2, 0] += 2
+        splats.log_scales.sub_(1)
+        splats.log_scales[::2, 0] += 2
     if name == "one":
-        splats["means"][:] = torch.tensor([[0.1, -0.2, 3.0]])
-        splats["opacity_logits"][:] = 1
+        splats.means[:] = torch.tensor([[0.1, -0.2, 3.0]])
+        splats.opacity_logits[:] = 1
     elif name == "needles":
-        splats["log_scales"][:, 0] = torch.from_numpy(random.uniform(-1, 0.5, count))
-        splats["log_scales"][:, 1:] = torch.from_numpy(random.uniform(-7, -5, (count, 2)))
+        splats.log_scales[:, 0] = torch.from_numpy(random.uniform(-1, 0.5, count))
+        splats.log_scales[:, 1:] = torch.from_numpy(random.uniform(-7, -5, (count, 2)))
     elif name == "screen-filling":
-        splats["log_scales"][::5] = 1.5
-        splats["opacity_logits"][::5] -= 2
+        splats.log_scales[::5] = 1.5
+        splats.opacity_logits[::5] -= 2
     elif name == "behind and near":
-        splats["means"][:, 2] = torch.from_numpy(random.uniform(-1, 1, count))
+        splats.means[:, 2] = torch.from_numpy(random.uniform(-1, 1, count))
     elif name == "caps":
-        splats["opacity_logits"][:] = torch.from_numpy(random.choice([-12.0, 3.0, 15.0], count))
+        splats.opacity_logits[:] = torch.from_numpy(random.choice([-12.0, 3.0, 15.0], count))
     elif name == "crowd":
-        splats["log_scales"] += 3
-        splats["opacity_logits"][:] = torch.from_numpy(random.uniform(-5.1, -4.5, count))
+        splats.log_scales.add_(3)
+        splats.opacity_logits[:] = torch.from_numpy(random.uniform(-5.1, -4.5, count))
     elif name == "active degree":
         return splats, {"sh_degree": 1}
     return splats, {"antialias": name == "antialiased"}
@@ -47,18 +47,20 @@ def drawn_and_differentiated(name, make_splats, camera, backend, kind, device="c
     """Every output of ``rasterize``, and the gradients of a loss that all of them have a part in."""
     splats, options = scene(name, make_splats)
     random = torch.Generator().manual_seed(1)
-    weights = torch.rand(len(splats["means"]), generator=random).double()
+    weights = torch.rand(len(splats), generator=random).double()
     weights[3::7] = 0
     shade = torch.rand(50, 75, 3, generator=random).double().to(device, kind)
-    leaves = [t.to(device, kind, copy=True).requires_grad_() for t in (*splats.values(), weights)]
+    tensors = (*vars(splats).values(), weights)
+    *leaves, weights = (t.to(device, kind, copy=True).requires_grad_() for t in tensors)
+    leaves = Gaussians(*leaves)
     drawn = rasterize(
-        *leaves[:5], camera, weights=leaves[5], background=(0.1, 0.5, 0.3), min_scale=0.01,
+        leaves, camera, weights=weights, background=(0.1, 0.5, 0.3), min_scale=0.01,
         near=0.2, outputs=OUTPUTS, backend=backend, **options,
     )  # fmt: skip
     loss = ((drawn.image - shade) ** 2).mean() + (drawn.alpha * shade[..., 0]).mean()
     loss = loss + 0.1 * (drawn.depth * shade[..., 1]).mean() + (drawn.normals * shade).mean()
     loss.backward()
-    found = {name: leaf.grad for name, leaf in zip((*splats, "weights"), leaves, strict=True)}
+    found = {name: leaf.grad for name, leaf in (vars(leaves) | {"weights": weights}).items()}
     found |= {name: getattr(drawn, name) for name in ("image", "alpha", "depth", "normals", "radii")}
     found |= {name: getattr(drawn, name) for name in ("grad2d", "absgrad2d", "tile_counts")}
     return {name: tensor.detach().cpu().double() for name, tensor in found.items()}
@@ -67,10 +69,10 @@ def drawn_and_differentiated(name, make_splats, camera, backend, kind, device="c
 def contributed(name, make_splats, camera, backend, kind, device="cpu"):
     """``contributions`` of a scene's first splats, and Σ alpha of the picture that they make."""
     splats, options = scene(name, make_splats)
-    splats = {key: tensor[:400].to(device, kind) for key, tensor in splats.items()}
+    splats = splats.select(slice(400)).to(device, kind)
     options.pop("sh_degree", None)
-    weights = torch.linspace(0, 1, len(splats["means"])).to(device, kind)
+    weights = torch.linspace(0, 1, len(splats)).to(device, kind)
     options |= {"weights": weights, "min_scale": 0.01, "near": 0.2, "backend": backend}
-    drawn = rasterize(*splats.values(), camera, **options)
-    found = contributions(*list(splats.values())[:4], [camera], **options)
+    drawn = rasterize(splats, camera, **options)
+    found = contributions(splats, [camera], **options)
     return {name: tensor.cpu() for name, tensor in vars(found).items()}, drawn.alpha.sum().item()

@@ -18,7 +18,7 @@ from training.errors import LodgsError
 from training.rasterize import Target, cuda, device_of, photometric_loss, rasterize, reference, resolve
 from training.rasterize.features import depths
 from training.rasterize.reference import ellipses, squared_reach
-from training.rasterize.rendering import View
+from training.rasterize.rendering import Settings, View
 from training.scenes.cameras import Camera
 
 GSPLAT_CAP = 0.999
@@ -29,9 +29,10 @@ GSPLAT_CAP = 0.999
         "cpu",
         pytest.param(
             "cuda",
-            marks=pytest.mark.skipif(
-                not torch.cuda.is_available(), reason="no NVIDIA GPU that torch can use"
-            ),
+            marks=[
+                pytest.mark.gpu,
+                pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU that torch can use"),
+            ],
         ),
     ]
 )
@@ -44,6 +45,7 @@ def device(request) -> str:
     return request.param
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 def test_it_agrees_with_the_reference(name, device, make_splats, odd_camera, monkeypatch):
     """Every output and gradient, relative L2 at most 5e-4; the GPU's fast exponential may cost some more."""
@@ -60,13 +62,13 @@ def test_it_agrees_with_the_reference(name, device, make_splats, odd_camera, mon
 
 def test_the_cap_is_all_that_differs_and_little(device, make_splats, odd_camera):
     """One opaque splat changes a pixel by at most 0.999 - 0.99; below 0.99 nothing changes."""
-    splats = {name: tensor[:1].clone() for name, tensor in make_splats(1).items()}
-    splats["means"][:] = torch.tensor([0.1, -0.2, 3.0])
-    splats["log_scales"][:] = -0.5
+    splats = make_splats(1)
+    splats.means[:] = torch.tensor([0.1, -0.2, 3.0])
+    splats.log_scales[:] = -0.5
     for logit, most in ((12.0, GSPLAT_CAP - 0.99), (4.0, 0.0)):
-        splats["opacity_logits"][:] = logit
+        splats.opacity_logits[:] = logit
         found, exact = (
-            rasterize(*(t.to(on, kind) for t in splats.values()), odd_camera, backend=backend).alpha.cpu()
+            rasterize(splats.to(on, kind), odd_camera, backend=backend).alpha.cpu()
             for backend, kind, on in (
                 ("cuda", torch.float32, device),
                 ("reference", torch.float64, "cpu"),
@@ -96,7 +98,7 @@ def test_median_depths_agree_with_the_reference(device, make_splats, odd_camera,
     splats = make_splats(300)
     found, exact = (
         rasterize(
-            *(t.to(on, kind) for t in splats.values()), odd_camera, outputs=["median_depth"], backend=backend
+            splats.to(on, kind), odd_camera, outputs=["median_depth"], backend=backend
         ).median_depth.cpu()
         for backend, kind, on in (("cuda", torch.float32, device), ("reference", torch.float64, "cpu"))
     )
@@ -106,11 +108,11 @@ def test_median_depths_agree_with_the_reference(device, make_splats, odd_camera,
 
 def test_every_splat_is_in_every_tile_it_touches_once_and_front_to_back(device, make_splats, odd_camera):
     """Against a count over all pixels in float64, as the cpu backend's pairs."""
-    splats = list(make_splats(400, seed=2).values())[:4]
-    options = {"view": View.of(odd_camera, 0.2), "min_scale": 0.01, "antialias": False}
-    visible = cuda.Visible.of(*(t.to(device, torch.float32) for t in splats), None, **options)
-    tiles = cuda.Tiles.of(visible, options["view"])
-    exact = ellipses(*splats, None, **options)
+    splats, view = make_splats(400, seed=2), View.of(odd_camera, 0.2)
+    settings = Settings(view, min_scale=0.01, antialias=False)
+    visible = cuda.Visible.of(splats.to(device, torch.float32), None, settings)
+    tiles = cuda.Tiles.of(visible, view)
+    exact = ellipses(splats, None, settings)
 
     (xx, xy, yy), mean = (v[:, None, None] for v in exact.covariance), exact.mean2d[:, :, None, None]
     dx, dy = torch.arange(80) + 0.5 - mean[:, 0], (torch.arange(64) + 0.5)[:, None] - mean[:, 1]
@@ -126,7 +128,7 @@ def test_every_splat_is_in_every_tile_it_touches_once_and_front_to_back(device, 
         assert (rows.diff() > 0).all()  # the rows are front to back, so each once and in order
         listed[visible.which[rows].cpu(), tile // 5, tile % 5] += 1
     assert tiles.counts.sum() == len(tiles.splat) and listed.max() == 1
-    depth = depths(splats[0][visible.which.cpu()], options["view"])
+    depth = depths(splats.means[visible.which.cpu()], view)
     torch.testing.assert_close(depth, exact.depth[exact.inside].sort().values)
     assert (listed[expected] == 1).float().mean() > 0.999
     assert listed.sum() <= 1.15 * expected.sum()
@@ -155,15 +157,18 @@ def test_two_backwards_give_the_same_and_nothing_is_kept(device, make_splats, od
     import gc
     import weakref
 
-    leaves = [t.to(device, torch.float32).requires_grad_() for t in make_splats(50).values()]
-    drawn = rasterize(*leaves, odd_camera, outputs=["absgrad2d"], backend="cuda")
+    leaves = make_splats(50).map(lambda t: t.to(device, torch.float32).requires_grad_())
+    drawn = rasterize(leaves, odd_camera, outputs=["absgrad2d"], backend="cuda")
     loss = drawn.image.sum()
     loss.backward(retain_graph=True)
-    first = [leaf.grad.clone() for leaf in leaves] + [drawn.grad2d.clone(), drawn.absgrad2d.clone()]
-    for leaf in leaves:
+    first = [leaf.grad.clone() for leaf in vars(leaves).values()] + [
+        drawn.grad2d.clone(),
+        drawn.absgrad2d.clone(),
+    ]
+    for leaf in vars(leaves).values():
         leaf.grad = None
     loss.backward()
-    again = [leaf.grad for leaf in leaves] + [drawn.grad2d, drawn.absgrad2d]
+    again = [leaf.grad for leaf in vars(leaves).values()] + [drawn.grad2d, drawn.absgrad2d]
     for one, other in zip(first, again, strict=True):
         torch.testing.assert_close(one, other)
 
@@ -180,11 +185,11 @@ def test_two_backwards_give_the_same_and_nothing_is_kept(device, make_splats, od
 
 
 def test_float32_on_the_card_is_asked_for(device, make_splats, odd_camera):
-    splats = [t.to(device, torch.float32) for t in make_splats(5).values()]
+    splats = make_splats(5).to(device, torch.float32)
     with pytest.raises(ValueError, match=r"float32 on a GPU, not torch\.float64"):
-        rasterize(*(t.double() for t in splats), odd_camera, backend="cuda")
+        rasterize(splats.to(dtype=torch.float64), odd_camera, backend="cuda")
     with pytest.raises(ValueError, match="on meta"):
-        rasterize(*(t.to("meta") for t in splats), odd_camera, backend="cuda")
+        rasterize(splats.to("meta"), odd_camera, backend="cuda")
 
 
 # -- which backend, and why not --------------------------------------------------------
@@ -220,7 +225,7 @@ def test_auto_follows_the_tensors_that_it_is_given(card, monkeypatch, make_splat
         raise AssertionError("tensors on the CPU went to the GPU")
 
     monkeypatch.setattr(cuda, "rasterize", refuse)
-    assert rasterize(*(t.float() for t in make_splats(5).values()), odd_camera).image.shape == (50, 75, 3)
+    assert rasterize(make_splats(5).to(dtype=torch.float32), odd_camera).image.shape == (50, 75, 3)
     assert rasterizer._backend("auto", SimpleNamespace(is_cuda=True)) is cuda  # type: ignore[arg-type]
 
 
@@ -280,8 +285,8 @@ def test_a_camera_that_sees_nothing_leaves_the_background(device, make_splats):
     import numpy as np
 
     away = Camera("away", 20, 10, 10.0, 10.0, 5.0, 5.0, np.diag([-1.0, 1.0, -1.0, 1.0]))
-    leaves = [t.to(device, torch.float32).requires_grad_() for t in make_splats(5).values()]
-    drawn = rasterize(*leaves, away, background=(0.2, 0.4, 0.6), outputs=["depth"], backend="cuda")
+    leaves = make_splats(5).map(lambda t: t.to(device, torch.float32).requires_grad_())
+    drawn = rasterize(leaves, away, background=(0.2, 0.4, 0.6), outputs=["depth"], backend="cuda")
     (drawn.image.sum() + drawn.depth.sum()).backward()
     assert torch.equal(drawn.image.detach().cpu(), torch.tensor([0.2, 0.4, 0.6]).expand(10, 20, 3))
-    assert all(leaf.grad is not None and leaf.grad.abs().max() == 0 for leaf in leaves)
+    assert all(leaf.grad is not None and leaf.grad.abs().max() == 0 for leaf in vars(leaves).values())

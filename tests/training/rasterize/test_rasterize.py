@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from tests.training.rasterize.scenes import CONTRIBUTING, SCENES, contributed, d
 from training.errors import LodgsError
 from training.rasterize import (
     OUTPUTS,
+    Gaussians,
     Target,
     contributions,
     cpu,
@@ -52,8 +54,8 @@ def isotropic(depths, sigma, opacities, colours, kind=torch.float32):
     quats = torch.tensor([[2.0, 0.0, 0.0, 0.0]]).repeat(count, 1)
     logits = torch.logit(torch.tensor(opacities))
     sh = (torch.tensor(colours).reshape(count, 1, 3) - 0.5) / SH_C0
-    tensors = means, quats, torch.full((count, 3), math.log(sigma)), logits, sh
-    return [tensor.to(kind).requires_grad_() for tensor in tensors]
+    log_scales = torch.full((count, 3), math.log(sigma))
+    return Gaussians(means, quats, log_scales, logits, sh).map(lambda t: t.to(kind).requires_grad_())
 
 
 def squared_distance():
@@ -65,7 +67,7 @@ def squared_distance():
 def test_one_round_splat_on_the_axis(backend, axis_camera):
     """Its variance is (f sigma / z)² + 0.3; it lies across four tiles."""
     splats = isotropic([2.0], 0.2, [0.8], [[0.9, 0.6, 0.3]])
-    drawn = rasterize(*splats, axis_camera, background=(0.1, 0.2, 0.4), backend=backend)
+    drawn = rasterize(splats, axis_camera, background=(0.1, 0.2, 0.4), backend=backend)
     variance = (40 * 0.2 / 2) ** 2 + 0.3
     alpha = 0.8 * np.exp(-squared_distance() / (2 * variance))
     alpha[alpha < 1 / 255] = 0
@@ -81,9 +83,9 @@ def test_one_round_splat_on_the_axis(backend, axis_camera):
 
 def test_colours_may_be_given_as_they_are(backend, axis_camera):
     """The picture is alpha times the colour, the gradient by a colour Σ alpha; below 0 there is neither."""
-    *splats, _ = isotropic([2.0], 0.2, [0.8], [[0.0, 0.0, 0.0]])
     colours = torch.tensor([[0.9, 0.25, -0.1]], requires_grad=True)
-    drawn = rasterize(*splats, colours, axis_camera, backend=backend)
+    splats = replace(isotropic([2.0], 0.2, [0.8], [[0.0, 0.0, 0.0]]), sh=colours)
+    drawn = rasterize(splats, axis_camera, backend=backend)
     alpha = drawn.alpha.detach()
     assert alpha.max() > 0.7
     torch.testing.assert_close(drawn.image.detach(), alpha[..., None] * torch.tensor([0.9, 0.25, 0.0]))
@@ -91,19 +93,19 @@ def test_colours_may_be_given_as_they_are(backend, axis_camera):
     assert colours.grad is not None
     total = alpha.sum().item()
     np.testing.assert_allclose(colours.grad, [[total, total, 0]], rtol=1e-5)
-    (picture,) = render(*splats, colours, [axis_camera], backend=backend)
+    (picture,) = render(splats, [axis_camera], backend=backend)
     np.testing.assert_array_equal(picture[..., :3], drawn.image.detach())
     with pytest.raises(ValueError, match=r"sh must be \(1, coefficients, 3\) or \(1, 3\)"):
-        rasterize(*splats, colours[:, :2], axis_camera, backend=backend)
+        replace(splats, sh=colours[:, :2])
     with pytest.raises(ValueError, match="asks for 1"):
-        rasterize(*splats, colours, axis_camera, sh_degree=1, backend=backend)
+        rasterize(splats, axis_camera, sh_degree=1, backend=backend)
 
 
 def test_a_splat_smaller_than_a_pixel_keeps_its_light_when_antialiased(backend, axis_camera):
     """Its opacity times its area: 0.8 · 2 pi sigma² before and after the filter."""
     sigma = 0.004
     splats = isotropic([2.0], sigma, [0.8], [[1.0, 1.0, 1.0]])
-    drawn = rasterize(*splats, axis_camera, antialias=True, backend=backend)
+    drawn = rasterize(splats, axis_camera, antialias=True, backend=backend)
     variance = (40 * sigma / 2) ** 2
     opacity = 0.8 * variance / (variance + 0.1)
     expected = opacity * np.exp(-squared_distance() / (2 * (variance + 0.1)))
@@ -114,7 +116,7 @@ def test_a_splat_smaller_than_a_pixel_keeps_its_light_when_antialiased(backend, 
 
 def test_two_splats_blend_front_to_back_whatever_their_order(backend, axis_camera):
     splats = isotropic([4.0, 2.0], 0.3, [0.9, 0.5], [[1.0, 0.0, 0.2], [0.0, 1.0, 0.2]])
-    drawn = rasterize(*splats, axis_camera, backend=backend).image.detach()
+    drawn = rasterize(splats, axis_camera, backend=backend).image.detach()
     far, near = (
         opacity * np.exp(-squared_distance() / (2 * ((40 * 0.3 / z) ** 2 + 0.3)))
         for opacity, z in ((0.9, 4), (0.5, 2))
@@ -132,7 +134,7 @@ def test_alpha_is_capped_and_dark_pixels_take_no_more(backend, axis_camera):
     """
     cap = 0.999 if backend == "cuda" else 0.99
     splats = isotropic([2.0, 3.0, 4.0], 50.0, [0.9999] * 3, [[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])
-    pixel = rasterize(*splats, axis_camera, backend=backend).image[16, 16].detach()
+    pixel = rasterize(splats, axis_camera, backend=backend).image[16, 16].detach()
     # rounding decides on which side of the bound the second falls
     assert pixel[0].item() == pytest.approx(cap, abs=1e-6)
     assert pixel[1].item() in (pytest.approx(cap * (1 - cap), abs=1e-6), 0.0)
@@ -146,9 +148,8 @@ def test_depths_and_normals_of_two_discs(backend, axis_camera):
     quats = torch.tensor([[1.0, 0.0, 0.0, 0.0], [math.cos(tilt / 2), math.sin(tilt / 2), 0.0, 0.0]])
     log_scales = torch.tensor([[1.0, 1.0, 0.001], [1.0, 1.0, 0.001]]).mul(5).log()
     logits = torch.logit(torch.tensor([0.5, 0.4]))
-    drawn = rasterize(
-        means, quats, log_scales, logits, torch.zeros(2, 1, 3), axis_camera, outputs=OUTPUTS, backend=backend
-    )
+    splats = Gaussians(means, quats, log_scales, logits, torch.zeros(2, 1, 3))
+    drawn = rasterize(splats, axis_camera, outputs=OUTPUTS, backend=backend)
     front, back = 0.4, 0.6 * 0.5  # weights at the middle, where both are at their full opacity
     at = 15, 15
     assert drawn.alpha[at].item() == pytest.approx(front + back, rel=1e-3)
@@ -162,23 +163,23 @@ def test_depths_and_normals_of_two_discs(backend, axis_camera):
 
 def test_what_is_empty_has_no_depth(backend, axis_camera):
     splats = isotropic([2.0], 0.02, [0.4], [[1.0, 1.0, 1.0]])
-    drawn = rasterize(*splats, axis_camera, outputs=OUTPUTS, backend=backend)
+    drawn = rasterize(splats, axis_camera, outputs=OUTPUTS, backend=backend)
     empty = drawn.alpha == 0
     assert 0 < empty.sum() < empty.numel()
     assert (drawn.depth[empty] == 0).all() and (drawn.normals[empty] == 0).all()
     assert torch.allclose(drawn.depth[~empty], torch.tensor(2.0))
     assert (drawn.median_depth == 0).all(), "0.4 leaves more than a half"
     (drawn.depth.sum() + drawn.normals.sum()).backward()
-    assert all(t.grad is None or t.grad.isfinite().all() for t in splats)
+    assert all(t.grad is None or t.grad.isfinite().all() for t in vars(splats).values())
 
 
 def test_a_limit_leaves_out_what_lies_behind_it(backend, axis_camera):
     """Worked by hand: splats at 2 and at 4, a limit of 3 on the left half and none on the right."""
-    splats = [t.detach() for t in isotropic([4.0, 2.0], 0.3, [0.9, 0.5], [[1.0, 0.0, 0.2], [0.0, 1.0, 0.2]])]
+    splats = isotropic([4.0, 2.0], 0.3, [0.9, 0.5], [[1.0, 0.0, 0.2], [0.0, 1.0, 0.2]]).detach()
     limit = torch.full((32, 32), 1e10)
     limit[:, :16] = 3
     options = {"background": (0.0, 0.0, 0.5), "outputs": ("depth", "median_depth"), "backend": backend}
-    drawn = rasterize(*splats, axis_camera, features=torch.eye(2), limit=limit, **options)
+    drawn = rasterize(splats, axis_camera, features=torch.eye(2), limit=limit, **options)
     far, near = (
         opacity * np.exp(-squared_distance() / (2 * ((40 * 0.3 / z) ** 2 + 0.3)))
         for opacity, z in ((0.9, 4), (0.5, 2))
@@ -197,11 +198,12 @@ def test_a_limit_leaves_out_what_lies_behind_it(backend, axis_camera):
     np.testing.assert_allclose(drawn.depth[some], expected, rtol=1e-5)
     assert drawn.median_depth[16, 14:18].tolist() == [0, 0, 4, 4]  # the first leaves more than a half
     limit[:] = 1  # before everything
-    empty = rasterize(*splats, axis_camera, limit=limit, **options)
+    empty = rasterize(splats, axis_camera, limit=limit, **options)
     assert empty.alpha.max() == 0 and empty.median_depth.max() == 0
     assert torch.equal(empty.image, torch.tensor([0.0, 0.0, 0.5]).expand(32, 32, 3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["degree 3", "antialiased", "needles", "screen-filling", "caps", "crowd"])
 def test_limits_agree_with_the_reference(name, fake_card, make_splats, odd_camera):
     """A depth of its own in every pixel: relative L2 at most 5e-4, median depths but for rounding."""
@@ -209,16 +211,14 @@ def test_limits_agree_with_the_reference(name, fake_card, make_splats, odd_camer
     random = torch.Generator().manual_seed(2)
     limit = 2 + 2 * torch.rand(50, 75, generator=random).double()
     limit[::3] = 1e10
-    features = torch.rand(len(splats["means"]), 4, generator=random).double()
+    features = torch.rand(len(splats), 4, generator=random).double()
     options |= {"background": (0.1, 0.5, 0.3), "outputs": ("depth", "median_depth", "normals")}
-    exact = rasterize(
-        *splats.values(), odd_camera, features=features, limit=limit, backend="reference", **options
-    )
-    free = rasterize(*splats.values(), odd_camera, backend="reference", **options)
+    exact = rasterize(splats, odd_camera, features=features, limit=limit, backend="reference", **options)
+    free = rasterize(splats, odd_camera, backend="reference", **options)
     assert (free.alpha - exact.alpha).abs().mean() > 0.01
     for backend in ("cpu", "cuda"):
         found = rasterize(
-            *(t.float() for t in splats.values()), odd_camera, features=features.float(), limit=limit.float(),
+            splats.to(dtype=torch.float32), odd_camera, features=features.float(), limit=limit.float(),
             backend=backend, **options,
         )  # fmt: skip
         for output in ("image", "alpha", "depth", "normals", "features"):
@@ -230,20 +230,20 @@ def test_limits_agree_with_the_reference(name, fake_card, make_splats, odd_camer
 
 def test_limits_of_strips_and_windows(backend, make_splats, odd_camera):
     """Are those of the whole; an infinite one is none."""
-    splats = [t.float() for t in make_splats(150).values()]
+    splats = make_splats(150).to(dtype=torch.float32)
     limit = 2 + 2 * torch.rand(50, 75, generator=torch.Generator().manual_seed(3))
     options = {"outputs": ("median_depth",), "backend": backend}
-    whole = rasterize(*splats, odd_camera, limit=limit, **options)
+    whole = rasterize(splats, odd_camera, limit=limit, **options)
     for left, top, width, height in ((0, 0, 75, 50), (20, 7, 41, 36)):
         inside = slice(top, top + height), slice(left, left + width)
         window = {"window": (left, top, width, height), "limit": limit[inside]}
-        parts = [drawn for _, drawn in strips(*splats, odd_camera, strip=1, **window, **options)]
+        parts = [drawn for _, drawn in strips(splats, odd_camera, strip=1, **window, **options)]
         assert len(parts) > 2
         for output in ("image", "alpha", "median_depth"):
             found = torch.cat([getattr(part, output) for part in parts])
             torch.testing.assert_close(found, getattr(whole, output)[inside], atol=2e-5, rtol=1e-4)
-    free = rasterize(*splats, odd_camera, **options)
-    boundless = rasterize(*splats, odd_camera, limit=torch.full((50, 75), math.inf), **options)
+    free = rasterize(splats, odd_camera, **options)
+    boundless = rasterize(splats, odd_camera, limit=torch.full((50, 75), math.inf), **options)
     for output in ("image", "alpha", "median_depth"):
         one, other = getattr(boundless, output), getattr(free, output)
         if backend == "cuda":  # its limited pictures have the definition's cap
@@ -253,18 +253,18 @@ def test_limits_of_strips_and_windows(backend, make_splats, odd_camera):
 
 
 def test_a_limit_is_for_pictures(backend, make_splats, odd_camera):
-    splats = [t.float().requires_grad_() for t in make_splats(5).values()]
+    splats = make_splats(5).map(lambda t: t.float().requires_grad_())
     with pytest.raises(ValueError, match="it has no gradients"):
-        rasterize(*splats, odd_camera, limit=torch.ones(50, 75), backend=backend)
+        rasterize(splats, odd_camera, limit=torch.ones(50, 75), backend=backend)
     with pytest.raises(ValueError, match=r"limit must have shape \(50, 75\)"):
-        next(strips(*splats, odd_camera, limit=torch.ones(75, 50), backend=backend))
+        next(strips(splats, odd_camera, limit=torch.ones(75, 50), backend=backend))
 
 
 def test_median_depths_agree_with_the_reference(make_splats, odd_camera):
     """Pixel for pixel, but for those where rounding decides which splat reaches the half."""
     splats = make_splats(300)
-    exact = rasterize(*splats.values(), odd_camera, outputs=["median_depth"], backend="reference")
-    found = rasterize(*(t.float() for t in splats.values()), odd_camera, outputs=["median_depth"])
+    exact = rasterize(splats, odd_camera, outputs=["median_depth"], backend="reference")
+    found = rasterize(splats.to(dtype=torch.float32), odd_camera, outputs=["median_depth"])
     same = (found.median_depth - exact.median_depth).abs() < 1e-4
     assert same.float().mean() > 0.999
     assert 0.2 < (exact.median_depth > 0).float().mean() < 1
@@ -275,7 +275,7 @@ def test_what_two_splats_contribute_to_two_views(backend, axis_camera):
     splats = isotropic([4.0, 2.0], 0.3, [0.9, 0.5], [[1.0, 1.0, 1.0]] * 2)
     half = Camera("half", 32, 32, 20.0, 20.0, 16.0, 16.0, np.eye(4))
     away = Camera("away", 32, 32, 20.0, 20.0, 16.0, 16.0, np.diag([-1.0, 1.0, -1.0, 1.0]))
-    found = contributions(*splats[:4], [axis_camera, half, away], backend=backend)
+    found = contributions(splats, [axis_camera, half, away], backend=backend)
     expected = np.zeros((3, 2))
     for focal in (40, 20):
         far, near = (
@@ -310,24 +310,31 @@ def test_contributions_agree_with_the_reference(name, make_splats, odd_camera):
 
 
 def test_no_splats_leave_the_background(backend, axis_camera):
-    empty = [torch.zeros(0, *shape, requires_grad=True) for shape in ((3,), (4,), (3,), (), (16, 3))]
-    drawn = rasterize(*empty, axis_camera, background=(0.2, 0.4, 0.6), backend=backend)
+    shapes = (3,), (4,), (3,), (), (16, 3)
+    empty = Gaussians(*(torch.zeros(0, *shape, requires_grad=True) for shape in shapes))
+    drawn = rasterize(empty, axis_camera, background=(0.2, 0.4, 0.6), backend=backend)
     (drawn.image.sum() + drawn.alpha.sum()).backward()
     assert torch.equal(drawn.image.detach(), torch.tensor([0.2, 0.4, 0.6]).expand(32, 32, 3))
     assert drawn.alpha.abs().max() == 0
-    assert all(tensor.grad is not None and tensor.grad.shape == tensor.shape for tensor in empty)
+    assert all(
+        tensor.grad is not None and tensor.grad.shape == tensor.shape for tensor in vars(empty).values()
+    )
 
 
+@pytest.mark.slow
 def test_the_references_gradients_are_finite_differences(make_splats):
     camera = Camera("small", 9, 7, 12.0, 11.0, 4.2, 3.3, np.eye(4))
-    splats = [tensor.requires_grad_() for tensor in make_splats(3, seed=4, coefficients=4).values()]
+    splats = make_splats(3, seed=4, coefficients=4).map(torch.Tensor.requires_grad_)
     weights = torch.tensor([0.9, 0.5, 0.7], dtype=torch.float64, requires_grad=True)
 
     def draw(*tensors):
-        drawn = rasterize(*tensors[:5], camera, weights=tensors[5], min_scale=0.05, backend="reference")
+        *splats, weights = tensors
+        splats = Gaussians(*splats)
+        drawn = rasterize(splats, camera, weights=weights, min_scale=0.05, backend="reference")
         return drawn.image, drawn.alpha
 
-    assert torch.autograd.gradcheck(draw, (*splats, weights), eps=1e-7, atol=1e-6, check_undefined_grad=False)
+    tensors = (*vars(splats).values(), weights)
+    assert torch.autograd.gradcheck(draw, tensors, eps=1e-7, atol=1e-6, check_undefined_grad=False)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -347,18 +354,18 @@ def test_cpu_agrees_with_the_reference(name, make_splats, odd_camera):
 def test_thousands_of_splats_are_blended_on_a_pixel_of_the_crowd(make_splats, odd_camera):
     """What the scene above claims: opacities so low that darkness comes after more than a thousand."""
     splats, _ = scene("crowd", make_splats)
-    alpha = torch.sigmoid(splats["opacity_logits"])
+    alpha = torch.sigmoid(splats.opacity_logits)
     assert math.log(1e-4) / math.log(1 - alpha.mean().item()) > 1000
-    drawn = rasterize(*(t.float() for t in splats.values()), odd_camera)
+    drawn = rasterize(splats.to(dtype=torch.float32), odd_camera)
     assert drawn.alpha[25, 37] > 0.99
 
 
 def test_weight_zero_is_as_if_the_splat_were_not_there(backend, make_splats, odd_camera):
-    splats = [tensor.float() for tensor in make_splats(60).values()]
+    splats = make_splats(60).to(dtype=torch.float32)
     weights = (torch.arange(60) % 3 > 0).float()
-    splats[0][0] = float("nan")  # dropped before projection: not even looked at
-    some = rasterize(*splats, odd_camera, weights=weights, backend=backend)
-    kept = rasterize(*(tensor[weights > 0] for tensor in splats), odd_camera, backend=backend)
+    splats.means[0] = float("nan")  # dropped before projection: not even looked at
+    some = rasterize(splats, odd_camera, weights=weights, backend=backend)
+    kept = rasterize(splats.select(weights > 0), odd_camera, backend=backend)
     torch.testing.assert_close(some.image, kept.image)
     torch.testing.assert_close(some.radii[weights > 0], kept.radii)
     assert backend != "cpu" or torch.equal(some.image, kept.image)
@@ -366,37 +373,37 @@ def test_weight_zero_is_as_if_the_splat_were_not_there(backend, make_splats, odd
 
 
 def everything(splats, camera, truth):
-    leaves = [tensor.float().clone().requires_grad_() for tensor in splats.values()]
-    drawn = rasterize(*leaves, camera)
+    leaves = splats.map(lambda tensor: tensor.float().clone().requires_grad_())
+    drawn = rasterize(leaves, camera)
     loss = photometric_loss(drawn.image, truth)
     loss.backward()
     return [drawn.image.detach(), drawn.alpha.detach(), drawn.radii, drawn.grad2d, loss.detach()] + [
-        leaf.grad for leaf in leaves
+        leaf.grad for leaf in vars(leaves).values()
     ]
 
 
-def test_pictures_for_eyes_are_what_training_sees(backend, make_splats, odd_camera, axis_camera):
+def test_rendered_pictures_are_what_training_sees(backend, make_splats, odd_camera, axis_camera):
     """In one piece and in strips of 16 rows, of every kind."""
-    splats = [t.float() for t in make_splats(150).values()]
+    splats = make_splats(150).to(dtype=torch.float32)
     options = {"background": (0.9, 0.2, 0.4), "sh_degree": 1, "min_scale": 0.01, "backend": backend}
     cameras = [odd_camera, axis_camera]
     for camera, whole, parts, small, half in zip(
         cameras,
-        render(*splats, cameras, **options),
-        render(*splats, cameras, strip=1, **options),
-        render(*splats, cameras, kind="uint8", **options),
-        render(*splats, cameras, kind="float16", **options),
+        render(splats, cameras, **options),
+        render(splats, cameras, strip=1, **options),
+        render(splats, cameras, dtype="uint8", **options),
+        render(splats, cameras, dtype="float16", **options),
         strict=True,
     ):
-        drawn = rasterize(*splats, camera, **options)
+        drawn = rasterize(splats, camera, **options)
         expected = torch.cat([drawn.image, drawn.alpha[..., None]], 2).numpy()
         np.testing.assert_array_equal(whole, expected)
         np.testing.assert_allclose(parts, expected, atol=2e-5)
         assert small.dtype == np.uint8 and half.dtype == np.float16
         np.testing.assert_array_equal(small, np.round(expected.clip(0, 1) * 255))
         np.testing.assert_allclose(half, expected, atol=2e-3)
-    with pytest.raises(ValueError, match="kind can be"):
-        next(render(*splats, cameras, kind="int8"))
+    with pytest.raises(ValueError, match="dtype can be"):
+        next(render(splats, cameras, dtype="int8"))
 
 
 def test_the_same_bits_whatever_the_number_of_threads(make_splats, odd_camera):
@@ -447,10 +454,10 @@ def test_ranges_are_fine_enough_for_sixteen_threads(make_splats, sixteen_threads
     """Work counted in pairs for tiles, in rows for the rest: whoever is free takes the next range."""
     width, height = 640, 480
     camera = Camera("even", width, height, 500.0, 500.0, 320.0, 240.0, np.eye(4))
-    splats = {name: tensor.float() for name, tensor in make_splats(40_000).items()}
-    splats["means"][:, :2] *= splats["means"][:, 2:] * 0.7
-    splats["log_scales"] -= 2
-    leaves = [tensor.requires_grad_() for tensor in splats.values()]
+    splats = make_splats(40_000).to(dtype=torch.float32)
+    splats.means[:, :2] *= splats.means[:, 2:] * 0.7
+    splats.log_scales.sub_(2)
+    leaves = splats.map(torch.Tensor.requires_grad_)
     dealt = []
 
     def spy(kernel, total, grain, *args):
@@ -458,7 +465,7 @@ def test_ranges_are_fine_enough_for_sixteen_threads(make_splats, sixteen_threads
         in_parallel(kernel, total, grain, *args)
 
     monkeypatch.setattr(cpu, "in_parallel", spy)
-    drawn = rasterize(*leaves, camera)
+    drawn = rasterize(leaves, camera)
     drawn.image.sum().backward()
     tiles = drawn.tile_counts.flatten().numpy()
     assert {name for name, *_ in dealt} >= {"project_forward", "blend_forward", "blend_backward"}
@@ -474,13 +481,13 @@ def test_two_renderings_may_wait_for_their_backward(make_splats, odd_camera, axi
     splats = make_splats(100)
     alone = []
     for camera in (odd_camera, axis_camera):
-        leaves = [tensor.float().clone().requires_grad_() for tensor in splats.values()]
-        rasterize(*leaves, camera).image.square().sum().backward()
-        alone.append([leaf.grad for leaf in leaves])
-    leaves = [tensor.float().clone().requires_grad_() for tensor in splats.values()]
-    images = [rasterize(*leaves, camera).image.square().sum() for camera in (odd_camera, axis_camera)]
+        leaves = splats.map(lambda tensor: tensor.float().clone().requires_grad_())
+        rasterize(leaves, camera).image.square().sum().backward()
+        alone.append([leaf.grad for leaf in vars(leaves).values()])
+    leaves = splats.map(lambda tensor: tensor.float().clone().requires_grad_())
+    images = [rasterize(leaves, camera).image.square().sum() for camera in (odd_camera, axis_camera)]
     sum(images).backward()
-    for leaf, first, second in zip(leaves, *alone, strict=True):
+    for leaf, first, second in zip(vars(leaves).values(), *alone, strict=True):
         torch.testing.assert_close(leaf.grad, first + second)
 
 
@@ -606,21 +613,22 @@ def test_exp2_is_right_to_a_few_parts_in_a_million():
 
 
 def test_what_does_not_belong_together_is_refused(make_splats, odd_camera):
-    splats = [tensor.float() for tensor in make_splats(5).values()]
+    splats = make_splats(5).to(dtype=torch.float32)
     with pytest.raises(ValueError, match=r"quats must have shape \(5, 4\)"):
-        rasterize(splats[0], splats[1][:4], *splats[2:], odd_camera)
+        replace(splats, quats=splats.quats[:4])
     with pytest.raises(ValueError, match="asks for 4"):
-        rasterize(*splats, odd_camera, sh_degree=4)
+        rasterize(splats, odd_camera, sh_degree=4)
     with pytest.raises(ValueError, match="outputs can be depth"):
-        rasterize(*splats, odd_camera, outputs=["depths"])
+        rasterize(splats, odd_camera, outputs=["depths"])
     with pytest.raises(ValueError, match="float32"):
-        rasterize(*(tensor.double() for tensor in splats), odd_camera, backend="cpu")
+        rasterize(splats.to(dtype=torch.float64), odd_camera, backend="cpu")
     with pytest.raises(LodgsError, match="gpu"):
-        rasterize(*splats, odd_camera, backend="gpu")
+        rasterize(splats, odd_camera, backend="gpu")
     with pytest.raises(ValueError, match="differ in shape"):
         photometric_loss(torch.zeros(4, 5, 3), Target(torch.zeros(5, 4, 3)))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes are not forked elsewhere")
 def test_the_first_time_two_processes_compile_every_kernel_once(tmp_path):
     program = """

@@ -5,22 +5,22 @@ import json
 import numpy as np
 import OpenEXR
 import pytest
-import torch
 from PIL import Image
 
 from tests.training.conftest import write_tiny_scene
 from training.__main__ import main
-from training.rasterize import render
+from training.rasterize import Gaussians, render
 from training.runs.job import Job
 from training.scenes.cameras import camera_as_dict, read_camera, write_camera
 from training.splats.bundle import Bundle, Level, write_bundle
+from training.splats.ply import write_ply
 
 
 @pytest.fixture
 def bundle(make_splats, tmp_path):
-    levels = [Level(1, make_splats(30), 0.2), Level(2, make_splats(60, seed=1), 0.0)]
+    levels = [Level(1, make_splats(30), {"s_min": 0.2}), Level(2, make_splats(60, seed=1), {"s_min": 0.0})]
     path = tmp_path / "bundle.ply"
-    write_bundle(path, Bundle("flod", levels))
+    write_bundle(path, Bundle("flod", levels, "bands"))
     return path, levels
 
 
@@ -30,8 +30,7 @@ def pixels(path):
 
 
 def expected(splats, camera, near=0.01):
-    columns = (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh)
-    return next(render(*map(torch.from_numpy, columns), [camera], near=near, kind="uint8"))[..., :3]
+    return next(render(Gaussians.of(splats), [camera], near=near, dtype="uint8"))[..., :3]
 
 
 def test_a_camera_survives_its_file(camera, tmp_path):
@@ -46,7 +45,7 @@ def test_levels_of_a_bundle(bundle, camera, tmp_path):
     common = ["render", str(path), "--camera", str(tmp_path / "camera.json"), "--out"]
     assert main([*common, str(tmp_path / "fine.png")]) == 0
     assert main([*common, str(tmp_path / "coarse.png"), "--level", "1"]) == 0
-    assert main([*common, str(tmp_path / "far.png"), "--from", "1", "--to", "2", "--gamma", "1e-6"]) == 0
+    assert main([*common, str(tmp_path / "far.png"), "--first", "1", "--last", "2", "--gamma", "0.01"]) == 0
     fine, coarse = (expected(level.splats, camera) for level in reversed(levels))
     assert np.abs(fine.astype(int) - coarse).max() > 20
     np.testing.assert_array_equal(pixels(tmp_path / "fine.png"), fine)
@@ -96,8 +95,9 @@ def test_a_holdout(bundle, camera, tmp_path):
     ("options", "sentence"),
     [
         (["--level", "7"], "There is no level 7. Choose from 1 (coarsest) to 2."),
-        (["--from", "2", "--to", "1"], "Levels 2 to 1 with gamma 1 cannot be shown."),
-        (["--gamma", "0"], "cannot be shown"),
+        (["--first", "2", "--last", "1"], "Levels 2 to 1 cannot be shown."),
+        (["--gamma", "0"], "gamma = 0.0 is not possible. Give a number from 0.01 to 1000."),
+        (["--offset", "1"], "The rule 'bands' has no option 'offset'. It has: gamma, first, last."),
         (["--gamma", "1", "--level", "1"], "Choose one."),
         (["--out", "a.gif"], "neither .png nor .exr"),
         (["--holdout", "gone.exr"], "There is no mesh depth gone.exr."),
@@ -143,3 +143,23 @@ def test_what_has_no_views_says_so(bundle, tmp_path, capsys):
     assert "No photograph is called a.jpg. There are: 00.jpg" in capsys.readouterr().err
     assert main(["render", str(tmp_path / "no.ply"), "--view", "a.jpg", *out]) == 2
     assert "There is no" in capsys.readouterr().err
+
+
+def test_what_is_drawn_otherwise_is_said(make_splats, camera, tmp_path, capsys):
+    write_camera(tmp_path / "camera.json", camera, 0.01)
+    write_ply(tmp_path / "mip.ply", make_splats(5), ["SplatRenderMode: mip"])
+    levels = [Level(1, make_splats(5)), Level(2, make_splats(9))]
+    write_bundle(tmp_path / "foreign.ply", Bundle("sundial", levels, "shadow"))
+
+    def said(*words):
+        out = tmp_path / "a.png"
+        assert (
+            main(["render", *map(str, words), "--camera", str(tmp_path / "camera.json"), "--out", str(out)])
+            == 0
+        )
+        return capsys.readouterr().err
+
+    assert said(tmp_path / "mip.ply").startswith("warning: ")
+    text = said(tmp_path / "foreign.ply")
+    assert text.count("\n") == 1 and "the rule 'shadow'" in text and "the finest level is shown" in text
+    assert said(tmp_path / "foreign.ply", "--level", 1) == ""

@@ -8,9 +8,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from training.errors import LodgsError
-from training.rasterize import rasterize
+from training.rasterize import Gaussians, rasterize
 from training.render.picture import NOTHING
-from training.render.scene import Placed, SplatSet, draw
+from training.render.scene import Instance, SplatSet, draw
 from training.splats.gaussians import Splats
 
 
@@ -31,21 +31,20 @@ def moved(camera, matrix):
 def test_it_draws_what_the_rasterizer_draws(make_splats, camera):
     splats = make_splats(200)
     weights = np.random.default_rng(1).uniform(size=200).astype(np.float32)
-    picture = draw([Placed(SplatSet(splats, weights))], camera, background=(0.2, 0.5, 0.9))
-    columns = (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh)
+    picture = draw([Instance(SplatSet(splats, weights))], camera, background=(0.2, 0.5, 0.9))
     drawn = rasterize(
-        *map(torch.from_numpy, columns), camera, weights=torch.from_numpy(weights), background=(0.2, 0.5, 0.9)
+        Gaussians.of(splats), camera, weights=torch.from_numpy(weights), background=(0.2, 0.5, 0.9)
     )
     np.testing.assert_array_equal(picture.image, drawn.image)
     assert (picture.alpha == 1).all()
-    clear = draw([Placed(SplatSet(splats, weights))], camera, background=None)
+    clear = draw([Instance(SplatSet(splats, weights))], camera, background=None)
     np.testing.assert_allclose(clear.alpha, drawn.alpha)
 
 
 def test_one_set_looks_the_same_wherever_it_stands(make_splats, camera):
     placed, matrix = SplatSet(make_splats(200)), transform((0.3, -0.8, 2), 3.0, (5, -2, 7))
-    here = draw([Placed(placed)], camera, depth=True)
-    there = draw([Placed(placed, matrix)], moved(camera, matrix), near=0.03, depth=True)
+    here = draw([Instance(placed)], camera, depth=True)
+    there = draw([Instance(placed, matrix)], moved(camera, matrix), near=0.03, depth=True)
     np.testing.assert_allclose(there.image, here.image, atol=2e-5)
     covered = here.depth < NOTHING
     assert covered.any()
@@ -57,8 +56,8 @@ def test_sets_in_several_places_keep_their_colours(make_splats, camera):
     splats, matrix = SplatSet(make_splats(200)), transform((1, 0.5, -2), 0.5, (1, 2, 3))
     far = SplatSet(make_splats(1))
     behind = transform(translation=(0, 0, -1e4))
-    here = draw([Placed(splats)], camera)
-    there = draw([Placed(splats, matrix), Placed(far, behind)], moved(camera, matrix))
+    here = draw([Instance(splats)], camera)
+    there = draw([Instance(splats, matrix), Instance(far, behind)], moved(camera, matrix))
     np.testing.assert_allclose(there.image, here.image, atol=1e-4)
 
 
@@ -76,8 +75,8 @@ def test_two_sets_are_sorted_together(make_splats, camera):
         opacity_logits=second.opacity_logits,
         sh=second.sh,
     )
-    together = draw([Placed(SplatSet(first)), Placed(SplatSet(second), matrix)], camera)
-    one = draw([Placed(SplatSet(Splats.concatenated([first, by_hand])))], camera)
+    together = draw([Instance(SplatSet(first)), Instance(SplatSet(second), matrix)], camera)
+    one = draw([Instance(SplatSet(Splats.concatenated([first, by_hand])))], camera)
     np.testing.assert_allclose(together.image, one.image, atol=1e-4)
 
 
@@ -91,7 +90,8 @@ def test_a_set_that_is_no_longer_similar_has_the_covariances_of_its_transform(ma
     whole = np.eye(4)
     whole[:3, :3] = linear
     splats = make_splats(50)
-    means, quats, log_scales = SplatSet(splats).in_world(whole)
+    there = SplatSet(splats).in_world(whole)
+    means, quats, log_scales = there.means, there.quats, there.log_scales
 
     def covariances(quats, log_scales):
         axes = Rotation.from_quat(np.asarray(quats, float)[:, [1, 2, 3, 0]]).as_matrix()
@@ -115,8 +115,8 @@ def wall(z: float, color: tuple[float, float, float]) -> Splats:
 def test_depth_and_levels(camera):
     """A half transparent wall of level 2 before an opaque one of level 3 (alpha is capped at 0.99)."""
     camera = replace(camera, world_to_camera=np.eye(4))
-    before = Placed(SplatSet(wall(2, (1, 0, 0)), np.float32([0.25])), level=2)
-    behind = Placed(SplatSet(wall(6, (0, 1, 0))), level=3)
+    before = Instance(SplatSet(wall(2, (1, 0, 0)), np.float32([0.25])), level=2)
+    behind = Instance(SplatSet(wall(6, (0, 1, 0))), level=3)
     picture = draw([before, behind], camera, depth=True, levels=True, background=None)
     center = 24, 32
     assert picture.depth[center] == pytest.approx(6)
@@ -141,7 +141,7 @@ def test_meshes_hold_out_what_is_behind_them(camera, background, scale):
     def placed(z, color, weight):
         splats = wall(z / scale, color)
         splats.log_scales -= np.float32(np.log(scale))
-        return Placed(SplatSet(splats, np.float32([weight])), matrix, level=int(z))
+        return Instance(SplatSet(splats, np.float32([weight])), matrix, level=int(z))
 
     both = [placed(2, (1, 0, 0), 0.25), placed(6, (0, 1, 0), 1)]
     picture = draw(both, camera, limit=limit, background=background, depth=True, levels=True)
@@ -165,7 +165,7 @@ def test_meshes_hold_out_what_is_behind_them(camera, background, scale):
 
 
 def test_nothing_to_draw_is_the_background(camera, make_splats):
-    nothing = Placed(SplatSet(make_splats(3).select(slice(0))), level=1)
+    nothing = Instance(SplatSet(make_splats(3).select(slice(0))), level=1)
     for placed in ([], [nothing]):
         picture = draw(placed, camera, background=(0.1, 0.2, 0.3), depth=True, levels=True)
         assert picture.image[5, 5] == pytest.approx((0.1, 0.2, 0.3))
@@ -176,10 +176,10 @@ def test_nothing_to_draw_is_the_background(camera, make_splats):
 def test_it_ends_when_it_is_no_longer_wanted(make_splats, camera, monkeypatch):
     monkeypatch.setattr("training.render.scene.STRIP", 1)
     told = []
-    picture = draw([Placed(SplatSet(make_splats(5)))], camera, wanted=lambda share: told.append(share))
+    picture = draw([Instance(SplatSet(make_splats(5)))], camera, progress=lambda share: told.append(share))
     assert picture is None and told == [pytest.approx(16 / 48)]
 
 
 def test_a_flat_transform_is_refused(make_splats, camera):
     with pytest.raises(LodgsError, match="scaled to nothing"):
-        draw([Placed(SplatSet(make_splats(5)), np.diag([1.0, 1, 0, 1]))], camera)
+        draw([Instance(SplatSet(make_splats(5)), np.diag([1.0, 1, 0, 1]))], camera)

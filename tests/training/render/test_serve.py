@@ -11,7 +11,7 @@ import OpenEXR
 import pytest
 
 from training.render import wire
-from training.render.scene import Placed, SplatSet, draw
+from training.render.scene import Instance, SplatSet, draw
 from training.scenes.cameras import camera_as_dict
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -73,7 +73,7 @@ def test_frames_are_what_draw_draws(client, make_splats, camera):
         assert answer["frame"] == frame
         planes = wire.read_planes(client.folder / "frame", len(answer["passes"]), 48, 64)
         picture = draw(
-            [Placed(SplatSet(splats, weights), matrix, 4)], camera, background=None, depth=True, levels=True
+            [Instance(SplatSet(splats, weights), matrix, 4)], camera, background=None, depth=True, levels=True
         )
         expected = picture.passes()
         assert answer["passes"] == list(expected)
@@ -93,7 +93,7 @@ def test_a_holdout_is_read_and_told_where_it_cannot_be(client, make_splats, came
     client.say(**request(camera, sets, **told))
     answer = client.hear("frame", "error")
     planes = wire.read_planes(client.folder / "frame", len(answer["passes"]), 40, 30)
-    placed, window = [Placed(SplatSet(splats))], (10, 5, 30, 40)
+    placed, window = [Instance(SplatSet(splats))], (10, 5, 30, 40)
     expected = draw(placed, camera, background=None, window=window, limit=depth[5:45, 10:40])
     free = draw(placed, camera, background=None, window=window)
     np.testing.assert_array_equal(planes[3], expected.linear()[..., 3])
@@ -114,6 +114,7 @@ def test_mistakes_are_answered_and_survived(client, make_splats, camera):
     assert client.hear("frame", "error")["frame"] == 9
 
 
+@pytest.mark.slow
 def test_a_frame_is_cancelled(client, make_splats, camera):
     client.hear("hello")
     wire.write_set(client.folder / "one", wire.packed(make_splats(3000), None))
@@ -129,6 +130,7 @@ def test_a_frame_is_cancelled(client, make_splats, camera):
     assert not (client.folder / "frame").stat().st_size > 8 * 4 * 64 * 48
 
 
+@pytest.mark.slow
 def test_it_ends_with_the_program_that_started_it(client, make_splats, camera):
     """In the middle of a large frame, too; and what it kept on the disk is gone."""
     client.hear("hello")

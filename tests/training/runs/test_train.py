@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from training.methods import MODULES
+from training.methods import METHODS
 from training.runs import train as training_loop
 from training.runs.folder import RunFolder
 from training.runs.job import Job
@@ -32,7 +32,7 @@ def run_in_process(keys: dict) -> tuple[int, list[dict]]:
 
 
 def method_of(keys: dict) -> type:
-    return import_module(f"training.methods.{MODULES[keys['method']]}").Method
+    return import_module(f"{METHODS[keys['method']].package}.train").Method
 
 
 def lasting(keys: dict, total: int) -> dict:
@@ -103,16 +103,17 @@ def test_levels_and_bundle_agree_and_record_the_constraint(unbroken):
         assert len(level.splats) == event["splats"]
         np.testing.assert_array_equal(level.splats.means, alone.means)
         assert level.splats.extras.keys() == alone.extras.keys()
-        assert level.s_min == event["s_min"]
-        if level.s_min:
-            assert np.exp(alone.log_scales).min() >= level.s_min * (1 - 1e-5)
+        assert level.facts == event["facts"]
+        if level.facts.get("s_min"):
+            assert np.exp(alone.log_scales).min() >= level.facts["s_min"] * (1 - 1e-5)
     upright = up_rotation(read_scene(Path(unbroken["keys"]["scene"])).cameras)
     np.testing.assert_allclose(bundle.meta["up_rotation"], upright, atol=1e-6)
     if bundle.method == "flod":
         assert bundle.meta["footprint_px"] == pytest.approx(6.0)
     else:
-        assert bundle.cumulative and bundle.meta["d_max"] > 0
-        assert bundle.meta["voxel"] * bundle.meta["focal_px"] / bundle.meta["d_max"] == pytest.approx(6.0)
+        assert bundle.cumulative and bundle.rule == "octree"
+        d_max, focal_px = bundle.facts["d_max"], bundle.facts["d_max_focal"]
+        assert bundle.meta["voxel"] * focal_px / d_max == pytest.approx(6.0)
 
 
 def test_training_makes_the_pictures_better(unbroken):
@@ -120,6 +121,7 @@ def test_training_makes_the_pictures_better(unbroken):
     assert quality == sorted(quality) and quality[-1] > quality[0] + 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [3, 23, 44])
 def test_a_killed_run_resumes_to_the_same_bits(unbroken, tmp_path, step):
     keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
@@ -210,6 +212,7 @@ def test_a_gpu_that_is_not_used_is_a_warning(unbroken, tmp_path, monkeypatch):
     assert "pip install gsplat" in warning
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="Windows cancels by the file")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_polite_signal_saves(unbroken, tmp_path, number):
@@ -228,6 +231,7 @@ def test_a_polite_signal_saves(unbroken, tmp_path, number):
     assert folder.state() == "cancelled" and list(folder.checkpoints.glob("*.pt"))
 
 
+@pytest.mark.slow
 def test_two_trainings_in_one_folder_are_refused_and_the_first_goes_on(unbroken, tmp_path):
     keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
     folder = RunFolder(keys["out"])
@@ -289,6 +293,20 @@ def test_a_damaged_checkpoint_falls_back_to_the_one_before(unbroken, tmp_path):
     assert folder.bundle.read_bytes() == unbroken["bundle"]
 
 
+def test_a_checkpoint_of_another_version_leaves_nothing_behind(unbroken, tmp_path):
+    keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
+    assert run_in_process(keys)[0] == 0
+    folder = RunFolder(keys["out"])
+    for path in folder.checkpoints.glob("*.pt"):
+        state = torch.load(path, weights_only=True)
+        del state["method"]["model"]["stats"]  # 0.1.0 kept them elsewhere
+        torch.save(state, path)
+    folder.bundle.unlink()
+    code, events = run_in_process(keys)
+    assert code == 0 and folder.bundle.read_bytes() == unbroken["bundle"]
+    assert any("cannot be read" in event.get("message", "") for event in events)
+
+
 def test_an_unexpected_error_is_an_event_and_its_details_go_to_the_log(
     unbroken, tmp_path, monkeypatch, capsys
 ):
@@ -302,6 +320,7 @@ def test_an_unexpected_error_is_an_event_and_its_details_go_to_the_log(
     assert "Traceback" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change, said",
     [

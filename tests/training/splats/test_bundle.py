@@ -12,12 +12,11 @@ from plyfile import PlyData
 from training.errors import LodgsError
 from training.splats.bundle import (
     Bundle,
-    Facts,
     Level,
     describe,
     read_bundle,
-    read_facts,
     read_folder,
+    read_head,
     write_bundle,
     write_folder,
 )
@@ -45,29 +44,34 @@ def bundle(make_splats):
         extras = {"decay": np.arange(count, dtype="f4") + number, "label": np.arange(count).astype("u1")}
         if number == 2:
             extras["only_here"] = np.arange(count, dtype="f8") / 3
-        levels.append(Level(number, make_splats(count, 3, **extras), s_min))
-    return Bundle("flod", levels, META)
+        levels.append(Level(number, make_splats(count, 3, **extras), {"s_min": s_min}))
+    return Bundle("flod", levels, "bands", {}, {"gamma": 1.5}, meta=META)
 
 
 def check_same(a: Bundle, b: Bundle, same):
-    assert (a.method, a.meta, a.cumulative) == (b.method, b.meta, b.cumulative)
-    assert [(x.number, x.s_min) for x in a.levels] == [(x.number, x.s_min) for x in b.levels]
+    for name in ("method", "rule", "facts", "controls", "cumulative", "meta"):
+        assert getattr(a, name) == getattr(b, name), name
+    assert [(x.number, x.facts) for x in a.levels] == [(x.number, x.facts) for x in b.levels]
     assert all(same(x.splats, y.splats) for x, y in zip(a.levels, b.levels, strict=True))
 
 
 @pytest.mark.parametrize("cumulative", [False, True])
-def test_facts_are_those_of_the_bundle(tmp_path, bundle, cumulative, monkeypatch):
+def test_the_head_is_that_of_the_bundle(tmp_path, bundle, cumulative, monkeypatch):
     bundle.cumulative = cumulative
     write_bundle(tmp_path / "b.ply", bundle)
     monkeypatch.setattr("training.splats.bundle.splats_from", None)  # no splat is looked at
-    facts = read_facts(tmp_path / "b.ply")
-    assert (facts.method, facts.numbers, facts.meta) == ("flod", [1, 2, 3], META)
-    assert facts.cumulative is cumulative
+    head = read_head(tmp_path / "b.ply")
+    assert (head.method, head.rule, head.controls, head.meta) == ("flod", "bands", {"gamma": 1.5}, META)
+    assert [(level.number, level.facts) for level in head.levels] == [
+        (n, {"s_min": s_min}) for n, s_min in enumerate(S_MIN, 1)
+    ]
+    assert head.cumulative is cumulative
     write_ply(tmp_path / "plain.ply", bundle.levels[0].splats)
-    assert read_facts(tmp_path / "plain.ply") == Facts("", [1])
+    plain = read_head(tmp_path / "plain.ply")
+    assert (plain.method, plain.rule, [level.number for level in plain.levels]) == ("", "", [1])
     (tmp_path / "b.ply").write_bytes((tmp_path / "b.ply").read_bytes().replace(b'"level":2', b'"level":[]'))
     with pytest.raises(LodgsError, match="cannot be followed"):
-        read_facts(tmp_path / "b.ply")
+        read_head(tmp_path / "b.ply")
 
 
 @pytest.mark.parametrize("order", ["finest_first", "stream"])
@@ -159,10 +163,11 @@ def test_readers_that_sum_all_properties_need_the_plain_file(tmp_path, bundle):
 
 def test_header_of_five_full_levels_stays_under_10_kb(tmp_path, make_splats):
     levels = [
-        Level(i, make_splats(2, 3, decay=np.zeros(2, "f4")), 0.123456789012345678 / i) for i in range(1, 6)
+        Level(i, make_splats(2, 3, decay=np.zeros(2, "f4")), {"s_min": 0.123456789012345678 / i})
+        for i in range(1, 6)
     ]
     meta = META | {f"parameter_{i}": i / 7 for i in range(12)}
-    write_bundle(tmp_path / "b.ply", Bundle("flod", levels, meta))
+    write_bundle(tmp_path / "b.ply", Bundle("flod", levels, "bands", meta=meta))
     assert (tmp_path / "b.ply").read_bytes().index(b"end_header\n") < 10 * 1024
 
 
@@ -219,9 +224,9 @@ def test_a_bundle_cut_short_says_what_is_missing(tmp_path, bundle, missing):
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        (b'lodsplat {"v":1', b'lodsplat {"v":1,'),
-        (b'lodsplat {"v":1,', b"lodsplat {"),
-        (b'lodsplat {"v":1,', b'lodsplat {"v":99,'),
+        (b'lodsplat {"v":2', b'lodsplat {"v":2,'),
+        (b'lodsplat {"v":2,', b"lodsplat {"),
+        (b'lodsplat {"v":2,', b'lodsplat {"v":99,'),
         (b'"element":"lod_2_vertex"', b'"element":"lod_9_vertex"'),
         (b'"level":2,"lod":1,"count":20', b'"level":2,"lod":1,"count":21'),
         (b'"extras":"lod_extra_1"', b'"extras":"lod_extra_2"'),
@@ -229,7 +234,19 @@ def test_a_bundle_cut_short_says_what_is_missing(tmp_path, bundle, missing):
         (b'{"level":1', b'[{"level":1'),
         (b'{"level":1,', b'{"level":"one",'),
         (b'"meta":{', b'"meta":{"up_rotation":[0,0,1],'),
-        (b'"meta":{', b'"meta":{"d_max":"far",'),
+        (b'"gamma":1.5', b'"gamma":"far"'),
+        (b'"rule":"bands"', b'"rule":null'),
+        (b'"cumulative":false', b'"cumulative":"false"'),
+        (b'"count":20,', b'"count":19,'),
+        (b'"level":2,', b'"level":"2",'),
+        (b'"level":2,', b'"level":2.5,'),
+        (b'"level":2,', b'"level":1e400,'),
+        (b'"level":1,', b'"level":0,'),
+        (b'"level":3,', b'"level":1099511627776,'),
+        (b'"meta":{', b'"meta":[],"was":{'),
+        (b'"camera_center":[', b'"camera_center":[NaN,0,0],"was":['),
+        (b'"camera_center":[', b'"camera_center":["1","2","3"],"was":['),
+        (b'"facts":{},', b'"facts":' + b"[" * 5000 + b","),
     ],
 )
 def test_a_header_that_contradicts_itself_is_one_sentence(tmp_path, bundle, old, new):
@@ -245,9 +262,10 @@ def test_a_header_that_contradicts_itself_is_one_sentence(tmp_path, bundle, old,
 
 def test_no_damage_to_the_header_is_a_traceback(tmp_path, make_splats):
     """Bytes changed, lost and inserted anywhere in the header: read, or one sentence that names the file."""
-    levels = [Level(1, make_splats(3, 1), 0.5), Level(2, make_splats(9, 1, id=np.arange(9, dtype="u1")), 0.0)]
+    finer = make_splats(9, 1, id=np.arange(9, dtype="u1"))
+    levels = [Level(1, make_splats(3, 1), {"s_min": 0.5}), Level(2, finer)]
     path = tmp_path / "b.ply"
-    write_bundle(path, Bundle("flod", levels, {"gamma": 1}))
+    write_bundle(path, Bundle("flod", levels, "bands", {}, {"gamma": 1}, meta={"gamma": 1}))
     whole = path.read_bytes()
     end = whole.index(b"end_header\n") + len(b"end_header\n")
     random = np.random.default_rng(5)
@@ -302,12 +320,38 @@ def test_folder_reads_back_and_its_manifest_tells_the_truth(tmp_path, bundle, sa
     check_same(bundle, read_folder(tmp_path / "f"), same)
 
 
-def test_folder_of_a_cumulative_bundle_holds_complete_scenes(tmp_path, bundle):
+def test_folder_of_a_cumulative_bundle_holds_complete_scenes_and_reads_back(tmp_path, bundle, same):
     bundle.cumulative = True
+    for level in bundle.levels:
+        level.splats.extras.pop("only_here", None)
     write_folder(tmp_path, bundle)
-    assert [len(level.splats) for level in read_folder(tmp_path).levels] == [3, 23, 5023]
+    assert [len(read_ply(tmp_path / f"lod{lod}.ply")) for lod in (2, 1, 0)] == [3, 23, 5023]
     expected = Splats.concatenated([level.splats for level in bundle.levels])
     np.testing.assert_array_equal(read_ply(tmp_path / "lod0.ply").sh, expected.sh)
+    check_same(bundle, read_folder(tmp_path), same)
+    write_ply(tmp_path / "lod1.ply", expected)
+    with pytest.raises(LodgsError, match="level 2 should have 23 splats"):
+        read_folder(tmp_path)
+
+
+def test_tables_come_back_and_have_no_place_in_a_folder(tmp_path, bundle, same):
+    rng = np.random.default_rng(0)
+    bundle.tables = {
+        "chunks": {"x": rng.normal(size=7).astype("f4"), "splats": np.arange(7, dtype="u4")},
+        "empty": {"x": np.zeros(0, "f4")},
+    }
+    write_bundle(tmp_path / "b.ply", bundle)
+    again = read_bundle(tmp_path / "b.ply")
+    check_same(bundle, again, same)
+    assert again.tables.keys() == bundle.tables.keys()
+    for name, table in bundle.tables.items():
+        for column, values in table.items():
+            np.testing.assert_array_equal(again.tables[name][column], values)
+            assert again.tables[name][column].dtype == values.dtype
+    assert "table chunks: 7 rows of x, splats" in describe(tmp_path / "b.ply")
+    with pytest.raises(LodgsError, match="no place for their tables"):
+        write_folder(tmp_path / "f", bundle)
+    assert not (tmp_path / "f").exists()
 
 
 def test_folder_without_manifest(tmp_path, make_splats):
@@ -336,12 +380,12 @@ def test_describe(tmp_path, bundle):
     write_bundle(tmp_path / "b.ply", bundle)
     text = describe(tmp_path / "b.ply")
     assert "flod, 3 levels" in text and "SH degree 3" in text and "(-1, 2, 0) to (5, 2, 3)" in text
-    rows = [line.split() for line in text.splitlines()[3:6]]
+    rows = [line.split() for line in text.splitlines()[4:7]]
     assert [row[:2] for row in rows] == [["1", "3"], ["2", "20"], ["3", "5,000"]]
     # 62 floats, a float and a byte of extras each
     assert rows[2][2] == f"{5000 * (62 * 4 + 5) / 1e6:.2f}" and rows[1][3] == "0.333333"
     assert "focal_px: 601.23456789" in text
     write_folder(tmp_path / "f", bundle)
-    assert describe(tmp_path / "f").splitlines()[3].split()[:2] == ["1", "3"]
+    assert describe(tmp_path / "f").splitlines()[4].split()[:2] == ["1", "3"]
     write_ply(tmp_path / "plain.ply", bundle.levels[0].splats)
     assert "plain 3DGS PLY, 1 level," in describe(tmp_path / "plain.ply")

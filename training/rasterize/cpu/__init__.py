@@ -9,12 +9,13 @@ calls ``torch.set_num_threads(1)``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
-from ..rendering import Drawn, Target, View
+from ..gaussians import Gaussians
+from ..rendering import Drawn, Settings, Target, View
 from .bin import TILE, Pairs, bin_splats
 from .blend import blend_backward, blend_backward_absolute, blend_forward, blend_median, blend_weights
 from .compile import Buffers, f32, in_parallel, serialised
@@ -39,56 +40,48 @@ TILES = 16
 
 
 def rasterize(
-    means: torch.Tensor,
-    quats: torch.Tensor,
-    log_scales: torch.Tensor,
-    opacity_logits: torch.Tensor,
-    sh: torch.Tensor,
-    weights: torch.Tensor | None,
-    features: torch.Tensor,
-    *,
-    view: View,
-    background: tuple[float, float, float],
-    degree: int,
-    min_scale: float,
-    antialias: bool,
-    median: bool,
-    absolute: bool,
-    limit: torch.Tensor | None,
+    gaussians: Gaussians, weights: torch.Tensor | None, features: torch.Tensor, settings: Settings
 ) -> Drawn:
     """See :func:`training.rasterize.rasterize`. Tensors are float32 on the CPU; ValueError otherwise.
 
     The image is laid out in planes: ``image.permute(2, 0, 1)`` is contiguous.
     """
+    view, limit, count = settings.view, settings.limit, len(gaussians)
     weights = torch.ones(0) if weights is None else weights
-    tensors = means, quats, log_scales, opacity_logits, sh, weights, features
+    tensors = *vars(gaussians).values(), weights, features
     for tensor in tensors:
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
             raise ValueError(
                 f"the cpu backend takes float32 on the CPU, not {tensor.dtype} on {tensor.device}"
             )
-    aside = _Aside(
-        radii=torch.zeros(len(means)),
-        grad2d=torch.zeros(len(means), 2),
-        absgrad2d=torch.zeros(len(means), 2) if absolute else None,
-        median=torch.full((view.height, view.width), -1, dtype=torch.int32) if median else None,
+    side = _SideOutputs(
+        radii=torch.zeros(count),
+        grad2d=torch.zeros(count, 2),
+        absgrad2d=torch.zeros(count, 2) if settings.absolute else None,
+        median=torch.full((view.height, view.width), -1, dtype=torch.int32) if settings.median else None,
         tile_counts=torch.empty(-(-view.height // TILE), -(-view.width // TILE), dtype=torch.int64),
     )
     if limit is not None:  # the kernels know no infinity
         limit = limit.to(torch.float32).clamp_max(torch.finfo(torch.float32).max).contiguous()
-    settings = *lens_of(view), view.width, view.height, degree, f32(min_scale), antialias
-    behind, most = np.array(background, np.float32), None if limit is None else limit.numpy()
-    planes, alpha, blended = _Rasterize.apply(*tensors, settings, view, behind, most, aside)
+    behind, most = np.array(settings.background, np.float32), None if limit is None else limit.numpy()
+    planes, alpha, blended = _Rasterize.apply(*tensors, _of_kernels(settings), view, behind, most, side)
     return Drawn(
-        image=planes.permute(1, 2, 0), alpha=alpha, radii=aside.radii, grad2d=aside.grad2d,
-        tile_counts=aside.tile_counts, absgrad2d=aside.absgrad2d, features=blended.permute(1, 2, 0),
-        median=aside.median,
+        image=planes.permute(1, 2, 0), alpha=alpha, radii=side.radii, grad2d=side.grad2d,
+        tile_counts=side.tile_counts, absgrad2d=side.absgrad2d, features=blended.permute(1, 2, 0),
+        median=side.median,
     )  # fmt: skip
 
 
+def _of_kernels(settings: Settings) -> tuple:
+    """The settings as ``project``'s kernels take them."""
+    view = settings.view
+    size = view.width, view.height
+    return *lens_of(view), *size, settings.degree, f32(settings.min_scale), settings.antialias
+
+
 @dataclass
-class _Aside:
-    """What a rendering tells besides what autograd differentiates; see ``rendering.Drawn``."""
+class _SideOutputs:
+    """What a rendering has besides what autograd differentiates; see ``rendering.Drawn``."""
 
     radii: torch.Tensor
     grad2d: torch.Tensor
@@ -119,13 +112,13 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @serialised
     def forward(
-        ctx, means, quats, log_scales, logits, sh, weights, features, settings, view, background, limit, aside
+        ctx, means, quats, log_scales, logits, sh, weights, features, settings, view, background, limit, side
     ):
         tensors = [tensor.contiguous() for tensor in (means, quats, log_scales, logits, sh, weights)]
         splats = [tensor.detach().numpy() for tensor in tensors]
         buffers = Buffers()
-        some, projected, pairs = _project_and_bin(splats, settings, view, aside.radii, buffers)
-        counts = aside.tile_counts.numpy()
+        some, projected, pairs = _project_and_bin(splats, settings, view, side.radii, buffers)
+        counts = side.tile_counts.numpy()
         counts[:] = np.diff(pairs.tile_start).reshape(counts.shape)
 
         tiles = pairs.splat, pairs.tile_start, counts.shape[1]
@@ -140,15 +133,15 @@ class _Rasterize(torch.autograd.Function):
                 blend_forward, counts.size, TILES, coloured, *tiles, behind, limit, image, transmittance,
                 walked, reached,
             )  # fmt: skip
-        if aside.median is not None:
-            median = aside.median.numpy()
+        if side.median is not None:
+            median = side.median.numpy()
             in_parallel(blend_median, counts.size, TILES, projected, *tiles, walked, limit, median)
             median[median >= 0] = some[median[median >= 0]]
         ctx.save_for_backward(*tensors)
         ctx.rest = (
             buffers,
             settings,
-            aside,
+            side,
             some,
             pairs,
             tiles,
@@ -164,11 +157,11 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @serialised
     def backward(ctx, by_planes, by_alpha, by_blended):
-        _, settings, aside, some, pairs, tiles, walked, reached, passes, images, transmittance = ctx.rest
+        _, settings, side, some, pairs, tiles, walked, reached, passes, images, transmittance = ctx.rest
         tensors, count = ctx.saved_tensors, len(some)
         of_pairs = pairs.first, pairs.count, pairs.row
         backward, columns = (
-            (blend_backward, SUMS) if aside.absgrad2d is None else (blend_backward_absolute, SUMS + 2)
+            (blend_backward, SUMS) if side.absgrad2d is None else (blend_backward_absolute, SUMS + 2)
         )
         working = Buffers()
         pair_sums = working.take("pair_sums", np.float32, len(pairs.splat), columns)
@@ -176,14 +169,14 @@ class _Rasterize(torch.autograd.Function):
             backward, walked.size, TILES, passes[0], *tiles, walked, reached, images[0], transmittance,
             by_planes.contiguous().numpy(), by_alpha.contiguous().numpy(), pair_sums,
         )  # fmt: skip
-        if aside.absgrad2d is not None:
+        if side.absgrad2d is not None:
             sums = np.zeros((count, columns), np.float32)
             in_parallel(gather_sums, count, GRAIN, *of_pairs, pair_sums, sums)
             height, width = transmittance.shape
             half_size = np.array([width / 2, height / 2], np.float32)
-            aside.absgrad2d.numpy()[some] = sums[:, SUMS:] * (half_size * LN2)
+            side.absgrad2d.numpy()[some] = sums[:, SUMS:] * (half_size * LN2)
 
-        by_features = np.zeros((len(aside.radii), 3 * (len(passes) - 1)), np.float32)
+        by_features = np.zeros((len(side.radii), 3 * (len(passes) - 1)), np.float32)
         by_images = np.zeros_like(images[1:])
         by_images.reshape(-1, *transmittance.shape)[: len(by_blended)] = by_blended.numpy()
         no_alpha = np.zeros_like(transmittance)
@@ -199,12 +192,12 @@ class _Rasterize(torch.autograd.Function):
             pair_sums[:, :G_RED] += further[:, :G_RED]
 
         # of splats without a weight no kernel writes the gradients
-        empty = torch.empty_like if count == len(aside.radii) else torch.zeros_like
+        empty = torch.empty_like if count == len(side.radii) else torch.zeros_like
         gradients = [empty(tensor, requires_grad=False) for tensor in tensors]
         in_parallel(
             project_backward, count, GRAIN, *(tensor.detach().numpy() for tensor in tensors), *settings,
             some, passes[0], *of_pairs, pair_sums,
-            *(gradient.numpy() for gradient in gradients), aside.grad2d.numpy(),
+            *(gradient.numpy() for gradient in gradients), side.grad2d.numpy(),
         )  # fmt: skip
         return *gradients, torch.from_numpy(by_features[:, : len(by_blended)]), *(None,) * 5
 
@@ -223,29 +216,17 @@ def _as_colours(features: np.ndarray, projected: np.ndarray) -> list[np.ndarray]
 
 @serialised
 def contributions(
-    means: torch.Tensor,
-    quats: torch.Tensor,
-    log_scales: torch.Tensor,
-    opacity_logits: torch.Tensor,
-    weights: torch.Tensor | None,
-    *,
-    view: View,
-    min_scale: float,
-    antialias: bool,
+    gaussians: Gaussians, weights: torch.Tensor | None, settings: Settings
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """See :func:`training.rasterize.contributions`: of one view, the largest, the sum, pixels and radii."""
-    count = len(means)
-    splats = [
-        tensor.detach().contiguous().numpy()
-        for tensor in (
-            means, quats, log_scales, opacity_logits, means.new_zeros(count, 1, 3),
-            means.new_ones(0) if weights is None else weights,
-        )
-    ]  # fmt: skip
+    count, view = len(gaussians), settings.view
+    gaussians = replace(gaussians, sh=gaussians.means.new_zeros(count, 1, 3))
+    weights = gaussians.means.new_ones(0) if weights is None else weights
+    tensors = *vars(gaussians).values(), weights
+    splats = [tensor.detach().contiguous().numpy() for tensor in tensors]
     radii = torch.zeros(count)
-    settings = *lens_of(view), view.width, view.height, 0, f32(min_scale), antialias
     buffers = Buffers()
-    some, projected, pairs = _project_and_bin(splats, settings, view, radii, buffers)
+    some, projected, pairs = _project_and_bin(splats, _of_kernels(settings), view, radii, buffers)
     pair_weights = buffers.take("pair_weights", np.float32, len(pairs.splat), 3)
     found, everywhere = np.empty((len(some), 3), np.float32), np.zeros((count, 3), np.float32)
     in_parallel(

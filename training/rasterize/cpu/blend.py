@@ -262,6 +262,7 @@ def _backward(absolute: bool):
         begin, end, projected, splat, tile_start, tiles_x, walked, reached, image, transmittance,
         by_image, by_alpha, pair_sums,
     ):  # fmt: skip
+        """Each pair's share of its splat's gradients (:func:`_backward` has the formulas)."""
         height, width = transmittance.shape
         state = np.empty(17 * stride, np.float32)  # the row above the first holds sums of zero only
         for j in range(state.shape[0]):

@@ -174,6 +174,7 @@ def loss_gradient(begin, end, image, truth, by_moments, l1_weight, ssim_weight, 
 
 
 def block_count(channels: int, height: int, width: int) -> int:
+    """Blocks of ROWS x COLUMNS pixels of one channel that cover an image (channels, height, width)."""
     return channels * -(-height // ROWS) * -(-width // COLUMNS)
 
 

@@ -60,11 +60,13 @@ def lens_of(view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @inlined(FAST)
 def to_camera(pose, axis, mean):
+    """A point's coordinate along one of a camera's axes (world_to_camera (4, 4))."""
     return pose[axis, 0] * mean[0] + pose[axis, 1] * mean[1] + pose[axis, 2] * mean[2] + pose[axis, 3]
 
 
 @inlined(FAST)
 def clamp(value, low, high):
+    """The value, kept between two bounds."""
     return min(max(value, low), high)
 
 

@@ -1,0 +1,54 @@
+"""The attributes of splats and points in Blender: their names, how they are read and how they are written.
+
+They follow Blender 5.3's native splats: ``position``, ``radiance:base`` (the three DC coefficients and the
+opacity), ``radiance:sh_1``.. (one vector a coefficient), ``scale`` (standard deviations) and ``rotation``
+(unit quaternion wxyz).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import bpy
+import numpy as np
+
+BASE, SH, SCALE, ROTATION = "radiance:base", "radiance:sh_{}", "scale", "rotation"
+LOG_SCALE, OPACITY_LOGIT, QUATERNION = "log_scale", "opacity_logit", "quaternion"
+COLOR, RADIUS, WEIGHT = "display_color", "radius", "lod_weight"
+
+
+class Layout(NamedTuple):
+    """How an attribute type travels through ``foreach_get`` and ``foreach_set``."""
+
+    key: str
+    dtype: type
+    width: int
+
+
+LAYOUTS = {
+    "FLOAT": Layout("value", np.float32, 1),
+    "FLOAT_VECTOR": Layout("vector", np.float32, 3),
+    "FLOAT_COLOR": Layout("color", np.float32, 4),
+    "FLOAT4": Layout("vector", np.float32, 4),
+    "QUATERNION": Layout("value", np.float32, 4),
+    "INT": Layout("value", np.int32, 1),
+    "INT32_2D": Layout("value", np.int32, 2),
+}
+
+
+def write_attribute(cloud: bpy.types.PointCloud, name: str, kind: str, values: np.ndarray) -> None:
+    """Sets a point attribute of type ``kind`` (a key of LAYOUTS) from (N,) or (N, width) values."""
+    layout = LAYOUTS[kind]
+    attribute = cloud.attributes.get(name) or cloud.attributes.new(name, kind, "POINT")
+    attribute.data.foreach_set(layout.key, np.ascontiguousarray(values, layout.dtype).reshape(-1))
+
+
+def read_attribute(cloud: bpy.types.PointCloud, name: str) -> np.ndarray | None:
+    """A point attribute as (N,) or (N, width), or None if there is none of that name and a known type."""
+    attribute = cloud.attributes.get(name)
+    if attribute is None or attribute.data_type not in LAYOUTS or attribute.domain != "POINT":
+        return None
+    layout = LAYOUTS[attribute.data_type]
+    values = np.empty(len(cloud.points) * layout.width, layout.dtype)
+    attribute.data.foreach_get(layout.key, values)
+    return values if layout.width == 1 else values.reshape(-1, layout.width)

@@ -1,0 +1,224 @@
+"""Splats and points as Blender point clouds, and back. One datablock, one set of splats.
+
+Attributes are those of ``attributes``, and every further column has its own name. Files hold logarithms,
+logits and quaternions of any length, which float32 cannot give back to the bit from activated values; they
+are therefore kept beside as ``log_scale``, ``opacity_logit`` and ``quaternion``. On the way back such a
+stored value counts where it still stands for the visible one: whatever an artist has changed, wins.
+"""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+
+from ...training.errors import LodgsError
+from ...training.scenes.color import linear_from_srgb
+from ...training.splats.gaussians import SH_C0, Splats
+from .. import compat
+from ..attributes import (
+    BASE,
+    COLOR,
+    LAYOUTS,
+    LOG_SCALE,
+    OPACITY_LOGIT,
+    QUATERNION,
+    RADIUS,
+    ROTATION,
+    SCALE,
+    SH,
+    WEIGHT,
+    read_attribute,
+    write_attribute,
+)
+from ..nodes import display
+
+_OWN = {"position", BASE, SCALE, ROTATION, LOG_SCALE, OPACITY_LOGIT, QUATERNION, COLOR, RADIUS, WEIGHT}
+_TYPE = "lodgs_type:"  # custom property that remembers a column's type
+_EXTRA = "column:"  # before a file's column whose name means something else to a point cloud
+
+
+def new_points(name: str, positions: np.ndarray, colors: np.ndarray, radius: float) -> bpy.types.Object:
+    """Coloured points as an object that is in no collection yet.
+
+    Args:
+        positions: (P, 3), in the object's own space.
+        colors: (P, 3) uint8, sRGB.
+        radius: display radius in the object's units.
+    """
+    cloud = compat.new_point_cloud(name, len(positions))
+    write_attribute(cloud, "position", "FLOAT_VECTOR", positions)
+    write_attribute(cloud, RADIUS, "FLOAT", np.full(len(positions), radius))
+    return _in_colors(name, cloud, colors)
+
+
+def new_splats(name: str, splats: Splats) -> bpy.types.Object:
+    """Splats as an object that is in no collection yet; its local space is the splats' world."""
+    cloud = compat.new_point_cloud(name, len(splats))
+    opacity, scale = _sigmoid(splats.opacity_logits), np.exp(splats.log_scales)
+    base = np.empty((len(splats), 4), np.float32)
+    base[:, :3], base[:, 3] = splats.sh[:, 0], opacity
+    write_attribute(cloud, "position", "FLOAT_VECTOR", splats.means)
+    write_attribute(cloud, BASE, compat.WIDE_TYPE, base)
+    for k in range(1, splats.sh.shape[1]):
+        write_attribute(cloud, SH.format(k), "FLOAT_VECTOR", splats.sh[:, k])
+    write_attribute(cloud, SCALE, "FLOAT_VECTOR", scale)
+    write_attribute(cloud, ROTATION, "QUATERNION", _unit(splats.quats))
+    write_attribute(cloud, LOG_SCALE, "FLOAT_VECTOR", splats.log_scales)
+    write_attribute(cloud, OPACITY_LOGIT, "FLOAT", splats.opacity_logits)
+    write_attribute(cloud, QUATERNION, compat.WIDE_TYPE, splats.quats)
+    for column, values in splats.extras.items():
+        taken = column in _OWN or column.startswith((".", _EXTRA, "radiance:"))
+        _write_column(cloud, _EXTRA + column if taken else column, values)
+    # A sphere with the splat's mean size; a faint splat covers less, so that fog does not hide the scene.
+    radius = np.exp(splats.log_scales @ np.full(3, 1 / 3, np.float32)) * np.sqrt(opacity)
+    write_attribute(cloud, RADIUS, "FLOAT", radius)
+    obj = _in_colors(name, cloud, to_bytes(SH_C0 * splats.sh[:, 0] + np.float32(0.5)))
+    display.attach(obj)
+    return obj
+
+
+def read_splats(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> Splats:
+    """The splats of an object, with all that artists have changed: its data, or what its modifiers leave.
+
+    Args:
+        depsgraph: where given, the modifiers are applied as it shows them, their weights to the opacities.
+
+    Raises:
+        LodgsError: if the object carries no splat attributes.
+    """
+    types = obj.data  # evaluated data keeps no custom properties
+    cloud = obj.evaluated_get(depsgraph).data if depsgraph else types
+    if depsgraph and not len(cloud.points):  # Blender drops the attributes with the last point
+        return read_splats(obj).select(slice(0))
+    splats = splats_of(cloud, read_attribute(cloud, WEIGHT))
+    if splats is None:
+        raise LodgsError(f"{obj.name} carries no splats.", "Undo what took its attributes away.")
+    known = {a.name for a in cloud.attributes if a.name.startswith("radiance:")} | _OWN
+    splats.extras |= {
+        a.name.removeprefix(_EXTRA): column
+        for a in cloud.attributes
+        if a.name not in known
+        and a.name[0] != "."
+        and (column := _read_column(cloud, a.name, types)) is not None
+    }
+    return splats
+
+
+def splats_of(cloud: bpy.types.PointCloud, weights: np.ndarray | None = None) -> Splats | None:
+    """The splats of a point cloud in the form that files have, without further columns.
+
+    Args:
+        weights: (N,) factors on the opacities; None leaves them as they are.
+
+    Returns:
+        None where the cloud lacks an attribute of splats.
+    """
+    means, base = read_attribute(cloud, "position"), read_attribute(cloud, BASE)
+    scale, rotation = read_attribute(cloud, SCALE), read_attribute(cloud, ROTATION)
+    if means is None or base is None or scale is None or rotation is None:
+        return None
+    if weights is not None:
+        base[:, 3] *= weights
+    coefficients = [base[:, :3]]
+    while (vector := read_attribute(cloud, SH.format(len(coefficients)))) is not None:
+        coefficients.append(vector)
+    whole = int(np.sqrt(len(coefficients))) ** 2  # a band that has lost a coefficient is left out
+    tiny = np.float32(1e-30)
+    opacity = np.clip(base[:, 3], np.float32(1e-6), np.float32(1 - 1e-6))
+    return Splats(
+        means=means,
+        quats=_kept(cloud, QUATERNION, _unit, rotation, rotation),
+        log_scales=_kept(cloud, LOG_SCALE, np.exp, scale, np.log(np.maximum(scale, tiny))),
+        opacity_logits=_kept(cloud, OPACITY_LOGIT, _sigmoid, base[:, 3], np.log(opacity / (1 - opacity))),
+        sh=np.stack(coefficients[:whole], axis=1),
+    )
+
+
+def megabytes(cloud: bpy.types.PointCloud) -> float:
+    """Size of the splats as a 3DGS file, in 10^6 bytes."""
+    names = [a.name for a in cloud.attributes if a.data_type in LAYOUTS and a.domain == "POINT"]
+    own = _OWN - {"position", BASE, SCALE, ROTATION}
+    widths = [LAYOUTS[cloud.attributes[name].data_type].width for name in names if name not in own]
+    normals = 3
+    return len(cloud.points) * 4e-6 * (sum(widths) + normals)
+
+
+def to_bytes(colors: np.ndarray) -> np.ndarray:
+    """Display colours in [0, 1], clipped and rounded to uint8."""
+    return (np.clip(colors, 0, 1) * np.float32(255) + np.float32(0.5)).astype(np.uint8)
+
+
+def _in_colors(name: str, cloud: bpy.types.PointCloud, colors: np.ndarray) -> bpy.types.Object:
+    """An object of the cloud in its (N, 3) uint8 sRGB colours; Blender shades in linear light."""
+    linear = linear_from_srgb(np.arange(256, dtype=np.float32) / 255).astype(np.float32)
+    rgba = np.ones((len(colors), 4), np.float32)
+    rgba[:, :3] = linear[colors]
+    write_attribute(cloud, COLOR, "FLOAT_COLOR", rgba)
+    cloud.materials.append(_material())
+    obj = bpy.data.objects.new(name, cloud)
+    if len(colors):
+        obj.color = rgba.mean(axis=0)  # what Solid shading can show of a point cloud
+    return obj
+
+
+def _material() -> bpy.types.Material:
+    """The one material that shows every point in its display colour, unlit."""
+    name = "LODGS Points"
+    material = bpy.data.materials.get(name)
+    if material is None:
+        material = bpy.data.materials.new(name)
+        if material.node_tree is None:
+            material.use_nodes = True
+        nodes, links = material.node_tree.nodes, material.node_tree.links
+        nodes.clear()
+        color, emission = nodes.new("ShaderNodeAttribute"), nodes.new("ShaderNodeEmission")
+        output = nodes.new("ShaderNodeOutputMaterial")
+        color.attribute_name = COLOR
+        links.new(color.outputs["Color"], emission.inputs["Color"])
+        links.new(emission.outputs["Emission"], output.inputs["Surface"])
+        for x, node in enumerate((color, emission, output)):
+            node.location = (x * 200, 0)
+    return material
+
+
+def _kept(cloud, name: str, activate, visible: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """The stored values where they still activate to the visible ones, the inverse elsewhere."""
+    stored = read_attribute(cloud, name)
+    if stored is None:
+        return inverse
+    with np.errstate(all="ignore"):
+        # Machines differ in the last bits of exp; an edit that small is none.
+        same = np.isclose(activate(stored), visible, rtol=1e-5, atol=1e-7)
+    if same.ndim == 2:
+        same = same.all(axis=1, keepdims=True)
+    return stored if same.all() else np.where(same, stored, inverse)
+
+
+def _write_column(cloud, name: str, values: np.ndarray) -> None:
+    """A file's own column, (N,) of any type that PLY has. What Blender has no type for is remembered."""
+    if values.dtype == np.float32:
+        write_attribute(cloud, name, "FLOAT", values)
+        return
+    if values.dtype == np.float64:
+        write_attribute(cloud, name, "INT32_2D", np.ascontiguousarray(values).view(np.int32))
+    else:
+        write_attribute(cloud, name, "INT", values.astype(np.int32))
+    cloud[_TYPE + name] = values.dtype.str
+
+
+def _read_column(cloud, name: str, types) -> np.ndarray | None:
+    """The inverse; None for an attribute that is no column of numbers."""
+    values, kind = read_attribute(cloud, name), types.get(_TYPE + name)
+    if values is not None and values.ndim == 2:
+        return values.reshape(-1).view(np.float64) if kind else None
+    return values if values is None or kind is None else values.astype(kind)
+
+
+def _sigmoid(logits: np.ndarray) -> np.ndarray:
+    with np.errstate(over="ignore"):
+        return 1 / (1 + np.exp(-logits))
+
+
+def _unit(quats: np.ndarray) -> np.ndarray:
+    norm = np.sqrt(np.einsum("ij,ij->i", quats, quats))[:, None]
+    return np.where(norm > 0, quats / np.maximum(norm, np.float32(1e-30)), np.float32([1, 0, 0, 0]))

@@ -1,0 +1,437 @@
+"""Splat scenes in Blender: a root, a collection, and in it cameras, points and levels.
+
+The scene root is an empty; ``root.lodgs`` holds what belongs to the scene (see ``properties.SplatScene``).
+Everything else is its child in COLMAP coordinates. These functions are what operators call and what scripts
+may call.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ...training.errors import LodgsError
+from ...training.lod.rule import find_rule
+from ...training.lod.selection import complete, unknown_rule
+from ...training.scenes.colmap import Scene, read_scene
+from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder
+from ...training.splats.gaussians import Splats
+from ..nodes import ellipsoids
+from . import objects, selection
+from .photographs import match_render, new_camera
+
+
+def roots(scene: bpy.types.Scene) -> list[bpy.types.Object]:
+    """The splat scenes' roots in a Blender scene."""
+    return [obj for obj in scene.objects if obj.lodgs.is_root]
+
+
+def active_root(context: bpy.types.Context) -> bpy.types.Object | None:
+    """The splat scene that is meant: the active object's, else the only one there is."""
+    obj = context.active_object
+    while obj is not None:
+        if obj.lodgs.is_root:
+            return obj
+        obj = obj.parent
+    found = roots(context.scene)
+    return found[0] if len(found) == 1 else None
+
+
+def root_with_levels(context: bpy.types.Context) -> bpy.types.Object | None:
+    """:func:`active_root`, where it has levels."""
+    root = active_root(context)
+    return root if root is not None and any(item.exists for item in root.lodgs.levels) else None
+
+
+def import_colmap(
+    context: bpy.types.Context,
+    folder: Path | str,
+    *,
+    model: Path | str | None = None,
+    images: Path | str | None = None,
+    upright: bool = True,
+    photographs: bool = True,
+    warn: Callable[[str], object] = print,
+) -> bpy.types.Object:
+    """A COLMAP scene as a new splat scene: cameras, their photographs and the coloured points.
+
+    Where the Blender scene has no camera, the first view becomes its camera and gives the render its size.
+
+    Args:
+        folder: the scene's folder, or that of a model in it.
+        model: folder of the model; by default the largest one. Training takes the same one.
+        images: folder of the photographs; by default found beside the model. Training takes the same one.
+        upright: turn the root so that the cameras' mean up direction is +z; otherwise leave COLMAP's axes.
+        photographs: show each camera's photograph behind its view.
+        warn: receives one sentence for each thing that was left out or is odd.
+
+    Returns:
+        The scene root.
+
+    Raises:
+        LodgsError: the folder holds no scene that can be read. Nothing is left behind in that case.
+    """
+    scene = read_scene(Path(folder), Path(model) if model else None, Path(images) if images else None)
+    for message in scene.warnings:
+        warn(message)
+    if scene.distorted:
+        warn(
+            f"{len(scene.distorted)} of {len(scene.cameras)} views have lens distortion: their photographs "
+            "fit the points only roughly here. Training undistorts them."
+        )
+    extent = _extent(scene)
+    with _new_scene(context, scene.folder.name) as root:
+        if upright:
+            root.rotation_mode = "QUATERNION"
+            root.rotation_quaternion = Matrix(scene.up_rotation().tolist()).to_quaternion()
+        root.empty_display_size = extent / 4
+        root.lodgs.scene_folder = str(scene.folder)
+        root.lodgs.camera_center = scene.center
+        root.lodgs.training.model = str(scene.model) if model else ""
+        root.lodgs.training.images = str(scene.images_folder) if images else ""
+
+        root.lodgs.cameras = bpy.data.collections.new(f"{root.name} cameras")
+        _collection(root).children.link(root.lodgs.cameras)
+        for camera in scene.cameras:
+            distorted = camera.name in scene.distorted
+            view = new_camera(camera, extent, photograph=photographs, distorted=distorted)
+            view.parent = root
+            root.lodgs.cameras.objects.link(view)
+            if context.scene.camera is None:
+                context.scene.camera = view
+                match_render(context.scene, camera)
+        if len(scene.points):
+            points = objects.new_points(
+                f"{root.name} points", scene.points, scene.point_colors, radius=extent / 400
+            )
+            points.parent = root
+            _collection(root).objects.link(points)
+            root.lodgs.points = points
+    return root
+
+
+def import_splats(
+    context: bpy.types.Context,
+    path: Path | str,
+    *,
+    upright: bool = True,
+    warn: Callable[[str], object] = print,
+) -> bpy.types.Object:
+    """A bundle, a folder of levels, or any 3DGS PLY as a single level, as a new splat scene.
+
+    Args:
+        upright: turn the root as the bundle says, or without that so that -y, which is up in most splat
+            files, is up; otherwise leave the axes.
+        warn: receives a sentence for each thing that is shown otherwise than the file's maker shows it.
+
+    Returns:
+        The scene root.
+
+    Raises:
+        LodgsError: the file cannot be read, or what it says is not possible. Nothing is left behind then.
+    """
+    path = Path(path)
+    bundle = (read_folder if path.is_dir() else read_bundle)(path, warn)
+    with _new_scene(context, path.stem) as root:
+        if upright:
+            rows = bundle.meta.get("up_rotation", ((1, 0, 0), (0, 0, 1), (0, -1, 0)))
+            root.rotation_euler = Matrix(rows).to_euler()
+        for level in bundle.levels:
+            _put_level(root, level)
+        set_bundle_facts(root, bundle)
+        root.lodgs.single_level = bundle.levels[-1].number
+        _follow_finest(root)
+        rule = find_rule(bundle.rule)
+        for control in rule.controls if rule else ():
+            if control.name in bundle.controls:
+                setattr(root.lodgs.controls, control.name, control.checked(bundle.controls[control.name]))
+    if bundle.rule and not root.lodgs.by_distance:
+        warn(" ".join(unknown_rule(bundle.rule)))
+    return root
+
+
+def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
+    """Takes over what a bundle says beside its splats. Levels whose objects are gone leave the list.
+
+    The bundle may have levels without splats, or none at all while they are on their way.
+    """
+    settings, rule = root.lodgs, find_rule(bundle.rule)
+    if rule is not None and rule.always and settings.rule != bundle.rule:
+        settings.mode = "SELECTIVE"
+    settings.method, settings.rule, settings.cumulative = bundle.method, bundle.rule, bundle.cumulative
+    settings.facts, settings.meta = json.dumps(bundle.facts), json.dumps(bundle.meta)
+    facts = {level.number: level.facts for level in bundle.levels}
+    for item in settings.levels:
+        if item.number in facts:
+            item.facts = json.dumps(facts[item.number])
+    if "camera_center" in bundle.meta:
+        settings.camera_center = bundle.meta["camera_center"]
+    _levels_changed(root)
+
+
+def set_level(root: bpy.types.Object, level: Level) -> bpy.types.Object:
+    """Adds a level to a splat scene, or replaces the one of its number; a new finest one is shown.
+
+    COLMAP's points are hidden when the first level arrives.
+
+    Returns:
+        The level's object.
+    """
+    first = not root.lodgs.levels
+    obj = _put_level(root, level)
+    _levels_changed(root)
+    if level.number == root.lodgs.levels[-1].number:
+        root.lodgs.single_level = level.number
+        _follow_finest(root)
+        root.lodgs.active_level = len(root.lodgs.levels) - 1
+    if first and root.lodgs.points:  # the splats stand where the points were
+        root.lodgs.points.hide_viewport = root.lodgs.points.hide_render = True
+    return obj
+
+
+def remove_finer_levels(root: bpy.types.Object) -> None:
+    """Removes all levels but the coarsest, whose object the coarsest of the next set takes over."""
+    for item in root.lodgs.levels:
+        if item.exists and item.number > 1:
+            cloud = item.object.data
+            bpy.data.objects.remove(item.object)
+            if not cloud.users:
+                bpy.data.pointclouds.remove(cloud)
+    _levels_changed(root)
+
+
+def read_levels(root: bpy.types.Object) -> Bundle:
+    """The levels of a splat scene with all that artists have changed in them, in the splats' own world.
+
+    The objects' transforms and modifiers are not applied.
+
+    Raises:
+        LodgsError: there are none.
+    """
+    levels = [
+        Level(item.number, objects.read_splats(item.object), selection.read_facts(item.facts))
+        for item in root.lodgs.levels
+        if item.exists
+    ]
+    if not levels:
+        raise LodgsError(f"{root.name} has no levels yet.", "Train it or import splats first.")
+    settings = root.lodgs
+    facts, meta = selection.read_facts(settings.facts), selection.read_json(settings.meta)
+    return Bundle(
+        settings.method, levels, settings.rule, facts, _set_controls(root), settings.cumulative, meta
+    )  # fmt: skip
+
+
+def read_level(root: bpy.types.Object, number: int) -> Splats:
+    """One level with all that artists have changed in it; where levels add up, with all coarser ones.
+
+    Raises:
+        LodgsError: there is no such level.
+    """
+    bundle = read_levels(root)
+    for level in bundle.levels:
+        if level.number == number:
+            return complete(bundle, level)
+    raise LodgsError(f"{root.name} has no level {number}.", "Choose one from the list of levels.")
+
+
+def shown_splats(context: bpy.types.Context, root: bpy.types.Object) -> Splats:
+    """The splats that the detail settings, and artists' own modifiers, leave visible in the view layer.
+
+    Columns that not every visible level has are left out.
+
+    Raises:
+        LodgsError: nothing is visible, or the levels have spherical harmonics of different degrees.
+    """
+    depsgraph = context.evaluated_depsgraph_get()
+    parts = [
+        objects.read_splats(item.object, depsgraph) for item in root.lodgs.levels if _visible(context, item)
+    ]
+    if not any(len(part) for part in parts):
+        raise LodgsError(f"No splats of {root.name} are shown.", "Look at the detail settings.")
+    if len({part.sh_degree for part in parts}) > 1:
+        raise LodgsError(
+            f"The levels of {root.name} have spherical harmonics of different degrees.", "Export one level."
+        )
+    shared = [name for name in parts[0].extras if all(name in part.extras for part in parts)]
+    arrays = ("means", "quats", "log_scales", "opacity_logits", "sh")
+    return Splats(
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays},
+        extras={name: np.concatenate([part.extras[name] for part in parts]) for name in shared},
+    )
+
+
+def count_shown(context: bpy.types.Context, root: bpy.types.Object) -> tuple[int, int]:
+    """How many splats are visible as of the last evaluation, and how many there are in all levels."""
+    depsgraph, shown, everything = context.view_layer.depsgraph, 0, 0
+    for item in root.lodgs.levels:
+        if item.exists:
+            everything += len(item.object.data.points)
+            if depsgraph is not None and _visible(context, item):
+                shown += len(item.object.evaluated_get(depsgraph).data.points)
+    return shown, everything
+
+
+def show_only(root: bpy.types.Object, number: int) -> None:
+    """Shows one level everywhere; where levels add up, with all coarser ones."""
+    root.lodgs.mode, root.lodgs.single_level = "SINGLE", number
+    for item in root.lodgs.levels:
+        if item.number == number or (root.lodgs.cumulative and item.number < number):
+            item.show = True
+
+
+def offer_ellipsoids(scene: bpy.types.Scene) -> None:
+    """Gives every level of a scene's splats the modifier that makes ellipsoids where they are wanted."""
+    for root in roots(scene):
+        for item in root.lodgs.levels:
+            if item.exists:
+                ellipsoids.attach(item.object)
+    cycles = getattr(scene, "cycles", None)
+    for limit in ("transparent_max_bounces", "min_transparent_bounces") if cycles else ():
+        setattr(cycles, limit, max(getattr(cycles, limit), ellipsoids.BOUNCES))
+
+
+@contextmanager
+def _new_scene(context: bpy.types.Context, name: str) -> Iterator[bpy.types.Object]:
+    """A new root in a new collection; both, and all in them, vanish again if the block fails."""
+    if context.mode != "OBJECT":
+        bpy.ops.object.mode_set(mode="OBJECT")
+    scene, camera = context.scene, context.scene.camera
+    images = set(bpy.data.images)
+    collection = bpy.data.collections.new(name)
+    root = bpy.data.objects.new(name, None)
+    root.lodgs.is_root = True
+    collection.objects.link(root)
+    scene.collection.children.link(collection)
+    try:
+        yield root
+    except BaseException:
+        scene.camera = camera
+        bpy.data.batch_remove(list(set(bpy.data.images) - images))
+        for part in [*collection.children_recursive, collection]:
+            for obj in list(part.objects):
+                data = obj.data
+                bpy.data.objects.remove(obj)
+                if data is not None:
+                    bpy.data.batch_remove([data])
+            bpy.data.collections.remove(part)
+        raise
+    for obj in context.selected_objects:
+        obj.select_set(False)
+    context.view_layer.objects.active = root
+    root.select_set(True)
+
+
+def _visible(context: bpy.types.Context, item) -> bool:
+    return item.exists and item.object.visible_get(view_layer=context.view_layer)
+
+
+def _collection(root: bpy.types.Object) -> bpy.types.Collection:
+    return root.users_collection[0]
+
+
+def _extent(scene: Scene) -> float:
+    """The scene's size, for what must be neither too small nor too large to see."""
+    try:
+        return scene.extent()
+    except LodgsError:  # one place to stand, and no points: nothing tells the size
+        return 1.0
+
+
+def _set_controls(root: bpy.types.Object) -> dict[str, float]:
+    """The values of the rule's controls that somebody has set, by name."""
+    rule, controls = find_rule(root.lodgs.rule), root.lodgs.controls
+    if rule is None or controls is None:
+        return {}
+    numbers = [item.number for item in root.lodgs.levels if item.exists]
+    following = {"finest": numbers[-1], "coarsest": numbers[0]}
+    values = {control: getattr(controls, control.name) for control in rule.controls}
+    return {
+        # Blender's floats are shorter than the files'
+        control.name: int(value) if control.whole else float(f"{value:.7g}")
+        for control, value in values.items()
+        if value not in (control.default, following.get(control.follows))
+    }
+
+
+def _follow_finest(root: bpy.types.Object) -> None:
+    """Controls that name the finest level go along with it."""
+    rule = find_rule(root.lodgs.rule)
+    for control in rule.controls if rule else ():
+        if control.follows == "finest":
+            setattr(root.lodgs.controls, control.name, root.lodgs.levels[-1].number)
+
+
+def _put_level(root: bpy.types.Object, level: Level) -> bpy.types.Object:
+    """The level's object in the scene and its entry in the list, without what depends on the whole list."""
+    settings = root.lodgs
+    fresh = objects.new_splats(f"{root.name} level {level.number}", level.splats)
+    item = next((entry for entry in settings.levels if entry.number == level.number), None)
+    if item is None:
+        item = settings.levels.add()
+        item.number = level.number
+        position = sum(entry.number < level.number for entry in settings.levels)
+        settings.levels.move(len(settings.levels) - 1, position)
+        item = settings.levels[position]
+    elif item.exists:
+        # The object stays, with all that artists have hung on it; only its splats change.
+        old, obj = item.object.data, item.object
+        obj.data, obj.color = fresh.data, fresh.color
+        bpy.data.objects.remove(fresh)
+        name = old.name
+        bpy.data.pointclouds.remove(old)
+        obj.data.name = name
+        fresh = obj
+    if fresh.parent is None:
+        fresh.parent = root
+        _collection(root).objects.link(fresh)
+    item.object = fresh
+    item.facts = json.dumps(level.facts)
+    return fresh
+
+
+def _levels_changed(root: bpy.types.Object) -> None:
+    """Drops levels whose objects are gone, keeps the settings within the rest, and renews the drivers."""
+    settings = root.lodgs
+    for index in reversed(range(len(settings.levels))):
+        if not settings.levels[index].exists:
+            settings.levels.remove(index)
+    if settings.levels:
+        finest = settings.levels[-1].number
+        settings.single_level = min(settings.single_level, finest)
+        rule = find_rule(settings.rule)
+        for control in rule.controls if rule else ():
+            if control.follows and getattr(settings.controls, control.name) > finest:
+                setattr(settings.controls, control.name, finest)
+    settings.active_level = min(settings.active_level, len(settings.levels) - 1)
+    selection.attach(root)
+    for scene in root.users_scene:
+        if scene.lodgs_render.ellipsoids:
+            offer_ellipsoids(scene)
+
+
+@bpy.app.handlers.persistent
+def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    """Follows artists: a deleted level leaves no gap in the distances, a new material is shown."""
+    editable = [root for root in roots(scene) if root.is_editable]  # others are linked from their own file
+    if depsgraph.id_type_updated("COLLECTION"):
+        for root in editable:
+            if not all(item.exists for item in root.lodgs.levels):
+                _levels_changed(root)
+    if any(update.is_updated_geometry for update in depsgraph.updates):
+        for root in editable:
+            selection.update_inputs(root)
+
+
+def register() -> None:
+    bpy.app.handlers.depsgraph_update_post.append(_on_update)
+
+
+def unregister() -> None:
+    bpy.app.handlers.depsgraph_update_post.remove(_on_update)

@@ -1,0 +1,314 @@
+"""What is shown of a splat scene: its rule's node groups on every level, driven by the scene's settings.
+
+Every level has one modifier that is on where levels are chosen by distance: the group of the scene's rule
+(``nodes.rules``). Its facts are set, its controls and the eye are driven by bare names, so that Blender
+evaluates them even where it may not run scripts, and without any handler. Reading the sockets of an evaluated
+modifier gives the rule's arguments back: :func:`choice`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import bpy
+import numpy as np
+
+from ...training.errors import LodgsError
+from ...training.lod.rule import Rule, facts_of, find_rule, rules
+from .. import compat
+from ..nodes import rules as groups
+from ..nodes.display import NAME as DISPLAY
+
+
+@dataclass(frozen=True)
+class Choice:
+    """By what a level's splats are chosen: a rule with all its arguments but the splats. Choices compare.
+
+    Attributes:
+        rule: its name.
+        eye: in the splats' own space.
+        focal_px: the eye's focal length in pixels.
+        facts, values: see ``training.lod.rule``, as pairs.
+    """
+
+    rule: str
+    eye: tuple[float, float, float]
+    focal_px: float
+    facts: tuple[tuple[str, float], ...]
+    values: tuple[tuple[str, float], ...]
+
+    def weights(self, means: np.ndarray, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+        """(N,) weights of splats at means (N, 3) with the rule's columns (N,) by name."""
+        rule = rules()[self.rule]
+        eye, facts, values = np.float32(self.eye), dict(self.facts), dict(self.values)
+        return rule.weights(means, eye, self.focal_px, columns, facts, values)
+
+    def wanted_level(self, means: np.ndarray) -> np.ndarray:
+        """(N,) the level that is wanted at each place."""
+        eye, facts, values = np.float32(self.eye), dict(self.facts), dict(self.values)
+        return rules()[self.rule].wanted_level(means, eye, self.focal_px, facts, values)
+
+    def coarser(self, levels: Sequence[int]) -> Choice | None:
+        """The next coarser choice, where there is one."""
+        values = rules()[self.rule].coarser(dict(self.values), levels)
+        return None if values is None else replace(self, values=tuple(values.items()))
+
+
+def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Choice | None:
+    """What the modifier of an evaluated level chooses by, as of the depsgraph; None where all is shown."""
+    modifier = _modifier(evaluated)
+    render = depsgraph.mode == "RENDER"
+    if modifier is None or not (modifier.show_render if render else modifier.show_viewport):
+        return None
+    rule = groups.rule_of_group(modifier.node_group)
+    assert rule is not None
+
+    def value(name: str):
+        return compat.get_input(modifier, name)
+
+    held = value(groups.FREEZE) or value(groups.EYE) >= groups.HELD
+    whose = groups.EYES[min(max(value(groups.EYE), 0), groups.HELD)]
+    if held or whose == "TRAINING":
+        eye = tuple(value(groups.EYE_POSITION))
+    else:
+        obj = depsgraph.scene.camera if whose == "CAMERA" else value(groups.EYE_OBJECT)
+        eye = (0.0, 0.0, 0.0)  # as geometry nodes have it without an object
+        if obj is not None:
+            place = obj.evaluated_get(depsgraph).matrix_world.translation
+            eye = tuple(evaluated.matrix_world.inverted_safe() @ place)
+    return Choice(
+        rule.name,
+        eye,
+        value(groups.HELD_FOCAL if held else groups.FOCAL),
+        tuple((name, value(name)) for name in groups.fact_names(rule)),
+        tuple((control.name, value(control.name)) for control in rule.controls),
+    )
+
+
+def only_chosen(evaluated: bpy.types.Object) -> bool:
+    """Whether an evaluated object shows its own splats as they are, chosen by nothing but :func:`choice`."""
+    return all(
+        modifier.type == "NODES" and (modifier.name == DISPLAY or groups.rule_of_group(modifier.node_group))
+        for modifier in evaluated.modifiers
+        if modifier.show_viewport
+    )
+
+
+def read_json(text: str) -> dict:
+    """What a property holds as JSON; nothing where somebody has made something else of it."""
+    try:
+        found = json.loads(text or "{}")
+        json.dumps(found, allow_nan=False)  # what files can hold
+    except (ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def read_facts(text: str) -> dict[str, float]:
+    """The numbers of :func:`read_json`, by name."""
+    return {name: value for name, value in read_json(text).items() if isinstance(value, int | float)}
+
+
+def eye_place(root: bpy.types.Object, scene: bpy.types.Scene) -> tuple[float, float, float]:
+    """Where the chosen eye is, in the splats' space, frozen or not. The viewport's starts at the camera's."""
+    settings = root.lodgs
+    if settings.eye == "TRAINING":
+        return tuple(settings.camera_center)
+    obj = settings.eye_object if settings.eye == "OBJECT" else scene.camera
+    if obj is None:
+        return (0.0, 0.0, 0.0)  # as geometry nodes have it
+    return tuple(root.matrix_world.inverted_safe() @ obj.matrix_world.translation)
+
+
+def hold(root: bpy.types.Object, eye: tuple[float, float, float], focal_px: float) -> None:
+    """Has distances measured from a place in the splats' own space, while they are frozen or the viewport's.
+
+    Nothing happens where that is the case already: setting evaluates the scene anew.
+    """
+    settings = root.lodgs
+    if not np.array_equal(np.float32(eye), np.float32(settings.held_eye)):
+        settings.held_eye = eye
+    if np.float32(focal_px) != np.float32(settings.held_focal):
+        settings.held_focal = focal_px
+
+
+def attach(root: bpy.types.Object) -> None:
+    """Gives every level of a splat scene its rule's modifier and its drivers, anew where they exist already.
+
+    Needed after the list of levels, the rule or its facts have changed. Levels whose rule is unknown, or
+    which have none, are shown one at a time.
+    """
+    settings = root.lodgs
+    _drive_focal_length(root)
+    rule = find_rule(settings.rule)
+    levels = [(item.number, read_facts(item.facts)) for item in settings.levels if item.exists]
+    scene = read_facts(settings.facts)
+    if rule is None:
+        settings.mode = "SINGLE"
+    for index, item in enumerate(settings.levels):
+        if item.exists:
+            _drive_visibility(root, index, item, rule)
+            if rule is None:
+                _detach(item.object)
+                continue
+            try:
+                facts = facts_of(rule, scene, levels, item.number)
+            except LodgsError:  # of a level that is still on its way
+                _detach(item.object)
+                continue
+            _drive_level(root, item.object, rule, facts)
+    update_inputs(root)
+
+
+def outdated(root: bpy.types.Object) -> bool:
+    """Whether a level's modifier is not the one that this version makes: its file is an older one's."""
+    rule = find_rule(root.lodgs.rule)
+    group = groups.rule_group(rule) if rule else None
+    return any(
+        item.exists and (modifier.node_group if (modifier := _modifier(item.object)) else None) != group
+        for item in root.lodgs.levels
+    )
+
+
+def update_inputs(root: bpy.types.Object) -> None:
+    """Hands on to the modifiers what cannot be driven: the chosen or held eye, and each level's material."""
+    for item in root.lodgs.levels:
+        modifier = item.exists and _modifier(item.object)
+        if modifier:
+            slots = item.object.material_slots
+            for name, value in (
+                (groups.EYE_OBJECT, root.lodgs.eye_object),
+                (groups.MATERIAL, slots[0].material if slots else None),
+            ):
+                if compat.get_input(modifier, name) != value:  # setting evaluates anew
+                    compat.set_input(modifier, name, value)
+            held = root.lodgs.freeze or root.lodgs.eye == "VIEW"
+            position = root.lodgs.held_eye if held else root.lodgs.camera_center
+            if tuple(compat.get_input(modifier, groups.EYE_POSITION)) != tuple(position):
+                compat.set_input(modifier, groups.EYE_POSITION, position)
+
+
+def _drive_focal_length(root: bpy.types.Object) -> None:
+    """f = lens * fitted side in pixels / fitted side of the sensor, as Blender's render has it.
+
+    Blender fits the render's longer side to the sensor's width unless told otherwise; where pixels are not
+    square, the smaller of fx and fy counts, as in ``training.scenes.cameras.Camera.focal``. Without a camera,
+    Blender's standard one is assumed.
+    """
+    variables = {
+        "lens": ("camera.data.lens", 50.0),
+        "fit": ("camera.data.sensor_fit", 0.0),
+        "sw": ("camera.data.sensor_width", 36.0),
+        "sh": ("camera.data.sensor_height", 24.0),
+        "rx": ("render.resolution_x", None),
+        "ry": ("render.resolution_y", None),
+        "p": ("render.resolution_percentage", None),
+        "ax": ("render.pixel_aspect_x", None),
+        "ay": ("render.pixel_aspect_y", None),
+    }
+    width, height = "floor(rx * p / 100)", "floor(ry * p / 100)"
+    driver = _driver(
+        root,
+        "lodgs.focal_px",
+        f"lens * min(1, ax / ay) * ({width} / sw if fit == 1 or (fit == 0 and ax * {width} >= ay * {height})"
+        f" else {height} * ay / ax / (sh if fit == 2 else sw))",
+    )
+    for name, (path, fallback) in variables.items():
+        variable = driver.variables.new()
+        variable.name, variable.type = name, "CONTEXT_PROP"
+        target = variable.targets[0]
+        target.context_property, target.data_path = "ACTIVE_SCENE", path
+        if fallback is not None:
+            target.use_fallback_value, target.fallback_value = True, fallback
+
+
+def _drive(obj: bpy.types.Object, path: str, root: bpy.types.Object, expression: str, **sources: str) -> None:
+    """Drives a property by an expression of the root's properties: names, and their paths in ``lodgs``."""
+    driver = _driver(obj, path, expression)
+    for name, source in sources.items():
+        variable = driver.variables.new()
+        variable.name, variable.type = name, "SINGLE_PROP"
+        variable.targets[0].id, variable.targets[0].data_path = root, f"lodgs.{source}"
+
+
+def _drive_visibility(root: bpy.types.Object, index: int, item, rule: Rule | None) -> None:
+    """A level is there where its rule has use for it, or where it is the one shown or adds to that."""
+    number, sources = item.number, {"show": f"levels[{index}].show"}
+    sources |= {name: name for name in ("mode", "single_level", "cumulative")}
+    in_use = "mode == 1"
+    for control in rule.controls if rule else ():
+        if control.follows:  # what is not in use is not even evaluated
+            sources[control.name] = f"{rule.name}.{control.name}"
+            in_use += f" and {control.name} {'<=' if control.follows == 'coarsest' else '>='} {number}"
+    alone = f"{number} == single_level or (cumulative and {number} <= single_level)"
+    for path in ("hide_viewport", "hide_render"):
+        expression = f"0 if show and (({in_use}) or (mode == 0 and ({alone}))) else 1"
+        _drive(item.object, path, root, expression, **sources)
+
+
+def _drive_level(root: bpy.types.Object, obj: bpy.types.Object, rule: Rule, facts: Mapping) -> None:
+    modifier = _modifier_of(obj, groups.rule_group(rule))
+    for name, value in facts.items():
+        if compat.get_input(modifier, name) != np.float32(value):
+            compat.set_input(modifier, name, float(value))
+    for path in ("show_viewport", "show_render"):
+        _drive(obj, f'modifiers["{modifier.name}"].{path}', root, "mode", mode="mode")
+    driven = {name: name for name in (groups.EYE, groups.FREEZE, groups.FOCAL, groups.HELD_FOCAL)}
+    driven |= {control.name: f"{rule.name}.{control.name}" for control in rule.controls}
+    for name, source in driven.items():
+        _drive(obj, compat.input_path(modifier, name), root, name, **{name: source})
+
+
+def _modifier_of(obj: bpy.types.Object, group: bpy.types.GeometryNodeTree) -> bpy.types.NodesModifier:
+    """The modifier with this group, made where there is none, in the place of one with another rule."""
+    modifier = _modifier(obj)
+    place = len(obj.modifiers)
+    if modifier is not None and modifier.node_group != group:  # of another method, or of an older version
+        place = obj.modifiers.find(modifier.name)
+        _detach(obj)
+        modifier = None
+    if modifier is None:
+        modifier = obj.modifiers.new(group.name, "NODES")
+        assert isinstance(modifier, bpy.types.NodesModifier)
+        modifier.node_group, modifier.show_expanded = group, False
+        obj.modifiers.move(len(obj.modifiers) - 1, min(place, len(obj.modifiers) - 1))
+    return modifier
+
+
+def _detach(obj: bpy.types.Object) -> None:
+    """Takes away the modifier that chooses by distance, its drivers, and its group if it was the last."""
+    modifier = _modifier(obj)
+    if modifier is None:
+        return
+    for driver in list(obj.animation_data.drivers if obj.animation_data else ()):
+        if driver.data_path.startswith(f'modifiers["{modifier.name}"]'):
+            obj.animation_data.drivers.remove(driver)
+    group = modifier.node_group
+    obj.modifiers.remove(modifier)
+    if group is not None and not group.users:
+        bpy.data.node_groups.remove(group)
+
+
+_BEFORE_RULES = ("LODGS Distance Band", "LODGS Octree Level")
+"""Modifiers of files that version 0.1.0 saved: their groups do not name a rule."""
+
+
+def _modifier(obj: bpy.types.Object) -> bpy.types.NodesModifier | None:
+    """The modifier that chooses by distance, whichever rule and version it is of."""
+    for modifier in obj.modifiers:
+        if isinstance(modifier, bpy.types.NodesModifier) and (
+            modifier.name in _BEFORE_RULES or (modifier.node_group and groups.RULE in modifier.node_group)
+        ):
+            return modifier
+    return None
+
+
+def _driver(obj: bpy.types.Object, path: str, expression: str) -> bpy.types.Driver:
+    """A fresh driver of the property at ``path``, without variables."""
+    obj.driver_remove(path)
+    driver = obj.driver_add(path).driver
+    assert driver is not None
+    driver.type, driver.expression = "SCRIPTED", expression
+    return driver

@@ -1,0 +1,181 @@
+"""What the training panel sets, kept on each scene root (``root.lodgs.training``)."""
+
+from __future__ import annotations
+
+from dataclasses import Field, fields
+from typing import Any
+
+import bpy
+
+from ...training.methods import METHODS, PRESETS, MethodInfo, method_info
+
+_WHOLE_MOST, _MOST = 2**31 - 1, 3.4e38
+_LEAST = 1e-6
+"""The smallest number above 0 that Blender shows."""
+
+
+def offered(method: str) -> list[Field]:
+    """The parameters of a method that the panel offers: those that it declares, but for per-level ones."""
+    info = method_info(method)
+    known = {f.name: f for f in fields(info.parameters)}
+    return [known[name] for name in info.offered if not isinstance(known[name].default, tuple)]
+
+
+def _preset_value(f: Field, method: str):
+    return lambda group: getattr(method_info(method).preset(group.id_data.lodgs.training.preset), f.name)
+
+
+def _property(f: Field, label: str, **options) -> Any:
+    """A property of the parameter's kind, within its bounds."""
+    about = f.metadata
+    options = {"name": label, "options": set(), **options}
+    if isinstance(f.default, bool):
+        return bpy.props.BoolProperty(**options)
+    if isinstance(f.default, str) and "get" in options:  # an enum's would have to give numbers
+        return bpy.props.StringProperty(**options)
+    if isinstance(f.default, str):
+        items = [(name, name.replace("_", " ").title(), "") for name in about["choices"]]
+        return bpy.props.EnumProperty(items=items, **options)
+    low, high, above = about["low"], about["high"], about["above"]
+    if isinstance(f.default, int):
+        low = low if above is None else above + 1
+        return bpy.props.IntProperty(min=int(low), max=int(min(high, _WHOLE_MOST)), **options)
+    subtype = "PIXEL" if about["unit"] == "px" else "FACTOR" if (low, high) == (0, 1) else "NONE"
+    low = low if above is None else above + _LEAST
+    return bpy.props.FloatProperty(min=low, max=min(high, _MOST), subtype=subtype, **options)
+
+
+def _properties_of(f: Field, method: str) -> dict[str, Any]:
+    """Three properties: the artist's value, whether there is one, and the preset's, to show until then."""
+    name, label = f.name, f.metadata["label"] or f.name.replace("_", " ").title()
+    about = f.metadata["about"].removesuffix(".")  # Blender adds one
+    preset_value = _preset_value(f, method)
+
+    def set_use(group: bpy.types.PropertyGroup, use: bool) -> None:
+        if not use:
+            group.property_unset(name)
+        elif not group.is_property_set(name):
+            setattr(group, name, preset_value(group))
+
+    tooltip = f"{about}. This is the preset's; tick the box to give another"
+    return {
+        name: _property(f, label, description=about, default=f.default),
+        f"use_{name}": bpy.props.BoolProperty(
+            name=f"Set {label}", description="Take a value of your own instead of the preset's",
+            get=lambda group: group.is_property_set(name), set=set_use, options=set(),
+        ),
+        f"preset_{name}": _property(f, label, description=tooltip, get=preset_value),
+    }  # fmt: skip
+
+
+def _parameters_of(method: MethodInfo) -> type[bpy.types.PropertyGroup]:
+    """A group with the parameters that a method offers; one counts when it is set (``is_property_set``)."""
+    annotations = {}
+    for f in offered(method.name):
+        annotations |= _properties_of(f, method.name)
+    return type(
+        f"LODGS_parameters_{method.name}", (bpy.types.PropertyGroup,), {"__annotations__": annotations}
+    )
+
+
+PARAMETERS = {method: _parameters_of(info) for method, info in METHODS.items()}
+"""The groups of all methods by name; each is a property ``parameters_<name>`` of ``TrainingSettings``."""
+
+
+class TrainingSettings(bpy.types.PropertyGroup):
+    """Choices of the training panel, and the scene root's newest run (``root.lodgs.training``).
+
+    ``run`` is the folder of that run, relative to the .blend where possible; all else about it is read from
+    there.
+    """
+
+    method: bpy.props.EnumProperty(
+        name="Method",
+        description="What is trained",
+        items=[(m.name, m.label, f"{m.label}: {m.about}", m.number) for m in METHODS.values()],
+    )
+    preset: bpy.props.EnumProperty(
+        name="Preset",
+        description="How long the training takes",
+        items=[(name, name.title(), text) for name, text in PRESETS.items()],
+    )
+    start_from: bpy.props.EnumProperty(
+        name="Start From",
+        description="What the training begins with",
+        items=[
+            ("POINTS", "Points", "The points of the COLMAP scene"),
+            ("RUN", "This Run", "The finest level of this scene's newest run, which has to be finished"),
+            (
+                "FILE",
+                "Splat File",
+                "The finest level of a finished run, of a bundle or of any splat PLY",
+            ),
+        ],
+    )
+    base: bpy.props.StringProperty(
+        name="Splats",
+        description="PLY of splats, or folder of a finished run, that the training begins with",
+        subtype="FILE_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
+    )
+    image_scale: bpy.props.FloatProperty(
+        name="Image Scale",
+        description="Size of the training images over the size of the photographs",
+        default=0.5,
+        min=0.01,
+        soft_min=0.1,
+        max=1.0,
+        subtype="FACTOR",
+    )
+    test_every: bpy.props.IntProperty(
+        name="Hold Out Every",
+        description="Every n-th view by name is kept out of training to measure quality; 0 trains on all",
+        default=8,
+        min=0,
+        soft_max=16,
+    )
+    seed: bpy.props.IntProperty(
+        name="Seed", description="Two runs with the same seed are equal", default=0, min=0
+    )
+    output: bpy.props.StringProperty(
+        name="Run Folders In",
+        description="Folder that receives the folders of the runs; empty: lodgs_runs beside the .blend file",
+        subtype="DIR_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
+    )
+    model: bpy.props.StringProperty(
+        name="Model",
+        description="Folder of the COLMAP model; empty: the scene's largest",
+        subtype="DIR_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
+    )
+    images: bpy.props.StringProperty(
+        name="Photographs",
+        description="Folder of the photographs; empty: found beside the model",
+        subtype="DIR_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
+    )
+    run: bpy.props.StringProperty(
+        name="Run Folder",
+        description="Folder of this scene's newest run",
+        subtype="DIR_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
+    )
+    read: bpy.props.IntProperty(
+        name="Events Read",
+        description="Bytes of the run's events that this file has taken in",
+        options={"HIDDEN"},
+    )
+
+    @property
+    def parameters(self) -> bpy.types.PropertyGroup:
+        """The parameters that the chosen method offers."""
+        return getattr(self, f"parameters_{self.method}")
+
+
+TrainingSettings.__annotations__ |= {
+    f"parameters_{name}": bpy.props.PointerProperty(
+        name=METHODS[name].label, description="What is changed from the preset", type=parameters
+    )
+    for name, parameters in PARAMETERS.items()
+}

@@ -1,0 +1,64 @@
+"""What panels share: their place in the sidebar, sentences that wrap, and the way to a trainer."""
+
+from __future__ import annotations
+
+import textwrap
+
+import bpy
+
+from ..data import scenes
+from ..runs import environment
+
+
+class Panel(bpy.types.Panel):
+    """A panel of the LODGS tab in the 3D viewport's sidebar."""
+
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "LODGS"
+
+
+class LevelsPanel(Panel):
+    """One that needs a splat scene with levels."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return scenes.root_with_levels(context) is not None
+
+
+def split_column(layout: bpy.types.UILayout, heading: str = "", align: bool = False) -> bpy.types.UILayout:
+    """A column of properties with their names on the left, without dots for animation."""
+    column = layout.column(heading=heading, align=align)
+    column.use_property_split = True
+    column.use_property_decorate = False
+    return column
+
+
+def say(layout: bpy.types.UILayout, text: str, icon: str) -> None:
+    """A sentence in as many lines as the panel needs for it."""
+    column = layout.column(align=True)
+    column.scale_y = 0.8
+    width = bpy.context.region.width / bpy.context.preferences.system.ui_scale
+    letters = max(int((width - 85) / 5.6), 24)  # of the default font, beside the icon and the tabs
+    for number, line in enumerate(textwrap.wrap(text, letters)):
+        column.label(text=line, icon="BLANK1" if number else icon)  # type: ignore[arg-type]
+
+
+def draw_environment(layout: bpy.types.UILayout, missing: str = "") -> None:
+    """The trainer's environment: a button that makes one and what is wrong, or how far the making is.
+
+    Args:
+        missing: what one lacks without it, as a sentence.
+    """
+    setup = environment.setup
+    if setup is not None and setup.running:
+        row = layout.row(align=True)
+        row.progress(text=setup.message, factor=setup.fraction)
+        row.operator("lodgs.cancel_environment", text="", icon="X")
+        return
+    problem = (setup and setup.problem) or missing
+    if problem:
+        say(layout, problem, "ERROR")
+    elif setup is not None:
+        say(layout, setup.message, "INFO")
+    layout.operator("lodgs.make_environment", icon="IMPORT")

@@ -1,0 +1,307 @@
+"""The trainer's rasterizer as a program beside Blender (``training.render.serve``), alive between frames.
+
+There is one, started with the first frame and given what has changed since the last. It ends with Blender,
+however that ends, with the file, or after some minutes without a frame.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import queue
+import shutil
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ...training.errors import LodgsError
+from ...training.render import wire
+from ...training.scenes.cameras import Camera, camera_as_dict
+from ...training.splats.gaussians import Splats
+from .. import extension
+from ..runs import environment, processes
+
+IDLE = 300.0
+"""Seconds without a frame after which the renderer gives its memory back."""
+
+PATIENCE = 1.0
+"""Seconds that a cancelled frame is waited for."""
+
+OnProgress = Callable[[float, str], bool]
+"""Called with the fraction that is done and a word on it; where it returns False the frame is cancelled."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A picture.
+
+    Attributes:
+        planes: (H, W) float32 by name as ``training.render.picture.Picture.passes``, rows from the top; the
+            photograph's, where one was given, are "Photograph.R", ..., display-coded.
+        psnr: in dB against the photograph; NaN where none was given.
+    """
+
+    planes: dict[str, np.ndarray]
+    psnr: float
+
+
+@dataclass(frozen=True)
+class PlacedSplats:
+    """Splats in the world, for one frame.
+
+    Attributes:
+        key: says which splats are the same from frame to frame.
+        splats: in the files' form, in their own space.
+        weights: (N,), or None for ones.
+        matrix: (4, 4) to the world.
+        level: 0 where they are no level.
+    """
+
+    key: int
+    splats: Splats
+    weights: np.ndarray | None
+    matrix: np.ndarray
+    level: int
+
+
+class Stopped(Exception):
+    """The program has ended by itself."""
+
+
+class Renderer:
+    """One program, and what it knows.
+
+    Raises:
+        LodgsError: no Python is set up that can do it.
+    """
+
+    def __init__(self) -> None:
+        python = environment.trainer_python()
+        environment.require(python)
+        self._folder = Path(tempfile.mkdtemp(prefix="lodgs-render-", dir=bpy.app.tempdir or None))
+        self._log = self._folder / "renderer.log"
+        self._fresh = True  # the first frame on a computer compiles, for some seconds
+        self._known: dict[int, Path] = {}
+        self._numbers = itertools.count(1)
+        self._answers: queue.SimpleQueue[dict | None] = queue.SimpleQueue()
+        command = [str(python), "-m", "training", "serve", str(self._folder)]
+        try:
+            self.process = processes.converse(
+                [*command, "--backend", extension.preferences().backend], self._log
+            )
+        except OSError as error:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            raise LodgsError(
+                f"The renderer cannot be started with {python}: {error.strerror or error}.",
+                "Check the trainer's Python in the preferences of LODGS.",
+            ) from error
+        threading.Thread(target=self._read_answers, daemon=True).start()
+
+    def frame(
+        self,
+        sets: list[PlacedSplats],
+        camera: Camera,
+        near: float,
+        on_progress: OnProgress,
+        *,
+        background: tuple[float, float, float] | None = None,
+        depth: bool = False,
+        levels: bool = False,
+        window: tuple[int, int, int, int] | None = None,
+        photograph: Path | None = None,
+        holdout: Path | None = None,
+    ) -> Frame | None:
+        """A picture, or None where it was cancelled.
+
+        Args: as ``training.render.scene.draw``, and
+            photograph: to compare with.
+            holdout: EXR with the depth of what hides splats.
+
+        Raises:
+            LodgsError: it cannot be drawn, says why.
+            Stopped: the program has ended.
+        """
+        frame = next(self._numbers)
+        out = self._folder / f"frame-{frame}"
+        try:
+            old, named = dict(self._known), self._write_sets(sets)
+            self._send(
+                frame=frame, out=out.name, sets=named, camera=camera_as_dict(camera, near),
+                background=background, depth=depth, levels=levels, window=window,
+                photograph=str(photograph) if photograph else None, holdout=str(holdout) if holdout else None,
+            )  # fmt: skip
+            answer = self._wait(frame, on_progress)
+            for path in set(old.values()) - set(self._known.values()):
+                path.unlink(missing_ok=True)
+            if answer["event"] == "error":
+                raise LodgsError(answer["what"], answer["remedy"])
+            if answer["event"] == "cancelled":
+                return None
+            names = answer["passes"]
+            planes = wire.read_planes(out, len(names), answer["height"], answer["width"])
+            out.unlink(missing_ok=True)
+            return Frame(dict(zip(names, planes, strict=True)), answer.get("psnr", float("nan")))
+        except OSError as error:
+            if self.process.poll() is not None or isinstance(error, BrokenPipeError):
+                raise Stopped from error
+            raise LodgsError(
+                f"The renderer's files in {self._folder} cannot be used: {error.strerror or error}.",
+                "Free some space there.",
+            ) from error
+
+    def close(self) -> None:
+        """Ends the program and takes its files away."""
+        with suppress(OSError):
+            self.process.stdin.close()
+        try:
+            self.process.wait(timeout=2)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def exit_reason(self) -> str:
+        """Why the program has ended, as far as one can know."""
+        with suppress(subprocess.TimeoutExpired):
+            self.process.wait(timeout=2)
+        code = self.process.returncode
+        if code is not None and code < 0:
+            return f"The renderer was killed (signal {-code}); often that means too little memory."
+        try:
+            last = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:]
+        except OSError:
+            last = []
+        return " ".join([f"The renderer stopped with exit code {code}.", *last])
+
+    def _write_sets(self, sets: list[PlacedSplats]) -> list[dict]:
+        """Writes the splats that are new or have changed, and names all."""
+        known, named = {}, []
+        for one in sets:
+            if one.key not in known:
+                columns = wire.packed(one.splats, one.weights)
+                path = self._known.get(one.key)
+                if path is None or not wire.holds(path, columns):
+                    path = self._folder / f"set-{next(self._numbers)}"
+                    wire.write_set(path, columns)
+                known[one.key] = path
+            named.append(
+                {
+                    "file": known[one.key].name,
+                    "count": len(one.splats),
+                    "matrix": one.matrix.tolist(),
+                    "level": one.level,
+                }
+            )
+        self._known = known
+        return named
+
+    def _wait(self, frame: int, on_progress: OnProgress) -> dict:
+        """The answer to a frame; that of a cancelled one may come late, and is then passed over."""
+        text, fraction, cancelled = "Preparing the renderer" if self._fresh else "Rendering", 0.0, 0.0
+        while True:
+            try:
+                answer = self._answers.get(timeout=0.1)
+            except queue.Empty:
+                answer = {}
+            if answer is None:
+                raise Stopped
+            kind, of = answer.get("event"), answer.get("frame")
+            if kind == "hello" and answer["protocol"] != wire.PROTOCOL:
+                raise LodgsError("The renderer is of another version.", "Restart Blender.")
+            if kind == "progress" and of == frame:
+                fraction, text, self._fresh = answer["share"], "Rendering", False
+            elif kind in {"frame", "cancelled", "error"} and of in {frame, None}:
+                return answer
+            if cancelled and time.monotonic() - cancelled > PATIENCE:
+                return {"event": "cancelled"}
+            if not on_progress(fraction, text) and not cancelled:
+                cancelled = time.monotonic()
+                self._send(cancel=frame)
+
+    def _send(self, **request) -> None:
+        self.process.stdin.write(json.dumps(request) + "\n")
+        self.process.stdin.flush()
+
+    def _read_answers(self) -> None:
+        """In a thread of its own: what the program answers, and that it has ended."""
+        for line in self.process.stdout or ():
+            with suppress(ValueError):
+                answer = json.loads(line)
+                if isinstance(answer, dict):
+                    self._answers.put(answer)
+        self._answers.put(None)
+
+
+_renderer: Renderer | None = None
+_lock = threading.Lock()
+_used = 0.0
+
+
+def frame(
+    sets: list[PlacedSplats], camera: Camera, near: float, on_progress: OnProgress, **options
+) -> Frame | None:
+    """:meth:`Renderer.frame` by the one renderer; started when there is none, and once again when it dies.
+
+    Raises:
+        LodgsError: no Python is set up that can render, it cannot be drawn, or the renderer died twice.
+    """
+    global _renderer, _used
+    with _lock:
+        for attempt in (1, 2):
+            if _renderer is None:
+                on_progress(0.0, "Starting the renderer")
+                _renderer = Renderer()
+            try:
+                return _renderer.frame(sets, camera, near, on_progress, **options)
+            except Stopped:
+                reason = _renderer.exit_reason()
+                _renderer.close()
+                _renderer = None
+                if attempt == 2:
+                    raise LodgsError(reason, "Render a coarser level or a smaller picture.") from None
+                print(f"LODGS: {reason} It is started again.")
+            finally:
+                _used = time.monotonic()
+    return None
+
+
+def close() -> None:
+    """Ends the renderer, if there is one; waits for the frame that is being drawn."""
+    global _renderer
+    with _lock:
+        if _renderer is not None:
+            _renderer.close()
+            _renderer = None
+
+
+def _close_when_idle() -> float:
+    """A timer: an idle renderer gives its memory back."""
+    if _renderer is not None and time.monotonic() - _used > IDLE and not _lock.locked():
+        close()
+    return 60.0
+
+
+@bpy.app.handlers.persistent
+def _on_load(*_) -> None:
+    close()
+
+
+def register() -> None:
+    bpy.app.handlers.load_pre.append(_on_load)
+    if not bpy.app.background:
+        bpy.app.timers.register(_close_when_idle, first_interval=60.0, persistent=True)
+
+
+def unregister() -> None:
+    bpy.app.handlers.load_pre.remove(_on_load)
+    if bpy.app.timers.is_registered(_close_when_idle):
+        bpy.app.timers.unregister(_close_when_idle)
+    close()

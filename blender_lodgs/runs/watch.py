@@ -1,0 +1,248 @@
+"""What Blender knows of the runs that it follows: a :class:`Watch` reads a run's events as they come.
+
+Everything that must last is in the run's folder; a level of splats becomes an object as soon as its file is
+there.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import time
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import bpy
+
+from ...training.errors import LodgsError
+from ...training.runs.folder import RunFolder
+from ...training.splats.bundle import Bundle, Level, read_head
+from ...training.splats.ply import read_ply
+from .. import extension
+from ..data import scenes
+
+UNRESPONSIVE_AFTER = 60.0
+"""Seconds without an event after which the panel says that the trainer does not answer."""
+
+
+NUMBERS = {
+    "progress": ("level", "levels", "step", "of", "loss", "psnr", "splats", "steps_per_s", "eta_s"),
+    "level": ("level", "splats"),
+}
+"""What an event must hold as numbers to be shown."""
+
+OUTPUT = "trainer.out"
+"""File in the run's folder that takes the trainer's standard output, for what it says outside its events."""
+
+
+@dataclass
+class Watch:
+    """What Blender knows of one run.
+
+    Attributes:
+        folder: the run's folder.
+        root: ``session_uid`` of the scene root that receives the levels; it survives undo and renaming.
+        process: the trainer, when this Blender started it.
+        state: as ``RunFolder.state``.
+        message: what the trainer is doing, or how the run ended.
+        problem: why the run failed, as a sentence with its remedy; empty when it did not.
+        progress: the newest ``progress`` event.
+        levels: the newest ``level`` event of each level.
+        warnings: the warnings of this run.
+        cancel_requested: whether it was asked to stop.
+        method: what it trains.
+        last_event: when an event came last, in seconds since the epoch.
+        offset: bytes of the run's events that have been read.
+    """
+
+    folder: RunFolder
+    root: int
+    process: subprocess.Popen | None = None
+    state: str = "running"
+    message: str = "Starting the trainer"
+    problem: str = ""
+    progress: dict = field(default_factory=dict)
+    levels: dict[int, dict] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+    cancel_requested: bool = False
+    method: str = ""
+    last_event: float = field(default_factory=time.time)
+    offset: int = 0
+
+    @property
+    def running(self) -> bool:
+        return self.state == "running"
+
+    @property
+    def unresponsive(self) -> bool:
+        """Whether a running trainer has sent no event for :data:`UNRESPONSIVE_AFTER` seconds."""
+        return self.running and time.time() - self.last_event > UNRESPONSIVE_AFTER
+
+    def step(self) -> bool:
+        """Handle the events since the last step; return whether there may be more.
+
+        A level becomes an object at once. Never raises: what goes wrong becomes ``problem``.
+        """
+        root = root_by_uid(self.root)
+        if watches.get(self.root) is not self:
+            return False
+        if root is None:  # deleted or undone; redo finds the run again
+            del watches[self.root]
+            return False
+        alive = True
+        try:
+            alive = self._alive()  # asked first: the events before the end are then read below
+            events, self.offset = self.folder.events(self.offset)
+            for event in events:
+                self._handle_event(root, event)
+            if not alive:
+                self._set_end()
+            if events or not alive:
+                extension.redraw()
+        except OSError as error:
+            self.problem = f"The run folder {self.folder.path} cannot be read: {error.strerror}."
+        return alive
+
+    def _handle_event(self, root: bpy.types.Object, event: dict) -> None:
+        self.last_event = time.time()
+        if not _is_complete(event):
+            self.problem = f"The trainer sent a '{event['event']}' that this version does not understand."
+            return
+        try:
+            self._apply(root, event)
+        except LodgsError as error:
+            self.problem = str(error)
+
+    def _alive(self) -> bool:
+        if self.process is not None and self.process.poll() is None:
+            return True
+        return self.folder.state() == "running"
+
+    def _apply(self, root: bpy.types.Object, event: dict) -> None:
+        match event["event"]:
+            case "hello":
+                self.problem, self.message = "", "Reading the scene"
+                self.method = str(event.get("method", ""))
+                self.warnings.clear()
+            case "status":
+                self.message = str(event.get("message", ""))
+            case "progress":
+                self.progress, self.message = event, str(event.get("stage", "")).capitalize()
+            case "warning":
+                self.warnings.append(str(event.get("message", "")))
+            case "level":
+                self._add_level(root, event)
+            case "done":
+                self._finish(root)
+
+    def _add_level(self, root: bpy.types.Object, event: dict) -> None:
+        splats = read_ply(self.folder.path / str(event.get("path")))
+        with _in_window():
+            if event["level"] == 1 and not event.get("again"):
+                scenes.remove_finer_levels(root)  # they are of an earlier run: two runs never mix
+            if "meta" in event:
+                scenes.set_bundle_facts(root, self._described(event))
+            scenes.set_level(root, Level(event["level"], splats, event.get("facts", {})))
+            root.lodgs.training.read = self.offset
+            if not event.get("more"):  # levels that come together are one step
+                _undo_step(f"Level {event['level']}")
+        self.levels[event["level"]] = event
+
+    def _described(self, event: dict) -> Bundle:
+        """What a level's event says of all levels, without them."""
+        return Bundle(
+            self.method, [], str(event.get("rule", "")), event.get("scene_facts", {}),
+            cumulative=bool(event.get("cumulative")), meta=event["meta"],
+        )  # fmt: skip
+
+    def _finish(self, root: bpy.types.Object) -> None:
+        head = read_head(self.folder.bundle)
+        with _in_window():
+            scenes.set_bundle_facts(root, head)
+            root.lodgs.training.read = self.offset
+            _undo_step("Training finished")
+
+    def _set_end(self) -> None:
+        """Say how the run ended."""
+        self.state = self.folder.state()
+        code = None if self.process is None else self.process.poll()
+        error = self.folder.last("error") if self.state == "failed" else None
+        if code == 2 and error is None:  # it could not even open its run
+            error = _last_error(self.folder.path / OUTPUT)
+        if error:
+            self.state = "failed"
+            self.problem = f"{error.get('what', '')} {error.get('remedy', '')}".strip()
+        elif self.state in {"interrupted", "empty"} or code not in {None, 0, 3}:
+            self.state = "interrupted"
+            self.problem = _exit_reason(code, self.folder.log_tail(1))
+        self.message = {
+            "done": "Finished",
+            "cancelled": "Cancelled; it can be resumed",
+        }.get(self.state, "Stopped; it can be resumed")
+
+
+watches: dict[int, Watch] = {}
+"""The newest run of each scene root, by the root's ``session_uid``."""
+
+
+def watch_of(root: bpy.types.Object | None) -> Watch | None:
+    """The run of a scene root that this Blender follows or followed, for the panel."""
+    return None if root is None else watches.get(root.session_uid)
+
+
+def begin(watch: Watch) -> Watch:
+    """Follows a run from now on, with what is known of it already."""
+    for event in watch.folder.events()[0]:
+        if not _is_complete(event):
+            continue
+        if event["event"] == "progress":
+            watch.progress = event
+        elif event["event"] == "level":
+            watch.levels[event["level"]] = event
+    watches[watch.root] = watch
+    return watch
+
+
+def _last_error(output: Path) -> dict | None:
+    """The ``error`` event that ends a trainer's standard output, if one does."""
+    try:
+        event = json.loads(output.read_bytes().splitlines()[-1])
+    except (OSError, ValueError, IndexError):
+        return None
+    return event if isinstance(event, dict) and event.get("event") == "error" else None
+
+
+def _is_complete(event: dict) -> bool:
+    numbers = NUMBERS.get(str(event["event"]), ())
+    return all(isinstance(event.get(name), int | float) for name in numbers)
+
+
+def _exit_reason(code: int | None, last_line: str) -> str:
+    """Why a trainer that sent no error has ended, as far as one can know."""
+    if code is not None and code < 0:
+        how = f"was killed (signal {-code}); often that means too little memory"
+    elif code:
+        how = f"stopped with exit code {code}"
+    else:
+        how = "stopped without a word: killed, or the computer was switched off"
+    last = f" Its last words: {last_line.strip()}" if last_line.strip() else ""
+    return f"The trainer {how}.{last}"
+
+
+def _in_window():
+    """A context with a window, which a timer lacks; as it is where there are none (in background)."""
+    windows = bpy.context.window_manager.windows
+    if bpy.context.window is not None or not windows:
+        return nullcontext()
+    return bpy.context.temp_override(window=windows[0])
+
+
+def _undo_step(message: str) -> None:
+    """Make what came by itself an undo step, so that undoing the user's next one does not take it away."""
+    bpy.ops.ed.undo_push(message=message)
+
+
+def root_by_uid(uid: int) -> bpy.types.Object | None:
+    """The object of a ``session_uid``; None where it was deleted or undone."""
+    return next((obj for obj in bpy.data.objects if obj.session_uid == uid), None)

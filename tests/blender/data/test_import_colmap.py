@@ -1,0 +1,201 @@
+"""COLMAP scenes in Blender, against the cameras' own projection and Blender's."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from training.scenes.colmap import read_scene
+
+
+@pytest.fixture
+def mini(shared_scenes) -> Path:
+    return shared_scenes / "variants" / "mini_saharov"
+
+
+def _everything(bpy) -> dict[str, int]:
+    names = [
+        "objects", "cameras", "images", "pointclouds", "meshes", "collections", "materials", "node_groups"
+    ]  # fmt: skip
+    return {name: len(getattr(bpy.data, name)) for name in names}
+
+
+def test_cameras_see_points_where_colmap_does(bpy, lodgs, mini):
+    from bpy_extras.object_utils import world_to_camera_view
+    from mathutils import Vector
+
+    scene = read_scene(mini)
+    root = lodgs("data.scenes").import_colmap(bpy.context, mini)
+    root.scale, root.location = (2, 2, 2), (1, 2, 3)
+    bpy.context.view_layer.update()
+    for camera in scene.cameras[::10]:
+        lodgs("data.photographs").match_render(bpy.context.scene, camera)
+        obj = bpy.data.objects[camera.name]
+        inside = 0
+        for point in scene.points[::197].astype(np.float64):
+            x, y, z = camera.world_to_camera[:3, :3] @ point + camera.world_to_camera[:3, 3]
+            u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+            seen = world_to_camera_view(bpy.context.scene, obj, root.matrix_world @ Vector(point))
+            if z > 0 and 0 < u < camera.width and 0 < v < camera.height:
+                inside += 1
+                assert seen.x * camera.width == pytest.approx(u, abs=0.01)
+                assert (1 - seen.y) * camera.height == pytest.approx(v, abs=0.01)
+        assert inside > 10
+
+
+def test_shifted_and_stretched_pixels(bpy, lodgs):
+    """Principal points off the middle and unequal focal lengths, wide and tall, by Blender's own matrix."""
+    from training.scenes.cameras import Camera
+
+    for width, height in ((640, 480), (480, 640)):
+        camera = Camera("a", width, height, 500.0, 550.0, 300.0, 260.0, np.eye(4))
+        obj = lodgs("data.photographs").new_camera(camera, 1.0, photograph=False)
+        bpy.context.scene.collection.objects.link(obj)
+        lodgs("data.photographs").match_render(bpy.context.scene, camera)
+        bpy.context.view_layer.update()
+        render = bpy.context.scene.render
+        projection = np.array(
+            obj.calc_matrix_camera(
+                bpy.context.evaluated_depsgraph_get(), x=width, y=height,
+                scale_x=render.pixel_aspect_x, scale_y=render.pixel_aspect_y,
+            )
+        )  # fmt: skip
+        point = np.array([0.3, -0.2, 2.0])
+        x, y, _, w = projection @ np.append(point * [1, -1, -1], 1)
+        u, v = (x / w + 1) / 2 * width, (1 - y / w) / 2 * height
+        assert u == pytest.approx(500 * 0.15 + 300, abs=1e-3)
+        assert v == pytest.approx(550 * -0.1 + 260, abs=1e-3)
+
+
+def test_operator_imports_everything_upright(bpy, mini):
+    scene = read_scene(mini)
+    assert bpy.ops.lodgs.import_colmap(directory=str(mini)) == {"FINISHED"}
+    (root,) = [o for o in bpy.data.objects if o.lodgs.is_root]
+    bpy.context.view_layer.update()
+
+    cameras = [o for o in root.children if o.type == "CAMERA"]
+    assert sorted(o.name for o in cameras) == [c.name for c in scene.cameras]
+    pictures = [o.data.background_images[0].image for o in cameras]
+    assert all(Path(p.filepath).is_file() for p in pictures)
+    up = np.mean([np.array(o.matrix_world)[:3, 1] for o in cameras], axis=0)
+    assert up[2] > 0.9 * np.linalg.norm(up)
+
+    (cloud,) = [o for o in root.children if o.type == "POINTCLOUD"]
+    positions = np.empty(len(cloud.data.points) * 3, np.float32)
+    cloud.data.attributes["position"].data.foreach_get("vector", positions)
+    assert np.array_equal(positions.reshape(-1, 3), scene.points)
+    code = scene.point_colors[5] / 255
+    linear = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+    assert cloud.data.attributes["display_color"].data[5].color[:3] == pytest.approx(linear, abs=1e-6)
+
+    assert bpy.context.scene.camera in cameras
+    assert (bpy.context.scene.render.resolution_x, bpy.context.scene.render.resolution_y) == (366, 553)
+    assert Path(root.lodgs.scene_folder) == mini
+    centers = np.mean([c.center for c in scene.cameras], axis=0)
+    assert tuple(root.lodgs.camera_center) == pytest.approx(centers, abs=1e-5)
+
+
+def test_looking_through_the_views(bpy, lodgs, shared_scenes):
+    """One after the other by name, around the end, and the selected one; the render takes each one's size."""
+    scene = read_scene(shared_scenes / "variants" / "multicam_subfolders")
+    lodgs("data.scenes").import_colmap(bpy.context, scene.folder, photographs=False)
+    sizes = {camera.name: (camera.width, camera.height) for camera in scene.cameras}
+    names = sorted(sizes)
+    assert len(set(sizes.values())) > 1
+    render = bpy.context.scene.render
+
+    def look(step):
+        assert bpy.ops.lodgs.look_through(step=step) == {"FINISHED"}
+        assert (render.resolution_x, render.resolution_y) == sizes[bpy.context.scene.camera.name]
+        return bpy.context.scene.camera.name
+
+    assert [look(1) for _ in names] == names[1:] + names[:1]
+    assert [look(-1), look(0)] == [names[-1]] * 2
+    bpy.context.view_layer.objects.active = bpy.data.objects[names[2]]
+    assert look(0) == names[2]
+    bpy.context.scene.camera = None
+    bpy.context.view_layer.objects.active = None
+    assert look(0) == names[0]
+
+
+def test_points_make_way_for_the_first_level(bpy, lodgs, mini):
+    root = lodgs("data.scenes").import_colmap(bpy.context, mini)
+    points, cameras = root.lodgs.points, root.lodgs.cameras
+    assert points.type == "POINTCLOUD" and len(cameras.objects) == 32
+    level = lodgs("training.splats.bundle").Level(
+        1,
+        lodgs("training.splats.gaussians").Splats(
+            *(np.zeros((4, n), np.float32) for n in (3, 4, 3)),
+            np.zeros(4, np.float32),
+            np.zeros((4, 1, 3), np.float32),
+        ),
+        0.1,
+    )
+    obj = lodgs("data.scenes").set_level(root, level)
+    bpy.context.view_layer.update()
+    assert obj.visible_get() and not points.visible_get()
+    points.hide_viewport = False
+    lodgs("data.scenes").set_level(root, level)
+    assert not points.hide_viewport  # the artist's choice stays
+
+
+def test_training_takes_the_model_and_photographs_of_the_import(bpy, lodgs, mini, tmp_path):
+    found = read_scene(mini)
+    root = lodgs("data.scenes").import_colmap(bpy.context, mini)
+    job = lodgs("runs.jobs").make_job(root, tmp_path, {})
+    assert (job.model, job.images) == ("", "")
+    root = lodgs("data.scenes").import_colmap(
+        bpy.context, mini, model=found.model, images=str(found.images_folder), photographs=False
+    )
+    job = lodgs("runs.jobs").make_job(root, tmp_path, {})
+    assert (Path(job.model), Path(job.images)) == (found.model, found.images_folder)
+
+
+def test_a_camera_that_is_there_stays(bpy, lodgs, mini):
+    mine = bpy.data.objects.new("mine", bpy.data.cameras.new("mine"))
+    bpy.context.scene.collection.objects.link(mine)
+    bpy.context.scene.camera = mine
+    size = bpy.context.scene.render.resolution_x
+    lodgs("data.scenes").import_colmap(bpy.context, mini, upright=False, photographs=False)
+    assert bpy.context.scene.camera == mine and bpy.context.scene.render.resolution_x == size
+    assert not bpy.data.images
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["multicam_subfolders", "names_unicode_spaces", "missing_images", "empty_points3D", "flat_sparse",
+     "distorted_simple_radial"],
+)  # fmt: skip
+def test_odd_scenes_import(bpy, lodgs, shared_scenes, name):
+    folder = shared_scenes / "variants" / name
+    scene, told = read_scene(folder), []
+    root = lodgs("data.scenes").import_colmap(bpy.context, folder, warn=told.append)
+    assert len([o for o in root.children if o.type == "CAMERA"]) == len(scene.cameras) > 0
+    assert bool([o for o in root.children if o.type == "POINTCLOUD"]) == bool(len(scene.points))
+    assert all(message in told for message in scene.warnings)
+    assert bool(scene.distorted) == any("distortion" in message for message in told)
+
+
+def test_failures_are_said_and_leave_nothing(bpy, lodgs, tmp_path, mini, monkeypatch):
+    before = _everything(bpy)
+    with pytest.raises(RuntimeError, match="no COLMAP model"):
+        bpy.ops.lodgs.import_colmap(directory=str(tmp_path))
+    assert _everything(bpy) == before
+
+    def fail(*args, **kwargs):
+        raise lodgs("training.errors").LodgsError("No room.", "Make some.")
+
+    monkeypatch.setattr(lodgs("data.objects"), "new_points", fail)
+    with pytest.raises(RuntimeError, match=r"No room\. Make some\."):
+        bpy.ops.lodgs.import_colmap(directory=str(mini))
+    assert _everything(bpy) == before
+    assert bpy.context.scene.camera is None
+
+
+def test_undo_leaves_nothing(bpy, mini):
+    bpy.ops.ed.undo_push(message="before")
+    before = _everything(bpy)
+    bpy.ops.lodgs.import_colmap("EXEC_DEFAULT", True, directory=str(mini))  # True: one undo step, as by hand
+    assert _everything(bpy)["cameras"] > before["cameras"]
+    bpy.ops.ed.undo()
+    assert _everything(bpy) == before

@@ -1,0 +1,222 @@
+"""Bundles and plain files in and out of Blender, through the operators, judged by plyfile and the bytes."""
+
+import json
+
+import numpy as np
+import plyfile
+import pytest
+
+
+@pytest.fixture
+def bundle(lodgs):
+    """Three FLoD-like levels with an extra column, out to 20 units."""
+    rng, made = np.random.default_rng(3), lodgs("training.splats.bundle")
+
+    def level(number: int, count: int, s_min: float):
+        splats = lodgs("training.splats.gaussians").Splats(
+            means=rng.uniform(-20, 20, (count, 3)).astype(np.float32),
+            quats=rng.standard_normal((count, 4)).astype(np.float32),
+            log_scales=rng.normal(-3, 2, (count, 3)).astype(np.float32),
+            opacity_logits=rng.normal(0, 5, count).astype(np.float32),
+            sh=rng.standard_normal((count, 16, 3)).astype(np.float32),
+            extras={"sigma": rng.random(count, np.float32)},
+        )
+        return made.Level(number, splats, {"s_min": s_min})
+
+    meta = {"camera_center": [1.0, 2.0, 3.0], "focal_px": 500.0, "seed": 4}
+    levels = [level(1, 200, 0.02), level(2, 500, 0.005), level(3, 1500, 0.0)]
+    return made.Bundle("flod", levels, "bands", {}, {"gamma": 1.5}, meta=meta)
+
+
+@pytest.fixture
+def file(lodgs, bundle, tmp_path):
+    path = tmp_path / "scène 1.ply"
+    lodgs("training.splats.bundle").write_bundle(path, bundle)
+    return path
+
+
+def the_root(bpy):
+    (root,) = [o for o in bpy.data.objects if o.lodgs.is_root]
+    return root
+
+
+def test_bundle_in_and_out_is_the_same_file(bpy, bundle, file, tmp_path):
+    assert bpy.ops.lodgs.import_splats(filepath=str(file)) == {"FINISHED"}
+    settings = the_root(bpy).lodgs
+    assert [(i.number, len(i.object.data.points), json.loads(i.facts)) for i in settings.levels] == [
+        (1, 200, {"s_min": 0.02}), (2, 500, {"s_min": 0.005}), (3, 1500, {"s_min": 0.0})
+    ]  # fmt: skip
+    assert (settings.method, settings.rule, settings.bands.gamma) == ("flod", "bands", 1.5)
+    assert tuple(settings.camera_center) == (1, 2, 3)
+    assert (settings.mode, settings.single_level) == ("SINGLE", 3)
+    assert (settings.bands.first, settings.bands.last) == (1, 3)
+
+    out = tmp_path / "out.ply"
+    assert bpy.ops.lodgs.export_bundle(filepath=str(out)) == {"FINISHED"}
+    assert out.read_bytes() == file.read_bytes()
+
+
+def test_saved_and_opened_still_the_same_file(bpy, file, tmp_path):
+    bpy.ops.lodgs.import_splats(filepath=str(file))
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"))
+    assert (tmp_path / "out.ply").read_bytes() == file.read_bytes()
+
+
+def test_several_plain_files_at_once_as_dropped(bpy, lodgs, bundle, tmp_path):
+    for level in bundle.levels[:2]:
+        lodgs("training.splats.ply").write_ply(tmp_path / f"plain{level.number}.ply", level.splats)
+    bpy.ops.lodgs.import_splats(
+        "INVOKE_DEFAULT", directory=str(tmp_path), files=[{"name": "plain1.ply"}, {"name": "plain2.ply"}]
+    )
+    roots = [o for o in bpy.data.objects if o.lodgs.is_root]
+    assert sorted(o.name for o in roots) == ["plain1", "plain2"]
+    for root in roots:
+        (item,) = root.lodgs.levels
+        assert (root.lodgs.method, root.lodgs.rule, item.facts) == ("", "", "{}")
+    bpy.context.view_layer.objects.active = bpy.data.objects["plain2"]
+    bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "out.ply"))
+    assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "plain2.ply").read_bytes()
+
+
+def test_a_foreign_dialect_is_warned_of_and_named_again_on_export(bpy, lodgs, bundle, tmp_path):
+    splats = bundle.levels[0].splats
+    lodgs("training.splats.ply").write_ply(tmp_path / "mip.ply", splats, ["SplatRenderMode: mip"])
+    said = []
+    lodgs("data.scenes").import_splats(bpy.context, tmp_path / "mip.ply", warn=said.append)
+    assert len(said) == 1 and "trained with Mip-Splatting's 2D filter" in said[0]
+    bpy.context.view_layer.objects.active = bpy.data.objects["mip"]
+    for source in ("SHOWN", "LEVEL"):
+        bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "out.ply"), source=source)
+        assert (tmp_path / "out.ply").read_bytes().count(b"\ncomment SplatRenderMode: mip\n") == 1
+
+
+def test_upright_turns_minus_y_up(bpy, lodgs, file):
+    root = lodgs("data.scenes").import_splats(bpy.context, file)
+    bpy.context.view_layer.update()
+    assert np.array(root.matrix_world)[:3, :3] @ [0, -1, 0] == pytest.approx([0, 0, 1], abs=1e-6)
+
+
+def test_upright_is_as_the_bundle_says(bpy, lodgs, bundle, tmp_path):
+    turned = np.array([[0, 0.6, 0.8], [1, 0, 0], [0, 0.8, -0.6]])  # a rotation
+    bundle.meta["up_rotation"] = turned
+    lodgs("training.splats.bundle").write_bundle(tmp_path / "b.ply", bundle)
+    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "b.ply")
+    bpy.context.view_layer.update()
+    assert np.array(root.matrix_world)[:3, :3] == pytest.approx(turned, abs=1e-6)
+
+
+def test_one_level_and_what_is_shown(bpy, lodgs, bundle, file, tmp_path):
+    bpy.ops.lodgs.import_splats(filepath=str(file))
+    root, out = the_root(bpy), tmp_path / "out.ply"
+    bpy.ops.lodgs.export_plain(filepath=str(out), source="LEVEL", level=2)
+    vertex = plyfile.PlyData.read(out)["vertex"]
+    splats = bundle.levels[1].splats
+    assert np.array_equal(np.column_stack([vertex[k] for k in "xyz"]), splats.means)
+    assert np.array_equal(vertex["opacity"], splats.opacity_logits)
+    assert np.array_equal(vertex["scale_1"], splats.log_scales[:, 1])
+    assert np.array_equal(vertex["rot_0"], splats.quats[:, 0])
+    assert np.array_equal(vertex["f_rest_15"], splats.sh[:, 1, 1])
+
+    root.lodgs.mode, root.lodgs.eye, root.lodgs.bands.gamma = "SELECTIVE", "TRAINING", 1.0
+    bpy.context.view_layer.update()
+    bpy.ops.lodgs.export_plain(filepath=str(out), source="SHOWN")
+    f = root.lodgs.focal_px
+    wanted = []
+    for level, near, far in zip(
+        bundle.levels, [0.02 * f, 0.005 * f, 0], [np.inf, 0.02 * f, 0.005 * f], strict=True
+    ):
+        distance = np.linalg.norm(level.splats.means.astype(float) - [1, 2, 3], axis=1)
+        wanted.append(level.splats.select((distance >= near) & (distance < far)))
+    assert all(len(part) for part in wanted[1:])
+    vertex = plyfile.PlyData.read(out)["vertex"]
+    assert np.array_equal(vertex["scale_2"], np.concatenate([part.log_scales[:, 2] for part in wanted]))
+    assert np.array_equal(vertex["f_rest_44"], np.concatenate([part.sh[:, 15, 2] for part in wanted]))
+    assert lodgs("data.scenes").count_shown(bpy.context, root) == (sum(map(len, wanted)), 2200)
+
+    for item in root.lodgs.levels:
+        item.show = False
+    bpy.context.view_layer.update()
+    with pytest.raises(RuntimeError, match="No splats of scène 1 are shown"):
+        bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "none.ply"))
+    assert not (tmp_path / "none.ply").exists()
+
+
+def test_only_this_one(bpy, file):
+    bpy.ops.lodgs.import_splats(filepath=str(file))
+    settings = the_root(bpy).lodgs
+    settings.mode, settings.levels[0].show = "SELECTIVE", False
+    bpy.ops.lodgs.show_only_level(level=1)
+    bpy.context.view_layer.update()
+    assert [i.object.visible_get() for i in settings.levels] == [True, False, False]
+
+
+def test_deleted_level_is_left_out(bpy, bundle, file, tmp_path):
+    bpy.ops.lodgs.import_splats(filepath=str(file))
+    root = the_root(bpy)
+    bpy.data.objects.remove(root.lodgs.levels[1].object)
+    bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"))
+    elements = plyfile.PlyData.read(tmp_path / "out.ply").elements
+    assert [e.count for e in elements if "vertex" in e.name] == [1500, 200]
+    with pytest.raises(RuntimeError, match="no level 2"):
+        bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "x.ply"), source="LEVEL", level=2)
+
+
+def test_folder(bpy, bundle, file, tmp_path):
+    bpy.ops.lodgs.import_splats(filepath=str(file))
+    folder = tmp_path / "new" / "levels"
+    assert bpy.ops.lodgs.export_folder(directory=str(folder)) == {"FINISHED"}
+    for lod, level in enumerate(reversed(bundle.levels)):
+        vertex = plyfile.PlyData.read(folder / f"lod{lod}.ply")["vertex"]
+        assert np.array_equal(vertex["x"], level.splats.means[:, 0])
+    assert len(json.loads((folder / "manifest.json").read_text())["levels"]) == 3
+    with pytest.raises(RuntimeError, match="already holds levels"):
+        bpy.ops.lodgs.export_folder(directory=str(folder))
+    assert bpy.ops.lodgs.export_folder(directory=str(folder), replace=True) == {"FINISHED"}
+
+
+def test_bad_files_are_said_and_leave_nothing(bpy, file, tmp_path):
+    short = tmp_path / "short.ply"
+    short.write_bytes(file.read_bytes()[:-100])
+    (tmp_path / "text.ply").write_text("hello")
+    for name in ("short.ply", "text.ply", "absent.ply"):
+        with pytest.raises(RuntimeError, match=name):
+            bpy.ops.lodgs.import_splats(filepath=str(tmp_path / name))
+    assert not bpy.data.objects and not bpy.data.pointclouds and not bpy.data.collections
+    assert not bpy.ops.lodgs.export_bundle.poll()
+
+
+def test_nothing_is_written_where_nothing_can_be(bpy, file, tmp_path):
+    bpy.ops.lodgs.import_splats(filepath=str(file))
+    (tmp_path / "blocked").write_text("a file, not a folder")
+    with pytest.raises(RuntimeError, match="could not be written"):
+        bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "blocked" / "out.ply"))
+
+
+def test_undo_of_an_import(bpy, file):
+    bpy.ops.ed.undo_push(message="before")
+    bpy.ops.lodgs.import_splats("EXEC_DEFAULT", True, filepath=str(file))
+    assert len(bpy.data.pointclouds) == 3
+    bpy.ops.ed.undo()
+    assert not bpy.data.pointclouds and not bpy.data.objects and not bpy.data.node_groups
+
+
+def test_menus_offer_them(bpy):
+    for menu in (bpy.types.TOPBAR_MT_file_import, bpy.types.TOPBAR_MT_file_export):
+        assert any("lodgs" in f.__module__ for f in menu._dyn_ui_initialize())
+    assert bpy.types.LODGS_FH_splats.bl_import_operator == "lodgs.import_splats"
+
+
+def test_everything_shown_has_a_tooltip(bpy):
+    """Operators, their options and the settings of a scene: short names, and a sentence each."""
+    names = [n for n in dir(bpy.ops.lodgs) if not n.startswith("_")]
+    shown = [getattr(bpy.ops.lodgs, name).get_rna_type() for name in names]
+    assert len(shown) > 5 and all(kind.description for kind in shown)
+    shown += [bpy.types.Object.bl_rna.properties["lodgs"].fixed_type]
+    for kind in shown:
+        for prop in kind.properties:
+            ours = prop.identifier not in {"rna_type", "name", "levels", "training", "files", "directory"}
+            if ours and not prop.is_hidden and "filter" not in prop.identifier:
+                assert prop.description, (kind.identifier, prop.identifier)
+                assert len(prop.name) <= 24, (kind.identifier, prop.name)

@@ -1,0 +1,146 @@
+"""Splats to point clouds and back: bit for bit where nobody touched them, and with what artists change."""
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture
+def make(lodgs):
+    def make(count: int, degree: int = 3, seed: int = 0, **extras):
+        rng = np.random.default_rng(seed)
+
+        def normal(*shape, spread=1.0):
+            return (spread * rng.standard_normal(shape)).astype(np.float32)
+
+        return lodgs("training.splats.gaussians").Splats(
+            means=normal(count, 3, spread=3),
+            quats=normal(count, 4),  # of any length, as files have them
+            log_scales=normal(count, 3, spread=2) - 2,
+            opacity_logits=normal(count, spread=4),
+            sh=normal(count, (degree + 1) ** 2, 3),
+            extras=extras,
+        )
+
+    return make
+
+
+def same_bits(a, b) -> bool:
+    fields = ("means", "quats", "log_scales", "opacity_logits", "sh")
+    pairs = [(getattr(a, name), getattr(b, name)) for name in fields]
+    pairs += [(a.extras[name], b.extras[name]) for name in a.extras]
+    return list(a.extras) == list(b.extras) and all(
+        x.dtype == y.dtype and x.shape == y.shape and x.tobytes() == y.tobytes() for x, y in pairs
+    )
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_there_and_back_to_the_bit(lodgs, make, degree):
+    objects = lodgs("data.objects")
+    rng = np.random.default_rng(1)
+    splats = make(
+        500,
+        degree,
+        sigma=rng.random(500, np.float32),
+        scale=rng.random(500, np.float32),  # a name that means something else to a point cloud
+        label=rng.integers(0, 255, 500).astype(np.uint8),
+        key=rng.integers(0, 2**32, 500).astype(np.uint32),
+        time=rng.random(500),
+    )
+    splats.log_scales[:100] *= 4
+    splats.opacity_logits[:100] *= 10  # sigmoid saturates
+    obj = objects.new_splats("s", splats)
+    assert same_bits(splats, objects.read_splats(obj))
+
+
+def test_no_splats_and_one(lodgs, make):
+    objects = lodgs("data.objects")
+    for count in (0, 1):
+        splats = make(count, 1)
+        assert same_bits(splats, objects.read_splats(objects.new_splats("s", splats)))
+
+
+def test_attributes_are_those_of_native_splats(lodgs, make):
+    objects, attributes, splats = lodgs("data.objects"), lodgs("attributes"), make(50, 2)
+    cloud = objects.new_splats("s", splats).data
+    base = attributes.read_attribute(cloud, "radiance:base")
+    assert np.array_equal(base[:, :3], splats.sh[:, 0])
+    assert base[:, 3] == pytest.approx(1 / (1 + np.exp(-splats.opacity_logits.astype(float))), abs=1e-6)
+    for k in range(1, 9):
+        assert np.array_equal(attributes.read_attribute(cloud, f"radiance:sh_{k}"), splats.sh[:, k])
+    assert "radiance:sh_9" not in cloud.attributes
+    scale = attributes.read_attribute(cloud, "scale")
+    assert scale == pytest.approx(np.exp(splats.log_scales.astype(float)), rel=1e-6)
+    rotation = attributes.read_attribute(cloud, "rotation")
+    quats = splats.quats.astype(float)
+    assert rotation == pytest.approx(quats / np.linalg.norm(quats, axis=1, keepdims=True), abs=1e-6)
+    assert cloud.attributes["rotation"].data_type == "QUATERNION"
+
+
+def test_display_colour(lodgs, make):
+    objects, attributes, splats = lodgs("data.objects"), lodgs("attributes"), make(50, 0)
+    obj = objects.new_splats("s", splats)
+    shown = attributes.read_attribute(obj.data, "display_color")[:, :3].astype(float)
+    srgb = np.where(shown <= 0.0031308, shown * 12.92, 1.055 * shown ** (1 / 2.4) - 0.055)
+    truth = np.clip(0.5 + splats.sh[:, 0] / (2 * np.sqrt(np.pi)), 0, 1)
+    assert srgb == pytest.approx(truth, abs=0.5 / 255 + 1e-4)
+    assert tuple(obj.color[:3]) == pytest.approx(shown.mean(axis=0), abs=1e-5)
+
+
+def test_what_artists_change_wins(lodgs, make):
+    objects, attributes, splats = lodgs("data.objects"), lodgs("attributes"), make(40, 1)
+    obj = objects.new_splats("s", splats)
+    cloud = obj.data
+    scale = attributes.read_attribute(cloud, "scale")
+    scale[:10] *= 2
+    attributes.write_attribute(cloud, "scale", "FLOAT_VECTOR", scale)
+    base = attributes.read_attribute(cloud, "radiance:base")
+    base[20:, 3] = 0.25
+    attributes.write_attribute(cloud, "radiance:base", cloud.attributes["radiance:base"].data_type, base)
+
+    back = objects.read_splats(obj)
+    changed = splats.log_scales[:10].astype(float) + np.log(2)
+    assert back.log_scales[:10] == pytest.approx(changed, abs=1e-5)
+    assert np.array_equal(back.log_scales[10:], splats.log_scales[10:])
+    assert np.array_equal(back.opacity_logits[:20], splats.opacity_logits[:20])
+    assert back.opacity_logits[20:] == pytest.approx(np.log(0.25 / 0.75), abs=1e-6)
+    assert np.array_equal(back.quats, splats.quats)
+
+
+def test_deleted_points_stay_away(bpy, lodgs, make):
+    """By a modifier, as its evaluated points; the others are still theirs to the bit."""
+    objects, splats = lodgs("data.objects"), make(60, 1, label=np.arange(60, dtype=np.uint8))
+    obj = objects.new_splats("s", splats)
+    bpy.context.scene.collection.objects.link(obj)
+    group = bpy.data.node_groups.new("crop", "GeometryNodeTree")
+    for way in ("INPUT", "OUTPUT"):
+        group.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
+    nodes = [
+        group.nodes.new(kind) for kind in ("NodeGroupInput", "GeometryNodeDeleteGeometry", "NodeGroupOutput")
+    ]
+    index, less = group.nodes.new("GeometryNodeInputIndex"), group.nodes.new("FunctionNodeCompare")
+    less.data_type, less.operation = "INT", "LESS_THAN"
+    a, b = [socket for socket in less.inputs if socket.enabled][:2]
+    b.default_value = 25
+    group.links.new(index.outputs[0], a)
+    group.links.new(less.outputs[0], nodes[1].inputs["Selection"])
+    group.links.new(nodes[0].outputs[0], nodes[1].inputs["Geometry"])
+    group.links.new(nodes[1].outputs[0], nodes[2].inputs[0])
+    obj.modifiers.new("crop", "NODES").node_group = group
+    left = objects.read_splats(obj, bpy.context.evaluated_depsgraph_get())
+    assert same_bits(splats.select(slice(25, None)), left)
+
+
+def test_not_splats(lodgs):
+    objects = lodgs("data.objects")
+    obj = objects.new_points("p", np.zeros((3, 3)), np.zeros((3, 3), np.uint8), 0.1)
+    with pytest.raises(lodgs("training.errors").LodgsError, match="no splats"):
+        objects.read_splats(obj)
+
+
+def test_megabytes_are_those_of_the_file(bpy, lodgs, make, tmp_path):
+    splats = make(2000, 3)
+    lodgs("training.splats.ply").write_ply(tmp_path / "a.ply", splats)
+    size = (tmp_path / "a.ply").stat().st_size / 1e6
+    assert lodgs("data.objects").megabytes(
+        lodgs("data.objects").new_splats("s", splats).data
+    ) == pytest.approx(size, rel=0.01)

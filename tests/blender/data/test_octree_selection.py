@@ -1,0 +1,155 @@
+"""Octree-GS in Blender: what the modifiers show of levels that add up, against the rule in numpy."""
+
+import numpy as np
+import pytest
+
+from training.lod.rules.octree import faded, wanted_at
+
+LEVELS, COUNT, D_MAX, FOCAL = 4, 5_000, 16.0, 700.0
+
+
+@pytest.fixture
+def root(bpy, lodgs, tmp_path):
+    """Four levels of points out to 40 units, from a bundle, with a scene camera."""
+    scene, rng = bpy.context.scene, np.random.default_rng(7)
+    scene.lodgs_viewport.splats = False  # points keep their radius
+    bundles = lodgs("training.splats.bundle")
+    levels = []
+    for number in range(1, LEVELS + 1):
+        direction = rng.standard_normal((COUNT, 3))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        splats = lodgs("training.splats.gaussians").Splats(
+            means=(direction * rng.uniform(0, 40, (COUNT, 1))).astype(np.float32),
+            quats=np.tile(np.float32([1, 0, 0, 0]), (COUNT, 1)),
+            log_scales=np.full((COUNT, 3), -5, np.float32),
+            opacity_logits=rng.normal(size=COUNT).astype(np.float32),
+            sh=np.zeros((COUNT, 1, 3), np.float32),
+            extras={"lod_bias": rng.uniform(0, 0.5, COUNT).astype(np.float32)},
+        )
+        levels.append(bundles.Level(number, splats))
+    facts = {"d_max": D_MAX, "d_max_focal": FOCAL}
+    bundle = bundles.Bundle("octree", levels, "octree", facts, cumulative=True)
+    bundles.write_bundle(tmp_path / "b.ply", bundle)
+    camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "b.ply")
+    root.lodgs.mode = "SELECTIVE"
+    return root
+
+
+def expected(root, eye, focal, offset=0.0):
+    """Each level's weights by the rule."""
+    found = []
+    for item in root.lodgs.levels:
+        cloud = item.object.data
+        means, bias = np.empty(3 * COUNT, np.float32), np.empty(COUNT, np.float32)
+        cloud.attributes["position"].data.foreach_get("vector", means)
+        cloud.attributes["lod_bias"].data.foreach_get("value", bias)
+        distances = np.linalg.norm(means.reshape(-1, 3) - np.float32(eye), axis=1) * (FOCAL / focal)
+        found.append(faded(wanted_at(distances, bias + offset, D_MAX, LEVELS), item.number))
+    return found
+
+
+def shown(bpy, root):
+    """Each level's weights and radii, of the points that are left."""
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    found = []
+    for item in root.lodgs.levels:
+        cloud = item.object.evaluated_get(depsgraph).data
+        weights, radii = np.empty(len(cloud.points), np.float32), np.empty(len(cloud.points), np.float32)
+        if len(weights):
+            cloud.attributes["lod_weight"].data.foreach_get("value", weights)
+            cloud.attributes["radius"].data.foreach_get("value", radii)
+        found.append((weights, radii))
+    return found
+
+
+@pytest.mark.parametrize("offset", [0.0, -1.3, 0.7])
+def test_levels_fade_in_as_the_rule_says(bpy, root, offset):
+    settings = root.lodgs
+    settings.octree.offset = offset
+    bpy.context.scene.camera.location = (3, -2, 1)
+    bpy.context.scene.camera.data.lens = 35
+    bpy.context.view_layer.update()
+    eye = root.matrix_world.inverted() @ bpy.context.scene.camera.matrix_world.translation
+    rule = expected(root, eye, settings.focal_px, offset)
+    counts = []
+    for item, wanted, (weights, radii) in zip(settings.levels, rule, shown(bpy, root), strict=True):
+        some = wanted > 1e-5
+        assert abs(len(weights) - some.sum()) <= 2  # the last bits of the logarithm at weight 0
+        if len(weights) == some.sum():
+            assert np.abs(weights - wanted[some]).max(initial=0) < 1e-4
+            before = np.empty(COUNT, np.float32)
+            item.object.data.attributes["radius"].data.foreach_get("value", before)
+            assert np.allclose(radii, before[some] * weights, rtol=1e-5)
+        counts.append(int(some.sum()))
+    assert counts[0] == COUNT  # level 1 is always there
+    assert counts == sorted(counts, reverse=True)
+    assert any(0 < n < COUNT for n in counts)
+
+
+def test_one_level_means_all_up_to_it(bpy, root):
+    root.lodgs.mode, root.lodgs.single_level = "SINGLE", 2
+    bpy.context.view_layer.update()
+    assert [item.object.visible_get() for item in root.lodgs.levels] == [True, True, False, False]
+    root.lodgs.mode = "SELECTIVE"
+    bpy.context.view_layer.update()
+    assert all(item.object.visible_get() for item in root.lodgs.levels)
+
+
+def test_the_star_shows_what_an_eye_had_hidden(bpy, lodgs, root):
+    root.lodgs.levels[0].show = root.lodgs.levels[2].show = False
+    bpy.ops.lodgs.show_only_level(level=2)
+    bpy.context.view_layer.update()
+    assert [item.object.visible_get() for item in root.lodgs.levels] == [True, True, False, False]
+
+
+def test_a_level_is_exported_with_all_that_it_adds_to(bpy, lodgs, root):
+    splats = lodgs("data.scenes").read_level(root, 3)
+    assert len(splats) == 3 * COUNT
+    means = np.empty(3 * COUNT, np.float32)
+    root.lodgs.levels[1].object.data.attributes["position"].data.foreach_get("vector", means)
+    assert (splats.means[COUNT : 2 * COUNT] == means.reshape(-1, 3)).all()
+
+
+def test_another_method_leaves_no_driver_of_the_first(bpy, lodgs, root):
+    """Trained again with FLoD and back: each level has one modifier, with the drivers of its rule only."""
+    Bundle = lodgs("training.splats.bundle").Bundle
+    for item in root.lodgs.levels:
+        item.facts = '{"s_min": 0.5}'
+    obj = root.lodgs.levels[0].object
+    obj.modifiers.new("mine", "NODES")
+    for rule, facts, name in (
+        ("bands", {}, "LODGS Bands"),
+        ("octree", {"d_max": 2.0, "d_max_focal": FOCAL}, "LODGS Octree"),
+    ):
+        bundle = Bundle("", [], rule, facts, cumulative=rule == "octree")
+        lodgs("data.scenes").set_bundle_facts(root, bundle)
+        for item in root.lodgs.levels:
+            names = [modifier.name for modifier in item.object.modifiers if modifier.name != "mine"]
+            assert names == ["LODGS Display", name]
+            paths = [driver.data_path for driver in item.object.animation_data.drivers]
+            assert len(paths) == len(set(paths))
+            assert all(name in path or "Display" in path for path in paths if path.startswith("modifiers"))
+            assert all(driver.driver.is_valid for driver in item.object.animation_data.drivers)
+        assert [modifier.name for modifier in obj.modifiers][1:] == [name, "mine"], "in its old place"
+    bpy.context.view_layer.update()
+    assert sum(len(weights) for weights, _ in shown(bpy, root)) > COUNT
+
+
+def test_what_is_shown_is_exported_as_it_fades(bpy, lodgs, root):
+    bpy.context.scene.camera.location = (3, -2, 1)
+    bpy.context.view_layer.update()
+    splats = lodgs("data.scenes").shown_splats(bpy.context, root)
+    eye = root.matrix_world.inverted() @ bpy.context.scene.camera.matrix_world.translation
+    opacities = []
+    for item, weights in zip(root.lodgs.levels, expected(root, eye, root.lodgs.focal_px), strict=True):
+        logits = np.empty(COUNT, np.float32)
+        item.object.data.attributes["opacity_logit"].data.foreach_get("value", logits)
+        opacities.append((weights / (1 + np.exp(-logits)))[weights > 0])
+    opacities = np.concatenate(opacities)
+    assert abs(len(splats) - len(opacities)) <= 4
+    assert "lod_weight" not in splats.extras
+    if len(splats) == len(opacities):
+        assert np.allclose(1 / (1 + np.exp(-splats.opacity_logits)), opacities, atol=1e-4)

@@ -1,0 +1,383 @@
+"""What the modifiers keep, against the rule in numpy, splat for splat, for cameras of every kind."""
+
+from math import inf
+
+import numpy as np
+import pytest
+
+S_MIN = [0.012, 0.003, 0.00075, 0.0001875, 0.0]
+COUNT = 20_000
+
+
+def flod_bands(s_min, f, gamma, first, last):
+    """FLoD, Eq. 7 and 8: near and far of each level, (inf, inf) where it is not in use."""
+    d_proj = [size / gamma * f for size in s_min]
+    return [
+        (d_proj[n - 1] if n < last else 0.0, d_proj[n - 2] if n > first else inf)
+        if first <= n <= last
+        else (inf, inf)
+        for n in range(1, len(s_min) + 1)
+    ]
+
+
+@pytest.fixture
+def root(bpy, lodgs):
+    """Five levels of points out to 40 units, with a scene camera."""
+    scene, rng = bpy.context.scene, np.random.default_rng(7)
+    bundle = lodgs("training.splats.bundle")
+    levels = []
+    for number, s_min in enumerate(S_MIN, 1):
+        direction = rng.standard_normal((COUNT, 3))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        splats = lodgs("training.splats.gaussians").Splats(
+            means=(direction * rng.uniform(0, 40, (COUNT, 1))).astype(np.float32),
+            quats=np.tile(np.float32([1, 0, 0, 0]), (COUNT, 1)),
+            log_scales=np.full((COUNT, 3), -5, np.float32),
+            opacity_logits=np.zeros(COUNT, np.float32),
+            sh=np.zeros((COUNT, 1, 3), np.float32),
+        )
+        levels.append(bundle.Level(number, splats, {"s_min": s_min}))
+    camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    with lodgs("data.scenes")._new_scene(bpy.context, "scene") as root:
+        lodgs("data.scenes").set_bundle_facts(root, bundle.Bundle("flod", [], "bands"))
+        for level in levels:
+            lodgs("data.scenes").set_level(root, level)
+    root.lodgs.mode = "SELECTIVE"
+    return root
+
+
+def focal(bpy) -> float:
+    """Focal length in pixels, the smaller of fx and fy, from the camera's own projection matrix."""
+    scene = bpy.context.scene
+    render, depsgraph = scene.render, bpy.context.evaluated_depsgraph_get()
+    scale = render.resolution_percentage / 100
+    width, height = int(render.resolution_x * scale), int(render.resolution_y * scale)
+    matrix = scene.camera.calc_matrix_camera(
+        depsgraph, x=width, y=height, scale_x=render.pixel_aspect_x, scale_y=render.pixel_aspect_y
+    )
+    return min(matrix[0][0] * width / 2, matrix[1][1] * height / 2)
+
+
+def kept(bpy, root) -> list[np.ndarray | None]:
+    """What each level shows: the positions that its modifier leaves, None where it is hidden."""
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    shown = {i.object.original.name for i in depsgraph.object_instances if not i.is_instance}
+    found = []
+    for item in root.lodgs.levels:
+        cloud = item.object.evaluated_get(depsgraph).data
+        positions = np.empty(len(cloud.points) * 3, np.float32)
+        if len(positions):
+            cloud.attributes["position"].data.foreach_get("vector", positions)
+        found.append(positions.reshape(-1, 3) if item.object.name in shown else None)
+    return found
+
+
+def check(bpy, root, eye=None, f=None) -> list[int]:
+    """Every level shows exactly what the rule says; returns how many splats."""
+    bpy.context.view_layer.update()
+    settings = root.lodgs
+    if f is None:
+        f = focal(bpy)
+    assert settings.focal_px == pytest.approx(f, rel=1e-6)
+    if eye is None:
+        world = np.array(bpy.context.scene.camera.matrix_world, np.float64)[:, 3]
+        eye = np.linalg.solve(np.array(root.matrix_world, np.float64), world)[:3]
+    bands = flod_bands(S_MIN, f, settings.bands.gamma, settings.bands.first, settings.bands.last)
+    counts = []
+    for item, shown, (near, far) in zip(settings.levels, kept(bpy, root), bands, strict=True):
+        everything = np.empty(COUNT * 3, np.float32)
+        item.object.data.attributes["position"].data.foreach_get("vector", everything)
+        everything = everything.reshape(-1, 3)
+        difference = everything - np.float32(eye)
+        x, y, z = (difference**2).T
+        away = np.sqrt(x + y + z)
+        wanted = everything[(away >= np.float32(near)) & (away < np.float32(far))]
+        if near == inf:
+            assert shown is None and len(wanted) == 0
+        else:
+            assert np.array_equal(shown, wanted)
+        counts.append(len(wanted))
+    return counts
+
+
+def test_every_setting_moves_the_bands(bpy, root):
+    scene, camera, settings = bpy.context.scene, bpy.context.scene.camera, root.lodgs
+    first = check(bpy, root)
+    assert all(first)
+    seen = [first]
+
+    def changed():
+        seen.append(check(bpy, root))
+        assert seen[-1] != seen[-2]
+
+    camera.location = (3, -2, 1)
+    changed()
+    settings.bands.gamma = 2.5
+    changed()
+    settings.bands.first, settings.bands.last = 3, 5
+    changed()
+    settings.bands.first, settings.bands.last = 2, 4
+    changed()
+    camera.data.lens = 85
+    changed()
+    camera.data.sensor_width = 22.3
+    changed()
+    scene.render.resolution_x, scene.render.resolution_y = 640, 1001
+    changed()
+    camera.data.sensor_fit = "VERTICAL"
+    changed()
+    camera.data.sensor_height = 18
+    changed()
+    camera.data.sensor_fit = "HORIZONTAL"
+    changed()
+    scene.render.resolution_percentage = 33
+    changed()
+    camera.data.sensor_fit = "AUTO"
+    scene.render.pixel_aspect_y = 1.6
+    changed()
+    before = root.lodgs.focal_px
+    scene.render.pixel_aspect_y = 2.0
+    check(bpy, root)
+    assert root.lodgs.focal_px == before  # taller pixels make fx larger, and the smaller one counts
+    scene.render.pixel_aspect_x = 2.6
+    changed()
+
+
+def test_moving_turning_and_scaling_the_root_changes_nothing(bpy, root):
+    """Where the camera goes along; the camera alone still counts in the splats' own units."""
+    bpy.context.scene.camera.parent = root
+    bpy.context.scene.camera.location = (1, 2, 3)
+    before = check(bpy, root, eye=(1, 2, 3))
+    root.location, root.rotation_euler, root.scale = (0.5, 0.25, -2), (0, 0, np.pi / 2), (4, 4, 4)
+    bpy.context.view_layer.update()
+    after = [len(p) for p in kept(bpy, root)]
+    # Blender's own transforms round, so a splat on the very edge of a band may change sides.
+    assert np.abs(np.subtract(after, before)).max() <= 1
+
+
+def test_the_eye(bpy, root):
+    chosen = bpy.data.objects.new("chosen", None)
+    bpy.context.scene.collection.objects.link(chosen)
+    chosen.location = (10, 0, 0)
+    bpy.context.scene.camera.location = (0, 5, 0)
+    seen = [check(bpy, root, eye=(0, 5, 0))]
+    root.lodgs.eye = "OBJECT"
+    root.lodgs.eye_object = chosen
+    seen.append(check(bpy, root, eye=(10, 0, 0)))
+    chosen.location.x = 5
+    seen.append(check(bpy, root, eye=(5, 0, 0)))
+    root.lodgs.eye = "TRAINING"
+    root.lodgs.camera_center = (0, 0, 20)
+    seen.append(check(bpy, root, eye=(0, 0, 20)))
+    bpy.context.scene.camera.location = (0, 0, 0)
+    assert check(bpy, root, eye=(0, 0, 20)) == seen[-1]
+    root.lodgs.eye = "CAMERA"
+    seen.append(check(bpy, root, eye=(0, 0, 0)))
+    assert len({tuple(counts) for counts in seen}) == len(seen)
+
+
+def test_animated_parented_constrained_and_switched_cameras(bpy, root):
+    scene, camera = bpy.context.scene, bpy.context.scene.camera
+    carrier, follower = bpy.data.objects.new("carrier", None), bpy.data.cameras.new("follower")
+    follower.lens = 24
+    second = bpy.data.objects.new("second", follower)
+    for obj in (carrier, second):
+        scene.collection.objects.link(obj)
+    camera.parent, camera.location = carrier, (0, 0, 2)
+    for frame, x in ((1, 0.0), (21, 30.0)):
+        carrier.location.x = x
+        carrier.keyframe_insert("location", index=0, frame=frame)
+    root.lodgs.bands.gamma = 1.0
+    root.lodgs.bands.keyframe_insert("gamma", frame=1)
+    root.lodgs.bands.gamma = 3.0
+    root.lodgs.bands.keyframe_insert("gamma", frame=21)
+    constraint = second.constraints.new("COPY_LOCATION")
+    constraint.target = carrier
+    scene.timeline_markers.new("a", frame=1).camera = camera
+    scene.timeline_markers.new("b", frame=11).camera = second
+
+    seen = []
+    for frame in (1, 6, 10, 11, 16, 21, 3):
+        scene.frame_set(frame)
+        assert scene.camera == (camera if frame < 11 else second)
+        seen.append(tuple(check(bpy, root)))
+    assert len(set(seen)) == len(seen)
+
+
+def test_one_level_alone(bpy, root):
+    root.lodgs.mode = "SINGLE"
+    for number in (1, 4):
+        root.lodgs.single_level = number
+        bpy.context.view_layer.update()
+        shown = kept(bpy, root)
+        assert [None if p is None else len(p) for p in shown] == [
+            COUNT if n == number else None for n in range(1, 6)
+        ]
+    root.lodgs.levels[3].show = False
+    bpy.context.view_layer.update()
+    assert all(p is None for p in kept(bpy, root))
+
+
+def test_no_level_beyond_the_finest_can_be_chosen(bpy, root):
+    bands = root.lodgs.bands
+    root.lodgs.single_level = bands.last = bands.first = 9
+    assert (root.lodgs.single_level, bands.first, bands.last) == (5, 5, 5)
+    bands.last = 2
+    assert (bands.first, bands.last) == (2, 2)
+
+
+def test_unused_levels_are_not_evaluated(bpy, root):
+    root.lodgs.bands.first, root.lodgs.bands.last = 3, 4
+    bpy.context.view_layer.update()
+    for item in root.lodgs.levels:
+        used = item.number in (3, 4)
+        assert (item.object.hide_viewport, item.object.hide_render) == (not used, not used)
+    root.lodgs.mode = "SINGLE"
+    bpy.context.view_layer.update()
+    modifier = root.lodgs.levels[3].object.modifiers["LODGS Bands"]
+    assert not modifier.show_viewport and not modifier.show_render
+
+
+def test_drivers_need_no_scripts(bpy, root):
+    """Simple expressions are what Blender evaluates with Auto Run Python Scripts off."""
+    drivers = [c.driver for t in [root, *root.children] if t.animation_data for c in t.animation_data.drivers]
+    assert len(drivers) == 1 + 12 * len(S_MIN)
+    assert all(driver.is_simple_expression and driver.is_valid for driver in drivers)
+
+
+def test_selection_survives_saving(bpy, root, tmp_path):
+    before = check(bpy, root)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
+    bpy.ops.wm.read_homefile(use_empty=True)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "scene.blend"))
+    (again,) = [o for o in bpy.data.objects if o.lodgs.is_root]
+    assert check(bpy, again) == before
+    again.lodgs.bands.gamma = 2
+    assert check(bpy, again) != before
+
+
+def test_a_level_arrives_anew(bpy, lodgs, root):
+    """In the middle of the list, too: drivers know levels by their place in it."""
+    settings = root.lodgs
+    bundle, objects = lodgs("training.splats.bundle"), lodgs("data.objects")
+    item = settings.levels[2]
+    obj, splats = item.object, objects.read_splats(item.object)
+    clouds = len(bpy.data.pointclouds)
+    again = lodgs("data.scenes").set_level(root, bundle.Level(3, splats, {"s_min": S_MIN[2]}))
+    assert again == obj and len(settings.levels) == 5 and len(bpy.data.pointclouds) == clouds
+    assert [entry.number for entry in settings.levels] == [1, 2, 3, 4, 5]
+    check(bpy, root)
+
+
+def test_a_level_arrives_while_an_artist_works(bpy, lodgs, root):
+    """Training goes on beside other work: mode, selection and active object stay."""
+    bpy.ops.mesh.primitive_cube_add()
+    cube = bpy.context.object
+    bpy.ops.object.mode_set(mode="EDIT")
+    splats = lodgs("data.objects").read_splats(root.lodgs.levels[0].object)
+    scenes = len(bpy.data.scenes)
+    lodgs("data.scenes").set_level(root, lodgs("training.splats.bundle").Level(6, splats, {"s_min": 0.0}))
+    assert bpy.context.mode == "EDIT_MESH" and bpy.context.object == cube
+    assert bpy.context.selected_objects == [cube] and len(bpy.data.scenes) == scenes
+    assert root.lodgs.bands.last == 6
+
+
+def test_levels_that_are_gone_leave_no_gap(bpy, lodgs, root):
+    """A shorter training after a longer one: its finest level reaches up to the eye."""
+    for item in list(root.lodgs.levels)[3:]:
+        bpy.data.objects.remove(item.object)
+    lodgs("data.scenes").set_bundle_facts(root, lodgs("training.splats.bundle").Bundle("flod", [], "bands"))
+    assert [item.number for item in root.lodgs.levels] == [1, 2, 3]
+    assert (root.lodgs.bands.last, root.lodgs.single_level) == (3, 3)
+    bpy.context.view_layer.update()
+    nearest = kept(bpy, root)[2]
+    assert np.linalg.norm(nearest, axis=1).min() < 0.1
+
+
+def test_levels_keep_their_material(bpy, root):
+    """Also one of the artist's own, on the data or on the object."""
+
+    def shown():
+        bpy.context.view_layer.update()
+        bpy.context.view_layer.update()  # what followed the change
+        evaluated = obj.evaluated_get(bpy.context.evaluated_depsgraph_get())
+        assert 0 < len(evaluated.data.points) < COUNT
+        return [material.name for material in evaluated.data.materials]
+
+    obj = root.lodgs.levels[1].object
+    assert shown() == ["LODGS Points"]
+    obj.data.materials[0] = bpy.data.materials.new("mine")
+    assert shown() == ["mine"]
+    obj.material_slots[0].link = "OBJECT"
+    obj.material_slots[0].material = bpy.data.materials.new("of the object")
+    assert shown() == ["of the object"]
+
+    updates = []
+    bpy.app.handlers.depsgraph_update_post.append(lambda *_: updates.append(1))
+    for _ in range(3):
+        bpy.context.view_layer.update()
+    bpy.app.handlers.depsgraph_update_post.pop()
+    assert not updates  # it comes to rest
+
+
+def test_a_level_deleted_by_hand_leaves_no_gap(bpy, lodgs, root):
+    """The others share its distances as if it had never been; undo brings it back."""
+    settings = root.lodgs
+    before = check(bpy, root)
+    bpy.ops.ed.undo_push(message="before")
+    for obj in bpy.context.selected_objects:
+        obj.select_set(False)
+    with bpy.context.temp_override(selected_objects=[settings.levels[2].object]):
+        bpy.ops.object.delete("EXEC_DEFAULT", True)
+    bpy.context.view_layer.update()
+    assert [item.number for item in settings.levels] == [1, 2, 4, 5]
+    bpy.context.view_layer.update()
+    bands = flod_bands([S_MIN[0], S_MIN[1], S_MIN[3], S_MIN[4]], focal(bpy), settings.bands.gamma, 1, 4)
+    for positions, (near, far) in zip(kept(bpy, root), bands, strict=True):
+        distances = np.linalg.norm(positions.astype(np.float64), axis=1)
+        assert distances.min() >= near * 0.9999 and distances.max() < min(far, 40.01) * 1.0001
+        assert abs(len(positions) / COUNT - (min(far, 40) - near) / 40) < 0.02  # uniform in the distance
+    settings.bands.first, settings.bands.last = 1, 3  # a number that is gone
+    bpy.context.view_layer.update()
+    assert np.linalg.norm(kept(bpy, root)[1], axis=1).min() < 0.1
+    settings.bands.first, settings.bands.last = 3, 5
+    bpy.context.view_layer.update()
+    assert np.linalg.norm(kept(bpy, root)[2], axis=1).max() > 39
+    bpy.ops.ed.undo()
+    (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
+    assert [item.number for item in root.lodgs.levels] == [1, 2, 3, 4, 5]
+    assert check(bpy, root) == before
+
+
+def test_without_a_camera(bpy, root):
+    """Blender's standard lens is assumed, and nothing breaks."""
+    bpy.context.scene.camera = None
+    check(bpy, root, eye=(0, 0, 0), f=50 / 36 * 1920)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "null", '{"s_min": "a"}', '{"s_min": NaN}', "[" * 5000])
+def test_facts_that_somebody_changed_are_none(bpy, lodgs, root, text):
+    """Other add-ons and scripts can write into any property."""
+    root.lodgs.facts = root.lodgs.meta = root.lodgs.levels[1].facts = text
+    lodgs("data.selection").attach(root)
+    lodgs("data.older_files").bring_up_to_date(root)
+    bundle = lodgs("data.scenes").read_levels(root)
+    assert bundle.facts.keys() <= {"s_min"} and "s_min" not in bundle.levels[1].facts
+    rule = lodgs("nodes.rules").rule_of_group
+    chosen = [
+        any(rule(getattr(modifier, "node_group", None)) for modifier in item.object.modifiers)
+        for item in root.lodgs.levels
+    ]
+    assert chosen == [True, False, False, True, True]  # the third needs to know of the second
+
+
+def test_a_level_whose_object_is_none_of_splats_leaves_the_list(bpy, lodgs, root):
+    mesh = bpy.data.objects.new("mesh", bpy.data.meshes.new("mesh"))
+    bpy.context.scene.collection.objects.link(mesh)
+    root.lodgs.levels[0].object = mesh
+    lodgs("data.selection").attach(root)
+    scenes = lodgs("data.scenes")
+    assert [level.number for level in scenes.read_levels(root).levels] == [2, 3, 4, 5]
+    assert scenes.count_shown(bpy.context, root)[1] == 4 * COUNT and not mesh.modifiers

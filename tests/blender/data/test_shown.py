@@ -1,0 +1,159 @@
+"""Which splats a scene shows, and how much of each: against the arrays that the splats were made of."""
+
+import json
+
+import numpy as np
+import pytest
+
+COUNT = 300
+
+
+def make_splats(lodgs, seed=0, count=COUNT, degree=1, **extras):
+    rng = np.random.default_rng(seed)
+    return lodgs("training.splats.gaussians").Splats(
+        means=rng.normal(size=(count, 3)).astype(np.float32),
+        quats=rng.normal(size=(count, 4)).astype(np.float32),
+        log_scales=rng.normal(-3, 0.5, (count, 3)).astype(np.float32),
+        opacity_logits=rng.normal(size=count).astype(np.float32),
+        sh=rng.normal(size=(count, (degree + 1) ** 2, 3)).astype(np.float32),
+        extras=extras,
+    )
+
+
+@pytest.fixture
+def two_levels(bpy, lodgs):
+    """A splat scene of two levels, side by side: root and the two levels' splats."""
+    level = lodgs("training.splats.bundle").Level
+    camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
+    bpy.context.scene.collection.objects.link(camera)
+    bpy.context.scene.camera = camera
+    splats = [make_splats(lodgs, seed) for seed in range(2)]
+    with lodgs("data.scenes")._new_scene(bpy.context, "scene") as root:
+        for number, s_min in ((2, 0.0), (1, 0.003)):
+            lodgs("data.scenes").set_level(root, level(number, splats[number - 1], {"s_min": s_min}))
+        bundle = lodgs("training.splats.bundle").Bundle("flod", [], "bands")
+        lodgs("data.scenes").set_bundle_facts(root, bundle)
+    root.location, root.rotation_euler, root.scale = (1, 2, 3), (0.3, 0.2, 0.1), (2, 2, 2)
+    bpy.context.view_layer.update()
+    return root, splats
+
+
+def sets(bpy, lodgs):
+    return lodgs("data.shown").visible_splats(bpy.context.evaluated_depsgraph_get())
+
+
+def test_arrays_are_activated_and_in_the_splats_own_space(bpy, lodgs, two_levels):
+    root, splats = two_levels
+    root.lodgs.single_level = 2
+    bpy.context.view_layer.update()
+    [(shown, arrays)] = sets(bpy, lodgs)
+    truth = splats[1]
+    assert shown.level == 2 and shown.object == root.lodgs.levels[1].object
+    assert np.allclose(shown.matrix_world, np.array(root.matrix_world), atol=1e-6)
+    assert np.array_equal(arrays.means, truth.means)
+    assert np.allclose(arrays.scales, np.exp(truth.log_scales.astype(float)), rtol=1e-6)
+    assert np.allclose(arrays.opacities, 1 / (1 + np.exp(-truth.opacity_logits.astype(float))), atol=1e-6)
+    norm = np.linalg.norm(truth.quats.astype(float), axis=1, keepdims=True)
+    assert np.allclose(arrays.quats, truth.quats / norm, atol=1e-6)
+    assert np.array_equal(arrays.sh, truth.sh)
+    assert arrays.weights is None
+    assert all(a.dtype == np.float32 for a in (arrays.means, arrays.quats, arrays.scales, arrays.sh))
+
+
+def test_distance_bands_count(bpy, lodgs, two_levels):
+    root, splats = two_levels
+    settings = root.lodgs
+    settings.mode, s_min = "SELECTIVE", json.loads(settings.levels[0].facts)["s_min"]
+    bpy.context.scene.camera.location = (3, 2, 3)
+    settings.bands.gamma = s_min * 1777.7 / 0.8  # near the middle of the splats
+    bpy.context.view_layer.update()
+    border = s_min / settings.bands.gamma * settings.focal_px
+    world = np.append(bpy.context.scene.camera.location, 1)
+    eye = np.linalg.solve(np.array(root.matrix_world, float), world)[:3]
+    found = sets(bpy, lodgs)
+    assert [shown.level for shown, _ in found] == [1, 2]
+    for (shown, arrays), truth in zip(found, splats, strict=True):
+        near = np.linalg.norm(truth.means - eye, axis=1) < border
+        assert np.array_equal(arrays.means, truth.means[near if shown.level == 2 else ~near])
+
+
+def test_octree_weights_are_beside_the_opacities(bpy, lodgs, two_levels):
+    root, splats = two_levels
+    Bundle, facts = lodgs("training.splats.bundle").Bundle, {"d_max": 1.2, "d_max_focal": 1000.0}
+    lodgs("data.scenes").set_bundle_facts(root, Bundle("", [], "octree", facts, cumulative=True))
+    root.lodgs.mode = "SELECTIVE"
+    bpy.context.view_layer.update()
+    found = sets(bpy, lodgs)
+    assert [len(arrays) for _, arrays in found] != [COUNT, COUNT]
+    assert (found[0][1].weights == 1).all()
+    fading = found[1][1].weights
+    assert ((fading > 0) & (fading <= 1)).all() and (fading < 1).any()
+    opacities = 1 / (1 + np.exp(-splats[1].opacity_logits))
+    assert np.isin(found[1][1].opacities, opacities.astype(np.float32)).all()
+
+
+def test_hidden_objects_are_not_shown_and_instances_are(bpy, lodgs, two_levels):
+    root, _ = two_levels
+    loose = lodgs("data.objects").new_splats("loose", make_splats(lodgs, 5, 7))
+    points = lodgs("data.objects").new_points("points", np.zeros((3, 3)), np.zeros((3, 3), np.uint8), 1.0)
+    for obj in (loose, points):
+        bpy.context.scene.collection.objects.link(obj)
+    carrier = bpy.data.objects.new("carrier", None)
+    carrier.instance_type, carrier.instance_collection = "COLLECTION", root.users_collection[0]
+    carrier.location = (10, 0, 0)
+    bpy.context.scene.collection.objects.link(carrier)
+    bpy.context.view_layer.update()
+    found = sets(bpy, lodgs)
+    assert [(shown.level, len(arrays)) for shown, arrays in found] == [(0, 7), (2, COUNT), (2, COUNT)]
+    first, second = (shown.matrix_world[:3, 3] for shown, _ in found[1:])
+    assert sorted(np.abs(first - second).round(5)) == [0, 0, 10]
+    loose.hide_set(True)
+    carrier.hide_viewport = True
+    bpy.context.view_layer.update()
+    assert [shown.level for shown, _ in sets(bpy, lodgs)] == [2]
+    root.users_collection[0].hide_viewport = True
+    bpy.context.view_layer.update()
+    assert sets(bpy, lodgs) == []
+
+
+def test_renders_and_viewports_hide_by_themselves(bpy, lodgs, two_levels):
+    """A render engine sees what is hidden in viewports alone, and not what is hidden in renders alone."""
+    seen = []
+
+    class Engine(bpy.types.RenderEngine):
+        bl_idname, bl_label = "LODGS_TEST", "Test"
+
+        def render(self, depsgraph):
+            seen.extend(shown.object.name for shown in lodgs("data.shown").splat_instances(depsgraph))
+
+    for name in ("a", "b"):
+        bpy.context.scene.collection.objects.link(
+            lodgs("data.objects").new_splats(name, make_splats(lodgs, 5, 7))
+        )
+    bpy.data.objects["a"].hide_render = True
+    bpy.data.objects["b"].hide_viewport = True
+    bpy.context.view_layer.update()
+    bpy.utils.register_class(Engine)
+    try:
+        bpy.context.scene.render.engine = "LODGS_TEST"
+        bpy.context.scene.render.resolution_percentage = 1
+        bpy.ops.render.render()
+    finally:
+        bpy.context.scene.render.engine = "BLENDER_WORKBENCH"
+        bpy.utils.unregister_class(Engine)
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    shown = [shown.object.name for shown in lodgs("data.shown").splat_instances(depsgraph)]
+    assert seen == ["b", "scene level 2"] and shown == ["a", "scene level 2"]
+
+
+def test_what_modifiers_take_away_is_gone(bpy, lodgs):
+    """Blender drops all attributes with the last point: nothing is shown, and nothing breaks."""
+    obj = lodgs("data.objects").new_splats("obj", make_splats(lodgs))
+    bpy.context.scene.collection.objects.link(obj)
+    group = bpy.data.node_groups.new("nothing", "GeometryNodeTree")
+    group.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
+    group.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    group.nodes.new("NodeGroupOutput")
+    obj.modifiers.new("nothing", "NODES").node_group = group
+    bpy.context.view_layer.update()
+    assert sets(bpy, lodgs) == []

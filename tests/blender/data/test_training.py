@@ -1,0 +1,79 @@
+"""The training panel's properties come from what methods declare."""
+
+from dataclasses import dataclass
+
+import pytest
+
+
+@pytest.fixture
+def made_up(bpy, lodgs, monkeypatch):
+    """The group of a method that nobody knew, on an object."""
+    parameters, methods = lodgs("training.methods.parameters"), lodgs("training.methods")
+    parameter = parameters.parameter
+
+    @dataclass(frozen=True)
+    class Made(parameters.Parameters):
+        decay: float = parameter(0.25, "Share that decays.", label="Faintness", high=1)
+        width: float = parameter(3.0, "Width.", above=0, unit="px")
+        turns: int = parameter(2, "Turns.", above=1, high=7)
+        fast: bool = parameter(True, "Whether it hurries.")
+        kind: str = parameter("far_off", "Kind.", choices=("near", "far_off"))
+        shares: tuple[float, ...] = parameter((0.5, 0.5), "Shares.")
+
+    offered = ("decay", "width", "turns", "fast", "kind", "shares")
+    presets = {"draft": Made(), "standard": Made(width=4.5, kind="near"), "paper": Made()}
+    info = methods.MethodInfo("made", 98, "Made", "up", Made, presets, offered=offered)
+    monkeypatch.setitem(methods.METHODS, "made", info)
+    group = lodgs("data.training")._parameters_of(info)
+    bpy.utils.register_class(group)
+    bpy.types.Object.made = bpy.props.PointerProperty(type=group)
+    obj = bpy.data.objects.new("made", None)
+    yield obj
+    bpy.data.objects.remove(obj)
+    del bpy.types.Object.made
+    bpy.utils.unregister_class(group)
+
+
+def test_a_method_that_is_added_brings_its_parameters(made_up):
+    group, known = made_up.made, made_up.made.bl_rna.properties
+    names = [name for name in known.keys() if name not in ("rna_type", "name")]  # noqa: SIM118
+    assert names == [
+        f"{kind}{name}"
+        for name in ("decay", "width", "turns", "fast", "kind")  # one number for each level has no place
+        for kind in ("", "use_", "preset_")
+    ]
+    assert not any(known[name].is_animatable for name in names)
+    assert (known["decay"].name, known["decay"].description) == ("Faintness", "Share that decays")
+    assert (known["decay"].hard_min, known["decay"].hard_max, known["decay"].subtype) == (0, 1, "FACTOR")
+    assert 0 < known["width"].hard_min < 1e-5 and known["width"].subtype == "PIXEL"
+    assert (known["turns"].hard_min, known["turns"].hard_max) == (2, 7)
+    made_up.lodgs.training.preset = "standard"
+    shown = [getattr(group, f"preset_{name}") for name in ("decay", "width", "turns", "fast", "kind")]
+    assert shown == [0.25, 4.5, 2, True, "near"]
+
+
+def test_ticking_begins_with_the_presets_value_and_unticking_forgets(made_up):
+    group = made_up.made
+    made_up.lodgs.training.preset = "standard"
+    assert not group.use_width and not group.use_kind
+    group.use_width = group.use_kind = True
+    assert (group.width, group.kind, group.use_decay) == (4.5, "near", False)
+    group.width = 6
+    group.use_width = True  # it is
+    assert group.width == 6
+    group.use_width = False
+    group.use_width = True
+    assert group.width == 4.5
+    group.turns = 5  # a script's value counts without a tick
+    assert group.use_turns
+
+
+def test_every_method_has_a_group(bpy, lodgs):
+    settings = bpy.data.objects.new("root", None).lodgs.training
+    for name, info in lodgs("training.methods").METHODS.items():
+        settings.method = name
+        for preset in lodgs("training.methods").PRESETS:
+            settings.preset = preset
+            shown = {name: getattr(settings.parameters, f"preset_{name}") for name in info.offered}
+            wanted = {name: getattr(info.preset(preset), name) for name in info.offered}
+            assert shown == pytest.approx(wanted)  # Blender's numbers are float32

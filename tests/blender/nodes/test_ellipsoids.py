@@ -1,0 +1,124 @@
+"""Splats as ellipsoids for Cycles: the picture of one is the rasterizer's, and LODGS ignores them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from training.splats.gaussians import Splats
+
+
+def splats(**changes) -> Splats:
+    """One long splat, turned."""
+    values = {
+        "means": [[0.1, 0, 0.05]], "quats": [[0.9, 0.1, 0.35, 0.2]], "log_scales": np.log([[0.5, 0.15, 0.3]]),
+        "opacity_logits": [1.5], "sh": np.full((1, 1, 3), (0.7 - 0.5) / 0.28209479177387814),
+    } | changes  # fmt: skip
+    return Splats(**{name: np.asarray(value, np.float32) for name, value in values.items()})
+
+
+@pytest.fixture
+def scene(bpy, lodgs):
+    """One splat before a camera, 64x48, transparent film, rendered by Cycles."""
+    scene = bpy.context.scene
+    collection = bpy.data.collections.new("one")
+    scene.collection.children.link(collection)
+    root = bpy.data.objects.new("one", None)
+    root.lodgs.is_root = True
+    collection.objects.link(root)
+    from training.splats.bundle import Level
+
+    lodgs("data.scenes").set_level(root, Level(1, splats(), 0.0))
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    camera.location, camera.rotation_euler = (0, -5, 0), (np.pi / 2, 0, 0)
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    scene.render.engine = "CYCLES"
+    scene.cycles.samples, scene.cycles.device, scene.cycles.use_denoising = 16, "CPU", False
+    scene.render.resolution_x, scene.render.resolution_y = 64, 48
+    scene.render.film_transparent = True
+    scene.render.dither_intensity = 0
+    scene.view_settings.view_transform = "Standard"
+    scene.render.image_settings.color_mode = "RGBA"
+    return scene
+
+
+def rendered(bpy, path) -> np.ndarray:
+    bpy.context.scene.render.filepath = str(path)
+    bpy.ops.render.render(write_still=True)
+    image = bpy.data.images.load(str(path))
+    image.colorspace_settings.name = "Non-Color"
+    image.alpha_mode = "CHANNEL_PACKED"
+    values = np.empty(image.size[0] * image.size[1] * 4, np.float32)
+    image.pixels.foreach_get(values)
+    return values.reshape(image.size[1], image.size[0], 4)
+
+
+def test_cycles_sees_what_the_rasterizer_draws(bpy, lodgs, scene, renderer, tmp_path):
+    scene.lodgs_render.ellipsoids = True
+    cycles = rendered(bpy, tmp_path / "cycles.png")
+    scene.render.engine = "LODGS"  # the ellipsoids are still wanted, by other engines
+    drawn = rendered(bpy, tmp_path / "lodgs.png")
+    assert drawn[..., 3].max() > 0.7
+    difference = np.abs(cycles[..., 3] - drawn[..., 3])
+    assert difference.max() < 0.06 and difference.mean() < 0.01
+    seen = drawn[..., 3] > 0.2
+    np.testing.assert_allclose(cycles[seen][:, :3], 0.7, atol=0.02)
+
+
+@pytest.mark.parametrize(("ahead", "seen"), [(1.0, True), (-1.0, False)])
+def test_a_splat_around_the_camera_is_seen_if_its_middle_is_before_it(
+    bpy, lodgs, scene, tmp_path, ahead, seen
+):
+    """Round, 2 wide: a ray that passes its middle in the distance d sees exp(-d²/8) of its opacity."""
+    from training.splats.bundle import Level
+
+    one = splats(means=[[0, -5 + ahead, 0]], quats=[[1, 0, 0, 0]], log_scales=np.log([[2.0, 2.0, 2.0]]))
+    lodgs("data.scenes").set_level(bpy.data.objects["one"], Level(1, one, 0.0))
+    scene.lodgs_render.ellipsoids = True
+    alpha = rendered(bpy, tmp_path / "cycles.png")[..., 3]
+    x, y = np.meshgrid(np.arange(64) - 31.5, np.arange(48) - 23.5)
+    size = scene.camera.data.sensor_width / scene.camera.data.lens / 64
+    tangent = np.hypot(x, y) * size  # of the angle at which a ray passes the middle
+    distance = ahead * tangent / np.hypot(1, tangent)
+    expected = np.exp(-(distance**2) / 8) / (1 + np.exp(-1.5)) if seen else np.zeros((48, 64))
+    np.testing.assert_allclose(alpha, expected, atol=0.015)
+
+
+def test_rays_go_on_through_many_ellipsoids(bpy, lodgs, scene, tmp_path):
+    """Thirty faint splats one behind the other, one ray a pixel: in the middle 1 - (1 - 0.1)^30 of them is
+    left, without noise. Cycles' own settings end most rays on the way."""
+    row = np.zeros((30, 3))
+    row[:, 1] = np.arange(30) * 0.1
+    many = splats(
+        means=row, quats=np.tile([1.0, 0, 0, 0], (30, 1)), log_scales=np.log(np.full((30, 3), 3.0)),
+        opacity_logits=np.full(30, np.log(0.1 / 0.9)), sh=np.zeros((30, 1, 3)),
+    )  # fmt: skip
+    from training.splats.bundle import Level
+
+    lodgs("data.scenes").set_level(bpy.data.objects["one"], Level(1, many, 0.0))
+    scene.camera.location.y = -30
+    scene.lodgs_render.ellipsoids, scene.cycles.samples = True, 1
+    alpha = rendered(bpy, tmp_path / "cycles.png")[22:26, 30:34, 3]
+    np.testing.assert_allclose(alpha, 1 - 0.9**30, atol=0.02)
+
+
+def test_they_are_there_only_where_they_are_wanted(bpy, lodgs, scene):
+    obj = bpy.data.objects["one level 1"]
+    scene.lodgs_render.ellipsoids = True
+    scene.lodgs_render.ellipsoids = True  # twice is once
+    assert [modifier.name for modifier in obj.modifiers].count("LODGS Ellipsoids") == 1
+    assert scene.cycles.transparent_max_bounces >= 256
+    modifier = obj.modifiers["LODGS Ellipsoids"]
+    for wanted, engine, expected in (
+        (True, "CYCLES", True), (False, "CYCLES", False), (True, "LODGS", False), (True, "CYCLES", True),
+    ):  # fmt: skip
+        scene.lodgs_render.ellipsoids, scene.render.engine = wanted, engine
+        bpy.context.view_layer.update()
+        assert modifier.show_render == expected
+    # a level that comes later has them too
+    from training.splats.bundle import Level
+
+    lodgs("data.scenes").set_level(bpy.data.objects["one"], Level(2, splats(), 0.0))
+    assert "LODGS Ellipsoids" in bpy.data.objects["one level 2"].modifiers
+    assert bpy.data.objects["one level 2"].modifiers[-1].name == "LODGS Ellipsoids"

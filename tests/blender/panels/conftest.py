@@ -1,0 +1,51 @@
+"""A layout that takes notes of what panels draw into it."""
+
+from types import SimpleNamespace
+
+import pytest
+
+
+class Notes:
+    """A layout that remembers its texts and operators and is its own row, column and box."""
+
+    def __init__(self):
+        self.texts: list[str] = []
+        self.operators: list[str] = []
+        self.properties: list[str] = []
+        self.sliders: list[str] = []
+
+    def row(self, **_):
+        return self
+
+    column = box = grid_flow = row
+
+    def label(self, text="", **_):
+        self.texts.append(text)
+
+    def progress(self, text, factor):
+        assert 0 <= factor <= 1
+        self.texts.append(text)
+
+    def operator(self, name, **_):
+        self.operators.append(name)
+        return SimpleNamespace()
+
+    def prop(self, owner, name, slider=False, **_):
+        assert hasattr(owner, name)
+        self.properties.append(name)
+        if slider:
+            self.sliders.append(name)
+
+
+@pytest.fixture
+def draw_panel(bpy, lodgs, monkeypatch):
+    """``draw_panel("levels", "LODGS_PT_detail")``: the notes of what a panel of that module draws now."""
+
+    def drawn(name, panel):
+        module, notes = lodgs(f"panels.{name}"), Notes()
+        for place in (module, lodgs("panels.parts")):
+            monkeypatch.setattr(place, "say", lambda layout, text, icon: layout.label(text=text))
+        getattr(module, panel).draw(SimpleNamespace(layout=notes), bpy.context)
+        return notes
+
+    return drawn

@@ -1,0 +1,125 @@
+"""What the training panel says and offers, drawn into a layout that takes notes."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+
+
+@pytest.fixture
+def root(bpy, tmp_path):
+    collection = bpy.data.collections.new("tiny")
+    bpy.context.scene.collection.children.link(collection)
+    root = bpy.data.objects.new("tiny", None)
+    collection.objects.link(root)
+    root.lodgs.is_root, root.lodgs.scene_folder = True, str(tmp_path)
+    return root
+
+
+@pytest.fixture
+def draw(draw_panel):
+    return lambda panel="LODGS_PT_training": draw_panel("training", panel)
+
+
+@pytest.fixture
+def watch(lodgs, root, tmp_path):
+    """A run that the panel believes to be followed."""
+    module, folder = lodgs("runs.watch"), lodgs("training.runs.folder")
+    watch = module.Watch(folder.RunFolder(tmp_path), root.session_uid)
+    module.watches[root.session_uid] = watch
+    return watch
+
+
+def test_before_training(root, draw, fake):
+    notes = draw()
+    assert notes.operators == ["lodgs.train"]
+    assert notes.properties == ["method", "preset", "image_scale"]
+    assert "4,300 steps in 5 levels" in notes.texts
+    root.lodgs.training.parameters.levels = 3
+    assert "3,500 steps in 3 levels" in draw().texts
+    root.lodgs.training.method = "3dgs"  # which has no levels
+    assert "4,300 steps" in draw().texts
+
+
+def test_a_parameter_shows_the_presets_number_until_it_is_set(root, draw):
+    settings = root.lodgs.training
+    common = ["seed", "test_every", "model", "images", "output"]
+
+    def shown():
+        notes = draw("LODGS_PT_training_advanced")
+        return [name for name in notes.properties if name not in common]
+
+    settings.preset = "standard"
+    assert shown() == [
+        "use_levels", "preset_levels", "use_footprint", "preset_footprint", "use_max_splats",
+        "preset_max_splats",
+    ]  # fmt: skip
+    settings.parameters.use_max_splats = True
+    assert shown()[-2:] == ["use_max_splats", "max_splats"]
+    assert settings.parameters.max_splats == settings.parameters.preset_max_splats == 1_000_000
+    settings.method = "3dgs"
+    assert shown() == ["use_max_splats", "preset_max_splats"]
+
+
+def test_what_training_starts_from_is_asked_where_a_method_can_choose(lodgs, root, draw, fake, monkeypatch):
+    assert "start_from" not in draw().properties
+    methods = lodgs("training.methods").METHODS
+    monkeypatch.setitem(methods, "3dgs", replace(methods["3dgs"], from_base=True))
+    root.lodgs.training.method = "3dgs"
+    assert "start_from" in draw().properties and "base" not in draw().properties
+    root.lodgs.training.start_from = "FILE"
+    assert draw().properties[-2:] == ["start_from", "base"]
+
+
+def test_without_a_trainer_one_sentence_and_one_button(root, draw, monkeypatch):
+    monkeypatch.delenv("LODGS_TRAINER_PYTHON", raising=False)
+    notes = draw()
+    assert notes.operators == ["lodgs.make_environment"]
+    assert "Training and rendering need a Python with PyTorch, and none is set up." in notes.texts
+
+
+def test_making_the_environment_is_shown_where_it_is_missing(lodgs, root, draw, monkeypatch):
+    monkeypatch.delenv("LODGS_TRAINER_PYTHON", raising=False)
+    setup = SimpleNamespace(running=True, message="Downloading torch", fraction=0.4, problem="")
+    monkeypatch.setattr(lodgs("runs.environment"), "setup", setup)
+    notes = draw()
+    assert notes.operators == ["lodgs.cancel_environment"] and "Downloading torch" in notes.texts
+    setup.running, setup.problem = False, "No network. Check it."
+    notes = draw()
+    assert notes.operators == ["lodgs.make_environment"] and "No network. Check it." in notes.texts
+
+
+def test_while_training(draw, watch):
+    assert "Starting the trainer" in draw().texts
+    watch.message = "Preparing the kernels (the first time on a computer)"
+    assert {"Preparing the kernels", "The first time on a computer"} <= set(draw().texts)
+    watch.message = "Level 2 of 5"
+    watch.progress = {
+        "level": 2, "levels": 5, "step": 1500, "of": 4300, "loss": 0.1234, "psnr": 21.5, "splats": 12345,
+        "steps_per_s": 12.34, "eta_s": 227.0,
+    }  # fmt: skip
+    notes = draw()
+    assert notes.operators == ["lodgs.cancel_training"]
+    facts = {"2 of 5", "1,500 of 4,300", "0.1234", "21.5 dB", "12,345", "12.3 steps/s", "4 min"}
+    assert facts | {"Level 2 of 5 · 35%"} <= set(notes.texts)
+    watch.last_event = 0
+    assert any("has not answered" in text for text in draw().texts)
+    watch.cancel_requested = True
+    assert "Cancel again to end it at once" in draw().texts
+
+
+def test_after_training(draw, watch, fake):
+    watch.state, watch.message = "done", "Finished"
+    watch.levels = {1: {"level": 1, "splats": 1234, "psnr": 20.04}, 2: {"level": 2, "splats": 5}}
+    notes = draw()
+    assert {"Finished", "Level 1: 1,234 splats, 20.0 dB", "Level 2: 5 splats"} <= set(notes.texts)
+    assert notes.operators == ["lodgs.train"]
+    watch.state, watch.problem = "interrupted", "The trainer was killed."
+    notes = draw()
+    assert "The trainer was killed." in notes.texts
+    assert notes.operators == ["lodgs.resume_training", "lodgs.show_log", "lodgs.train"]
+
+
+def test_a_run_that_is_not_followed_can_be_opened(root, draw, fake):
+    root.lodgs.training.run = "/somewhere/run"
+    assert draw().operators == ["lodgs.open_run", "lodgs.train"]

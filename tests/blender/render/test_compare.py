@@ -1,0 +1,139 @@
+"""Views compared with their photographs: PSNR, the worst, the wipe, and what cannot be compared."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from training.splats.bundle import Bundle, Level, write_bundle
+from training.splats.gaussians import Splats
+
+GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
+
+
+def haze(color: float) -> Splats:
+    """Large grey splats around the garden, seen from everywhere."""
+    rng = np.random.default_rng(0)
+    return Splats(
+        means=rng.normal(0, 5, (300, 3)).astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (300, 1)),
+        log_scales=np.zeros((300, 3), np.float32),
+        opacity_logits=np.zeros(300, np.float32),
+        sh=np.full((300, 1, 3), (color - 0.5) / 0.28209479177387814, np.float32),
+    )
+
+
+@pytest.fixture
+def root(bpy, lodgs, tmp_path):
+    """The example's views with haze for splats."""
+    write_bundle(tmp_path / "haze.ply", Bundle("flod", [Level(1, haze(0.4))]))
+    root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+    root.lodgs.training.image_scale = 1.0
+    lodgs("data.scenes").set_level(root, Level(1, haze(0.4)))
+    bpy.context.view_layer.update()
+    return root
+
+
+def photograph(bpy, view) -> np.ndarray:
+    """(H, W, 3) as Blender reads it, rows from the top."""
+    image = bpy.data.images.load(view.data.lodgs.photograph)
+    image.colorspace_settings.name = "Non-Color"
+    values = np.empty(image.size[0] * image.size[1] * 4, np.float32)
+    image.pixels.foreach_get(values)
+    return values.reshape(image.size[1], image.size[0], 4)[::-1, :, :3]
+
+
+def test_psnr_is_that_of_the_f12_picture(bpy, lodgs, root, renderer, tmp_path):
+    scene, view = bpy.context.scene, lodgs("data.photographs").views(root)[5]
+    lodgs("data.photographs").through(bpy.context, view)
+    found = lodgs("render.compare").compare_view(bpy.context, root, view)
+    lodgs("render.engine").use(scene)
+    scene.render.dither_intensity = 0
+    scene.render.filepath = str(tmp_path / "view.png")
+    bpy.ops.render.render(write_still=True)
+    image = bpy.data.images.load(scene.render.filepath)
+    image.colorspace_settings.name = "Non-Color"
+    values = np.empty(image.size[0] * image.size[1] * 4, np.float32)
+    image.pixels.foreach_get(values)
+    rendered = values.reshape(image.size[1], image.size[0], 4)[::-1, :, :3]
+    truth = photograph(bpy, view)
+    psnr = -10 * np.log10(((rendered.astype(float) - truth) ** 2).mean())
+    assert 5 < psnr < 20
+    assert found.psnr == pytest.approx(psnr, abs=0.02)
+    assert view.data.lodgs.psnr == pytest.approx(found.psnr)
+    np.testing.assert_allclose(found.photograph, truth, atol=2.5 / 255)
+    np.testing.assert_allclose(found.rendered, rendered, atol=0.6 / 255)
+
+
+def test_measuring_all_finds_the_worst(bpy, lodgs, root, renderer):
+    compare, photographs = lodgs("render.compare"), lodgs("data.photographs")
+    with pytest.raises(RuntimeError, match="No view has been measured"):
+        bpy.ops.lodgs.compare_view(worst=True)
+    root.lodgs.training.image_scale = 0.1
+    for view in photographs.views(root)[6:]:
+        view.data.lodgs.photograph = ""
+    before = bpy.context.scene.camera
+    assert bpy.ops.lodgs.measure_views() == {"FINISHED"}
+    assert bpy.context.scene.camera == before
+    psnrs = {view: view.data.lodgs.psnr for view in photographs.views(root)}
+    assert (
+        compare.measurement.done == compare.measurement.total == 6 == sum(psnr > 0 for psnr in psnrs.values())
+    )
+    worst = min((view for view in psnrs if psnrs[view] > 0), key=psnrs.get)
+    assert bpy.ops.lodgs.compare_view(worst=True) == {"FINISHED"}
+    assert bpy.context.scene.camera == worst and lodgs("viewport.wipe").comparison.view == worst.session_uid
+    assert bpy.context.scene.lodgs_render.show_comparison
+
+
+def test_measuring_is_cancelled(bpy, lodgs, root, renderer):
+    root.lodgs.training.image_scale = 0.1
+    measurement = lodgs("render.compare").measure(bpy.context, root)
+    assert measurement.step()
+    with pytest.raises(RuntimeError, match="being measured"):
+        bpy.ops.lodgs.measure_views()
+    assert bpy.ops.lodgs.cancel_measuring() == {"FINISHED"}
+    assert not measurement.step() and measurement.done == 1
+
+
+def test_what_cannot_be_compared_is_reported(bpy, lodgs, root, renderer):
+    view = bpy.context.scene.camera
+    view.data.lodgs.distorted = True
+    with pytest.raises(RuntimeError, match="bends lines"):
+        bpy.ops.lodgs.compare_view()
+    view.data.lodgs.distorted, view.data.lodgs.photograph = False, "/nowhere/a.jpg"
+    with pytest.raises(RuntimeError, match=r"a\.jpg"):
+        bpy.ops.lodgs.compare_view()
+    view.data.lodgs.photograph = ""
+    with pytest.raises(RuntimeError, match="has no photograph"):
+        bpy.ops.lodgs.compare_view()
+    bpy.context.scene.camera = None
+    with pytest.raises(RuntimeError, match="none of the views"):
+        bpy.ops.lodgs.compare_view()
+
+
+def test_a_click_in_the_list_looks_through(bpy, lodgs, root):
+    root.lodgs.active_view = 7
+    assert bpy.context.scene.camera == root.lodgs.cameras.objects[7]
+
+
+def test_the_list_goes_along_with_the_arrows(bpy, lodgs, root):
+    for step in (1, 1, -1, -1, -1):
+        assert bpy.ops.lodgs.look_through(step=step) == {"FINISHED"}
+        assert root.lodgs.cameras.objects[root.lodgs.active_view] == bpy.context.scene.camera
+
+
+def test_the_list_sorts_the_worst_first(bpy, lodgs, root):
+    objects = root.lodgs.cameras.objects
+    for index, psnr in ((3, 12.0), (5, 10.0), (9, 30.0)):
+        objects[index].data.lodgs.psnr = psnr
+    fake = SimpleNamespace(filter_name="", worst_first=True, bitflag_filter_item=1 << 30)
+    filter_items = lodgs("panels.compare").LODGS_UL_views.filter_items
+    _, order = filter_items(fake, bpy.context, root.lodgs.cameras, "objects")
+    by_place = np.argsort(order)
+    assert by_place[:3].tolist() == [5, 3, 9]
+    fake.filter_name = "view_07"
+    shown, _ = filter_items(fake, bpy.context, root.lodgs.cameras, "objects")
+    assert sum(map(bool, shown)) == 1

@@ -1,0 +1,592 @@
+"""F12 with the engine LODGS and the real renderer: pixels, passes, animations, and what can go wrong."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from training.splats.bundle import Bundle, Level, write_bundle
+from training.splats.gaussians import Splats
+
+ROOT = Path(__file__).resolve().parents[3]
+TRAINER = os.environ.get("LODGS_TRAINER_PYTHON", "")
+NOTHING = 1e10
+
+
+pytestmark = pytest.mark.usefixtures("renderer")
+
+
+def random_splats(count: int, degree: int = 3, seed: int = 0) -> Splats:
+    rng = np.random.default_rng(seed)
+    return Splats(
+        means=rng.uniform(-0.7, 0.7, (count, 3)).astype(np.float32),
+        quats=rng.normal(size=(count, 4)).astype(np.float32),
+        log_scales=rng.normal(-3, 0.6, (count, 3)).astype(np.float32),
+        opacity_logits=rng.normal(1, 1.5, count).astype(np.float32),
+        sh=(rng.normal(size=(count, (degree + 1) ** 2, 3)) * 0.3).astype(np.float32),
+    )
+
+
+@pytest.fixture
+def bundle(tmp_path) -> Path:
+    path = tmp_path / "bundle.ply"
+    levels = [
+        Level(1, random_splats(150), {"s_min": 0.05}),
+        Level(2, random_splats(1500, seed=1), {"s_min": 0.0}),
+    ]
+    write_bundle(path, Bundle("flod", levels, "bands"))
+    return path
+
+
+@pytest.fixture
+def scene(bpy, lodgs, bundle):
+    """A bundle, turned and moved and scaled, and a camera before it; LODGS renders it to PNG."""
+    scene = bpy.context.scene
+    root = lodgs("data.scenes").import_splats(bpy.context, bundle)
+    root.location, root.scale = (1, 2, -0.5), (1.7,) * 3
+    root.rotation_euler = (-1.2, 0.3, 0.4)
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    scene.collection.objects.link(camera)
+    camera.location, camera.rotation_euler = (1.3, -5.5, 0.2), (1.45, 0, 0.02)
+    camera.data.shift_x = 0.03
+    scene.camera = camera
+    lodgs("render.engine").use(scene)
+    scene.render.dither_intensity = 0
+    scene.render.resolution_x, scene.render.resolution_y = 640, 480
+    return scene
+
+
+def f12(bpy, tmp_path, name="f12.png") -> np.ndarray:
+    """Renders; the file's values (H, W, 4) as they lie in it, rows from the top."""
+    path = tmp_path / name
+    bpy.context.scene.render.filepath = str(path)
+    assert bpy.ops.render.render(write_still=True) == {"FINISHED"}
+    return pixels(bpy, path)
+
+
+def pixels(bpy, path: Path) -> np.ndarray:
+    image = bpy.data.images.load(str(path))
+    image.colorspace_settings.name = "Non-Color"
+    image.alpha_mode = "CHANNEL_PACKED"
+    values = np.empty(image.size[0] * image.size[1] * 4, np.float32)
+    image.pixels.foreach_get(values)
+    values = values.reshape(image.size[1], image.size[0], 4)[::-1]
+    bpy.data.images.remove(image)
+    return values
+
+
+def bytes_of(values: np.ndarray) -> np.ndarray:
+    return np.round(values * 255).astype(np.uint8)
+
+
+def without_blender(bundle: Path, camera: Path, out: Path, *options: str) -> None:
+    """``python -m training render`` of a camera that Blender has written."""
+    command = [TRAINER, "-m", "training", "render", str(bundle), "--camera", str(camera), "--out", str(out)]
+    subprocess.run([*command, *options], cwd=ROOT, check=True)
+
+
+def passes(bpy, lodgs, **settings):
+    """The planes that the engine draws of the scene as it is."""
+    engine, scene = lodgs("render.engine"), bpy.context.scene
+    scene.view_layers[0].use_pass_z = scene.lodgs_render.use_pass_levels = True
+    width, height = engine.size(scene.render)
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    drawn = engine.frame(depsgraph, width, height, engine.border(scene.render, width, height), **settings)
+    return drawn and drawn.planes
+
+
+@pytest.mark.parametrize("transparent", [False, True])
+def test_f12_is_what_training_render_draws_to_the_bit(bpy, scene, bundle, tmp_path, transparent):
+    scene.render.film_transparent = transparent
+    scene.render.image_settings.color_mode = "RGBA"
+    shown = f12(bpy, tmp_path)
+    camera = tmp_path / "camera.json"
+    assert bpy.ops.lodgs.export_camera(filepath=str(camera)) == {"FINISHED"}
+    options = ["--background", "transparent"] if transparent else []
+    without_blender(bundle, camera, tmp_path / "trainer.png", *options)
+    expected = pixels(bpy, tmp_path / "trainer.png")
+    assert shown.shape == (480, 640, 4) and bytes_of(shown[..., :3]).max() > 200
+    np.testing.assert_array_equal(bytes_of(shown), bytes_of(expected))
+
+
+def test_levels_by_distance_are_what_training_render_chooses(bpy, lodgs, scene, bundle, tmp_path):
+    root = lodgs("data.scenes").roots(scene)[0]
+    root.lodgs.mode, root.lodgs.bands.gamma = "SELECTIVE", 10
+    shown = f12(bpy, tmp_path)
+    camera = tmp_path / "camera.json"
+    bpy.ops.lodgs.export_camera(filepath=str(camera))
+    without_blender(bundle, camera, tmp_path / "trainer.png", "--gamma", "10", "--first", "1", "--last", "2")
+    np.testing.assert_array_equal(bytes_of(shown), bytes_of(pixels(bpy, tmp_path / "trainer.png")))
+    levels = passes(bpy, lodgs)["Level.X"]
+    assert {1, 2} <= set(np.unique(levels))  # both have their part
+
+
+def test_an_imported_view_is_the_photographs_camera(bpy, lodgs, bundle, tmp_path):
+    """Rendered from Blender's camera, and from COLMAP's own numbers: but for float32, the same."""
+    from training.scenes.cameras import write_camera
+    from training.scenes.colmap import read_scene
+
+    folder = ROOT / "examples" / "lantern_garden"
+    photographed = lodgs("data.scenes").import_colmap(bpy.context, folder, photographs=False)
+    photographed.lodgs.points.hide_render = True
+    root = lodgs("data.scenes").import_splats(bpy.context, bundle, upright=False)
+    bpy.context.view_layer.update()
+    root.matrix_world = photographed.matrix_world
+    bpy.context.scene.render.dither_intensity = 0
+    lodgs("render.engine").use(bpy.context.scene)
+    shown = f12(bpy, tmp_path)
+    view = next(c for c in read_scene(folder).cameras if c.name == bpy.context.scene.camera.name)
+    write_camera(tmp_path / "camera.json", view, bpy.context.scene.camera.data.clip_start)
+    without_blender(bundle, tmp_path / "camera.json", tmp_path / "trainer.png")
+    difference = np.abs(bytes_of(shown).astype(int) - bytes_of(pixels(bpy, tmp_path / "trainer.png")))
+    assert difference.max() <= 1 and (difference > 0).mean() < 0.01
+
+
+def test_depth_and_levels(bpy, lodgs, scene):
+    planes = passes(bpy, lodgs)
+    covered = planes["Level.X"] > 0
+    assert 0.1 < covered.mean() < 0.9
+    depth = planes["Depth.Z"]
+    assert (depth[~covered] == NOTHING).all()
+    assert depth[covered].min() > 1 and depth[covered].max() < 15  # the set is 7.5 away and 5 deep
+    np.testing.assert_array_equal(planes["Level.X"][covered], 2)
+    assert planes["Level 2.X"].max() > 0.9
+    assert planes["Combined.A"].min() == 1
+
+
+def test_border_and_percentage(bpy, scene, tmp_path):
+    whole = f12(bpy, tmp_path)
+    scene.render.use_border = scene.render.use_crop_to_border = True
+    scene.render.border_min_x, scene.render.border_max_x = 0.31, 0.66
+    scene.render.border_min_y, scene.render.border_max_y = 0.2, 0.81
+    cropped = f12(bpy, tmp_path)
+    part = whole[480 - 388 : 480 - 96, 198:422]
+    assert cropped.shape == part.shape == (292, 224, 4)
+    assert np.abs(cropped - part).max() <= 1.001 / 255
+    scene.render.use_crop_to_border = False
+    framed = f12(bpy, tmp_path)
+    assert framed.shape == whole.shape
+    np.testing.assert_array_equal(framed[480 - 388 : 480 - 96, 198:422], cropped)
+    scene.render.use_border, scene.render.resolution_percentage = False, 50
+    small = f12(bpy, tmp_path)
+    assert small.shape == (240, 320, 4)
+    assert np.abs(small - whole.reshape(240, 2, 320, 2, 4).mean((1, 3))).mean() < 0.02
+
+
+def test_background_colour(bpy, scene, tmp_path):
+    scene.lodgs_render.background = (1, 0.5, 0)
+    assert bytes_of(f12(bpy, tmp_path))[0, 0].tolist() == [255, 128, 0, 255]
+
+
+def test_two_sets_and_an_instance(bpy, lodgs, scene, bundle, tmp_path):
+    """A second import and a copy of a collection, each elsewhere: all are in the picture."""
+    alone = passes(bpy, lodgs)["Level.X"] > 0
+    left = lodgs("data.scenes").import_splats(bpy.context, bundle)
+    left.location = (-1.5, 2, 0)
+    instance = bpy.data.objects.new("instance", None)
+    instance.instance_type = "COLLECTION"
+    instance.instance_collection = left.users_collection[0]
+    instance.location = (5, 0, 0)
+    scene.collection.objects.link(instance)
+    bpy.context.view_layer.update()
+    drawn = passes(bpy, lodgs)["Level.X"] > 0
+    assert len(lodgs("render.engine").placed_splats(bpy.context.evaluated_depsgraph_get())) == 3
+    assert drawn[:, :150].sum() > alone[:, :150].sum() + 1000
+    assert drawn[:, 500:].sum() > alone[:, 500:].sum() + 1000
+
+
+def test_an_animation_starts_the_renderer_once(bpy, lodgs, scene, tmp_path, monkeypatch):
+    renderer, started = lodgs("render.renderer"), []
+    renderer.close()
+    converse = lodgs("runs.processes").converse
+    monkeypatch.setattr(
+        lodgs("runs.processes"), "converse", lambda *a: started.append(converse(*a)) or started[-1]
+    )
+    written = []
+    write_set = renderer.wire.write_set
+    monkeypatch.setattr(renderer.wire, "write_set", lambda *a: written.append(a) or write_set(*a))
+    scene.frame_end = 24
+    scene.render.resolution_percentage = 20
+    camera = scene.camera
+    for frame, x in ((1, 0.3), (24, 2.3)):
+        camera.location.x = x
+        camera.keyframe_insert("location", frame=frame)
+    scene.render.filepath = str(tmp_path / "frame_")
+    assert bpy.ops.render.render(animation=True) == {"FINISHED"}
+    frames = sorted(tmp_path.glob("frame_*.png"))
+    assert len(frames) == 24 and len(started) == 1 and len(written) == 1
+    first, middle, last = (pixels(bpy, frames[i]) for i in (0, 12, 23))
+    assert np.abs(first - middle).max() > 0.2 and np.abs(middle - last).max() > 0.2
+    assert started[0].poll() is None
+
+
+def test_what_changes_is_handed_over(bpy, lodgs, scene, tmp_path):
+    before = f12(bpy, tmp_path)
+    cloud = lodgs("data.scenes").roots(scene)[0].lodgs.levels[1].object.data
+    base = lodgs("attributes").read_attribute(cloud, "radiance:base")
+    base[:, :3] = 0
+    lodgs("attributes").write_attribute(
+        cloud, "radiance:base", cloud.attributes["radiance:base"].data_type, base
+    )
+    cloud.update_tag()
+    after = f12(bpy, tmp_path)
+    assert np.abs(before - after).mean() > 0.01
+
+
+def test_cancel(bpy, lodgs, scene, monkeypatch):
+    """Asked to stop, it stops soon and without a picture; the renderer is the same and draws on."""
+    passes(bpy, lodgs)
+    process = lodgs("render.renderer")._renderer.process
+    scene.render.resolution_x, scene.render.resolution_y = 6000, 4500
+    fractions = []
+
+    def on_progress(fraction, text):
+        fractions.append(fraction)
+        return not fraction > 0
+
+    started = time.monotonic()
+    assert passes(bpy, lodgs, on_progress=on_progress) is None
+    assert fractions[-1] < 0.5, "it went on drawing"
+    assert time.monotonic() - started < 30
+    scene.render.resolution_x, scene.render.resolution_y = 64, 48
+    assert passes(bpy, lodgs)["Combined.R"].shape == (48, 64)
+    assert lodgs("render.renderer")._renderer.process is process
+
+
+def test_a_killed_renderer_is_started_again(bpy, lodgs, scene, tmp_path, capsys):
+    before = f12(bpy, tmp_path)
+    process = lodgs("render.renderer")._renderer.process
+    folder = lodgs("render.renderer")._renderer._folder
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    np.testing.assert_array_equal(f12(bpy, tmp_path), before)
+    assert lodgs("render.renderer")._renderer.process is not process
+    assert not folder.exists()
+    assert "The renderer was killed (signal 9)" in capsys.readouterr().out
+
+
+def test_a_renderer_that_always_dies_is_reported(bpy, lodgs, scene, tmp_path, monkeypatch):
+    lodgs("render.renderer").close()
+    program = tmp_path / "dies"
+    program.write_text(
+        f'#!/bin/sh\n[ "$3" = serve ] && {{ echo "no luck today" >&2; exit 7; }}\nexec "{TRAINER}" "$@"\n'
+    )
+    program.chmod(0o755)
+    monkeypatch.setenv("LODGS_TRAINER_PYTHON", str(program))
+    scene.render.filepath = str(tmp_path / "none.png")
+    with pytest.raises(RuntimeError, match=r"exit code 7\. no luck today"):
+        bpy.ops.render.render(write_still=True)
+    assert not (tmp_path / "none.png").exists()
+    assert lodgs("render.renderer")._renderer is None
+
+
+def test_without_a_trainer_it_says_so(bpy, lodgs, scene, tmp_path, monkeypatch):
+    lodgs("render.renderer").close()
+    monkeypatch.delenv("LODGS_TRAINER_PYTHON")
+    scene.render.filepath = str(tmp_path / "none.png")
+    with pytest.raises(RuntimeError, match="need a Python with PyTorch"):
+        bpy.ops.render.render(write_still=True)
+    assert not (tmp_path / "none.png").exists()
+
+
+def test_other_lenses_are_refused(bpy, scene):
+    scene.camera.data.type = "ORTHO"
+    with pytest.raises(RuntimeError, match="'camera' is ortho"):
+        bpy.ops.render.render()
+
+
+def test_nothing_to_see_is_the_background(bpy, lodgs, scene, tmp_path):
+    for obj in bpy.data.objects:
+        obj.hide_render = obj.type != "CAMERA"
+    lodgs("data.scenes").roots(scene)[0].lodgs.levels[1].show = False
+    assert f12(bpy, tmp_path)[..., :3].max() == 0
+
+
+def test_no_program_outlives_blender(bundle, tmp_path):
+    """A Blender that renders and is then killed: its renderer ends, and takes its files along."""
+    script = tmp_path / "script.py"
+    script.write_text(f"""
+import importlib, os, signal, sys, tempfile
+sys.path.insert(0, {str(ROOT)!r})
+from tools.blender_module import EXTENSION, start_blender
+bpy = start_blender()
+bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+load = lambda name: importlib.import_module(EXTENSION + ".blender_lodgs." + name)
+load("data.scenes").import_splats(bpy.context, {str(bundle)!r})
+camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+bpy.context.scene.collection.objects.link(camera)
+bpy.context.scene.camera = camera
+load("render.engine").use(bpy.context.scene)
+bpy.context.scene.render.resolution_percentage = 5
+bpy.ops.render.render()
+renderer = load("render.renderer")._renderer
+print("RENDERER", renderer.process.pid, renderer._folder, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+""")
+    cache = {"NUMBA_CACHE_DIR": os.environ.get("NUMBA_CACHE_DIR", str(tmp_path / "numba"))}
+    done = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, env=os.environ | cache, timeout=200
+    )
+    line = next(line for line in done.stdout.splitlines() if line.startswith("RENDERER"))
+    _, pid, folder = line.split(" ", 2)
+    for _ in range(100):
+        if not Path(folder).exists() and not Path(f"/proc/{pid}").exists():
+            break
+        time.sleep(0.1)
+    assert not Path(folder).exists()
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(pid), 0)
+
+
+def flat_wall(y: float, color: tuple[float, float, float], logit: float = 10.0) -> Splats:
+    """Splats side by side in the plane y, opaque from a distance, in COLMAP's axes (y is depth)."""
+    x, z = np.meshgrid(np.linspace(-4, 4, 81), np.linspace(-4, 4, 81))
+    means = np.stack([x.ravel(), np.full(x.size, y), z.ravel()], 1)
+    return Splats(
+        means=means.astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (x.size, 1)),
+        log_scales=np.tile(np.log(np.float32([0.1, 0.001, 0.1])), (x.size, 1)),
+        opacity_logits=np.full(x.size, logit, np.float32),
+        sh=np.tile(((np.float32(color) - 0.5) / 0.28209479177387814), (x.size, 1, 1)).astype(np.float32),
+    )
+
+
+def import_wall(bpy, lodgs, path: Path, *wall):
+    write_bundle(path, Bundle("", [Level(1, flat_wall(*wall))]))
+    return lodgs("data.scenes").import_splats(bpy.context, path, upright=False)
+
+
+def add_red_cube(bpy):
+    """A red cube, turned, six units before a camera of 320x240 pixels."""
+    scene = bpy.context.scene
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    camera.location, camera.rotation_euler = (0, -6, 0), (np.pi / 2, 0, 0)
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    bpy.ops.mesh.primitive_cube_add(size=2, location=(0.3, 0.4, 0.2), rotation=(0.5, 0.3, 0.7))
+    cube = bpy.context.object
+    material = bpy.data.materials.new("red")
+    material.use_nodes = True
+    nodes = material.node_tree.nodes
+    nodes.clear()
+    emission, output = nodes.new("ShaderNodeEmission"), nodes.new("ShaderNodeOutputMaterial")
+    emission.inputs["Color"].default_value = (1, 0, 0, 1)
+    material.node_tree.links.new(emission.outputs[0], output.inputs["Surface"])
+    cube.data.materials.append(material)
+    scene.render.resolution_x, scene.render.resolution_y = 320, 240
+    scene.render.dither_intensity = 0
+    scene.render.image_settings.color_mode = "RGBA"
+    return cube
+
+
+def depths_of(cube, eye=(0, -6, 0)) -> tuple[np.ndarray, np.ndarray]:
+    """Where the ray through each pixel's centre enters and leaves the cube, along the camera's axis: worked
+    out in the cube's own space. It meets the cube where it enters before it leaves."""
+    focal = 320 * 50 / 36
+    x, y = np.meshgrid((np.arange(320) + 0.5 - 160) / focal, (120 - np.arange(240) - 0.5) / focal)
+    directions = np.stack([x, np.ones_like(x), y], 2)
+    to_cube = np.linalg.inv(np.array(cube.matrix_world, float))
+    origin = to_cube @ (*eye, 1)
+    local = directions @ to_cube[:3, :3].T
+    first, last = (np.sort([(s - origin[:3]) / local for s in (-1, 1)], axis=0)[i] for i in (0, 1))
+    return first.max(2), last.min(2)
+
+
+def test_a_cube_of_cycles_stands_in_the_splats(bpy, lodgs, tmp_path):
+    """A red cube, turned, sticks out of a green wall of splats: each pixel shows what analysis says is
+    nearer, but for a seam of a pixel or two."""
+    scene = bpy.context.scene
+    import_wall(bpy, lodgs, tmp_path / "wall.ply", 0.0, (0.1, 0.8, 0.2))
+    cube = add_red_cube(bpy)
+    assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
+    meshes = scene.lodgs_render.meshes
+    meshes.cycles.samples, meshes.cycles.device = 4, "CPU"
+    shown = f12(bpy, tmp_path)
+
+    enters, leaves = depths_of(cube)
+    red = (enters < leaves) & (enters < 6)  # the wall is at 6
+    assert 0.02 < red.mean() < 0.5
+    assert ((enters < leaves) & (enters > 6)).sum() > 500  # parts of the cube are behind the wall
+    clear = ~edge(red, 2)
+    assert clear.mean() > 0.9
+    is_red = shown[..., 0] > 0.5
+    np.testing.assert_array_equal(is_red[clear], red[clear])
+    assert np.abs(shown[clear & ~red][:, :3] - (0.1, 0.8, 0.2)).max() < 0.03
+    # pressed again after a change of size, both scenes have it
+    scene.render.resolution_x = 200
+    assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
+    assert meshes.render.resolution_x == 200 and len(bpy.data.scenes) == 2
+
+
+def edge(mask: np.ndarray, reach: int) -> np.ndarray:
+    """Pixels that have one of the other kind within reach."""
+    found = np.zeros_like(mask)
+    for dy in range(-reach, reach + 1):
+        for dx in range(-reach, reach + 1):
+            found |= np.roll(mask, (dy, dx), (0, 1)) != mask
+    return found
+
+
+@pytest.fixture
+def fog_and_wall(bpy, lodgs, tmp_path):
+    """Thin blue fog at 3 before a red cube, and behind it, at 9, a green wall; the wall and the cube."""
+    cube = add_red_cube(bpy)
+    import_wall(bpy, lodgs, tmp_path / "fog.ply", -3.0, (0.1, 0.2, 0.8), -3.0)
+    wall = import_wall(bpy, lodgs, tmp_path / "wall.ply", 3.0, (0.1, 0.8, 0.2))
+    lodgs("render.engine").use(bpy.context.scene)
+    bpy.context.scene.render.film_transparent = True
+    return wall, cube
+
+
+def test_a_cube_holds_out_the_splats_behind_it(bpy, lodgs, fog_and_wall, tmp_path):
+    """In every pixel whose centre the cube covers there is the fog alone, with its own alpha; in every other
+    one fog and wall. Combined with the meshes, fog lies over the cube."""
+    scene, (wall, cube) = bpy.context.scene, fog_and_wall
+    free = f12(bpy, tmp_path, "free.png")
+    wall.lodgs.levels[0].show = False
+    fog = f12(bpy, tmp_path, "fog.png")
+    wall.lodgs.levels[0].show = True
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "garden.blend"))
+    assert bpy.ops.lodgs.render_mesh_depth() == {"FINISHED"}
+    assert scene.lodgs_render.holdout == "//garden_depth/Scene_####.exr" and len(bpy.data.scenes) == 1
+    assert (tmp_path / "garden_depth" / "Scene_0001.exr").exists()
+    held = f12(bpy, tmp_path, "held.png")
+
+    enters, leaves = depths_of(cube)
+    covered = enters < leaves
+    assert 0.05 < covered.mean() < 0.5
+    assert fog[..., 3].min() > 0.15 and fog[..., 3].max() < 0.45 and free[..., 3].min() > 0.95
+    same_to_the_pixel(held[..., 3] < 0.5, covered)
+    clear = ~edge(covered, 1)
+    np.testing.assert_array_equal(held[covered & clear], fog[covered & clear])
+    np.testing.assert_array_equal(held[~covered & clear], free[~covered & clear])
+    planes = passes(bpy, lodgs)
+    np.testing.assert_allclose(planes["Depth.Z"][covered & clear], 3, atol=1e-4)
+    np.testing.assert_allclose(planes["Depth.Z"][~covered & clear], 9, atol=1e-4)
+
+    scene.render.use_border = True  # a part of the picture takes a part of the depth
+    scene.render.border_min_x, scene.render.border_max_x = 0.25, 0.75
+    scene.render.border_min_y, scene.render.border_max_y = 0.1, 0.6
+    part = f12(bpy, tmp_path, "part.png")
+    assert np.abs(part[96:216, 80:240] - held[96:216, 80:240]).max() <= 1.001 / 255
+    scene.render.use_border = False
+
+    assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
+    assert joins(lodgs, scene) == ["CompositorNodeAlphaOver"]
+    meshes = scene.lodgs_render.meshes
+    meshes.cycles.samples, meshes.cycles.use_denoising = 4, False
+    both = f12(bpy, tmp_path, "both.png")
+    inside = covered & ~edge(covered, 2)
+    alpha = fog[inside][:, 3:]
+    over = srgb_to_linear(fog[inside][:, :3]) * alpha + (1 - alpha) * np.float32([1, 0, 0])
+    np.testing.assert_allclose(srgb_to_linear(both[inside][:, :3]), over, atol=0.02)
+    outside = ~covered & ~edge(covered, 2)
+    np.testing.assert_allclose(both[outside], free[outside], atol=0.02)
+    scene.lodgs_render.holdout = ""
+    assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
+    assert joins(lodgs, scene) == ["CompositorNodeZcombine"]
+    wall.lodgs.levels[0].show = False
+    nearer = f12(bpy, tmp_path, "nearer.png")
+    np.testing.assert_allclose(srgb_to_linear(nearer[inside][:, :3]), over, atol=0.02)
+    assert bpy.ops.lodgs.render_mesh_depth() == {"FINISHED"}
+    assert joins(lodgs, scene) == ["CompositorNodeAlphaOver"]
+    assert bpy.data.scenes[:] == [scene, meshes]
+
+
+def test_depth_stopped_after_a_frame_leaves_the_scene_as_it_was(bpy, lodgs, fog_and_wall, tmp_path):
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "garden.blend"))
+    scene = bpy.context.scene
+    work = lodgs("render.compositing").render_mesh_depth(scene, range(1, 4))
+    first = next(work)
+    assert first.exists() and len(bpy.data.scenes) == 2
+    work.close()
+    assert bpy.data.scenes[:] == [scene] and scene.lodgs_render.holdout == ""
+
+
+def same_to_the_pixel(found: np.ndarray, expected: np.ndarray) -> None:
+    """But for a pixel or two whose centre lies on the very edge."""
+    differ = found != expected
+    assert differ.sum() <= 3 and not (differ & ~edge(expected, 1)).any()
+
+
+def joins(lodgs, scene) -> list[str]:
+    """The compositor's nodes that join two pictures."""
+    nodes = lodgs("compat").compositor_tree(scene).nodes
+    return [node.bl_idname for node in nodes if node.bl_idname.endswith(("Zcombine", "AlphaOver"))]
+
+
+def srgb_to_linear(coded: np.ndarray) -> np.ndarray:
+    return np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
+
+
+def test_a_moving_cube_holds_out_frame_by_frame(bpy, lodgs, fog_and_wall, tmp_path):
+    """Before the file is saved, in the temporary folder; a frame without its depth is no picture."""
+    scene, (_, cube) = bpy.context.scene, fog_and_wall
+    for frame, x in ((1, -1.0), (3, 1.0)):
+        cube.location.x = x
+        cube.keyframe_insert("location", frame=frame)
+    scene.frame_start, scene.frame_end, scene.frame_step = 1, 3, 2
+    assert bpy.ops.lodgs.render_mesh_depth(animation=True) == {"FINISHED"}
+    assert scene.frame_current == 1
+    for frame in (1, 3):
+        scene.frame_set(frame)
+        enters, leaves = depths_of(cube)
+        held = f12(bpy, tmp_path, f"{frame}.png")
+        same_to_the_pixel(held[..., 3] < 0.5, enters < leaves)
+    scene.frame_set(2)
+    scene.render.filepath = str(tmp_path / "none.png")
+    with pytest.raises(RuntimeError, match=r"meshes in frame 2 is missing: .*Scene_0002\.exr"):
+        bpy.ops.render.render(write_still=True)
+    assert not (tmp_path / "none.png").exists()
+    scene.frame_set(3)
+    scene.render.resolution_x = 100
+    with pytest.raises(RuntimeError, match=r"has 320x240 pixels, the picture 100x240"):
+        bpy.ops.render.render(write_still=True)
+    assert not (tmp_path / "none.png").exists()
+    scene.lodgs_render.holdout = ""
+    assert f12(bpy, tmp_path, "none.png")[..., 3].min() > 0.95
+
+
+@pytest.mark.parametrize(
+    ("pattern", "frame", "name"),
+    [("/d/a_####.exr", 7, "a_0007.exr"), ("/d/##a#.exr", 12, "##a12.exr"), ("/d/a.exr", 3, "a.exr"),
+     ("/d/a_####.exr", -7, "a_-0007.exr"), ("/d##/a_##.exr", 123, "a_123.exr")],
+)  # fmt: skip
+def test_frames_have_their_numbers(bpy, lodgs, pattern, frame, name):
+    scene = bpy.context.scene
+    path = lodgs("render.engine").at_frame(pattern, scene, frame)
+    assert path.name == name and str(path.parent) == pattern.rpartition("/")[0]
+
+
+def test_an_artists_compositor_is_left_alone(bpy, lodgs, scene):
+    tree = lodgs("compat").compositor_tree(scene)
+    tree.nodes.new("CompositorNodeBlur")
+    with pytest.raises(RuntimeError, match="has compositor nodes already"):
+        bpy.ops.lodgs.combine_with_meshes()
+    assert len(bpy.data.scenes) == 1
+
+
+@pytest.mark.parametrize("transparent", [False, True])
+def test_viewport_quality_is_nearly_the_same(bpy, lodgs, scene, tmp_path, frame, transparent):
+    """``frame`` skips where there are no graphics in background."""
+    scene.render.resolution_percentage = 50
+    scene.render.film_transparent = transparent
+    scene.render.image_settings.color_mode = "RGBA"
+    shown = f12(bpy, tmp_path)
+    scene.frame_end = 2
+    scene.render.filepath = str(tmp_path / "quick_")
+    assert bpy.ops.lodgs.render_quick(animation=True) == {"FINISHED"}
+    files = sorted(tmp_path.glob("quick_*.png"))
+    assert len(files) == 2
+    quick = pixels(bpy, files[1])
+    seen = shown[..., 3:] > 0
+    error = (((quick - shown)[..., :3] * seen).astype(float) ** 2).mean()
+    assert -10 * np.log10(error) > 35
+    np.testing.assert_allclose(quick[..., 3], shown[..., 3], atol=0.03)

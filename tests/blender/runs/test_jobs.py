@@ -1,0 +1,475 @@
+"""Trainings from Blender, with a fake trainer that fails on request and with the real one."""
+
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.blender.fake_trainer import COUNTS, splats
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+TRAINER = os.environ.get("LODGS_TRAINER_PYTHON", "")
+
+
+@pytest.fixture
+def jobs(lodgs):
+    return lodgs("runs.jobs")
+
+
+@pytest.fixture
+def watch_of(lodgs):
+    return lodgs("runs.watch").watch_of
+
+
+@pytest.fixture
+def root(bpy, tmp_path):
+    """A scene root as an import makes it, without its cameras."""
+    collection = bpy.data.collections.new("tiny")
+    bpy.context.scene.collection.children.link(collection)
+    root = bpy.data.objects.new("tiny", None)
+    collection.objects.link(root)
+    root.lodgs.is_root, root.lodgs.scene_folder = True, str(tmp_path / "scene")
+    return root
+
+
+def _levels(root) -> dict[int, int]:
+    """Points of each level's object."""
+    return {item.number: len(item.object.data.points) for item in root.lodgs.levels if item.exists}
+
+
+def _wait(watch, until, seconds=20.0):
+    """Steps a run, as the timer does in a window, until something holds."""
+    end = time.monotonic() + seconds
+    while not until():
+        assert watch.running, (watch.message, watch.problem)
+        assert time.monotonic() < end, (watch.state, watch.message, watch.problem)
+        watch.step()
+        time.sleep(0.02)
+
+
+def test_training_brings_levels_and_facts(bpy, jobs, watch_of, fake, root, tmp_path):
+    fake()
+    run = tmp_path / "run"
+    assert bpy.ops.lodgs.train(folder=str(run)) == {"FINISHED"}
+    assert _levels(root) == COUNTS
+    positions = np.empty(COUNTS[2] * 3, np.float32)
+    root.lodgs.levels[1].object.data.attributes["position"].data.foreach_get("vector", positions)
+    assert np.array_equal(positions.reshape(-1, 3), splats(COUNTS[2]).means)
+    assert (root.lodgs.rule, root.lodgs.levels[0].facts) == ("bands", '{"s_min": 0.1}')
+    assert tuple(root.lodgs.camera_center) == (1, 2, 3)
+    assert root.lodgs.method == "flod" and '"focal_px": 100.0' in root.lodgs.meta
+    watch = watch_of(root)
+    assert (watch.state, watch.problem) == ("done", "")
+    assert watch.warnings == ["One photograph is missing."]
+    assert watch.progress["of"] == 10_000
+
+
+def test_settings_become_the_job(bpy, lodgs, jobs, fake, root, tmp_path):
+    settings = root.lodgs.training
+    settings.method, settings.preset, settings.seed = "flod", "standard", 7
+    settings.parameters.levels, settings.parameters.max_splats, settings.image_scale = 3, 1234, 0.25
+    fake()
+    bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
+    job = lodgs("training.runs.job").Job.from_file(tmp_path / "run" / "job.toml")
+    assert (job.method, job.preset, job.seed, job.image_scale) == ("flod", "standard", 7, 0.25)
+    assert job.scene == str(tmp_path / "scene")
+    assert job.parameters["levels"] == 3 and job.parameters["max_splats"] == 1234
+    assert job.parameters["steps"] == [4000, 6000, 15000]
+    assert job.parameters["footprint"] == 16.0  # not set: the preset's
+
+
+def test_numbers_are_what_was_typed(jobs, root):
+    settings = root.lodgs.training
+    settings.image_scale, settings.parameters.footprint = 0.3, 8.3
+    assert jobs.changes(settings) == {"footprint": 8.3}
+    assert jobs.make_job(root, Path("/run"), {}).image_scale == 0.3
+
+
+@pytest.fixture
+def from_base(lodgs, monkeypatch):
+    """FLoD as a method that can begin with splats."""
+    methods = lodgs("training.methods").METHODS
+    monkeypatch.setitem(methods, "flod", replace(methods["flod"], from_base=True))
+
+
+def test_training_starts_from_points_this_run_or_a_file(
+    bpy, lodgs, jobs, fake, root, tmp_path, from_base, monkeypatch
+):
+    settings, base = root.lodgs.training, lambda: jobs.make_job(root, Path("/run"), {}).base
+    error = lodgs("training.errors").LodgsError
+    assert base() == ""
+    settings.start_from = "RUN"
+    with pytest.raises(error, match="'tiny' has no finished run to start from"):
+        base()
+    fake("killed")
+    settings.start_from = "POINTS"
+    with pytest.raises(RuntimeError):
+        bpy.ops.lodgs.train(folder=str(tmp_path / "first"))
+    settings.start_from = "RUN"
+    with pytest.raises(RuntimeError, match="no finished run"):
+        bpy.ops.lodgs.train(folder=str(tmp_path / "second"))
+    assert not (tmp_path / "second").exists()
+    fake()
+    bpy.ops.lodgs.resume_training()
+    assert base() == str(tmp_path / "first")
+    fake("killed")
+    with pytest.raises(RuntimeError):
+        bpy.ops.lodgs.train(folder=str(tmp_path / "second"))
+    fake()
+    assert bpy.ops.lodgs.resume_training() == {"FINISHED"}, "its base is not asked for again"
+    job = lodgs("training.runs.job").Job.from_file(tmp_path / "second" / "job.toml")
+    assert job.base == str(tmp_path / "first")
+    settings.start_from = "FILE"
+    with pytest.raises(error, match="No splats are chosen"):
+        base()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"), check_existing=False)
+    settings = bpy.data.objects["tiny"].lodgs.training
+    settings.base = "//splats.ply"
+    root = bpy.data.objects["tiny"]
+    assert jobs.make_job(root, Path("/run"), {}).base == str(tmp_path / "splats.ply")
+    settings.method = "3dgs"  # which cannot
+    assert jobs.make_job(root, Path("/run"), {}).base == ""
+
+
+def test_the_panel_shows_a_job(lodgs, jobs, root, from_base):
+    settings = root.lodgs.training
+    settings.parameters.max_splats = 5
+    parameters = {"levels": 2, "footprint": 9.5, "steps": [10, 20]}
+    job = lodgs("training.runs.job").Job(
+        "/scene", "/run", "flod", "standard", base="/before", seed=9, parameters=parameters
+    )
+    jobs.show(settings, job)
+    assert jobs.changes(settings) == {"levels": 2, "footprint": 9.5}
+    root.lodgs.scene_folder = "/scene"
+    again = jobs.make_job(root, Path("/run"), {"steps": [10, 20]})
+    assert again == job
+    jobs.show(settings, job.resolved())  # as a run keeps it
+    assert jobs.changes(settings) == {"levels": 2, "footprint": 9.5}
+
+
+@pytest.mark.parametrize("backend", ["auto", "cpu", "cuda"])
+def test_what_trains_is_a_preference(bpy, lodgs, jobs, fake, root, tmp_path, backend):
+    preferences = lodgs("extension").preferences()
+    assert preferences.backend == "auto"
+    fake()
+    try:
+        preferences.backend = backend
+        bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
+    finally:
+        preferences.backend = "auto"
+    assert lodgs("training.runs.job").Job.from_file(tmp_path / "run" / "job.toml").backend == backend
+
+
+@pytest.mark.parametrize(
+    ("mode", "state", "says"),
+    [
+        ("killed", "interrupted", "signal 9"),
+        ("crash", "interrupted", "the card caught fire"),
+        ("full", "failed", "The disk is full; training stopped. Free some space and resume the run."),
+        ("odd", "interrupted", "exit code 1"),
+        ("refused", "failed", "The run folder belongs to another job. Choose another."),
+    ],
+)
+def test_a_dead_trainer_is_reported_and_resumed(bpy, jobs, watch_of, fake, root, tmp_path, mode, state, says):
+    fake(mode)
+    with pytest.raises(RuntimeError, match="Error:") as error:
+        bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
+    assert says in str(error.value) and "Traceback" not in str(error.value)
+    watch = watch_of(root)
+    assert watch.state == state and says in watch.problem
+    if mode == "odd":
+        assert not watch.progress and not _levels(root)
+    if mode in {"killed", "crash"}:
+        assert _levels(root) == {1: COUNTS[1]}  # what was trained is there
+    if mode == "crash":
+        assert bpy.ops.lodgs.show_log() == {"FINISHED"}
+        assert "RuntimeError" in bpy.data.texts[jobs.LOG].as_string()
+    fake()
+    assert bpy.ops.lodgs.resume_training() == {"FINISHED"}
+    assert watch_of(root).problem == "" and _levels(root) == COUNTS
+
+
+def test_garbage_is_passed_over(bpy, jobs, fake, root, tmp_path):
+    fake("garbage")
+    assert bpy.ops.lodgs.train(folder=str(tmp_path / "run")) == {"FINISHED"}
+    assert _levels(root) == COUNTS
+
+
+def test_cancel_and_resume(bpy, jobs, fake, root, tmp_path):
+    fake("slow")
+    watch = jobs.start(root, str(tmp_path / "run"))
+    _wait(watch, lambda: watch.progress)
+    assert bpy.ops.lodgs.cancel_training() == {"FINISHED"}
+    _wait(watch, lambda: not watch.running)
+    assert (watch.state, watch.problem) == ("cancelled", "")
+    with pytest.raises(RuntimeError, match="No training of 'tiny' is at work"):
+        bpy.ops.lodgs.cancel_training()
+    fake()
+    assert bpy.ops.lodgs.resume_training() == {"FINISHED"}
+    with pytest.raises(RuntimeError, match="is finished"):
+        bpy.ops.lodgs.resume_training()
+
+
+def test_an_unresponsive_trainer_is_reported_and_can_be_ended(lodgs, jobs, fake, root, tmp_path, monkeypatch):
+    fake("mute")
+    monkeypatch.setattr(lodgs("runs.watch"), "UNRESPONSIVE_AFTER", 0.2)
+    watch = jobs.start(root, str(tmp_path / "run"))
+    _wait(watch, lambda: watch.unresponsive)
+    jobs.cancel(root)
+    assert watch.step() and watch.running  # it does not listen
+    jobs.cancel(root)
+    _wait(watch, lambda: not watch.running)
+    assert watch.state == "interrupted"
+
+
+def test_one_trainer_a_folder_but_several_at_once(bpy, lodgs, jobs, fake, root, tmp_path):
+    error = lodgs("training.errors").LodgsError
+    other = root.copy()
+    root.users_collection[0].objects.link(other)
+    fake("slow")
+    first = jobs.start(root, str(tmp_path / "run"))
+    _wait(first, lambda: first.progress)
+    with pytest.raises(error, match="Another training is already at work"):
+        jobs.start(other, str(tmp_path / "run"))
+    second = jobs.start(other, str(tmp_path / "run 2"))
+    _wait(second, lambda: second.progress)
+    for obj in (root, other):
+        jobs.cancel(obj)
+    _wait(first, lambda: not first.running)
+    _wait(second, lambda: not second.running)
+    with pytest.raises(error, match="already holds a run"):
+        jobs.start(other, str(tmp_path / "run"))
+
+
+def test_a_run_outlives_the_file_and_is_found_again(bpy, jobs, watch_of, fake, root, tmp_path):
+    """Saved while it trains, closed, opened while it trains, closed, opened when it is finished."""
+    blend = str(tmp_path / "scene.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=blend)
+    fake("slow")
+    watch = jobs.start(root)
+    assert watch.folder.path == tmp_path / "lodgs_runs" / "tiny"
+    assert root.lodgs.training.run == "//lodgs_runs/tiny"
+    _wait(watch, lambda: watch.progress)
+    bpy.ops.wm.save_mainfile()
+
+    bpy.ops.wm.read_homefile(use_empty=True)
+    assert not watch.step()  # its scene root is not here any more
+    bpy.ops.wm.open_mainfile(filepath=blend)
+    found = watch_of(bpy.data.objects["tiny"])
+    assert found.running and found.process is None and found.progress["step"] >= 1
+    jobs.cancel(bpy.data.objects["tiny"])
+    _wait(found, lambda: not found.running)
+    assert found.state == "cancelled"
+    bpy.ops.wm.save_mainfile()
+
+    fake()
+    resumed = jobs.resume(bpy.data.objects["tiny"])
+    bpy.ops.wm.read_homefile(use_empty=True)  # closed before any level came
+    resumed.process.wait(20)
+    bpy.ops.wm.open_mainfile(filepath=blend)
+    root = bpy.data.objects["tiny"]
+    assert watch_of(root).state == "done" and _levels(root) == COUNTS
+    assert tuple(root.lodgs.camera_center) == (1, 2, 3)
+
+    # What was loaded is not loaded twice: a level that the artist deleted stays away.
+    bpy.data.objects.remove(root.lodgs.levels[0].object)
+    bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.open_mainfile(filepath=blend)
+    root = bpy.data.objects["tiny"]
+    assert watch_of(root).state == "done" and _levels(root) == {2: COUNTS[2]}
+    assert bpy.ops.lodgs.open_run(directory="//lodgs_runs/tiny") == {"FINISHED"}
+    assert _levels(root) == COUNTS
+
+
+def test_undo_takes_neither_levels_nor_the_run(bpy, jobs, watch_of, fake, tmp_path, request):
+    """Undoing what followed a level keeps the level; undoing the import and redoing it finds the run."""
+    bpy.ops.ed.undo_push(message="Start")
+    root = request.getfixturevalue("root")
+    bpy.ops.ed.undo_push(message="Import")
+    fake("slow")
+    watch = jobs.start(root, str(tmp_path / "run"))
+    bpy.ops.ed.undo_push(message="Train")
+    _wait(watch, lambda: watch.progress)
+
+    bpy.ops.ed.undo()  # what was known before Train
+    root = bpy.data.objects["tiny"]
+    assert root.lodgs.training.run == str(tmp_path / "run") and watch_of(root) is watch
+    bpy.ops.ed.undo()  # before the import
+    assert "tiny" not in bpy.data.objects and not watch.step()
+    bpy.ops.ed.redo()
+    root = bpy.data.objects["tiny"]
+    assert watch_of(root) is None  # it had no run then
+    bpy.ops.ed.redo()
+    root = bpy.data.objects["tiny"]
+    found = watch_of(root)
+    assert found is not watch and found.running
+    jobs.cancel(root)
+    _wait(found, lambda: not found.running)
+
+    fake()
+    resumed = jobs.resume(root)
+    _wait(resumed, lambda: not resumed.running)
+    bpy.context.scene.collection.objects.link(bpy.data.objects.new("the artist's", None))
+    bpy.ops.ed.undo_push(message="Add")
+    bpy.ops.ed.undo()
+    root = bpy.data.objects["tiny"]
+    assert "the artist's" not in bpy.data.objects and _levels(root) == COUNTS
+    bpy.ops.ed.undo()  # Training finished
+    bpy.ops.ed.undo()  # Level 2
+    assert _levels(bpy.data.objects["tiny"]) == {1: COUNTS[1]}
+    bpy.ops.ed.redo()
+    assert _levels(bpy.data.objects["tiny"]) == COUNTS
+
+
+def test_a_lost_run_folder_is_no_error_on_opening(bpy, jobs, watch_of, root, tmp_path):
+    root.lodgs.training.run = str(tmp_path / "gone")
+    blend = str(tmp_path / "scene.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=blend)
+    bpy.ops.wm.open_mainfile(filepath=blend)
+    assert watch_of(bpy.data.objects["tiny"]) is None
+    with pytest.raises(RuntimeError, match="holds no run"):
+        bpy.ops.lodgs.open_run(directory=str(tmp_path / "gone"))
+
+
+def test_deleting_the_root_ends_the_watching_only(bpy, jobs, lodgs, fake, root, tmp_path):
+    fake("slow")
+    watch = jobs.start(root, str(tmp_path / "run"))
+    _wait(watch, lambda: watch.progress)
+    bpy.data.objects.remove(root)
+    assert not watch.step()
+    assert lodgs("runs.watch").watches == {} and watch.folder.state() == "running"
+    watch.folder.request_cancel()
+    assert watch.process.wait(20) == 3
+
+
+def test_a_shorter_run_removes_the_levels_of_a_longer_one(bpy, lodgs, jobs, fake, root, tmp_path):
+    Level = lodgs("training.splats.bundle").Level
+    for number in (1, 2, 3):
+        lodgs("data.scenes").set_level(root, Level(number, splats(3)))
+    fake()
+    bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
+    assert _levels(root) == COUNTS
+
+
+def test_levels_of_two_runs_never_stand_together(bpy, lodgs, jobs, fake, root, tmp_path):
+    """A second training that dies after its first level leaves that level alone."""
+    fake()
+    bpy.ops.lodgs.train(folder=str(tmp_path / "first"))
+    coarsest = root.lodgs.levels[0].object
+    fake("crash")
+    with pytest.raises(RuntimeError):
+        bpy.ops.lodgs.train(folder=str(tmp_path / "second"))
+    assert _levels(root) == {1: COUNTS[1]}
+    assert root.lodgs.levels[0].object == coarsest, "the object stays, with what artists hung on it"
+    assert (root.lodgs.bands.last, root.lodgs.single_level) == (1, 1)
+    assert [level.number for level in lodgs("data.scenes").read_levels(root).levels] == [1]
+
+
+def test_run_folders_do_not_collide(bpy, jobs, watch_of, fake, root, tmp_path):
+    fake()
+    first, second = jobs.start(root), jobs.start(root)  # not saved: at home
+    assert first.folder.path == tmp_path / "home" / "lodgs_runs" / "tiny"
+    assert second.folder.path == tmp_path / "home" / "lodgs_runs" / "tiny-2"
+    root.lodgs.training.output = str(tmp_path / "mine")
+    assert jobs.start(root).folder.path == tmp_path / "mine" / "tiny"
+    for watch in (first, second, watch_of(root)):
+        watch.process.wait(20)
+
+
+def test_mistakes_are_sentences(bpy, jobs, fake, root, tmp_path, monkeypatch):
+    fake()
+    with pytest.raises(RuntimeError, match="has no run to resume"):
+        bpy.ops.lodgs.resume_training()
+    with pytest.raises(RuntimeError, match="written no log"):
+        bpy.ops.lodgs.show_log()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RuntimeError, match="cannot be read"):
+        bpy.ops.lodgs.train(folder=str(tmp_path / "file" / "run"))
+    root.lodgs.training.test_every = 1
+    with pytest.raises(RuntimeError, match="test_every"):
+        bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
+    root.lodgs.training.test_every = 8
+    fake("no_torch")
+    with pytest.raises(RuntimeError, match="torch is missing"):
+        bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
+    monkeypatch.delenv("LODGS_TRAINER_PYTHON")
+    with pytest.raises(RuntimeError, match="none is set up"):
+        bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
+    root.lodgs.scene_folder = ""
+    with pytest.raises(RuntimeError, match="not imported from photographs"):
+        bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+    bpy.data.objects.remove(root)
+    assert not bpy.ops.lodgs.train.poll()
+
+
+def test_the_real_trainer(bpy, jobs, tmp_path, monkeypatch):
+    """Photographs to levels and back to a bundle, in a few steps on tiny images."""
+    if not TRAINER:
+        pytest.skip("no trainer; set LODGS_TRAINER_PYTHON")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")  # the checkout's own, so that kernels compile once
+    bpy.ops.lodgs.import_colmap(directory=str(REPOSITORY / "examples" / "lantern_garden"), photographs=False)
+    (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
+    root.lodgs.training.image_scale = 0.1
+    watch = jobs.start(root, str(tmp_path / "run"), {"levels": 2, "steps": [10, 2000]})
+    _wait(watch, lambda: watch.progress.get("step", 0) > 12, 120)
+    assert list(_levels(root)) == [1]
+    jobs.cancel(root)
+    _wait(watch, lambda: not watch.running)
+    assert (watch.state, watch.problem) == ("cancelled", "")
+    watch = jobs.resume(root)
+    _wait(watch, lambda: watch.message.startswith("Level"), 60)
+    assert watch.progress["step"] > 12
+    watch.process.kill()
+    _wait(watch, lambda: not watch.running)
+    assert "signal 9" in watch.problem
+
+
+def test_resuming_takes_what_trains_now(bpy, lodgs, jobs, fake, root, tmp_path):
+    fake("killed")
+    with pytest.raises(RuntimeError):
+        bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
+    lodgs("extension").preferences().backend = "cpu"
+    fake()
+    bpy.ops.lodgs.resume_training()
+    Job = lodgs("training.runs.job").Job
+    assert Job.from_file(tmp_path / "run" / "job.toml").backend == "cpu"
+
+
+def test_octree_levels_add_up_and_follow_the_distance(bpy, lodgs, jobs, tmp_path, monkeypatch):
+    """The real trainer again: all levels arrive together, twice, and choose by distance at once."""
+    if not TRAINER:
+        pytest.skip("no trainer; set LODGS_TRAINER_PYTHON")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
+    bpy.ops.lodgs.import_colmap(directory=str(REPOSITORY / "examples" / "lantern_garden"), photographs=False)
+    (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
+    root.lodgs.training.image_scale, root.lodgs.training.method = 0.1, "octree"
+    watch = jobs.start(root, str(tmp_path / "run"), {"levels": 3, "steps": 12, "coarse_share": 0.5})
+    _wait(watch, lambda: len(watch.levels) == 3, 120)
+    finest = root.lodgs.levels[-1].object
+    _wait(watch, lambda: not watch.running, 60)
+    assert (watch.state, watch.problem) == ("done", "")
+    settings = root.lodgs
+    assert settings.cumulative and settings.rule == "octree" and '"d_max"' in settings.facts
+    assert list(_levels(root)) == [1, 2, 3]
+    assert settings.levels[-1].object == finest, "a newer version of a level keeps its object"
+    settings.mode = "SELECTIVE"
+    bpy.context.view_layer.update()
+    shown, everything = lodgs("data.scenes").count_shown(bpy.context, root)
+    settings.octree.offset = -16
+    bpy.context.view_layer.update()
+    assert lodgs("data.scenes").count_shown(bpy.context, root)[0] == len(
+        settings.levels[0].object.data.points
+    )
+    assert 0 < shown <= everything
+    bundles = lodgs("training.splats.bundle")
+    bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "again.ply"))
+    ours, theirs = (bundles.read_bundle(p) for p in (tmp_path / "again.ply", watch.folder.bundle))
+    assert ours.cumulative and ours.meta == theirs.meta
+    for a, b in zip(ours.levels, theirs.levels, strict=True):
+        assert (a.splats.means == b.splats.means).all()
+        assert (a.splats.extras["lod_bias"] == b.splats.extras["lod_bias"]).all()
+        assert (a.splats.extras["lod_level"] == a.number).all()

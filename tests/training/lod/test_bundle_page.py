@@ -1,0 +1,213 @@
+"""docs/bundle.md read by a stranger: what it says, with numpy and plyfile alone, chooses what we choose."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plyfile import PlyData
+
+from training.lod.rule import rules
+from training.lod.selection import select_levels, settings
+from training.splats.bundle import Bundle, Level, read_bundle, read_folder, write_bundle, write_folder
+from training.splats.gaussians import Splats
+
+ROOT = Path(__file__).parents[3]
+OLD = ROOT / "tests" / "data" / "version_0_1_0"
+EYES = ((0, 0, 0), (1.5, -2, 3), (9, 0, 1), (40.25, 3, -8), (-3000, 0, 0))
+FOCAL = (60.0, 500.0, 1333.3)
+CHOICES = {
+    "bands": [{}, {"gamma": 0.3}, {"gamma": 4, "first": 1}, {"first": 2, "last": 4}, {"first": 1, "last": 1}],
+    "decay": [{}, {"s_v": 1.7}, {"s_v": 4}, {"at_most": 120}, {"at_most": 17, "s_v": 2}],
+    "octree": [{}, {"offset": 1.7}, {"offset": -3.1}, {"fade": 0}, {"fade": 0, "offset": 0.6}],
+}
+
+
+class Page:
+    """A bundle or a folder as the page describes it; ``means`` and ``columns`` by number of the level."""
+
+    def __init__(self, path: Path) -> None:
+        if path.is_dir():
+            self.head = json.loads((path / "manifest.json").read_text())
+            self.meta, lines = self.head["meta"], self.head["levels"]
+            rows = {line["level"]: PlyData.read(path / line["file"])["vertex"].data for line in lines}
+            extras = rows
+        else:
+            ply = PlyData.read(path)
+            elements, begin, rows, extras = {e.name: e.data for e in ply.elements}, {}, {}, {}
+            said = [text.removeprefix("lodsplat ") for text in ply["vertex"].comments]
+            self.head, *others = [json.loads(text) for text in said]
+            self.meta = next(line["meta"] for line in others if "meta" in line)
+            lines = [line for line in others if "level" in line]
+            for line in lines:
+                start = begin.get(line["element"], 0)
+                begin[line["element"]] = start + line["count"]
+                rows[line["level"]] = elements[line["element"]][start : begin[line["element"]]]
+                extras[line["level"]] = elements[line["extras"]] if "extras" in line else None
+        lines.sort(key=lambda line: line["level"])
+        self.numbers = [line["level"] for line in lines]
+        self.conclude(lines)
+        self.means, self.opacities, self.columns, before = {}, {}, {}, 0
+        for n in self.numbers:
+            part, extra = rows[n][before:], extras[n]
+            self.means[n] = np.stack([part[axis] for axis in "xyz"], 1)
+            self.opacities[n] = 1 / (1 + np.exp(-part["opacity"]))
+            names = extra.dtype.names if extra is not None else ()
+            self.columns[n] = {name: extra[name][before:] for name in names}
+            if path.is_dir() and self.cumulative:  # each file has the coarser levels too
+                before = len(rows[n])
+
+    def conclude(self, lines: list[dict]) -> None:
+        """The rule; of version 1 by its section."""
+        if self.head["v"] == 2:
+            self.rule, self.facts, self.controls = (self.head[key] for key in ("rule", "facts", "controls"))
+            self.cumulative = self.head["cumulative"]
+            self.level_facts = {line["level"]: line.get("facts", {}) for line in lines}
+            return
+        self.cumulative = self.head.get("cumulative", "d_max" in self.meta)
+        self.rule, self.facts, self.controls, self.level_facts = "", {}, {}, {}
+        if self.cumulative and "d_max" in self.meta:
+            self.rule = "octree"
+            self.facts = {"d_max": self.meta["d_max"], "d_max_focal": self.meta["focal_px"]}
+        elif len(lines) > 1 and all(line["s_min"] is not None for line in lines):
+            self.rule = "bands"
+            self.level_facts = {line["level"]: {"s_min": line["s_min"]} for line in lines}
+            self.controls = {"gamma": self.meta["gamma"]} if "gamma" in self.meta else {}
+
+    def weights(self, eye, f: float, given: dict) -> dict[int, np.ndarray]:
+        """w of every splat, level by level."""
+        first, last = self.numbers[-3:][0], self.numbers[-1]
+        formula, defaults = {
+            "bands": (self.bands, {"gamma": 1, "first": first, "last": last}),
+            "octree": (self.octree, {"offset": 0, "fade": 1}),
+            "decay": (self.decay, {"s_v": 1, "at_most": 0}),
+        }[self.rule]
+        values = defaults | self.controls | given
+        return {
+            n: formula(n, np.sqrt(((means - np.float32(eye)) ** 2).sum(axis=1)), f, values)
+            for n, means in self.means.items()
+        }
+
+    def bands(self, n: int, d: np.ndarray, f: float, values: dict) -> np.ndarray:
+        used = [each for each in self.numbers if values["first"] <= each <= values["last"]]
+        if n not in used:
+            return np.zeros(len(d))
+        border = {each: self.level_facts[each]["s_min"] / values["gamma"] * f for each in used}
+        near = 0.0 if n == used[-1] else border[n]
+        far = np.inf if n == used[0] else border[used[used.index(n) - 1]]
+        return ((np.float32(near) <= d) & (d < np.float32(far))).astype(float)
+
+    def octree(self, n: int, d: np.ndarray, f: float, values: dict) -> np.ndarray:
+        bias = self.columns[n].get("lod_bias", np.zeros(len(d), np.float32)) + np.float32(values["offset"])
+        reach = np.float32(self.facts["d_max"] * f / self.facts["d_max_focal"])
+        with np.errstate(divide="ignore"):
+            wanted = 1 + np.clip(np.log2(reach / d) + bias, 0, self.numbers[-1] - 1)
+        w = np.clip(2 * (wanted - n + np.float32(0.5)) + np.float32(0.5), 0, 1)
+        return w if values["fade"] else (w >= 0.5).astype(float)
+
+    def decay(self, n: int, d: np.ndarray, f: float, values: dict) -> np.ndarray:
+        opacity, sigma = self.opacities[n], np.maximum(self.columns[n]["sigma_d"], 0)
+        normalized = d / np.float32(self.facts["reference"] or d.max())
+
+        def weights(s: float) -> np.ndarray:
+            a = np.exp(-((normalized * s) ** 2) / (2 * sigma**2 + 1e-8))
+            return np.where(opacity * a > self.facts["tau"] * s, a, 0)
+
+        s = values["s_v"]
+        if values["at_most"] and (weights(s) > 0).sum() > values["at_most"]:
+            low, high = s, 1000.0  # any search that keeps the number
+            for _ in range(60):
+                middle = (low + high) / 2
+                low, high = (
+                    (middle, high) if (weights(middle) > 0).sum() > values["at_most"] else (low, middle)
+                )
+            s = high * (1 + 1e-5)
+        return weights(s)
+
+
+def levels(facts: dict[int, dict], columns: tuple[str, ...]) -> list[Level]:
+    rng = np.random.default_rng(5)
+    return [
+        Level(
+            n,
+            Splats(
+                rng.normal(0, 4, (300 * n, 3)).astype(np.float32),
+                rng.normal(size=(300 * n, 4)).astype(np.float32),
+                rng.normal(-2, 0.5, (300 * n, 3)).astype(np.float32),
+                rng.normal(0, 2, 300 * n).astype(np.float32),
+                rng.normal(size=(300 * n, 1, 3)).astype(np.float32),
+                {name: rng.normal(size=300 * n).astype(np.float32) for name in columns},
+            ),
+            facts[n],
+        )
+        for n in facts
+    ]
+
+
+@pytest.fixture
+def made(tmp_path):
+    """``made(name)``: a file or folder of that name, of version 2."""
+    sizes = {1: 0.4, 2: 0.1, 4: 0.03, 5: 0.01, 7: 0.0}  # numbers may have gaps
+    bands = Bundle("flod", levels({n: {"s_min": s} for n, s in sizes.items()}, ()), "bands")
+    bands.controls = {"gamma": 1.3, "first": 2}
+    facts, controls = {"d_max": 25.0, "d_max_focal": 480.0}, {"offset": -0.25}
+    of_octree = levels({n: {} for n in (1, 2, 3, 5)}, ("lod_bias",))
+    octree = Bundle("octree", of_octree, "octree", facts, controls, True)
+    fading = Bundle("clod", levels({1: {}}, ("sigma_d",)), "decay", {"reference": 9.5, "tau": 0.004})
+    farthest = Bundle("clod", fading.levels, "decay", {"reference": 0.0, "tau": 0.004})
+    bundles = {"bands": bands, "octree": octree, "decay": fading, "farthest": farthest}
+
+    def make(name: str) -> Path:
+        path, bundle = tmp_path / name, bundles[name.split(maxsplit=1)[0]]
+        if name.endswith("folder"):
+            write_folder(path, bundle)
+        else:
+            write_bundle(path, bundle, "stream" if name.endswith("stream") else "finest_first")
+        return path
+
+    return make
+
+
+WRITTEN_BY_0_1_0 = ("flod.ply", "octree.ply", "flod_folder", "octree_folder")
+WRITTEN_NOW = (
+    "bands",
+    "bands stream",
+    "bands folder",
+    "octree",
+    "octree folder",
+    "decay",
+    "decay folder",
+    "farthest",
+)
+
+
+@pytest.mark.parametrize("name", [*WRITTEN_BY_0_1_0, *WRITTEN_NOW])
+def test_a_stranger_chooses_what_we_choose(name, made):
+    path = OLD / name if name in WRITTEN_BY_0_1_0 else made(name)
+    page, bundle = Page(path), (read_folder if path.is_dir() else read_bundle)(path)
+    assert page.rule == bundle.rule and page.numbers == [level.number for level in bundle.levels]
+    drawn = 0
+    for eye in EYES:
+        for f in FOCAL:
+            for given in CHOICES[page.rule]:
+                theirs = page.weights(eye, f, given)
+                for ours in select_levels(bundle, np.array(eye), f, settings(bundle, given)):
+                    weights, count = theirs[ours.number], len(ours.splats)
+                    assert (weights > 0).sum() == count
+                    total = count if ours.weights is None else ours.weights.sum(dtype=np.float64)
+                    # a search for a budget ends at nearly the same scale
+                    near = 1e-3 if given.get("at_most") else 1e-6
+                    assert weights.sum(dtype=np.float64) == pytest.approx(total, rel=near, abs=1e-9)
+                    drawn += count
+    assert drawn > 1000
+
+
+@pytest.mark.parametrize("name", rules())
+def test_the_page_states_every_rule_and_control(name):
+    page = (ROOT / "docs" / "bundle.md").read_text(encoding="utf-8")
+    assert f"## Rule `{name}`" in page
+    section = page.split(f"## Rule `{name}`")[1].split("\n#")[0]
+    rule = rules()[name]
+    controls = [control.name for control in rule.controls]
+    names = [*rule.scene_facts, *rule.level_facts, *rule.columns, *controls]
+    assert [each for each in names if f"`{each}`" not in section] == []

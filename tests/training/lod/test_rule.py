@@ -1,0 +1,146 @@
+"""What holds of every rule: its declarations, its place in files, and what it refuses."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from training.errors import LodgsError
+from training.lod.rule import Control, every_control, facts_of, find_rule, rules
+from training.lod.selection import select, select_levels, settings
+from training.splats.bundle import Bundle, Level, read_bundle, read_folder, write_bundle, write_folder
+from training.splats.gaussians import Splats
+
+RULES = sorted(rules())
+OLD = Path(__file__).parents[2] / "data" / "version_0_1_0"
+
+
+def splats(count: int, seed: int, columns: tuple[str, ...]) -> Splats:
+    rng = np.random.default_rng(seed)
+    return Splats(
+        means=rng.normal(0, 4, (count, 3)).astype(np.float32),
+        quats=rng.normal(size=(count, 4)).astype(np.float32),
+        log_scales=rng.normal(-2, 0.5, (count, 3)).astype(np.float32),
+        opacity_logits=rng.normal(0, 2, count).astype(np.float32),
+        sh=rng.normal(size=(count, 4, 3)).astype(np.float32),
+        extras={name: rng.uniform(0.2, 2, count).astype(np.float32) for name in columns if name != "opacity"},
+    )
+
+
+def bundle_of(name: str) -> Bundle:
+    rule, rng = rules()[name], np.random.default_rng(3)
+    count = 4 if rule.cumulative or rule.level_facts else 1
+    levels = [
+        Level(n, splats(30 * n, n, rule.columns), {fact: rng.uniform(0.5, 6) for fact in rule.level_facts})
+        for n in range(1, count + 1)
+    ]
+    facts = {fact: rng.uniform(2, 6) for fact in rule.scene_facts}
+    return Bundle("any", levels, name, facts, cumulative=rule.cumulative)
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_a_rule_declares_itself(name):
+    rule = rules()[name]
+    assert rule.name == name and find_rule(name) is rule
+    for control in rule.controls:
+        assert control.low <= control.default <= control.high
+        assert control.label and control.about and not control.about.endswith(".")
+        assert every_control()[control.name].whole == control.whole
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_files_give_back_the_rule_its_facts_and_the_same_choice(name, tmp_path):
+    bundle = bundle_of(name)
+    control = rules()[name].controls[0]
+    bundle.controls = {control.name: control.low + 0.125}
+    write_bundle(tmp_path / "b.ply", bundle)
+    write_folder(tmp_path / "folder", bundle)
+    values = settings(bundle, {})
+    assert values[control.name] == control.low + 0.125
+    for again in (read_bundle(tmp_path / "b.ply"), read_folder(tmp_path / "folder")):
+        assert (again.rule, again.facts, again.controls) == (name, bundle.facts, bundle.controls)
+        assert [level.facts for level in again.levels] == [level.facts for level in bundle.levels]
+        for eye in ((0, 0, 0), (9, 0, 0), (500, 0, 0)):
+            one = select_levels(bundle, np.array(eye), 3.0, values)
+            other = select_levels(again, np.array(eye), 3.0, settings(again, {}))
+            for a, b in zip(one, other, strict=True):
+                np.testing.assert_array_equal(a.splats.means, b.splats.means)
+                np.testing.assert_array_equal(a.weights, b.weights)
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_an_option_of_another_rule_is_a_sentence(name):
+    bundle, own = bundle_of(name), {control.name for control in rules()[name].controls}
+    for foreign in every_control().keys() - own | {"nonsense"}:
+        with pytest.raises(LodgsError, match=f"The rule '{name}' has no option '{foreign}'. It has: "):
+            settings(bundle, {foreign: 1})
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_missing_facts_are_a_sentence(name):
+    bundle = bundle_of(name)
+    rule = rules()[name]
+    bundle.facts = {}
+    for level in bundle.levels:
+        level.facts = {}
+    assert rule.scene_facts or rule.level_facts
+    with pytest.raises(LodgsError, match="its facts are incomplete"):
+        select(bundle, np.zeros(3), 100.0, rule.defaults([level.number for level in bundle.levels]))
+
+
+@pytest.mark.parametrize("name", RULES)
+@pytest.mark.parametrize("value", [-1.0, float("nan"), "4 m", None, 10**400])
+def test_impossible_facts_are_a_sentence(name, value):
+    bundle = bundle_of(name)
+    rule = rules()[name]
+    bundle.facts = dict.fromkeys(bundle.facts, value)
+    bundle.levels[-1].facts = dict.fromkeys(bundle.levels[-1].facts, value)
+    with pytest.raises(LodgsError, match="its facts are incomplete"):
+        select(bundle, np.zeros(3), 100.0, rule.defaults([level.number for level in bundle.levels]))
+
+
+@pytest.mark.parametrize("rule, said", [("telepathy", "rule 'telepathy', which"), ("", "not made for dist")])
+def test_no_rule_and_an_unknown_one_are_sentences(rule, said):
+    with pytest.raises(LodgsError, match=said):
+        settings(Bundle("any", [Level(1, splats(3, 0, ()))], rule), {})
+
+
+@pytest.mark.parametrize("value", [0.5, 3, -1, float("nan"), float("inf"), 10**400, "2", None])
+def test_what_is_no_number_of_a_control_is_a_sentence(value):
+    control = Control("turns", 1, 0, 2, "Turns", "How many", whole=True)
+    with pytest.raises(LodgsError, match=r"turns = .* is not possible. Give a whole number from 0 to 2."):
+        control.checked(value)
+
+
+def test_facts_know_the_neighbours():
+    levels = [(1, {"s_min": 4.0}), (3, {"s_min": 2.0}), (7, {"s_min": 0.0})]
+    found = facts_of(rules()["bands"], {}, levels, 3)
+    assert found == {
+        "level": 3, "finer": 7, "coarser": 1, "levels": 7, "s_min": 2.0, "coarser_s_min": 4.0,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("form", ["ply", "folder"])
+@pytest.mark.parametrize("method, rule", [("flod", "bands"), ("octree", "octree")])
+def test_files_of_version_0_1_0_choose_as_before(method, rule, form):
+    bundle = read_bundle(OLD / f"{method}.ply") if form == "ply" else read_folder(OLD / f"{method}_folder")
+    assert bundle.rule == rule
+    now_called = {"start": "first", "end": "last"}
+    for case in json.loads((OLD / "expected.json").read_text())[method]:
+        given = {now_called.get(name, name): float(value) for name, value in case["detail"].items()}
+        shown = select_levels(bundle, np.array(case["eye"]), case["focal"], settings(bundle, given))
+        found = [
+            (one.number, len(one.splats), len(one.splats) if one.weights is None else one.weights.sum())
+            for one in shown
+        ]
+        wanted = {
+            row["level"]: (row["count"], row["count"] if row["weight"] is None else row["weight"])
+            for row in case["shown"]
+        }
+        for number, count, weight in found:
+            assert (count, weight) == pytest.approx(wanted.get(number, (0, 0)), abs=1e-3)
+
+
+def test_a_plain_file_of_version_0_1_0_has_no_rule():
+    assert read_bundle(OLD / "plain.ply").rule == ""

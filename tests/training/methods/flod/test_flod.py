@@ -1,0 +1,157 @@
+"""FLoD as published: constraint, level rise, overlap pruning, schedule."""
+
+import numpy as np
+import pytest
+import torch
+
+from training.errors import LodgsError
+from training.methods.data import TrainingData
+from training.methods.flod import METHOD
+from training.methods.flod.train import Method, apart
+from training.methods.parameters import override
+from training.rasterize import rasterize
+from training.scenes.colmap import read_scene
+
+
+def make(data, **values) -> Method:
+    values = {"levels": 3, "steps": [6, 6, 6], "footprint": 6.0, "overlap_interval": 0, **values}
+    return Method(data, override(METHOD.preset("draft"), values), seed=0, backend="cpu")
+
+
+def test_footprint_is_in_pixels_at_the_median_depth(data):
+    flod = make(data)
+    assert flod.s_min[0] * data.focal / data.median_depth == pytest.approx(6.0)
+    assert flod.s_min == pytest.approx([flod.s_min[0], flod.s_min[0] / 4, 0])
+
+
+def test_an_absolute_constraint_is_taken_as_it_is(data):
+    assert make(data, s_min_1=0.125).s_min == pytest.approx([0.125, 0.03125, 0])
+
+
+@pytest.mark.slow
+def test_no_splat_is_ever_smaller_than_its_level_allows_and_levels_come_in_order(data):
+    flod, finished = make(data, footprint=40.0), []  # larger than the points' distances: it binds
+    for step in range(flod.steps):
+        assert flod.level_at(step) == step // 6 + 1
+        flod.train_step(step)
+        finished += flod.levels_after(step)
+    assert [level.number for level in finished] == [1, 2, 3]
+    for level in finished[:2]:
+        assert np.exp(level.splats.log_scales).min() >= level.facts["s_min"] * (1 - 1e-6)
+    assert np.exp(finished[0].splats.log_scales).min() < finished[0].facts["s_min"] * 1.2
+
+
+def test_the_picture_does_not_jump_when_the_level_rises(data):
+    flod = make(data, rejoin_points=False)
+
+    def picture(level):
+        with torch.no_grad():
+            return rasterize(
+                flod.model.gaussians, data.train[0], min_scale=flod.s_min[level - 1], near=data.near
+            ).image
+
+    for step in range(6):
+        flod.train_step(step)
+    before = picture(1)
+    assert len(flod.levels_after(5)) == 1
+    torch.testing.assert_close(picture(2), before, atol=2e-5, rtol=0)
+    # and it is the new constraint that is in force: the old one would draw larger splats
+    assert (picture(1) - before).abs().max() > 0.01
+
+
+def test_points_that_have_room_at_the_next_level_join_again(data):
+    flod = make(data, min_opacity=0.0, densify_interval=100)
+    points = torch.from_numpy(np.unique(data.scene.points, axis=0))
+    flod.model.keep(torch.arange(len(points)) % 2 == 0)  # as if pruned
+    stayed = flod.model["means"].detach().clone()
+    flod.rise_to(2)
+    distances = torch.cdist(points, stayed).min(1).values
+    expected = points[distances >= flod.s_min[1] / 2]
+    assert 0 < len(expected) < len(points)
+    assert torch.equal(flod.model["means"].detach(), torch.cat([stayed, expected]))
+
+
+def test_of_more_points_than_there_is_room_for_some_join(data):
+    """As many as there is room for, from all over, the same ones in every run of a seed."""
+    models = []
+    for _ in range(2):
+        flod = make(data, min_opacity=0.0, densify_interval=100, max_splats=50, budget_ratio=0.8)
+        points = flod.points
+        flod.model.keep(torch.arange(len(points)) < 10)
+        flod.rise_to(2)
+        assert len(flod.model) == flod.budget(2) == 40
+        models.append(flod.model["means"].detach())
+    assert torch.equal(*models)
+    joined = {tuple(mean) for mean in models[0][10:].tolist()}
+    assert len(joined) == 30 and joined <= {tuple(point) for point in np.float32(points).tolist()}
+    assert {tuple(point) for point in np.float32(points[10:40]).tolist()} != joined
+
+
+def test_training_begins_with_no_more_points_than_splats_may_be(data):
+    flod = make(data, max_splats=20)
+    assert len(flod.model) == len(flod.points) == 20
+    everything = {tuple(point) for point in data.scene.points.tolist()}
+    assert {tuple(point) for point in flod.points.tolist()} < everything
+
+
+def test_overlap_pruning_equals_brute_force():
+    means = torch.from_numpy(np.random.default_rng(3).normal(size=(300, 3)).astype(np.float32))
+    distances = torch.cdist(means.double(), means.double())
+    mean_of_three = distances.sort(1).values[:, 1:4].mean(1)
+    assert torch.equal(apart(means, 0.35), mean_of_three >= 0.35)
+    assert 0 < apart(means, 0.35).sum() < 300
+
+
+def test_overlap_pruning_spares_the_last_level(data):
+    flod = make(data, overlap_interval=1, s_min_1=1e6, steps=[1, 1, 4], densify_until=1.0)
+    with pytest.raises(LodgsError, match="footprint"):  # nothing is a million apart: level 1 loses all
+        flod.train_step(0)
+    last = make(data, overlap_interval=1, levels=1, steps=[4], densify_until=1.0)
+    before = len(last.model)
+    last.train_step(0)
+    assert len(last.model) == before
+
+
+def test_every_level_keeps_to_its_share_of_the_budget(data):
+    flod = make(
+        data, s_min_1=1e-3, steps=[12, 12, 12], densify_interval=2, densify_until=1.0, grad_threshold=0.0,
+        max_splats=200, budget_ratio=0.5, min_opacity=0.0, rejoin_points=False,
+    )  # fmt: skip
+    counts = []
+    for step in range(flod.steps):
+        flod.train_step(step)
+        counts += [len(level.splats) for level in flod.levels_after(step)]
+    # 200 x 0.5^2 = 50 is fewer than the 60 points to begin with; then 100 and 200 are filled to the last
+    assert counts == [60, 100, 200]
+
+
+def test_gradients_are_averaged_over_the_views_that_saw_a_splat(data):
+    flod = make(data, densify_interval=100, prune_interval=100)
+    for step in range(3):
+        flod.train_step(step)
+    seen, gradient_sum = flod.model.stats["seen"], flod.model.stats["gradient_sum"]
+    assert 0 < seen.max() <= 3
+    assert (gradient_sum[seen == 0] == 0).all()
+    assert torch.equal(flod.model.mean_gradient(), gradient_sum / seen.clamp_min(1))
+
+
+def test_a_preset_of_the_paper_is_the_papers():
+    paper = METHOD.preset("paper")
+    assert paper.steps == (10_000, 15_000, 20_000, 25_000, 30_000)
+    until = [share * steps for share, steps in zip(paper.densify_until, paper.steps, strict=True)]
+    assert until == pytest.approx([5000, 6000, 8000, 10000, 15000])
+    assert paper.densify_interval == (2000, 1000, 500, 500, 200)
+    assert (paper.rho, paper.levels, paper.overlap_interval) == (4, 5, 1000)
+
+
+def test_points_that_repeat_are_no_trouble_and_too_few_are_said(data, tiny_scene, tmp_path):
+    from dataclasses import replace
+
+    scene = read_scene(tiny_scene)
+    double = replace(
+        scene, points=np.repeat(scene.points, 2, 0), point_colors=np.repeat(scene.point_colors, 2, 0)
+    )
+    assert len(make(TrainingData(double)).model) == len(np.unique(scene.points, axis=0))
+    few = replace(scene, points=scene.points[:3], point_colors=scene.point_colors[:3])
+    with pytest.raises(LodgsError, match="at least 4"):
+        make(TrainingData(few))

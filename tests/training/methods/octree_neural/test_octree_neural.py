@@ -1,0 +1,232 @@
+"""Octree-GS with neural anchors: decoding as the papers say, baking against the networks themselves."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from training.methods.octree_neural import METHOD
+from training.methods.octree_neural.train import Method
+from training.methods.parameters import override
+from training.rasterize import Gaussians, contributions, rasterize
+
+
+def make(data, **values) -> Method:
+    values = {
+        "levels": 3, "coarser_levels": 0, "nearest": 0.0, "farthest": 1.0, "footprint": 12.0, "steps": 40,
+        "offsets": 4, "features": 8, "far_share": 0.0, "full_share": 0.0, "sh_degree": 2, "view_shapes": True,
+        **values,
+    }  # fmt: skip
+    method = Method(data, override(METHOD.preset("draft"), values), seed=0, backend="cpu")
+    rng = torch.Generator().manual_seed(1)
+    for name in set(method.model.adam.tensors) & {"features", "offsets", "looks"}:  # as if trained
+        method.model[name].data.copy_(torch.randn(method.model[name].shape, generator=rng))
+    return method
+
+
+def test_an_anchor_stands_in_the_middle_of_its_voxel(data):
+    method = make(data)
+    means, level = method.model["means"].detach().double().numpy(), method.model.columns["level"].numpy()
+    cells = (means - method.schedule.tree.origin) / method.schedule.tree.size(level)[:, None]
+    np.testing.assert_allclose(cells % 1, 0.5, atol=1e-4)
+
+
+def test_there_are_no_more_gaussians_than_asked_for_from_the_start(data):
+    assert len(make(data).model) > 10
+    assert len(make(data, max_splats=43, offsets=4).model) == 10
+
+
+@pytest.mark.parametrize("changes", [{"direct": False}, {}, {"view_shapes": False}])
+def test_decoding_is_the_papers(data, changes):
+    """One anchor by hand in float64: Scaffold-GS, Sec. 3.2, Gaussian by Gaussian.
+
+    Its own looks are added, and then opacity is a sigmoid; shapes that do not change with the view see no
+    direction.
+    """
+    method, camera = make(data, **changes), data.train[2]
+    direct = method.parameters.direct
+    if direct:
+        method.model["looks"].data[:, 1::2, 0] = -30
+    counts = method.decode(camera, torch.arange(len(method.model))).anchor.bincount()
+    anchor = int((counts == 2).nonzero()[0])
+    g = method.decode(camera, torch.tensor([anchor]))
+    tensors = method.model.adam.tensors
+    model = {name: tensor.detach()[anchor].double().numpy() for name, tensor in tensors.items()}
+    direction = model["means"] - camera.center
+    direction /= np.linalg.norm(direction)
+    inputs = np.concatenate([model["features"], direction])
+    still = np.concatenate([model["features"], direction * method.parameters.view_shapes])
+
+    def network(net, inputs=still):
+        (w1, b1), (w2, b2) = ((x.weight.detach().double().numpy(), x.bias.detach().double().numpy())
+                              for x in (net[0], net[2]))  # fmt: skip
+        return w2 @ np.maximum(w1 @ inputs + b1, 0) + b2
+
+    own = model.get("looks", np.zeros((4, 11)))
+    logit = network(method.networks.opacity) + own[:, 0]
+    opacity = 1 / (1 + np.exp(-logit)) if direct else np.tanh(logit)
+    shown = np.flatnonzero(opacity > (1 / 255 if direct else 0))
+    assert len(shown) == 2 and g.which.tolist() == shown.tolist()
+    looks = (network(method.networks.covariance).reshape(4, 7) + own[:, 1:8])[shown]
+    colors = (network(method.networks.color, inputs).reshape(4, 3) + own[:, 8:])[shown]
+    extents = np.exp(model["log_scales"])
+    for name, expected in {
+        "opacities": opacity[shown],
+        "colors": 1 / (1 + np.exp(-colors)),
+        "means": model["means"] + model["offsets"][shown] * extents[:3],
+        "scales": extents[3:] / (1 + np.exp(-looks[:, :3])),
+        "quats": looks[:, 3:],
+    }.items():
+        np.testing.assert_allclose(getattr(g, name).detach().numpy(), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_anchors_beside_the_image_whose_gaussians_reach_into_it_are_drawn(data):
+    method = make(data)
+    method.model["log_scales"].data -= 2
+    everything = torch.arange(len(method.model))
+    beside = 0
+    for camera in data.train:
+        camera = replace(camera, fx=8 * camera.fx, fy=8 * camera.fy)  # a narrow view
+        visible = method.visible(camera, torch.ones(len(method.model)))
+        with torch.no_grad():
+            all_of_it = method.rasterize_decoded(method.decode(camera, everything), camera).image
+            drawn = method.rasterize_decoded(method.decode(camera, visible), camera).image
+        assert (drawn - all_of_it).abs().max() < 1e-5
+        local = method.model["means"][visible].detach().numpy() @ camera.world_to_camera[:3, :3].T
+        x, _, z = (local + camera.world_to_camera[:3, 3]).T
+        beside += np.sum((np.abs(camera.fx * x / z) > 0.6 * camera.width) | (z < 0))
+        assert len(visible) < len(everything)
+    assert beside > 0
+
+
+def test_a_gaussian_that_no_view_sees_much_of_is_never_drawn_again(data):
+    """Against the largest blending weights of another rasterizer, the reference."""
+    method = make(data, least_weight=0.1)
+    method.schedule.joins = [0] * len(method.schedule.joins)
+    largest = torch.zeros_like(method.model.stats["seen"])
+    for view, camera in enumerate(data.train):
+        g = method.decode(camera, method.drawn_by(camera), view)
+        found = contributions(g.gaussians(), [camera], near=data.near, backend="reference").largest
+        largest[g.anchor, g.which] = torch.maximum(largest[g.anchor, g.which], found)
+    stay = (largest >= 0.1).any(1)
+    assert 0 < stay.sum() < len(stay)
+    method.prune_unseen(39)
+    alive = method.model["looks"][..., 0].detach() > -20
+    assert torch.equal(alive, largest[stay] >= 0.1) and not alive.all()
+    assert method.splats == alive.sum()
+
+
+def test_anchors_of_which_nothing_is_drawn_are_removed(data, monkeypatch):
+    method = make(data, grad_threshold=1e9)
+    method.model["looks"].data[:5, :, 0] = -30
+    monkeypatch.setattr(method.schedule, "weights", lambda *_, **__: torch.ones(len(method.model)))
+    view = data.view(data.training_view(0, 0))
+    drawings = method.draw(view, 0)
+    drawings[0].rendering.grad2d = torch.zeros(len(drawings[0].rendering.radii), 2)
+    unseen = 5 - int((drawings[0].anchors < 5).sum())
+    before = len(method.model)
+    method.accumulate_stats(drawings, view, 0)
+    method.grow(20)
+    assert unseen < 5
+    assert len(method.model) == before - 5 + unseen
+
+
+def draw(splats, camera, data):
+    return rasterize(Gaussians.of(splats), camera, near=data.near).image
+
+
+def ever_drawn(method: Method) -> torch.Tensor:
+    """Anchors (indices) that a training view draws; others are not baked."""
+    return torch.cat([method.drawn_by(camera) for camera in method.data.train]).unique()
+
+
+def blind(method: Method, *names: str) -> None:
+    """Networks that do not look at the direction."""
+    for name in names:
+        features = method.parameters.features
+        getattr(method.networks, name)[0].weight.data[:, features : features + 3] = 0
+
+
+@pytest.mark.parametrize("appearance", [0, 2])
+def test_baking_loses_nothing_where_nothing_depends_on_the_view(data, appearance):
+    """Nor is the light of single photographs taken for what the direction does."""
+    method = make(data, appearance=appearance)
+    method.networks.appearance.data.normal_(generator=torch.Generator().manual_seed(2))
+    blind(method, "opacity", "covariance", "color")
+    baked = method.bake()
+    for camera in (data.train[0], data.test[0]):
+        with torch.no_grad():
+            everything = method.rasterize_decoded(method.decode(camera, ever_drawn(method)), camera).image
+        assert everything.max() > 0.2
+        assert (draw(baked, camera, data) - everything).abs().max() < 1e-3
+
+
+def test_opacity_and_covariance_are_those_of_the_median_view(data):
+    method = make(data)
+    baked = method.bake()
+    means, anchors = method.model["means"].detach(), []
+    for anchor in range(len(method.model)):
+        seen = [camera for camera in data.train if anchor in method.drawn_by(camera)]
+        if not seen:
+            continue
+        far = [float((means[anchor] - torch.as_tensor(c.center).float()).norm()) for c in seen]
+        camera = seen[int(np.argsort(far)[(len(far) - 1) // 2])]
+        anchors.append(method.decode(camera, torch.tensor([anchor])))
+    opacity = torch.cat([g.opacities for g in anchors]).detach()
+    scales = torch.cat([g.scales for g in anchors]).detach()
+    np.testing.assert_allclose(1 / (1 + np.exp(-baked.opacity_logits)), opacity, rtol=1e-4)
+    np.testing.assert_allclose(np.exp(baked.log_scales), scales, rtol=1e-4)
+
+
+def test_harmonics_fit_colours_that_are_harmonics(data):
+    """Colours that change linearly with the direction are found again between the training views."""
+    method = make(data, bake_ridge=1e-5)
+    blind(method, "opacity", "covariance")
+    # sigmoid(x) is x/4 + 1/2 near 0: a first layer of directions that stay positive, a faint second one
+    first, last = method.networks.color[0], method.networks.color[2]
+    first.weight.data.zero_()
+    first.weight.data[:3, -3:] = torch.eye(3)
+    first.bias.data[:] = 1.0
+    last.weight.data.mul_(0.5)
+    baked = method.bake()
+    camera = data.test[1]
+    with torch.no_grad():
+        g = method.decode(camera, ever_drawn(method))
+        shown = method.rasterize_decoded(g, camera).image
+        flat = np.array(baked.sh)
+        flat[:, 1:] = 0
+    error = (draw(baked, camera, data) - shown).abs().mean()
+    baked.sh = flat
+    assert error < 0.3 * (draw(baked, camera, data) - shown).abs().mean()
+
+
+def test_the_networks_come_back_from_their_arrays(data, tmp_path):
+    method = make(data, appearance=2)
+    for step in range(4):
+        method.train_step(step)
+    np.savez(tmp_path / "model.npz", **method.arrays())  # pyright: ignore[reportArgumentType]
+    other = make(data, appearance=2)
+    with np.load(tmp_path / "model.npz", allow_pickle=False) as arrays:
+        other.load_arrays(arrays)
+    camera = data.test[0]
+    assert torch.equal(other.picture(camera), method.picture(camera))
+    other.train_step(4)  # and training can go on
+
+
+def test_new_anchors_come_where_steep_gaussians_are(data):
+    method = make(data, steps=400, coarse_share=0.0, min_opacity=0.0, max_splats=10_000)
+    count, columns = len(method.model), method.model.columns
+    method.model.stats["seen"] += 1
+    method.model.stats["gradient_sum"][:, 1] += 1  # one of each anchor's four
+    places = method.model["means"] + method.model["offsets"][:, 1] * method.model["log_scales"].exp()[:, :3]
+    level = (columns["level"] + 1).clamp_max(method.levels)
+    keys = method.schedule.tree.keys(places.detach().double().numpy(), level.long().numpy())
+    method.grow(200)
+    added = method.model["means"][count:].detach().double().numpy()
+    assert len(added) > 0
+    grown = method.schedule.tree.keys(added, method.model.columns["level"][count:].long().numpy())
+    assert set(grown) <= set(keys)
+    apart = method.model["offsets"][count:].detach()
+    assert (apart.abs() <= 0.5).all()  # in their voxel, no two in one place
+    assert all(len(places.unique(dim=0)) == 4 for places in apart)

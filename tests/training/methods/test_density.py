@@ -1,0 +1,84 @@
+"""Splats that are cloned, split and pruned, whatever columns they have."""
+
+import numpy as np
+import pytest
+import torch
+
+from training.methods.density import constrained_log, densify, prune, reset_opacities
+from training.methods.model import NAMES, Model
+
+ALL = (*NAMES, "decay")
+
+
+def test_small_splats_are_cloned_in_place(model, moments):
+    before = {name: model[name].detach().clone() for name in ALL}
+    gradients = torch.zeros(50)
+    gradients[[4, 7]] = 1.0
+    added = densify(
+        model, gradients, threshold=0.5, clone_below=1e9, max_splats=1000, min_scale=0.0,
+        rng=np.random.default_rng(0),
+    )  # fmt: skip
+    assert added == 2 and len(model) == 52
+    for name in ALL:
+        assert torch.equal(model[name][:50], before[name])
+        assert torch.equal(model[name][50:], before[name][[4, 7]])
+        assert moments(model, name, 0)[50:].tolist() == [0, 0]
+        assert torch.equal(moments(model, name, 0)[:50], torch.arange(1.0, 51.0))
+
+
+def test_large_splats_are_split_into_two_smaller_ones_drawn_from_them(model):
+    model.assign("log_scales", torch.log(torch.tensor([[0.5, 1.0, 2.0]])).repeat(50, 1))
+    # a quarter turn about z: the splat's x axis lies along the world's y
+    model.assign(
+        "quats", torch.tensor([[np.sqrt(0.5), 0, 0, np.sqrt(0.5)]], dtype=torch.float32).repeat(50, 1)
+    )
+    parents = model["means"].detach().clone()
+    gradients = torch.ones(50)
+    offsets = []
+    for seed in range(40):
+        copy = Model({name: model[name].detach().clone() for name in ALL}, model.adam.lr)
+        densify(
+            copy, gradients, threshold=0.5, clone_below=0.0, max_splats=1000, min_scale=0.1,
+            rng=np.random.default_rng(seed),
+        )  # fmt: skip
+        assert len(copy) == 100
+        assert copy["decay"].tolist() == [*range(10, 60)] * 2
+        # FLoD: child scale + s_min = parent scale / 1.6, with the constrained scale
+        expected = (torch.tensor([0.5, 1.0, 2.0]) + 0.1) / 1.6
+        torch.testing.assert_close(copy["log_scales"].exp() + 0.1, expected.repeat(100, 1))
+        offsets.append((copy["means"].detach() - parents.repeat(2, 1)).numpy())
+    spread = np.concatenate(offsets).std(0)
+    np.testing.assert_allclose(spread, [1.1, 0.6, 2.1], rtol=0.05)
+
+
+def test_the_budget_goes_to_the_largest_gradients(model):
+    gradients = torch.linspace(0, 1, 50)
+    before = model["means"].detach().clone()
+    added = densify(
+        model, gradients, threshold=0.1, clone_below=1e9, max_splats=53, min_scale=0.0,
+        rng=np.random.default_rng(0),
+    )  # fmt: skip
+    assert added == 3
+    assert torch.equal(model["means"][50:], before[[47, 48, 49]])
+
+
+def test_constrained_log_undoes_the_constraint_and_stays_free_below_it():
+    scales = torch.tensor([0.5, 0.2])
+    torch.testing.assert_close(constrained_log(scales, 0.1).exp() + 0.1, scales)
+    assert constrained_log(torch.tensor([0.05]), 0.1).exp().item() == pytest.approx(0.005)
+
+
+def test_pruning_takes_what_is_more_transparent_than_asked_for(model):
+    model.assign("opacity_logits", torch.logit(torch.linspace(0.01, 0.99, 50)))
+    prune(model, 0.5)
+    assert model["decay"].tolist() == [*range(35, 60)]
+
+
+def test_an_opacity_reset_leaves_a_hundredth_at_most_and_no_moments(model, moments):
+    model.assign("opacity_logits", torch.logit(torch.linspace(0.001, 0.9, 50)))
+    model.adam.state["opacity_logits"][0][:] = 1
+    reset_opacities(model)
+    opacity = model["opacity_logits"].detach().sigmoid()
+    assert opacity.max().item() == pytest.approx(0.01) and opacity.min().item() == pytest.approx(0.001)
+    assert not moments(model, "opacity_logits", 0).any()
+    assert moments(model, "means", 0)[0] == 1

@@ -1,0 +1,235 @@
+"""A method is a folder: one that nobody knew is found, trains a column of its own and begins with a base."""
+
+import inspect
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from training import methods
+from training.errors import LodgsError
+from training.methods.method import Method
+from training.runs import train as training_loop
+from training.runs.base import read_base
+from training.runs.folder import RunFolder
+from training.runs.job import Job
+from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
+from training.splats.gaussians import Splats
+from training.splats.ply import write_ply
+
+ABOUT = """
+from dataclasses import dataclass
+from ..info import MethodInfo
+from ..parameters import Parameters, parameter
+
+@dataclass(frozen=True)
+class TinyParameters(Parameters):
+    lr_decay: float = parameter(0.1, "Learning rate of decays.", above=0)
+
+METHOD = MethodInfo(
+    name="tiny", number=99, label="Tiny", about="for tests", parameters=TinyParameters,
+    presets={name: TinyParameters(steps=8) for name in ("draft", "standard", "paper")}, from_base=True,
+)
+"""
+TRAIN = '''
+import numpy as np
+import torch
+from ...splats.bundle import Level
+from .. import method
+from ..density import densify, prune
+from ..method import Drawing
+from ..model import Model, splat_rates
+from ..start import distinct, from_points, from_splats
+
+class Method(method.Method):
+    """Draws everything, and once more with weights that are trained; clones in step 4, prunes in step 6."""
+
+    def setup(self, base):
+        p, scene = self.parameters, self.data.scene
+        if base is None:
+            tensors = from_points(*distinct(scene.points, scene.point_colors), p.sh_degree, self.device)
+        else:
+            tensors = from_splats(base, p.sh_degree, self.device)
+        tensors["decay"] = torch.linspace(0.5, 1.5, len(tensors["means"]))
+        self.model = Model(tensors, splat_rates(p, self.data.extent) | {"decay": p.lr_decay})
+
+    def levels_after(self, step):
+        return [Level(1, self.model.splats())] if step + 1 == self.steps else []
+
+    def draw(self, view, step):
+        weights = torch.exp(-self.model["decay"] ** 2)
+        return [Drawing(self.rasterize_model(view.camera, step, weights=w)) for w in (None, weights)]
+
+    def accumulate_stats(self, drawings, view, step):
+        self.model.accumulate_stats(drawings[0].rendering)
+
+    def set_learning_rates(self, step):
+        pass
+
+    def control_density(self, step):
+        if step == 4:
+            densify(
+                self.model, self.model.mean_gradient(), threshold=0.0, clone_below=1e9, max_splats=70,
+                rng=np.random.default_rng(0),
+            )
+        if step == 6:
+            prune(self.model, 0.05)
+'''
+
+
+@pytest.fixture
+def tiny(tmp_path, monkeypatch):
+    """What a folder called ``tiny_folder`` beside the methods' own declares."""
+    folder = tmp_path / "methods" / "tiny_folder"
+    folder.mkdir(parents=True)
+    (folder / "__init__.py").write_text(ABOUT)
+    (folder / "train.py").write_text(TRAIN)
+    monkeypatch.setattr(methods, "__path__", [*methods.__path__, str(folder.parent)])
+    found = methods.found()
+    monkeypatch.setitem(methods.METHODS, "tiny", found["tiny"])
+    yield found["tiny"]
+    for name in [name for name in sys.modules if name.startswith("training.methods.tiny_folder")]:
+        del sys.modules[name]
+
+
+def base(count: int = 40, sh_degree: int = 1) -> Splats:
+    rng = np.random.default_rng(5)
+
+    def random(*shape: int) -> np.ndarray:
+        return rng.normal(0, 0.5, (count, *shape)).astype(np.float32)
+
+    return Splats(random(3), random(4), random(3) - 2, random(), random((sh_degree + 1) ** 2, 3))
+
+
+def job(scene: Path, out: Path, **keys) -> Job:
+    values = {"scene": str(scene), "out": str(out), "method": "tiny", "image_scale": 1.0, "test_every": 4}
+    return Job.from_dict(values | keys)
+
+
+def test_a_folder_is_found_and_every_folder_declares_its_name(tiny):
+    assert tiny.package == "training.methods.tiny_folder" and list(methods.found())[-1] == "tiny"
+    folders = {path.parent.name for path in Path(methods.__file__).parent.glob("*/train.py")}
+    assert folders == {
+        method.package.rsplit(".", 1)[1] for method in methods.METHODS.values() if method != tiny
+    }
+
+
+def test_no_other_room_of_the_trainer_names_a_methods_folder():
+    """What a new method would have to be added to."""
+    root = Path(methods.__file__).parents[1]
+    for path in root.rglob("*.py"):
+        inside = path.relative_to(root).parts
+        if inside[0] != "methods" or len(inside) == 2:
+            text = path.read_text(encoding="utf-8")
+            assert not any(f"methods.{name}" in text for name in ("flod", "octree", "threedgs")), path
+            assert not any(f"from .{name} " in text for name in ("flod", "octree", "threedgs")), path
+
+
+def test_a_step_of_two_drawings_trains_weights_and_keeps_a_column_of_ones_own(tiny, data):
+    method = methods.create("tiny", data, tiny.preset("draft"), seed=0, backend="cpu")
+    before, count = method.model["decay"].detach().clone(), len(method.model)
+    loss, image, target = method.train_step(0)
+    assert loss > 0 and image.shape == target.image.shape
+    learned = (method.model["decay"].detach() - before).abs()
+    assert (learned > 0).sum() > count / 2
+    assert learned.max() == pytest.approx(0.1, rel=1e-3)  # Adam's first step is the rate
+    for step in range(1, 8):
+        if step == 4:
+            parents = method.model["decay"].detach().clone()
+        method.train_step(step)
+    (level,) = method.levels_after(7)
+    assert len(parents) == count and len(level.splats) == len(method.model) > 0
+    assert list(level.splats.extras) == ["decay"]
+
+
+def test_the_loss_of_two_drawings_is_the_sum_and_one_is_the_loss_itself(tiny, data):
+    method = methods.create("tiny", data, tiny.preset("draft"), seed=0, backend="cpu")
+    view = method.choose_view(0)
+    both = method.draw(view, 0)
+    losses = [float(method.loss([drawing], view, 0).detach()) for drawing in both]
+    assert losses[0] != losses[1]
+    assert float(method.loss(both, view, 0).detach()) == pytest.approx(sum(losses))
+
+
+def test_a_run_begins_with_a_base_and_ends_with_its_column_in_the_bundle(tiny, tiny_scene, tmp_path):
+    write_ply(tmp_path / "base.ply", base())
+    made = job(tiny_scene, tmp_path / "run", base=str(tmp_path / "base.ply"))
+    assert training_loop.train(made) == 0
+    folder = RunFolder(made.out)
+    splats = read_bundle(folder.bundle).levels[0].splats
+    assert "decay" in splats.extras and splats.extras["decay"].dtype == np.float32
+    assert splats.sh_degree == 3
+    # what began as the base's first splats hardly moved in eight steps
+    near = np.linalg.norm(splats.means[:, None] - base().means, axis=2).min(1)
+    assert np.median(near) < 0.05
+    assert training_loop.train(made) == 0, "started again with the same job, it is resumed"
+
+
+def test_what_is_odd_about_a_base_is_a_warning_of_the_run(tiny, tiny_scene, tmp_path):
+    write_ply(tmp_path / "base.ply", base(), ["SplatRenderMode: mip"])
+    made = job(tiny_scene, tmp_path / "run", base=str(tmp_path / "base.ply"))
+    assert training_loop.train(made) == 0
+    events, _ = RunFolder(made.out).events()
+    said = [event["message"] for event in events if event["event"] == "warning"]
+    assert len([text for text in said if "Mip-Splatting's 2D filter" in text]) == 1
+
+
+def test_a_base_is_refused_where_a_method_cannot_begin_with_one_and_where_there_is_none(
+    tiny, tiny_scene, tmp_path
+):
+    with pytest.raises(LodgsError, match=r"'flod' cannot begin.*Leave out 'base'"):
+        job(tiny_scene, tmp_path / "run", method="flod", base=str(tmp_path / "base.ply"))
+    made = job(tiny_scene, tmp_path / "run", base=str(tmp_path / "absent.ply"))
+    assert training_loop.train(made) == training_loop.BAD_INPUT
+    event = RunFolder(made.out).events()[0][-1]
+    assert event["event"] == "error" and "absent.ply" in event["what"] and event["remedy"]
+
+
+def test_a_jobs_base_is_relative_to_its_file(tiny, tmp_path):
+    (tmp_path / "job.toml").write_text('scene = "s"\nout = "run"\nmethod = "tiny"\nbase = "before/run"\n')
+    made = Job.from_file(tmp_path / "job.toml")
+    assert made.base == str(tmp_path / "before" / "run")
+    made.resolved().write(tmp_path / "again.toml")
+    assert Job.from_file(tmp_path / "again.toml").base == made.base
+
+
+def test_a_base_is_the_finest_complete_level_of_a_run_a_bundle_or_a_ply(tmp_path):
+    coarse, fine = base(10), base(30)
+    run = RunFolder(tmp_path / "run")
+    with pytest.raises(LodgsError, match="There is no"):
+        read_base(run.path)
+    run.make()
+    with pytest.raises(LodgsError, match=r"no finished run.*to the end"):
+        read_base(run.path)
+    levels = [Level(1, coarse), Level(2, fine)]
+    write_bundle(run.bundle, Bundle("flod", levels))
+    for path in (run.path, run.bundle):
+        np.testing.assert_array_equal(read_base(path).means, fine.means)
+    write_bundle(run.bundle, Bundle("octree", levels, cumulative=True))
+    np.testing.assert_array_equal(read_base(run.path).means, np.concatenate([coarse.means, fine.means]))
+    write_ply(tmp_path / "plain.ply", coarse)
+    np.testing.assert_array_equal(read_base(tmp_path / "plain.ply").means, coarse.means)
+    write_ply(tmp_path / "empty.ply", base(0))
+    with pytest.raises(LodgsError, match="holds no splats"):
+        read_base(tmp_path / "empty.ply")
+
+
+def test_a_method_that_forgets_something_cannot_be_made(data, tiny):
+    class Forgetful(Method):
+        def setup(self, base):
+            pass
+
+    assert inspect.isabstract(Method)
+    with pytest.raises(TypeError, match="levels_after"):
+        Forgetful(data, tiny.preset("draft"), 0, "cpu")  # pyright: ignore[reportAbstractUsage]
+
+
+def test_what_all_methods_record_of_a_scene(data, tiny):
+    method = methods.create("tiny", data, tiny.preset("draft"), seed=0, backend="cpu")
+    meta = method.meta()
+    assert meta["focal_px"] == 60 and meta["focal_width"] == 64
+    assert meta["camera_center"] == pytest.approx(np.mean([c.center for c in data.train], 0).tolist())
+    assert {"scene_extent", "median_depth"} <= set(meta) and method.facts() == {}
+    assert torch.device("cpu") == method.device

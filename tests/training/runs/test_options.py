@@ -1,0 +1,75 @@
+"""Options of ``train``: they say what a job file says."""
+
+import argparse
+from dataclasses import fields
+
+import pytest
+
+from training.__main__ import main
+from training.errors import LodgsError
+from training.runs.job import Job
+from training.runs.options import add_options, job_from
+
+
+def job(*words) -> Job:
+    parser = argparse.ArgumentParser()
+    add_options(parser)
+    return job_from(parser.parse_args([str(word) for word in words]))
+
+
+def test_every_key_of_a_job_has_an_option(capsys):
+    with pytest.raises(SystemExit):
+        job("--help")
+    said = capsys.readouterr().out
+    names = {field.name for field in fields(Job)} - {"parameters"} | {"set"}
+    assert [name for name in names if f"--{name.replace('_', '-')} " not in said] == []
+
+
+def test_options_and_a_file_say_the_same(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    told = job(
+        "--scene", "photos", "--out", "run", "--method", "octree", "--preset", "standard",
+        "--image-scale", 0.25, "--test-every", 0, "--seed", 7, "--backend", "cpu", "--exposure", -1.5,
+        "--model", "sparse/1", "--images", "small", "--set", "max_splats=5000", "--set", "nearest=0.1",
+    )  # fmt: skip
+    (tmp_path / "job.toml").write_text(
+        'scene = "photos"\nout = "run"\nmethod = "octree"\npreset = "standard"\nimage_scale = 0.25\n'
+        'test_every = 0\nseed = 7\nbackend = "cpu"\nexposure = -1.5\nmodel = "sparse/1"\nimages = "small"\n'
+        "[parameters]\nmax_splats = 5000\nnearest = 0.1\n"
+    )
+    assert told == Job.from_file(tmp_path / "job.toml") == job("job.toml")
+
+
+def test_what_is_not_given_is_the_jobs_default(tmp_path):
+    assert job("--scene", "/a", "--out", "/b") == Job("/a", "/b")
+
+
+def test_options_go_before_what_the_file_says(tmp_path):
+    Job("/a", "/b", seed=1, parameters={"rho": 3, "footprint": 9}).write(tmp_path / "job.toml")
+    changed = job(tmp_path / "job.toml", "--seed", 2, "--out", "/c", "--set", "rho=2")
+    assert changed == Job("/a", "/c", seed=2, parameters={"rho": 2, "footprint": 9})
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "not said what to train"),
+        (["--scene", "a"], "--out RUN"),
+        (["--scene", "a", "--out", "b", "--set", "rho"], "--set rho is not NAME=VALUE"),
+        (["--scene", "a", "--out", "b", "--set", "rho=four"], "--set rho=four is not NAME=VALUE"),
+        (["--scene", "a", "--out", "b", "--set", "wings=2"], "unknown parameter 'wings'"),
+        (["--scene", "a", "--out", "b", "--image-scale", "7"], "image_scale = 7.0 is not possible"),
+        (["--scene", "a", "--out", "b", "--test-every", "1"], "test_every = 1 is not possible"),
+        (["--scene", "a", "--out", "b", "--base", "c"], "'flod' cannot begin with the splats"),
+        (["absent.toml"], r"absent\.toml"),
+    ],
+)
+def test_mistakes_are_named(words, said):
+    with pytest.raises(LodgsError, match=said):
+        job(*words)
+
+
+def test_the_command_says_mistakes_as_events(capsys):
+    assert main(["train", "--scene", "a", "--out", "b", "--set", "wings=2"]) == 2
+    out, err = capsys.readouterr()
+    assert "unknown parameter 'wings'" in out and out.startswith('{"event": "error"') and not err

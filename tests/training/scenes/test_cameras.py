@@ -1,0 +1,53 @@
+"""Where cameras see points: worked by hand, and as pycolmap projects them."""
+
+import numpy as np
+import pycolmap
+from scipy.spatial.transform import Rotation
+
+from training.scenes.cameras import Camera
+
+POSE = np.array([[0.0, 1, 0, -2], [-1, 0, 0, 3], [0, 0, 1, 4], [0, 0, 0, 1]])
+"""A quarter turn about z, then a step: a world point (x, y, z) is (y - 2, 3 - x, z + 4) to the camera."""
+
+
+def test_points_worked_by_hand():
+    camera = Camera("a", 100, 80, 50.0, 60.0, 40.5, 30.0, POSE)
+    points = np.array([[3, 2, 0], [2, 4, 1], [3, 2, -8], [0, 2, 0]], np.float32)
+    uv, depth = camera.project(points)
+    assert depth.tolist() == [4, 5, -4, 4] and uv.dtype == np.float64
+    assert uv[[0, 1, 3]].tolist() == [[40.5, 30], [40.5 + 50 * 2 / 5, 30 + 60 * 1 / 5], [40.5, 75]]
+    assert camera.view_space(points)[1].tolist() == [2, 1, 5]
+    assert camera.sees(points).tolist() == [True, True, False, True]
+    assert camera.sees(points, near=4).tolist() == [False, True, False, False]
+    assert camera.focal == 50 and Camera("b", 1, 1, 7.0, 6.0, 0, 0, POSE).focal == 6
+
+
+def test_the_borders_of_the_image():
+    """Its left and upper edges belong to it, its right and lower ones do not; a margin widens all four."""
+    camera = Camera("a", 8, 4, 1.0, 1.0, 0.0, 0.0, np.eye(4))
+    uv = np.array([[0, 0], [8, 0], [0, 4], [7.75, 3.75], [-0.25, 0], [0, -0.25], [-2, -1], [9.75, 4.75]])
+    points = np.column_stack([uv, np.ones(len(uv))])
+    assert camera.sees(points).tolist() == [True, False, False, True, False, False, False, False]
+    assert camera.sees(points, margin=0.25).all()
+    assert not camera.sees(points * [1, 1, 0]).any(), "nothing is seen at the eye's own depth"
+    assert camera.sees(np.zeros((0, 3))).shape == (0,)
+
+
+def test_projections_are_colmaps():
+    """Pixel centres at +0.5, y down: pycolmap's own projection of the same points."""
+    random = np.random.default_rng(3)
+    intrinsics = 61.5, 58.25, 47.25, 33.0
+    lens = pycolmap.Camera(model="PINHOLE", width=96, height=72, params=intrinsics)
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("xyz", (0.4, -1.1, 0.2)).as_matrix()
+    pose[:3, 3] = 0.5, -1, 6
+    camera = Camera("a", 96, 72, *intrinsics, pose)
+    points = random.uniform(-2, 2, (200, 3))
+    uv, depth = camera.project(points)
+    local = np.array([pycolmap.Rigid3d(pose[:3]) * point for point in points])
+    np.testing.assert_allclose(depth, local[:, 2], rtol=1e-12)
+    assert (depth > 0).all()
+    np.testing.assert_allclose(uv, [lens.img_from_cam(point) for point in local], rtol=1e-10, atol=1e-9)
+    seen = camera.sees(points)
+    assert 0 < seen.sum() < len(seen)
+    assert np.array_equal(seen, ((uv >= 0) & (uv < (96, 72))).all(1))

@@ -1,0 +1,255 @@
+"""Dialects of splat PLYs: files as their makers write them, by plyfile, against numbers worked by hand."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData, PlyElement
+
+from training.errors import LodgsError
+from training.rasterize.filter3d import smoothed
+from training.render.scene import Instance, SplatSet, draw
+from training.scenes.cameras import Camera
+from training.splats.bundle import (
+    Bundle,
+    Level,
+    describe,
+    read_bundle,
+    read_folder,
+    read_head,
+    write_bundle,
+    write_folder,
+)
+from training.splats.dialects import comments_of
+from training.splats.ply import read_ply, write_ply
+
+XYZ = ["x", "y", "z"]
+NORMALS = ["nx", "ny", "nz"]
+DC = [f"f_dc_{i}" for i in range(3)]
+REST = [f"f_rest_{i}" for i in range(45)]
+ROT = [f"rot_{i}" for i in range(4)]
+OFFSETS = [f"f_offset_{i}" for i in range(3)]
+
+
+def scales(count):
+    return [f"scale_{i}" for i in range(count)]
+
+
+PLAIN = [*XYZ, *NORMALS, *DC, "opacity", *scales(3), *ROT]
+ANYGS = [*XYZ, "level", "extra_level", *OFFSETS, *DC, *REST, "opacity", *scales(6), *ROT]
+SPACETIME = [*XYZ, "trbf_center", "trbf_scale", *NORMALS, *[f"motion_{i}" for i in range(9)], *DC, "opacity"]
+FLOD = [*XYZ, *NORMALS, *DC, *REST, "opacity", *scales(3), *ROT, "ancestry_lod_0", "ancestry_lod_1"]
+SCAFFOLD = [*XYZ, *NORMALS, *[f"f_offset_{i}" for i in range(30)], *[f"f_anchor_feat_{i}" for i in range(32)]]
+SCAFFOLD += ["opacity", *scales(6), *ROT]
+OCTREE = [*XYZ, "level", "extra_level", "info", *SCAFFOLD[6:]]
+
+
+@pytest.fixture
+def write(tmp_path):
+    """write(columns, values, ...): a float PLY by plyfile; columns without values are random numbers."""
+
+    def make(columns, values=None, *, count=2, comments=(), obj_info=(), name="a.ply", elements=()):
+        random = np.random.default_rng(3)
+        rows = np.zeros(count, [(column, "f4") for column in columns])
+        for column in columns:
+            rows[column] = (values or {}).get(column, random.normal(0, 0.5, count))
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        data = PlyData(
+            [*elements, PlyElement.describe(rows, "vertex")], comments=list(comments), obj_info=list(obj_info)
+        )
+        data.write(str(path))
+        return path
+
+    return make
+
+
+def test_the_3d_filter_is_applied(write):
+    """s = 0.3, 0.4, 1.2 under 0.4: s'² = 0.25, 0.32, 1.6; the mass 0.9 · 0.144 stays. And a filter of 0."""
+    values = {f"scale_{i}": [math.log(s), -1] for i, s in enumerate((0.3, 0.4, 1.2))}
+    values |= {"opacity": [math.log(9), 20], "filter_3D": [0.4, 0]} | dict.fromkeys(NORMALS, 0)
+    splats = read_ply(write([*PLAIN, "filter_3D"], values))
+    expected = np.log([0.5, math.sqrt(0.32), math.sqrt(1.6)])
+    np.testing.assert_allclose(splats.log_scales, np.stack([expected, np.full(3, -1.0)]), rtol=1e-6)
+    opacity = 1 / (1 + np.exp(-splats.opacity_logits.astype(np.float64)))
+    np.testing.assert_allclose(opacity[0], 0.9 * 0.3 * 0.4 * 1.2 / np.sqrt(0.25 * 0.32 * 1.6), rtol=1e-6)
+    assert splats.opacity_logits[1] == 20
+    assert splats.extras == {} and splats.log_scales.dtype == splats.opacity_logits.dtype == np.float32
+
+
+def test_a_filter_of_any_size_leaves_numbers(write):
+    """Narrow and wide, opaque and clear: s'² and the mass in 80 digits' worth of range."""
+    s, o, f = (x.ravel() for x in np.meshgrid([-40.0, -3, 5], [-90.0, 0, 15, 200], [0, 1e-12, 0.1, 1e4]))
+    values = {"scale_0": s, "scale_1": s, "scale_2": s, "opacity": o, "filter_3D": f}
+    splats = read_ply(write([*PLAIN, "filter_3D"], values, count=len(s)))
+    wide = 0.5 * np.log(np.exp(2 * s) + f**2)
+    np.testing.assert_allclose(splats.log_scales[:, 0], wide, rtol=1e-5, atol=1e-6)
+    log_opacity = -np.logaddexp(0, -o) + 3 * (s - wide)
+    log_found = -np.logaddexp(0, -splats.opacity_logits.astype(np.float64))
+    np.testing.assert_allclose(log_found, log_opacity, rtol=1e-5, atol=1e-5)
+    assert (splats.opacity_logits <= o.astype(np.float32)).all()
+
+
+def test_a_filtered_scene_looks_as_the_trainers_filter_makes_it(write):
+    random = np.random.default_rng(1)
+    count = 200
+    values = {axis: random.uniform(-1, 1, count) for axis in "xy"} | {"z": random.uniform(2, 4, count)}
+    values |= {f"scale_{i}": random.normal(-4, 1, count) for i in range(3)}
+    values["filter_3D"] = random.uniform(0.01, 0.05, count)
+    raw = read_ply(write(PLAIN, {k: v for k, v in values.items() if k in PLAIN}, count=count, name="raw.ply"))
+    read = read_ply(write([*PLAIN, "filter_3D"], values, count=count))
+    std = torch.from_numpy(values["filter_3D"]).float()
+    log_scales, logits = smoothed(torch.from_numpy(raw.log_scales), torch.from_numpy(raw.opacity_logits), std)
+    camera = Camera("a", 48, 40, 40.0, 40.0, 24.0, 20.0, np.eye(4))
+
+    def picture(splats):
+        drawn = draw([Instance(SplatSet(splats, backend="reference"))], camera, backend="reference")
+        assert drawn is not None
+        return drawn.image
+
+    unfiltered = picture(raw)
+    raw.log_scales, raw.opacity_logits = log_scales.numpy(), logits.numpy()
+    np.testing.assert_allclose(picture(read), picture(raw), atol=1e-5)
+    assert np.abs(picture(read) - unfiltered).max() > 0.05
+
+
+def test_anchors_become_splats(write):
+    """Octree-AnyGS, explicit: 1, 2, 3 + (0.5, -1, 2) · (2, 0.5, 1) = 2, 1.5, 5."""
+    values = {"x": 1, "y": 2, "z": 3, "f_offset_0": 0.5, "f_offset_1": -1, "f_offset_2": 2}
+    values |= {f"scale_{i}": math.log(s) for i, s in enumerate((2, 0.5, 1, 0.1, 0.2, 0.3))}
+    values |= {"level": [0, 3], "extra_level": [0.02, 0]}
+    path = write(ANYGS, values, obj_info=["standard_dist 12.500000", "levels 4.000000"])
+    warnings = []
+    splats = read_ply(path, warnings.append)
+    np.testing.assert_allclose(splats.means, [[2, 1.5, 5]] * 2, rtol=1e-6)
+    np.testing.assert_allclose(np.exp(splats.log_scales), [[0.1, 0.2, 0.3]] * 2, rtol=1e-6)
+    assert splats.sh_degree == 3 and list(splats.extras) == ["level", "extra_level"]
+    assert splats.extras["level"].tolist() == [0, 3]
+    assert len(warnings) == 1 and "all levels are drawn together" in warnings[0] and str(path) in warnings[0]
+    without_levels = write([name for name in ANYGS if "level" not in name], values, name="b.ply")
+    np.testing.assert_array_equal(read_ply(without_levels, warnings.append).means, splats.means)
+    assert len(warnings) == 1
+
+
+@pytest.mark.parametrize("columns", [[*PLAIN, "filter_3D"], ANYGS])
+def test_nothing_is_applied_twice(write, tmp_path, same, columns):
+    splats = read_ply(write(columns))
+    write_ply(tmp_path / "b.ply", splats)
+    assert same(splats, read_ply(tmp_path / "b.ply"))
+    assert same(splats, read_bundle(tmp_path / "a.ply").levels[0].splats)
+
+
+PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
+
+
+@pytest.mark.parametrize(
+    ("columns", "what", "remedy"),
+    [
+        (PACKED, "is a compressed PLY, as SuperSplat", "splat-transform a.ply"),
+        (SCAFFOLD, "anchors of Scaffold-GS or Octree-GS: networks that are not in the file", "Train"),
+        (OCTREE, "anchors of Scaffold-GS or Octree-GS: networks that are not in the file", "Train"),
+        ([*ANYGS, "f_offset_3", "f_offset_4", "f_offset_5"], "several splats each", "Export"),
+        ([*PLAIN, *OFFSETS], "several splats each", "Export"),
+        (FLOD, "FLoD's own program: its scales lack s_min", "convert4viewer.py"),
+        (SPACETIME, "splats that move in time", "one moment"),
+        ([*PLAIN, "t", "scale_t"], "splats that move in time", "one moment"),
+        ([*PLAIN, "t", "scale_t_0", "rot_r_0"], "splats that move in time", "one moment"),
+        ([name for name in PLAIN if name != "scale_2"], "2D Gaussian Splatting", "3DGS trainer"),
+        ([*XYZ, "red", "green", "blue"], "point cloud or a mesh with colours", "3DGS trainer"),
+        ([*PLAIN[:-1]], "it has no rot_3", "3DGS trainer"),
+    ],
+)
+def test_what_cannot_be_drawn_is_named(write, columns, what, remedy):
+    path = write(columns)
+    for read in (read_ply, read_bundle, read_head):
+        with pytest.raises(LodgsError, match=what) as caught:
+            read(path)
+        assert str(path) in caught.value.what and remedy in caught.value.remedy
+
+
+def test_a_compressed_ply_with_its_chunks_is_named(write):
+    chunk = PlyElement.describe(np.zeros(1, [("min_x", "f4"), ("max_x", "f4")]), "chunk")
+    with pytest.raises(LodgsError, match="compressed"):
+        read_ply(write(PACKED, elements=[chunk]))
+
+
+def test_the_coarsest_level_of_flod_is_known_by_its_folder(write):
+    with pytest.raises(LodgsError, match="s_min"):
+        read_ply(write(PLAIN, name="point_cloud/lod_1_iteration_10000/point_cloud.ply"))
+    read_ply(write(PLAIN, name="point_cloud/iteration_30000/point_cloud.ply"))
+
+
+@pytest.mark.parametrize(
+    ("comments", "mip"),
+    [
+        (["Exported from Brush", "SH degree: 0", "SplatRenderMode: mip"], True),
+        (["SplatRenderMode: default"], False),
+        (["splatrendermode:  MIP "], True),
+        (["SplatRenderMode: unheard-of"], False),
+        (["antialiased 1"], True),
+        (["antialiased 1", "SplatRenderMode: default"], False),
+        (["antialiased by hand"], False),
+        ([], False),
+    ],
+)
+def test_a_2d_filter_is_known_and_warned_of(write, comments, mip):
+    path, warnings = write(PLAIN, comments=comments), []
+    meta = read_bundle(path, warnings.append).meta
+    assert meta == ({"antialias": True} if mip else {}) == read_head(path).meta
+    assert [("drawn with 3DGS's dilation" in text, str(path) in text) for text in warnings] == [
+        (True, True)
+    ] * mip
+    assert ("antialias: true" in describe(path)) is ("dilation" in describe(path)) is mip
+    read_ply(path, warnings.append)
+    assert len(warnings) == 2 * mip
+
+
+def test_flat_splats_by_a_comment_are_refused(write):
+    with pytest.raises(LodgsError, match="2D Gaussian Splatting"):
+        read_ply(write(PLAIN, comments=["SplatRenderMode: 2dgs"]))
+
+
+def test_the_2d_filter_survives_every_way_of_writing(tmp_path, make_splats):
+    """Other programs know it by the comment, ours too; a bundle's is no second warning."""
+    comment = "SplatRenderMode: mip"
+    levels = [Level(1, make_splats(2, 0)), Level(2, make_splats(5, 0))]
+    bundle = Bundle("lodge", levels, meta={"antialias": True})
+    write_bundle(tmp_path / "b.ply", bundle)
+    assert comment in PlyData.read(str(tmp_path / "b.ply"))["vertex"].comments
+    assert read_bundle(tmp_path / "b.ply").meta == bundle.meta
+    write_ply(tmp_path / "p.ply", levels[0].splats, comments_of(bundle.meta))
+    assert read_bundle(tmp_path / "p.ply").meta == bundle.meta
+    write_folder(tmp_path / "f", bundle)
+    assert all(
+        comment in PlyData.read(str(tmp_path / "f" / f"lod{i}.ply"))["vertex"].comments for i in (0, 1)
+    )
+    (tmp_path / "f" / "manifest.json").unlink()
+    assert read_folder(tmp_path / "f").meta == bundle.meta
+    assert comments_of({}) == []
+
+
+def test_splats_that_are_no_numbers_are_left_out(write):
+    count = 9
+    values = {name: np.zeros(count) for name in PLAIN} | {"rot_0": np.ones(count), "x": np.arange(count)}
+    values["x"] = np.where(np.arange(count) == 0, np.inf, values["x"])
+    values["f_dc_1"][1] = values["opacity"][2] = values["rot_2"][3] = np.nan
+    values["scale_1"][4] = np.inf
+    values["opacity"][5] = np.inf  # opaque
+    values["scale_2"][6] = -np.inf  # flat
+    values["rot_0"][7] = 0  # unturned
+    warnings = []
+    splats = read_ply(write(PLAIN, values, count=count), warnings.append)
+    assert splats.means[:, 0].tolist() == [5, 6, 7, 8]
+    assert splats.quats[2].tolist() == [1, 0, 0, 0]
+    assert len(warnings) == 1 and warnings[0].startswith("5 splats of ")
+
+
+def test_our_own_levels_keep_every_row(tmp_path, make_splats, same):
+    """Where levels add up, rows are counted: nothing of what we wrote is left out."""
+    splats = make_splats(5, 1)
+    splats.opacity_logits[2] = splats.sh[3, 0, 0] = np.nan
+    write_bundle(tmp_path / "b.ply", Bundle("flod", [Level(1, splats)]))
+    assert same(splats, read_bundle(tmp_path / "b.ply").levels[0].splats)
+    write_folder(tmp_path / "f", Bundle("flod", [Level(1, splats)]))
+    assert same(splats, read_folder(tmp_path / "f").levels[0].splats)

@@ -1,0 +1,133 @@
+"""What people see, as it was when somebody last looked: small renderings, tables, and the help of commands.
+
+After a change that is meant, ``pytest tests/training/test_snapshots.py --force-regen`` writes them anew; look
+at the difference before it is committed.
+"""
+
+import numpy as np
+import pytest
+
+from training.__main__ import main
+from training.runs.measure import table
+from training.scenes.cameras import Camera, write_camera
+from training.splats.bundle import Bundle, Level, write_bundle
+from training.splats.gaussians import Splats
+from training.splats.ply import write_ply
+
+SHARE = 0.02
+"""Percent of the range that pixels may differ by on average: another processor rounds a few otherwise."""
+
+
+def splats(count: int, seed: int, size: float) -> Splats:
+    """Random splats around the origin; ``size``: logarithm of their mean scale."""
+    random = np.random.default_rng(seed)
+    return Splats(
+        means=random.normal(0, 0.7, (count, 3)).astype(np.float32),
+        quats=random.normal(size=(count, 4)).astype(np.float32),
+        log_scales=random.normal(size, 0.5, (count, 3)).astype(np.float32),
+        opacity_logits=random.normal(1, 1, count).astype(np.float32),
+        sh=(random.normal(size=(count, 16, 3)) * 0.3).astype(np.float32),
+    )
+
+
+@pytest.fixture(scope="module")
+def levels() -> list[Splats]:
+    return [splats(40, 1, -1.5), splats(120, 2, -2.2), splats(500, 3, -3.0)]
+
+
+@pytest.fixture
+def bundle(levels, tmp_path):
+    path = tmp_path / "bundle.ply"
+    sizes = (0.4, 0.1, 0.0)
+    made = [Level(n + 1, levels[n], {"s_min": sizes[n]}) for n in range(3)]
+    write_bundle(path, Bundle("flod", made, "bands"))
+    return path
+
+
+@pytest.fixture
+def drawn(tmp_path):
+    """``drawn(source, *options)``: the PNG of 64x48 pixels that ``render`` makes, as bytes."""
+    pose = np.eye(4)
+    pose[:3, 3] = 0.1, -0.05, 3
+    write_camera(tmp_path / "camera.json", Camera("", 64, 48, 60.0, 62.0, 30.5, 25.0, pose), 0.01)
+
+    def draw(source, *options: str) -> bytes:
+        out = tmp_path / "drawn.png"
+        words = ["render", source, "--camera", tmp_path / "camera.json", "--out", out, "--backend", "cpu"]
+        assert main([*map(str, words), *options]) == 0
+        return out.read_bytes()
+
+    return draw
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("finest", []),
+        ("coarsest", ["--level", "1", "--background", "0.2,0.4,0.6"]),
+        ("by distance", ["--first", "1", "--last", "3", "--gamma", "2"]),
+    ],
+)
+def test_renderings_of_a_bundle(bundle, drawn, image_regression, name, options):
+    image_regression.check(drawn(bundle, *options), SHARE, basename=name.replace(" ", "_"))
+
+
+def test_rendering_of_a_ply(levels, drawn, tmp_path, image_regression):
+    write_ply(tmp_path / "splats.ply", levels[1])
+    image_regression.check(
+        drawn(tmp_path / "splats.ply", "--background", "transparent"), SHARE, basename="ply"
+    )
+
+
+def test_what_info_says(bundle, levels, tmp_path, monkeypatch, capsys, file_regression):
+    monkeypatch.chdir(tmp_path)
+    write_ply(tmp_path / "splats.ply", levels[0])
+    assert main(["info", "bundle.ply"]) == main(["info", "splats.ply"]) == 0
+    file_regression.check(capsys.readouterr().out, basename="info")
+
+
+def test_the_table_of_evaluate(file_regression):
+    numbers = [(1, 0.08, 4_000, 19.5, 0.61), (2, 0.02, 21_000, 23.25, 0.755), (3, 0.0, 120_000, 28.125, 0.9)]
+    rows = [
+        {
+            "level": n,
+            "s_min": s_min,
+            "splats": count,
+            "drawn": count // 2,
+            "psnr": psnr,
+            "ssim": ssim,
+            "frame_s": count / 1e6,
+        }
+        for n, s_min, count, psnr, ssim in numbers
+    ]
+    detail = {
+        "gamma": 1.0,
+        "first": 1,
+        "last": 3,
+        "splats": 35_000,
+        "drawn": 9_500,
+        "psnr": 26.5,
+        "ssim": 0.85,
+        "frame_s": 0.04,
+    }
+    report = {
+        "levels": rows,
+        "selective": [{"set": "per view", **detail}, {"set": "predetermined", **detail}],
+        "farther": [{"factor": 2, "drawn": 9_000, "drawn_full": 120_000, "psnr": 31.5}],
+        "jumps": {"faded": 1.25, "hard": 3.5},
+    }
+    file_regression.check(table(report) + "\n", basename="evaluate")
+
+
+@pytest.mark.parametrize("name", ["", "flod"])
+def test_what_methods_says(name, capsys, file_regression):
+    assert main(["methods", *name.split()]) == 0
+    file_regression.check(capsys.readouterr().out, basename=f"methods_{name or 'all'}")
+
+
+@pytest.mark.parametrize("command", ["", "train", "evaluate", "render", "info", "methods"])
+def test_help(command, monkeypatch, capsys, file_regression):
+    monkeypatch.setenv("COLUMNS", "100")
+    with pytest.raises(SystemExit):
+        main([*command.split(), "--help"])
+    file_regression.check(capsys.readouterr().out, basename=f"help_{command or 'lodgs'}")

@@ -1,0 +1,31 @@
+"""The pages that tools/tables.py writes say what methods and rules declare today."""
+
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from tools import tables
+from training.lod.rule import rules
+from training.methods import METHODS
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+@pytest.mark.parametrize("name", tables.PAGES)
+def test_the_committed_page_is_what_the_tool_writes(name):
+    written = (DOCS / name).read_text(encoding="utf-8")
+    assert written == tables.PAGES[name](), "run `make tables` and look at the difference"
+
+
+def test_every_parameter_and_control_has_a_row():
+    parameters, controls = tables.parameters_page(), tables.controls_page()
+    for method in METHODS.values():
+        section = parameters.split(f"\n`{method.name}`: ")[1].split("\n## ")[0]
+        rows = [line for line in section.splitlines() if line.startswith("| `")]
+        assert [row.split("`")[1] for row in rows] == [f.name for f in fields(method.parameters)]
+        assert all(row.count(" | ") == 6 for row in rows)
+    for rule in rules().values():
+        section = controls.split(f"\n## {rule.name}\n")[1].split("\n## ")[0]
+        for control in rule.controls:
+            assert f"`--{control.name.replace('_', '-')}` | {control.label} | " in section

@@ -1,0 +1,88 @@
+"""FLoD's rule (Seo et al. 2025, Sec. 4.4): each level serves a band of distances, alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import inf
+
+import numpy as np
+
+from ...errors import LodgsError
+from ..rule import Control, Rule, Values, distances
+
+MOST = 64
+"""The largest number of a level that can be asked for: more than any scene has."""
+
+
+def s_min_of(s_min_1: float, rho: float, levels: int) -> list[float]:
+    """FLoD's 3D scale constraint of each level (Eq. 3): s_min_1 * rho**(1 - l), and 0 at the last.
+
+    Args:
+        s_min_1: constraint of level 1, in scene units (the paper's lambda).
+        rho: factor by which it shrinks from level to level.
+        levels: number of levels; with one level there is no constraint, which is plain 3DGS.
+    """
+    return [s_min_1 * rho ** (1 - level) for level in range(1, levels)] + [0.0]
+
+
+class Bands(Rule):
+    """Level l is drawn where d_proj(l) <= d < d_proj(l - 1) (Eq. 7).
+
+    d_proj(l) = s_min(l) / gamma * focal_px (Eq. 8) is where the smallest detail of level l covers gamma
+    pixels. The finest level in use begins at 0, the coarsest has no end.
+    """
+
+    name = "bands"
+    level_facts = ("s_min",)
+    controls = (
+        Control(
+            "gamma", 1.0, 0.01, 1000.0, "Screen Size",
+            "γ: a finer level takes over where the smallest detail of the coarser one would cover this many "
+            "pixels. Smaller is finer",
+            soft=(0.1, 10.0), unit="PIXEL",
+        ),
+        Control(
+            "first", 1, 1, MOST, "Coarsest", "Coarsest level in use: it is shown farthest away",
+            whole=True, follows="coarsest",
+        ),
+        Control(
+            "last", MOST, 1, MOST, "Finest", "Finest level in use: it is shown nearest to the eye",
+            whole=True, follows="finest",
+        ),
+    )  # fmt: skip
+
+    def band(self, focal_px: float, facts: Mapping[str, float], values: Values) -> tuple[float, float]:
+        """Near and far end of a level's band, in scene units; (inf, inf) for a level that is not in use."""
+        first = min(values["first"], values["last"], facts["levels"])  # sliders that cross leave some level
+        last = max(values["first"], values["last"])
+        if not first <= facts["level"] <= last:
+            return inf, inf
+        near = facts["s_min"] / values["gamma"] * focal_px if facts["finer"] <= last else 0.0
+        far = facts["coarser_s_min"] / values["gamma"] * focal_px if facts["coarser"] >= first else inf
+        return near, far
+
+    def weights(self, means, eye, focal_px, columns, facts, values) -> np.ndarray:
+        near, far = self.band(focal_px, facts, values)
+        away = distances(means, eye)
+        return ((away >= np.float32(near)) & (away < np.float32(far))).astype(np.float32)
+
+    def defaults(self, levels: Sequence[int]) -> dict[str, float]:
+        """The three finest levels, as published figures have them (Sec. 5)."""
+        return super().defaults(levels) | {"first": levels[-3:][0], "last": levels[-1]}
+
+    def settings(self, given: Values, levels: Sequence[int], recorded: Values | None = None) -> Values:
+        values = super().settings(given, levels, recorded)
+        first, last = (int(values[name]) for name in ("first", "last"))
+        if not levels[0] <= first <= last <= levels[-1]:
+            raise LodgsError(
+                f"Levels {first} to {last} cannot be shown.",
+                f"Choose levels from {levels[0]} to {levels[-1]}, coarse to fine.",
+            )
+        return values
+
+    def coarser(self, values: Values, levels: Sequence[int]) -> Values | None:
+        in_use = [number for number in levels if values["first"] <= number <= values["last"]]
+        return {**values, "last": in_use[-2]} if len(in_use) > 1 else None
+
+
+RULE = Bands()

@@ -1,0 +1,85 @@
+"""Octree-GS's rule (Ren et al. 2024, Sec. 4.1): levels add up, and fade in as the eye comes nearer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ..rule import Control, Rule, Values, distances
+
+BIAS = "lod_bias"
+"""Column of each splat's bias, in levels."""
+FADE = 0.5
+"""Over how many levels of what is wanted a level fades in."""
+STEP = 0.25
+"""Levels that a budget goes without at a time."""
+
+
+def wanted_at(distances, bias, d_max: float, levels: float):
+    """The level that is wanted at a distance, 1 to ``levels``, not rounded (Eq. 5 with the bias).
+
+    Args:
+        distances: (N,) numpy or torch, from the eye, times the focal length that d_max belongs to over the
+            eye's own.
+        bias: (N,) each splat's bias, in levels, to which a global offset may be added.
+        d_max: the distance from which on level 1 alone is wanted where the bias is 0.
+    """
+    ratio = d_max / distances.clip(1e-20)
+    log2 = ratio.log2() if hasattr(ratio, "log2") else np.log2(ratio)
+    return (log2 + bias).clip(0, levels - 1) + 1
+
+
+def faded(wanted, level):
+    """Weights (N,) of splats of a level: 1 below the wanted level, part of it near that, 0 above.
+
+    Level 1 is always there. Sec. 4.1: piecewise linear in the wanted level. The paper rounds it in training,
+    which is where this is at least one half; a level fades in over FADE levels around that place (1 in the
+    paper: then up to half a level more is drawn than training knew).
+
+    Args:
+        wanted: (N,) of :func:`wanted_at`, numpy or torch.
+        level: (N,) or a number, 1 is the coarsest.
+    """
+    return ((wanted - level + 0.5) / FADE + 0.5).clip(0, 1)
+
+
+class Octree(Rule):
+    """``faded(wanted_at(...), level)``: of the wanted level part, all coarser ones, no finer one."""
+
+    name = "octree"
+    cumulative = True
+    scene_facts = ("d_max", "d_max_focal")
+    columns = (BIAS,)
+    controls = (
+        Control(
+            "offset", 0.0, -16.0, 16.0, "Level Offset",
+            "Levels finer (above 0) or coarser (below 0) than the distance asks for", soft=(-4.0, 4.0),
+        ),
+        Control(
+            "fade", 1, 0, 1, "Fade",
+            "Levels fade in as the eye comes nearer; without it (0) they are there at once", whole=True,
+        ),
+    )  # fmt: skip
+
+    def weights(self, means, eye, focal_px, columns, facts, values) -> np.ndarray:
+        found = self._wanted(means, eye, focal_px, columns[BIAS], facts, values)
+        weight = faded(found, np.float32(facts["level"])).astype(np.float32)
+        return weight if values["fade"] else (weight >= 0.5).astype(np.float32)
+
+    def wanted_level(self, means, eye, focal_px, facts, values) -> np.ndarray:
+        return np.floor(self._wanted(means, eye, focal_px, np.float32(0), facts, values))
+
+    def coarser(self, values: Values, levels: Sequence[int]) -> Values | None:
+        offset = values["offset"] - STEP
+        return {**values, "offset": offset} if offset > -levels[-1] else None
+
+    def _wanted(
+        self, means, eye, focal_px: float, bias, facts: Mapping[str, float], values: Values
+    ) -> np.ndarray:
+        """The level wanted where each splat is; the focal length counts as in Sec. 5.2."""
+        d_max = float(np.float32(facts["d_max"] * (focal_px / max(facts["d_max_focal"], 1e-20))))
+        return wanted_at(distances(means, eye), bias + np.float32(values["offset"]), d_max, facts["levels"])
+
+
+RULE = Octree()

@@ -1,0 +1,100 @@
+"""Splats are added and removed: 3DGS's adaptive density control (Kerbl et al. 2023, Sec. 5.2), as functions
+that methods share. They change a model of splats in place, with whatever columns it has.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from ..errors import LodgsError
+from ..rasterize.features import rotation_matrices
+from .model import Model
+
+RESET_OPACITY = 0.01
+"""What an opacity reset leaves at most."""
+
+
+@torch.no_grad()
+def densify(
+    model: Model,
+    gradients: torch.Tensor,
+    *,
+    threshold: float,
+    clone_below: float,
+    max_splats: int,
+    rng: np.random.Generator,
+    min_scale: float = 0.0,
+) -> int:
+    """Clones small and splits large splats whose image-plane gradient is large.
+
+    Clones and children have their parent's other values; of the model's columns they begin with zeros.
+
+    Args:
+        gradients: (N,) mean norm of the image-plane gradient over the views that saw each splat.
+        threshold: the gradient above which a splat is densified.
+        clone_below: largest scale (scene units) that is cloned; larger ones are split in two.
+        max_splats: the largest gradients come first until this number is reached.
+        rng: places the children of a split.
+        min_scale: FLoD's s_min; the scale that counts is exp(log_scales) + min_scale.
+
+    Returns:
+        How many splats were added.
+    """
+    chosen = torch.nonzero(gradients > threshold).squeeze(1)
+    room = max(max_splats - len(model), 0)
+    if len(chosen) > room:
+        order = torch.argsort(gradients[chosen], descending=True, stable=True)
+        chosen = chosen[order[:room]].sort().values
+    if len(chosen) == 0:
+        return 0
+    scales = model["log_scales"][chosen].exp() + min_scale
+    small = scales.amax(1) <= clone_below
+    clones = model.rows(chosen[small])
+    parents, scales = chosen[~small], scales[~small]
+    children = model.rows(parents.repeat(2))
+    children["means"] += sample_inside(children["quats"], scales.repeat(2, 1), rng)
+    children["log_scales"] = constrained_log(scales / 1.6, min_scale).repeat(2, 1)
+    alive = torch.ones(len(model), dtype=torch.bool, device=parents.device)
+    alive[parents] = False
+    model.keep(alive)
+    model.append({name: torch.cat([clone, children[name]]) for name, clone in clones.items()})
+    return len(chosen)
+
+
+def prune(model: Model, min_opacity: float) -> None:
+    """Removes splats below an opacity."""
+    model.keep(model["opacity_logits"].detach().sigmoid() >= min_opacity)
+
+
+def reset_opacities(model: Model) -> None:
+    """Opacities fall to RESET_OPACITY at most, from where only splats that are needed rise again."""
+    most = float(np.log(RESET_OPACITY / (1 - RESET_OPACITY)))
+    model.assign("opacity_logits", model["opacity_logits"].detach().clamp_max(most))
+
+
+def require_rows(model: Model, step: int, limit: str) -> None:
+    """LodgsError where nothing is left after a step; ``limit`` names the parameter that took it."""
+    if not len(model):
+        raise LodgsError(
+            f"No splat is left at step {step + 1}.", f"Lower '{limit}', or choose another preset."
+        )
+
+
+def sample_inside(quats: torch.Tensor, scales: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
+    """For each of N Gaussians a place drawn from it, (N, 3) from its mean.
+
+    Args:
+        quats, scales: (N, 4) wxyz and (N, 3) standard deviations.
+    """
+    local = torch.from_numpy(rng.standard_normal((len(scales), 3), np.float32)).to(scales)
+    return torch.einsum("nij,nj->ni", rotation_matrices(quats), local * scales)
+
+
+def constrained_log(scales: torch.Tensor, min_scale: float, floor: float = 0.05) -> torch.Tensor:
+    """s_opt with exp(s_opt) + min_scale = scales (FLoD, Eq. 5), where that is possible.
+
+    The published code clamps the difference at 1e-7, from which a splat hardly ever grows again (its
+    gradient is proportional to the difference); a share of ``min_scale`` leaves it free to move.
+    """
+    return (scales - min_scale).clamp_min(max(floor * min_scale, 1e-9)).log()

@@ -1,0 +1,88 @@
+"""FLoD (Seo et al. 2025): independent levels, each limited to a smallest size of detail."""
+
+from dataclasses import dataclass, replace
+
+from ...splats.bundle import MOST_LEVELS
+from ..info import MethodInfo
+from ..parameters import PAPER, STANDARD, DensityParameters, parameter
+
+
+@dataclass(frozen=True)
+class FlodParameters(DensityParameters):
+    """A tuple has one entry for each level, coarse to fine. ``max_splats`` is the last level's."""
+
+    levels: int = parameter(5, "Number of levels (FLoD: L_max).", low=1, high=MOST_LEVELS)
+    rho: float = parameter(
+        4.0, "Factor between the smallest sizes of two neighbouring levels (FLoD: rho).", above=0
+    )
+    footprint: float = parameter(
+        16.0,
+        "Pixels that level 1's smallest size covers at the scene's median depth; sets lambda.",
+        label="Coarsest Detail",
+        above=0,
+        unit="px",
+    )
+    s_min_1: float = parameter(
+        0.0, "Level 1's smallest size in scene units (FLoD: lambda); 0 takes it from 'footprint'."
+    )
+    steps: tuple[int, ...] = parameter(
+        (300, 500, 600, 900, 2000), "Training steps of each level.", above=0, unit="steps"
+    )
+    densify_until: tuple[float, ...] = parameter(
+        (0.5,) * 5, "Share of a level's steps after which splats are no longer added or removed.", high=1
+    )
+    densify_interval: tuple[int, ...] = parameter(
+        (50,) * 5, "Steps between two densifications.", above=0, unit="steps"
+    )
+    budget_ratio: float = parameter(
+        0.65,
+        "A level's share of the next finer level's budget of splats, so that every level adds some.",
+        above=0,
+        high=1,
+    )
+    overlap_interval: int = parameter(
+        50,
+        "Steps between two overlap prunings; the last level has none (FLoD, Sec. 4.3). 0 never prunes.",
+        unit="steps",
+    )
+    rejoin_points: bool = parameter(
+        True,
+        "Whether structure-from-motion points that overlap pruning took join again at the level that has "
+        "room for them, all or a random sample. Not in the paper; in short schedules it lets finer levels "
+        "begin from exact positions.",
+    )
+
+    @property
+    def total_steps(self) -> int:
+        return sum(self.steps)
+
+
+_DRAFT = FlodParameters()
+_STANDARD = replace(
+    _DRAFT,
+    **STANDARD,
+    steps=(2_000, 3_000, 4_000, 6_000, 15_000),
+    densify_interval=(100,) * 5,
+)
+_PAPER = replace(
+    _STANDARD,
+    **PAPER,
+    footprint=40.0,
+    steps=(10_000, 15_000, 20_000, 25_000, 30_000),
+    densify_until=(0.5, 0.4, 0.4, 0.4, 0.5),
+    densify_interval=(2000, 1000, 500, 500, 200),
+    overlap_interval=1000,
+    rejoin_points=False,
+    budget_ratio=1.0,
+)
+
+METHOD = MethodInfo(
+    name="flod",
+    number=0,
+    label="FLoD",
+    about="independent levels, each limited to a smallest size of detail",
+    parameters=FlodParameters,
+    presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
+    rule="bands",
+    offered=("levels", "footprint", "max_splats"),
+)

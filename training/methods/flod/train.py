@@ -1,0 +1,159 @@
+"""FLoD (Seo et al. 2025): levels trained one after another under a shrinking 3D scale constraint."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from itertools import accumulate
+
+import numpy as np
+import torch
+from scipy.spatial import KDTree
+
+from ...errors import LodgsError
+from ...lod.rules.bands import s_min_of
+from ...splats.bundle import Level
+from ...splats.gaussians import Splats
+from .. import method
+from ..data import TrainingView
+from ..density import constrained_log, densify, prune, reset_opacities
+from ..method import Drawing
+from ..model import Model, splat_rates
+from ..schedules import due, log_linear
+from ..start import distinct, from_points, neighbour_distances, sampled
+from . import FlodParameters
+
+
+class Method(method.Method[FlodParameters, Drawing]):
+    """One run of FLoD.
+
+    Attributes:
+        s_min: the smallest standard deviation of each level, coarse to fine, in scene units.
+        points, colors: the scene's points to begin with, (P, 3) both.
+    """
+
+    def setup(self, base: Splats | None) -> None:
+        p, data = self.parameters, self.data
+        s_min_1 = p.s_min_1 or p.footprint * data.median_depth / data.focal
+        self.s_min = s_min_of(s_min_1, p.rho, p.levels)
+        self._ends = list(accumulate(p.steps))
+        points, colors = distinct(data.scene.points, data.scene.point_colors)
+        self.points, self.colors = sampled(points, colors, p.max_splats, self.seed)
+        self.model = self._new_model(self._from_points(1))
+
+    @property
+    def levels(self) -> int:
+        return self.parameters.levels
+
+    def level_at(self, step: int) -> int:
+        return bisect_right(self._ends, step) + 1
+
+    def levels_after(self, step: int) -> list[Level]:
+        """The level that the step completed; the next one is then prepared."""
+        if step + 1 not in self._ends:
+            return []
+        number = self.level_at(step)
+        s_min = self.s_min[number - 1]
+        finished = Level(number, self.model.splats(s_min), {"s_min": s_min})
+        if number < self.levels:
+            self.rise_to(number + 1)
+        return [finished]
+
+    def meta(self) -> dict:
+        footprint = self.s_min[0] * self.data.focal / self.data.median_depth
+        return {"rho": self.parameters.rho, **super().meta(), "footprint_px": footprint}
+
+    # -- a step ----------------------------------------------------------------------------------------
+
+    def draw(self, view: TrainingView, step: int) -> list[Drawing]:
+        min_scale = self.s_min[self.level_at(step) - 1]
+        return [Drawing(self.rasterize_model(view.camera, step, min_scale=min_scale))]
+
+    def accumulate_stats(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> None:
+        if self._local(step) < self._densify_until(step):
+            self.model.accumulate_stats(drawings[0].rendering)
+
+    def set_learning_rates(self, step: int) -> None:
+        p = self.parameters
+        share = self._local(step) / (p.lr_means_steps or p.steps[self.level_at(step) - 1])
+        rate = log_linear(p.lr_means, p.lr_means_final, share) * self.data.extent
+        self.model.adam.lr["means"] = rate
+
+    def control_density(self, step: int) -> None:
+        p, model, level, local = self.parameters, self.model, self.level_at(step), self._local(step) + 1
+        if local > self._densify_until(step):
+            return
+        before, s_min = len(model), self.s_min[level - 1]
+        if due(p.densify_interval[level - 1], local):
+            densify(
+                model,
+                model.mean_gradient(),
+                threshold=p.grad_threshold * self.data.threshold_scale,
+                clone_below=p.clone_extent * self.data.extent,
+                max_splats=self.budget(level),
+                rng=np.random.default_rng([self.seed, step, 1]),
+                min_scale=s_min,
+            )
+            model.reset_stats()
+        if due(p.prune_interval, local):
+            prune(model, p.min_opacity)
+        if due(p.overlap_interval, local) and level < p.levels:
+            model.keep(apart(model["means"].detach().cpu(), s_min / 2))
+        if due(p.opacity_reset_interval, local):
+            reset_opacities(model)
+        if before and not len(model):
+            raise LodgsError(
+                f"Level {level} lost all its splats at step {step + 1}.",
+                "Lower 'footprint' (or 's_min_1'), so that coarse levels keep more splats.",
+            )
+
+    def _local(self, step: int) -> int:
+        """Steps that the level of a step has seen before it."""
+        level = self.level_at(step)
+        return step - (self._ends[level - 2] if level > 1 else 0)
+
+    def _densify_until(self, step: int) -> float:
+        """Steps of the level of a step in which splats are added and removed."""
+        p, level = self.parameters, self.level_at(step)
+        return p.densify_until[level - 1] * p.steps[level - 1]
+
+    # -- levels ----------------------------------------------------------------------------------------
+
+    def budget(self, level: int) -> int:
+        """Most splats that a level may have."""
+        p = self.parameters
+        return int(p.max_splats * p.budget_ratio ** (p.levels - level))
+
+    def rise_to(self, level: int) -> None:
+        """The next level starts from this one: same scales, a smaller constraint, Adam anew (Eq. 5)."""
+        before, after = self.s_min[level - 2], self.s_min[level - 1]
+        tensors = {name: tensor.detach() for name, tensor in self.model.adam.tensors.items()}
+        tensors["log_scales"] = constrained_log(tensors["log_scales"].exp() + before, after)
+        if self.parameters.rejoin_points:
+            # What overlap pruning counts as too close is now half of a smaller size.
+            distances, _ = KDTree(tensors["means"].cpu().numpy()).query(self.points)
+            free = np.flatnonzero(distances >= after / 2)
+            room = max(self.budget(level) - len(tensors["means"]), 0)
+            if len(free) > room:
+                rng = np.random.default_rng([self.seed, level, 2])
+                free = np.sort(rng.choice(free, room, replace=False))
+            points = self._from_points(level)
+            tensors = {name: torch.cat([tensor, points[name][free]]) for name, tensor in tensors.items()}
+        self.model = self._new_model(tensors)
+
+    def _from_points(self, level: int) -> dict[str, torch.Tensor]:
+        s_min = self.s_min[level - 1]
+        return from_points(self.points, self.colors, self.parameters.sh_degree, self.device, s_min)
+
+    def _new_model(self, tensors: dict[str, torch.Tensor]) -> Model:
+        return Model(tensors, splat_rates(self.parameters, self.data.extent))
+
+
+def apart(means: torch.Tensor, distance: float) -> torch.Tensor:
+    """Overlap pruning (FLoD, Eq. 6): where the mean distance to the 3 nearest neighbours is at least this.
+
+    As in the published code all splats are judged at once, so that both of a close pair go.
+    """
+    if len(means) <= 3:
+        return torch.ones(len(means), dtype=torch.bool)
+    return torch.from_numpy(neighbour_distances(means.numpy()).mean(1) >= distance)

@@ -1,0 +1,57 @@
+"""What a method says of itself without torch: its name, parameters and presets, for panels and job checks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from ..errors import LodgsError
+from .parameters import Parameters
+
+PRESETS = {
+    "draft": "Minutes on two processor cores: a first look",
+    "standard": "An evening on a laptop, minutes on a GPU",
+    "paper": "The paper's own schedule",
+}
+"""The presets that every method has, each with what it is for."""
+
+
+@dataclass(frozen=True)
+class MethodInfo:
+    """A method, as its folder declares it in ``METHOD``.
+
+    Attributes:
+        name: what jobs, command lines and bundles call it.
+        number: its place in lists, and what a .blend stores of it: the next free one, for good.
+        label: what a panel calls it.
+        about: what it makes, as the end of a sentence that begins with the label.
+        parameters: the class of its parameters.
+        presets: the parameters of each of PRESETS.
+        rule: the name of the rule that chooses its detail (``training.lod``); "" for none.
+        offered: the parameters that a panel shows, beside the presets.
+        from_base: whether training can begin with splats (a job's ``base``) instead of the scene's points.
+        retired: names of parameters that earlier versions wrote into job files without any effect.
+        package: the folder as a module, set where the method is found.
+    """
+
+    name: str
+    number: int
+    label: str
+    about: str
+    parameters: type[Parameters]
+    presets: Mapping[str, Parameters]
+    rule: str = ""
+    offered: tuple[str, ...] = ()
+    from_base: bool = False
+    retired: tuple[str, ...] = ()
+    package: str = ""
+
+    def preset(self, name: str) -> Parameters:
+        """The parameters of a preset.
+
+        Raises:
+            LodgsError: there is no such preset.
+        """
+        if name not in self.presets:
+            raise LodgsError(f"There is no preset '{name}'.", f"Choose one of: {', '.join(self.presets)}.")
+        return self.presets[name]

@@ -1,0 +1,203 @@
+"""What every method is to the training loop, and the step that all have in common."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+import torch
+
+from ..rasterize import Adam, Rendering, Target, device_of, photometric_loss, rasterize
+from ..scenes.cameras import Camera
+from ..splats.bundle import Level
+from ..splats.gaussians import Splats
+from .data import TrainingData, TrainingView
+from .model import Model
+from .parameters import Parameters
+
+
+@dataclass
+class Drawing:
+    """One picture that a step draws; methods add what they have to know of it after ``backward``."""
+
+    rendering: Rendering
+
+
+P = TypeVar("P", bound=Parameters)
+D = TypeVar("D", bound=Drawing)
+
+
+class Method(ABC, Generic[P, D]):
+    """One run of a method, step by step. P is the class of its parameters, D that of its drawings.
+
+    :meth:`train_step` is the same for all; a method says what it sees, draws and changes. Every random choice
+    is drawn from (seed, step), so that a resumed run repeats an unbroken one.
+
+    Attributes:
+        model: the rows that are trained.
+        device: where tensors live.
+
+    Args:
+        backend: the rasterizer's.
+        base: splats to begin with instead of the scene's points; None unless the method's ``from_base``.
+    """
+
+    model: Model
+
+    def __init__(
+        self, data: TrainingData, parameters: P, seed: int, backend: str, base: Splats | None = None
+    ) -> None:
+        self.data, self.parameters, self.seed, self.backend = data, parameters, seed, backend
+        self.device = device_of(backend)
+        self.setup(base)
+
+    @abstractmethod
+    def setup(self, base: Splats | None) -> None:
+        """Makes ``model`` and all else that the first step needs, from a base or from the scene's points."""
+
+    # -- what it makes ---------------------------------------------------------------------------------
+
+    @property
+    def steps(self) -> int:
+        """Number of steps of the whole run."""
+        return self.parameters.total_steps
+
+    @property
+    def levels(self) -> int:
+        """Number of levels."""
+        return 1
+
+    @property
+    def splats(self) -> int:
+        """How many splats there are now."""
+        return len(self.model)
+
+    def level_at(self, step: int) -> int:
+        """The finest level (1-based) that a step trains."""
+        return 1
+
+    @abstractmethod
+    def levels_after(self, step: int) -> list[Level]:
+        """The levels to hand over after a step, finished or newer than before, coarse to fine."""
+
+    def facts(self) -> dict[str, float]:
+        """What the method's rule has to know of the scene, by the names that the rule declares."""
+        return {}
+
+    def meta(self) -> dict:
+        """What a bundle records of this run. Methods add to it."""
+        data = self.data
+        return {
+            "camera_center": data.mean_camera.tolist(),
+            "focal_px": data.focal,
+            "focal_width": data.train[0].width,
+            "scene_extent": data.extent,
+            "median_depth": data.median_depth,
+        }
+
+    # -- a step ----------------------------------------------------------------------------------------
+
+    def train_step(self, step: int) -> tuple[float, torch.Tensor, Target]:
+        """Makes one step; the first has number 0.
+
+        Returns:
+            The loss, the (first) image (H, W, 3) and its target.
+        """
+        view = self.choose_view(step)
+        drawings = self.draw(view, step)
+        loss = self.loss(drawings, view, step)
+        loss.backward()
+        self.accumulate_stats(drawings, view, step)
+        self.set_learning_rates(step)
+        for optimizer in self.optimizers():
+            optimizer.step()
+            optimizer.zero_grad()
+        self.control_density(step)
+        return float(loss.detach()), drawings[0].rendering.image.detach(), view.target
+
+    def choose_view(self, step: int) -> TrainingView:
+        """The photograph of a step: every epoch shows each once."""
+        return self.data.view(self.data.training_view(step, self.seed))
+
+    @abstractmethod
+    def draw(self, view: TrainingView, step: int) -> Sequence[D]:
+        """The pictures that the loss is made of, one or more; the first is the one that is shown."""
+
+    def loss(self, drawings: Sequence[D], view: TrainingView, step: int) -> torch.Tensor:
+        """What the step makes smaller: the sum of the pictures' photometric losses (3DGS, Eq. 7).
+
+        It is a sum so that the first picture's gradients are what they would be alone: densification's
+        threshold means the same.
+        """
+        weight = self.parameters.ssim_weight
+        first, *others = (
+            photometric_loss(drawing.rendering.image, view.target, weight, backend=self.backend)
+            for drawing in drawings
+        )
+        return sum(others, first)
+
+    @abstractmethod
+    def accumulate_stats(self, drawings: Sequence[D], view: TrainingView, step: int) -> None:
+        """After ``backward``: what :meth:`control_density` decides by is added up (``model.stats``)."""
+
+    @abstractmethod
+    def set_learning_rates(self, step: int) -> None:
+        """Gives the optimizers their rates of this step."""
+
+    def optimizers(self) -> Sequence[Adam]:
+        """Those that make a step together."""
+        return (self.model.adam,)
+
+    @abstractmethod
+    def control_density(self, step: int) -> None:
+        """After the optimizers: splats are added and removed where that is due.
+
+        Raises:
+            LodgsError: none is left.
+        """
+
+    # -- what methods draw with ------------------------------------------------------------------------
+
+    def sh_degree(self, step: int) -> int:
+        """The degree of the harmonics that have joined in."""
+        p = self.parameters
+        return min(p.sh_degree, step // max(p.sh_interval, 1))
+
+    def rasterize_model(
+        self, camera: Camera, step: int, weights: torch.Tensor | None = None, min_scale: float = 0.0
+    ) -> Rendering:
+        """What a camera sees of a model of splats; arguments as for ``training.rasterize.rasterize``."""
+        return rasterize(
+            self.model.gaussians,
+            camera,
+            weights=weights,
+            min_scale=min_scale,
+            sh_degree=self.sh_degree(step),
+            near=self.data.near,
+            backend=self.backend,
+        )
+
+    # -- what lasts ------------------------------------------------------------------------------------
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What levels do not hold of the model, to go on with it or to draw it; empty where they hold all."""
+        return {}
+
+    def load_arrays(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Takes the model from what ``arrays`` gave."""
+        raise NotImplementedError("the levels hold all")
+
+    def picture(self, camera: Camera) -> torch.Tensor:
+        """What the model itself shows a camera, (H, W, 3); asked only where ``arrays`` gives some."""
+        raise NotImplementedError("the levels hold all")
+
+    def state_dict(self) -> dict:
+        """Everything that the next step depends on, as tensors and numbers."""
+        return {"model": self.model.state_dict()}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Continues from what ``state_dict`` gave."""
+        self.model.load_state_dict(state["model"])

@@ -1,0 +1,151 @@
+"""Octree-GS (Ren et al. 2024) with explicit anchors: levels of an octree that add up, chosen by distance.
+
+An anchor is one Gaussian with parameters of its own and no network. It belongs to a level, and began in a
+voxel of that level in which no other anchor was. What a view draws follows ``lod.rules.octree``,
+rounded while training.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from ...lod.rules.octree import BIAS
+from ...rasterize import contributions
+from ...rasterize.rendering import ALPHA_MIN
+from ...scenes.cameras import Camera
+from ...splats.bundle import Level
+from ...splats.gaussians import Splats
+from .. import method
+from ..data import TrainingView
+from ..density import require_rows, sample_inside
+from ..method import Drawing
+from ..model import Model, splat_rates
+from ..schedules import log_linear
+from ..start import from_points
+from . import OctreeParameters, growing
+
+
+class Method(method.Method[OctreeParameters, Drawing]):
+    """One run of Octree-GS.
+
+    Attributes:
+        schedule: which levels a step draws, with the octree.
+    """
+
+    def setup(self, base: Splats | None) -> None:
+        p = self.parameters
+        self.schedule, points, colors, level = growing.plant(self.data, p, self.seed, p.max_splats)
+        tensors = from_points(points, colors, p.sh_degree, self.device)
+        tensors["log_scales"] = growing.log_spacing(points, level, columns=3).to(self.device)
+        zeros = torch.zeros(len(points), device=self.device)
+        columns = {"level": torch.from_numpy(level).float().to(self.device), "bias": zeros}
+        self._rates = splat_rates(p, self.data.extent)
+        self.model = Model(tensors, self._rates, columns, stats={"opacity_sum": zeros.clone()})
+
+    @property
+    def levels(self) -> int:
+        return self.schedule.tree.levels
+
+    def level_at(self, step: int) -> int:
+        return self.schedule.level_at(step)
+
+    def levels_after(self, step: int) -> list[Level]:
+        """All levels, when the last one has joined and at the end."""
+        if not self.schedule.hands_over(step):
+            return []
+        splats, level = self.model.splats(), self.model.columns["level"].cpu().numpy()
+        splats.extras |= {"lod_level": level.astype(np.uint8), BIAS: self.model.columns["bias"].cpu().numpy()}
+        return [Level(number, splats.select(level == number)) for number in range(1, self.levels + 1)]
+
+    def facts(self) -> dict[str, float]:
+        return self.schedule.tree.facts()
+
+    def meta(self) -> dict:
+        tree = self.schedule.tree
+        return {"voxel": tree.voxel, **super().meta()}
+
+    # -- a step ----------------------------------------------------------------------------------------
+
+    def choose_view(self, step: int) -> TrainingView:
+        return self.schedule.view(step)
+
+    def draw(self, view: TrainingView, step: int) -> list[Drawing]:
+        weights = self.schedule.weights(view.camera, self.model, step, full=view.shrink == 1)
+        return [Drawing(self.rasterize_model(view.camera, step, weights))]
+
+    def loss(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> torch.Tensor:
+        """With the volume of what is drawn (Octree-GS, Sec. 7.1)."""
+        loss = super().loss(drawings, view, step)
+        if not self.parameters.volume_weight:
+            return loss
+        drawn = drawings[0].rendering.radii > 0
+        scales = self.model["log_scales"][drawn].exp() / self.data.median_depth
+        return loss + self.parameters.volume_weight * scales.prod(1).mean()
+
+    def accumulate_stats(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> None:
+        if not self.schedule.counts(view, step):
+            return
+        rendering = drawings[0].rendering
+        rendering.grad2d /= view.shrink  # as TrainingData.threshold_scale has it for smaller photographs
+        self.model.accumulate_stats(rendering)
+        opacity = self.model["opacity_logits"].detach().sigmoid()
+        self.model.stats["opacity_sum"] += torch.where(rendering.radii > 0, opacity, 0)
+
+    def set_learning_rates(self, step: int) -> None:
+        p, lr = self.parameters, self.schedule.learning_rates(self._rates, step)
+        lr["means"] = log_linear(p.lr_means, p.lr_means_final, step / p.steps) * self.data.extent
+        self.model.adam.lr = lr
+
+    def control_density(self, step: int) -> None:
+        if self.schedule.grows_after(step):
+            self.grow(step)
+        if self.schedule.prunes_unseen_after(step):
+            self.prune_unseen(step)
+        if self.schedule.reassigns_after(step):
+            self.reassign_levels(step)
+
+    # -- anchors ---------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def grow(self, step: int) -> None:
+        """New anchors in free voxels where gradients are large (Octree-GS, Sec. 4.2); faint ones go.
+
+        A splat proposes its likeness, smaller and faint, at places drawn from itself. Faint are those whose
+        opacity was too low on average in the views that drew them, or is for any.
+        """
+        p, model = self.parameters, self.model
+        source, _, level = growing.steep(self.schedule, model, step)
+        source, level = (column.repeat_interleave(p.candidates) for column in (source, level))
+        rows = model.rows(source)
+        rng = np.random.default_rng([self.seed, step, 1])
+        rows["means"] += sample_inside(rows["quats"], rows["log_scales"].exp(), rng)
+        rows["log_scales"] -= float(np.log(1.6))
+        rows["opacity_logits"].clamp_max_(growing.FAINT)
+        rows |= {"level": level, "bias": model.columns["bias"][source]}
+        rows = growing.with_room(self.schedule, model, rows, step, p.max_splats)
+
+        opacity, stats = model["opacity_logits"].detach().sigmoid(), model.stats
+        faint = stats["opacity_sum"] < p.min_opacity * stats["seen"]
+        model.keep(~(faint | (opacity < min(p.min_opacity, ALPHA_MIN))))
+        model.append(rows)
+        model.reset_stats()
+        require_rows(model, step, "min_opacity")
+
+    def prune_unseen(self, step: int) -> None:
+        """Splats go of which no view, near or far, sees much, by their largest blending weight (RadSplat)."""
+        self.model.keep(~growing.unseen(self.schedule, self.model, step, self._largest_weights))
+        require_rows(self.model, step, "least_weight")
+
+    def _largest_weights(self, camera: Camera, view: int, weights: torch.Tensor) -> torch.Tensor:
+        return contributions(
+            self.model.gaussians, [camera], weights=weights, near=self.data.near, backend=self.backend
+        ).largest
+
+    def reassign_levels(self, step: int) -> None:
+        """Splats that have become too wide or too narrow for their level move to one that they fit."""
+        columns, newest = self.model.columns, self.level_at(step)
+        means, log_scales = self.model["means"].detach(), self.model["log_scales"].detach()
+        columns["level"] = growing.fitting_levels(self.schedule, columns["level"], means, log_scales, newest)

@@ -1,0 +1,128 @@
+"""Measuring a finished run on its held-out views: every level, and what its rule chooses by distance."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import LodgsError
+from ..evaluate.distance import farther, jumps
+from ..evaluate.picture import level_picture
+from ..evaluate.views import Evaluation
+from ..files import atomic_write
+from ..lod.rule import Values, find_rule
+from ..lod.selection import select, settings, unknown_rule
+from ..methods import create
+from ..splats.bundle import read_bundle
+from .data import training_data
+from .folder import RunFolder
+from .job import Job
+
+
+def evaluate_run(
+    run: Path, given: Values | None = None, picture: Path | None = None, far: bool = False
+) -> dict:
+    """Measures a finished run and writes its ``metrics.json``.
+
+    Args:
+        run: the run's folder.
+        given: controls of the run's rule by name (``lod.rule``); the others are the rule's own.
+        picture: a PNG to write, with the levels side by side as the middle held-out view sees them.
+        far: measure also how levels do from farther away (``evaluate.distance``).
+
+    Returns:
+        ``levels``: coarse to fine, ``level``, its facts, ``splats``, ``psnr``, ``ssim``, ``frame_s``; where
+        levels add up, of each with all coarser ones. ``selective``: per view and predetermined (chosen from
+        the mean training camera), with the values of the rule's controls; none where the levels have no rule.
+        ``curve``: the same for each value of the rule's ``sweep``, where it has one. ``networks``: of a model
+        that was baked, before that. ``farther`` and ``jumps`` (of the middle
+        held-out view), where asked for.
+
+    Raises:
+        LodgsError: if the run is not finished or holds out no views, or its rule has no such control.
+    """
+    folder = RunFolder(run)
+    if not folder.bundle.exists():
+        raise LodgsError(f"{run} holds no finished run (no bundle.ply).", "Train it to the end first.")
+    job = Job.from_file(folder.job)
+    data = training_data(job, folder)
+    if not data.test:
+        raise LodgsError(f"The run {run} holds out no views to measure on.", "Train with test_every = 8.")
+    evaluation, bundle = Evaluation(data, job.backend), read_bundle(folder.bundle)
+    rule = find_rule(bundle.rule)
+    if rule is None and (given or bundle.rule):
+        raise LodgsError(*unknown_rule(bundle.rule))
+    levels = [
+        {"level": level.number, **level.facts, **evaluation.measure_level(bundle, level)}
+        for level in bundle.levels
+    ]
+    report = {
+        "scene": job.scene,
+        "method": job.method,
+        "rule": bundle.rule,
+        "test_views": [camera.name for camera in data.test],
+        "levels": levels,
+        "selective": [],
+    }
+    values = settings(bundle, given or {}) if rule else {}
+    if rule:
+        predetermined = select(bundle, data.mean_camera, data.focal, values)
+        report["selective"] = [
+            {"set": "per view", **values, **evaluation.measure_by_distance(bundle, values)},
+            {"set": "predetermined", **values, **evaluation.measure(lambda camera: predetermined)},
+        ]
+    if rule and rule.sweep:
+        name, steps = rule.sweep
+        report["curve"] = [
+            {name: step, **evaluation.measure_by_distance(bundle, {**values, name: step})} for step in steps
+        ]
+    if folder.model.exists():
+        method = create(job.method, data, job.resolved_parameters(), job.seed, job.backend)
+        with np.load(folder.model, allow_pickle=False) as arrays:
+            method.load_arrays(arrays)
+        report["networks"] = evaluation.measure_pictures(method.picture)
+    middle = data.test[len(data.test) // 2]
+    if far and rule:
+        report["farther"] = farther(evaluation, bundle, values)
+        report["jumps"] = jumps(evaluation, bundle, values, middle)
+    if picture is not None:
+        level_picture(picture, bundle, evaluation, middle, values)
+    with atomic_write(folder.metrics) as temporary:
+        Path(temporary).write_text(json.dumps(report, indent=1), encoding="utf-8")
+    return report
+
+
+def table(report: dict) -> str:
+    """``evaluate_run``'s report as text."""
+    measured = ("splats", "drawn", "psnr", "ssim", "frame_s")
+    lines = [f"{'':>28} {'splats':>9} {'PSNR':>7} {'SSIM':>7} {'s/frame':>8}"]
+    rows = []
+    for row in report["levels"]:
+        facts = "".join(f", {k} {v:.5g}" for k, v in row.items() if k not in ("level", *measured))
+        rows.append((f"level {row['level']}{facts}", row))
+    for row in report["selective"]:
+        values = ", ".join(f"{k} {v:g}" for k, v in row.items() if k not in ("set", *measured))
+        rows.append((f"by distance, {row['set']}", row))
+        if row is report["selective"][-1]:
+            rows.append((f"  ({values})", None))
+    for row in report.get("curve", []):
+        (name, value), *_ = row.items()
+        rows.append((f"{name} = {value:g}, {row['drawn']:,} drawn", row))
+    if "networks" in report:
+        rows.append(("with networks", {"splats": 0, **report["networks"]}))
+    lines += [
+        f"{name:<28} {r['splats']:>9,} {r['psnr']:>7.2f} {r['ssim']:>7.4f} {r['frame_s']:>8.3f}"
+        if r
+        else name
+        for name, r in rows
+    ]
+    for row in report.get("farther", []):
+        lines.append(
+            f"{row['factor']}x the distance: {row['drawn']:,} of {row['drawn_full']:,} splats drawn, "
+            f"{row['psnr']:.1f} dB against full detail"
+        )
+    for name, jump in report.get("jumps", {}).items():
+        lines.append(f"largest jump, {name}: {jump} times that of full detail")
+    return "\n".join(lines)

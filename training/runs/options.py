@@ -1,0 +1,76 @@
+"""The options of ``train``, the same for ``lodgs train`` and ``blender --command lodgs train``. No torch."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import MISSING, asdict, fields
+from pathlib import Path
+
+from ..errors import LodgsError
+from ..methods import METHODS, PRESETS
+from .job import BACKENDS, Job
+
+
+def _whole(text: str) -> int:
+    if not 0 <= int(text) < 2**31:
+        raise argparse.ArgumentTypeError(f"{text} is not between 0 and {2**31 - 1}")
+    return int(text)
+
+
+_OPTIONS: dict[str, dict] = {
+    "scene": {"metavar": "DIR", "help": "folder of the COLMAP scene"},
+    "out": {"metavar": "RUN", "help": "run folder; goes on with what the same command began there"},
+    "method": {"choices": list(METHODS), "help": "what to train, see the command methods"},
+    "preset": {"choices": list(PRESETS), "help": "how long to train"},
+    "base": {"metavar": "PATH", "help": "run, bundle or PLY to begin with instead of the scene's points"},
+    "image_scale": {"metavar": "SHARE", "type": float, "help": "size of training images over photographs"},
+    "test_every": {"metavar": "N", "type": _whole, "help": "hold out every N-th view; 0 holds out none"},
+    "seed": {"metavar": "N", "type": _whole, "help": "of every random choice"},
+    "backend": {"choices": list(BACKENDS), "help": "what draws; auto is cuda where that works, else cpu"},
+    "exposure": {"metavar": "STOPS", "type": float, "help": "stops added to linear (EXR) images"},
+    "model": {"metavar": "DIR", "help": "folder of the COLMAP model, where it is not found by itself"},
+    "images": {"metavar": "DIR", "help": "folder of the photographs, where it is not found by itself"},
+}
+"""What argparse is told of each key of a job; the defaults are the job's own."""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declares a job file and, for each key of a :class:`Job`, an option that goes before the file."""
+    parser.add_argument(
+        "job", nargs="?", type=Path, metavar="JOB", help="job file (TOML or JSON); a run's own resumes it"
+    )
+    defaults = {key.name: key.default for key in fields(Job)}
+    for name, option in _OPTIONS.items():
+        default = "" if defaults[name] in ("", MISSING) else f" (default {defaults[name]})"
+        option = option | {"help": option["help"] + default}
+        parser.add_argument(f"--{name.replace('_', '-')}", default=argparse.SUPPRESS, **option)
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="NAME=VALUE",
+        help="a parameter of the method, see the command methods; repeatable",
+    )  # fmt: skip
+
+
+def job_from(chosen: argparse.Namespace) -> Job:
+    """The job that the options of :func:`add_options` ask for, checked; paths are relative to here.
+
+    Raises:
+        LodgsError: neither a job file nor a scene and a run folder, or an impossible value.
+    """
+    given = {name: value for name, value in vars(chosen).items() if name in _OPTIONS}
+    values = asdict(Job.from_file(chosen.job)) if chosen.job else {}
+    if not {"scene", "out"} <= values.keys() | given.keys():
+        raise LodgsError("It is not said what to train.", "Give a job file, or --scene DIR and --out RUN.")
+    parameters = values.get("parameters", {}) | dict(map(_assignment, chosen.set))
+    return Job.from_dict(values | given | {"parameters": parameters})
+
+
+def _assignment(text: str) -> tuple[str, object]:
+    """``name=value`` with a value as JSON has it: a number, a list of numbers."""
+    name, equals, value = text.partition("=")
+    try:
+        if not equals:
+            raise ValueError
+        return name.strip(), json.loads(value)
+    except ValueError:
+        raise LodgsError(f"--set {text} is not NAME=VALUE.", "For example: --set max_splats=50000") from None
