@@ -1,0 +1,132 @@
+"""CLoD-GS's rule: Eq. 2 and the mask worked by hand, the budget against counting."""
+
+from itertools import pairwise
+from math import exp, log
+
+import numpy as np
+import pytest
+
+from training.evaluate.distance import full_detail
+from training.lod.rule import rules
+from training.lod.rules.decay import attenuation, last_seen_at
+from training.runs.base import read_base
+from training.scenes.cameras import Camera
+from training.splats.bundle import Bundle, Level, write_bundle
+from training.splats.gaussians import Splats
+
+DECAY = rules()["decay"]
+FACTS = {"reference": 8.0, "tau": 0.004}
+
+
+def scene(count=4000, seed=0):
+    rng = np.random.default_rng(seed)
+    means = rng.normal(0, 5, (count, 3)).astype(np.float32)
+    columns = {
+        "sigma_d": rng.uniform(-0.2, 2, count).astype(np.float32),
+        "opacity": rng.uniform(0, 1, count).astype(np.float32),
+    }
+    return means, columns
+
+
+def weights(means, columns, s_v=1.0, at_most=0, facts=FACTS, eye=(0, 0, 0)):
+    values = {"s_v": s_v, "at_most": at_most}
+    return DECAY.weights(means, np.array(eye), 500.0, columns, facts, values)
+
+
+def test_equation_2_by_hand():
+    # 4 units away of 8: d' = 0.5; s_v = 2, sigma 0.8: exp(-(0.5 * 2)^2 / (2 * 0.64 + 1e-8))
+    means = np.float32([[4, 0, 0], [4, 0, 0], [4, 0, 0], [4, 0, 0]])
+    falloff = exp(-1 / 1.28)
+    edge = 0.004 * 2 / falloff  # the opacity that just meets tau * s_v
+    columns = {
+        "sigma_d": np.float32([0.8, 0.8, 0.8, -1]),
+        "opacity": np.float32([1, edge * 1.01, edge * 0.99, 1]),
+    }
+    assert weights(means, columns, 2.0).tolist() == pytest.approx([falloff, falloff, 0, 0])
+
+
+def test_a_focal_length_changes_nothing_and_the_eye_does():
+    means, columns = scene()
+    values = {"s_v": 2.0, "at_most": 0}
+    near, far = (DECAY.weights(means, np.zeros(3), focal, columns, FACTS, values) for focal in (100, 900))
+    np.testing.assert_array_equal(near, far)
+    assert (weights(means, columns, eye=(50, 0, 0)) > 0).sum() < (weights(means, columns) > 0).sum()
+
+
+def test_without_a_reference_the_farthest_splat_is_at_1():
+    means, columns = scene()
+    farthest = np.linalg.norm(means, axis=1).max()
+    published = weights(means, columns, 2.0, facts={"reference": 0.0, "tau": 0.004})
+    stored = weights(means, columns, 2.0, facts={"reference": farthest, "tau": 0.004})
+    np.testing.assert_allclose(published, stored, rtol=1e-5)
+
+
+def test_a_larger_scale_shows_a_part_of_what_a_smaller_one_does():
+    means, columns = scene()
+    shown = [weights(means, columns, s_v) > 0 for s_v in (1, 1.5, 2, 3, 5, 20)]
+    for more, less in pairwise(shown):
+        assert less.sum() < more.sum() and not (less & ~more).any()
+
+
+def test_where_a_splat_is_last_seen_is_where_its_opacity_meets_the_threshold():
+    means, columns = scene()
+    normalized = (np.linalg.norm(means, axis=1) / 8).astype(np.float32)
+    sigma, opacity = columns["sigma_d"], columns["opacity"]
+    limit = last_seen_at(normalized, sigma, opacity, 0.004).astype(np.float64)
+    some = (sigma > 0.01) & (opacity > 0.01)
+    attenuated = opacity * attenuation(normalized.astype(np.float64), sigma.astype(np.float64), limit)
+    np.testing.assert_allclose(np.log(attenuated[some]), np.log(0.004 * limit[some]), atol=1e-4)
+    assert np.isfinite(limit).all()
+
+
+@pytest.mark.parametrize("at_most", [1, 7, 500, 1500])
+@pytest.mark.parametrize("eye", [(0, 0, 0), (30, 1, 2)])
+def test_a_budget_is_kept_by_the_splats_that_last_longest(at_most, eye):
+    means, columns = scene()
+    everything = (weights(means, columns, eye=eye) > 0).sum()
+    shown = weights(means, columns, at_most=at_most, eye=eye) > 0
+    assert min(at_most, everything) - 2 <= shown.sum() <= at_most
+    normalized = DECAY.normalized(means, np.float32(eye), FACTS)
+    limit = last_seen_at(normalized, columns["sigma_d"], columns["opacity"], 0.004)
+    assert limit[shown].min() >= limit[~shown].max() * (1 - 1e-4)
+
+
+def test_a_budget_that_is_not_needed_changes_nothing():
+    means, columns = scene()
+    for at_most in (0, 4000, 10**6):
+        np.testing.assert_array_equal(weights(means, columns, 2.0, at_most), weights(means, columns, 2.0))
+
+
+def test_a_viewers_budget_raises_the_scale():
+    values = {"s_v": 1.0, "at_most": 0}
+    steps = 0
+    while (values := DECAY.coarser(values, [1])) is not None:
+        assert values["at_most"] == 0 and values["s_v"] <= 100
+        steps += 1
+    assert steps == int(log(100) / log(1.25))
+
+
+def test_as_a_base_and_as_full_detail_splats_have_the_weights_that_a_camera_sees(tmp_path):
+    """Raw opacities are not what was trained: a bundle's base has them from the middle of its cameras."""
+    means, columns = scene(300)
+    splats = Splats(
+        means,
+        np.tile(np.float32([1, 0, 0, 0]), (300, 1)),
+        np.full((300, 3), -3, np.float32),
+        np.log(columns["opacity"] / (1 - columns["opacity"])).astype(np.float32),
+        np.zeros((300, 1, 3), np.float32),
+        {"sigma_d": columns["sigma_d"]},
+    )
+    meta = {"camera_center": [2.0, 0.0, 0.0]}
+    bundle = Bundle("clod", [Level(1, splats)], "decay", FACTS, meta=meta)
+    write_bundle(tmp_path / "a.ply", bundle)
+    base = read_base(tmp_path / "a.ply")
+    by_rule = weights(means, columns, eye=(2, 0, 0))
+    expected = (by_rule * columns["opacity"])[by_rule > 0]
+    assert 0 < len(expected) < 300 and len(base) == len(expected)
+    np.testing.assert_allclose(1 / (1 + np.exp(-base.opacity_logits)), expected, rtol=1e-4)
+    camera = Camera("a", 64, 64, 100.0, 100.0, 32.0, 32.0, np.eye(4))
+    seen, fixed = full_detail(bundle, camera)
+    by_rule = weights(means, columns)
+    np.testing.assert_allclose(fixed, by_rule[by_rule > 0], rtol=1e-4)
+    assert len(seen) == len(fixed)

@@ -1,0 +1,193 @@
+"""CLoD-GS: its formulas by hand and by autograd in float64, how decays begin, and whole runs."""
+
+from copy import deepcopy
+
+import numpy as np
+import pytest
+import torch
+
+from training.errors import LodgsError
+from training.lod.rule import facts_of, rules
+from training.lod.selection import select, settings
+from training.methods import create, method_info
+from training.methods.clod.train import ClodDrawing
+from training.methods.parameters import override
+from training.rasterize import contributions
+from training.splats.bundle import Bundle
+
+
+def make(data, base=None, preset="draft", **values):
+    values = {"steps": 24, "begin": 0.5, "densify_until": 0.4, "prune_interval": 6, **values}
+    return create("clod", data, override(method_info("clod").preset(preset), values), 0, "cpu", base)
+
+
+def trained(clod, until=None):
+    levels = []
+    for step in range(until or clod.steps):
+        clod.train_step(step)
+        levels += clod.levels_after(step)
+    return levels
+
+
+def bundle_of(clod, levels) -> Bundle:
+    return Bundle("clod", levels, "decay", clod.facts())
+
+
+def test_until_the_decay_begins_it_is_3dgs(data):
+    values = {"steps": 24, "densify_until": 0.4, "prune_interval": 6}
+    plain = create("3dgs", data, override(method_info("3dgs").preset("draft"), values), 0, "cpu")
+    clod = make(data)
+    for step in range(12):
+        assert clod.train_step(step)[0] == plain.train_step(step)[0]
+    assert torch.equal(clod.model["means"], plain.model["means"])
+    assert clod.sigma.detach().unique().tolist() == pytest.approx([10.0])
+    before = len(clod.model)
+    clod.train_step(12)
+    assert len(clod.model) < before and len(clod.sigma.detach().unique()) > before / 4
+
+
+def test_training_draws_by_the_rule(data):
+    """Attenuations and masks of a step are what the rule says of the splats that it hands over."""
+    clod = make(data, keep_share=1.0)
+    [level] = trained(clod)
+    camera, rule = data.train[1], rules()["decay"]
+    for s_v in (1.0, 2.5):
+        falloff, _, shown = clod.attenuated(camera, s_v)
+        opacity = clod.model["opacity_logits"].sigmoid()
+        columns = {"sigma_d": clod.sigma.detach().numpy(), "opacity": opacity.detach().numpy()}
+        facts = facts_of(rule, clod.facts(), [(1, {})], 1)
+        means = clod.model["means"].detach().numpy()
+        values = {"s_v": s_v, "at_most": 0}
+        wanted = rule.weights(means, camera.center, camera.focal, columns, facts, values)
+        found = (falloff * shown).detach().numpy()
+        assert (np.abs(found - wanted) > 1e-5).sum() <= 1
+    assert level.splats.extras["sigma_d"].shape == (len(level.splats),)
+
+
+def test_the_counts_gradient_goes_straight_through(data):
+    clod = make(data)
+    trained(clod, 13)
+    camera, p = data.train[0], clod.parameters
+    inside = torch.from_numpy(camera.sees(clod.model["means"].detach().numpy(), near=data.near))
+    assert 3 < inside.sum() < len(inside)
+    opacities = torch.rand(len(inside), dtype=torch.float64, requires_grad=True)
+    s_v = 4.0
+    shown = opacities.detach() > p.tau * s_v
+    excess = clod.count_excess(ClodDrawing(None, s_v, opacities, shown, inside))
+    share = shown[inside].double().mean()
+    target = (s_v / p.onset) ** -p.exponent
+    assert share > target
+    assert excess.item() == pytest.approx(9 * (share - target).item() ** 2)
+    excess.backward()
+    # d excess / d share times the mean's, times the sigmoid's of the logarithm, by hand
+    margin = (opacities.detach() / (p.tau * s_v)).log() / p.count_softness
+    slope = margin.sigmoid() * (1 - margin.sigmoid()) / p.count_softness / opacities.detach()
+    expected = 18 * (share - target) / inside.sum() * slope * inside
+    torch.testing.assert_close(opacities.grad, expected)
+    few = clod.count_excess(ClodDrawing(None, s_v, opacities, torch.zeros_like(shown), inside))
+    near = clod.count_excess(ClodDrawing(None, 1.9, opacities, torch.ones_like(shown), inside))
+    assert few.item() == near.item() == 0
+
+
+def test_decays_begin_by_importance(data):
+    clod = make(data, tau=0.004)
+    trained(clod, 12)
+    before, p = clod.model["opacity_logits"].detach().sigmoid(), clod.parameters
+    found = contributions(clod.model.gaussians.detach(), data.train, near=data.near, backend="cpu")
+    means = clod.model["means"].detach().numpy().copy()
+    clod.begin_decay()
+    # those that give most to the pixels of a view stay, as many as views draw 74 % of what they drew
+    kept = torch.from_numpy((means[:, None] == clod.model["means"].detach().numpy()[None]).all(2).any(1))
+    views, importance = found.views.double(), found.total / found.views.clamp_min(1)
+    assert importance[kept].min() >= importance[~kept].max()
+    assert 0.6 < views[kept].sum() / views.sum() <= 0.74
+
+    distances = np.stack([np.linalg.norm(means[kept] - camera.center, axis=1) for camera in data.train], 1)
+    inside = np.stack([camera.sees(means[kept], near=data.near) for camera in data.train], 1)
+    some = torch.from_numpy(inside.any(1))
+    mean = torch.from_numpy((distances * inside).sum(1) / inside.sum(1).clip(1) / clod.reference)
+    nearest = torch.from_numpy(np.where(inside, distances, np.inf).min(1) / clod.reference)
+    alpha, sigma = clod.model["opacity_logits"].detach().sigmoid(), clod.sigma.detach()
+    some &= (sigma > 2e-3) & (sigma < 49) & (alpha < 0.989) & (alpha > 2e-4)
+    # from its nearest view a splat looks as before ...
+    seen = alpha * torch.exp(-(nearest**2) / (2 * sigma**2))
+    assert some.sum() > 5
+    torch.testing.assert_close(seen[some], before[kept].double()[some], rtol=2e-3, atol=1e-5)
+    # ... and from its mean one it is gone at the scale of its rank
+    rank = (torch.argsort(torch.argsort(importance[kept], descending=True, stable=True)) + 0.5) / int(
+        kept.sum()
+    )
+    vanishes = (p.onset * rank ** (-1 / p.exponent)).clamp(1.1, 50)
+    edge = alpha * torch.exp(-((mean * vanishes) ** 2) / (2 * sigma**2))
+    close = some & (before[kept] > 1.06 * p.tau * vanishes)
+    assert close.sum() > 5
+    torch.testing.assert_close(edge[close], (p.tau * vanishes[close]).double(), rtol=2e-2, atol=0)
+
+
+def test_the_reference_is_a_quantile_of_what_views_see_or_each_views_farthest(data):
+    points = data.scene.points
+    seen = [
+        np.linalg.norm(points[camera.sees(points, near=data.near)] - camera.center, axis=1)
+        for camera in data.train
+    ]
+    clod = make(data, reference_quantile=0.9)
+    assert clod.reference == pytest.approx(np.quantile(np.concatenate(seen), 0.9), rel=1e-5)
+    published = make(data, reference_quantile=0.0)
+    assert published.facts()["reference"] == 0
+    assert published.normalized(data.train[0]).max() == pytest.approx(1)
+
+
+def test_any_prefix_is_a_coarser_scene_and_counts_fall_with_the_scale(data):
+    clod = make(data)
+    [level] = trained(clod)
+    bundle, camera = bundle_of(clod, [level]), data.train[0]
+    counts = []
+    for s_v in (1.0, 2.0, 4.0):
+        chosen, weights = select(bundle, camera.center, camera.focal, settings(bundle, {"s_v": s_v}))
+        counts.append(len(chosen))
+        assert weights is not None
+    assert counts[0] > counts[1] > counts[2] > 0
+    mean = np.zeros(len(level.splats))
+    for view in data.train:
+        rule, facts = rules()["decay"], facts_of(rules()["decay"], clod.facts(), [(1, {})], 1)
+        opacity = 1 / (1 + np.exp(-level.splats.opacity_logits))
+        columns = {"sigma_d": level.splats.extras["sigma_d"], "opacity": opacity}
+        values = {"s_v": 1.0, "at_most": 0}
+        mean += rule.weights(level.splats.means, view.center, view.focal, columns, facts, values)
+    assert (np.diff(mean) <= 1e-4).all()
+
+
+def test_what_no_view_draws_goes(data):
+    clod = make(data, keep_share=1.0)
+    trained(clod, 13)
+    some = torch.arange(5)
+    with torch.no_grad():
+        clod.model["opacity_logits"][some] = -6.0  # far below tau
+    seen = clod.seen_somewhere()
+    assert not seen[some].any() and seen.sum() > 5
+
+
+@pytest.mark.parametrize("preset", ["draft", "paper"])
+def test_a_base_begins_at_once_and_without_new_splats(data, preset):
+    first = make(data, steps=12, begin=1.0)
+    [level] = trained(first)
+    clod = make(data, base=level.splats, preset=preset, steps=4, prune_interval=0, opacity_reset_interval=0)
+    assert len(clod.model) == len(level.splats)
+    torch.testing.assert_close(clod.model["means"].detach(), torch.from_numpy(level.splats.means))
+    trained(clod)
+    assert len(clod.model) == len(level.splats) if preset == "paper" else len(clod.model) < len(level.splats)
+
+
+def test_a_resumed_run_goes_on_with_the_same_decay(data):
+    clod = make(data)
+    trained(clod, 15)
+    again = make(data)
+    again.load_state_dict(deepcopy(clod.state_dict()))
+    assert clod.train_step(15)[0] == again.train_step(15)[0]
+
+
+def test_impossible_values_are_sentences():
+    draft = method_info("clod").preset("draft")
+    for name, value in (("s_v_most", 0.5), ("exponent", 0), ("keep_share", 0), ("tau", 0), ("begin", 1.5)):
+        with pytest.raises(LodgsError, match=name):
+            override(draft, {name: value})

@@ -1,0 +1,104 @@
+"""CLoD-GS's rule (Anonymous 2025, Sec. 3.2): opacity decays with distance, splat by splat, without levels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ..rule import OPACITY, Control, Rule, Values, distances
+
+SIGMA = "sigma_d"
+"""Column of each splat's decay, the paper's σ_d."""
+EPSILON = 1e-8
+"""The paper's ε."""
+CLEAR = 1e-5
+"""Share by which a budget's virtual scale is larger than that of the first splat that it leaves out, so that
+rounding does not bring that one back."""
+NEWTON_STEPS = 6
+"""Steps of :func:`last_seen_at`, of which each doubles the digits."""
+STEP = 1.25
+"""Factor by which a viewer's budget raises the virtual scale at a time."""
+
+
+def attenuation(normalized, sigma, s_v: float):
+    """exp(−(d′ s_v)² / (2 ReLU(σ_d)² + ε)), (N,): the factor on the opacity (Eq. 2).
+
+    Args:
+        normalized: (N,) d′, distances over the reference distance, numpy or torch.
+        sigma: (N,) σ_d.
+        s_v: virtual distance scale.
+    """
+    exponent = -((normalized * s_v) ** 2) / (2 * sigma.clip(0) ** 2 + EPSILON)
+    return exponent.exp() if hasattr(exponent, "exp") else np.exp(exponent)
+
+
+def last_seen_at(normalized: np.ndarray, sigma: np.ndarray, opacity: np.ndarray, tau: float) -> np.ndarray:
+    """The virtual scale (N,) at which each splat's attenuated opacity meets the threshold τ s_v.
+
+    α exp(−a s² / 2) = τ s with a = 2 d′² / (2 ReLU(σ_d)² + ε) has the one solution s = (α / τ) exp(−W / 2),
+    W exp(W) = a (α / τ)²: Lambert's W, here by Newton's method on ln W + W.
+    """
+    ratio = opacity / np.float32(tau)
+    product = 2 * normalized**2 / (2 * sigma.clip(0) ** 2 + np.float32(EPSILON)) * ratio**2
+    product = product.clip(np.float32(1e-12), np.float32(1e30))
+    w = np.log(1 + product)
+    for _ in range(NEWTON_STEPS):
+        w = w / (1 + w) * (1 + np.log(product / w))
+    return ratio * np.exp(-w / 2)
+
+
+class Decay(Rule):
+    """The attenuation where α·attenuation > τ s_v, 0 elsewhere (Sec. 3.2).
+
+    d′ is the distance over ``reference``, or where that is 0 over that of the farthest splat (in the paper,
+    of those in view). With ``at_most`` the virtual scale is as much larger than ``s_v`` as leaves no more
+    splats than that.
+    """
+
+    name = "decay"
+    scene_facts = ("reference", "tau")
+    columns = (SIGMA, OPACITY)
+    controls = (
+        Control(
+            "s_v", 1.0, 1.0, 100.0, "Distance Scale",
+            "s_v: as if the eye were so many times farther away. Larger shows fewer splats", soft=(1.0, 10.0),
+        ),
+        Control(
+            "at_most", 0, 0, 2**30, "Splat Limit",
+            "Most splats that are shown: where there are more, s_v rises by itself. 0 is no limit",
+            whole=True, step=1000,
+        ),
+    )  # fmt: skip
+    always = True
+    sweep = ("s_v", (1.0, 1.5, 2.0, 3.0, 5.0))
+
+    def normalized(self, means: np.ndarray, eye: np.ndarray, facts: Mapping[str, float]) -> np.ndarray:
+        """d′ (N,) of splats at means (N, 3)."""
+        away = distances(means, eye)
+        reference = facts["reference"] or float(away.max(initial=0))
+        return away / np.float32(max(reference, 1e-20))
+
+    def virtual_scale(
+        self, normalized, columns: Mapping[str, np.ndarray], tau: float, values: Values
+    ) -> float:
+        """``s_v``, or as much more as the budget asks for."""
+        s_v, at_most = values["s_v"], int(values["at_most"])
+        if not 0 < at_most < len(normalized):
+            return s_v
+        limits = last_seen_at(normalized, columns[SIGMA], columns[OPACITY], tau)
+        first_left_out = np.partition(limits, len(limits) - at_most - 1)[len(limits) - at_most - 1]
+        return max(s_v, float(first_left_out) * (1 + CLEAR))
+
+    def weights(self, means, eye, focal_px, columns, facts, values) -> np.ndarray:
+        normalized, tau = self.normalized(means, eye, facts), facts["tau"]
+        s_v = self.virtual_scale(normalized, columns, tau, values)
+        weight = attenuation(normalized, columns[SIGMA], s_v).astype(np.float32)
+        return np.where(columns[OPACITY] * weight > tau * s_v, weight, np.float32(0))
+
+    def coarser(self, values: Values, levels: Sequence[int]) -> Values | None:
+        s_v = values["s_v"] * STEP
+        return {**values, "s_v": s_v} if s_v <= self.controls[0].high else None
+
+
+RULE = Decay()
