@@ -16,8 +16,8 @@ def public(owner, module: str):
     for name, value in vars(owner).items():
         value = value.__func__ if isinstance(value, classmethod | staticmethod) else value
         described = value.fget if isinstance(value, property) else value
-        # NumPy's functions, scipy's expit among them, have no __module__.
-        if not name.startswith("_") and callable(described) and getattr(described, "__module__", "") == module:
+        home = getattr(described, "__module__", "")  # a ufunc, scipy's expit for one, has none
+        if not name.startswith("_") and callable(described) and home == module:
             yield name, value
 
 
