@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 
 import numpy as np
@@ -42,14 +42,21 @@ class Evaluation:
         """A picture of splats on black, (H, W, 3), on the CPU, with a weight on each splat's opacity."""
         return self.render(splats, camera, weights).image.cpu()
 
-    def render(self, splats: Splats, camera: Camera, weights: np.ndarray | None = None) -> Rendering:
-        """The same with all that a rendering tells."""
+    def render(
+        self,
+        splats: Splats,
+        camera: Camera,
+        weights: np.ndarray | None = None,
+        outputs: Collection[str] = (),
+    ) -> Rendering:
+        """The same with all that a rendering tells, and ``outputs`` of it (``rasterize.OUTPUTS``)."""
         with torch.no_grad():
             return rasterize(
                 Gaussians.of(splats, self.device),
                 camera,
                 weights=None if weights is None else torch.as_tensor(weights).to(self.device, torch.float32),
                 near=self.data.near,
+                outputs=outputs,
                 backend=self.backend,
             )
 
