@@ -97,6 +97,7 @@ def test_the_table_of_evaluate(file_regression):
             "psnr": psnr,
             "ssim": ssim,
             "frame_s": count / 1e6,
+            "veil": {"mean": 0.04 * n, "max": 1.0},
         }
         for n, s_min, count, psnr, ssim in numbers
     ]
@@ -111,6 +112,12 @@ def test_the_table_of_evaluate(file_regression):
         "frame_s": 0.04,
     }
     report = {
+        "test_views": ["view_00.jpg"],
+        "train_psnr": 30.75,
+        "worst": {"view": "view_00.jpg", "psnr": 16.84},
+        "veil": {"mean": 0.12, "max": 1.0},
+        "oversized": 1_234,
+        "aside": {"psnr": 21.25, "views": ["a.jpg", "b.jpg"]},
         "levels": rows,
         "selective": [{"set": "per view", **detail}, {"set": "predetermined", **detail}],
         "farther": [{"factor": 2, "drawn": 9_000, "drawn_full": 120_000, "psnr": 31.5}],

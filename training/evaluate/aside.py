@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import KDTree
 
+from ..methods.data import TrainingData
 from ..scenes.cameras import Camera
-from ..splats.gaussians import Splats
-from .views import Evaluation
+from .views import Evaluation, Shown, evenly
 
 NEIGHBOURS = (1, 2, 4)
 """Which of a camera's nearest other cameras a place lies halfway to."""
@@ -24,11 +24,14 @@ MOST_PLACES = 120
 
 
 def halfway(cameras: Sequence[Camera]) -> list[Camera]:
-    """Views from halfway between each camera and its 1st, 2nd and 4th nearest, looking as the camera does."""
+    """Views from halfway between each camera and its 1st, 2nd and 4th nearest, looking as the camera does.
+
+    Places that need more cameras than there are do not exist.
+    """
     centers = np.array([camera.center for camera in cameras])
     found = []
-    _, order = KDTree(centers).query(centers, k=[1 + nearest for nearest in NEIGHBOURS])
-    for camera, others in zip(cameras, order, strict=True):
+    order = np.asarray(KDTree(centers).query(centers, k=1 + max(NEIGHBOURS))[1])  # itself is the first
+    for camera, others in zip(cameras, order[:, list(NEIGHBOURS)], strict=True):
         for other in others[others < len(cameras)]:  # those that do not exist are numbered beyond
             pose = camera.world_to_camera.copy()
             pose[:3, 3] = -pose[:3, :3] @ (camera.center + centers[other]) / 2
@@ -36,33 +39,40 @@ def halfway(cameras: Sequence[Camera]) -> list[Camera]:
     return found
 
 
-def veil(evaluation: Evaluation, splats: Splats, weights: np.ndarray | None = None) -> dict[str, float]:
+def veil(evaluation: Evaluation, shown_to: Callable[[Camera], Shown]) -> dict[str, float]:
     """Share of the pixels that something hangs before, seen from places halfway between training cameras.
 
     A pixel is veiled where its median depth, at which half of its light is stopped, is less than ``VEIL`` of
     the scene's median depth.
 
+    Args:
+        shown_to: what a camera is shown.
+
     Returns:
-        ``mean`` and ``max`` over the places: all of :func:`halfway`, or ``MOST_PLACES`` evenly chosen.
+        ``mean`` and ``max`` over the places, from 0 to 1: all of :func:`halfway`, or ``MOST_PLACES`` evenly
+        chosen.
     """
-    data = evaluation.data
-    places = halfway(data.train)
-    places = places[:: -(-len(places) // MOST_PLACES)]
     shares = []
-    for place in places:
-        depth = evaluation.render(splats, place, weights, outputs=("median_depth",)).median_depth
-        assert depth is not None
-        shares.append(float(((depth > 0) & (depth < VEIL * data.median_depth)).float().mean()))
+    for place in evenly(halfway(evaluation.data.train), MOST_PLACES):
+        splats, weights = shown_to(place)
+        before = place.view_space(splats.means)[:, 2] < VEIL * evaluation.data.median_depth
+        # only what hangs before is drawn: the depth at which half of the light is stopped is among it, or not
+        near = evaluation.render(splats.select(before), place, None if weights is None else weights[before])
+        shares.append(float((near.alpha >= 0.5).float().mean()))
     return {"mean": round(float(np.mean(shares)), 5), "max": round(float(np.max(shares)), 5)}
 
 
-def oversized(evaluation: Evaluation, splats: Splats) -> int:
+def oversized(data: TrainingData, shown_to: Callable[[Camera], Shown]) -> int:
     """How many opaque splats among the cameras have a standard deviation over half the median depth.
 
-    Among the cameras is no farther from their mean than the scene's extent.
+    Among the cameras is no farther from their mean than the scene's extent; opaque is, with its weight, what
+    the training camera nearest to that mean is shown so.
     """
-    data = evaluation.data
+    splats, weights = shown_to(
+        min(data.train, key=lambda camera: np.linalg.norm(camera.center - data.mean_camera))
+    )
     among = np.linalg.norm(splats.means - data.mean_camera, axis=1) <= data.extent
-    opaque = splats.opacity_logits >= np.log(OPAQUE / (1 - OPAQUE))
+    opacity = 1 / (1 + np.exp(-splats.opacity_logits.astype(np.float64)))
+    opaque = opacity * (1 if weights is None else weights) >= OPAQUE
     large = splats.log_scales.max(axis=1) > np.log(OVERSIZED * data.median_depth)
     return int((among & opaque & large).sum())

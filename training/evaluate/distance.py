@@ -9,12 +9,11 @@ from itertools import pairwise
 import numpy as np
 
 from ..lod.rule import Values
-from ..lod.selection import complete, rule_of, select, settings
+from ..lod.selection import rule_of, select
 from ..scenes.cameras import Camera
 from ..splats.bundle import Bundle
-from ..splats.gaussians import Splats
 from .metrics import psnr
-from .views import Evaluation
+from .views import Evaluation, shown_at
 
 FACTORS = (1, 2, 4, 8)
 FRAMES = 120
@@ -27,30 +26,21 @@ def pulled_back(camera: Camera, factor: float, depth: float) -> Camera:
     return replace(camera, world_to_camera=pose)
 
 
-def full_detail(bundle: Bundle, camera: Camera) -> tuple[Splats, np.ndarray | None]:
-    """All that there is, with the weights it keeps however far the camera is then pulled back.
-
-    Those are 1, but for rules whose weights always count: there they are those that the camera sees where it
-    stands, as splats without them are not what was trained.
-    """
-    if rule_of(bundle).always:
-        return select(bundle, camera.center, camera.focal, settings(bundle, {}))
-    return complete(bundle, bundle.levels[-1]), None
-
-
 def farther(evaluation: Evaluation, bundle: Bundle, values: Values) -> list[dict]:
-    """Held-out views, pulled back: splats drawn by distance and at full detail, and how alike they look.
+    """The evaluation's views, pulled back: splats drawn by distance and at full detail, how alike they look.
+
+    Weights at full detail are those that the view has before it is pulled back.
 
     Returns:
         For each of FACTORS ``factor``, ``drawn`` and ``drawn_full`` (splats in the image), and ``psnr`` of
         the picture by distance against that of full detail, means over views.
     """
-    rows = []
+    rows, full_detail = [], shown_at(bundle, bundle.levels[-1])
     for factor in FACTORS:
         found = []
         for camera in evaluation.cameras:
             view = pulled_back(camera, factor, evaluation.data.median_depth)
-            everything, fixed = full_detail(bundle, camera)
+            everything, fixed = full_detail(camera)
             full = evaluation.render(everything, view, fixed)
             chosen, weights = select(bundle, view.center, view.focal, values)
             some = evaluation.render(chosen, view, weights)
@@ -78,7 +68,7 @@ def jumps(evaluation: Evaluation, bundle: Bundle, values: Values, camera: Camera
         The largest jump, by what it is of: ``by distance``; where the rule's levels fade, ``faded`` and
         ``hard``, with levels switched on and off.
     """
-    everything, fixed = full_detail(bundle, camera)
+    everything, fixed = shown_at(bundle, bundle.levels[-1])(camera)
     views = [
         pulled_back(camera, factor, evaluation.data.median_depth)
         for factor in np.geomspace(FACTORS[0], FACTORS[-1], FRAMES)

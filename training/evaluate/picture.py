@@ -25,7 +25,7 @@ def level_picture(path: Path, bundle: Bundle, evaluation: Evaluation, camera: Ca
 
     Args:
         path: file to write.
-        camera: a held-out view.
+        camera: a view with its photograph.
         values: of the rule's controls, for what is chosen by distance; without use where there is no rule.
     """
     target = evaluation.target(camera)

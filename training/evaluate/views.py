@@ -1,10 +1,12 @@
-"""The held-out views of a scene: what pictures of splats are measured on."""
+"""The views of a scene that pictures of splats are measured on: held-out ones, where there are some."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -18,57 +20,95 @@ from ..splats.bundle import Bundle, Level
 from ..splats.gaussians import Splats
 from .metrics import psnr, ssim
 
+Item = TypeVar("Item")
+
+MOST_TRAINING_VIEWS = 24
+"""How many training views tell the quality of all."""
+
+Shown = tuple[Splats, np.ndarray | None]
+"""Splats and the weights on their opacities, (N,) in [0, 1]; None: all 1."""
+
+
+def evenly(items: Sequence[Item], most: int) -> list[Item]:
+    """At most so many of the items, evenly chosen, the first and the last among them."""
+    chosen = np.linspace(0, len(items) - 1, min(most, len(items)))
+    return [items[place] for place in chosen.round().astype(int)]
+
+
+def shown_at(bundle: Bundle, level: Level) -> Callable[[Camera], Shown]:
+    """What a camera is shown at full detail up to a level.
+
+    That is all that is drawn at the level, but for rules whose weights always count: there splats without
+    them are not what was trained, and each camera is shown what the rule gives it.
+    """
+    rule = find_rule(bundle.rule)
+    if rule is None or not rule.always:
+        everything = complete(bundle, level)
+        return lambda camera: (everything, None)
+    alone = replace(bundle, levels=bundle.upto(level.number))
+    values = settings(alone, {})
+    return lambda camera: select(alone, camera.center, camera.focal, values)
+
 
 class Evaluation:
-    """The held-out views of a scene, ready to be compared with.
+    """Views of a scene, ready to be compared with.
 
     Args:
-        data: the scene at training size; its ``test`` views are used.
+        data: the scene at training size.
         backend: rasterizer.
+
+    Attributes:
+        cameras: the held-out views; where none are, training views, ``MOST_TRAINING_VIEWS`` at most.
+        prefix: of the names that quality on ``cameras`` goes by: none, or ``train_`` for training views.
     """
 
     def __init__(self, data: TrainingData, backend: str = "auto") -> None:
         self.data, self.backend, self.device = data, backend, device_of(backend)
-        self.cameras = data.test
-        self._targets: dict[str, torch.Tensor] = {}
+        self.cameras = data.test or evenly(data.train, MOST_TRAINING_VIEWS)
+        self.prefix = "" if data.test else "train_"
+        self._training = {camera.image: index for index, camera in enumerate(data.train)}
+        self._targets: dict[Path | None, torch.Tensor] = {}
 
     def target(self, camera: Camera) -> torch.Tensor:
         """The photograph of a view, (H, W, 3)."""
-        if camera.name not in self._targets:
-            self._targets[camera.name] = torch.from_numpy(self.data.image(camera))
-        return self._targets[camera.name]
+        if camera.image in self._training:  # which a run at its end has read long ago
+            return self.data.target(self._training[camera.image]).image
+        if camera.image not in self._targets:
+            self._targets[camera.image] = torch.from_numpy(self.data.image(camera))
+        return self._targets[camera.image]
 
     def draw(self, splats: Splats, camera: Camera, weights: np.ndarray | None = None) -> torch.Tensor:
         """A picture of splats on black, (H, W, 3), on the CPU, with a weight on each splat's opacity."""
         return self.render(splats, camera, weights).image.cpu()
 
-    def render(
-        self,
-        splats: Splats,
-        camera: Camera,
-        weights: np.ndarray | None = None,
-        outputs: Collection[str] = (),
-    ) -> Rendering:
-        """The same with all that a rendering tells, and ``outputs`` of it (``rasterize.OUTPUTS``)."""
+    def render(self, splats: Splats, camera: Camera, weights: np.ndarray | None = None) -> Rendering:
+        """The same with all that a rendering tells."""
         with torch.no_grad():
             return rasterize(
                 Gaussians.of(splats, self.device),
                 camera,
                 weights=None if weights is None else torch.as_tensor(weights).to(self.device, torch.float32),
                 near=self.data.near,
-                outputs=outputs,
                 backend=self.backend,
             )
 
-    def measure(self, shown_to: Callable[[Camera], tuple[Splats, np.ndarray | None]]) -> dict:
-        """Mean quality, splats given to the rasterizer and seconds a frame over the held-out views.
+    def psnrs(self, cameras: Sequence[Camera], shown_to: Callable[[Camera], Shown]) -> np.ndarray:
+        """The PSNR of each of some views with a photograph, in dB, (V,)."""
+        found = []
+        for camera in cameras:
+            splats, weights = shown_to(camera)
+            found.append(psnr(self.draw(splats, camera, weights), self.target(camera)))
+        return np.array(found)
+
+    def measure(self, shown_to: Callable[[Camera], Shown]) -> dict:
+        """Mean quality, splats given to the rasterizer and seconds a frame over ``cameras``.
 
         Args:
-            shown_to: the splats that a camera is shown, with their weights.
+            shown_to: what a camera is shown.
 
         Returns:
             ``splats`` (mean count), ``drawn`` (of these in the image), ``psnr`` (dB), ``ssim``, ``frame_s``
-            (median, selection included).
+            (median, selection included); on training views ``train_psnr`` and ``train_ssim``.
         """
         counts = []
 
@@ -84,7 +124,7 @@ class Evaluation:
         return {"splats": round(float(np.mean(splats))), "drawn": round(float(np.mean(drawn))), **quality}
 
     def measure_pictures(self, picture: Callable[[Camera], torch.Tensor]) -> dict:
-        """``psnr``, ``ssim`` and ``frame_s`` as :meth:`measure`, of pictures however they are made."""
+        """Quality and ``frame_s`` as :meth:`measure`, of pictures however they are made."""
         rows = []
         for camera in self.cameras:
             started = time.perf_counter()
@@ -94,8 +134,8 @@ class Evaluation:
             rows.append((psnr(image, target), ssim(image, target), seconds))
         table = np.array(rows)
         return {
-            "psnr": round(float(table[:, 0].mean()), 3),
-            "ssim": round(float(table[:, 1].mean()), 4),
+            f"{self.prefix}psnr": round(float(table[:, 0].mean()), 3),
+            f"{self.prefix}ssim": round(float(table[:, 1].mean()), 4),
             "frame_s": round(float(np.median(table[:, 2])), 4),
         }
 
@@ -105,12 +145,4 @@ class Evaluation:
 
     def measure_level(self, bundle: Bundle, level: Level) -> dict:
         """The same of all that is drawn at a level; by the bundle's rule where its weights always count."""
-        rule = find_rule(bundle.rule)
-        if rule is None or not rule.always:
-            return self.measure_set(complete(bundle, level))
-        alone = replace(bundle, levels=bundle.upto(level.number))
-        return self.measure_by_distance(alone, settings(alone, {}))
-
-    def measure_set(self, splats: Splats) -> dict:
-        """The same for one set of splats that every view is shown."""
-        return self.measure(lambda camera: (splats, None))
+        return self.measure(shown_at(bundle, level))

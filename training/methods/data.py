@@ -59,8 +59,8 @@ class TrainingData:
                 "Check that the image folder holds the photographs that the model names.",
             )
         self.scene, self.exposure = scene, exposure
-        self.train = [_shrunk(camera, image_scale) for camera in train]
-        self.test = [_shrunk(camera, image_scale) for camera in test]
+        self.train = [camera.scaled(image_scale) for camera in train]
+        self.test = [camera.scaled(image_scale) for camera in test]
         self._targets: dict[tuple[int, int], Target] = {}
         self._room = IMAGE_MEMORY
 
@@ -115,7 +115,7 @@ class TrainingData:
 
     def camera(self, view: int, shrink: int = 1) -> Camera:
         """A training view, its image ``shrink`` times smaller: what one as far away would see."""
-        return self.train[view] if shrink == 1 else _shrunk(self.train[view], 1 / shrink)
+        return self.train[view] if shrink == 1 else self.train[view].scaled(1 / shrink)
 
     def target(self, view: int, shrink: int = 1) -> Target:
         """The ground truth of a training view, ``shrink`` times smaller, ready for the loss."""
@@ -128,7 +128,3 @@ class TrainingData:
                 self._room -= size
                 self._targets[view, shrink] = target
         return target
-
-
-def _shrunk(camera: Camera, scale: float) -> Camera:
-    return camera.resized(max(int(camera.width * scale), 1), max(int(camera.height * scale), 1))

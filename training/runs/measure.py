@@ -1,4 +1,4 @@
-"""Measuring a finished run on its held-out views: every level, and what its rule chooses by distance."""
+"""Measuring a finished run: every level, what its rule chooses by distance, and how it looks a step aside."""
 
 from __future__ import annotations
 
@@ -8,13 +8,17 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LodgsError
+from ..evaluate.aside import veil
 from ..evaluate.distance import farther, jumps
 from ..evaluate.picture import level_picture
-from ..evaluate.views import Evaluation
+from ..evaluate.summary import summary
+from ..evaluate.views import Evaluation, shown_at
+from ..evaluate.words import summary_lines
 from ..files import atomic_write
 from ..lod.rule import Values, find_rule
 from ..lod.selection import select, settings, unknown_rule
 from ..methods import create
+from ..scenes.aside import read_aside
 from ..splats.bundle import read_bundle
 from .data import training_data
 from .folder import RunFolder
@@ -33,39 +37,51 @@ def evaluate_run(
         far: measure also how levels do from farther away (``evaluate.distance``).
 
     Returns:
-        ``levels``: coarse to fine, ``level``, its facts, ``splats``, ``psnr``, ``ssim``, ``frame_s``; where
-        levels add up, of each with all coarser ones. ``selective``: per view and predetermined (chosen from
-        the mean training camera), with the values of the rule's controls; none where the levels have no rule.
-        ``curve``: the same for each value of the rule's ``sweep``, where it has one. ``networks``: of a model
-        that was baked, before that. ``farther`` and ``jumps`` (of the middle
-        held-out view), where asked for.
+        Of all levels, ``levels``: coarse to fine, ``level``, its facts, ``splats``, ``drawn``, ``psnr``,
+        ``ssim``, ``frame_s``, ``veil``; where levels add up, of each with all coarser ones. Of the finest,
+        ``train_psnr``, ``veil``, ``oversized``, ``worst`` (``evaluate.summary``), and ``aside`` where the
+        scene has views off its path (``scenes.aside``): their mean ``psnr`` and the names of the ``views``.
+        By the rule, ``selective``: per view and predetermined (chosen from the mean training camera), with
+        the values of the rule's controls; none where the levels have no rule. ``curve``: the same for each
+        value of the rule's ``sweep``, where it has one. ``networks``: of a model that was baked, before that.
+        ``farther`` and ``jumps`` (of the middle view), where asked for.
+
+        Where no views are held out, ``test_views`` is empty, there is no ``worst``, and quality is of
+        training views: it is called ``train_psnr`` and ``train_ssim`` throughout.
 
     Raises:
-        LodgsError: if the run is not finished or holds out no views, or its rule has no such control.
+        LodgsError: if the run is not finished, its rule has no such control, or a view off the path cannot be
+            read.
     """
     folder = RunFolder(run)
     if not folder.bundle.exists():
         raise LodgsError(f"{run} holds no finished run (no bundle.ply).", "Train it to the end first.")
     job = Job.from_file(folder.job)
     data = training_data(job, folder)
-    if not data.test:
-        raise LodgsError(f"The run {run} holds out no views to measure on.", "Train with test_every = 8.")
     evaluation, bundle = Evaluation(data, job.backend), read_bundle(folder.bundle)
     rule = find_rule(bundle.rule)
     if rule is None and (given or bundle.rule):
         raise LodgsError(*unknown_rule(bundle.rule))
+    aside = [camera.scaled(job.image_scale) for camera in read_aside(data.scene.folder)]
+    *coarser, finest = bundle.levels
+    measured = summary(evaluation, bundle)
+    veils = [veil(evaluation, shown_at(bundle, level)) for level in coarser] + [measured["veil"]]
     levels = [
-        {"level": level.number, **level.facts, **evaluation.measure_level(bundle, level)}
-        for level in bundle.levels
+        {"level": level.number, **level.facts, **evaluation.measure_level(bundle, level), "veil": veiled}
+        for level, veiled in zip(bundle.levels, veils, strict=True)
     ]
     report = {
         "scene": job.scene,
         "method": job.method,
         "rule": bundle.rule,
         "test_views": [camera.name for camera in data.test],
+        **measured,
         "levels": levels,
         "selective": [],
     }
+    if aside:
+        quality = float(evaluation.psnrs(aside, shown_at(bundle, finest)).mean())
+        report["aside"] = {"psnr": round(quality, 3), "views": [camera.name for camera in aside]}
     values = settings(bundle, given or {}) if rule else {}
     if rule:
         predetermined = select(bundle, data.mean_camera, data.focal, values)
@@ -83,7 +99,7 @@ def evaluate_run(
         with np.load(folder.model, allow_pickle=False) as arrays:
             method.load_arrays(arrays)
         report["networks"] = evaluation.measure_pictures(method.picture)
-    middle = data.test[len(data.test) // 2]
+    middle = evaluation.cameras[len(evaluation.cameras) // 2]
     if far and rule:
         report["farther"] = farther(evaluation, bundle, values)
         report["jumps"] = jumps(evaluation, bundle, values, middle)
@@ -96,8 +112,9 @@ def evaluate_run(
 
 def table(report: dict) -> str:
     """``evaluate_run``'s report as text."""
-    measured = ("splats", "drawn", "psnr", "ssim", "frame_s")
-    lines = [f"{'':>28} {'splats':>9} {'PSNR':>7} {'SSIM':>7} {'s/frame':>8}"]
+    quality = [f"{'' if report['test_views'] else 'train_'}{name}" for name in ("psnr", "ssim")]
+    measured = ("splats", "drawn", *quality, "frame_s", "veil")
+    lines = [f"{'':>28} {'splats':>9} {'PSNR':>7} {'SSIM':>7} {'s/frame':>8} {'veiled':>7}"]
     rows = []
     for row in report["levels"]:
         facts = "".join(f", {k} {v:.5g}" for k, v in row.items() if k not in ("level", *measured))
@@ -112,12 +129,16 @@ def table(report: dict) -> str:
         rows.append((f"{name} = {value:g}, {row['drawn']:,} drawn", row))
     if "networks" in report:
         rows.append(("with networks", {"splats": 0, **report["networks"]}))
-    lines += [
-        f"{name:<28} {r['splats']:>9,} {r['psnr']:>7.2f} {r['ssim']:>7.4f} {r['frame_s']:>8.3f}"
-        if r
-        else name
-        for name, r in rows
-    ]
+    for name, row in rows:
+        if row is None:
+            lines.append(name)
+            continue
+        psnr, ssim = (row[each] for each in quality)
+        veiled = f" {row['veil']['mean']:>7.1%}" if "veil" in row else ""
+        lines.append(
+            f"{name:<28} {row['splats']:>9,} {psnr:>7.2f} {ssim:>7.4f} {row['frame_s']:>8.3f}{veiled}"
+        )
+    lines += summary_lines(report)
     for row in report.get("farther", []):
         lines.append(
             f"{row['factor']}x the distance: {row['drawn']:,} of {row['drawn_full']:,} splats drawn, "

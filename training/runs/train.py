@@ -20,6 +20,7 @@ import torch
 from .. import VERSION
 from ..errors import LodgsError
 from ..evaluate.metrics import psnr
+from ..evaluate.summary import summary
 from ..evaluate.views import Evaluation
 from ..files import atomic_write
 from ..lod.rule import find_rule
@@ -100,8 +101,10 @@ def _train(job: Job, folder: RunFolder, events: Events) -> int:
     with _stop_signals() as stopped:
         if not run.to_the_end(stopped):
             return CANCELLED
-    run.write_bundle()
-    events("done", bundle=folder.bundle.name, seconds=round(time.monotonic() - started, 1))
+    bundle = run.write_bundle()
+    seconds = round(time.monotonic() - started, 1)
+    events("status", message="Measuring the result")
+    events("done", bundle=folder.bundle.name, seconds=seconds, **summary(run.evaluation, bundle))
     return DONE
 
 
@@ -167,7 +170,7 @@ class _Run:
                 last_checkpoint = time.monotonic()
         return True
 
-    def write_bundle(self) -> None:
+    def write_bundle(self) -> Bundle:
         """All levels, as they were written one by one, in one file."""
         levels = [
             Level(record["level"], read_ply(self.folder.path / record["path"]), record["facts"])
@@ -179,13 +182,14 @@ class _Run:
         if arrays := self.method.arrays():
             with atomic_write(self.folder.model) as temporary, open(temporary, "wb") as file:
                 np.savez(file, **arrays)
-            if self.evaluation.cameras:
+            if self.data.test:
                 before = self.evaluation.measure_pictures(self.method.picture)["psnr"]
                 after = self.evaluation.measure_by_distance(bundle, settings(bundle, {}))["psnr"]
                 meta |= {"neural_psnr": before, "baked_psnr": after}
                 message = f"Held-out views: {before:.2f} dB with networks, {after:.2f} dB baked for Blender."
                 self._warn(message)
         write_bundle(self.folder.bundle, bundle)
+        return bundle
 
     def _without_splats(self) -> Bundle:
         """What the method says of its levels, as a bundle that has none yet."""
@@ -225,7 +229,7 @@ class _Run:
                 "splats": len(level.splats),
                 "facts": level.facts,
             }
-            quality = self.evaluation.measure_level(bundle, level) if self.evaluation.cameras else {}
+            quality = self.evaluation.measure_level(bundle, level)
             self.events(
                 "level", **(quality | record), rule=bundle.rule, scene_facts=bundle.facts,
                 cumulative=bundle.cumulative, meta=bundle.meta, again=level.number in known,

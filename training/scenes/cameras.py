@@ -83,6 +83,10 @@ class Camera:
             fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy,
         )  # fmt: skip
 
+    def scaled(self, share: float) -> Camera:
+        """The same view, its image this share of the size, in whole pixels."""
+        return self.resized(max(int(self.width * share), 1), max(int(self.height * share), 1))
+
     def within(self, matrix: np.ndarray) -> tuple[Camera, float]:
         """This view of a world as seen from inside an object in it: pixels stay the same.
 

@@ -39,7 +39,7 @@ def camera() -> Camera:
 
 @pytest.fixture
 def evaluation(camera) -> Evaluation:
-    data = SimpleNamespace(test=[camera], median_depth=5.0, near=0.01)
+    data = SimpleNamespace(train=[], test=[camera], median_depth=5.0, near=0.01)
     return Evaluation(data, "cpu")  # pyright: ignore[reportArgumentType]
 
 

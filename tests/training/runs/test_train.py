@@ -88,6 +88,7 @@ def test_every_line_is_an_event_and_the_file_holds_the_same(unbroken):
     assert printed == folder.events()[0]
     kinds = [event["event"] for event in printed]
     assert kinds[0] == "hello" and kinds[-1] == "done"
+    assert {"train_psnr", "veil", "oversized", "worst"} <= printed[-1].keys()
     assert {event["level"] for event in folder.levels()} == {1, 2, 3}
     assert folder.state() == "done"
     last = folder.last("progress")
