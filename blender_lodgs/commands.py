@@ -12,6 +12,7 @@ from pathlib import Path
 import bpy
 
 from ..training.errors import LodgsError
+from ..training.evaluate.words import summary_lines
 from ..training.methods.describe import describe_method, describe_methods
 from ..training.runs.options import add_options, job_from
 from ..training.splats.bundle import describe, write_bundle
@@ -94,6 +95,8 @@ def _train(args: argparse.Namespace) -> int:
     watch = jobs.start_or_resume(root, job)
     with _interrupts():
         jobs.follow(watch, _Bar())
+    for line in summary_lines(watch.summary):
+        _print(line)
     for warning in watch.warnings:
         _print(f"warning: {warning}")
     if args.blend:

@@ -8,10 +8,25 @@ from typing import Any
 import bpy
 
 from ...training.methods import METHODS, PRESETS, MethodInfo, method_info
+from ...training.runs.job import Job
+from . import photographs
 
 _WHOLE_MOST, _MOST = 2**31 - 1, 3.4e38
 _LEAST = 1e-6
 """The smallest number above 0 that Blender shows."""
+
+FEW = 40
+"""Photographs below which every one is needed to train on."""
+
+
+def hold_out(root: bpy.types.Object) -> int:
+    """Of how many photographs the root's next training holds one out: what is set, or affordable; 0: none."""
+    settings = root.lodgs.training
+    return settings.test_every if settings.use_test_every else settings.preset_test_every
+
+
+def _affordable(settings: bpy.types.PropertyGroup) -> int:
+    return 0 if len(photographs.views(settings.id_data)) < FEW else Job.test_every
 
 
 def offered(method: str) -> list[Field]:
@@ -45,27 +60,31 @@ def _property(f: Field, label: str, **options) -> Any:
     return bpy.props.FloatProperty(min=low, max=min(high, _MOST), subtype=subtype, **options)
 
 
-def _properties_of(f: Field, method: str) -> dict[str, Any]:
-    """Three properties: the artist's value, whether there is one, and the preset's, to show until then."""
-    name, label = f.name, f.metadata["label"] or f.name.replace("_", " ").title()
-    about = f.metadata["about"].removesuffix(".")  # Blender adds one
-    preset_value = _preset_value(f, method)
+def _use(name: str, label: str, description: str) -> Any:
+    """A box to tick for a value of the artist's own: it begins as what was taken before, and is forgotten."""
 
     def set_use(group: bpy.types.PropertyGroup, use: bool) -> None:
         if not use:
             group.property_unset(name)
         elif not group.is_property_set(name):
-            setattr(group, name, preset_value(group))
+            setattr(group, name, getattr(group, f"preset_{name}"))
 
+    return bpy.props.BoolProperty(
+        name=f"Set {label}", description=description, get=lambda group: group.is_property_set(name),
+        set=set_use, options=set(),
+    )  # fmt: skip
+
+
+def _properties_of(f: Field, method: str) -> dict[str, Any]:
+    """Three properties: the artist's value, whether there is one, and the preset's, to show until then."""
+    name, label = f.name, f.metadata["label"] or f.name.replace("_", " ").title()
+    about = f.metadata["about"].removesuffix(".")  # Blender adds one
     tooltip = f"{about}. This is the preset's; tick the box to give another"
     return {
         name: _property(f, label, description=about, default=f.default),
-        f"use_{name}": bpy.props.BoolProperty(
-            name=f"Set {label}", description="Take a value of your own instead of the preset's",
-            get=lambda group: group.is_property_set(name), set=set_use, options=set(),
-        ),
-        f"preset_{name}": _property(f, label, description=tooltip, get=preset_value),
-    }  # fmt: skip
+        f"use_{name}": _use(name, label, "Take a value of your own instead of the preset's"),
+        f"preset_{name}": _property(f, label, description=tooltip, get=_preset_value(f, method)),
+    }
 
 
 def _parameters_of(method: MethodInfo) -> type[bpy.types.PropertyGroup]:
@@ -130,9 +149,19 @@ class TrainingSettings(bpy.types.PropertyGroup):
     test_every: bpy.props.IntProperty(
         name="Hold Out Every",
         description="Every n-th view by name is kept out of training to measure quality; 0 trains on all",
-        default=8,
+        default=Job.test_every,
         min=0,
         soft_max=16,
+    )
+    use_test_every: _use(
+        "test_every", "Hold Out Every", "Take a number of your own instead of the one for so many photographs"
+    )
+    preset_test_every: bpy.props.IntProperty(
+        name="Hold Out Every",
+        description=f"Every {Job.test_every}th view is kept out of training to measure quality, or none (0) "
+        f"where there are fewer than {FEW} photographs; tick the box to give another number",
+        get=_affordable,
+        options=set(),
     )
     seed: bpy.props.IntProperty(
         name="Seed", description="Two runs with the same seed are equal", default=0, min=0

@@ -5,9 +5,10 @@ from __future__ import annotations
 import bpy
 
 from ...training.errors import LodgsError
+from ...training.evaluate.words import summary_lines
 from ...training.methods import method_info
 from ..data import scenes
-from ..data.training import offered
+from ..data.training import hold_out, offered
 from ..runs import environment, jobs
 from ..runs.watch import Watch, watch_of
 from ..runs.words import level_line, progress_facts
@@ -56,7 +57,7 @@ class LODGS_PT_training_advanced(Panel):
         layout.use_property_split = True
         layout.use_property_decorate = False
         layout.prop(settings, "seed")
-        layout.prop(settings, "test_every")
+        _draw_parameter(layout, settings, "test_every")
         for f in offered(settings.method):
             _draw_parameter(layout, settings.parameters, f.name)
         layout.prop(settings, "model")
@@ -83,6 +84,8 @@ def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
         levels = parameters.levels  # 0: the scene decides
         text = f" in {levels} levels" if levels > 1 else ""
         column.label(text=f"{parameters.total_steps:,} steps{text}")
+        if not hold_out(root):
+            say(layout, "No photographs are held out: quality will be of training views.", "INFO")
     except LodgsError as error:
         say(layout, str(error), "ERROR")
         return
@@ -95,7 +98,7 @@ def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
 
 
 def _draw_parameter(layout: bpy.types.UILayout, group: bpy.types.PropertyGroup, name: str) -> None:
-    """A box to tick before the artist's value, or before the preset's, greyed."""
+    """A box to tick before the artist's value, or before that which is taken without one, greyed."""
     row = layout.row(align=True, heading=group.bl_rna.properties[name].name)
     row.prop(group, f"use_{name}", text="")
     value = row.row(align=True)
@@ -131,6 +134,8 @@ def _draw_ended(layout: bpy.types.UILayout, watch: Watch) -> None:
     column.scale_y = 0.8
     for number in sorted(watch.levels):
         column.label(text=level_line(watch.levels[number]), icon="BLANK1")
+    for line in summary_lines(watch.summary):
+        say(box, line, "BLANK1")
     if watch.problem:
         say(box, watch.problem, "ERROR")
     for warning in watch.warnings[-3:]:

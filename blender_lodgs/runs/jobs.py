@@ -25,7 +25,7 @@ from ...training.methods.parameters import Parameters
 from ...training.runs.folder import RunFolder
 from ...training.runs.job import Job
 from .. import extension
-from ..data.training import offered
+from ..data.training import hold_out, offered
 from . import environment, processes
 from .watch import OUTPUT, Watch, begin, root_by_uid, watch_of, watches
 
@@ -225,7 +225,7 @@ def make_job(root: bpy.types.Object, out: Path, parameters: dict) -> Job:
         "preset": settings.preset,
         "base": base_of(root),
         "seed": settings.seed,
-        "test_every": settings.test_every,
+        "test_every": hold_out(root),
         "image_scale": _as_typed(settings.image_scale),
         "backend": extension.preferences().backend,
         "parameters": changes(settings) | parameters,

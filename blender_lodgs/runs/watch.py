@@ -49,6 +49,7 @@ class Watch:
         problem: why the run failed, as a sentence with its remedy; empty when it did not.
         progress: the newest ``progress`` event.
         levels: the newest ``level`` event of each level.
+        summary: of a finished run the ``done`` event, with what it is worth.
         warnings: the warnings of this run.
         cancel_requested: whether it was asked to stop.
         method: what it trains.
@@ -64,6 +65,7 @@ class Watch:
     problem: str = ""
     progress: dict = field(default_factory=dict)
     levels: dict[int, dict] = field(default_factory=dict)
+    summary: dict = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     cancel_requested: bool = False
     method: str = ""
@@ -134,6 +136,7 @@ class Watch:
             case "level":
                 self._add_level(root, event)
             case "done":
+                self.summary = event
                 self._finish(root)
 
     def _add_level(self, root: bpy.types.Object, event: dict) -> None:
@@ -200,6 +203,8 @@ def begin(watch: Watch) -> Watch:
             watch.progress = event
         elif event["event"] == "level":
             watch.levels[event["level"]] = event
+        elif event["event"] == "done":
+            watch.summary = event
     watches[watch.root] = watch
     return watch
 

@@ -20,7 +20,10 @@ def progress_facts(progress: dict) -> dict[str, str]:
 
 def level_line(event: dict) -> str:
     """A ``level`` event in one line."""
-    quality = f", {event['psnr']:.1f} dB" if isinstance(event.get("psnr"), float) else ""
+    quality = ""
+    for name, views in (("train_psnr", " on training views"), ("psnr", "")):
+        if isinstance(event.get(name), float):
+            quality = f", {event[name]:.1f} dB{views}"
     return f"Level {event['level']}: {event['splats']:,} splats{quality}"
 
 

@@ -77,3 +77,43 @@ def test_every_method_has_a_group(bpy, lodgs):
             shown = {name: getattr(settings.parameters, f"preset_{name}") for name in info.offered}
             wanted = {name: getattr(info.preset(preset), name) for name in info.offered}
             assert shown == pytest.approx(wanted)  # Blender's numbers are float32
+
+
+@pytest.fixture
+def photographed(bpy):
+    """``photographed(40)``: a scene root with so many photographs."""
+
+    def make(count):
+        root = bpy.data.objects.new("root", None)
+        root.lodgs.is_root, root.lodgs.cameras = True, bpy.data.collections.new("cameras")
+        for number in range(count):
+            camera = bpy.data.cameras.new(f"{number}")
+            root.lodgs.cameras.objects.link(bpy.data.objects.new(f"{number}", camera))
+        return root
+
+    return make
+
+
+@pytest.mark.parametrize(("count", "every"), [(0, 0), (2, 0), (39, 0), (40, 8), (48, 8)])
+def test_photographs_are_held_out_where_there_are_enough(lodgs, photographed, count, every):
+    root, training = photographed(count), lodgs("data.training")
+    settings = root.lodgs.training
+    assert training.hold_out(root) == settings.preset_test_every == every and not settings.use_test_every
+    settings.use_test_every = True
+    assert training.hold_out(root) == settings.test_every == every
+    for own in (5, 0):
+        settings.test_every = own
+        assert training.hold_out(root) == own and settings.preset_test_every == every
+    settings.use_test_every = False
+    assert training.hold_out(root) == every
+
+
+def test_what_is_held_out_is_the_jobs(lodgs, photographed, tmp_path):
+    root, jobs = photographed(40), lodgs("runs.jobs")
+    root.lodgs.scene_folder = str(tmp_path)
+    assert jobs.make_job(root, tmp_path, {}).test_every == 8
+    cameras = root.lodgs.cameras.objects
+    cameras.unlink(cameras[0])
+    assert jobs.make_job(root, tmp_path, {}).test_every == 0
+    root.lodgs.training.test_every = 4
+    assert jobs.make_job(root, tmp_path, {}).test_every == 4

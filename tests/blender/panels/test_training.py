@@ -5,6 +5,8 @@ from types import SimpleNamespace
 
 import pytest
 
+NONE_HELD_OUT = "No photographs are held out: quality will be of training views."
+
 
 @pytest.fixture
 def root(bpy, tmp_path):
@@ -35,6 +37,9 @@ def test_before_training(root, draw, fake):
     assert notes.operators == ["lodgs.train"]
     assert notes.properties == ["method", "preset", "image_scale"]
     assert "4,300 steps in 5 levels" in notes.texts
+    assert NONE_HELD_OUT in notes.texts
+    root.lodgs.training.test_every = 8
+    assert NONE_HELD_OUT not in draw().texts
     root.lodgs.training.parameters.levels = 3
     assert "3,500 steps in 3 levels" in draw().texts
     root.lodgs.training.method = "3dgs"  # which has no levels
@@ -43,7 +48,7 @@ def test_before_training(root, draw, fake):
 
 def test_a_parameter_shows_the_presets_number_until_it_is_set(root, draw):
     settings = root.lodgs.training
-    common = ["seed", "test_every", "model", "images", "output"]
+    common = ["seed", "use_test_every", "preset_test_every", "model", "images", "output"]
 
     def shown():
         notes = draw("LODGS_PT_training_advanced")
@@ -114,6 +119,27 @@ def test_after_training(draw, watch, fake):
     notes = draw()
     assert {"Finished", "Level 1: 1,234 splats, 20.0 dB", "Level 2: 5 splats"} <= set(notes.texts)
     assert notes.operators == ["lodgs.train"]
+    watch.summary = {
+        "train_psnr": 35.8, "veil": {"mean": 0.1234, "max": 1.0}, "oversized": 1234,
+        "worst": {"view": "a.jpg", "psnr": 16.75},
+    }  # fmt: skip
+    measured = [
+        "Training views: 35.8 dB",
+        "Worst held-out view: 16.8 dB (a.jpg)",
+        "Between views: 12.3% veiled, 100.0% at worst",
+        "Oversized opaque splats: 1,234",
+    ]
+    texts = draw().texts
+    assert [text for text in texts if text in measured] == measured
+    del watch.summary["worst"]
+    watch.levels[1] = {"level": 1, "splats": 1234, "train_psnr": 20.04}
+    texts = draw().texts
+    assert "No views were held out: quality is of training views." in texts
+    assert "Level 1: 1,234 splats, 20.0 dB on training views" in texts
+    watch.summary = {}
+    nothing = draw().texts
+    watch.summary = {"train_psnr": None, "veil": {"mean": "much"}, "worst": 3, "oversized": 0}
+    assert draw().texts == nothing, "what is odd has no line"
     watch.state, watch.problem = "interrupted", "The trainer was killed."
     notes = draw()
     assert "The trainer was killed." in notes.texts

@@ -55,6 +55,7 @@ def test_training_brings_levels_and_facts(bpy, jobs, watch_of, fake, root, tmp_p
     run = tmp_path / "run"
     assert bpy.ops.lodgs.train(folder=str(run)) == {"FINISHED"}
     assert _levels(root) == COUNTS
+    assert watch_of(root).summary["train_psnr"] == 21.5
     positions = np.empty(COUNTS[2] * 3, np.float32)
     root.lodgs.levels[1].object.data.attributes["position"].data.foreach_get("vector", positions)
     assert np.array_equal(positions.reshape(-1, 3), splats(COUNTS[2]).means)
