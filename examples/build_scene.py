@@ -1,11 +1,10 @@
 """The lantern garden, modelled and rendered with Blender's own tools (the bpy module, Cycles on the CPU).
 
-    python -m examples.build_scene build/example          48 views, some ten minutes on two cores
-    python -m examples.write_model build/example examples/lantern_garden
+    python -m examples.build_scene build/example          88 views, some twenty minutes on two cores
 
-The first writes images/view_NN.png, positions/view_NN.exr (world positions of the surfaces that the pixels
-see) and garden.blend; the second makes the photographs and the COLMAP model of them. Lengths are metres, z is
-up, the table stands at the origin and the cameras look north (+y).
+It writes images/view_NN.png, positions/view_NN.exr (world positions of the surfaces that the pixels see) of
+every set of cameras that rig.py states, and garden.blend; write_model.py makes photographs and COLMAP models
+of them. Lengths are metres, z is up, the table stands at the origin and the arcs of cameras look north (+y).
 """
 
 # Blender's stubs give nodes, sockets, modifiers and object data their base classes' types.
@@ -707,6 +706,41 @@ def blossoms(points, size, colors, seed=0):
 # ------------------------------------------------------------------------------------------ the garden
 
 
+def flower_pot(at, r, number):
+    """A clay pot of radius r with flowers in it; number chooses their colours."""
+    x, y, z = at
+    profile = [
+        (0, 0),
+        (0.68 * r, 0),
+        (0.92 * r, 1.2 * r),
+        (1.06 * r, 1.2 * r),
+        (1.06 * r, 1.5 * r),
+        (0.92 * r, 1.5 * r),
+        (0.9 * r, 1.35 * r),
+        (0, 1.35 * r),
+    ]
+    pot = lathe("pot", profile, bpy.data.materials["clay"], at=at, segments=48)
+    pot.data.shade_flat()
+    soil = bpy.data.materials["soil"]
+    lathe("soil", [(0, 1.38 * r), (0.88 * r, 1.36 * r)], soil, at=at, segments=32)
+    angle, reach = rng.uniform(0, 6.3, 26), r * 0.8 * np.sqrt(rng.uniform(0, 1, 26))
+    roots = np.stack([x + reach * np.cos(angle), y + reach * np.sin(angle), np.full(26, z + 1.36 * r)], 1)
+    scatter(
+        "plant",
+        roots,
+        bpy.data.materials["leaf"],
+        blades=5,
+        height=r * 1.3,
+        width=r * 0.11,
+        lean=0.9,
+        colors=["#4c7030", "#6b8f3a", "#88a552"],
+        seed=20 + number,
+    )
+    tops = roots + rng.normal(size=(26, 3)) * [0.3 * r, 0.3 * r, 0.22 * r] + np.array([0, 0, r * 1.25])
+    petals = [["#e0526b", "#f2a0ae"], ["#f3d04e", "#f2ead8"], ["#8d6cc4", "#c9b2e6"], ["#e8743b", "#f3c04e"]]
+    blossoms(tops, r * 0.24, petals[number % 4], seed=number)
+
+
 def garden():
     """What stands around the table: lantern posts, pots, crates, stones, grass and flowers."""
     post = wood("post", ("#4b3220", "#6c4a2c", "#8a6440"), along=2)
@@ -732,47 +766,19 @@ def garden():
         height = 2.03 - 4 * 0.20 * t * (1 - t)
         paper_lantern((ends[0][0] + 3.1 * t, 0.95, height - 0.19 - 0.03 * math.sin(9 * t)), color)
 
-    clay = material("clay", ["#8f4a2b", "#b4643c", "#cf8558"], scale=9, bump=0.15, vary=0.15)
-    soil = material("soil", ["#2e2118", "#4a3626"], scale=30, bump=0.6)
-    petal = [["#e0526b", "#f2a0ae"], ["#f3d04e", "#f2ead8"], ["#8d6cc4", "#c9b2e6"], ["#e8743b", "#f3c04e"]]
-    leaf = bpy.data.materials["leaf"]
-    pots = [
-        (-1.25, -0.15, 0.19),
-        (-1.05, 0.62, 0.16),
-        (1.22, -0.1, 0.17),
-        (1.15, 0.55, 0.21),
-        (-0.55, -0.8, 0.13),
-        (0.78, -0.85, 0.14),
-    ]
-    for i, (x, y, r) in enumerate(pots):
-        profile = [
-            (0, 0),
-            (0.68 * r, 0),
-            (0.92 * r, 1.2 * r),
-            (1.06 * r, 1.2 * r),
-            (1.06 * r, 1.5 * r),
-            (0.92 * r, 1.5 * r),
-            (0.9 * r, 1.35 * r),
-            (0, 1.35 * r),
+    material("clay", ["#8f4a2b", "#b4643c", "#cf8558"], scale=9, bump=0.15, vary=0.15)
+    material("soil", ["#2e2118", "#4a3626"], scale=30, bump=0.6)
+    for i, (x, y, r) in enumerate(
+        [
+            (-1.25, -0.15, 0.19),
+            (-1.05, 0.62, 0.16),
+            (1.22, -0.1, 0.17),
+            (1.15, 0.55, 0.21),
+            (-0.55, -0.8, 0.13),
+            (0.78, -0.85, 0.14),
         ]
-        pot = lathe("pot", profile, clay, at=(x, y, 0.0), segments=48)
-        pot.data.shade_flat()
-        lathe("soil", [(0, 1.38 * r), (0.88 * r, 1.36 * r)], soil, at=(x, y, 0), segments=32)
-        angle, reach = rng.uniform(0, 6.3, 26), r * 0.8 * np.sqrt(rng.uniform(0, 1, 26))
-        roots = np.stack([x + reach * np.cos(angle), y + reach * np.sin(angle), np.full(26, 1.36 * r)], 1)
-        scatter(
-            "plant",
-            roots,
-            leaf,
-            blades=5,
-            height=r * 1.3,
-            width=r * 0.11,
-            lean=0.9,
-            colors=["#4c7030", "#6b8f3a", "#88a552"],
-            seed=20 + i,
-        )
-        tops = roots + rng.normal(size=(26, 3)) * [0.3 * r, 0.3 * r, 0.22 * r] + np.array([0, 0, r * 1.25])
-        blossoms(tops, r * 0.24, petal[i % 4], seed=i)
+    ):
+        flower_pot((x, y, 0.0), r, i)
 
     crate = wood("crate", ("#8a6a44", "#b08c5e", "#c9a878"), along=0)
     for x, y, turn in ((-1.75, 0.35, 0.35), (1.85, 0.1, -0.3)):
@@ -853,6 +859,25 @@ def garden():
         spots = meadow(2600, 1.8, 20)
         spots = spots[wobble(spots[:, :2], 60 + i, 0.8, 2) > 0.3]
         blossoms(spots + np.array([0, 0, 0.12]), 0.045, colors, seed=30 + i)
+
+
+def path_side():
+    """What stands along the path in the walk alone, within arm's reach: lanterns on poles, pots, pumpkins."""
+    post, colors = bpy.data.materials["post"], ("#f6b23c", "#5aa6a6", "#e8543f", "#f3d36b", "#d4577c")
+    for i, y in enumerate(np.arange(2.9, 9.2, 0.8)):
+        side = -1 if i % 2 else 1
+        x, _, z = on_ground(path_x(y) + 1.0 * side, y)
+        box("pole", (0.06, 0.06, 2.15), post, at=(x, y, z + 1.0))
+        box("arm", (0.36, 0.04, 0.04), post, at=(x - 0.14 * side, y, z + 2.0))
+        paper_lantern((x - 0.25 * side, y, z + 1.65 + 0.06 * math.sin(5 * i)), colors[i % 5], radius=0.12)
+        flower_pot((x + 0.02 * i, y - 0.22, z), 0.13 + 0.012 * (i % 4), i)
+        if i % 3 == 1:
+            pumpkin((x + 0.1 * side, y + 0.27, z), 0.15, "#d9781f")
+    for i, (x, y) in enumerate([(-0.15, 2.25), (1.75, 2.6), (-0.55, 1.55)]):
+        box("stool", (0.36, 0.36, 0.05), bpy.data.materials["crate"], at=(x, y, 0.62), turn=0.4 * i)
+        for dx, dy in itertools.product((-0.12, 0.12), repeat=2):
+            box("stool leg", (0.04, 0.04, 0.6), bpy.data.materials["crate"], at=(x + dx, y + dy, 0.3))
+        flower_pot((x, y, 0.645), 0.15, i + 1)
 
 
 # -------------------------------------------------------------------------------------------- far away
@@ -1118,8 +1143,8 @@ def set_up_rendering(samples: int, percentage: int):
     scene.collection.objects.link(scene.camera)
 
 
-def render(out: Path, views: list[int]):
-    """Picture and world positions of each view."""
+def render(out: Path, cameras: str, views: list[int] | None):
+    """Picture and world positions of each view of a set, or of some of them."""
     scene = bpy.context.scene
     scene.use_nodes = True
     tree = scene.node_tree
@@ -1129,14 +1154,14 @@ def render(out: Path, views: list[int]):
     tree.links.new(layers.outputs["Image"], picture.inputs["Image"])
     store.base_path = str(out / "positions")
     store.format.file_format, store.format.color_depth, store.format.exr_codec = "OPEN_EXR", "32", "ZIP"
-    store.file_slots[0].path = "view_##"
+    store.file_slots[0].path = f"{cameras}_##"
     tree.links.new(layers.outputs["Position"], store.inputs[0])
     scene.render.image_settings.file_format, scene.render.image_settings.color_mode = "PNG", "RGB"
-    poses = np.linalg.inv(rig.world_to_cameras()) @ np.diag([1.0, -1.0, -1.0, 1.0])
-    for view in views:
+    poses = np.linalg.inv(rig.world_to_cameras(cameras)) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    for view in range(len(poses)) if views is None else views:
         scene.frame_set(view)
         scene.camera.matrix_world = Matrix(poses[view].tolist())
-        scene.render.filepath = str(out / "images" / f"{rig.view_name(view)}.png")
+        scene.render.filepath = str(out / "images" / f"{rig.view_name(cameras, view)}.png")
         bpy.ops.render.render(write_still=True)
 
 
@@ -1147,13 +1172,17 @@ def main():
     parser.add_argument("out", type=Path)
     parser.add_argument("--samples", type=int, default=16)
     parser.add_argument("--percentage", type=int, default=100, help="of 480x320, for a quick look")
+    sets = list(rig.SETS)
+    parser.add_argument("--cameras", nargs="*", choices=sets, default=sets, help="only these sets")
     parser.add_argument("--views", type=int, nargs="*", help="only these; all by default")
     options = parser.parse_args()
     out = options.out.resolve()
     build()
     set_up_rendering(options.samples, options.percentage)
-    views = range(len(rig.world_to_cameras())) if options.views is None else options.views
-    render(out, list(views))
+    for cameras in sorted(options.cameras, key=sets.index):  # the walk last: it adds to the garden
+        if cameras == "walk":
+            path_side()
+        render(out, cameras, options.views)
     bpy.ops.wm.save_as_mainfile(filepath=str(out / "garden.blend"), compress=True)
 
 

@@ -1,7 +1,12 @@
-"""The cameras of the lantern garden: what the renderer uses and what the COLMAP model states. numpy only.
+"""The cameras of the lantern garden: what the renderer uses and what the COLMAP models state. numpy only.
 
-A photographer walks three arcs round the table, to and fro: close and low, in the middle, far and high.
-The walk starts a quarter along the first arc, so that every 8th view (held out) has neighbours on both sides.
+Three sets, each called by what the names of its pictures begin with:
+
+- ``view``   A photographer goes along three arcs round the table, to and fro: close and low, in the middle,
+  far and high. He starts a quarter along the first arc, so that every 8th view (held out) has neighbours on
+  both sides.
+- ``aside``  Some of these views, a step aside and turned: what somebody sees who leaves that way.
+- ``walk``   Somebody goes round the table and on up the path, at eye height, things close by on all sides.
 """
 
 from __future__ import annotations
@@ -17,11 +22,41 @@ ARCS = [
     (2.75, 1.70, 58.0, (0.0, 0.40, 1.32)),
     (3.50, 2.15, 54.0, (0.0, 0.60, 1.46)),
 ]
+# of which view; metres to the right, up and ahead; metres that the point looked at moves to the right and up
+ASIDE = [
+    (3, (0.0, -0.40, 0.10), (-0.15, -0.10)),
+    (0, (0.25, 0.0, 0.55), (-0.20, 0.0)),
+    (8, (-0.15, 0.45, 0.40), (0.25, -0.10)),
+    (11, (0.55, 0.05, 0.0), (-0.30, 0.0)),
+    (44, (-0.55, 0.05, 0.0), (0.30, -0.10)),
+    (20, (0.10, 0.80, -0.10), (0.30, -0.20)),
+    (16, (0.20, -0.65, 0.20), (-0.40, 0.0)),
+    (30, (-0.30, 0.15, -0.75), (0.50, 0.10)),
+    (41, (0.20, -0.80, -0.20), (-0.50, 0.0)),
+    (36, (0.10, 0.60, 0.45), (0.40, -0.20)),
+]
+# where the walker stands (x, y) and what he looks at (x, y, z), metres; from row to row takes equal time
+WALK = [
+    ((-2.35, 0.30), (0.2, 0.2, 0.95)),
+    ((-2.15, -0.75), (0.2, 0.3, 0.95)),
+    ((-1.20, -1.30), (0.2, 0.3, 0.95)),
+    ((0.00, -1.30), (0.0, 0.6, 1.00)),
+    ((1.30, -1.20), (0.0, 0.4, 1.00)),
+    ((2.15, -0.55), (0.2, 0.4, 1.00)),
+    ((2.35, 0.55), (0.4, 0.7, 1.10)),
+    ((1.95, 1.65), (0.0, 1.0, 1.20)),
+    ((1.05, 1.95), (-1.0, 2.2, 1.20)),
+    ((0.65, 2.70), (0.0, 6.0, 1.20)),
+    ((0.95, 3.80), (1.4, 8.0, 1.20)),
+    ((1.12, 5.10), (1.0, 9.0, 1.20)),
+]
+WALK_VIEWS = 30
+EYE_HEIGHT = 1.6
 LANTERN = np.array([-0.44, 0.16, 0.97])  # the heart of the lit lantern on the table: a landmark
 
 
-def eyes_and_targets() -> tuple[np.ndarray, np.ndarray]:
-    """Camera positions and the points they look at, (V, 3) float64 each, metres, in the order of views."""
+def arcs() -> tuple[np.ndarray, np.ndarray]:
+    """Eyes of the set ``view`` and the points they look at, (48, 3) float64 each, metres."""
     eyes, targets = [], []
     for arc, (radius, height, half_opening, target) in enumerate(ARCS):
         sweep = np.linspace(-1.0, 1.0, VIEWS_PER_ARC) * (-1.0 if arc % 2 else 1.0)
@@ -38,11 +73,30 @@ def eyes_and_targets() -> tuple[np.ndarray, np.ndarray]:
     return np.roll(np.concatenate(eyes), -start, axis=0), np.roll(np.concatenate(targets), -start, axis=0)
 
 
-def world_to_cameras() -> np.ndarray:
-    """Rigid transforms from the world (z up) to each camera (x right, y down, z forward), (V, 4, 4)."""
-    eyes, targets = eyes_and_targets()
-    forward = targets - eyes
-    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+def aside() -> tuple[np.ndarray, np.ndarray]:
+    """Eyes of the set ``aside`` and the points they look at, (10, 3) float64 each, metres."""
+    views, steps, shifts = (np.array(column) for column in zip(*ASIDE, strict=True))
+    eyes, targets = (points[views] for points in arcs())
+    right, down, ahead = np.moveaxis(look_at(eyes, targets)[:, :3, :3], 1, 0)  # each view's axes, (10, 3)
+    eyes = eyes + steps[:, :1] * right - steps[:, 1:2] * down + steps[:, 2:] * ahead
+    return eyes, targets + shifts[:, :1] * right - shifts[:, 1:] * down
+
+
+def walk() -> tuple[np.ndarray, np.ndarray]:
+    """Eyes of the set ``walk`` and the points they look at, (30, 3) float64 each, metres."""
+    time = np.linspace(0, len(WALK) - 1, WALK_VIEWS)
+    knots = np.arange(len(WALK))
+    eyes, targets = (
+        np.stack([np.interp(time, knots, column) for column in np.array(rows).T], axis=1)
+        for rows in zip(*WALK, strict=True)
+    )
+    height = EYE_HEIGHT + 0.06 * np.sin(2.3 * time)  # steps, and bending down a little
+    return np.column_stack([eyes, height]), targets
+
+
+def look_at(eyes: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Rigid transforms from the world (z up) to cameras (x right, y down, z forward), (V, 4, 4)."""
+    forward = (targets - eyes) / np.linalg.norm(targets - eyes, axis=1, keepdims=True)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     down = np.cross(forward, right)
@@ -53,9 +107,17 @@ def world_to_cameras() -> np.ndarray:
     return matrices
 
 
-def view_name(index: int) -> str:
-    """Name of a view without its ending: view_00, view_01, ..."""
-    return f"view_{index:02d}"
+SETS = {"view": arcs, "aside": aside, "walk": walk}
+
+
+def world_to_cameras(name: str) -> np.ndarray:
+    """The cameras of a set in the order of its views, as :func:`look_at` has them."""
+    return look_at(*SETS[name]())
+
+
+def view_name(name: str, index: int) -> str:
+    """Name of a picture of a set without its ending: view_00, view_01, ..."""
+    return f"{name}_{index:02d}"
 
 
 def project(points: np.ndarray, world_to_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
