@@ -66,7 +66,9 @@ def _parser() -> argparse.ArgumentParser:
     methods = commands.add_parser("methods", help="say which methods there are, or what one can be told")
     methods.add_argument("name", nargs="?", metavar="NAME", help="method whose parameters to list")
 
-    evaluate = commands.add_parser("evaluate", help="measure a finished run on its held-out views")
+    evaluate = commands.add_parser(
+        "evaluate", help="measure a finished run, also a step aside of its photographs"
+    )
     evaluate.add_argument("run", type=Path, help="run folder")
     _add_controls(evaluate)
     evaluate.add_argument("--picture", type=Path, help="PNG to write: the levels side by side from one view")

@@ -95,6 +95,18 @@ def test_every_line_is_an_event_and_the_file_holds_the_same(unbroken):
     assert last is not None and last["step"] == last["of"] == 70
 
 
+def test_without_held_out_views_a_run_measures_training_views_and_says_so(tiny_scene, tmp_path):
+    keys = {
+        "scene": str(tiny_scene), "out": str(tmp_path / "run"), "image_scale": 1.0, "test_every": 0,
+        "method": "3dgs", "backend": "cpu", "parameters": {"steps": 5},
+    }  # fmt: skip
+    code, events = run_in_process(keys)
+    assert code == 0
+    (level,) = (event for event in events if event["event"] == "level")
+    assert "psnr" not in level and level["train_psnr"] == events[-1]["train_psnr"] > 5
+    assert "worst" not in events[-1] and 0 <= events[-1]["veil"]["mean"] <= events[-1]["veil"]["max"] <= 1
+
+
 def test_levels_and_bundle_agree_and_record_the_constraint(unbroken):
     folder = RunFolder(unbroken["keys"]["out"])
     bundle = read_bundle(folder.bundle)
