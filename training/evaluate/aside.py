@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import KDTree
+from scipy.special import expit
 
 from ..methods.data import TrainingData
 from ..scenes.cameras import Camera
-from .views import Evaluation, Shown, evenly
+from .views import Evaluation, ShownTo, evenly
 
 NEIGHBOURS = (1, 2, 4)
 """Which of a camera's nearest other cameras a place lies halfway to."""
 VEIL = 0.1
 """What is nearer than this share of the scene's median depth hangs before the scene."""
 OPAQUE = 0.5
-"""Opacity from which a splat hides what is behind it."""
+"""Opacity from which a splat, or what hangs before a pixel, hides what is behind it."""
 OVERSIZED = 0.5
 """Share of the scene's median depth that no opaque splat among the cameras should reach."""
 MOST_PLACES = 120
@@ -39,7 +40,7 @@ def halfway(cameras: Sequence[Camera]) -> list[Camera]:
     return found
 
 
-def veil(evaluation: Evaluation, shown_to: Callable[[Camera], Shown]) -> dict[str, float]:
+def veil(evaluation: Evaluation, shown_to: ShownTo) -> dict[str, float]:
     """Share of the pixels that something hangs before, seen from places halfway between training cameras.
 
     A pixel is veiled where its median depth, at which half of its light is stopped, is less than ``VEIL`` of
@@ -58,11 +59,11 @@ def veil(evaluation: Evaluation, shown_to: Callable[[Camera], Shown]) -> dict[st
         before = place.view_space(splats.means)[:, 2] < VEIL * evaluation.data.median_depth
         # only what hangs before is drawn: the depth at which half of the light is stopped is among it, or not
         near = evaluation.render(splats.select(before), place, None if weights is None else weights[before])
-        shares.append(float((near.alpha >= 0.5).float().mean()))
+        shares.append(float((near.alpha >= OPAQUE).float().mean()))
     return {"mean": round(float(np.mean(shares)), 5), "max": round(float(np.max(shares)), 5)}
 
 
-def oversized(data: TrainingData, shown_to: Callable[[Camera], Shown]) -> int:
+def oversized(data: TrainingData, shown_to: ShownTo) -> int:
     """How many opaque splats among the cameras have a standard deviation over half the median depth.
 
     Among the cameras is no farther from their mean than the scene's extent; opaque is, with its weight, what
@@ -72,7 +73,6 @@ def oversized(data: TrainingData, shown_to: Callable[[Camera], Shown]) -> int:
         min(data.train, key=lambda camera: np.linalg.norm(camera.center - data.mean_camera))
     )
     among = np.linalg.norm(splats.means - data.mean_camera, axis=1) <= data.extent
-    opacity = 1 / (1 + np.exp(-splats.opacity_logits.astype(np.float64)))
-    opaque = opacity * (1 if weights is None else weights) >= OPAQUE
+    opaque = expit(splats.opacity_logits) * (1 if weights is None else weights) >= OPAQUE
     large = splats.log_scales.max(axis=1) > np.log(OVERSIZED * data.median_depth)
     return int((among & opaque & large).sum())

@@ -25,8 +25,8 @@ Item = TypeVar("Item")
 MOST_TRAINING_VIEWS = 24
 """How many training views tell the quality of all."""
 
-Shown = tuple[Splats, np.ndarray | None]
-"""Splats and the weights on their opacities, (N,) in [0, 1]; None: all 1."""
+ShownTo = Callable[[Camera], tuple[Splats, np.ndarray | None]]
+"""What a camera is shown: splats, and the weights on their opacities, (N,) in [0, 1]; None: all 1."""
 
 
 def evenly(items: Sequence[Item], most: int) -> list[Item]:
@@ -35,7 +35,7 @@ def evenly(items: Sequence[Item], most: int) -> list[Item]:
     return [items[place] for place in chosen.round().astype(int)]
 
 
-def shown_at(bundle: Bundle, level: Level) -> Callable[[Camera], Shown]:
+def shown_at(bundle: Bundle, level: Level) -> ShownTo:
     """What a camera is shown at full detail up to a level.
 
     That is all that is drawn at the level, but for rules whose weights always count: there splats without
@@ -92,7 +92,7 @@ class Evaluation:
                 backend=self.backend,
             )
 
-    def psnrs(self, cameras: Sequence[Camera], shown_to: Callable[[Camera], Shown]) -> np.ndarray:
+    def psnrs(self, cameras: Sequence[Camera], shown_to: ShownTo) -> np.ndarray:
         """The PSNR of each of some views with a photograph, in dB, (V,)."""
         found = []
         for camera in cameras:
@@ -100,7 +100,7 @@ class Evaluation:
             found.append(psnr(self.draw(splats, camera, weights), self.target(camera)))
         return np.array(found)
 
-    def measure(self, shown_to: Callable[[Camera], Shown]) -> dict:
+    def measure(self, shown_to: ShownTo) -> dict:
         """Mean quality, splats given to the rasterizer and seconds a frame over ``cameras``.
 
         Args:

@@ -62,7 +62,7 @@ def evaluate_run(
     rule = find_rule(bundle.rule)
     if rule is None and (given or bundle.rule):
         raise LodgsError(*unknown_rule(bundle.rule))
-    aside = [camera.scaled(job.image_scale) for camera in read_aside(data.scene.folder)]
+    aside = [camera.scaled(job.image_scale) for camera in read_aside(Path(job.scene))]
     *coarser, finest = bundle.levels
     measured = summary(evaluation, bundle)
     veils = [veil(evaluation, shown_at(bundle, level)) for level in coarser] + [measured["veil"]]
