@@ -11,7 +11,8 @@ import pytest
 from PIL import Image
 
 from examples import rig
-from training.evaluate.aside import VEIL, halfway
+from training.evaluate.aside import VEIL
+from training.methods.support import halfway
 from training.scenes.aside import read_aside
 from training.scenes.colmap import read_scene
 

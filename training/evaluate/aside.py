@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-
 import numpy as np
-from scipy.spatial import KDTree
 from scipy.special import expit
 
 from ..methods.data import TrainingData
-from ..scenes.cameras import Camera
+from ..methods.support import halfway
 from .views import Evaluation, ShownTo, evenly
 
-NEIGHBOURS = (1, 2, 4)
-"""Which of a camera's nearest other cameras a place lies halfway to."""
 VEIL = 0.1
 """What is nearer than this share of the scene's median depth hangs before the scene."""
 OPAQUE = 0.5
@@ -22,22 +16,6 @@ OPAQUE = 0.5
 OVERSIZED = 0.5
 """Share of the scene's median depth that no opaque splat among the cameras should reach."""
 MOST_PLACES = 120
-
-
-def halfway(cameras: Sequence[Camera]) -> list[Camera]:
-    """Views from halfway between each camera and its 1st, 2nd and 4th nearest, looking as the camera does.
-
-    Places that need more cameras than there are do not exist.
-    """
-    centers = np.array([camera.center for camera in cameras])
-    found = []
-    order = np.asarray(KDTree(centers).query(centers, k=1 + max(NEIGHBOURS))[1])  # itself is the first
-    for camera, others in zip(cameras, order[:, list(NEIGHBOURS)], strict=True):
-        for other in others[others < len(cameras)]:  # those that do not exist are numbered beyond
-            pose = camera.world_to_camera.copy()
-            pose[:3, 3] = -pose[:3, :3] @ (camera.center + centers[other]) / 2
-            found.append(replace(camera, world_to_camera=pose, image=None))
-    return found
 
 
 def veil(evaluation: Evaluation, shown_to: ShownTo) -> dict[str, float]:

@@ -12,6 +12,7 @@ from ..rasterize import Target
 from ..scenes.cameras import Camera
 from ..scenes.colmap import Scene
 from ..scenes.images import load_image
+from .support import Support
 
 IMAGE_MEMORY = 2 << 30
 """Bytes of ground truth, with its cached moments, that are kept; further views are read when needed."""
@@ -34,7 +35,7 @@ class TrainingView:
     index: int
     camera: Camera
     target: Target
-    shrink: int = 1
+    shrink: float = 1
 
 
 class TrainingData:
@@ -61,7 +62,7 @@ class TrainingData:
         self.scene, self.exposure = scene, exposure
         self.train = [camera.scaled(image_scale) for camera in train]
         self.test = [camera.scaled(image_scale) for camera in test]
-        self._targets: dict[tuple[int, int], Target] = {}
+        self._targets: dict[tuple[int, float], Target] = {}
         self._room = IMAGE_MEMORY
 
     @cached_property
@@ -83,6 +84,11 @@ class TrainingData:
     def focal(self) -> float:
         """Focal length in pixels: the training views' median."""
         return float(np.median([camera.focal for camera in self.train]))
+
+    @cached_property
+    def support(self) -> Support:
+        """Where the training views leave room for splats."""
+        return Support(self.train, self.scene.points)
 
     @property
     def near(self) -> float:
@@ -109,15 +115,15 @@ class TrainingData:
         assert camera.image is not None
         return load_image(camera.image, camera.width, camera.height, exposure=self.exposure)
 
-    def view(self, index: int, shrink: int = 1) -> TrainingView:
+    def view(self, index: int, shrink: float = 1) -> TrainingView:
         """A training view by index, its image ``shrink`` times smaller."""
         return TrainingView(index, self.camera(index, shrink), self.target(index, shrink), shrink)
 
-    def camera(self, view: int, shrink: int = 1) -> Camera:
+    def camera(self, view: int, shrink: float = 1) -> Camera:
         """A training view, its image ``shrink`` times smaller: what one as far away would see."""
         return self.train[view] if shrink == 1 else self.train[view].scaled(1 / shrink)
 
-    def target(self, view: int, shrink: int = 1) -> Target:
+    def target(self, view: int, shrink: float = 1) -> Target:
         """The ground truth of a training view, ``shrink`` times smaller, ready for the loss."""
         target = self._targets.get((view, shrink))
         if target is None:

@@ -15,8 +15,12 @@ from ..scenes.cameras import Camera
 from ..splats.bundle import Level
 from ..splats.gaussians import Splats
 from .data import TrainingData, TrainingView
+from .density import require_rows
+from .exposure import Exposure
 from .model import Model
 from .parameters import Parameters
+from .schedules import due
+from .support import INTERVAL
 
 
 @dataclass
@@ -52,6 +56,7 @@ class Method(ABC, Generic[P, D]):
     ) -> None:
         self.data, self.parameters, self.seed, self.backend = data, parameters, seed, backend
         self.device = device_of(backend)
+        self.exposure = Exposure(len(data.train), parameters.lr_exposure, self.device)
         self.setup(base)
 
     @abstractmethod
@@ -112,15 +117,22 @@ class Method(ABC, Generic[P, D]):
         loss.backward()
         self.accumulate_stats(drawings, view, step)
         self.set_learning_rates(step)
-        for optimizer in self.optimizers():
+        for optimizer in (*self.optimizers(), *self.exposure.optimizers(step / self.steps)):
             optimizer.step()
             optimizer.zero_grad()
         self.control_density(step)
+        if due(INTERVAL, step + 1) or self.ends_level(step):
+            self.exposure.center()
+            self.keep_supported(step)
         return float(loss.detach()), drawings[0].rendering.image.detach(), view.target
 
     def choose_view(self, step: int) -> TrainingView:
         """The photograph of a step: every epoch shows each once."""
-        return self.data.view(self.data.training_view(step, self.seed))
+        return self.data.view(self.data.training_view(step, self.seed), self.shrink(step))
+
+    def shrink(self, step: int) -> float:
+        """How many times smaller the photograph of a step is."""
+        return 1
 
     @abstractmethod
     def draw(self, view: TrainingView, step: int) -> Sequence[D]:
@@ -134,7 +146,9 @@ class Method(ABC, Generic[P, D]):
         """
         weight = self.parameters.ssim_weight
         first, *others = (
-            photometric_loss(drawing.rendering.image, view.target, weight, backend=self.backend)
+            photometric_loss(
+                self.exposure(drawing.rendering.image, view.index), view.target, weight, backend=self.backend
+            )
             for drawing in drawings
         )
         return sum(others, first)
@@ -158,6 +172,29 @@ class Method(ABC, Generic[P, D]):
         Raises:
             LodgsError: none is left.
         """
+
+    def ends_level(self, step: int) -> bool:
+        """Whether a level, or the run, is finished after a step."""
+        return step + 1 == self.steps or self.level_at(step + 1) > self.level_at(step)
+
+    @torch.no_grad()
+    def keep_supported(self, step: int) -> None:
+        """Removes what stands in the way of the training views, and bounds how large splats are.
+
+        Raises:
+            LodgsError: none is left.
+        """
+        p, model, support = self.parameters, self.model, self.data.support
+        if not (p.free_depth or p.largest):
+            return
+        means = model["means"].detach().cpu().numpy()
+        distances = support.distances(means)
+        if p.largest:
+            most = torch.from_numpy(np.log(p.largest * distances + 1e-9)).to(model["log_scales"])
+            model["log_scales"].clamp_max_(most[:, None])
+        if p.free_depth:
+            model.keep(torch.from_numpy(~support.intruding(means, distances, p.free_depth)))
+            require_rows(model, step, "free_depth")
 
     # -- what methods draw with ------------------------------------------------------------------------
 
@@ -196,8 +233,9 @@ class Method(ABC, Generic[P, D]):
 
     def state_dict(self) -> dict:
         """Everything that the next step depends on, as tensors and numbers."""
-        return {"model": self.model.state_dict()}
+        return {"model": self.model.state_dict(), "exposure": self.exposure.state_dict()}
 
     def load_state_dict(self, state: dict) -> None:
         """Continues from what ``state_dict`` gave."""
         self.model.load_state_dict(state["model"])
+        self.exposure.load_state_dict(state["exposure"])

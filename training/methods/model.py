@@ -95,9 +95,14 @@ class Model:
         """Gives a trained tensor new values and zero moments."""
         self._replace(name, values, torch.zeros_like(values), torch.zeros_like(values))
 
-    def accumulate_stats(self, rendering: Rendering) -> None:
-        """After ``backward``: adds up image-plane gradients' norms, and how often each splat was drawn."""
-        self.stats["gradient_sum"] += rendering.grad2d.norm(dim=1)
+    def accumulate_stats(self, rendering: Rendering, shrink: float = 1) -> None:
+        """After ``backward``: adds up image-plane gradients' norms, and how often each splat was drawn.
+
+        Args:
+            shrink: how many times smaller the photograph was, which made gradients as many times larger (see
+                ``TrainingData.threshold_scale``).
+        """
+        self.stats["gradient_sum"] += rendering.grad2d.norm(dim=1) / shrink
         self.stats["seen"] += rendering.radii > 0
 
     def reset_stats(self) -> None:

@@ -61,6 +61,22 @@ class Parameters:
     )
     sh_interval: int = parameter(250, "Steps after which the next degree joins in.", unit="steps")
     ssim_weight: float = parameter(0.2, "Weight of D-SSIM against L1 in the loss.", high=1)
+    free_depth: float = parameter(
+        0.5,
+        "Nothing stands before a training view, or one halfway between two, that is nearer than this share "
+        "of the nearest points in it; 0 lets splats stand anywhere.",
+        high=1,
+    )
+    largest: float = parameter(
+        0.3,
+        "Largest standard deviation of a splat, as a share of its distance from the nearest training view; 0 "
+        "sets no bound.",
+    )
+    lr_exposure: float = parameter(
+        0.0,
+        "Learning rate of each photograph's own gain and offset of colours, which pictures do not have; for "
+        "photographs that differ in exposure or white balance. 0 learns none.",
+    )
     lr_means: float = parameter(
         3e-4,
         "Learning rate of positions, times the scene extent, at the start of a level (FLoD) or of the run.",
@@ -95,6 +111,15 @@ class Parameters:
 class DensityParameters(Parameters):
     """Those of methods that clone, split and prune as 3DGS does (``methods.density``)."""
 
+    first_resolution: float = parameter(
+        0.35,
+        "Photographs begin this much smaller, as a share of their side; 1 trains on their size throughout.",
+        above=0,
+        high=1,
+    )
+    full_resolution: float = parameter(
+        0.5, "Share of the steps after which photographs have their size.", high=1
+    )
     clone_extent: float = parameter(
         0.01, "Splats larger than this multiple of the scene extent are split, smaller ones cloned."
     )
@@ -117,7 +142,13 @@ STANDARD: dict[str, Any] = {
     "lr_scales": 5e-3,
 }
 """What presets *standard* take from 3DGS as published, but for its number of splats."""
-PAPER: dict[str, Any] = {
+AS_PUBLISHED: dict[str, Any] = {
+    "free_depth": 0.0,
+    "largest": 0.0,
+}
+"""What presets *paper* leave out, whatever the method: it is in none of the papers."""
+PAPER: dict[str, Any] = AS_PUBLISHED | {
+    "first_resolution": 1.0,
     "opacity_reset_interval": 3000,
     "grad_threshold": 2e-4,
     "max_splats": 5_000_000,

@@ -6,8 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from training.evaluate.aside import MOST_PLACES, VEIL, halfway, oversized, veil
+from training.evaluate.aside import MOST_PLACES, VEIL, oversized, veil
 from training.evaluate.views import Evaluation, evenly
+from training.methods.support import halfway
 from training.rasterize import Gaussians, rasterize
 from training.scenes.cameras import Camera
 from training.splats.gaussians import Splats

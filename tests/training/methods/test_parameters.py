@@ -75,3 +75,11 @@ def test_values_of_every_kind_are_taken_and_none_leaves_one_as_it_is():
 def test_what_is_not_possible_is_said_with_what_is(values, said):
     with pytest.raises(LodgsError, match=said):
         override(Made(), values)
+
+
+@pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
+def test_presets_of_the_papers_leave_out_what_is_in_no_paper(method):
+    paper, draft = method.preset("paper"), method.preset("draft")
+    assert (paper.free_depth, paper.largest, paper.lr_exposure) == (0, 0, 0)
+    assert draft.free_depth > 0 and draft.largest > 0
+    assert getattr(paper, "first_resolution", 1) == 1

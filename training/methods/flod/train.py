@@ -19,7 +19,7 @@ from ..data import TrainingView
 from ..density import constrained_log, densify, prune, reset_opacities
 from ..method import Drawing
 from ..model import Model, splat_rates
-from ..schedules import due, log_linear
+from ..schedules import due, log_linear, shrink_at
 from ..start import distinct, from_points, neighbour_distances, sampled
 from . import FlodParameters
 
@@ -65,13 +65,17 @@ class Method(method.Method[FlodParameters, Drawing]):
 
     # -- a step ----------------------------------------------------------------------------------------
 
+    def shrink(self, step: int) -> float:
+        p = self.parameters
+        return shrink_at(step / self.steps, p.first_resolution, p.full_resolution)
+
     def draw(self, view: TrainingView, step: int) -> list[Drawing]:
         min_scale = self.s_min[self.level_at(step) - 1]
         return [Drawing(self.rasterize_model(view.camera, step, min_scale=min_scale))]
 
     def accumulate_stats(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> None:
         if self._local(step) < self._densify_until(step):
-            self.model.accumulate_stats(drawings[0].rendering)
+            self.model.accumulate_stats(drawings[0].rendering, view.shrink)
 
     def set_learning_rates(self, step: int) -> None:
         p = self.parameters

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from ...errors import LodgsError
 from ...splats.bundle import MOST_LEVELS
 from ..info import MethodInfo
-from ..parameters import STANDARD, Parameters, parameter
+from ..parameters import AS_PUBLISHED, STANDARD, Parameters, parameter
 
 
 @dataclass(frozen=True)
@@ -123,6 +123,7 @@ _DRAFT = OctreeParameters(lr_means=4e-4, lr_sh=5e-3)
 _STANDARD = replace(_DRAFT, **STANDARD, steps=30_000, lr_sh=2.5e-3, grow_interval=100)
 _PAPER = replace(
     _STANDARD,
+    **AS_PUBLISHED,
     steps=40_000,
     coarser_levels=0,
     narrowest=0.0,

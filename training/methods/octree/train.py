@@ -89,8 +89,7 @@ class Method(method.Method[OctreeParameters, Drawing]):
         if not self.schedule.counts(view, step):
             return
         rendering = drawings[0].rendering
-        rendering.grad2d /= view.shrink  # as TrainingData.threshold_scale has it for smaller photographs
-        self.model.accumulate_stats(rendering)
+        self.model.accumulate_stats(rendering, view.shrink)
         opacity = self.model["opacity_logits"].detach().sigmoid()
         self.model.stats["opacity_sum"] += torch.where(rendering.radii > 0, opacity, 0)
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from ...errors import LodgsError
 from ..info import MethodInfo
 from ..octree import OctreeParameters
-from ..parameters import parameter
+from ..parameters import AS_PUBLISHED, parameter
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,7 @@ _DRAFT = NeuralOctreeParameters(
 _STANDARD = replace(_DRAFT, steps=30_000, max_splats=2_000_000, offsets=10, grow_interval=100)
 _PAPER = replace(
     _STANDARD,
+    **AS_PUBLISHED,
     steps=40_000,
     max_splats=10_000_000,
     coarser_levels=0,

@@ -13,7 +13,7 @@ from ..data import TrainingView
 from ..density import densify, prune, require_rows, reset_opacities
 from ..method import Drawing
 from ..model import Model, splat_rates
-from ..schedules import due, log_linear
+from ..schedules import due, log_linear, shrink_at
 from ..start import distinct, from_points, sampled
 from . import ThreedgsParameters
 
@@ -33,12 +33,16 @@ class Method(method.Method[ThreedgsParameters, Drawing]):
         """The one level, at the end."""
         return [Level(1, self.model.splats())] if step + 1 == self.steps else []
 
+    def shrink(self, step: int) -> float:
+        p = self.parameters
+        return shrink_at(step / self.steps, p.first_resolution, p.full_resolution)
+
     def draw(self, view: TrainingView, step: int) -> list[Drawing]:
         return [Drawing(self.rasterize_model(view.camera, step))]
 
     def accumulate_stats(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> None:
         if step < self._densify_until:
-            self.model.accumulate_stats(drawings[0].rendering)
+            self.model.accumulate_stats(drawings[0].rendering, view.shrink)
 
     def set_learning_rates(self, step: int) -> None:
         p = self.parameters
