@@ -6,6 +6,10 @@ from ...splats.bundle import MOST_LEVELS
 from ..info import MethodInfo
 from ..parameters import PAPER, STANDARD, DensityParameters, parameter
 
+PAPER_FOOTPRINT = 40.0
+"""Pixels that the paper's lambda, 0.2 COLMAP units, covers at the median depth of its scenes, about. Its
+gamma of one pixel belongs to that; a run of another footprint records one in proportion."""
+
 
 @dataclass(frozen=True)
 class FlodParameters(DensityParameters):
@@ -17,7 +21,8 @@ class FlodParameters(DensityParameters):
     )
     footprint: float = parameter(
         16.0,
-        "Pixels that level 1's smallest size covers at the scene's median depth; sets lambda.",
+        "Pixels that level 1's smallest size covers at the scene's median depth; sets lambda, and the screen "
+        "size (gamma) that levels are chosen with by distance.",
         label="Coarsest Detail",
         above=0,
         unit="px",
@@ -67,7 +72,7 @@ _STANDARD = replace(
 _PAPER = replace(
     _STANDARD,
     **PAPER,
-    footprint=40.0,
+    footprint=PAPER_FOOTPRINT,
     steps=(10_000, 15_000, 20_000, 25_000, 30_000),
     densify_until=(0.5, 0.4, 0.4, 0.4, 0.5),
     densify_interval=(2000, 1000, 500, 500, 200),

@@ -11,6 +11,7 @@ import torch
 from scipy.spatial import KDTree
 
 from ...errors import LodgsError
+from ...lod.rule import every_control
 from ...lod.rules.bands import s_min_of
 from ...splats.bundle import Level
 from ...splats.gaussians import Splats
@@ -21,7 +22,7 @@ from ..method import Drawing
 from ..model import Model, splat_rates
 from ..schedules import due, log_linear
 from ..start import distinct, from_points, neighbour_distances, sampled
-from . import FlodParameters
+from . import PAPER_FOOTPRINT, FlodParameters
 
 
 class Method(method.Method[FlodParameters, Drawing]):
@@ -59,9 +60,23 @@ class Method(method.Method[FlodParameters, Drawing]):
             self.rise_to(number + 1)
         return [finished]
 
+    @property
+    def footprint(self) -> float:
+        """Pixels that level 1's smallest size covers at the scene's median depth."""
+        return self.s_min[0] * self.data.focal / self.data.median_depth
+
+    def controls(self) -> dict[str, float]:
+        """A gamma with which levels change over at the paper's share of the median depth.
+
+        d_proj(l) = s_min(l) / gamma * f (Eq. 8) is footprint / gamma * rho**(1 - l) median depths, so it is
+        the ratio that has to be the paper's.
+        """
+        gamma = every_control()["gamma"]
+        value = np.clip(self.footprint / PAPER_FOOTPRINT, gamma.low, gamma.high)
+        return {gamma.name: float(f"{value:.6g}")}  # as many digits as Blender keeps
+
     def meta(self) -> dict:
-        footprint = self.s_min[0] * self.data.focal / self.data.median_depth
-        return {"rho": self.parameters.rho, **super().meta(), "footprint_px": footprint}
+        return {"rho": self.parameters.rho, **super().meta(), "footprint_px": self.footprint}
 
     # -- a step ----------------------------------------------------------------------------------------
 

@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from training.errors import LodgsError
+from training.lod.rule import every_control
 from training.methods.data import TrainingData
-from training.methods.flod import METHOD
+from training.methods.flod import METHOD, PAPER_FOOTPRINT
 from training.methods.flod.train import Method, apart
 from training.methods.parameters import override
 from training.rasterize import rasterize
@@ -26,6 +27,24 @@ def test_footprint_is_in_pixels_at_the_median_depth(data):
 
 def test_an_absolute_constraint_is_taken_as_it_is(data):
     assert make(data, s_min_1=0.125).s_min == pytest.approx([0.125, 0.03125, 0])
+
+
+@pytest.mark.parametrize(
+    "values", [{}, {"footprint": 16.0}, {"s_min_1": 0.125}, {"footprint": 90.0, "rho": 3.0}]
+)
+def test_levels_change_over_where_the_papers_do_whatever_the_footprint(data, values):
+    """In median depths; the paper's is 40 pixels, where gamma is 1 (Eq. 8)."""
+    flod = make(data, **values)
+    (gamma,) = flod.controls().values()
+    borders = [s_min / gamma * data.focal / data.median_depth for s_min in flod.s_min]
+    rho = flod.parameters.rho
+    assert borders == pytest.approx([40, 40 / rho, 0], rel=1e-5)
+
+
+def test_gamma_stays_possible(data):
+    for s_min_1 in (1e-9, 1e9):
+        (gamma,) = make(data, s_min_1=s_min_1).controls().values()
+        assert every_control()["gamma"].checked(gamma) == gamma
 
 
 @pytest.mark.slow
@@ -137,6 +156,7 @@ def test_gradients_are_averaged_over_the_views_that_saw_a_splat(data):
 
 def test_a_preset_of_the_paper_is_the_papers():
     paper = METHOD.preset("paper")
+    assert paper.footprint / PAPER_FOOTPRINT == 1  # gamma
     assert paper.steps == (10_000, 15_000, 20_000, 25_000, 30_000)
     until = [share * steps for share, steps in zip(paper.densify_until, paper.steps, strict=True)]
     assert until == pytest.approx([5000, 6000, 8000, 10000, 15000])
