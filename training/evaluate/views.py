@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ..lod.rule import Values, find_rule
-from ..lod.selection import complete, select, settings
+from ..lod.selection import Choice, complete, settings
 from ..methods.data import TrainingData
 from ..rasterize import Gaussians, Rendering, device_of, rasterize
 from ..scenes.cameras import Camera
@@ -38,13 +38,19 @@ class Evaluation:
             self._targets[camera.name] = torch.from_numpy(self.data.image(camera))
         return self._targets[camera.name]
 
-    def draw(self, splats: Splats, camera: Camera, weights: np.ndarray | None = None) -> torch.Tensor:
+    def load(self, splats: Splats | Gaussians) -> Gaussians:
+        """Splats where they are drawn, for those that are drawn again and again."""
+        return splats if isinstance(splats, Gaussians) else Gaussians.of(splats, self.device)
+
+    def draw(
+        self, splats: Splats | Gaussians, camera: Camera, weights: np.ndarray | None = None
+    ) -> torch.Tensor:
         """A picture of splats on black, (H, W, 3), on the CPU, with a weight on each splat's opacity."""
         return self.render(splats, camera, weights).image.cpu()
 
     def render(
         self,
-        splats: Splats,
+        splats: Splats | Gaussians,
         camera: Camera,
         weights: np.ndarray | None = None,
         outputs: Collection[str] = (),
@@ -52,7 +58,7 @@ class Evaluation:
         """The same with all that a rendering tells, and ``outputs`` of it (``rasterize.OUTPUTS``)."""
         with torch.no_grad():
             return rasterize(
-                Gaussians.of(splats, self.device),
+                self.load(splats),
                 camera,
                 weights=None if weights is None else torch.as_tensor(weights).to(self.device, torch.float32),
                 near=self.data.near,
@@ -60,27 +66,27 @@ class Evaluation:
                 backend=self.backend,
             )
 
-    def measure(self, shown_to: Callable[[Camera], tuple[Splats, np.ndarray | None]]) -> dict:
-        """Mean quality, splats given to the rasterizer and seconds a frame over the held-out views.
+    def measure(self, shown_to: Callable[[Camera], tuple[Gaussians, np.ndarray | None]]) -> dict:
+        """Mean quality, splats that have a weight and seconds a frame over the held-out views.
 
         Args:
-            shown_to: the splats that a camera is shown, with their weights.
+            shown_to: the splats that a camera is shown, with their weights (None: all 1).
 
         Returns:
             ``splats`` (mean count), ``drawn`` (of these in the image), ``psnr`` (dB), ``ssim``, ``frame_s``
             (median, selection included).
         """
-        counts = []
+        found = []
 
         def picture(camera: Camera) -> torch.Tensor:
             splats, weights = shown_to(camera)
             rendering = self.render(splats, camera, weights)
-            counts.append((len(splats), rendering.radii))
+            found.append((len(splats) if weights is None else weights, rendering.radii))
             return rendering.image.cpu()
 
         quality = self.measure_pictures(picture)
-        drawn = [int((radii > 0).sum()) for _, radii in counts]
-        splats = [count for count, _ in counts]
+        drawn = [int((radii > 0).sum()) for _, radii in found]
+        splats = [given if isinstance(given, int) else np.count_nonzero(given > 0) for given, _ in found]
         return {"splats": round(float(np.mean(splats))), "drawn": round(float(np.mean(drawn))), **quality}
 
     def measure_pictures(self, picture: Callable[[Camera], torch.Tensor]) -> dict:
@@ -101,7 +107,9 @@ class Evaluation:
 
     def measure_by_distance(self, bundle: Bundle, values: Values) -> dict:
         """The same of what each view is shown of a bundle by its rule, with these values of the controls."""
-        return self.measure(lambda camera: select(bundle, camera.center, camera.focal, values))
+        choice = Choice(bundle)
+        splats = self.load(choice.splats)
+        return self.measure(lambda camera: (splats, choice.weights(camera.center, camera.focal, values)))
 
     def measure_level(self, bundle: Bundle, level: Level) -> dict:
         """The same of all that is drawn at a level; by the bundle's rule where its weights always count."""
@@ -111,6 +119,7 @@ class Evaluation:
         alone = replace(bundle, levels=bundle.upto(level.number))
         return self.measure_by_distance(alone, settings(alone, {}))
 
-    def measure_set(self, splats: Splats) -> dict:
+    def measure_set(self, splats: Splats, weights: np.ndarray | None = None) -> dict:
         """The same for one set of splats that every view is shown."""
-        return self.measure(lambda camera: (splats, None))
+        loaded = self.load(splats)
+        return self.measure(lambda camera: (loaded, weights))
