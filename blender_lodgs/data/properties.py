@@ -139,6 +139,11 @@ class SplatScene(bpy.types.PropertyGroup):
     meta: bpy.props.StringProperty(
         name="Further Facts", description="What else is known of the levels, as JSON", options={"HIDDEN"}
     )
+    recorded: bpy.props.StringProperty(
+        name="Recorded",
+        description="What the file or the run records of the rule's controls, as JSON",
+        options={"HIDDEN"},
+    )
     cumulative: bpy.props.BoolProperty(
         name="Cumulative",
         description="Each level only holds what it adds to the coarser ones",

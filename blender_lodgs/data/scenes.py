@@ -17,7 +17,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...training.errors import LodgsError
-from ...training.lod.rule import find_rule
+from ...training.lod.rule import Control, find_rule
 from ...training.lod.selection import complete, unknown_rule
 from ...training.scenes.colmap import Scene, read_scene
 from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder
@@ -147,10 +147,6 @@ def import_splats(
         set_bundle_facts(root, bundle)
         root.lodgs.single_level = bundle.levels[-1].number
         _follow_finest(root)
-        rule = find_rule(bundle.rule)
-        for control in rule.controls if rule else ():
-            if control.name in bundle.controls:
-                setattr(root.lodgs.controls, control.name, control.checked(bundle.controls[control.name]))
     if bundle.rule and not root.lodgs.by_distance:
         warn(" ".join(unknown_rule(bundle.rule)))
     return root
@@ -159,13 +155,15 @@ def import_splats(
 def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
     """Takes over what a bundle says beside its splats. Levels whose objects are gone leave the list.
 
-    The bundle may have levels without splats, or none at all while they are on their way.
+    Controls take the values that it records, but for those that somebody has set. The bundle may have levels
+    without splats, or none at all while they are on their way.
     """
     settings, rule = root.lodgs, find_rule(bundle.rule)
     if rule is not None and rule.always and settings.rule != bundle.rule:
         settings.mode = "SELECTIVE"
     settings.method, settings.rule, settings.cumulative = bundle.method, bundle.rule, bundle.cumulative
     settings.facts, settings.meta = json.dumps(bundle.facts), json.dumps(bundle.meta)
+    _record_controls(root, bundle.controls)
     facts = {level.number: level.facts for level in bundle.levels}
     for item in settings.levels:
         if item.number in facts:
@@ -345,26 +343,47 @@ def _extent(scene: Scene) -> float:
 
 
 def _set_controls(root: bpy.types.Object) -> dict[str, float]:
-    """The values of the rule's controls that somebody has set, by name."""
+    """The values of the rule's controls that are not the rule's own, by name."""
     rule, controls = find_rule(root.lodgs.rule), root.lodgs.controls
     if rule is None or controls is None:
         return {}
     numbers = [item.number for item in root.lodgs.levels if item.exists]
     following = {"finest": numbers[-1], "coarsest": numbers[0]}
-    values = {control: getattr(controls, control.name) for control in rule.controls}
+    values = {control: _value(root, control) for control in rule.controls}
     return {
-        # Blender's floats are shorter than the files'
-        control.name: int(value) if control.whole else float(f"{value:.7g}")
+        control.name: value
         for control, value in values.items()
         if value not in (control.default, following.get(control.follows))
     }
 
 
-def _follow_finest(root: bpy.types.Object) -> None:
-    """Controls that name the finest level go along with it."""
-    rule = find_rule(root.lodgs.rule)
+def _record_controls(root: bpy.types.Object, values: dict[str, float]) -> None:
+    """What a bundle or a run records of its rule's controls; those that nobody has set take these values."""
+    rule, before = find_rule(root.lodgs.rule), selection.read_facts(root.lodgs.recorded)
     for control in rule.controls if rule else ():
-        if control.follows == "finest":
+        begun, begins = (
+            control.checked(each.get(control.name, control.default)) for each in (before, values)
+        )
+        if begins != begun and _value(root, control) == _short(begun):
+            setattr(root.lodgs.controls, control.name, begins)
+    root.lodgs.recorded = json.dumps(values)
+
+
+def _value(root: bpy.types.Object, control: Control) -> float:
+    """What a control is set to."""
+    return _short(getattr(root.lodgs.controls, control.name))
+
+
+def _short(value: float) -> float:
+    """A number to as many digits as Blender's floats have, which are shorter than the files'."""
+    return value if isinstance(value, int) else float(f"{value:.7g}")
+
+
+def _follow_finest(root: bpy.types.Object) -> None:
+    """Controls that name the finest level go along with it, where no other is recorded."""
+    rule, recorded = find_rule(root.lodgs.rule), selection.read_facts(root.lodgs.recorded)
+    for control in rule.controls if rule else ():
+        if control.follows == "finest" and control.name not in recorded:
             setattr(root.lodgs.controls, control.name, root.lodgs.levels[-1].number)
 
 

@@ -156,7 +156,7 @@ class Watch:
         """What a level's event says of all levels, without them."""
         return Bundle(
             self.method, [], str(event.get("rule", "")), event.get("scene_facts", {}),
-            cumulative=bool(event.get("cumulative")), meta=event["meta"],
+            event.get("controls", {}), bool(event.get("cumulative")), event["meta"],
         )  # fmt: skip
 
     def _finish(self, root: bpy.types.Object) -> None:

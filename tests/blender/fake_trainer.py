@@ -91,7 +91,8 @@ def run(mode: str, job: Job, folder: RunFolder, say: Events) -> int:
         write_ply(path, levels[-1].splats)
         say(
             "level", level=number, path=f"levels/{path.name}", splats=count, psnr=20.0,
-            facts=levels[-1].facts, rule="bands", scene_facts={}, cumulative=False, meta={},
+            facts=levels[-1].facts, rule="bands", scene_facts={}, controls={"gamma": 2.0},
+            cumulative=False, meta={},
         )  # fmt: skip
         if mode == "killed":
             os.kill(os.getpid(), signal.SIGKILL)

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from ..lod.rule import Values, find_rule
-from ..lod.selection import complete, select, settings
+from ..lod.selection import Choice, complete, settings
 from ..methods.data import TrainingData
 from ..rasterize import Gaussians, Rendering, device_of, rasterize
 from ..scenes.cameras import Camera
@@ -26,7 +26,7 @@ MOST_TRAINING_VIEWS = 24
 """How many training views tell the quality of all."""
 
 ShownTo = Callable[[Camera], tuple[Splats, np.ndarray | None]]
-"""What a camera is shown: splats, and the weights on their opacities, (N,) in [0, 1]; None: all 1."""
+"""What a camera is shown: splats, the same for all, and the weights on their opacities, (N,) in [0, 1]; None: 1."""
 
 
 def evenly(items: Sequence[Item], most: int) -> list[Item]:
@@ -46,8 +46,8 @@ def shown_at(bundle: Bundle, level: Level) -> ShownTo:
         everything = complete(bundle, level)
         return lambda camera: (everything, None)
     alone = replace(bundle, levels=bundle.upto(level.number))
-    values = settings(alone, {})
-    return lambda camera: select(alone, camera.center, camera.focal, values)
+    choice, values = Choice(alone), settings(alone, {})
+    return lambda camera: (choice.splats, choice.weights(camera.center, camera.focal, values))
 
 
 class Evaluation:
@@ -77,15 +77,23 @@ class Evaluation:
             self._targets[camera.image] = torch.from_numpy(self.data.image(camera))
         return self._targets[camera.image]
 
-    def draw(self, splats: Splats, camera: Camera, weights: np.ndarray | None = None) -> torch.Tensor:
+    def load(self, splats: Splats | Gaussians) -> Gaussians:
+        """Splats where they are drawn, for those that are drawn again and again."""
+        return splats if isinstance(splats, Gaussians) else Gaussians.of(splats, self.device)
+
+    def draw(
+        self, splats: Splats | Gaussians, camera: Camera, weights: np.ndarray | None = None
+    ) -> torch.Tensor:
         """A picture of splats on black, (H, W, 3), on the CPU, with a weight on each splat's opacity."""
         return self.render(splats, camera, weights).image.cpu()
 
-    def render(self, splats: Splats, camera: Camera, weights: np.ndarray | None = None) -> Rendering:
+    def render(
+        self, splats: Splats | Gaussians, camera: Camera, weights: np.ndarray | None = None
+    ) -> Rendering:
         """The same with all that a rendering tells."""
         with torch.no_grad():
             return rasterize(
-                Gaussians.of(splats, self.device),
+                self.load(splats),
                 camera,
                 weights=None if weights is None else torch.as_tensor(weights).to(self.device, torch.float32),
                 near=self.data.near,
@@ -100,27 +108,27 @@ class Evaluation:
             found.append(psnr(self.draw(splats, camera, weights), self.target(camera)))
         return np.array(found)
 
-    def measure(self, shown_to: ShownTo) -> dict:
-        """Mean quality, splats given to the rasterizer and seconds a frame over ``cameras``.
+    def measure(self, shown_to: Callable[[Camera], tuple[Gaussians, np.ndarray | None]]) -> dict:
+        """Mean quality, splats that have a weight and seconds a frame over ``cameras``.
 
         Args:
-            shown_to: what a camera is shown.
+            shown_to: the splats that a camera is shown, with their weights (None: all 1).
 
         Returns:
             ``splats`` (mean count), ``drawn`` (of these in the image), ``psnr`` (dB), ``ssim``, ``frame_s``
             (median, selection included); on training views ``train_psnr`` and ``train_ssim``.
         """
-        counts = []
+        found = []
 
         def picture(camera: Camera) -> torch.Tensor:
             splats, weights = shown_to(camera)
             rendering = self.render(splats, camera, weights)
-            counts.append((len(splats), rendering.radii))
+            found.append((len(splats) if weights is None else weights, rendering.radii))
             return rendering.image.cpu()
 
         quality = self.measure_pictures(picture)
-        drawn = [int((radii > 0).sum()) for _, radii in counts]
-        splats = [count for count, _ in counts]
+        drawn = [int((radii > 0).sum()) for _, radii in found]
+        splats = [given if isinstance(given, int) else np.count_nonzero(given > 0) for given, _ in found]
         return {"splats": round(float(np.mean(splats))), "drawn": round(float(np.mean(drawn))), **quality}
 
     def measure_pictures(self, picture: Callable[[Camera], torch.Tensor]) -> dict:
@@ -141,8 +149,17 @@ class Evaluation:
 
     def measure_by_distance(self, bundle: Bundle, values: Values) -> dict:
         """The same of what each view is shown of a bundle by its rule, with these values of the controls."""
-        return self.measure(lambda camera: select(bundle, camera.center, camera.focal, values))
+        choice = Choice(bundle)
+        splats = self.load(choice.splats)
+        return self.measure(lambda camera: (splats, choice.weights(camera.center, camera.focal, values)))
 
     def measure_level(self, bundle: Bundle, level: Level) -> dict:
         """The same of all that is drawn at a level; by the bundle's rule where its weights always count."""
-        return self.measure(shown_at(bundle, level))
+        shown = shown_at(bundle, level)
+        loaded = self.load(shown(self.cameras[0])[0])  # of all cameras the same, but for their weights
+        return self.measure(lambda camera: (loaded, shown(camera)[1]))
+
+    def measure_set(self, splats: Splats, weights: np.ndarray | None = None) -> dict:
+        """The same for one set of splats that every view is shown."""
+        loaded = self.load(splats)
+        return self.measure(lambda camera: (loaded, weights))

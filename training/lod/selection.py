@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -62,7 +63,9 @@ def settings(bundle: Bundle, given: Values) -> Values:
 def select(
     bundle: Bundle, eye: np.ndarray, focal_px: float, values: Values
 ) -> tuple[Splats, np.ndarray | None]:
-    """The splats of a bundle that an eye is shown by its rule, and their weights (None: all 1).
+    """A copy of the splats of a bundle that an eye is shown by its rule, and their weights (None: all 1).
+
+    For one eye after another see :class:`Choice`.
 
     Args:
         eye: (3,) world position that distances are measured from.
@@ -82,17 +85,49 @@ def select(
 
 def select_levels(bundle: Bundle, eye: np.ndarray, focal_px: float, values: Values) -> list[Shown]:
     """The same level by level, coarse to fine; levels of which nothing is shown have no splats."""
-    rule, shown = rule_of(bundle), []
-    scene, levels = bundle.facts, [(level.number, level.facts) for level in bundle.levels]
-    for level in bundle.levels:
-        splats = level.splats
-        columns = _columns(rule, splats)
-        facts = facts_of(rule, scene, levels, level.number)
-        weights = rule.weights(splats.means, np.asarray(eye, np.float32), focal_px, columns, facts, values)
+    shown = []
+    of_levels = Choice(bundle).of_levels(eye, focal_px, values)
+    for level, weights in zip(bundle.levels, of_levels, strict=True):
         some = weights > 0
-        weights = weights[some]
-        shown.append(Shown(level.number, splats.select(some), None if (weights == 1).all() else weights))
+        splats, weights = level.splats.select(some), weights[some]
+        shown.append(Shown(level.number, splats, None if (weights == 1).all() else weights))
     return shown
+
+
+class Choice:
+    """A bundle's levels, to choose from for one eye after another: weights alone, and no copy of a splat.
+
+    What a rule needs to know is gathered once. Whoever draws keeps ``splats`` where they are drawn, on a GPU
+    for example; splats of weight 0 cost a rasterizer next to nothing.
+
+    Raises:
+        LodgsError: as :func:`rule_of`, or the rule's facts are incomplete.
+    """
+
+    def __init__(self, bundle: Bundle) -> None:
+        self._rule, self._levels = rule_of(bundle), bundle.levels
+        numbered = [(level.number, level.facts) for level in bundle.levels]
+        self._known = [
+            (_columns(self._rule, level.splats), facts_of(self._rule, bundle.facts, numbered, level.number))
+            for level in bundle.levels
+        ]
+
+    @cached_property
+    def splats(self) -> Splats:
+        """The splats of all levels, coarse to fine."""
+        return Splats.concatenated([level.splats for level in self._levels])
+
+    def of_levels(self, eye: np.ndarray, focal_px: float, values: Values) -> list[np.ndarray]:
+        """The weights of each level's splats; arguments as of :func:`select`."""
+        eye = np.asarray(eye, np.float32)
+        return [
+            self._rule.weights(level.splats.means, eye, focal_px, columns, facts, values)
+            for level, (columns, facts) in zip(self._levels, self._known, strict=True)
+        ]
+
+    def weights(self, eye: np.ndarray, focal_px: float, values: Values) -> np.ndarray:
+        """The weights (N,) of ``splats``; those of weight 0 are not to be drawn."""
+        return np.concatenate(self.of_levels(eye, focal_px, values))
 
 
 def _columns(rule: Rule, splats: Splats) -> dict[str, np.ndarray]:

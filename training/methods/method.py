@@ -92,6 +92,10 @@ class Method(ABC, Generic[P, D]):
         """What the method's rule has to know of the scene, by the names that the rule declares."""
         return {}
 
+    def controls(self) -> dict[str, float]:
+        """Values of the rule's controls that pictures of this run begin with; of others the rule's own."""
+        return {}
+
     def meta(self) -> dict:
         """What a bundle records of this run. Methods add to it."""
         data = self.data

@@ -87,7 +87,7 @@ def evaluate_run(
         predetermined = select(bundle, data.mean_camera, data.focal, values)
         report["selective"] = [
             {"set": "per view", **values, **evaluation.measure_by_distance(bundle, values)},
-            {"set": "predetermined", **values, **evaluation.measure(lambda camera: predetermined)},
+            {"set": "predetermined", **values, **evaluation.measure_set(*predetermined)},
         ]
     if rule and rule.sweep:
         name, steps = rule.sweep

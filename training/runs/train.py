@@ -200,7 +200,7 @@ class _Run:
             [],
             info.rule,
             method.facts(),
-            {},
+            method.controls(),
             rule is not None and rule.cumulative,
             method.meta(),
         )
@@ -232,8 +232,8 @@ class _Run:
             quality = self.evaluation.measure_level(bundle, level)
             self.events(
                 "level", **(quality | record), rule=bundle.rule, scene_facts=bundle.facts,
-                cumulative=bundle.cumulative, meta=bundle.meta, again=level.number in known,
-                more=place < len(levels),
+                controls=bundle.controls, cumulative=bundle.cumulative, meta=bundle.meta,
+                again=level.number in known, more=place < len(levels),
             )  # fmt: skip
             known[level.number] = record
         self.levels = [known[number] for number in sorted(known)]

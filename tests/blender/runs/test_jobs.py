@@ -68,6 +68,23 @@ def test_training_brings_levels_and_facts(bpy, jobs, watch_of, fake, root, tmp_p
     assert watch.progress["of"] == 10_000
 
 
+def test_controls_begin_with_what_a_run_records_until_somebody_sets_them(
+    bpy, lodgs, jobs, fake, root, tmp_path
+):
+    fake()
+    assert root.lodgs.bands.gamma == 1.0
+    bpy.ops.lodgs.train(folder=str(tmp_path / "first"))
+    assert root.lodgs.bands.gamma == 2.0
+    scenes, Bundle = lodgs("data.scenes"), lodgs("training.splats.bundle").Bundle
+    scenes.set_bundle_facts(root, Bundle("flod", [], "bands", {}, {"gamma": 0.4}))
+    assert root.lodgs.bands.gamma == pytest.approx(0.4), "nobody has set it"
+    assert scenes.read_levels(root).controls == {"gamma": 0.4}
+    root.lodgs.bands.gamma = 0.7
+    bpy.ops.lodgs.train(folder=str(tmp_path / "second"))
+    assert root.lodgs.bands.gamma == pytest.approx(0.7)
+    assert scenes.read_levels(root).controls == {"gamma": 0.7}
+
+
 def test_settings_become_the_job(bpy, lodgs, jobs, fake, root, tmp_path):
     settings = root.lodgs.training
     settings.method, settings.preset, settings.seed = "flod", "standard", 7

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from training.errors import LodgsError
-from training.lod.rule import Control, every_control, facts_of, find_rule, rules
-from training.lod.selection import select, select_levels, settings
+from training.lod.rule import Control, distances, every_control, facts_of, find_rule, rules
+from training.lod.selection import Choice, select, select_levels, settings
 from training.splats.bundle import Bundle, Level, read_bundle, read_folder, write_bundle, write_folder
 from training.splats.gaussians import Splats
 
@@ -67,6 +67,49 @@ def test_files_give_back_the_rule_its_facts_and_the_same_choice(name, tmp_path):
             for a, b in zip(one, other, strict=True):
                 np.testing.assert_array_equal(a.splats.means, b.splats.means)
                 np.testing.assert_array_equal(a.weights, b.weights)
+
+
+@pytest.mark.parametrize("name", RULES)
+@pytest.mark.parametrize("seed", range(5))
+def test_an_eye_is_shown_what_the_rule_gives_weight_bit_for_bit(name, seed):
+    """One choice for many eyes, a copy for one eye, and the rule asked level by level are the same."""
+    bundle, rule, rng = bundle_of(name), rules()[name], np.random.default_rng(seed)
+    choice, levels = Choice(bundle), [(level.number, level.facts) for level in bundle.levels]
+    for _ in range(10):
+        eye, focal = rng.normal(0, 6, 3), rng.uniform(0.5, 9)
+        given = {}
+        for control in rule.controls:
+            low, high = (control.low, min(control.high, 4)) if control.whole else control.soft or (1, 4)
+            value = rng.uniform(low, high)
+            given[control.name] = round(value) if control.whole else value
+        if "first" in given:
+            given["first"], given["last"] = sorted((given["first"], given["last"]))
+        values = settings(bundle, given)
+        expected = []
+        for level in bundle.levels:
+            columns = {n: level.splats.extras[n] for n in rule.columns if n != "opacity"}
+            columns["opacity"] = 1 / (1 + np.exp(-level.splats.opacity_logits))
+            facts = facts_of(rule, bundle.facts, levels, level.number)
+            expected.append(rule.weights(level.splats.means, np.float32(eye), focal, columns, facts, values))
+        weights = np.concatenate(expected)
+        np.testing.assert_array_equal(choice.weights(eye, focal, values), weights)
+        copied, its_weights = select(bundle, eye, focal, values)
+        shown = weights > 0
+        for name_of in ("means", "sh", "log_scales"):
+            np.testing.assert_array_equal(getattr(copied, name_of), getattr(choice.splats, name_of)[shown])
+        np.testing.assert_array_equal(
+            np.ones(len(copied)) if its_weights is None else its_weights, weights[shown]
+        )
+
+
+def test_distances_are_those_of_float64():
+    rng = np.random.default_rng(1)
+    means, eye = rng.normal(0, 50, (1000, 3)).astype(np.float32), rng.normal(0, 50, 3).astype(np.float32)
+    exact = np.linalg.norm(means.astype(np.float64) - eye.astype(np.float64), axis=1)
+    found = distances(means, eye)
+    assert found.dtype == np.float32 and distances(means[:0], eye).shape == (0,)
+    np.testing.assert_allclose(found, exact, rtol=3e-7)
+    np.testing.assert_array_equal(distances(np.asfortranarray(means), eye), found)
 
 
 @pytest.mark.parametrize("name", RULES)

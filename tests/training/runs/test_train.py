@@ -38,7 +38,8 @@ def method_of(keys: dict) -> type:
 def lasting(keys: dict, total: int) -> dict:
     """The job's keys with another number of steps in all, a multiple of 3."""
     steps = [total // 3] * 3 if keys["method"] == "flod" else total
-    return {**keys, "parameters": {**keys["parameters"], "steps": steps}}
+    further = {"finish_share": 0.0} if keys["method"] == "flod" else {}
+    return {**keys, "parameters": {**keys["parameters"], "steps": steps, **further}}
 
 
 def command(path: Path, keys: dict) -> list[str]:
@@ -48,7 +49,8 @@ def command(path: Path, keys: dict) -> list[str]:
 
 TINY = {
     "flod": {
-        "levels": 3, "steps": [20, 20, 30], "footprint": 6.0, "densify_interval": 5, "prune_interval": 10,
+        "levels": 3, "steps": [14, 16, 20], "finish_share": 0.4, "footprint": 6.0, "densify_interval": 5,
+        "prune_interval": 10,
         "overlap_interval": 10, "sh_interval": 15, "grad_threshold": 1e-5, "max_splats": 300,
     },
     "octree": {
@@ -135,7 +137,7 @@ def test_training_makes_the_pictures_better(unbroken):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("step", [3, 23, 44])
+@pytest.mark.parametrize("step", [3, 23, 44, 61])
 def test_a_killed_run_resumes_to_the_same_bits(unbroken, tmp_path, step):
     keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
     environment = {**os.environ, "LODGS_CHECKPOINT_SECONDS": "0"}  # a checkpoint after every step
@@ -155,7 +157,7 @@ def test_a_killed_run_resumes_to_the_same_bits(unbroken, tmp_path, step):
     assert folder.bundle.read_bytes() == unbroken["bundle"]
 
 
-@pytest.mark.parametrize("at", [7, 33])
+@pytest.mark.parametrize("at", [7, 33, 58])
 def test_cancel_by_file_saves_and_resume_gives_the_same_bits(unbroken, tmp_path, monkeypatch, at):
     keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
     folder = RunFolder(keys["out"])

@@ -63,6 +63,8 @@ class Bands(Rule):
 
     def weights(self, means, eye, focal_px, columns, facts, values) -> np.ndarray:
         near, far = self.band(focal_px, facts, values)
+        if near == inf:
+            return np.zeros(len(means), np.float32)
         away = distances(means, eye)
         return ((away >= np.float32(near)) & (away < np.float32(far))).astype(np.float32)
 

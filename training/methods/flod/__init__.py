@@ -6,6 +6,11 @@ from ...splats.bundle import MOST_LEVELS
 from ..info import MethodInfo
 from ..parameters import PAPER, STANDARD, DensityParameters, parameter
 
+PAPER_FOOTPRINT = 40.0
+"""Pixels that the paper's lambda, 0.2 COLMAP units, covers at the median depth of its scenes, about."""
+PAPER_REACH = PAPER_FOOTPRINT / 4**3
+"""How far the paper's finest level of five reaches by distance (Eq. 8, gamma 1), in median depths: 5/8."""
+
 
 @dataclass(frozen=True)
 class FlodParameters(DensityParameters):
@@ -17,7 +22,8 @@ class FlodParameters(DensityParameters):
     )
     footprint: float = parameter(
         16.0,
-        "Pixels that level 1's smallest size covers at the scene's median depth; sets lambda.",
+        "Pixels that level 1's smallest size covers at the scene's median depth; sets lambda, and the screen "
+        "size (gamma) that levels are chosen with by distance.",
         label="Coarsest Detail",
         above=0,
         unit="px",
@@ -35,8 +41,9 @@ class FlodParameters(DensityParameters):
         (50,) * 5, "Steps between two densifications.", above=0, unit="steps"
     )
     budget_ratio: float = parameter(
-        0.65,
-        "A level's share of the next finer level's budget of splats, so that every level adds some.",
+        0.5,
+        "A level's share of the next finer level's budget of splats, so that every level adds some; about "
+        "what the paper's levels have by themselves.",
         above=0,
         high=1,
     )
@@ -52,9 +59,26 @@ class FlodParameters(DensityParameters):
         "begin from exact positions.",
     )
 
+    finish_share: float = parameter(
+        0.14,
+        "Further steps at the end, as a share of all levels', that fit the two levels before the finest to "
+        "how the three are drawn together by distance. Not in the paper.",
+        high=1,
+    )
+    finish_alone: float = parameter(
+        0.25,
+        "Share of these steps that draw one of these two alone, so that it does not need the others.",
+        high=1,
+    )
+
     @property
     def total_steps(self) -> int:
-        return sum(self.steps)
+        return sum(self.steps) + self.finish_steps
+
+    @property
+    def finish_steps(self) -> int:
+        """Steps that train the finest levels together; none where there is but one."""
+        return round(self.finish_share * sum(self.steps)) if self.levels > 1 else 0
 
 
 _DRAFT = FlodParameters()
@@ -67,12 +91,13 @@ _STANDARD = replace(
 _PAPER = replace(
     _STANDARD,
     **PAPER,
-    footprint=40.0,
+    footprint=PAPER_FOOTPRINT,
     steps=(10_000, 15_000, 20_000, 25_000, 30_000),
     densify_until=(0.5, 0.4, 0.4, 0.4, 0.5),
     densify_interval=(2000, 1000, 500, 500, 200),
     overlap_interval=1000,
     rejoin_points=False,
+    finish_share=0.0,
     budget_ratio=1.0,
 )
 

@@ -11,6 +11,7 @@ import torch
 from scipy.spatial import KDTree
 
 from ...errors import LodgsError
+from ...lod.rule import Values, every_control
 from ...lod.rules.bands import s_min_of
 from ...splats.bundle import Level
 from ...splats.gaussians import Splats
@@ -20,8 +21,8 @@ from ..density import constrained_log, densify, prune, reset_opacities
 from ..method import Drawing
 from ..model import Model, splat_rates
 from ..schedules import due, log_linear, shrink_at
-from ..start import distinct, from_points, neighbour_distances, sampled
-from . import FlodParameters
+from ..start import distinct, from_points, from_splats, neighbour_distances, sampled
+from . import PAPER_REACH, FlodParameters, finish
 
 
 class Method(method.Method[FlodParameters, Drawing]):
@@ -30,6 +31,7 @@ class Method(method.Method[FlodParameters, Drawing]):
     Attributes:
         s_min: the smallest standard deviation of each level, coarse to fine, in scene units.
         points, colors: the scene's points to begin with, (P, 3) both.
+        kept: the finished ones of the levels that finishing steps train, as tensors by name.
     """
 
     def setup(self, base: Splats | None) -> None:
@@ -40,24 +42,52 @@ class Method(method.Method[FlodParameters, Drawing]):
         points, colors = distinct(data.scene.points, data.scene.point_colors)
         self.points, self.colors = sampled(points, colors, p.max_splats, self.seed)
         self.model = self._new_model(self._from_points(1))
+        self.kept: dict[int, dict[str, torch.Tensor]] = {}
 
     @property
     def levels(self) -> int:
         return self.parameters.levels
 
     def level_at(self, step: int) -> int:
-        return bisect_right(self._ends, step) + 1
+        return min(bisect_right(self._ends, step) + 1, self.levels)
+
+    def ends_level(self, step: int) -> bool:
+        return step + 1 in self._ends or super().ends_level(step)
+
+    def finishing(self, step: int) -> bool:
+        """Whether a step is one of those that train the finest levels together."""
+        return step >= self._ends[-1]
 
     def levels_after(self, step: int) -> list[Level]:
-        """The level that the step completed; the next one is then prepared."""
+        """The level that the step completed, the next one is then prepared; at the end the refined ones."""
+        if self.finishing(step) and step + 1 == self.steps:
+            return finish.levels_of(self.model, self.s_min)
         if step + 1 not in self._ends:
             return []
         number = self.level_at(step)
         s_min = self.s_min[number - 1]
         finished = Level(number, self.model.splats(s_min), {"s_min": s_min})
+        if self.parameters.finish_steps and number > self.levels - finish.TOGETHER:
+            self.kept[number] = from_splats(finished.splats, self.parameters.sh_degree, self.device)
         if number < self.levels:
             self.rise_to(number + 1)
+        elif self.kept:
+            self.model = finish.joined(self.kept, finish.rates(self.parameters, self.data.extent, 0.0))
+            self.kept = {}
         return [finished]
+
+    def controls(self) -> dict[str, float]:
+        """The gamma with which the finest level reaches as far as the paper's, in median depths.
+
+        d_proj(l) = s_min(l) / gamma * f (Eq. 8) falls with s_min: a gamma that did not follow it would leave
+        the finest level of a smaller footprint, or of more levels, nothing to draw. It is never more than the
+        paper's one pixel, so that few levels with coarse detail are not shown nearer than that is seen.
+        """
+        if self.levels == 1:
+            return {}
+        pixels = self.s_min[-2] * self.data.focal / self.data.median_depth
+        value = max(min(pixels / PAPER_REACH, 1.0), every_control()["gamma"].low)
+        return {"gamma": float(f"{value:.6g}")}  # as many digits as Blender keeps
 
     def meta(self) -> dict:
         footprint = self.s_min[0] * self.data.focal / self.data.median_depth
@@ -70,20 +100,32 @@ class Method(method.Method[FlodParameters, Drawing]):
         return shrink_at(step / self.steps, p.first_resolution, p.full_resolution)
 
     def draw(self, view: TrainingView, step: int) -> list[Drawing]:
+        if self.finishing(step):
+            weights = finish.weights(self.model, self.s_min, view.camera, self._finishing_values(step))
+            return [Drawing(self.rasterize_model(view.camera, step, weights=weights))]
         min_scale = self.s_min[self.level_at(step) - 1]
         return [Drawing(self.rasterize_model(view.camera, step, min_scale=min_scale))]
 
     def accumulate_stats(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> None:
-        if self._local(step) < self._densify_until(step):
+        if self.finishing(step):
+            finish.hold_finest(self.model)
+        elif self._local(step) < self._densify_until(step):
             self.model.accumulate_stats(drawings[0].rendering, view.shrink)
 
     def set_learning_rates(self, step: int) -> None:
         p = self.parameters
+        if self.finishing(step):
+            share = (step - self._ends[-1]) / p.finish_steps
+            self.model.adam.lr = finish.rates(p, self.data.extent, share)
+            return
         share = self._local(step) / (p.lr_means_steps or p.steps[self.level_at(step) - 1])
         rate = log_linear(p.lr_means, p.lr_means_final, share) * self.data.extent
         self.model.adam.lr["means"] = rate
 
     def control_density(self, step: int) -> None:
+        if self.finishing(step):
+            finish.keep_sizes(self.model, self.s_min)
+            return
         p, model, level, local = self.parameters, self.model, self.level_at(step), self._local(step) + 1
         if local > self._densify_until(step):
             return
@@ -110,6 +152,11 @@ class Method(method.Method[FlodParameters, Drawing]):
                 f"Level {level} lost all its splats at step {step + 1}.",
                 "Lower 'footprint' (or 's_min_1'), so that coarse levels keep more splats.",
             )
+
+    def _finishing_values(self, step: int) -> Values:
+        """What a finishing step draws."""
+        rng = np.random.default_rng([self.seed, step, 3])
+        return finish.random_values(rng, self.controls()["gamma"], self.model, self.parameters.finish_alone)
 
     def _local(self, step: int) -> int:
         """Steps that the level of a step has seen before it."""
@@ -151,6 +198,15 @@ class Method(method.Method[FlodParameters, Drawing]):
 
     def _new_model(self, tensors: dict[str, torch.Tensor]) -> Model:
         return Model(tensors, splat_rates(self.parameters, self.data.extent))
+
+    # -- what lasts ------------------------------------------------------------------------------------
+
+    def state_dict(self) -> dict:
+        return {**super().state_dict(), "kept": self.kept}
+
+    def load_state_dict(self, state: dict) -> None:
+        super().load_state_dict(state)
+        self.kept = state.get("kept", {})
 
 
 def apart(means: torch.Tensor, distance: float) -> torch.Tensor:

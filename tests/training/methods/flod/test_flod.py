@@ -1,20 +1,33 @@
 """FLoD as published: constraint, level rise, overlap pruning, schedule."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
 
 from training.errors import LodgsError
+from training.lod.rule import every_control
+from training.lod.selection import select
 from training.methods.data import TrainingData
-from training.methods.flod import METHOD
+from training.methods.flod import METHOD, finish
 from training.methods.flod.train import Method, apart
+from training.methods.model import NAMES
 from training.methods.parameters import override
-from training.rasterize import rasterize
+from training.rasterize import Gaussians, rasterize
 from training.scenes.colmap import read_scene
+from training.splats.bundle import Bundle, Level
 
 
 def make(data, **values) -> Method:
-    values = {"levels": 3, "steps": [6, 6, 6], "footprint": 6.0, "overlap_interval": 0, **values}
+    values = {
+        "finish_share": 0.0,
+        "levels": 3,
+        "steps": [6, 6, 6],
+        "footprint": 6.0,
+        "overlap_interval": 0,
+        **values,
+    }
     return Method(data, override(METHOD.preset("draft"), values), seed=0, backend="cpu")
 
 
@@ -26,6 +39,31 @@ def test_footprint_is_in_pixels_at_the_median_depth(data):
 
 def test_an_absolute_constraint_is_taken_as_it_is(data):
     assert make(data, s_min_1=0.125).s_min == pytest.approx([0.125, 0.03125, 0])
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{}, {"footprint": 40.0}, {"s_min_1": 0.125}, {"levels": 7, "rho": 3.0}, {"footprint": 4.0, "levels": 4}],
+)
+def test_the_finest_level_reaches_as_far_as_the_papers_whatever_the_footprint(data, values):
+    """The paper's: 40 pixels at the median depth, a quarter from level to level, gamma 1 (Eq. 3, 8)."""
+    flod = make(data, **({"levels": 5, "steps": 6, "footprint": 16.0} | values))
+    (gamma,) = flod.controls().values()
+    reach = flod.s_min[-2] / gamma * data.focal / data.median_depth
+    assert reach == pytest.approx(40 / 4**3, rel=1e-5)
+
+
+def test_a_draft_is_chosen_at_two_fifths_of_a_pixel_and_the_paper_at_one(data):
+    for preset, gamma in (("draft", 0.4), ("standard", 0.4), ("paper", 1.0)):
+        flod = Method(data, METHOD.preset(preset), seed=0, backend="cpu")
+        assert flod.controls() == {"gamma": pytest.approx(gamma, rel=1e-5)}
+
+
+@pytest.mark.parametrize("s_min_1, expected", [(1e-9, 0.01), (1e9, 1)])
+def test_gamma_stays_possible_and_within_a_pixel(data, s_min_1, expected):
+    assert make(data, s_min_1=s_min_1).controls() == {"gamma": expected}
+    assert every_control()["gamma"].checked(expected) == expected
+    assert make(data, levels=1, steps=[4]).controls() == {}
 
 
 @pytest.mark.slow
@@ -141,7 +179,7 @@ def test_a_preset_of_the_paper_is_the_papers():
     until = [share * steps for share, steps in zip(paper.densify_until, paper.steps, strict=True)]
     assert until == pytest.approx([5000, 6000, 8000, 10000, 15000])
     assert paper.densify_interval == (2000, 1000, 500, 500, 200)
-    assert (paper.rho, paper.levels, paper.overlap_interval) == (4, 5, 1000)
+    assert (paper.rho, paper.levels, paper.overlap_interval, paper.finish_steps) == (4, 5, 1000, 0)
 
 
 def test_points_that_repeat_are_no_trouble_and_too_few_are_said(data, tiny_scene, tmp_path):
@@ -155,3 +193,86 @@ def test_points_that_repeat_are_no_trouble_and_too_few_are_said(data, tiny_scene
     few = replace(scene, points=scene.points[:3], point_colors=scene.point_colors[:3])
     with pytest.raises(LodgsError, match="at least 4"):
         make(TrainingData(few))
+
+
+def finishing(data, **values) -> tuple[Method, list[Level]]:
+    """A run just before its first finishing step, and what it has handed over."""
+    flod, handed = make(data, finish_share=0.5, footprint=40.0, **values), []
+    for step in range(18):
+        flod.train_step(step)
+        handed += flod.levels_after(step)
+    return flod, handed
+
+
+def test_finishing_begins_with_the_levels_as_they_were_handed_over(data):
+    flod, handed = finishing(data, levels=4, steps=[3, 5, 5, 5])
+    assert flod.steps == 27 and [level.number for level in handed] == [1, 2, 3, 4]
+    again = finish.levels_of(flod.model, flod.s_min)
+    assert [level.number for level in again] == [2, 3], "the two before the finest"
+    for before, after in zip(handed[1:3], again, strict=True):
+        assert before.facts == after.facts
+        for name in NAMES:
+            np.testing.assert_array_equal(getattr(before.splats, name), getattr(after.splats, name))
+
+
+@pytest.mark.parametrize("alone", [0.0, 1.0])
+def test_finishing_steps_draw_what_the_rule_chooses(data, alone):
+    flod, handed = finishing(data, finish_alone=alone)
+    bundle, seen = Bundle("flod", handed, "bands"), set()
+    for step in range(18, 27):
+        view, values = flod.choose_view(step), flod._finishing_values(step)
+        assert (values["first"] == values["last"]) == bool(alone)
+        seen.add(values["gamma"])
+        assert 0.5 <= values["gamma"] / flod.controls()["gamma"] <= 2
+        splats, weights = select(bundle, view.camera.center, view.camera.focal, values)
+        with torch.no_grad():
+            drawn = flod.draw(view, step)[0].rendering.image
+            expected = rasterize(
+                Gaussians.of(splats), view.camera, near=data.near, sh_degree=flod.sh_degree(step)
+            )
+        assert weights is None and 0 < len(splats) < sum(len(level.splats) for level in handed)
+        torch.testing.assert_close(drawn, expected.image)
+    assert len(seen) == 9
+
+
+def test_finished_levels_keep_their_sizes_and_their_number_of_splats(data):
+    flod, handed = finishing(data, finish_alone=1.0)
+    for step in range(18, 27):
+        flod.train_step(step)
+        final = flod.levels_after(step)
+        assert bool(final) == (step == 26) and flod.level_at(step) == 3
+    finest = flod.model.splats().select(slice(-len(handed[2].splats), None))
+    for name in NAMES:
+        np.testing.assert_array_equal(getattr(finest, name), getattr(handed[2].splats, name))
+    for before, after in zip(handed[:2], final, strict=True):
+        assert (before.number, len(before.splats), before.facts) == (
+            after.number,
+            len(after.splats),
+            after.facts,
+        )
+        assert not np.array_equal(before.splats.sh, after.splats.sh)
+        assert np.exp(after.splats.log_scales).min() >= after.facts["s_min"] * (1 - 1e-6)
+
+
+def test_one_level_has_nothing_to_meet(data):
+    flod = make(data, levels=1, steps=[4], finish_share=1.0)
+    assert flod.steps == 4
+
+
+@pytest.mark.parametrize("stop", [8, 18, 21])
+def test_what_is_resumed_ends_where_an_unbroken_run_ends(data, stop):
+    """Before the last level, when it is finished, and amid the finishing steps."""
+    ends, state = [], None
+    for broken in (False, True):
+        flod, handed = make(data, finish_share=0.5), {}
+        for step in range(flod.steps):
+            if broken and step == stop:
+                state = copy.deepcopy(flod.state_dict())
+                flod = make(data, finish_share=0.5)
+                flod.load_state_dict(state)
+            flod.train_step(step)
+            handed |= {level.number: level for level in flod.levels_after(step)}
+        ends.append(handed)
+    for one, other in zip(ends[0].values(), ends[1].values(), strict=True):
+        for name in NAMES:
+            np.testing.assert_array_equal(getattr(one.splats, name), getattr(other.splats, name))
