@@ -44,9 +44,11 @@ class Exposure:
 
     def optimizers(self, share: float) -> Sequence[Adam]:
         """What makes a step, if anything, after a share of the run's steps: its rate falls to a tenth."""
-        rate = log_linear(self._lr, FALL * self._lr, share) if self._lr else 0.0
-        self._adam.lr = dict.fromkeys(self._names, rate)
-        return (self._adam,) if self._lr else ()
+        if not self._lr:
+            return ()
+        rate = log_linear(self._lr, FALL * self._lr, share)
+        self._adam.lr.update(dict.fromkeys(self._names, rate))
+        return (self._adam,)
 
     @torch.no_grad()
     def center(self) -> None:

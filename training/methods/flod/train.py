@@ -168,6 +168,11 @@ class Method(method.Method[FlodParameters, Drawing]):
         p, level = self.parameters, self.level_at(step)
         return p.densify_until[level - 1] * p.steps[level - 1]
 
+    def keep_supported(self, step: int) -> None:
+        super().keep_supported(step)
+        if self.finishing(step):  # what a level allows comes first
+            finish.keep_sizes(self.model, self.s_min)
+
     # -- levels ----------------------------------------------------------------------------------------
 
     def budget(self, level: int) -> int:

@@ -40,7 +40,8 @@ def test_it_is_flod_with_one_level_to_the_bit(data):
 
 
 def test_splats_are_only_added_before_densification_ends(data):
-    method = make(data, steps=20, densify_interval=2, densify_until=0.5, grad_threshold=0.0, min_opacity=0.0)
+    density = {"densify_interval": 2, "densify_until": 0.5, "grad_threshold": 0.0, "min_opacity": 0.0}
+    method = make(data, steps=20, free_depth=0.0, **density)
     counts = []
     for step in range(20):
         method.train_step(step)
