@@ -3,12 +3,13 @@ PYTHON ?= python3
 VENV := .venv/bin/python
 BLENDER_5_2 := .venv-blender-5.2/bin/python
 METHOD ?= flod
+SCENES ?= examples/lantern_garden examples/lantern_walk
 # One worker a core. Kernels are compiled once, into the user's cache.
 PYTEST := -m pytest -n auto
 quick test test-5.0: export OMP_NUM_THREADS := 1  # torch's threads would come on top of the workers
 export LODGS_TRAINER_PYTHON := $(CURDIR)/$(VENV)
 
-.PHONY: help setup demo check quick test test-5.0 lint docs tables bench extension window interop clean
+.PHONY: help setup demo check quick test test-5.0 lint docs tables bench bench-quality extension window interop clean
 
 help:
 	@echo "make setup      environments from pinned packages (needs Python 3.11; 3.13 for Blender 5.2's tests)"
@@ -19,6 +20,7 @@ help:
 	@echo "make docs       build/api: the trainer's functions and classes, from their docstrings"
 	@echo "make tables     docs/parameters.md and controls.md, from what methods and rules declare"
 	@echo "make bench      how fast it is, as ratios from one run"
+	@echo "make bench-quality  PSNR and veil against seconds, all methods (SCENES=\"DIR ...\", BASE=another checkout)"
 	@echo "make extension  dist/lodgs-VERSION.zip, checked by Blender"
 	@echo "make window     a tour in a real Blender window, with pictures (METHOD=flod; needs Blender, Xvfb, ImageMagick)"
 	@echo "make interop    other programs read our files (needs Node)"
@@ -60,6 +62,9 @@ bench: setup
 	$(VENV) tools/bench.py $(if $(BASE),--base $(BASE))
 	$(VENV) tools/bench_blender.py
 	@if [ -x $(BLENDER_5_2) ]; then set -x; $(BLENDER_5_2) tools/bench_blender.py; fi
+
+bench-quality: setup
+	$(VENV) tools/bench_quality.py $(if $(BASE),--report --base $(BASE)) $(SCENES)
 
 extension: setup
 	$(VENV) tools/extension.py

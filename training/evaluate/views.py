@@ -26,7 +26,7 @@ MOST_TRAINING_VIEWS = 24
 """How many training views tell the quality of all."""
 
 ShownTo = Callable[[Camera], tuple[Splats, np.ndarray | None]]
-"""What a camera is shown: splats, the same for all, and weights (N,) in [0, 1] on their opacities; None: 1."""
+"""What a camera is shown: splats, the same for all, and weights (N,) in [0, 1] on opacities; None: all 1."""
 
 
 def evenly(items: Sequence[Item], most: int) -> list[Item]:

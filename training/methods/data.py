@@ -42,18 +42,23 @@ class TrainingData:
     """A scene's views, resized, with images read when first needed.
 
     Attributes:
-        train, test: cameras at training size; test views are every n-th by name.
+        train, test: cameras at training size; test views are every n-th by name (see ``Scene.split``).
     """
 
     def __init__(
-        self, scene: Scene, image_scale: float = 1.0, test_every: int = 8, exposure: float = 0.0
+        self,
+        scene: Scene,
+        image_scale: float = 1.0,
+        test_every: int = 8,
+        exposure: float = 0.0,
+        validation: bool = False,
     ) -> None:
         if len(scene.points) == 0:
             raise LodgsError(
                 f"The COLMAP model in {scene.model} has no 3D points, so there is nothing to train from.",
                 "Triangulate the model's points in COLMAP, or choose another model.",
             )
-        train, test = scene.split(test_every)
+        train, test = scene.split(test_every, validation)
         if len(train) < 2:
             raise LodgsError(
                 f"The scene {scene.folder} has {len(train)} usable view(s) to train on; 2 are needed.",

@@ -32,4 +32,4 @@ def training_data(job: Job, folder: RunFolder, tell: Callable[..., None] | None 
     for warning in warnings:
         if tell:
             tell("warning", message=warning)
-    return TrainingData(scene, job.image_scale, job.test_every, job.exposure)
+    return TrainingData(scene, job.image_scale, job.test_every, job.exposure, job.validation)

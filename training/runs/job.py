@@ -31,6 +31,8 @@ class Job:
             another one.
         image_scale: training image size over the photograph's, 0 < s <= 1.
         test_every: every n-th view by name is held out to measure quality; 0 trains on all.
+        validation: hold out other views instead and leave those out altogether: who tries settings measures
+            them so, and the views that report quality have had no part in it.
         exposure: stops added to linear (EXR) images before they are trained on.
         model, images: the COLMAP model's and the photographs' folder where they are not found by themselves.
         parameters: changes to the preset's parameters by name.
@@ -45,6 +47,7 @@ class Job:
     backend: str = "auto"
     image_scale: float = 0.5
     test_every: int = 8
+    validation: bool = False
     exposure: float = 0.0
     model: str = ""
     images: str = ""
@@ -109,6 +112,8 @@ class Job:
                 f"seed = {self.seed!r}, test_every = {self.test_every!r} is not possible.",
                 "Both are whole numbers of at least 0, and test_every is not 1.",
             )
+        if not isinstance(self.validation, bool):
+            raise LodgsError(f"validation = {self.validation!r} is not possible.", "Give true or false.")
         if not isinstance(self.image_scale, int | float) or not 0 < self.image_scale <= 1:
             raise LodgsError(
                 f"image_scale = {self.image_scale!r} is not possible.", "Give a number above 0, at most 1."

@@ -26,6 +26,10 @@ _OPTIONS: dict[str, dict] = {
     "base": {"metavar": "PATH", "help": "run, bundle or PLY to begin with instead of the scene's points"},
     "image_scale": {"metavar": "SHARE", "type": float, "help": "size of training images over photographs"},
     "test_every": {"metavar": "N", "type": _whole, "help": "hold out every N-th view; 0 holds out none"},
+    "validation": {
+        "action": "store_true",
+        "help": "hold out the views between those instead, and leave those out: to try settings by",
+    },
     "seed": {"metavar": "N", "type": _whole, "help": "of every random choice"},
     "backend": {"choices": list(BACKENDS), "help": "what draws; auto is cuda where that works, else cpu"},
     "exposure": {"metavar": "STOPS", "type": float, "help": "stops added to linear (EXR) images"},
@@ -42,7 +46,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     defaults = {key.name: key.default for key in fields(Job)}
     for name, option in _OPTIONS.items():
-        default = "" if defaults[name] in ("", MISSING) else f" (default {defaults[name]})"
+        unsaid = defaults[name] is False or defaults[name] in ("", MISSING)
+        default = "" if unsaid else f" (default {defaults[name]})"
         option = option | {"help": option["help"] + default}
         parser.add_argument(f"--{name.replace('_', '-')}", default=argparse.SUPPRESS, **option)
     parser.add_argument(

@@ -115,12 +115,17 @@ class Scene:
     distorted: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
-    def split(self, test_every: int) -> tuple[list[Camera], list[Camera]]:
-        """Training and test cameras: of every `test_every` by name the first is held out; 0: none is."""
+    def split(self, test_every: int, validation: bool = False) -> tuple[list[Camera], list[Camera]]:
+        """Training and held-out cameras: of every `test_every` by name the first is held out; 0: none is.
+
+        Args:
+            validation: leave those out altogether, and hold out the one in the middle between two of them.
+        """
         if test_every <= 0:
             return list(self.cameras), []
-        train = [camera for i, camera in enumerate(self.cameras) if i % test_every]
-        return train, self.cameras[::test_every]
+        middle = test_every // 2 if validation else 0
+        train = [camera for i, camera in enumerate(self.cameras) if i % test_every not in (0, middle)]
+        return train, self.cameras[middle::test_every]
 
     @property
     def center(self) -> np.ndarray:

@@ -59,6 +59,7 @@ def test_one_number_serves_every_level_and_fewer_levels_keep_the_finest():
         ('scene = "a"\nout = "b"\nimage_scale = 0\n', "image_scale = 0"),
         ('scene = "a"\nout = "b"\nseed = -1\n', "seed = -1"),
         ('scene = "a"\nout = "b"\nseed = 1.5\n', "seed = 1.5"),
+        ('scene = "a"\nout = "b"\nvalidation = 1\n', "validation = 1"),
         ('scene = "a"\nout = "b"\n[parameters]\nsteps = [1, 2]\n', "2 entries for 5 levels"),
         ('scene = "a"\nout = "b"\n[parameters]\nlevels = 0\n', "levels = 0"),
         ('scene = "a"\nout = "b"\n[parameters]\nrho = "four"\n', "rho = 'four'"),

@@ -31,11 +31,12 @@ def test_options_and_a_file_say_the_same(tmp_path, monkeypatch):
         "--scene", "photos", "--out", "run", "--method", "octree", "--preset", "standard",
         "--image-scale", 0.25, "--test-every", 0, "--seed", 7, "--backend", "cpu", "--exposure", -1.5,
         "--model", "sparse/1", "--images", "small", "--set", "max_splats=5000", "--set", "nearest=0.1",
+        "--validation",
     )  # fmt: skip
     (tmp_path / "job.toml").write_text(
         'scene = "photos"\nout = "run"\nmethod = "octree"\npreset = "standard"\nimage_scale = 0.25\n'
         'test_every = 0\nseed = 7\nbackend = "cpu"\nexposure = -1.5\nmodel = "sparse/1"\nimages = "small"\n'
-        "[parameters]\nmax_splats = 5000\nnearest = 0.1\n"
+        "validation = true\n[parameters]\nmax_splats = 5000\nnearest = 0.1\n"
     )
     assert told == Job.from_file(tmp_path / "job.toml") == job("job.toml")
 

@@ -367,6 +367,9 @@ def test_split_extent_and_depth(tmp_path):
     assert [camera.name for camera in test] == ["0.png", "8.png"]
     assert [camera.name for camera in train] == [f"{i}.png" for i in range(1, 8)]
     assert [len(part) for part in scene.split(0)] == [9, 0]
+    train, held = scene.split(8, validation=True)  # 0 and 8 have no part in it
+    assert [camera.name for camera in held] == ["4.png"]
+    assert [camera.name for camera in train] == [f"{i}.png" for i in (1, 2, 3, 5, 6, 7)]
 
 
 def test_no_points_have_no_depth(tmp_path):
