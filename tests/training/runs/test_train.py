@@ -133,7 +133,7 @@ def test_levels_and_bundle_agree_and_record_the_constraint(unbroken):
 
 def test_training_makes_the_pictures_better(unbroken):
     quality = [event["psnr"] for event in RunFolder(unbroken["keys"]["out"]).levels()]
-    # FLoD's finishing steps go on with all levels but the finest, so on a scene this small the last two may tie
+    # FLoD's finishing steps go on with the coarser levels: on a scene this small the last two may tie
     assert quality == sorted(quality, key=lambda psnr: round(psnr, 1)) and quality[-1] > quality[0] + 0.5
 
 
