@@ -188,13 +188,15 @@ class Method(ABC, Generic[P, D]):
         Raises:
             LodgsError: none is left.
         """
-        p, model, support = self.parameters, self.model, self.data.support
+        p, model = self.parameters, self.model
         if not (p.free_depth or p.largest):
             return
+        support = self.data.support
         means = model["means"].detach().cpu().numpy()
         distances = support.distances(means)
         if p.largest:
-            most = torch.from_numpy(np.log(p.largest * distances + 1e-9)).to(model["log_scales"])
+            sizes = np.maximum(p.largest * distances, np.finfo(np.float32).tiny)
+            most = torch.from_numpy(np.log(sizes)).to(model["log_scales"])
             model["log_scales"].clamp_max_(most[:, None])
         if p.free_depth:
             model.keep(torch.from_numpy(~support.intruding(means, distances, p.free_depth)))

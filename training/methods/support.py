@@ -19,6 +19,7 @@ NEAREST = 0.01
 MARGIN = 0.1
 """What a view is widened by on every side, as a share of its image."""
 POINTS = 20_000
+"""Most points that are looked at."""
 
 
 def halfway(cameras: Sequence[Camera]) -> list[Camera]:
