@@ -4,6 +4,8 @@ that methods share. They change a model of splats in place, with whatever column
 
 from __future__ import annotations
 
+from math import sqrt
+
 import numpy as np
 import torch
 
@@ -15,27 +17,38 @@ RESET_OPACITY = 0.01
 """What an opacity reset leaves at most."""
 
 
+SHORTER = 0.45
+"""What a split along the longest axis takes from that axis (Improved-GS, arXiv 2508.12313)."""
+APART = 3 * SHORTER
+"""How far from the parent's mean its children lie on that axis, in its standard deviations there."""
+NARROWER = sqrt(1 - SHORTER**2)
+"""The children's share of the parent's other two."""
+FAINTER = 0.6
+"""The children's share of its opacity."""
+
+
 @torch.no_grad()
 def densify(
     model: Model,
     gradients: torch.Tensor,
     *,
     threshold: float,
-    clone_below: float,
+    clone_below: float | None,
     max_splats: int,
     rng: np.random.Generator,
     min_scale: float = 0.0,
 ) -> int:
-    """Clones small and splits large splats whose image-plane gradient is large.
+    """Adds splats where the image-plane gradient is large: one more for each.
 
-    Clones and children have their parent's other values; of the model's columns they begin with zeros.
+    Children have their parent's other values; of the model's columns they begin with zeros.
 
     Args:
         gradients: (N,) mean norm of the image-plane gradient over the views that saw each splat.
         threshold: the gradient above which a splat is densified.
-        clone_below: largest scale (scene units) that is cloned; larger ones are split in two.
+        clone_below: largest scale (scene units) that is cloned; larger ones are split in two at random, as
+            in 3DGS. None: all are split in two along their longest axis.
         max_splats: the largest gradients come first until this number is reached.
-        rng: places the children of a split.
+        rng: places the children of a split at random.
         min_scale: FLoD's s_min; the scale that counts is exp(log_scales) + min_scale.
 
     Returns:
@@ -49,17 +62,44 @@ def densify(
     if len(chosen) == 0:
         return 0
     scales = model["log_scales"][chosen].exp() + min_scale
-    small = scales.amax(1) <= clone_below
-    clones = model.rows(chosen[small])
-    parents, scales = chosen[~small], scales[~small]
-    children = model.rows(parents.repeat(2))
-    children["means"] += sample_inside(children["quats"], scales.repeat(2, 1), rng)
-    children["log_scales"] = constrained_log(scales / 1.6, min_scale).repeat(2, 1)
+    cloned = torch.zeros_like(chosen, dtype=torch.bool)
+    if clone_below is not None:
+        cloned = scales.amax(1) <= clone_below
+    clones = model.rows(chosen[cloned])
+    parents, scales = chosen[~cloned], scales[~cloned]
+    if clone_below is None:
+        children, scales = _along_longest_axis(model.rows(parents.repeat(2)), scales)
+    else:
+        children, scales = model.rows(parents.repeat(2)), (scales / 1.6).repeat(2, 1)
+        children["means"] += sample_inside(children["quats"], 1.6 * scales, rng)
+    children["log_scales"] = constrained_log(scales, min_scale)
     alive = torch.ones(len(model), dtype=torch.bool, device=parents.device)
     alive[parents] = False
     model.keep(alive)
     model.append({name: torch.cat([clone, children[name]]) for name, clone in clones.items()})
     return len(chosen)
+
+
+def _along_longest_axis(
+    children: dict[str, torch.Tensor], scales: torch.Tensor
+) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+    """Two children on either side of each parent, which together look much as it did.
+
+    Args:
+        children: twice the rows of P parents.
+        scales: (P, 3) of the parents.
+
+    Returns:
+        The children's rows, changed in place, and their scales (2 P, 3).
+    """
+    count, longest = len(scales), scales.argmax(1)
+    axes = rotation_matrices(children["quats"][:count])[torch.arange(count), :, longest]
+    offset = APART * scales.amax(1, keepdim=True) * axes
+    children["means"] += torch.cat([offset, -offset])
+    children["opacity_logits"] = (FAINTER * children["opacity_logits"].sigmoid()).logit()
+    shares = torch.full_like(scales, NARROWER)
+    shares[torch.arange(count), longest] = 1 - SHORTER
+    return children, (scales * shares).repeat(2, 1)
 
 
 def prune(model: Model, min_opacity: float) -> None:

@@ -10,13 +10,14 @@ from typing import Generic, TypeVar
 import numpy as np
 import torch
 
-from ..rasterize import Adam, Rendering, Target, device_of, photometric_loss, rasterize
+from ..rasterize import Adam, Gaussians, Rendering, Target, device_of, photometric_loss, rasterize
 from ..scenes.cameras import Camera
 from ..splats.bundle import Level
 from ..splats.gaussians import Splats
 from .data import TrainingData, TrainingView
 from .density import require_rows
 from .exposure import Exposure
+from .margins import Margins
 from .model import Model
 from .parameters import Parameters
 from .schedules import due
@@ -125,10 +126,12 @@ class Method(ABC, Generic[P, D]):
             optimizer.step()
             optimizer.zero_grad()
         self.control_density(step)
+        if self.parameters.margin and self.continues_margins(step):
+            self.continue_margins(step)
         if due(INTERVAL, step + 1) or self.ends_level(step):
             self.exposure.center()
             self.keep_supported(step)
-        return float(loss.detach()), drawings[0].rendering.image.detach(), view.target
+        return float(loss.detach()), self.over_black(drawings[0].rendering, step), view.target
 
     def choose_view(self, step: int) -> TrainingView:
         """The photograph of a step: every epoch shows each once."""
@@ -181,6 +184,36 @@ class Method(ABC, Generic[P, D]):
         """Whether a level, or the run, is finished after a step."""
         return step + 1 == self.steps or self.level_at(step + 1) > self.level_at(step)
 
+    def continues_margins(self, step: int) -> bool:
+        """Whether photographs are continued after a step: best when splats are no longer added."""
+        return False
+
+    @torch.no_grad()
+    def continue_margins(self, step: int) -> None:
+        """Adds what continues the photographs beyond their edges."""
+        room = self.parameters.margin_room(self.budget_at(step))
+        self.append_margins(vars(self.margins().continued(self.gaussians_at(step), room)), step)
+
+    def budget_at(self, step: int) -> int:
+        """Most splats that the model may have after a step."""
+        return self.parameters.max_splats
+
+    def growth_limit(self, step: int) -> int:
+        """Most splats that growing may bring it to: there is room left to continue photographs."""
+        return self.budget_at(step) - self.parameters.margin_room(self.budget_at(step))
+
+    def margins(self) -> Margins:
+        """What the training views would show if they were wider."""
+        return Margins(self.data.train, self.parameters.margin, self.data.near, self.backend)
+
+    def gaussians_at(self, step: int) -> Gaussians:
+        """The splats as a step draws all of them."""
+        return self.model.gaussians
+
+    def append_margins(self, rows: Mapping[str, torch.Tensor], step: int) -> None:
+        """Adds splats to the model, by the names of ``model.NAMES``, as ``gaussians_at`` has them."""
+        self.model.append(rows)
+
     @torch.no_grad()
     def keep_supported(self, step: int) -> None:
         """Removes what stands in the way of the training views, and bounds how large splats are.
@@ -220,8 +253,22 @@ class Method(ABC, Generic[P, D]):
             min_scale=min_scale,
             sh_degree=self.sh_degree(step),
             near=self.data.near,
+            background=self.background(step),
             backend=self.backend,
         )
+
+    def background(self, step: int) -> tuple[float, float, float]:
+        """The colour behind everything in a step, the same for all of its pictures."""
+        if not self.parameters.random_background:
+            return 0.0, 0.0, 0.0
+        red, green, blue = np.random.default_rng([self.seed, step, 5]).random(3)
+        return red, green, blue
+
+    @torch.no_grad()
+    def over_black(self, rendering: Rendering, step: int) -> torch.Tensor:
+        """A step's picture (H, W, 3) as it is over black, which pictures have behind them."""
+        background = torch.tensor(self.background(step)).to(rendering.image)
+        return rendering.image - (1 - rendering.alpha[..., None]) * background
 
     # -- what lasts ------------------------------------------------------------------------------------
 

@@ -9,6 +9,9 @@ from typing import Any
 
 from ..errors import LodgsError
 
+MARGIN_SHARE = 0.05
+"""The most of all splats that may continue photographs beyond their edges."""
+
 
 def parameter(
     default: Any,
@@ -72,6 +75,16 @@ class Parameters:
         "Largest standard deviation of a splat, as a share of its distance from the nearest training view; 0 "
         "sets no bound.",
     )
+    random_background: bool = parameter(
+        True,
+        "Whether every step draws over another colour, so that no splat can use the black behind it as a "
+        "colour of the scene.",
+    )
+    margin: float = parameter(
+        0.5,
+        "How much photographs are continued on every side, as a share of their size, where none shows "
+        "anything: blurred colours at the depth of the edge instead of black. 0 leaves it empty.",
+    )
     lr_exposure: float = parameter(
         0.0,
         "Learning rate of each photograph's own gain and offset of colours, which pictures do not have; for "
@@ -99,6 +112,10 @@ class Parameters:
         """Training steps of a whole run."""
         return self.steps
 
+    def margin_room(self, budget: int) -> int:
+        """How many of at most so many splats may continue photographs."""
+        return int(MARGIN_SHARE * budget) if self.margin else 0
+
     def check(self) -> None:
         """What values must be beside each other; a method's class says it of its own.
 
@@ -120,8 +137,14 @@ class DensityParameters(Parameters):
     full_resolution: float = parameter(
         0.5, "Share of the steps after which photographs have their size.", high=1
     )
+    long_axis: bool = parameter(
+        True,
+        "Whether splats are added by splitting one in two along its longest axis, so that the picture stays "
+        "much as it was; otherwise small ones are cloned and large ones split at random, as in 3DGS.",
+    )
     clone_extent: float = parameter(
-        0.01, "Splats larger than this multiple of the scene extent are split, smaller ones cloned."
+        0.01,
+        "Splats larger than this multiple of the scene extent are split at random, smaller ones cloned.",
     )
     prune_interval: int = parameter(
         100, "Steps between two removals of transparent splats; 0 never removes.", unit="steps"
@@ -145,10 +168,13 @@ STANDARD: dict[str, Any] = {
 AS_PUBLISHED: dict[str, Any] = {
     "free_depth": 0.0,
     "largest": 0.0,
+    "random_background": False,
+    "margin": 0.0,
 }
 """What presets *paper* leave out, whatever the method: it is in none of the papers."""
 PAPER: dict[str, Any] = AS_PUBLISHED | {
     "first_resolution": 1.0,
+    "long_axis": False,
     "opacity_reset_interval": 3000,
     "grad_threshold": 2e-4,
     "max_splats": 5_000_000,

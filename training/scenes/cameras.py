@@ -87,6 +87,14 @@ class Camera:
         """The same view, its image this share of the size, in whole pixels."""
         return self.resized(max(int(self.width * share), 1), max(int(self.height * share), 1))
 
+    def widened(self, share: float) -> Camera:
+        """The same eye with a larger image: on every side by a share of its size, in whole pixels."""
+        across, down = round(share * self.width), round(share * self.height)
+        return replace(
+            self, width=self.width + 2 * across, height=self.height + 2 * down,
+            cx=self.cx + across, cy=self.cy + down, image=None,
+        )  # fmt: skip
+
     def within(self, matrix: np.ndarray) -> tuple[Camera, float]:
         """This view of a world as seen from inside an object in it: pixels stay the same.
 

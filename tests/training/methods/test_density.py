@@ -51,6 +51,43 @@ def test_large_splats_are_split_into_two_smaller_ones_drawn_from_them(model):
     np.testing.assert_allclose(spread, [1.1, 0.6, 2.1], rtol=0.05)
 
 
+def test_a_split_along_the_longest_axis_looks_much_like_its_parent(model, moments):
+    """Places, sizes and opacity by Improved-GS's formulas; what a camera sees stays nearly the same."""
+    model.assign("log_scales", torch.log(torch.tensor([[0.05, 0.4, 0.1]])).repeat(50, 1))
+    # a quarter turn about z: the splat's y axis lies along the world's -x
+    turn = torch.tensor([[np.sqrt(0.5), 0, 0, np.sqrt(0.5)]], dtype=torch.float32)
+    model.assign("quats", turn.repeat(50, 1))
+    model.assign("opacity_logits", torch.full((50,), 0.5).logit())
+    parent = {name: model[name].detach()[7].clone() for name in ALL}
+    gradients = torch.zeros(50)
+    gradients[7] = 1.0
+    added = densify(
+        model, gradients, threshold=0.5, clone_below=None, max_splats=1000, rng=np.random.default_rng(0)
+    )
+    assert added == 1 and len(model) == 51 and not (model["decay"][:49] == 17).any()
+    children = {name: model[name].detach()[49:] for name in ALL}
+    offsets = children["means"] - parent["means"]
+    torch.testing.assert_close(offsets, torch.tensor([[-0.54, 0, 0], [0.54, 0, 0]]), atol=1e-5, rtol=0)
+    narrow = np.sqrt(1 - 0.45**2)
+    expected = torch.tensor([[0.05 * narrow, 0.4 * 0.55, 0.1 * narrow]], dtype=torch.float32)
+    torch.testing.assert_close(children["log_scales"].exp(), expected.repeat(2, 1))
+    torch.testing.assert_close(children["opacity_logits"].sigmoid(), torch.full((2,), 0.3))
+    for name in ("quats", "sh", "decay"):
+        assert torch.equal(children[name], torch.stack([parent[name]] * 2))
+    assert moments(model, "means", 0)[49:].tolist() == [0, 0]
+
+
+def test_a_split_along_the_longest_axis_keeps_flods_constraint(model):
+    model.assign("log_scales", torch.log(torch.tensor([[0.5, 1.0, 2.0]])).repeat(50, 1))
+    densify(
+        model, torch.ones(50), threshold=0.5, clone_below=None, max_splats=1000, min_scale=0.1,
+        rng=np.random.default_rng(0),
+    )  # fmt: skip
+    narrow = np.sqrt(1 - 0.45**2)
+    expected = torch.tensor([0.6 * narrow, 1.1 * narrow, 2.1 * 0.55], dtype=torch.float32)
+    torch.testing.assert_close(model["log_scales"].exp() + 0.1, expected.repeat(100, 1))
+
+
 def test_the_budget_goes_to_the_largest_gradients(model):
     gradients = torch.linspace(0, 1, 50)
     before = model["means"].detach().clone()

@@ -233,3 +233,23 @@ def test_what_all_methods_record_of_a_scene(data, tiny):
     assert meta["camera_center"] == pytest.approx(np.mean([c.center for c in data.train], 0).tolist())
     assert {"scene_extent", "median_depth"} <= set(meta) and method.facts() == {}
     assert torch.device("cpu") == method.device
+
+
+def test_a_step_has_its_own_background_and_its_picture_has_none(data, tiny):
+    from training.methods import create
+    from training.methods.parameters import override
+
+    presets = methods.method_info("3dgs").presets
+    method = create("3dgs", data, presets["draft"], seed=0, backend="cpu")
+    view = method.choose_view(3)
+    drawn = method.draw(view, 3)[0].rendering
+    behind = torch.tensor(method.background(3)).float()
+    black = create("3dgs", data, override(presets["draft"], {"random_background": False}), 0, "cpu")
+    expected = black.draw(view, 3)[0].rendering
+    torch.testing.assert_close(drawn.image - expected.image, (1 - drawn.alpha[..., None]) * behind)
+    torch.testing.assert_close(method.over_black(drawn, 3), expected.image)
+    assert (drawn.alpha < 0.5).any()
+    colors = {method.background(step) for step in range(9)}
+    assert len(colors) == 9 and black.background(3) == (0, 0, 0) == tuple(
+        create("3dgs", data, presets["paper"], 0, "cpu").background(3)
+    )

@@ -6,7 +6,7 @@ scale s_v > 1, where fewer splats shall give the same photograph (Sec. 3.3).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -172,6 +172,14 @@ class Method(threedgs_train.Method):
         if step >= self.begins and due(self.parameters.prune_interval, step + 1):
             self.model.keep(self.seen_somewhere())
             require_rows(self.model, step, "tau")
+
+    def continues_margins(self, step: int) -> bool:
+        """Right after the decay has begun, which removes what photographs show little of."""
+        return step == self.begins > 0
+
+    def append_margins(self, rows: Mapping[str, torch.Tensor], step: int) -> None:
+        sigma = torch.full_like(rows["opacity_logits"], self.parameters.sigma_init)
+        super().append_margins({**rows, SIGMA: self._stored(sigma)}, step)
 
     @torch.no_grad()
     def seen_somewhere(self) -> torch.Tensor:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import accumulate
 
 import numpy as np
@@ -13,6 +14,7 @@ from scipy.spatial import KDTree
 from ...errors import LodgsError
 from ...lod.rule import Values, every_control
 from ...lod.rules.bands import s_min_of
+from ...rasterize import Gaussians
 from ...splats.bundle import Level
 from ...splats.gaussians import Splats
 from .. import method
@@ -135,8 +137,8 @@ class Method(method.Method[FlodParameters, Drawing]):
                 model,
                 model.mean_gradient(),
                 threshold=p.grad_threshold * self.data.threshold_scale,
-                clone_below=p.clone_extent * self.data.extent,
-                max_splats=self.budget(level),
+                clone_below=None if p.long_axis else p.clone_extent * self.data.extent,
+                max_splats=self.growth_limit(step),
                 rng=np.random.default_rng([self.seed, step, 1]),
                 min_scale=s_min,
             )
@@ -152,6 +154,21 @@ class Method(method.Method[FlodParameters, Drawing]):
                 f"Level {level} lost all its splats at step {step + 1}.",
                 "Lower 'footprint' (or 's_min_1'), so that coarse levels keep more splats.",
             )
+
+    def continues_margins(self, step: int) -> bool:
+        local = self._local(step)
+        return not self.finishing(step) and local < self._densify_until(step) <= local + 1
+
+    def budget_at(self, step: int) -> int:
+        return self.budget(self.level_at(step))
+
+    def gaussians_at(self, step: int) -> Gaussians:
+        scales = self.model["log_scales"].detach().exp() + self.s_min[self.level_at(step) - 1]
+        return replace(self.model.gaussians, log_scales=scales.log())
+
+    def append_margins(self, rows: Mapping[str, torch.Tensor], step: int) -> None:
+        scales = constrained_log(rows["log_scales"].exp(), self.s_min[self.level_at(step) - 1])
+        super().append_margins({**rows, "log_scales": scales}, step)
 
     def _finishing_values(self, step: int) -> Values:
         """What a finishing step draws."""

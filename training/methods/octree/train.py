@@ -7,7 +7,7 @@ rounded while training.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -27,6 +27,9 @@ from ..schedules import log_linear
 from ..start import from_points
 from . import OctreeParameters, growing
 
+MARGIN = "margin"
+"""Column: whether a splat continues a photograph beyond its edge."""
+
 
 class Method(method.Method[OctreeParameters, Drawing]):
     """One run of Octree-GS.
@@ -37,11 +40,12 @@ class Method(method.Method[OctreeParameters, Drawing]):
 
     def setup(self, base: Splats | None) -> None:
         p = self.parameters
-        self.schedule, points, colors, level = growing.plant(self.data, p, self.seed, p.max_splats)
+        self.schedule, points, colors, level = growing.plant(self.data, p, self.seed, self.growth_limit(0))
         tensors = from_points(points, colors, p.sh_degree, self.device)
         tensors["log_scales"] = growing.log_spacing(points, level, columns=3).to(self.device)
         zeros = torch.zeros(len(points), device=self.device)
-        columns = {"level": torch.from_numpy(level).float().to(self.device), "bias": zeros}
+        levels = torch.from_numpy(level).float().to(self.device)
+        columns = {"level": levels, "bias": zeros, MARGIN: torch.zeros_like(levels, dtype=torch.bool)}
         self._rates = splat_rates(p, self.data.extent)
         self.model = Model(tensors, self._rates, columns, stats={"opacity_sum": zeros.clone()})
 
@@ -106,6 +110,14 @@ class Method(method.Method[OctreeParameters, Drawing]):
         if self.schedule.reassigns_after(step):
             self.reassign_levels(step)
 
+    def continues_margins(self, step: int) -> bool:
+        return self.schedule.growing(step) and not self.schedule.growing(step + 1)
+
+    def append_margins(self, rows: Mapping[str, torch.Tensor], step: int) -> None:
+        """They are of the coarsest level, for every distance, whatever photographs show of them."""
+        ones = torch.ones_like(rows["opacity_logits"])
+        super().append_margins({**rows, "level": ones, MARGIN: ones.bool()}, step)
+
     # -- anchors ---------------------------------------------------------------------------------------
 
     @torch.no_grad()
@@ -124,7 +136,7 @@ class Method(method.Method[OctreeParameters, Drawing]):
         rows["log_scales"] -= float(np.log(1.6))
         rows["opacity_logits"].clamp_max_(growing.FAINT)
         rows |= {"level": level, "bias": model.columns["bias"][source]}
-        rows = growing.with_room(self.schedule, model, rows, step, p.max_splats)
+        rows = growing.with_room(self.schedule, model, rows, step, self.growth_limit(step))
 
         opacity, stats = model["opacity_logits"].detach().sigmoid(), model.stats
         faint = stats["opacity_sum"] < p.min_opacity * stats["seen"]
@@ -135,7 +147,8 @@ class Method(method.Method[OctreeParameters, Drawing]):
 
     def prune_unseen(self, step: int) -> None:
         """Splats go of which no view, near or far, sees much, by their largest blending weight (RadSplat)."""
-        self.model.keep(~growing.unseen(self.schedule, self.model, step, self._largest_weights))
+        unseen = growing.unseen(self.schedule, self.model, step, self._largest_weights)
+        self.model.keep(~unseen | self.model.columns[MARGIN])
         require_rows(self.model, step, "least_weight")
 
     def _largest_weights(self, camera: Camera, view: int, weights: torch.Tensor) -> torch.Tensor:

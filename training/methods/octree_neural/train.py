@@ -162,7 +162,7 @@ class Method(method.Method[NeuralOctreeParameters, Drawing]):
         """All levels, baked, when the last one has joined and at the end."""
         if not self.schedule.hands_over(step):
             return []
-        splats = self.bake()
+        splats = self.with_margins(self.bake())
         level = splats.extras["lod_level"]
         return [Level(number, splats.select(level == number)) for number in range(1, self.levels + 1)]
 
@@ -206,7 +206,8 @@ class Method(method.Method[NeuralOctreeParameters, Drawing]):
         weights = self.schedule.weights(view.camera, self.model, step, full=view.shrink == 1)
         anchors = self.visible(view.camera, weights)
         decoded = self.decode(view.camera, anchors, view.index)
-        return [Drawing(self.rasterize_decoded(decoded, view.camera), anchors, decoded)]
+        rendering = self.rasterize_decoded(decoded, view.camera, background=self.background(step))
+        return [Drawing(rendering, anchors, decoded)]
 
     def loss(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> torch.Tensor:
         """With the volume of what is drawn (Octree-GS, Sec. 7.1)."""
@@ -293,11 +294,20 @@ class Method(method.Method[NeuralOctreeParameters, Drawing]):
             return self.rasterize_decoded(decoded, camera, weights[decoded.anchor]).image
 
     def rasterize_decoded(
-        self, decoded: NeuralGaussians, camera: Camera, weights: torch.Tensor | None = None
+        self,
+        decoded: NeuralGaussians,
+        camera: Camera,
+        weights: torch.Tensor | None = None,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> Rendering:
-        """What a camera sees of Gaussians, with weights (M,) on their opacities."""
+        """What a camera sees of Gaussians, with weights (M,) on their opacities, over a background."""
         return rasterize(
-            decoded.gaussians(), camera, weights=weights, near=self.data.near, backend=self.backend
+            decoded.gaussians(),
+            camera,
+            weights=weights,
+            near=self.data.near,
+            background=background,
+            backend=self.backend,
         )
 
     def visible(self, camera: Camera, weights: torch.Tensor) -> torch.Tensor:
@@ -442,6 +452,16 @@ class Method(method.Method[NeuralOctreeParameters, Drawing]):
                 BIAS: columns["bias"][anchor].cpu().numpy(),
             },
         )
+
+    def with_margins(self, baked: Splats) -> Splats:
+        """Baked splats with those that continue the photographs, in the coarsest level."""
+        if not self.parameters.margin:
+            return baked
+        room = self.parameters.margin_room(self.parameters.max_splats)
+        margins = self.margins().continued(Gaussians.of(baked, self.device), room)
+        level, bias = np.ones(len(margins), np.uint8), np.zeros(len(margins), np.float32)
+        arrays = {name: tensor.cpu().numpy() for name, tensor in vars(margins).items()}
+        return Splats.concatenated([baked, Splats(**arrays, extras={"lod_level": level, BIAS: bias})])
 
     def drawn_by(self, camera: Camera) -> torch.Tensor:
         """The anchors (indices) that a view draws, with all levels joined."""

@@ -24,7 +24,7 @@ class Method(method.Method[ThreedgsParameters, Drawing]):
     def setup(self, base: Splats | None) -> None:
         p, scene = self.parameters, self.data.scene
         points, colors = distinct(scene.points, scene.point_colors)
-        points, colors = sampled(points, colors, p.max_splats, self.seed)
+        points, colors = sampled(points, colors, self.growth_limit(0), self.seed)
         tensors = from_points(points, colors, p.sh_degree, self.device)
         self.model = Model(tensors, splat_rates(p, self.data.extent))
         self._densify_until = p.densify_until * p.steps
@@ -58,8 +58,8 @@ class Method(method.Method[ThreedgsParameters, Drawing]):
                 model,
                 model.mean_gradient(),
                 threshold=p.grad_threshold * self.data.threshold_scale,
-                clone_below=p.clone_extent * self.data.extent,
-                max_splats=p.max_splats,
+                clone_below=None if p.long_axis else p.clone_extent * self.data.extent,
+                max_splats=self.growth_limit(step),
                 rng=np.random.default_rng([self.seed, step, 1]),
             )
             model.reset_stats()
@@ -68,3 +68,6 @@ class Method(method.Method[ThreedgsParameters, Drawing]):
             require_rows(model, step, "min_opacity")
         if due(p.opacity_reset_interval, done):
             reset_opacities(model)
+
+    def continues_margins(self, step: int) -> bool:
+        return step < self._densify_until <= step + 1

@@ -150,17 +150,21 @@ def test_overlap_pruning_spares_the_last_level(data):
     assert len(last.model) == before
 
 
-def test_every_level_keeps_to_its_share_of_the_budget(data):
+@pytest.mark.parametrize("margin", [0.0, 0.5])
+def test_every_level_keeps_to_its_share_of_the_budget(data, margin):
     flod = make(
-        data, s_min_1=1e-3, steps=[12, 12, 12], densify_interval=2, densify_until=1.0, grad_threshold=0.0,
-        max_splats=200, budget_ratio=0.5, min_opacity=0.0, rejoin_points=False,
+        data, margin=margin, s_min_1=1e-3, steps=[12, 12, 12], densify_interval=2, densify_until=1.0,
+        grad_threshold=0.0, max_splats=200, budget_ratio=0.5, min_opacity=0.0, rejoin_points=False,
     )  # fmt: skip
     counts = []
     for step in range(flod.steps):
         flod.train_step(step)
         counts += [len(level.splats) for level in flod.levels_after(step)]
     # 200 x 0.5^2 = 50 is fewer than the 60 points to begin with; then 100 and 200 are filled to the last
-    assert counts == [60, 100, 200]
+    if not margin:
+        assert counts == [60, 100, 200]
+    # a twentieth of each budget is for what continues photographs
+    assert counts[0] <= 62 and 95 <= counts[1] <= 100 and 190 < counts[2] <= 200
 
 
 def test_gradients_are_averaged_over_the_views_that_saw_a_splat(data):
@@ -197,7 +201,7 @@ def test_points_that_repeat_are_no_trouble_and_too_few_are_said(data, tiny_scene
 
 def finishing(data, **values) -> tuple[Method, list[Level]]:
     """A run just before its first finishing step, and what it has handed over."""
-    flod, handed = make(data, finish_share=0.5, footprint=40.0, **values), []
+    flod, handed = make(data, finish_share=0.5, footprint=40.0, random_background=False, **values), []
     for step in range(18):
         flod.train_step(step)
         handed += flod.levels_after(step)
