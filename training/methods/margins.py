@@ -21,6 +21,8 @@ VIEWS = 48
 """Most views that are continued, evenly chosen."""
 CELLS = 32
 """Splats along a photograph's longer side where it is continued, if there may be so many."""
+FEWEST_CELLS = 10
+"""No fewer: then photographs are not continued, as so large splats would reach into them."""
 KNOWN = 64
 """Pixels along that side of what is known of each view."""
 SIZE = 0.7
@@ -63,7 +65,7 @@ class Margins:
         """
         gaussians, cells = gaussians.detach(), CELLS
         known = [self._known(gaussians, camera) for camera in self._cameras]
-        while cells > 1:
+        while cells >= FEWEST_CELLS:
             total = gaussians
             for camera in self._cameras:
                 total = Gaussians.concatenated([total, self._beyond(total, camera, cells, known)])
@@ -97,9 +99,12 @@ class Margins:
         shown = np.concatenate([image / np.maximum(alpha, 0.5)[..., None], inverse[..., None]], 2)
         shown, reached = blurred(shown, covered)
         across, down = (wide.width - small.width) // 2, (wide.height - small.height) // 2
-        inside = np.zeros_like(covered)
-        inside[down : down + small.height, across : across + small.width] = True
-        row, column = np.nonzero(~covered & ~inside & reached)
+        row, column = np.nonzero(~covered & reached)
+        edge_row = row.clip(down, down + small.height - 1)
+        edge_column = column.clip(across, across + small.width - 1)
+        outside = (edge_row != row) | (edge_column != column)
+        goes_on = outside & covered[edge_row, edge_column]  # a photograph that ends in nothing does not
+        row, column = row[goes_on], column[goes_on]
 
         rays = np.stack([(column + 0.5 - wide.cx) / wide.fx, (row + 0.5 - wide.cy) / wide.fy], 1)
         rays = np.concatenate([rays, np.ones((len(rays), 1))], 1) @ wide.world_to_camera[:3, :3]

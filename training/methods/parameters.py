@@ -9,8 +9,8 @@ from typing import Any
 
 from ..errors import LodgsError
 
-MARGIN_SHARE = 0.05
-"""The most of all splats that may continue photographs beyond their edges."""
+MARGIN_SHARE, MARGIN_SPLATS = 0.1, 4000
+"""The most of all splats that may continue photographs beyond their edges, and the most at all."""
 
 
 def parameter(
@@ -78,7 +78,7 @@ class Parameters:
     random_background: bool = parameter(
         True,
         "Whether every step draws over another colour, so that no splat can use the black behind it as a "
-        "colour of the scene.",
+        "colour of the scene; not for photographs whose black is nothing.",
     )
     margin: float = parameter(
         0.5,
@@ -114,7 +114,7 @@ class Parameters:
 
     def margin_room(self, budget: int) -> int:
         """How many of at most so many splats may continue photographs."""
-        return int(MARGIN_SHARE * budget) if self.margin else 0
+        return min(int(MARGIN_SHARE * budget), MARGIN_SPLATS) if self.margin else 0
 
     def check(self) -> None:
         """What values must be beside each other; a method's class says it of its own.

@@ -50,19 +50,20 @@ def command(path: Path, keys: dict) -> list[str]:
 TINY = {
     "flod": {
         "levels": 3, "steps": [14, 16, 20], "finish_share": 0.4, "footprint": 6.0, "densify_interval": 5,
-        "prune_interval": 10,
-        "overlap_interval": 10, "sh_interval": 15, "grad_threshold": 1e-5, "max_splats": 300,
+        "prune_interval": 10, "overlap_interval": 10, "sh_interval": 15, "grad_threshold": 1e-5,
+        "max_splats": 300, "random_background": False, "margin": 0.0,
     },
     "octree": {
         "levels": 3, "steps": 70, "footprint": 6.0, "grow_interval": 5, "far_share": 0.2, "sh_interval": 15,
-        "grad_threshold": 1e-5, "max_splats": 300, "full_share": 0.1,
+        "grad_threshold": 1e-5, "max_splats": 300, "full_share": 0.1, "random_background": False,
     },
     "octree_neural": {
         "levels": 3, "steps": 70, "footprint": 6.0, "grow_interval": 5, "far_share": 0.2, "offsets": 3,
         "grad_threshold": 1e-5, "max_splats": 300, "appearance": 4, "sh_degree": 2,
+        "random_background": False,
     },
 }  # fmt: skip
-"""Parameters of a run of 70 steps and 3 levels on the tiny scene, by method."""
+"""Parameters of a run of 70 steps and 3 levels on the tiny scene, whose background is black, by method."""
 
 
 @pytest.fixture(scope="module", params=TINY)
