@@ -37,7 +37,6 @@ def main() -> int:
     started = time.monotonic()
     out: Path = chosen.out
     run = RunFolder(out / chosen.method)
-    draft = METHODS[chosen.method].preset("draft")
     if run.state() == "done":  # an interrupted demo is resumed, a finished one is made anew
         shutil.rmtree(run.path)
     os.environ.setdefault("LODGS_TRAINER_PYTHON", sys.executable)
@@ -48,7 +47,6 @@ def main() -> int:
         ["train", "--scene", str(chosen.scene), "--method", chosen.method, "--preset", "draft",
          "--image-scale", str(chosen.image_scale), "--out", str(run.path),
          "--blend", str(out / "scene.blend"), "--export", str(out / "bundle.ply"),
-         "--set", f"max_splats={draft.max_splats // 2}",  # minutes on two cores
          *(word for setting in chosen.set for word in ("--set", setting))]
     )  # fmt: skip
     if code:

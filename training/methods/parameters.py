@@ -48,9 +48,9 @@ class Parameters:
     multiples of the scene extent.
     """
 
-    steps: int = parameter(4300, "Training steps.", above=0, unit="steps")
+    steps: int = parameter(3000, "Training steps.", above=0, unit="steps")
     max_splats: int = parameter(
-        120_000,
+        60_000,
         "Most splats; those with the largest gradients are densified first. Of more structure-from-motion "
         "points than this, training begins with a random sample.",
         above=0,

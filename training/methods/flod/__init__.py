@@ -32,7 +32,7 @@ class FlodParameters(DensityParameters):
         0.0, "Level 1's smallest size in scene units (FLoD: lambda); 0 takes it from 'footprint'."
     )
     steps: tuple[int, ...] = parameter(
-        (300, 500, 600, 900, 2000), "Training steps of each level.", above=0, unit="steps"
+        (250, 400, 500, 700, 1250), "Training steps of each level.", above=0, unit="steps"
     )
     densify_until: tuple[float, ...] = parameter(
         (0.5,) * 5, "Share of a level's steps after which splats are no longer added or removed.", high=1
