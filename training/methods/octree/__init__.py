@@ -13,8 +13,8 @@ class OctreeParameters(Parameters):
     """Those of Octree-GS; explicit and neural anchors share them."""
 
     max_splats: int = parameter(
-        180_000,
-        "Most splats of all levels together, which add up; FLoD's five levels are over 300,000.",
+        90_000,
+        "Most splats of all levels together, which add up; FLoD's five levels are over 110,000.",
         above=0,
     )
     grad_threshold: float = parameter(

@@ -67,7 +67,14 @@ class NeuralOctreeParameters(OctreeParameters):
 
 
 _DRAFT = NeuralOctreeParameters(
-    footprint=2.0, full_share=0.1, least_weight=0.03, volume_weight=0.01, lr_means=4e-4, lr_sh=5e-3
+    steps=4300,
+    max_splats=180_000,
+    footprint=2.0,
+    full_share=0.1,
+    least_weight=0.03,
+    volume_weight=0.01,
+    lr_means=4e-4,
+    lr_sh=5e-3,
 )
 _STANDARD = replace(_DRAFT, steps=30_000, max_splats=2_000_000, offsets=10, grow_interval=100)
 _PAPER = replace(
