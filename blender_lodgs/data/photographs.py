@@ -6,10 +6,11 @@ from typing import Protocol
 
 import bpy
 import numpy as np
-from mathutils import Matrix
+from mathutils import Matrix, Vector
 
 from ...training.errors import LodgsError
 from ...training.scenes.cameras import Camera
+from . import selection
 
 SENSOR = 36.0
 """Longer side of every imported camera's sensor in millimetres: lenses read as on a full-frame camera."""
@@ -93,6 +94,23 @@ def look_through(context: bpy.types.Context, root: bpy.types.Object, step: int =
         current = context.active_object
     index = cameras.index(current) if current in cameras else min(-step, 0)
     return through(context, cameras[(index + step) % len(cameras)])
+
+
+def look_as_photographed(context: bpy.types.Context, root: bpy.types.Object) -> None:
+    """Turns the window's viewports to where the splats of a bundle were photographed from, to orbit there.
+
+    A file that does not say so leaves them as they are.
+    """
+    meta = selection.read_json(root.lodgs.meta)
+    if context.screen is None or "view" not in meta:
+        return
+    eye, target = (root.matrix_basis @ Vector(place) for place in meta["view"])
+    for area in context.screen.areas:
+        if area.type == "VIEW_3D":
+            looks = area.spaces.active.region_3d
+            looks.view_perspective = "PERSP"
+            looks.view_rotation = (eye - target).to_track_quat("Z", "Y")
+            looks.view_location, looks.view_distance = target, (eye - target).length
 
 
 def through(context: bpy.types.Context, view: bpy.types.Object) -> bpy.types.Object:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import bpy
 
-from ..data import scenes
+from ..data import photographs, scenes
 from .parts import report_errors
 
 
@@ -40,13 +40,17 @@ class LODGS_OT_import_splats(bpy.types.Operator):
     @report_errors
     def execute(self, context):
         paths = [Path(self.directory, file.name) for file in self.files if file.name]
+        first = not scenes.roots(context.scene)
         for path in paths or [Path(self.filepath)]:
-            scenes.import_splats(
+            root = scenes.import_splats(
                 context,
                 bpy.path.abspath(str(path)),
                 upright=self.upright,
                 warn=lambda message: self.report({"WARNING"}, message),
             )
+            if first:  # otherwise the artist is looking at something
+                photographs.look_as_photographed(context, root)
+                first = False
         return {"FINISHED"}
 
 

@@ -43,7 +43,7 @@ _FORBIDDEN = ("packed_", "f_rest_", "end_header", "element chunk")
 # Some viewers read no further than 10 KB to find the end of the header.
 _MAX_COMMENTS = 2560
 # What readers rely on of meta.
-_META_SHAPES = {"camera_center": (3,), "up_rotation": (3, 3)}
+_META_SHAPES = {"camera_center": (3,), "up_rotation": (3, 3), "view": (2, 3)}
 # What reading JSON of others' making raises where something in it is missing, of another type or too deep.
 _CONTRADICTIONS = (ValueError, KeyError, TypeError, AttributeError, RecursionError)
 

@@ -56,6 +56,33 @@ def test_bundle_in_and_out_is_the_same_file(bpy, bundle, file, tmp_path):
     assert out.read_bytes() == file.read_bytes()
 
 
+def test_the_first_bundle_turns_the_viewports_to_where_it_was_photographed_from(bpy, lodgs, bundle, tmp_path):
+    """An eye at (1, 0, -5) that looks along +z where -y is up: in Blender along +y from y = -5."""
+    bundle.meta |= {"view": [[1, 0, -5], [1, 0, 3]], "up_rotation": [[1, 0, 0], [0, 0, 1], [0, -1, 0]]}
+    path = tmp_path / "seen.ply"
+    lodgs("training.splats.bundle").write_bundle(path, bundle)
+    looks = [area.spaces.active.region_3d for area in bpy.context.screen.areas if area.type == "VIEW_3D"]
+    assert looks
+    assert bpy.ops.lodgs.import_splats(filepath=str(path)) == {"FINISHED"}
+    for look in looks:
+        assert tuple(look.view_location) == pytest.approx((1, 3, 0), abs=1e-5)
+        assert look.view_distance == pytest.approx(8)
+        toward = look.view_rotation.to_matrix() @ type(look.view_location)((0, 0, -1))
+        assert tuple(toward) == pytest.approx((0, 1, 0), abs=1e-5)
+        look.view_distance = 1.0
+    bpy.ops.lodgs.import_splats(filepath=str(path))
+    assert [look.view_distance for look in looks] == [1.0] * len(looks)
+
+
+@pytest.mark.parametrize("view", [[[0, 0, 0]], "far", [[0, 0, None], [0, 0, 1]]])
+def test_an_impossible_view_is_refused_in_a_sentence(bpy, lodgs, bundle, tmp_path, view):
+    bundle.meta |= {"view": view}
+    path = tmp_path / "seen.ply"
+    lodgs("training.splats.bundle").write_bundle(path, bundle)
+    with pytest.raises(RuntimeError, match="view is not"):
+        bpy.ops.lodgs.import_splats(filepath=str(path))
+
+
 def test_saved_and_opened_still_the_same_file(bpy, file, tmp_path):
     bpy.ops.lodgs.import_splats(filepath=str(file))
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
