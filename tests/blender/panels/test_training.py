@@ -36,12 +36,12 @@ def test_before_training(root, draw, fake):
     notes = draw()
     assert notes.operators == ["lodgs.train"]
     assert notes.properties == ["method", "preset", "image_scale"]
-    assert "3,534 steps in 5 levels" in notes.texts
+    assert "3,762 steps in 5 levels" in notes.texts
     assert NONE_HELD_OUT in notes.texts
     root.lodgs.training.test_every = 8
     assert NONE_HELD_OUT not in draw().texts
     root.lodgs.training.parameters.levels = 3
-    assert "2,793 steps in 3 levels" in draw().texts
+    assert "3,021 steps in 3 levels" in draw().texts
     root.lodgs.training.method = "3dgs"  # which has no levels
     assert "3,000 steps" in draw().texts
 

@@ -32,7 +32,7 @@ class FlodParameters(DensityParameters):
         0.0, "Level 1's smallest size in scene units (FLoD: lambda); 0 takes it from 'footprint'."
     )
     steps: tuple[int, ...] = parameter(
-        (250, 400, 500, 700, 1250), "Training steps of each level.", above=0, unit="steps"
+        (250, 400, 500, 900, 1250), "Training steps of each level.", above=0, unit="steps"
     )
     densify_until: tuple[float, ...] = parameter(
         (0.5,) * 5, "Share of a level's steps after which splats are no longer added or removed.", high=1
@@ -41,7 +41,7 @@ class FlodParameters(DensityParameters):
         (50,) * 5, "Steps between two densifications.", above=0, unit="steps"
     )
     budget_ratio: float = parameter(
-        0.5,
+        0.6,
         "A level's share of the next finer level's budget of splats, so that every level adds some; about "
         "what the paper's levels have by themselves.",
         above=0,
