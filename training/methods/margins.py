@@ -17,7 +17,7 @@ from ..rasterize import Gaussians, rasterize
 from ..scenes.cameras import Camera
 from ..splats.gaussians import SH_C0
 
-VIEWS = 48
+VIEWS = 32
 """Most views that are continued, evenly chosen."""
 CELLS = 32
 """Splats along a photograph's longer side where it is continued, if there may be so many."""
@@ -68,7 +68,8 @@ class Margins:
         while cells >= FEWEST_CELLS:
             total = gaussians
             for camera in self._cameras:
-                total = Gaussians.concatenated([total, self._beyond(total, camera, cells, known)])
+                if added := self._beyond(total, camera, cells, known):
+                    total = Gaussians.concatenated([total, added])
                 if len(total) > len(gaussians) + most:
                     break
             else:
@@ -89,8 +90,8 @@ class Margins:
         camera: Camera,
         cells: int,
         known: Sequence[tuple[Camera, np.ndarray]],
-    ) -> Gaussians:
-        """What continues one view where nothing does yet."""
+    ) -> Gaussians | None:
+        """What continues one view where nothing does yet, if anything."""
         small = camera.scaled(cells / max(camera.width, camera.height))
         wide = small.widened(self._share)
         image, alpha, depth = self._draw(gaussians, wide)
@@ -105,6 +106,8 @@ class Margins:
         outside = (edge_row != row) | (edge_column != column)
         goes_on = outside & covered[edge_row, edge_column]  # a photograph that ends in nothing does not
         row, column = row[goes_on], column[goes_on]
+        if not len(row):
+            return None
 
         rays = np.stack([(column + 0.5 - wide.cx) / wide.fx, (row + 0.5 - wide.cy) / wide.fy], 1)
         rays = np.concatenate([rays, np.ones((len(rays), 1))], 1) @ wide.world_to_camera[:3, :3]
@@ -112,7 +115,8 @@ class Margins:
         depths = np.full(len(rays), np.nan)
         for times in FARTHER:
             places = wide.center + rays * (start * times)[:, None]
-            free = np.isnan(depths) & ~_before(places, known)
+            open_ = np.flatnonzero(np.isnan(depths))
+            free = open_[~_before(places[open_], known)]
             depths[free] = times * start[free]
         kept = ~np.isnan(depths)
         away = rays[kept] * depths[kept, None]
