@@ -23,10 +23,10 @@ CELLS = 32
 """Splats along a photograph's longer side where it is continued, if there may be so many."""
 FEWEST_CELLS = 10
 """No fewer: then photographs are not continued, as so large splats would reach into them."""
-KNOWN = 64
-"""Pixels along that side of what is known of each view."""
 SIZE = 0.7
 """Their standard deviation, in the distance between two."""
+KNOWN = 64
+"""Pixels along that side of what is known of each view."""
 OPACITY = 0.95
 BEHIND = 1.1
 """They lie so many times as deep as what they continue, so that photographs stay as they are."""

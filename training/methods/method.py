@@ -104,7 +104,7 @@ class Method(ABC, Generic[P, D]):
         ahead = middle.center + data.median_depth * middle.world_to_camera[2, :3]
         return {
             "camera_center": data.mean_camera.tolist(),
-            "view": np.round([middle.center, ahead], 6).tolist(),
+            "view": [middle.center.tolist(), ahead.tolist()],
             "focal_px": data.focal,
             "focal_width": data.train[0].width,
             "scene_extent": data.extent,

@@ -230,6 +230,12 @@ def test_what_all_methods_record_of_a_scene(data, tiny):
     method = methods.create("tiny", data, tiny.preset("draft"), seed=0, backend="cpu")
     meta = method.meta()
     assert meta["focal_px"] == 60 and meta["focal_width"] == 64
+    eye, target = np.array(meta["view"])
+    middle = np.argmin(
+        np.linalg.norm([c.center - np.array(meta["camera_center"]) for c in data.train], axis=1)
+    )
+    assert eye == pytest.approx(data.train[middle].center)
+    assert data.train[middle].view_space(target[None])[0] == pytest.approx([0, 0, data.median_depth])
     assert meta["camera_center"] == pytest.approx(np.mean([c.center for c in data.train], 0).tolist())
     assert {"scene_extent", "median_depth"} <= set(meta) and method.facts() == {}
     assert torch.device("cpu") == method.device
