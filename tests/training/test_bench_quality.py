@@ -29,7 +29,7 @@ def test_a_point_for_every_run_and_a_picture_of_them(tiny_scene, tmp_path):
     run = next(tmp_path.glob("tiny-3dgs-this-0.001-*"))
     assert (
         "validation = true" in (run / "job.toml").read_text()
-        and "steps = 4\n" in (run / "job.toml").read_text()
+        and "steps = 3\n" in (run / "job.toml").read_text()
     )
     before = (run / "events.jsonl").read_bytes()
     assert bench(tiny_scene, *options).returncode == 0

@@ -51,7 +51,7 @@ TINY = {
     "flod": {
         "levels": 3, "steps": [14, 16, 20], "finish_share": 0.4, "footprint": 6.0, "densify_interval": 5,
         "prune_interval": 10, "overlap_interval": 10, "sh_interval": 15, "grad_threshold": 1e-5,
-        "max_splats": 300, "random_background": False, "margin": 0.0,
+        "max_splats": 300, "budget_ratio": 0.5, "random_background": False, "margin": 0.0,
     },
     "octree": {
         "levels": 3, "steps": 70, "footprint": 6.0, "grow_interval": 5, "far_share": 0.2, "sh_interval": 15,
