@@ -7,7 +7,8 @@ from scipy.special import expit
 
 from ..methods.data import TrainingData
 from ..methods.support import halfway
-from .views import Evaluation, ShownTo, evenly
+from ..scenes.cameras import evenly
+from .views import Evaluation, ShownTo
 
 VEIL = 0.1
 """What is nearer than this share of the scene's median depth hangs before the scene."""

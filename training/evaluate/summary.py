@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from ..scenes.cameras import evenly
 from ..splats.bundle import Bundle
 from .aside import oversized, veil
-from .views import MOST_TRAINING_VIEWS, Evaluation, evenly, shown_at
+from .views import MOST_TRAINING_VIEWS, Evaluation, shown_at
 
 
 def summary(evaluation: Evaluation, bundle: Bundle) -> dict:

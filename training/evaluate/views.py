@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import torch
@@ -15,24 +14,16 @@ from ..lod.rule import Values, find_rule
 from ..lod.selection import Choice, complete, settings
 from ..methods.data import TrainingData
 from ..rasterize import Gaussians, Rendering, device_of, rasterize
-from ..scenes.cameras import Camera
+from ..scenes.cameras import Camera, evenly
 from ..splats.bundle import Bundle, Level
 from ..splats.gaussians import Splats
 from .metrics import psnr, ssim
-
-Item = TypeVar("Item")
 
 MOST_TRAINING_VIEWS = 24
 """How many training views tell the quality of all."""
 
 ShownTo = Callable[[Camera], tuple[Splats, np.ndarray | None]]
 """What a camera is shown: splats, the same for all, and weights (N,) in [0, 1] on opacities; None: all 1."""
-
-
-def evenly(items: Sequence[Item], most: int) -> list[Item]:
-    """At most so many of the items, evenly chosen, the first and the last among them."""
-    chosen = np.linspace(0, len(items) - 1, min(most, len(items)))
-    return [items[place] for place in chosen.round().astype(int)]
 
 
 def shown_at(bundle: Bundle, level: Level) -> ShownTo:

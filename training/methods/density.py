@@ -62,16 +62,15 @@ def densify(
     if len(chosen) == 0:
         return 0
     scales = model["log_scales"][chosen].exp() + min_scale
-    cloned = torch.zeros_like(chosen, dtype=torch.bool)
-    if clone_below is not None:
-        cloned = scales.amax(1) <= clone_below
+    cloned = scales.amax(1) <= (-torch.inf if clone_below is None else clone_below)
     clones = model.rows(chosen[cloned])
     parents, scales = chosen[~cloned], scales[~cloned]
     if clone_below is None:
         children, scales = _along_longest_axis(model.rows(parents.repeat(2)), scales)
     else:
-        children, scales = model.rows(parents.repeat(2)), (scales / 1.6).repeat(2, 1)
-        children["means"] += sample_inside(children["quats"], 1.6 * scales, rng)
+        children = model.rows(parents.repeat(2))
+        children["means"] += sample_inside(children["quats"], scales.repeat(2, 1), rng)
+        scales = (scales / 1.6).repeat(2, 1)
     children["log_scales"] = constrained_log(scales, min_scale)
     alive = torch.ones(len(model), dtype=torch.bool, device=parents.device)
     alive[parents] = False

@@ -14,7 +14,7 @@ import torch
 from scipy.ndimage import gaussian_filter, maximum_filter
 
 from ..rasterize import Gaussians, rasterize
-from ..scenes.cameras import Camera
+from ..scenes.cameras import Camera, evenly
 from ..splats.gaussians import SH_C0
 
 VIEWS = 32
@@ -49,15 +49,14 @@ class Margins:
     """
 
     def __init__(self, cameras: Sequence[Camera], share: float, near: float, backend: str) -> None:
-        chosen = np.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).round().astype(int)
-        self._cameras = [cameras[place] for place in chosen]
+        self._cameras = evenly(cameras, VIEWS)
         self._share, self._near, self._backend = share, near, backend
 
     def continued(self, gaussians: Gaussians, most: int) -> Gaussians:
         """Splats where the wider views show next to nothing; none before what a view itself shows.
 
         Args:
-            gaussians: N splats as they are drawn.
+            gaussians: N splats as they are drawn, in the world of the cameras.
             most: of new ones; they are the larger the fewer.
 
         Returns:

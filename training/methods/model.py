@@ -127,7 +127,13 @@ class Model:
         }
 
     def load_state_dict(self, state: dict) -> None:
-        """Becomes what ``state_dict`` gave."""
+        """Becomes what ``state_dict`` gave.
+
+        Raises:
+            ValueError: it lacks a column, as an earlier version's may.
+        """
+        if missing := set(self.columns) - set(state["columns"]):
+            raise ValueError(f"columns {sorted(missing)} are missing")
         for name, tensor in state["tensors"].items():
             self.adam.replace(name, tensor.requires_grad_(True))
         self.columns, self.stats = state["columns"], state["stats"]

@@ -84,6 +84,7 @@ class Parameters:
         0.5,
         "How much photographs are continued on every side, as a share of their size, where none shows "
         "anything: blurred colours at the depth of the edge instead of black. 0 leaves it empty.",
+        high=2,
     )
     lr_exposure: float = parameter(
         0.0,

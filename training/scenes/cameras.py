@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -108,6 +109,12 @@ class Camera:
         pose = self.world_to_camera @ matrix
         pose[:3] /= scale
         return replace(self, world_to_camera=pose), scale
+
+
+def evenly(cameras: Sequence[Camera], most: int) -> list[Camera]:
+    """At most so many of the cameras, evenly chosen, the first and the last among them."""
+    chosen = np.linspace(0, len(cameras) - 1, min(most, len(cameras)))
+    return [cameras[place] for place in chosen.round().astype(int)]
 
 
 def write_camera(path: Path, camera: Camera, near: float) -> None:

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from training.evaluate.aside import MOST_PLACES, VEIL, oversized, veil
-from training.evaluate.views import Evaluation, evenly
+from training.evaluate.views import Evaluation
 from training.methods.support import halfway
 from training.rasterize import Gaussians, rasterize
-from training.scenes.cameras import Camera
+from training.scenes.cameras import Camera, evenly
 from training.splats.gaussians import Splats
 
 MEDIAN_DEPTH = 10.0

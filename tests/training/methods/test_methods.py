@@ -241,21 +241,22 @@ def test_what_all_methods_record_of_a_scene(data, tiny):
     assert torch.device("cpu") == method.device
 
 
-def test_a_step_has_its_own_background_and_its_picture_has_none(data, tiny):
+@pytest.mark.parametrize("name", sorted(methods.METHODS))
+def test_a_step_has_its_own_background_and_its_picture_has_none(data, name):
     from training.methods import create
     from training.methods.parameters import override
 
-    presets = methods.method_info("3dgs").presets
-    method = create("3dgs", data, presets["draft"], seed=0, backend="cpu")
+    presets = methods.method_info(name).presets
+    method = create(name, data, presets["draft"], seed=0, backend="cpu")
     view = method.choose_view(3)
     drawn = method.draw(view, 3)[0].rendering
     behind = torch.tensor(method.background(3)).float()
-    black = create("3dgs", data, override(presets["draft"], {"random_background": False}), 0, "cpu")
+    black = create(name, data, override(presets["draft"], {"random_background": False}), 0, "cpu")
     expected = black.draw(view, 3)[0].rendering
     torch.testing.assert_close(drawn.image - expected.image, (1 - drawn.alpha[..., None]) * behind)
     torch.testing.assert_close(method.over_black(drawn, 3), expected.image)
     assert (drawn.alpha < 0.5).any()
     colors = {method.background(step) for step in range(9)}
     assert len(colors) == 9 and black.background(3) == (0, 0, 0) == tuple(
-        create("3dgs", data, presets["paper"], 0, "cpu").background(3)
+        create(name, data, presets["paper"], 0, "cpu").background(3)
     )

@@ -3,6 +3,7 @@
 import io
 
 import numpy as np
+import pytest
 import torch
 
 from training.methods.model import NAMES, Model
@@ -80,3 +81,15 @@ def test_statistics_begin_anew_in_the_shape_they_had():
         "gradient_sum": (2,), "seen": (2, 4), "opacity_sum": (2,)
     }  # fmt: skip
     assert not any(stat.any() for stat in model.stats.values())
+
+
+def test_a_state_without_a_column_is_refused_and_changes_nothing(model):
+    state, before = model.state_dict(), model["means"].detach().clone()
+    lacking = {
+        **state,
+        "columns": {},
+        "tensors": {name: tensor + 1 for name, tensor in state["tensors"].items()},
+    }
+    with pytest.raises(ValueError, match=r"columns \['level'\] are missing"):
+        model.load_state_dict(lacking)
+    assert torch.equal(model["means"], before)
