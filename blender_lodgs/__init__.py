@@ -8,7 +8,7 @@ unregistered in reverse.
 import bpy
 
 from . import commands, operators, panels, viewport
-from .data import older_files, properties, scenes, updates
+from .data import older_files, properties, removal, scenes, updates
 from .render import compare, engine, renderer
 from .runs import jobs
 from .viewport import wipe
@@ -20,6 +20,7 @@ MODULES = (
     *panels.MODULES,
     older_files,
     scenes,
+    removal,
     viewport,
     renderer,
     engine,

@@ -119,6 +119,21 @@ def compositor_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
     return tree
 
 
+def reset_compositor(scene: bpy.types.Scene) -> None:
+    """Makes the compositor of a scene what it is before anybody has worked on it."""
+    if hasattr(scene, "compositing_node_group"):
+        tree, scene.compositing_node_group = scene.compositing_node_group, None
+        if tree is not None and not tree.users:
+            bpy.data.node_groups.remove(tree)
+        return
+    nodes = compositor_tree(scene).nodes
+    nodes.clear()
+    layers, output = nodes.new("CompositorNodeRLayers"), nodes.new("CompositorNodeComposite")
+    output.location = (400, 0)
+    scene.node_tree.links.new(layers.outputs["Image"], output.inputs["Image"])
+    scene.use_nodes = False
+
+
 def to_straight(tree: bpy.types.NodeTree) -> bpy.types.Node:
     """A new node that divides colours by their alpha."""
     node = tree.nodes.new("CompositorNodePremulKey")

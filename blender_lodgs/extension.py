@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Protocol, cast
 
@@ -34,6 +35,20 @@ def user_folder(name: str = "") -> Path:
 def preferences() -> Settings:
     """The extension's preferences."""
     return cast(Settings, bpy.context.preferences.addons[ID].preferences)
+
+
+def in_window():
+    """A context with a window, which a timer lacks; as it is where there are none (in background)."""
+    windows = bpy.context.window_manager.windows
+    if bpy.context.window is not None or not windows:
+        return nullcontext()
+    return bpy.context.temp_override(window=windows[0])
+
+
+def undo_step(message: str) -> None:
+    """Makes what came by itself an undo step, so that undoing the user's next one does not take it away."""
+    with in_window():
+        bpy.ops.ed.undo_push(message=message)
 
 
 def redraw() -> None:

@@ -8,6 +8,9 @@ stored value counts where it still stands for the visible one: whatever an artis
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import bpy
 import numpy as np
 
@@ -35,8 +38,22 @@ from ..nodes import display
 _OWN = {"position", BASE, SCALE, ROTATION, LOG_SCALE, OPACITY_LOGIT, QUATERNION, COLOR, RADIUS, WEIGHT}
 _TYPE = "lodgs_type:"  # custom property that remembers a column's type
 _EXTRA = "column:"  # before a file's column whose name means something else to a point cloud
+_MADE = ("scenes", "objects", "collections", "pointclouds", "meshes", "cameras", "images")
 
 
+@contextmanager
+def all_or_nothing() -> Iterator[None]:
+    """What the block has made in the file vanishes again if it fails."""
+    before = {kind: set(getattr(bpy.data, kind)) for kind in _MADE}
+    try:
+        yield
+    except BaseException:
+        for kind, there in before.items():
+            bpy.data.batch_remove(list(set(getattr(bpy.data, kind)) - there))
+        raise
+
+
+@all_or_nothing()
 def new_points(name: str, positions: np.ndarray, colors: np.ndarray, radius: float) -> bpy.types.Object:
     """Coloured points as an object that is in no collection yet.
 
@@ -51,6 +68,7 @@ def new_points(name: str, positions: np.ndarray, colors: np.ndarray, radius: flo
     return _in_colors(name, cloud, colors)
 
 
+@all_or_nothing()
 def new_splats(name: str, splats: Splats) -> bpy.types.Object:
     """Splats as an object that is in no collection yet; its local space is the splats' world."""
     cloud = compat.new_point_cloud(name, len(splats))

@@ -22,6 +22,8 @@ def bring_up_to_date(root: bpy.types.Object) -> None:
             _from_0_1_0(root, stored)
     if "training" in stored:
         _training_from_0_1_0(root, group["training"])
+    if root.lodgs.itself is None:
+        root.lodgs.itself = root
     if selection.outdated(root):
         selection.attach(root)
 

@@ -10,6 +10,7 @@ from mathutils import Matrix, Vector
 
 from ...training.errors import LodgsError
 from ...training.scenes.cameras import Camera
+from ..attributes import read_attribute
 from . import selection
 
 SENSOR = 36.0
@@ -73,6 +74,19 @@ def views(root: bpy.types.Object) -> list[bpy.types.Object]:
     return sorted(found, key=lambda obj: obj.name)
 
 
+def held_out(root: bpy.types.Object) -> list[bpy.types.Object]:
+    """The views that the run of the scene's levels did not train on, as far as it says so."""
+    return [view for view in views(root) if is_held_out(root, view)]
+
+
+def is_held_out(root: bpy.types.Object, view: bpy.types.Object) -> bool:
+    """Whether the run of the scene's levels did not train on a view; False where it does not say so."""
+    match selection.read_json(root.lodgs.meta).get("held_out"):
+        case [int(first), int(every)] if every > 0:
+            return view.data.lodgs.place >= first and (view.data.lodgs.place - first) % every == 0
+    return False
+
+
 def look_through(context: bpy.types.Context, root: bpy.types.Object, step: int = 0) -> bpy.types.Object:
     """Makes one of the views the scene's camera, and gives the render its size.
 
@@ -96,21 +110,59 @@ def look_through(context: bpy.types.Context, root: bpy.types.Object, step: int =
     return through(context, cameras[(index + step) % len(cameras)])
 
 
-def look_as_photographed(context: bpy.types.Context, root: bpy.types.Object) -> None:
-    """Turns the window's viewports to where the splats of a bundle were photographed from, to orbit there.
-
-    A file that does not say so leaves them as they are.
-    """
-    meta = selection.read_json(root.lodgs.meta)
-    if context.screen is None or "view" not in meta:
+def look_at_scene(context: bpy.types.Context, root: bpy.types.Object) -> None:
+    """Turns the window's viewports to a splat scene, to orbit there: as it was photographed, where that is
+    known, else from where they look already, with most of it in sight."""
+    if context.screen is None:
         return
-    eye, target = (root.matrix_basis @ Vector(place) for place in meta["view"])
+    photographed = photographed_from(root)
     for area in context.screen.areas:
         if area.type == "VIEW_3D":
             looks = area.spaces.active.region_3d
             looks.view_perspective = "PERSP"
-            looks.view_rotation = (eye - target).to_track_quat("Z", "Y")
-            looks.view_location, looks.view_distance = target, (eye - target).length
+            if photographed is not None:
+                eye, target = photographed
+                looks.view_rotation = (eye - target).to_track_quat("Z", "Y")
+                looks.view_location, looks.view_distance = target, (eye - target).length
+            elif (bounds := bounds_of_most(root)) is not None:
+                looks.view_location, size = bounds
+                looks.view_distance = 1.5 * size
+
+
+def photographed_from(root: bpy.types.Object) -> tuple[Vector, Vector] | None:
+    """An eye and what it looks at, in the root's parent: what a bundle records, or else of the view in the
+    middle of all views, at the median depth of the points. None where neither is there."""
+    meta = selection.read_json(root.lodgs.meta)
+    if "view" in meta:
+        eye, target = (root.matrix_basis @ Vector(place) for place in meta["view"])
+        return eye, target
+    poses, places = np.array([view.matrix_basis for view in views(root)]), _positions(root.lodgs.points)
+    if not len(poses) or not len(places):
+        return None
+    eyes = poses[:, :3, 3]
+    pose = poses[np.linalg.norm(eyes - eyes.mean(0), axis=1).argmin()]
+    eye, ahead = pose[:3, 3], -pose[:3, 2]
+    depths = (places - eye) @ ahead
+    depth = np.median(depths[depths > 0]) if (depths > 0).any() else 1.0
+    return root.matrix_basis @ Vector(eye), root.matrix_basis @ Vector(eye + depth * ahead)
+
+
+def bounds_of_most(root: bpy.types.Object) -> tuple[Vector, float] | None:
+    """Middle and diagonal, in the root's parent, of a box around nine tenths of the finest level along each
+    axis: far outliers, which splats always have, are left out. None without splats."""
+    levels = [item.object for item in root.lodgs.levels if item.exists]
+    places = _positions(levels[-1] if levels else None)
+    if not len(places):
+        return None
+    low, high = np.percentile(places, (5, 95), axis=0)
+    size = float(np.linalg.norm(high - low)) * max(root.matrix_basis.to_scale())
+    return root.matrix_basis @ Vector((low + high) / 2), size
+
+
+def _positions(obj: bpy.types.Object | None) -> np.ndarray:
+    """(N, 3) places of an object's points, in its own space."""
+    found = None if obj is None else read_attribute(obj.data, "position")
+    return np.zeros((0, 3), np.float32) if found is None else found
 
 
 def through(context: bpy.types.Context, view: bpy.types.Object) -> bpy.types.Object:
@@ -127,8 +179,8 @@ def through(context: bpy.types.Context, view: bpy.types.Object) -> bpy.types.Obj
 
 
 def match_render(scene: bpy.types.Scene, view: View) -> None:
-    """Gives the render the size and the pixel shape of a view."""
+    """Gives the render the size and the pixel shape of a view; what percentage of it, is the artist's."""
     render = scene.render
-    render.resolution_x, render.resolution_y, render.resolution_percentage = view.width, view.height, 100
+    render.resolution_x, render.resolution_y = view.width, view.height
     render.pixel_aspect_x = max(1.0, view.fy / view.fx)
     render.pixel_aspect_y = max(1.0, view.fx / view.fy)

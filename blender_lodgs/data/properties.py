@@ -42,6 +42,10 @@ def _single_changed(self, context) -> None:
     _changed(self, context)
 
 
+def _became_root(self, context) -> None:
+    self.itself = self.id_data if self.is_root else None
+
+
 def _can_be_eye(self, obj: bpy.types.Object) -> bool:
     return not obj.lodgs.is_root
 
@@ -122,7 +126,13 @@ class SplatScene(bpy.types.PropertyGroup):
     Children keep COLMAP coordinates; the root's transform stands it upright, scales and places it.
     """
 
-    is_root: bpy.props.BoolProperty(options={"HIDDEN"})
+    is_root: bpy.props.BoolProperty(update=_became_root, options={"HIDDEN"})
+    itself: bpy.props.PointerProperty(
+        name="Itself",
+        description="The root, which so outlives its deletion until all that belongs to it is removed",
+        type=bpy.types.Object,
+        options={"HIDDEN"},
+    )
     scene_folder: bpy.props.StringProperty(
         name="Scene", description="Folder of the COLMAP scene", subtype="DIR_PATH"
     )
@@ -284,9 +294,9 @@ class ViewportSettings(bpy.types.PropertyGroup):
         options=set(),
     )
     budget: bpy.props.IntProperty(
-        name="At Most",
-        description="Most splats that a viewport draws. Where there are more, coarser levels stand in for "
-        "the finest, and of a single level the most visible splats are drawn",
+        name="Splats at Most",
+        description="How many splats a viewport draws at most. Where there are more, coarser levels stand "
+        "in for the finest, and of a single level the most visible splats are drawn",
         default=2_000_000,
         min=1000,
         max=16_000_000,
@@ -317,6 +327,9 @@ class ViewSettings(bpy.types.PropertyGroup):
     )
     distorted: bpy.props.BoolProperty(
         name="Distorted", description="The lens bends lines in the photograph, which the camera does not show"
+    )
+    place: bpy.props.IntProperty(
+        name="Place", description="Place by name among the views of the COLMAP model, from 0", default=-1
     )
     psnr: bpy.props.FloatProperty(
         name="PSNR",
@@ -378,6 +391,11 @@ class RenderSettings(bpy.types.PropertyGroup):
         name="Meshes",
         description="Scene that renders the meshes, joined with the splats by depth in the compositor",
         type=bpy.types.Scene,
+    )
+    before_meshes: bpy.props.StringProperty(
+        name="Before Meshes",
+        description="What combining with meshes has switched on, to be switched off again, as JSON",
+        options={"HIDDEN"},
     )
 
 

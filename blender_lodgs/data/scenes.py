@@ -24,7 +24,12 @@ from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder
 from ...training.splats.gaussians import Splats
 from ..nodes import ellipsoids
 from . import objects, selection
-from .photographs import match_render, new_camera
+from .photographs import match_render, new_camera, views
+
+LINKED = (
+    "This splat scene is linked from another file, where its settings are. To change them here, append it "
+    "instead of linking it (File, Append), or make it local (Object, Relations, Make Local, All)."
+)
 
 
 def roots(scene: bpy.types.Scene) -> list[bpy.types.Object]:
@@ -41,6 +46,24 @@ def active_root(context: bpy.types.Context) -> bpy.types.Object | None:
         obj = obj.parent
     found = roots(context.scene)
     return found[0] if len(found) == 1 else None
+
+
+def shows_splats(scene: bpy.types.Scene) -> bool:
+    """Whether a Blender scene has splat scenes, its own or in instances of collections."""
+    return bool(roots(scene)) or any(map(_instanced, scene.objects))
+
+
+def linked(context: bpy.types.Context) -> bool:
+    """Whether the splat scene that is meant is another file's, or the selected instance shows such a one."""
+    root, obj = active_root(context), context.active_object
+    found = [root] if root is not None else [] if obj is None else _instanced(obj)
+    return any(not one.is_editable for one in found)
+
+
+def _instanced(obj: bpy.types.Object) -> list[bpy.types.Object]:
+    """The roots in the collection that an object is an instance of."""
+    collection = obj.instance_collection if obj.instance_type == "COLLECTION" else None
+    return [] if collection is None else [each for each in collection.all_objects if each.lodgs.is_root]
 
 
 def root_with_levels(context: bpy.types.Context) -> bpy.types.Object | None:
@@ -98,14 +121,11 @@ def import_colmap(
 
         root.lodgs.cameras = bpy.data.collections.new(f"{root.name} cameras")
         _collection(root).children.link(root.lodgs.cameras)
-        for camera in scene.cameras:
+        for place, camera in enumerate(scene.cameras):
             distorted = camera.name in scene.distorted
             view = new_camera(camera, extent, photograph=photographs, distorted=distorted)
-            view.parent = root
+            view.parent, view.data.lodgs.place = root, place
             root.lodgs.cameras.objects.link(view)
-            if context.scene.camera is None:
-                context.scene.camera = view
-                match_render(context.scene, camera)
         if len(scene.points):
             points = objects.new_points(
                 f"{root.name} points", scene.points, scene.point_colors, radius=extent / 400
@@ -113,6 +133,9 @@ def import_colmap(
             points.parent = root
             _collection(root).objects.link(points)
             root.lodgs.points = points
+        if context.scene.camera is None and scene.cameras:
+            context.scene.camera = root.lodgs.cameras.objects[0]
+            match_render(context.scene, scene.cameras[0])
     return root
 
 
@@ -191,6 +214,18 @@ def set_level(root: bpy.types.Object, level: Level) -> bpy.types.Object:
     if first and root.lodgs.points:  # the splats stand where the points were
         root.lodgs.points.hide_viewport = root.lodgs.points.hide_render = True
     return obj
+
+
+def contents(root: bpy.types.Object) -> str:
+    """What a splat scene holds, in a few words: photographs, points, levels and their splats."""
+    levels = [item.object for item in root.lodgs.levels if item.exists]
+    counts = (
+        (sum(bool(view.data.lodgs.photograph) for view in views(root)), "photograph"),
+        (len(root.lodgs.points.data.points) if root.lodgs.points else 0, "point"),
+        (len(levels), "level"),
+        (sum(len(obj.data.points) for obj in levels), "splat"),
+    )
+    return ", ".join(f"{count:,} {what}{'s' * (count != 1)}" for count, what in counts if count)
 
 
 def remove_finer_levels(root: bpy.types.Object) -> None:
@@ -300,26 +335,13 @@ def _new_scene(context: bpy.types.Context, name: str) -> Iterator[bpy.types.Obje
     """A new root in a new collection; both, and all in them, vanish again if the block fails."""
     if context.mode != "OBJECT":
         bpy.ops.object.mode_set(mode="OBJECT")
-    scene, camera = context.scene, context.scene.camera
-    images = set(bpy.data.images)
-    collection = bpy.data.collections.new(name)
-    root = bpy.data.objects.new(name, None)
-    root.lodgs.is_root = True
-    collection.objects.link(root)
-    scene.collection.children.link(collection)
-    try:
+    with objects.all_or_nothing():
+        collection = bpy.data.collections.new(name)
+        root = bpy.data.objects.new(name, None)
+        root.lodgs.is_root = True
+        collection.objects.link(root)
+        context.scene.collection.children.link(collection)
         yield root
-    except BaseException:
-        scene.camera = camera
-        bpy.data.batch_remove(list(set(bpy.data.images) - images))
-        for part in [*collection.children_recursive, collection]:
-            for obj in list(part.objects):
-                data = obj.data
-                bpy.data.objects.remove(obj)
-                if data is not None:
-                    bpy.data.batch_remove([data])
-            bpy.data.collections.remove(part)
-        raise
     for obj in context.selected_objects:
         obj.select_set(False)
     context.view_layer.objects.active = root

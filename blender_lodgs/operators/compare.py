@@ -54,29 +54,60 @@ class LODGS_OT_cancel_measuring(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LODGS_OT_compare_view(_OnViews, bpy.types.Operator):
-    """Put the photograph of the scene's camera over its rendered picture, with a wipe"""
+class _Compare(_OnViews):
+    """Compares a view, and looks through it."""
 
-    bl_idname = "lodgs.compare_view"
-    bl_label = "Compare"
-
-    worst: bpy.props.BoolProperty(
-        name="Worst",
-        description="Compare the view that was least like its photograph when measured",
-        options={"SKIP_SAVE"},
-    )
+    def view(self, context: bpy.types.Context) -> bpy.types.Object | None:
+        """The camera object that is compared."""
+        raise NotImplementedError
 
     @report_errors
     def execute(self, context):
-        root = scenes.active_root(context)
-        view = compare.worst(root) if self.worst else context.scene.camera
+        root, view = scenes.active_root(context), self.view(context)
         if view not in photographs.views(root):
             raise LodgsError("The scene's camera is none of the views.", "Choose one in the list.")
         found = compare.show(context, root, view)
         if context.region_data is not None:
             context.region_data.view_perspective = "CAMERA"
-        self.report({"INFO"}, f"{view.name}: {found.psnr:.2f} dB")
+        seen = ", held out" if photographs.is_held_out(root, view) else ""
+        self.report({"INFO"}, f"{view.name}: {found.psnr:.2f} dB{seen}")
         return {"FINISHED"}
 
 
-CLASSES = (LODGS_OT_measure_views, LODGS_OT_cancel_measuring, LODGS_OT_compare_view)
+class LODGS_OT_compare_view(_Compare, bpy.types.Operator):
+    """Put the photograph of the scene's camera over its rendered picture, with a wipe"""
+
+    bl_idname = "lodgs.compare_view"
+    bl_label = "Compare"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def view(self, context):
+        return context.scene.camera
+
+
+class LODGS_OT_compare_worst(_Compare, bpy.types.Operator):
+    """Compare the view that was least like its photograph when measured"""
+
+    bl_idname = "lodgs.compare_worst"
+    bl_label = "Worst"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context):
+        if not super().poll(context):
+            return False
+        if compare.worst(scenes.active_root(context)) is None:
+            cls.poll_message_set("Press Measure first")
+            return False
+        return True
+
+    def view(self, context):
+        return compare.worst(scenes.active_root(context))
+
+
+CLASSES = (
+    LODGS_OT_measure_views,
+    LODGS_OT_cancel_measuring,
+    LODGS_OT_compare_view,
+    LODGS_OT_compare_worst,
+)

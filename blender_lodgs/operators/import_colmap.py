@@ -6,7 +6,7 @@ from pathlib import Path
 
 import bpy
 
-from ..data import scenes
+from ..data import photographs, scenes
 from .parts import report_errors
 
 
@@ -38,13 +38,17 @@ class LODGS_OT_import_colmap(bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        scenes.import_colmap(
+        first = not scenes.roots(context.scene)
+        root = scenes.import_colmap(
             context,
             Path(bpy.path.abspath(self.directory)),
             upright=self.upright,
             photographs=self.photographs,
             warn=lambda message: self.report({"WARNING"}, message),
         )
+        if first:  # otherwise the artist is looking at something
+            photographs.look_at_scene(context, root)
+        self.report({"INFO"}, f"'{root.name}': {scenes.contents(root)}")
         return {"FINISHED"}
 
 

@@ -49,8 +49,9 @@ class LODGS_OT_import_splats(bpy.types.Operator):
                 warn=lambda message: self.report({"WARNING"}, message),
             )
             if first:  # otherwise the artist is looking at something
-                photographs.look_as_photographed(context, root)
+                photographs.look_at_scene(context, root)
                 first = False
+            self.report({"INFO"}, f"'{root.name}': {scenes.contents(root)}")
         return {"FINISHED"}
 
 

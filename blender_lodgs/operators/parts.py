@@ -11,7 +11,10 @@ from ..data import scenes
 
 
 def report_errors(execute):
-    """Wraps an operator's execute: a LodgsError becomes a report of its sentences, and it cancels."""
+    """Wraps an operator's execute: a LodgsError becomes a report of its sentences, and it cancels.
+
+    So does a lack of memory.
+    """
 
     @functools.wraps(execute)
     def wrapper(self, context):
@@ -19,7 +22,9 @@ def report_errors(execute):
             return execute(self, context)
         except LodgsError as error:
             self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+        except MemoryError:
+            self.report({"ERROR"}, "There is not enough memory for this. Close other files and programs.")
+        return {"CANCELLED"}
 
     return wrapper
 
@@ -29,10 +34,12 @@ class OnScene:
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if scenes.active_root(context) is None:
+        root = scenes.active_root(context)
+        if root is None:
             cls.poll_message_set("Select a splat scene, or import one first")  # type: ignore[attr-defined]
-            return False
-        return True
+        elif not root.is_editable:
+            cls.poll_message_set(scenes.LINKED)  # type: ignore[attr-defined]
+        return root is not None and root.is_editable
 
 
 class OnLevels:

@@ -40,6 +40,26 @@ class LODGS_OT_combine_with_meshes(bpy.types.Operator):
         return {"FINISHED"}
 
 
+class LODGS_OT_separate_meshes(bpy.types.Operator):
+    """Render without the meshes again: remove their scene and the nodes that join both pictures"""
+
+    bl_idname = "lodgs.separate_meshes"
+    bl_label = "Remove"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context):
+        if context.scene.lodgs_render.meshes is None:
+            cls.poll_message_set("The scene is not combined with meshes")
+            return False
+        return True
+
+    @report_errors
+    def execute(self, context):
+        compositing.separate_meshes(context.scene)
+        return {"FINISHED"}
+
+
 class LODGS_OT_render_mesh_depth(FrameByFrame, bpy.types.Operator):
     """Render how far the meshes are with Cycles, and have them hold out the splats behind them"""
 
@@ -74,12 +94,14 @@ class LODGS_OT_render_quick(FrameByFrame, bpy.types.Operator):
         if self.animation:
             yield from quick.render_animation(context, self.frames(context))
         else:
-            yield quick.render(context)
+            image = quick.render(context)
+            quick.show(context, image)
+            yield image
 
     def done(self, count):
         if self.animation:
             return f"{'1 frame' if count == 1 else f'{count} frames'} saved"
-        return f"Drawn into the image '{quick.IMAGE}'; the Image Editor shows it"
+        return f"Drawn into the image '{quick.IMAGE}'"
 
 
 class LODGS_OT_export_camera(bpy.types.Operator, ExportHelper):
@@ -117,6 +139,7 @@ class LODGS_OT_export_camera(bpy.types.Operator, ExportHelper):
 CLASSES = (
     LODGS_OT_use_engine,
     LODGS_OT_combine_with_meshes,
+    LODGS_OT_separate_meshes,
     LODGS_OT_render_mesh_depth,
     LODGS_OT_render_quick,
     LODGS_OT_export_camera,

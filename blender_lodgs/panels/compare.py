@@ -17,9 +17,12 @@ class LODGS_UL_views(bpy.types.UIList):
 
     def draw_item(self, context, layout, data, item, icon, active_data, active_property, index=0, flt_flag=0):
         psnr = item.data.lodgs.psnr
-        split = layout.split(factor=0.7)
+        split = layout.split(factor=0.52)
         is_camera = item == context.scene.camera
         split.label(text=item.name, icon="VIEW_CAMERA" if is_camera else "CAMERA_DATA")
+        split = split.split(factor=0.5)
+        root = scenes.active_root(context)
+        split.label(text="held out" if root and photographs.is_held_out(root, item) else "")
         split.label(text=f"{psnr:.1f} dB" if psnr > 0 else "")
 
     def draw_filter(self, context, layout):
@@ -67,10 +70,11 @@ class LODGS_PT_compare(Panel):
         else:
             row = layout.row(align=True)
             row.operator("lodgs.measure_views", icon="DRIVER_DISTANCE")
-            row.operator("lodgs.compare_view", text="Worst", icon="SORT_ASC").worst = True
+            row.operator("lodgs.compare_worst", icon="SORT_ASC")
             if measurement is not None and measurement.problem:
                 say(layout, measurement.problem, "ERROR")
-        layout.operator("lodgs.compare_view", icon="IMAGE_ALPHA").worst = False
+        _draw_means(layout, root)
+        layout.operator("lodgs.compare_view", icon="IMAGE_ALPHA")
         comparison = wipe.comparison
         if comparison is not None:
             row = layout.row(align=True)
@@ -78,6 +82,20 @@ class LODGS_PT_compare(Panel):
             row.prop(settings, "wipe", slider=True)
             if context.scene.camera is None or context.scene.camera.session_uid != comparison.view:
                 say(layout, "Press Compare for this view.", "INFO")
+
+
+def _draw_means(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
+    """What was measured, in the mean: held-out views apart, because only they tell of what is between."""
+    held_out = set(photographs.held_out(root))
+    measured = [view for view in photographs.views(root) if view.data.lodgs.psnr > 0]
+    column = layout.column(align=True)
+    for name, views in (
+        ("Trained on" if held_out else "Mean", [view for view in measured if view not in held_out]),
+        ("Held out", [view for view in measured if view in held_out]),
+    ):
+        if views:
+            mean = sum(view.data.lodgs.psnr for view in views) / len(views)
+            column.label(text=f"{name}: {mean:.1f} dB ({len(views)} view{'s' * (len(views) != 1)})")
 
 
 CLASSES = (LODGS_UL_views, LODGS_PT_compare)

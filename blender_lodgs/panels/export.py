@@ -8,6 +8,7 @@ from .parts import LevelsPanel
 class LODGS_PT_export(LevelsPanel):
     bl_label = "Export"
     bl_order = 7
+    bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context):
         column = self.layout.column(align=True)

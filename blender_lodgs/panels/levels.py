@@ -23,7 +23,8 @@ class LODGS_UL_levels(bpy.types.UIList):
         row = layout.row(align=True)
         row.prop(item, "show", text="", icon="HIDE_OFF" if item.show else "HIDE_ON", emboss=False)
         cloud = item.object.data
-        detail = " ".join(f"{value:.2g}" for value in selection.read_facts(item.facts).values())
+        facts = selection.read_facts(item.facts).values()
+        detail = " ".join(f"{value:.2g}" if value else "all" for value in facts)  # 0: nothing is too small
         _columns(row, str(item.number), f"{len(cloud.points):,}", f"{objects.megabytes(cloud):.1f}", detail)
         alone = data.mode == "SINGLE" and data.single_level == item.number
         only = row.operator(

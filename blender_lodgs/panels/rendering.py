@@ -18,7 +18,7 @@ class LODGS_PT_rendering(Panel):
 
     @classmethod
     def poll(cls, context):
-        return bool(scenes.roots(context.scene))
+        return scenes.shows_splats(context.scene)
 
     def draw(self, context):
         layout, scene = self.layout, context.scene
@@ -30,20 +30,19 @@ class LODGS_PT_rendering(Panel):
                 say(layout, text, "INFO")
             return
         _draw_film(layout, scene)
-        _draw_passes(layout, scene, context.view_layer)
+        missing = _missing_trainer()
         column = layout.column(align=True)
-        for name, text, icon in (
-            ("render.render", "Render Image", "RENDER_STILL"),
-            ("lodgs.render_quick", "Viewport Quality", "RESTRICT_VIEW_OFF"),
-        ):
-            row = column.row(align=True)
-            row.operator_context = "INVOKE_DEFAULT"  # with progress, beside which one works on
-            row.operator(name, text=text, icon=icon).animation = False
-            row.operator(name, text="", icon="RENDER_ANIMATION").animation = True
+        if missing:
+            draw_environment(column, missing)
+            say(column, "Or draw with the graphics card, as the viewport does:", "INFO")
+        else:
+            _draw_passes(layout, scene, context.view_layer)
+            column = layout.column(align=True)
+            _draw_render(column, "render.render", "Render Image", "RENDER_STILL")
+        _draw_render(column, "lodgs.render_quick", "Viewport Quality", "RESTRICT_VIEW_OFF")
         _draw_holdout(layout, scene)
-        column = layout.column(align=True)
-        column.operator("lodgs.combine_with_meshes", icon="NODE_COMPOSITING")
-        column.operator("lodgs.export_camera", icon="CAMERA_DATA", text="Export Camera…")
+        _draw_meshes(layout, scene)
+        layout.operator("lodgs.export_camera", icon="CAMERA_DATA", text="Export Camera…")
 
 
 class _Properties(bpy.types.Panel):
@@ -62,6 +61,9 @@ class LODGS_RENDER_PT_film(_Properties):
 
     def draw(self, context):
         _draw_film(self.layout, context.scene)
+        missing = _missing_trainer()
+        if missing:
+            draw_environment(self.layout, missing)
 
 
 class LODGS_VIEWLAYER_PT_passes(_Properties):
@@ -82,11 +84,37 @@ def _draw_film(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
         name = scene.view_settings.view_transform
         say(layout, f"{name} changes the colours of the photographs; Standard keeps them.", "INFO")
         layout.operator("lodgs.use_engine", text="Use Standard", icon="COLOR")
+
+
+def _missing_trainer() -> str:
+    """What one lacks without a trainer's Python, as a sentence; empty with one."""
     try:
         environment.trainer_python()
     except LodgsError as error:
-        draw_environment(layout, error.what)
-        say(layout, "Or draw with the graphics card, as the viewport does:", "INFO")
+        return error.what
+    return ""
+
+
+def _draw_render(layout: bpy.types.UILayout, operator: str, text: str, icon: str) -> None:
+    """A button for one picture, and a small one for every frame."""
+    row = layout.row(align=True)
+    row.operator_context = "INVOKE_DEFAULT"  # with progress, beside which one works on
+    row.operator(operator, text=text, icon=icon).animation = False
+    row.operator(operator, text="", icon="RENDER_ANIMATION").animation = True
+
+
+def _draw_meshes(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
+    """Whether the meshes are rendered as well, by which scene, and how to stop that."""
+    meshes, column = scene.lodgs_render.meshes, layout.column(align=True)
+    if meshes is None:
+        column.operator("lodgs.combine_with_meshes", icon="NODE_COMPOSITING")
+        return
+    column.label(text=f"Meshes are rendered by '{meshes.name}'", icon="NODE_COMPOSITING")
+    if meshes.render.engine == "CYCLES":
+        split_column(column).prop(meshes.cycles, "samples", text="Its Samples")
+    row = column.row(align=True)
+    row.operator("lodgs.combine_with_meshes", text="Update", icon="FILE_REFRESH")
+    row.operator("lodgs.separate_meshes", icon="X")
 
 
 def _draw_passes(layout: bpy.types.UILayout, scene: bpy.types.Scene, layer: bpy.types.ViewLayer) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ..data import photographs, scenes
-from .parts import Panel, split_column
+from .parts import Panel, say, split_column
 
 
 class LODGS_PT_scene(Panel):
@@ -16,6 +16,8 @@ class LODGS_PT_scene(Panel):
         column.operator("lodgs.import_colmap", text="Import Photographs (COLMAP)…", icon="CAMERA_DATA")
         column.operator("lodgs.import_splats", text="Import Splats…", icon="POINTCLOUD_DATA")
         root = scenes.active_root(context)
+        if scenes.linked(context):
+            say(layout, scenes.LINKED, "LINKED")
         if root is None:
             if scenes.roots(context.scene):
                 layout.label(text="Select one of the splat scenes", icon="INFO")
@@ -36,6 +38,7 @@ class LODGS_PT_scene(Panel):
             name = camera.name if camera in views else "Look Through"
             row.operator("lodgs.look_through", text=name, icon="OUTLINER_DATA_CAMERA").step = 0
             row.operator("lodgs.look_through", text="", icon="TRIA_RIGHT").step = 1
+        layout.operator("lodgs.remove_scene", icon="TRASH")
 
 
 CLASSES = (LODGS_PT_scene,)

@@ -31,12 +31,12 @@ class LODGS_PT_training(Panel):
             _draw_running(self.layout, watch)
             return
         if watch is not None:
-            _draw_ended(self.layout, watch)
+            _draw_ended(self.layout, watch, root)
         elif root.lodgs.training.run:
             row = self.layout.row()
             row.label(text="There was a run", icon="FILE_FOLDER")
             row.operator("lodgs.open_run").directory = root.lodgs.training.run
-        _draw_choices(self.layout, root)
+        _draw_choices(self.layout, root, resumable=watch is not None and watch.state != "done")
 
 
 class LODGS_PT_training_advanced(Panel):
@@ -66,7 +66,7 @@ class LODGS_PT_training_advanced(Panel):
         layout.operator("lodgs.open_run", icon="FILE_FOLDER", text="Open Run…")
 
 
-def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
+def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object, resumable: bool) -> None:
     settings = root.lodgs.training
     if not root.lodgs.scene_folder:
         say(layout, "Not imported from photographs: nothing to train on.", "INFO")
@@ -94,7 +94,13 @@ def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
     except LodgsError as error:
         draw_environment(layout, error.what)
         return
-    layout.operator("lodgs.train", icon="PLAY")
+    if not bpy.data.is_saved and not settings.output:
+        text = f"This file is not saved yet: the run's folder will lie in {jobs.runs_folder(root)}."
+        say(layout, text, "INFO")
+    if resumable:
+        layout.operator("lodgs.train", text="Train Anew", icon="FILE_REFRESH")
+    else:
+        layout.operator("lodgs.train", icon="PLAY")
 
 
 def _draw_parameter(layout: bpy.types.UILayout, group: bpy.types.PropertyGroup, name: str) -> None:
@@ -127,13 +133,17 @@ def _draw_running(layout: bpy.types.UILayout, watch: Watch) -> None:
             grid.label(text=value)
 
 
-def _draw_ended(layout: bpy.types.UILayout, watch: Watch) -> None:
-    box = layout.box()
+def _draw_ended(layout: bpy.types.UILayout, watch: Watch, root: bpy.types.Object) -> None:
+    box, there = layout.box(), {item.number for item in root.lodgs.levels if item.exists}
     box.label(text=watch.message, icon="CHECKMARK" if watch.state == "done" else "PAUSE")
     column = box.column(align=True)
     column.scale_y = 0.8
-    for number in sorted(watch.levels):
+    for number in sorted(watch.levels.keys() & there):
         column.label(text=level_line(watch.levels[number]), icon="BLANK1")
+    if missing := sorted(watch.levels.keys() - there):
+        say(box, f"The run has more than is here: level {', '.join(map(str, missing))}.", "INFO")
+        load = box.operator("lodgs.open_run", text="Load Its Levels", icon="IMPORT")
+        load.directory = str(watch.folder.path)
     for line in summary_lines(watch.summary):
         say(box, line, "BLANK1")
     if watch.problem:

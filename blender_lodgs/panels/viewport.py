@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bpy
 
+from ...training.lod.colors import level_color
 from .. import compat
 from ..data import scenes
 from ..viewport import views
@@ -16,7 +17,7 @@ class LODGS_PT_viewport(Panel):
 
     @classmethod
     def poll(cls, context):
-        return bool(scenes.roots(context.scene))
+        return scenes.shows_splats(context.scene)
 
     def draw(self, context):
         layout, settings = self.layout, context.scene.lodgs_viewport
@@ -31,13 +32,24 @@ class LODGS_PT_viewport(Panel):
             row = column.row()
             row.active = len(root.lodgs.levels) != 1  # one level has one colour
             row.prop(root.lodgs, "tell", expand=True)
+            if root.lodgs.tell != "OWN" and row.active:
+                _legend(layout, [item.number for item in root.lodgs.levels if item.exists])
         left_out = views.left_out()
         if settings.splats and left_out:
             layout.label(text=f"{left_out:,} splats left out to stay within that", icon="INFO")
 
 
+def _legend(layout, numbers):
+    """Which colour is which level, coarse to fine."""
+    grid = layout.grid_flow(row_major=True, columns=min(len(numbers), 6), align=True)
+    for number in numbers:
+        entry = grid.row(align=True)
+        entry.template_node_socket(color=(*level_color(number), 1.0))
+        entry.label(text=str(number))
+
+
 def _overlays(self, context):
-    if not scenes.roots(context.scene):
+    if not scenes.shows_splats(context.scene):
         return
     self.layout.label(text="LODGS")
     row = self.layout.row()

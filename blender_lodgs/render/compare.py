@@ -87,20 +87,16 @@ def show(context: bpy.types.Context, root: bpy.types.Object, view: bpy.types.Obj
     return found
 
 
-def worst(root: bpy.types.Object) -> bpy.types.Object:
-    """The view that was least like its photograph when measured.
-
-    Raises:
-        LodgsError: none was measured.
-    """
+def worst(root: bpy.types.Object) -> bpy.types.Object | None:
+    """The view that was least like its photograph when measured; None where none was."""
     measured = [view for view in photographs.views(root) if view.data.lodgs.psnr > 0]
-    if not measured:
-        raise LodgsError("No view has been measured.", "Press Measure first.")
-    return min(measured, key=lambda view: view.data.lodgs.psnr)
+    return min(measured, key=lambda view: view.data.lodgs.psnr, default=None)
 
 
 class Measurement:
     """All views compared one after the other; ``processes.follow`` steps through them.
+
+    What was measured is one undo step at the end, and undoing something else meanwhile loses none of it.
 
     Attributes:
         done, total: views measured, and to measure.
@@ -113,6 +109,7 @@ class Measurement:
         if not self._views:
             raise LodgsError(f"'{root.name}' has no photographs to measure on.", "Import a COLMAP folder.")
         self.done, self.total, self.problem, self.running = 0, len(self._views), "", True
+        self._found: dict[int, float] = {}
 
     def step(self) -> bool:
         """Measure one view; return whether there are more."""
@@ -121,12 +118,18 @@ class Measurement:
         try:
             if root is not None and self.running and self.done < self.total:
                 view = objects.get(self._views[self.done])
-                if view is not None:
-                    compare_view(bpy.context, root, view)
+                found = None if view is None else compare_view(bpy.context, root, view)
+                if found is not None:
+                    self._found[found.view] = found.psnr
                 self.done += 1
         except LodgsError as error:
             self.problem, self.running = str(error), False
         self.running = self.running and root is not None and self.done < self.total
+        if not self.running and self._found:
+            for uid in self._found.keys() & objects.keys():
+                objects[uid].data.lodgs.psnr = self._found[uid]
+            self._found.clear()
+            extension.undo_step("Measure")
         extension.redraw()
         return self.running
 

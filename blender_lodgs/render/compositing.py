@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -10,7 +11,7 @@ import bpy
 
 from ...training.errors import LodgsError
 from .. import compat
-from ..data import scenes
+from ..data import scenes, selection
 from . import engine
 from .cameras import scene_camera
 
@@ -22,6 +23,9 @@ _COPIED = (
 
 
 NEARER, OVER = _JOINS = "CompositorNodeZcombine", "CompositorNodeAlphaOver"
+
+SAMPLES = 128
+"""Of Cycles for the meshes, to begin with: Blender's 4096 are for who has the time."""
 
 
 def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> bpy.types.Scene:
@@ -41,19 +45,20 @@ def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> 
     if not scenes.roots(scene):
         raise LodgsError(f"The scene '{scene.name}' has no splats.", "Import or train some first.")
     meshes = scene.lodgs_render.meshes
-    tree = compat.compositor_tree(scene)
-    kinds = {node.bl_idname for node in tree.nodes}
-    ours = kinds <= {*compat.COMPOSITOR_START, *_JOINS, "CompositorNodePremulKey"}
+    tree, before = compat.compositor_tree(scene), _switched(scene)
     join = OVER if scene.lodgs_render.holdout else NEARER
     if meshes is None:
-        if not ours:
+        if not _is_ours(tree):
             raise LodgsError(
                 "This scene has compositor nodes already.",
                 "Add a Z Combine node with the depth of both pictures; docs/rendering.md shows which.",
             )
         meshes = scene.lodgs_render.meshes = bpy.data.scenes.new(f"{scene.name} Meshes")
         meshes.render.engine = mesh_engine
-    if ours and join not in kinds:
+        meshes.cycles.samples = SAMPLES
+        scene.lodgs_render.before_meshes = json.dumps(before)
+        _join(tree, join, scene, meshes)
+    elif _is_ours(tree) and join not in _kinds(tree):
         _join(tree, join, scene, meshes)
     engine.use(scene)
     for one in (scene, meshes):
@@ -62,6 +67,46 @@ def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> 
             layer.use_pass_z = True
     _match(scene, meshes)
     return meshes
+
+
+def separate_meshes(scene: bpy.types.Scene) -> None:
+    """Takes back :func:`combine_with_meshes`: the meshes' scene, the nodes, and what it has switched on.
+
+    Raises:
+        LodgsError: the scene is not combined, or its compositor has further nodes by now.
+    """
+    meshes, tree = scene.lodgs_render.meshes, compat.compositor_tree(scene)
+    if meshes is None:
+        raise LodgsError(f"The scene '{scene.name}' is not combined with meshes.")
+    if not _is_ours(tree):
+        raise LodgsError(
+            "This scene has compositor nodes of your own beside those that join the pictures.",
+            f"Take the join out there, then delete the scene '{meshes.name}'.",
+        )
+    before = selection.read_json(scene.lodgs_render.before_meshes)
+    scene.render.film_transparent = bool(before.get("film_transparent"))
+    for layer in scene.view_layers:
+        layer.use_pass_z = layer.name in before.get("use_pass_z", ())
+    compat.reset_compositor(scene)
+    scene.lodgs_render.before_meshes = ""
+    bpy.data.scenes.remove(meshes)
+
+
+def _switched(scene: bpy.types.Scene) -> dict:
+    """What combining switches on, as it is now."""
+    return {
+        "film_transparent": scene.render.film_transparent,
+        "use_pass_z": [layer.name for layer in scene.view_layers if layer.use_pass_z],
+    }
+
+
+def _kinds(tree: bpy.types.NodeTree) -> set[str]:
+    return {node.bl_idname for node in tree.nodes}
+
+
+def _is_ours(tree: bpy.types.NodeTree) -> bool:
+    """Whether nobody but combining has worked on a compositor tree."""
+    return _kinds(tree) <= {*compat.COMPOSITOR_START, *_JOINS, "CompositorNodePremulKey"}
 
 
 def render_mesh_depth(scene: bpy.types.Scene, frames: Iterable[int]) -> Iterator[Path]:

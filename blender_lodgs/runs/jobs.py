@@ -332,14 +332,18 @@ def _link_run(root: bpy.types.Object, run: RunFolder) -> None:
     root.lodgs.training.run = path
 
 
-def _new_folder(root: bpy.types.Object) -> Path:
-    """A folder for a run, not there yet: where the settings say, else beside the .blend or at home."""
+def runs_folder(root: bpy.types.Object) -> Path:
+    """What holds the folders of a root's runs: where the settings say, else beside the .blend or at home."""
     if root.lodgs.training.output:
-        parent = Path(bpy.path.abspath(root.lodgs.training.output)).resolve()
-    elif bpy.data.is_saved:
-        parent = Path(bpy.path.abspath("//lodgs_runs"))
-    else:
-        parent = Path.home() / "lodgs_runs"
+        return Path(bpy.path.abspath(root.lodgs.training.output)).resolve()
+    if bpy.data.is_saved:
+        return Path(bpy.path.abspath("//lodgs_runs"))
+    return Path.home() / "lodgs_runs"
+
+
+def _new_folder(root: bpy.types.Object) -> Path:
+    """A folder for a run, not there yet."""
+    parent = runs_folder(root)
     name = bpy.path.clean_name(root.name)
     names = itertools.chain([name], (f"{name}-{n}" for n in itertools.count(2)))
     return next(parent / n for n in names if not (parent / n).exists())

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import subprocess
 import time
-from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -140,17 +139,21 @@ class Watch:
                 self._finish(root)
 
     def _add_level(self, root: bpy.types.Object, event: dict) -> None:
-        splats = read_ply(self.folder.path / str(event.get("path")))
-        with _in_window():
+        level = self._read_level(event)
+        with extension.in_window():
             if event["level"] == 1 and not event.get("again"):
                 scenes.remove_finer_levels(root)  # they are of an earlier run: two runs never mix
             if "meta" in event:
                 scenes.set_bundle_facts(root, self._described(event))
-            scenes.set_level(root, Level(event["level"], splats, event.get("facts", {})))
+            scenes.set_level(root, level)
             root.lodgs.training.read = self.offset
             if not event.get("more"):  # levels that come together are one step
-                _undo_step(f"Level {event['level']}")
+                extension.undo_step(f"Level {event['level']}")
         self.levels[event["level"]] = event
+
+    def _read_level(self, event: dict) -> Level:
+        splats = read_ply(self.folder.path / str(event.get("path")))
+        return Level(event["level"], splats, event.get("facts", {}))
 
     def _described(self, event: dict) -> Bundle:
         """What a level's event says of all levels, without them."""
@@ -161,10 +164,13 @@ class Watch:
 
     def _finish(self, root: bpy.types.Object) -> None:
         head = read_head(self.folder.bundle)
-        with _in_window():
+        with extension.in_window():
+            there = {item.number for item in root.lodgs.levels if item.exists}
+            for number in {level.number for level in head.levels} & self.levels.keys() - there:
+                scenes.set_level(root, self._read_level(self.levels[number]))  # an undo took it away
             scenes.set_bundle_facts(root, head)
             root.lodgs.training.read = self.offset
-            _undo_step("Training finished")
+            extension.undo_step("Training finished")
 
     def _set_end(self) -> None:
         """Say how the run ended."""
@@ -233,19 +239,6 @@ def _exit_reason(code: int | None, last_line: str) -> str:
         how = "stopped without a word: killed, or the computer was switched off"
     last = f" Its last words: {last_line.strip()}" if last_line.strip() else ""
     return f"The trainer {how}.{last}"
-
-
-def _in_window():
-    """A context with a window, which a timer lacks; as it is where there are none (in background)."""
-    windows = bpy.context.window_manager.windows
-    if bpy.context.window is not None or not windows:
-        return nullcontext()
-    return bpy.context.temp_override(window=windows[0])
-
-
-def _undo_step(message: str) -> None:
-    """Make what came by itself an undo step, so that undoing the user's next one does not take it away."""
-    bpy.ops.ed.undo_push(message=message)
 
 
 def root_by_uid(uid: int) -> bpy.types.Object | None:

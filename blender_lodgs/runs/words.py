@@ -11,7 +11,7 @@ def progress_facts(progress: dict) -> dict[str, str]:
         "Level": f"{progress['level']} of {progress['levels']}",
         "Step": f"{progress['step']:,} of {progress['of']:,}",
         "Loss": f"{progress['loss']:.4f}",
-        "PSNR": f"{progress['psnr']:.1f} dB",
+        "PSNR, training": f"{progress['psnr']:.1f} dB",
         "Splats": f"{progress['splats']:,}",
         "Speed": f"{progress['steps_per_s']:.1f} steps/s",
         "Time left": duration(progress["eta_s"]),
@@ -21,7 +21,7 @@ def progress_facts(progress: dict) -> dict[str, str]:
 def level_line(event: dict) -> str:
     """A ``level`` event in one line."""
     quality = ""
-    for name, views in (("train_psnr", " on training views"), ("psnr", "")):
+    for name, views in (("train_psnr", " on training views"), ("psnr", " on held-out views")):
         if isinstance(event.get(name), float):
             quality = f", {event[name]:.1f} dB{views}"
     return f"Level {event['level']}: {event['splats']:,} splats{quality}"

@@ -11,6 +11,8 @@ import numpy as np
 from bpy_extras.view3d_utils import location_3d_to_region_2d
 from gpu_extras.batch import batch_for_shader
 
+from ..data import scenes
+
 _VERTEX = """
 void main()
 {
@@ -122,10 +124,9 @@ def _draw() -> None:
     context = bpy.context
     scene, region, view = context.scene, context.region, context.region_data
     camera = scene.camera
-    if comparison is None or camera is None or not scene.lodgs_render.show_comparison:
+    if view.view_perspective != "CAMERA" or not shown(context):
         return
-    if view.view_perspective != "CAMERA" or camera.session_uid != comparison.view:
-        return
+    assert comparison is not None
     pose = camera.matrix_world.normalized()
     frame = [
         location_3d_to_region_2d(region, view, pose @ corner)
@@ -139,6 +140,18 @@ def _draw() -> None:
         for x, y in ((min(xs), min(ys)), (max(xs), max(ys)))
     ]
     draw(comparison, scene.lodgs_render.wipe, corners, 0.75 / max(max(xs) - min(xs), 1))
+
+
+def shown(context: bpy.types.Context) -> bool:
+    """Whether there is a comparison of the scene's camera, and the panel that can switch it off again."""
+    camera, root = context.scene.camera, scenes.active_root(context)
+    if comparison is None or camera is None or root is None or root.lodgs.cameras is None:
+        return False
+    return (
+        context.scene.lodgs_render.show_comparison
+        and camera.session_uid == comparison.view
+        and camera in root.lodgs.cameras.objects[:]
+    )
 
 
 @bpy.app.handlers.persistent

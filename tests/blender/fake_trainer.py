@@ -1,6 +1,7 @@
 """Stands in for the trainer's Python: speaks the protocol of a run, and goes wrong as $LODGS_FAKE says.
 
 - ``""``        two levels and done
+- ``two halves``  two levels, and done when the file ``go on`` is there
 - ``slow``      steps until it is asked to stop
 - ``killed``    one level, then SIGKILL to itself
 - ``crash``     one level, then a traceback and exit code 1
@@ -102,6 +103,8 @@ def run(mode: str, job: Job, folder: RunFolder, say: Events) -> int:
             print("garbage {on stdout")
             with folder.events_file.open("ab") as file:
                 file.write(b'not json\n{"no": "event"}\n[1, 2]\n\xff\xfe\n')
+    while mode == "two halves" and not (folder.path / "go on").exists():
+        time.sleep(0.02)
     meta = {"camera_center": [1.0, 2.0, 3.0], "focal_px": 100.0}
     write_bundle(folder.bundle, Bundle(job.method, levels, "bands", {}, {"gamma": 2.0}, meta=meta))
     say("done", bundle=folder.bundle.name, seconds=1.0, train_psnr=21.5, veil={"mean": 0.01, "max": 0.25},

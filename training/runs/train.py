@@ -91,7 +91,7 @@ def _train(job: Job, folder: RunFolder, events: Events) -> int:
     )  # fmt: skip
     events("status", message="Reading the scene")
     data = training_data(job, folder, events)
-    events("status", message="Preparing the kernels (the first time on a computer up to a minute)")
+    events("status", message="Preparing to train (the first time on a computer up to a minute)")
     torch.set_num_threads(1)  # torch's thread pool beside the kernels' slows both
     _keep_freed_memory()
     backend = resolve(job.backend)
@@ -178,6 +178,8 @@ class _Run:
         ]
         up = up_rotation(self.data.scene.cameras).round(6)
         meta = {**self.method.meta(), "up_rotation": up, "seed": self.job.seed}
+        if self.job.test_every:
+            meta["held_out"] = [self.job.test_every // 2 if self.job.validation else 0, self.job.test_every]
         bundle = replace(self._without_splats(), levels=levels, meta=meta)
         if arrays := self.method.arrays():
             with atomic_write(self.folder.model) as temporary, open(temporary, "wb") as file:

@@ -11,6 +11,8 @@ class Notes:
     def __init__(self):
         self.texts: list[str] = []
         self.operators: list[str] = []
+        self.buttons: list[str] = []
+        self.colors: list[tuple[float, ...]] = []
         self.properties: list[str] = []
         self.sliders: list[str] = []
 
@@ -26,9 +28,16 @@ class Notes:
         assert 0 <= factor <= 1
         self.texts.append(text)
 
-    def operator(self, name, **_):
+    def operator(self, name, text="", **_):
         self.operators.append(name)
+        self.buttons.append(text)
         return SimpleNamespace()
+
+    def template_list(self, *_, **__):
+        pass
+
+    def template_node_socket(self, color):
+        self.colors.append(tuple(color))
 
     def prop(self, owner, name, slider=False, **_):
         assert hasattr(owner, name)
@@ -44,7 +53,9 @@ def draw_panel(bpy, lodgs, monkeypatch):
     def drawn(name, panel):
         module, notes = lodgs(f"panels.{name}"), Notes()
         for place in (module, lodgs("panels.parts")):
-            monkeypatch.setattr(place, "say", lambda layout, text, icon: layout.label(text=text))
+            monkeypatch.setattr(
+                place, "say", lambda layout, text, icon: layout.label(text=text), raising=False
+            )
         getattr(module, panel).draw(SimpleNamespace(layout=notes), bpy.context)
         return notes
 

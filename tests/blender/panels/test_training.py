@@ -34,7 +34,7 @@ def watch(lodgs, root, tmp_path):
 
 def test_before_training(root, draw, fake):
     notes = draw()
-    assert notes.operators == ["lodgs.train"]
+    assert (notes.operators, notes.buttons) == (["lodgs.train"], [""])
     assert notes.properties == ["method", "preset", "image_scale"]
     assert "3,762 steps in 5 levels" in notes.texts
     assert NONE_HELD_OUT in notes.texts
@@ -96,8 +96,8 @@ def test_making_the_environment_is_shown_where_it_is_missing(lodgs, root, draw, 
 
 def test_while_training(draw, watch):
     assert "Starting the trainer" in draw().texts
-    watch.message = "Preparing the kernels (the first time on a computer)"
-    assert {"Preparing the kernels", "The first time on a computer"} <= set(draw().texts)
+    watch.message = "Preparing to train (the first time on a computer)"
+    assert {"Preparing to train", "The first time on a computer"} <= set(draw().texts)
     watch.message = "Level 2 of 5"
     watch.progress = {
         "level": 2, "levels": 5, "step": 1500, "of": 4300, "loss": 0.1234, "psnr": 21.5, "splats": 12345,
@@ -113,12 +113,22 @@ def test_while_training(draw, watch):
     assert "Cancel again to end it at once" in draw().texts
 
 
-def test_after_training(draw, watch, fake):
+def test_after_training(bpy, lodgs, root, draw, watch, fake):
     watch.state, watch.message = "done", "Finished"
     watch.levels = {1: {"level": 1, "splats": 1234, "psnr": 20.04}, 2: {"level": 2, "splats": 5}}
+    levels = lodgs("training.splats.bundle")
+    for number in (1, 2):
+        lodgs("data.scenes").set_level(root, levels.Level(number, levels.NO_SPLATS))
     notes = draw()
-    assert {"Finished", "Level 1: 1,234 splats, 20.0 dB", "Level 2: 5 splats"} <= set(notes.texts)
+    first = "Level 1: 1,234 splats, 20.0 dB on held-out views"
+    assert {"Finished", first, "Level 2: 5 splats"} <= set(notes.texts)
     assert notes.operators == ["lodgs.train"]
+    bpy.data.objects.remove(root.lodgs.levels[0].object)
+    notes = draw()
+    assert first not in notes.texts and "Level 2: 5 splats" in notes.texts
+    assert "The run has more than is here: level 1." in notes.texts
+    assert notes.operators == ["lodgs.open_run", "lodgs.train"]
+    lodgs("data.scenes").set_level(root, levels.Level(1, levels.NO_SPLATS))
     watch.summary = {
         "train_psnr": 35.8, "veil": {"mean": 0.1234, "max": 1.0}, "oversized": 1234,
         "worst": {"view": "a.jpg", "psnr": 16.75},
@@ -144,6 +154,16 @@ def test_after_training(draw, watch, fake):
     notes = draw()
     assert "The trainer was killed." in notes.texts
     assert notes.operators == ["lodgs.resume_training", "lodgs.show_log", "lodgs.train"]
+    assert notes.buttons[-1] == "Train Anew", "beside Resume it must not look like that"
+
+
+def test_where_an_unsaved_files_run_will_lie_is_said(bpy, root, draw, fake, tmp_path):
+    assert any(f"not saved yet: the run's folder will lie in {tmp_path}" in text for text in draw().texts)
+    root.lodgs.training.output = str(tmp_path)
+    assert not any("not saved" in text for text in draw().texts)
+    root.lodgs.training.output = ""
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    assert not any("not saved" in text for text in draw().texts)
 
 
 def test_a_run_that_is_not_followed_can_be_opened(root, draw, fake):

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from training.scenes.colmap import read_scene
 from training.splats.bundle import Bundle, Level, write_bundle
 from training.splats.gaussians import Splats
 
@@ -70,8 +71,7 @@ def test_psnr_is_that_of_the_f12_picture(bpy, lodgs, root, renderer, tmp_path):
 
 def test_measuring_all_finds_the_worst(bpy, lodgs, root, renderer):
     compare, photographs = lodgs("render.compare"), lodgs("data.photographs")
-    with pytest.raises(RuntimeError, match="No view has been measured"):
-        bpy.ops.lodgs.compare_view(worst=True)
+    assert not bpy.ops.lodgs.compare_worst.poll()
     root.lodgs.training.image_scale = 0.1
     for view in photographs.views(root)[6:]:
         view.data.lodgs.photograph = ""
@@ -83,7 +83,7 @@ def test_measuring_all_finds_the_worst(bpy, lodgs, root, renderer):
         compare.measurement.done == compare.measurement.total == 6 == sum(psnr > 0 for psnr in psnrs.values())
     )
     worst = min((view for view in psnrs if psnrs[view] > 0), key=psnrs.get)
-    assert bpy.ops.lodgs.compare_view(worst=True) == {"FINISHED"}
+    assert bpy.ops.lodgs.compare_worst() == {"FINISHED"}
     assert bpy.context.scene.camera == worst and lodgs("viewport.wipe").comparison.view == worst.session_uid
     assert bpy.context.scene.lodgs_render.show_comparison
 
@@ -96,6 +96,96 @@ def test_measuring_is_cancelled(bpy, lodgs, root, renderer):
         bpy.ops.lodgs.measure_views()
     assert bpy.ops.lodgs.cancel_measuring() == {"FINISHED"}
     assert not measurement.step() and measurement.done == 1
+
+
+def measured(bpy) -> dict[str, float]:
+    return {
+        obj.name: round(obj.data.lodgs.psnr, 3)
+        for obj in bpy.data.objects
+        if obj.type == "CAMERA" and obj.data.lodgs.psnr > 0
+    }
+
+
+def test_undoing_something_else_loses_no_measure(bpy, lodgs, root, renderer):
+    """Neither what follows measuring, nor what is done and undone while it goes on."""
+    root.lodgs.training.image_scale = 0.05
+    for view in lodgs("data.photographs").views(root)[3:]:
+        view.data.lodgs.photograph = ""
+    bpy.ops.ed.undo_push(message="before")
+    measurement = lodgs("render.compare").measure(bpy.context, root)
+    assert measurement.step()
+    bpy.context.scene.collection.objects.link(bpy.data.objects.new("the artist's", None))
+    bpy.ops.ed.undo_push(message="Add")
+    assert measurement.step()
+    bpy.ops.ed.undo()
+    assert len(measured(bpy)) < 2
+    assert not measurement.step()
+    found = measured(bpy)
+    assert len(found) == 3
+    bpy.context.scene.collection.objects.link(bpy.data.objects.new("the artist's", None))
+    bpy.ops.ed.undo_push(message="Add")
+    bpy.ops.ed.undo()
+    assert "the artist's" not in bpy.data.objects and measured(bpy) == found
+    bpy.ops.ed.undo()
+    assert not measured(bpy)
+
+
+@pytest.mark.parametrize("look", ["compare_view", "compare_worst", "look_through"])
+def test_looking_is_a_step_of_its_own(bpy, lodgs, root, renderer, look):
+    """It leaves the render's percentage alone, and undoing what follows leaves the camera that was looked
+    through."""
+    root.lodgs.training.image_scale, render = 0.05, bpy.context.scene.render
+    views = lodgs("data.photographs").views(root)
+    views[4].data.lodgs.psnr = 1.0  # the worst
+    render.resolution_percentage, render.resolution_x = 40, 77
+    first = bpy.context.scene.camera.name
+    bpy.ops.ed.undo_push(message="before")
+    given = {"step": 1} if look == "look_through" else {}
+    assert getattr(bpy.ops.lodgs, look)("EXEC_DEFAULT", True, **given) == {"FINISHED"}  # True: as by hand
+    render = bpy.context.scene.render
+    looked = (bpy.context.scene.camera.name, render.resolution_x, render.resolution_percentage)
+    assert looked[1:] == (views[0].data.lodgs.width, 40)
+    bpy.context.scene.collection.objects.link(bpy.data.objects.new("the artist's", None))
+    bpy.ops.ed.undo_push(message="Add")
+    bpy.ops.ed.undo()
+    render = bpy.context.scene.render
+    assert (bpy.context.scene.camera.name, render.resolution_x, render.resolution_percentage) == looked
+    bpy.ops.ed.undo()
+    render = bpy.context.scene.render
+    assert (bpy.context.scene.camera.name, render.resolution_x) == (first, 77)
+
+
+def test_the_wipe_goes_with_its_panel(bpy, lodgs, root):
+    """Where the panel is gone nothing could switch it off: another scene selected, the view taken out."""
+    wipe, panel = lodgs("viewport.wipe"), lodgs("panels.compare").LODGS_PT_compare
+    nothing, camera = np.zeros((2, 2, 3), np.float32), bpy.context.scene.camera
+    wipe.show(bpy.context, wipe.Comparison(camera.session_uid, nothing, nothing, 20.0))
+    assert wipe.shown(bpy.context) and panel.poll(bpy.context)
+    write_bundle(Path(bpy.app.tempdir) / "haze.ply", Bundle("flod", [Level(1, haze(0.4))]))
+    other = lodgs("data.scenes").import_splats(bpy.context, Path(bpy.app.tempdir) / "haze.ply")
+    assert bpy.context.view_layer.objects.active == other and not panel.poll(bpy.context)
+    assert not wipe.shown(bpy.context)
+    bpy.context.view_layer.objects.active = root
+    assert wipe.shown(bpy.context)
+    bpy.context.scene.lodgs_render.show_comparison = False
+    assert not wipe.shown(bpy.context)
+    bpy.context.scene.lodgs_render.show_comparison = True
+    root.lodgs.cameras.objects.unlink(camera)
+    bpy.context.scene.collection.objects.link(camera)
+    assert not wipe.shown(bpy.context)
+
+
+@pytest.mark.parametrize(("validation", "first"), [(False, 0), (True, 4)])
+def test_held_out_views_are_those_of_the_run(bpy, lodgs, root, validation, first):
+    """As the trainer splits the scene, also where the artist has deleted a view."""
+    photographs, scene = lodgs("data.photographs"), read_scene(GARDEN)
+    assert photographs.held_out(root) == []
+    record = Bundle("flod", [], meta={"held_out": [first, 8]})
+    lodgs("data.scenes").set_bundle_facts(root, record)
+    truth = [camera.name for camera in scene.split(8, validation)[1]]
+    assert [view.name for view in photographs.held_out(root)] == truth
+    bpy.data.objects.remove(photographs.views(root)[1])
+    assert [view.name for view in photographs.held_out(root)] == [n for n in truth if n in bpy.data.objects]
 
 
 def test_what_cannot_be_compared_is_reported(bpy, lodgs, root, renderer):

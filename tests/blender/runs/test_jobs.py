@@ -342,6 +342,24 @@ def test_undo_takes_neither_levels_nor_the_run(bpy, jobs, watch_of, fake, tmp_pa
     assert _levels(bpy.data.objects["tiny"]) == COUNTS
 
 
+def test_a_level_that_an_undo_took_away_is_back_at_the_end(bpy, jobs, fake, tmp_path, request):
+    """Undo past a level, do something else, and nothing could redo the level."""
+    root = request.getfixturevalue("root")
+    bpy.ops.ed.undo_push(message="Import")
+    fake("two halves")
+    watch = jobs.start(root, str(tmp_path / "run"))
+    _wait(watch, lambda: 2 in watch.levels)
+    bpy.ops.ed.undo()
+    bpy.context.scene.collection.objects.link(bpy.data.objects.new("the artist's", None))
+    bpy.ops.ed.undo_push(message="Add")
+    assert _levels(bpy.data.objects["tiny"]) == {1: COUNTS[1]}
+    (tmp_path / "run" / "go on").touch()
+    _wait(watch, lambda: not watch.running)
+    root = bpy.data.objects["tiny"]
+    assert watch.state == "done" and not watch.problem and _levels(root) == COUNTS
+    assert [item.number for item in root.lodgs.levels] == [1, 2] and "the artist's" in bpy.data.objects
+
+
 def test_a_lost_run_folder_is_no_error_on_opening(bpy, jobs, watch_of, root, tmp_path):
     root.lodgs.training.run = str(tmp_path / "gone")
     blend = str(tmp_path / "scene.blend")

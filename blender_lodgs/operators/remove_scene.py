@@ -1,0 +1,35 @@
+"""Remove a splat scene with all that belongs to it."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..data import removal, scenes
+from .parts import OnScene
+
+
+class LODGS_OT_remove_scene(OnScene, bpy.types.Operator):
+    """Remove the splat scene: its levels, points, cameras and collections. Files and runs stay"""
+
+    bl_idname = "lodgs.remove_scene"
+    bl_label = "Remove Scene"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def invoke(self, context, event):
+        name = scenes.active_root(context).name
+        return context.window_manager.invoke_confirm(
+            self, event, title=f"Remove '{name}'?", confirm_text="Remove", icon="WARNING",
+            message="Its levels, points and cameras leave this file. Photographs and runs stay on disk.",
+        )  # fmt: skip
+
+    def execute(self, context):
+        root = scenes.active_root(context)
+        name = root.name
+        if context.mode != "OBJECT":
+            bpy.ops.object.mode_set(mode="OBJECT")
+        removal.remove(root)
+        self.report({"INFO"}, f"'{name}' is removed")
+        return {"FINISHED"}
+
+
+CLASSES = (LODGS_OT_remove_scene,)
