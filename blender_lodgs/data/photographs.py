@@ -169,7 +169,7 @@ def through(context: bpy.types.Context, view: bpy.types.Object) -> bpy.types.Obj
     """Makes a view the scene's camera, and gives the render its size. Returns the view."""
     context.scene.camera = view
     if view.data.lodgs.width:
-        match_render(context.scene, view.data.lodgs)
+        match_render(context.scene, view.data.lodgs, context.scene.render.resolution_percentage)
     root = view.parent
     if root is not None and root.lodgs.cameras is not None:
         line = root.lodgs.cameras.objects.find(view.name)
@@ -178,9 +178,10 @@ def through(context: bpy.types.Context, view: bpy.types.Object) -> bpy.types.Obj
     return view
 
 
-def match_render(scene: bpy.types.Scene, view: View) -> None:
-    """Gives the render the size and the pixel shape of a view; what percentage of it, is the artist's."""
+def match_render(scene: bpy.types.Scene, view: View, percentage: int = 100) -> None:
+    """Gives the render the size and the pixel shape of a view."""
     render = scene.render
     render.resolution_x, render.resolution_y = view.width, view.height
+    render.resolution_percentage = percentage
     render.pixel_aspect_x = max(1.0, view.fy / view.fx)
     render.pixel_aspect_y = max(1.0, view.fx / view.fy)

@@ -135,7 +135,7 @@ def import_colmap(
             root.lodgs.points = points
         if context.scene.camera is None and scene.cameras:
             context.scene.camera = root.lodgs.cameras.objects[0]
-            match_render(context.scene, scene.cameras[0])
+            match_render(context.scene, scene.cameras[0], context.scene.render.resolution_percentage)
     return root
 
 
@@ -180,8 +180,13 @@ def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
 
     Controls take the values that it records, but for those that somebody has set. The bundle may have levels
     without splats, or none at all while they are on their way.
+
+    Raises:
+        LodgsError: a value that it records is not possible. Nothing is taken over in that case.
     """
     settings, rule = root.lodgs, find_rule(bundle.rule)
+    for control in rule.controls if rule else ():
+        control.checked(bundle.controls.get(control.name, control.default))
     if rule is not None and rule.always and settings.rule != bundle.rule:
         settings.mode = "SELECTIVE"
     settings.method, settings.rule, settings.cumulative = bundle.method, bundle.rule, bundle.cumulative

@@ -42,28 +42,11 @@ def render(context: bpy.types.Context) -> bpy.types.Image:
         image.alpha_mode = "PREMUL"
     image.pixels.foreach_set(np.ascontiguousarray(linear[::-1]).reshape(-1))
     image.update()
-    for editor in _image_editors(context):
-        editor.image = image
+    for window in context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "IMAGE_EDITOR":
+                area.spaces.active.image = image
     return image
-
-
-def show(context: bpy.types.Context, image: bpy.types.Image) -> None:
-    """Shows an image in a window of its own, where no Image Editor is open that would."""
-    if bpy.app.background or _image_editors(context):
-        return
-    bpy.ops.wm.window_new()
-    area = context.window_manager.windows[-1].screen.areas[0]
-    area.type = "IMAGE_EDITOR"
-    area.spaces.active.image = image
-
-
-def _image_editors(context: bpy.types.Context) -> list[bpy.types.SpaceImageEditor]:
-    return [
-        area.spaces.active
-        for window in context.window_manager.windows
-        for area in window.screen.areas
-        if area.type == "IMAGE_EDITOR"
-    ]
 
 
 def render_animation(context: bpy.types.Context, frames: Iterable[int]) -> Iterator[Path]:

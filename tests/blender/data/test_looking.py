@@ -1,0 +1,92 @@
+"""Where a viewport begins to look at what was imported, and that a lack of memory leaves nothing behind."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from training.scenes.colmap import read_scene
+from training.splats.bundle import Bundle, Level, write_bundle
+from training.splats.gaussians import Splats
+
+GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
+KINDS = ("objects", "collections", "pointclouds", "cameras", "images", "meshes", "scenes")
+
+
+def ball(count: int, outliers: int) -> Splats:
+    """Splats within 2 of (10, 20, 30), and far outliers."""
+    rng = np.random.default_rng(0)
+    means = np.float32((10, 20, 30)) + rng.uniform(-1, 1, (count, 3))
+    means[:outliers] = rng.uniform(1e3, 1e6, (outliers, 3))
+    return Splats(
+        means=means.astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        log_scales=np.zeros((count, 3), np.float32),
+        opacity_logits=np.zeros(count, np.float32),
+        sh=np.zeros((count, 1, 3), np.float32),
+    )
+
+
+def test_outliers_do_not_count_for_what_is_looked_at(bpy, lodgs, tmp_path):
+    write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, ball(2000, 40))]))
+    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "b.ply", upright=False)
+    root.scale, root.location = (2, 2, 2), (0, 0, 5)
+    assert lodgs("data.photographs").photographed_from(root) is None
+    middle, size = lodgs("data.photographs").bounds_of_most(root)
+    np.testing.assert_allclose(middle, (20, 40, 65), atol=0.3)
+    assert size == pytest.approx(2 * 2 * 0.9 * 3**0.5, rel=0.1)
+    empty = bpy.data.objects.new("nothing", None)
+    assert lodgs("data.photographs").bounds_of_most(empty) is None
+
+
+def test_photographs_are_looked_at_from_the_view_in_the_middle(bpy, lodgs):
+    root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+    root.location = (1, 2, 3)
+    bpy.context.view_layer.update()
+    eye, target = lodgs("data.photographs").photographed_from(root)
+    scene = read_scene(GARDEN)
+    middle = min(scene.cameras, key=lambda camera: float(np.linalg.norm(camera.center - scene.center)))
+    points = (middle.world_to_camera[:3, :3] @ scene.points.T).T + middle.world_to_camera[:3, 3]
+    view = bpy.data.objects[middle.name]
+    np.testing.assert_allclose(eye, view.matrix_world.translation, atol=1e-4)
+    assert (target - eye).length == pytest.approx(np.median(points[points[:, 2] > 0, 2]), rel=1e-4)
+    ahead = np.array(view.matrix_world)[:3, 2] * -1
+    np.testing.assert_allclose((target - eye).normalized(), ahead, atol=1e-4)
+
+
+def test_an_impossible_control_changes_nothing(bpy, lodgs, tmp_path):
+    write_bundle(tmp_path / "b.ply", Bundle("mine", [Level(1, ball(5, 0))]))
+    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "b.ply")
+    odd = Bundle("flod", [], "bands", controls={"gamma": -1.0}, meta={"a": 1}, cumulative=True)
+    before = {name: getattr(root.lodgs, name) for name in ("method", "rule", "cumulative", "meta", "mode")}
+    with pytest.raises(lodgs("training.errors").LodgsError, match="gamma = -1"):
+        lodgs("data.scenes").set_bundle_facts(root, odd)
+    assert {name: getattr(root.lodgs, name) for name in before} == before
+
+
+@pytest.mark.parametrize("fails_at", [1, 4])
+@pytest.mark.parametrize("what", ["splats", "colmap", "level"])
+def test_too_little_memory_leaves_nothing(bpy, lodgs, monkeypatch, tmp_path, what, fails_at):
+    """One sentence, and no half of a scene or of a level, whichever array is one too many."""
+    write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, ball(5, 0))]))
+    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "b.ply")
+    before = {kind: sorted(one.name for one in getattr(bpy.data, kind)) for kind in KINDS}
+    objects, written = lodgs("data.objects"), []
+    write = objects.write_attribute
+
+    def too_much(*given):
+        written.append(given)
+        if len(written) >= min(fails_at, 3 if what == "colmap" else fails_at):
+            raise MemoryError
+        write(*given)
+
+    monkeypatch.setattr(objects, "write_attribute", too_much)
+    if what == "level":
+        with pytest.raises(MemoryError):
+            lodgs("data.scenes").set_level(root, Level(2, ball(7, 0)))
+    else:
+        given = {"directory": str(GARDEN)} if what == "colmap" else {"filepath": str(tmp_path / "b.ply")}
+        with pytest.raises(RuntimeError, match="not enough memory"):
+            getattr(bpy.ops.lodgs, f"import_{what}")(**given)
+    assert {kind: sorted(one.name for one in getattr(bpy.data, kind)) for kind in KINDS} == before
+    assert [item.number for item in root.lodgs.levels] == [1] and bpy.context.scene.camera is None
