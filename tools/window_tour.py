@@ -260,7 +260,7 @@ def compare(root: bpy.types.Object) -> Steps:
     assert not module_.measurement.problem, module_.measurement.problem
     assert module_.measurement.done == len(module("data.photographs").views(root))
     bpy.context.scene.lodgs_viewport.splats = True
-    press("lodgs.compare_view", worst=True)
+    press("lodgs.compare_worst")
     scroll(60)
     yield from settle()
     least = min(view.data.lodgs.psnr for view in module("data.photographs").views(root))

@@ -224,17 +224,34 @@ def _drive_focal_length(root: bpy.types.Object) -> None:
             target.use_fallback_value, target.fallback_value = True, fallback
 
 
-def _drive(obj: bpy.types.Object, path: str, root: bpy.types.Object, expression: str, **sources: str) -> None:
-    """Drives a property by an expression of the root's properties: names, and their paths in ``lodgs``."""
+def _drive(
+    obj: bpy.types.Object,
+    path: str,
+    root: bpy.types.Object,
+    expression: str,
+    without: Mapping[str, float] | None = None,
+    **sources: str,
+) -> None:
+    """Drives a property by an expression of the root's properties: names, and their paths in ``lodgs``.
+
+    Args:
+        without: values of names where this extension, and with it the properties, are missing; others are 0.
+    """
     driver = _driver(obj, path, expression)
     for name, source in sources.items():
         variable = driver.variables.new()
         variable.name, variable.type = name, "SINGLE_PROP"
-        variable.targets[0].id, variable.targets[0].data_path = root, f"lodgs.{source}"
+        target = variable.targets[0]
+        target.id, target.data_path = root, f"lodgs.{source}"
+        if without is not None:
+            target.use_fallback_value, target.fallback_value = True, without.get(name, 0)
 
 
 def _drive_visibility(root: bpy.types.Object, index: int, item, rule: Rule | None) -> None:
-    """A level is there where its rule has use for it, or where it is the one shown or adds to that."""
+    """A level is there where its rule has use for it, or where it is the one shown or adds to that.
+
+    Where this extension is missing, the finest one is there, so that nobody opens an empty file.
+    """
     number, sources = item.number, {"show": f"levels[{index}].show"}
     sources |= {name: name for name in ("mode", "single_level", "cumulative")}
     in_use = "mode == 1"
@@ -243,9 +260,11 @@ def _drive_visibility(root: bpy.types.Object, index: int, item, rule: Rule | Non
             sources[control.name] = f"{rule.name}.{control.name}"
             in_use += f" and {control.name} {'<=' if control.follows == 'coarsest' else '>='} {number}"
     alone = f"{number} == single_level or (cumulative and {number} <= single_level)"
+    finest = max(one.number for one in root.lodgs.levels if one.exists)
+    without = {"show": 1, "single_level": finest, "cumulative": root.lodgs.cumulative}
     for path in ("hide_viewport", "hide_render"):
         expression = f"0 if show and (({in_use}) or (mode == 0 and ({alone}))) else 1"
-        _drive(item.object, path, root, expression, **sources)
+        _drive(item.object, path, root, expression, without, **sources)
 
 
 def _drive_level(root: bpy.types.Object, obj: bpy.types.Object, rule: Rule, facts: Mapping) -> None:

@@ -9,6 +9,9 @@ from ..render import compare
 from ..viewport import wipe
 from .parts import Panel, say
 
+HELD_OUT = "HIDE_ON"
+"""The icon of views that training has not seen."""
+
 
 class LODGS_UL_views(bpy.types.UIList):
     worst_first: bpy.props.BoolProperty(
@@ -17,13 +20,12 @@ class LODGS_UL_views(bpy.types.UIList):
 
     def draw_item(self, context, layout, data, item, icon, active_data, active_property, index=0, flt_flag=0):
         psnr = item.data.lodgs.psnr
-        split = layout.split(factor=0.52)
-        is_camera = item == context.scene.camera
+        root, is_camera = scenes.active_root(context), item == context.scene.camera
+        held_out = root is not None and photographs.is_held_out(root, item)
+        split = layout.split(factor=0.62)
         split.label(text=item.name, icon="VIEW_CAMERA" if is_camera else "CAMERA_DATA")
-        split = split.split(factor=0.5)
-        root = scenes.active_root(context)
-        split.label(text="held out" if root and photographs.is_held_out(root, item) else "")
-        split.label(text=f"{psnr:.1f} dB" if psnr > 0 else "")
+        quality = f"{psnr:.1f} dB" if psnr > 0 else ""
+        split.label(text=quality, icon=HELD_OUT if held_out else "BLANK1")
 
     def draw_filter(self, context, layout):
         row = layout.row(align=True)
@@ -89,13 +91,14 @@ def _draw_means(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
     held_out = set(photographs.held_out(root))
     measured = [view for view in photographs.views(root) if view.data.lodgs.psnr > 0]
     column = layout.column(align=True)
-    for name, views in (
-        ("Trained on" if held_out else "Mean", [view for view in measured if view not in held_out]),
-        ("Held out", [view for view in measured if view in held_out]),
+    for name, icon, views in (
+        ("Trained on" if held_out else "Mean", "BLANK1", [view for view in measured if view not in held_out]),
+        ("Held out", HELD_OUT, [view for view in measured if view in held_out]),
     ):
         if views:
             mean = sum(view.data.lodgs.psnr for view in views) / len(views)
-            column.label(text=f"{name}: {mean:.1f} dB ({len(views)} view{'s' * (len(views) != 1)})")
+            text = f"{name}: {mean:.1f} dB ({len(views)} view{'s' * (len(views) != 1)})"
+            column.label(text=text, icon=icon)
 
 
 CLASSES = (LODGS_UL_views, LODGS_PT_compare)

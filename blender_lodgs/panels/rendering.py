@@ -109,9 +109,9 @@ def _draw_meshes(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     if meshes is None:
         column.operator("lodgs.combine_with_meshes", icon="NODE_COMPOSITING")
         return
-    column.label(text=f"Meshes are rendered by '{meshes.name}'", icon="NODE_COMPOSITING")
+    column.label(text=f"Meshes: '{meshes.name}'", icon="NODE_COMPOSITING")
     if meshes.render.engine == "CYCLES":
-        split_column(column).prop(meshes.cycles, "samples", text="Its Samples")
+        split_column(column).prop(meshes.cycles, "samples", text="Samples")
     row = column.row(align=True)
     row.operator("lodgs.combine_with_meshes", text="Update", icon="FILE_REFRESH")
     row.operator("lodgs.separate_meshes", icon="X")

@@ -23,7 +23,9 @@ class LODGS_PT_scene(Panel):
                 layout.label(text="Select one of the splat scenes", icon="INFO")
             return
         column = split_column(layout)
-        column.prop(root, "name", text="Name")
+        row = column.row(align=True)
+        row.prop(root, "name", text="Name")
+        row.operator("lodgs.remove_scene", text="", icon="TRASH")
         if root.lodgs.scene_folder:
             column.prop(root.lodgs, "scene_folder", text="Photographs")
         row = layout.row(align=True)
@@ -38,7 +40,6 @@ class LODGS_PT_scene(Panel):
             name = camera.name if camera in views else "Look Through"
             row.operator("lodgs.look_through", text=name, icon="OUTLINER_DATA_CAMERA").step = 0
             row.operator("lodgs.look_through", text="", icon="TRIA_RIGHT").step = 1
-        layout.operator("lodgs.remove_scene", icon="TRASH")
 
 
 CLASSES = (LODGS_PT_scene,)

@@ -1,0 +1,48 @@
+"""A file that is opened where LODGS is not installed shows the finest level as points, not nothing."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from tests.blender.fake_trainer import splats
+from training.splats.bundle import Bundle, Level, write_bundle
+
+COUNTS = {1: 5, 2: 20, 3: 9}
+LOOK = """
+import bpy, json, sys
+import numpy as np
+bpy.ops.wm.open_mainfile(filepath=sys.argv[1])
+depsgraph, seen = bpy.context.evaluated_depsgraph_get(), {}
+for obj in bpy.data.objects:
+    if obj.type == "POINTCLOUD" and obj.visible_get():
+        cloud = obj.evaluated_get(depsgraph).data
+        radii = np.zeros(len(cloud.points), np.float32)
+        cloud.attributes["radius"].data.foreach_get("value", radii)
+        seen[obj.name] = [len(radii), float(radii.min()), obj.hide_render]
+assert not hasattr(bpy.types.Object, "lodgs")
+sys.stdout.write("\\nSEEN" + json.dumps(seen))
+sys.stdout.flush()
+import os
+os._exit(0)
+"""
+
+
+@pytest.mark.parametrize("cumulative", [False, True])
+def test_the_finest_level_is_there_as_points(bpy, lodgs, tmp_path, cumulative):
+    levels = [Level(number, splats(count), {"s_min": 0.1 / number}) for number, count in COUNTS.items()]
+    levels[-1].facts["s_min"] = 0.0
+    write_bundle(tmp_path / "b.ply", Bundle("flod", levels, "bands", cumulative=cumulative))
+    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "b.ply")
+    root.lodgs.mode, root.lodgs.levels[2].show = "SELECTIVE", False
+    bpy.context.view_layer.update()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "b.blend"))
+    command = [sys.executable, "-c", LOOK, str(tmp_path / "b.blend")]
+    out = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout
+    seen = json.loads(out.rpartition("SEEN")[2])
+    shown = COUNTS if cumulative else {3: COUNTS[3]}
+    assert {name: found[0] for name, found in seen.items()} == {
+        f"b level {number}": count for number, count in shown.items()
+    }
+    assert all(radius > 0 and not hidden for _, radius, hidden in seen.values())
