@@ -179,7 +179,7 @@ class _Bar:
             bar = "█" * round(24 * share)
             print(
                 f"\r\033[K{watch.message:<16} |{bar:<24}| {share:4.0%}  {progress['splats']:,} splats  "
-                f"{progress['psnr']:.1f} dB  {progress['steps_per_s']:.1f} steps/s  "
+                f"{progress['psnr']:.1f} dB in training  {progress['steps_per_s']:.1f} steps/s  "
                 f"{duration(progress['eta_s'])} left",
                 end="", file=sys.stderr, flush=True,
             )  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..data import removal, scenes
+from ..runs.watch import watch_of
 from .parts import OnScene
 
 
@@ -24,11 +25,12 @@ class LODGS_OT_remove_scene(OnScene, bpy.types.Operator):
 
     def execute(self, context):
         root = scenes.active_root(context)
-        name = root.name
+        name, watch = root.name, watch_of(root)
         if context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
         removal.remove(root)
-        self.report({"INFO"}, f"'{name}' is removed")
+        aside = f"; its training goes on in {watch.folder.path}" if watch and watch.running else ""
+        self.report({"INFO"}, f"'{name}' is removed{aside}")
         return {"FINISHED"}
 
 

@@ -29,7 +29,11 @@ def test_train_saves_and_exports(bpy, lodgs, lodgs_command, fake, tmp_path, capf
     )  # fmt: skip
     assert code == 0
     said = capfd.readouterr().err
-    for line in ("Level 1: 5 splats, 20.0 dB", "Finished", "warning: One photograph is missing."):
+    for line in (
+        "Level 1: 5 splats, 20.0 dB on held-out views",
+        "Finished",
+        "warning: One photograph is missing.",
+    ):
         assert line in said.splitlines()
     job = lodgs("training.runs.job").Job.from_file(run / "job.toml")
     assert (job.seed, job.image_scale, job.parameters["steps"]) == (3, 0.25, [4, 5])

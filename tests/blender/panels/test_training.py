@@ -105,7 +105,16 @@ def test_while_training(draw, watch):
     }  # fmt: skip
     notes = draw()
     assert notes.operators == ["lodgs.cancel_training"]
-    facts = {"2 of 5", "1,500 of 4,300", "0.1234", "21.5 dB", "12,345", "12.3 steps/s", "4 min"}
+    facts = {
+        "2 of 5",
+        "1,500 of 4,300",
+        "0.1234",
+        "PSNR, training",
+        "21.5 dB",
+        "12,345",
+        "12.3 steps/s",
+        "4 min",
+    }
     assert facts | {"Level 2 of 5 · 35%"} <= set(notes.texts)
     watch.last_event = 0
     assert any("has not answered" in text for text in draw().texts)

@@ -360,6 +360,17 @@ def test_a_level_that_an_undo_took_away_is_back_at_the_end(bpy, jobs, fake, tmp_
     assert [item.number for item in root.lodgs.levels] == [1, 2] and "the artist's" in bpy.data.objects
 
 
+def test_a_removed_scenes_training_goes_on(bpy, jobs, fake, root, tmp_path, capfd):
+    fake("slow")
+    watch = jobs.start(root, str(tmp_path / "run"))
+    _wait(watch, lambda: watch.progress)
+    assert bpy.ops.lodgs.remove_scene() == {"FINISHED"}
+    assert f"its training goes on in {tmp_path / 'run'}" in capfd.readouterr().out
+    assert not watch.step() and watch.process.poll() is None
+    watch.folder.request_cancel()
+    assert watch.process.wait(20) == 3
+
+
 def test_a_lost_run_folder_is_no_error_on_opening(bpy, jobs, watch_of, root, tmp_path):
     root.lodgs.training.run = str(tmp_path / "gone")
     blend = str(tmp_path / "scene.blend")

@@ -107,6 +107,7 @@ def test_without_held_out_views_a_run_measures_training_views_and_says_so(tiny_s
     assert code == 0
     (level,) = (event for event in events if event["event"] == "level")
     assert "psnr" not in level and level["train_psnr"] == events[-1]["train_psnr"] > 5
+    assert "held_out" not in read_bundle(tmp_path / "run" / "bundle.ply").meta
     assert "worst" not in events[-1] and 0 <= events[-1]["veil"]["mean"] <= events[-1]["veil"]["max"] <= 1
 
 
@@ -114,6 +115,7 @@ def test_levels_and_bundle_agree_and_record_the_constraint(unbroken):
     folder = RunFolder(unbroken["keys"]["out"])
     bundle = read_bundle(folder.bundle)
     assert [level.number for level in bundle.levels] == [1, 2, 3]
+    assert bundle.meta["held_out"] == [0, 4]
     for level, event in zip(bundle.levels, folder.levels(), strict=True):
         alone = read_ply(folder.path / event["path"])
         assert len(level.splats) == event["splats"]
