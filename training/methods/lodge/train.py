@@ -115,6 +115,8 @@ class Method(threedgs_train.Method):
     def set_learning_rates(self, step: int) -> None:
         if step < self.finest_steps:
             super().set_learning_rates(step)
+        else:  # a finished model's (the paper says nothing)
+            self.model.adam.lr["means"] = self.parameters.lr_means_final * self.data.extent
 
     def keep_supported(self, step: int) -> None:
         if step < self.finest_steps:
@@ -147,9 +149,8 @@ class Method(threedgs_train.Method):
             thresholds = Thresholds(data.train, data.near, self.backend, p.prune_weight, self._std)
             self.d_l[number], costs = thresholds.next(self.finished, self.d_l)
             self.costs.append({"level": number, **costs})
-        rates = splat_rates(p, data.extent) | {"means": p.lr_means_final * data.extent}
         tensors = {name: getattr(finest, name).clone() for name in NAMES}
-        self.model = Model(tensors, rates)
+        self.model = Model(tensors, splat_rates(p, data.extent))
 
     def smoothed(self, number: int) -> Gaussians:
         """The model as a level: with the filter of its distance (Eq. 3), which no step can undo."""
@@ -167,7 +168,8 @@ class Method(threedgs_train.Method):
     def importance(self, number: int) -> torch.Tensor:
         """The largest share (N,) of a pixel that each splat of the level in training has.
 
-        In the training views, beside the finer levels; and alone in views as far away as its distance.
+        In the training views, beside the finer levels; and alone in views as far away as its distance, which
+        see what continues the photographs, too.
         """
         data, count, backend = self.data, len(self.model), self.backend
         levels, alone, farther = self._levels_to(number), self.smoothed(number), self._farther(number)
@@ -175,11 +177,12 @@ class Method(threedgs_train.Method):
         found = importance(beside, count, data.near, backend)
         if not self.parameters.tune_alone:
             return found
-        away = ((camera.scaled(1 / farther), alone, None) for camera in data.train)
+        margin = self.parameters.margin
+        away = ((camera.widened(margin).scaled(1 / farther), alone, None) for camera in data.train)
         return torch.maximum(found, importance(away, count, data.near, backend))
 
     def _level(self, number: int) -> Level:
-        g = self.smoothed(number).detach()
+        g = self.finished[number] if number in self.finished else self.smoothed(number).detach()
         splats = Splats(*(tensor.cpu().numpy().copy() for tensor in vars(g).values()))
         return Level(number, splats, {"d_l": self.d_l[number]})
 
