@@ -1,7 +1,7 @@
 """A town of as many splats as wanted, made by a program: its truth is known, and nothing was trained.
 
     python -m examples.town build/town --splats 3000000          town.ply, cameras/*.json: a minute
-    python -m examples.town build/town --splats 3000000 --views 120    a COLMAP scene of it as well
+    python -m examples.town build/town --splats 3000000 --views 120    scene/, a COLMAP scene of it, as well
 
 Splats lie on the surfaces of what ``town_shapes`` plans, as discs as large as they stand apart. More splats
 are first smaller ones, then more blocks. Two ways lead through it: a walk in the streets at eye height, and a
@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from training.rasterize.sh import basis, coefficients
+from training.render.capture import write_scene
 from training.scenes.cameras import Camera, write_camera
 from training.splats.gaussians import SH_C0, Splats
 from training.splats.ply import write_ply
@@ -261,7 +262,7 @@ def _sky(plan: Plan, count: int) -> Discs:
     radius = (plan.half + shapes.PITCH) * 14
     size = np.full((count, 1), 1.4 * radius * np.sqrt(2.24 * np.pi / count))
     blue = np.asarray(z.clip(0, 1) ** 0.6, np.float64)[:, None]
-    color = np.array([0.80, 0.87, 0.94]) * (1 - blue) + np.array([0.28, 0.48, 0.80]) * blue
+    color = np.array([0.80, 0.87, 0.94]) * np.subtract(1, blue) + np.array([0.28, 0.48, 0.80]) * blue
     flat = np.maximum(z, 0.04)
     across, along = out[:, 0] / flat, out[:, 1] / flat
     clouds = shapes.noise(across * 0.8, along * 0.8, 20.0, 4) * 0.9 - 0.05
@@ -413,10 +414,8 @@ def main() -> None:
             write_camera(options.out / "cameras" / f"{camera.name}.json", camera, NEAR)
     print(f"{len(splats):,} splats, {plan.blocks} x {plan.blocks} blocks: {options.out / 'town.ply'}")
     if options.views:
-        from .town_scene import write_scene
-
         views = [*walk(plan, options.views), *flight(plan, options.views)]
-        write_scene(options.out, splats, views, NEAR, POINTS)
+        write_scene(options.out / "scene", splats, views, NEAR, POINTS)
 
 
 if __name__ == "__main__":

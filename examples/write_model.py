@@ -20,9 +20,9 @@ import pycolmap
 from PIL import Image
 
 from training.scenes.cameras import Camera, write_camera
+from training.scenes.write_colmap import thinned, visible_in, write_colmap
 
 from . import rig
-from .colmap_model import thinned, visible_in, write_colmap
 
 SAMPLES = 15_360  # points before those that too few views see are left out
 SHORTEST_TRACK, LONGEST_TRACK = 3, 4  # views; longer ones are thinned to keep the model small

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from examples import town, town_scene, town_shapes
+from examples import town, town_shapes
+from training.render.capture import write_scene
 from training.scenes.colmap import read_scene
 
 
@@ -60,8 +61,8 @@ def test_both_ways_lead_through_the_open_and_other_phases_are_other_places(plan,
 
 def test_its_colmap_scene_has_points_where_the_cameras_see_surfaces(plan, tmp_path):
     splats, cameras = town.build(plan, 40_000), town.walk(plan, 4) + town.flight(plan, 6)
-    town_scene.write_scene(tmp_path, splats, [c.scaled(0.25) for c in cameras], town.NEAR, points=3000)
-    scene = read_scene(tmp_path)
+    write_scene(tmp_path / "scene", splats, [c.scaled(0.25) for c in cameras], town.NEAR, points=3000)
+    scene = read_scene(tmp_path / "scene")
     assert [camera.name for camera in scene.cameras] == sorted(f"{camera.name}.jpg" for camera in cameras)
     assert len(scene.points) > 500
     assert (scene.points[:, 2] > -1).all()

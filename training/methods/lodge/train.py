@@ -105,6 +105,10 @@ class Method(threedgs_train.Method):
             gaussians, weights = composite(self._levels_to(number), self.d_l, view.camera, scale)
         return [Drawing(self.rasterize_model(view.camera, step, weights, gaussians=gaussians))]
 
+    def background(self, step: int) -> tuple[float, float, float]:
+        """Black for the coarser levels, which the finest covers for: what is nothing may be black."""
+        return super().background(step) if step < self.finest_steps else (0.0, 0.0, 0.0)
+
     def sh_degree(self, step: int) -> int:
         return super().sh_degree(step) if step < self.finest_steps else self.parameters.sh_degree
 

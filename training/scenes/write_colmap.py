@@ -1,4 +1,4 @@
-"""COLMAP models of cameras and points that are known exactly."""
+"""COLMAP models of cameras and points that are known exactly: of scenes that a program renders."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from training.scenes.cameras import Camera
+from .cameras import Camera
 
 DEPTH_TOLERANCE = 0.01  # relative: a point this much behind the surface that a view sees is hidden there
 
@@ -49,10 +49,11 @@ def write_colmap(
     visible: np.ndarray,
     colors: np.ndarray,
 ) -> pycolmap.Reconstruction:
-    """Writes the model scene/sparse/0/*.bin.
+    """Writes the model scene/sparse/0/*.bin; the images themselves are the caller's.
 
     Args:
-        cameras: V views of one lens; their names are those of the images.
+        scene: its folder.
+        cameras: V views of one lens without distortion; their names are those of the images.
         points: (N, 3) in the world.
         pixels: (V, N, 2) where views see them.
         visible: (V, N), which observations the tracks hold.
