@@ -261,14 +261,14 @@ def _sky(plan: Plan, count: int) -> Discs:
     out = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
     radius = (plan.half + shapes.PITCH) * 14
     size = np.full((count, 1), 1.4 * radius * np.sqrt(2.24 * np.pi / count))
-    blue = np.asarray(z.clip(0, 1) ** 0.6, np.float64)[:, None]
-    color = np.array([0.80, 0.87, 0.94]) * np.subtract(1, blue) + np.array([0.28, 0.48, 0.80]) * blue
+    blue = z.clip(0, 1)[:, None] ** 0.6
+    color = np.array([0.80, 0.87, 0.94]) * (1 - blue) + np.array([0.28, 0.48, 0.80]) * blue
     flat = np.maximum(z, 0.04)
     across, along = out[:, 0] / flat, out[:, 1] / flat
     clouds = shapes.noise(across * 0.8, along * 0.8, 20.0, 4) * 0.9 - 0.05
     white = clouds.clip(0, 0.85)[:, None]
     color = color * (1 - white) + 0.97 * white
-    return Discs(out * radius, -out, np.cross(out, [0.31, 0.52, 0.79]), size, color, np.zeros(count))
+    return Discs(out * radius, np.negative(out), np.cross(out, [0.31, 0.52, 0.79]), size, color, np.zeros(count))
 
 
 def _lit(plan: Plan, means: np.ndarray, normals: np.ndarray, albedo: np.ndarray) -> np.ndarray:
