@@ -104,6 +104,19 @@ def _parser() -> argparse.ArgumentParser:
     )
     render.add_argument("--backend", default="auto", help="auto, cpu, cuda or reference")
 
+    capture = commands.add_parser(
+        "capture", help="pictures of splats that have no photographs, as a COLMAP scene to train from"
+    )
+    capture.add_argument(
+        "source", type=Path, help="bundle, folder of levels, any 3DGS PLY, or a run's folder"
+    )
+    capture.add_argument("--out", type=Path, required=True, help="folder of the scene; not there yet")
+    capture.add_argument(
+        "--cameras", type=Path, metavar="DIR", help="camera files (*.json) to draw; otherwise from all around"
+    )
+    capture.add_argument("--views", type=int, default=64, help="how many from all around (default 64)")
+    capture.add_argument("--backend", default="auto", help="auto, cpu, cuda or reference")
+
     serve = commands.add_parser("serve", help="draw frame after frame for Blender")
     serve.add_argument("folder", type=Path, help="folder for arrays; removed at the end")
     serve.add_argument("--backend", default="auto", help="auto, cpu, cuda or reference")
@@ -211,6 +224,31 @@ def _render(chosen: argparse.Namespace) -> int:
     return 0
 
 
+def _capture(chosen: argparse.Namespace) -> int:
+    from .lod.selection import complete
+    from .render.capture import dome, write_scene
+    from .render.command import Source
+    from .scenes.cameras import read_camera
+
+    bundle = Source.read(chosen.source, _warn).bundle
+    splats = complete(bundle, bundle.levels[-1])
+    if chosen.cameras:
+        files = sorted(chosen.cameras.glob("*.json"))
+        if len(files) < 2:
+            raise LodgsError(
+                f"{chosen.cameras} holds no two camera files (*.json).", "Choose another folder."
+            )
+        views, nears = zip(*map(read_camera, files), strict=True)
+        near = min(nears)
+    elif chosen.views < 2:
+        raise LodgsError("A scene takes two views or more.", "Give --views 64.")
+    else:
+        views, near = dome(splats, chosen.views)
+    points = write_scene(chosen.out, splats, views, near, backend=chosen.backend)
+    print(f"{chosen.out}: {len(views)} views, {points:,} points")
+    return 0
+
+
 def _warn(message: str) -> None:
     print(f"warning: {message}", file=sys.stderr)
 
@@ -269,6 +307,7 @@ _COMMANDS = {
     "methods": _methods,
     "evaluate": _evaluate,
     "render": _render,
+    "capture": _capture,
     "serve": _serve,
     "info": _info,
 }

@@ -246,11 +246,16 @@ class Method(ABC, Generic[P, D]):
         return min(p.sh_degree, step // max(p.sh_interval, 1))
 
     def rasterize_model(
-        self, camera: Camera, step: int, weights: torch.Tensor | None = None, min_scale: float = 0.0
+        self,
+        camera: Camera,
+        step: int,
+        weights: torch.Tensor | None = None,
+        min_scale: float = 0.0,
+        gaussians: Gaussians | None = None,
     ) -> Rendering:
-        """What a camera sees of a model of splats; arguments as for ``training.rasterize.rasterize``."""
+        """What a camera sees of a model of splats, or of others; arguments as of ``rasterize``."""
         return rasterize(
-            self.model.gaussians,
+            self.model.gaussians if gaussians is None else gaussians,
             camera,
             weights=weights,
             min_scale=min_scale,

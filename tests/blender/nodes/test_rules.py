@@ -8,7 +8,7 @@ from training.lod.rule import rules
 RULES = sorted(rules())
 RANGES = {
     "tau": (0.002, 0.02), "reference": (-3, 20), "sigma_d": (-0.5, 3), "s_v": (1, 4),
-    "at_most": (-1500, 3000),
+    "at_most": (-1500, 3000), "d_l": (1, 6), "coarser_d_l": (7, 14), "distance_scale": (0.7, 1.6),
 }  # fmt: skip
 """Of facts, controls and columns for which the usual ones would show everything or nothing."""
 

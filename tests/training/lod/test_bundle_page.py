@@ -18,6 +18,7 @@ EYES = ((0, 0, 0), (1.5, -2, 3), (9, 0, 1), (40.25, 3, -8), (-3000, 0, 0))
 FOCAL = (60.0, 500.0, 1333.3)
 CHOICES = {
     "bands": [{}, {"gamma": 0.3}, {"gamma": 4, "first": 1}, {"first": 2, "last": 4}, {"first": 1, "last": 1}],
+    "chunks": [{}, {"distance_scale": 0.3}, {"distance_scale": 7.7}],
     "decay": [{}, {"s_v": 1.7}, {"s_v": 4}, {"at_most": 120}, {"at_most": 17, "s_v": 2}],
     "octree": [{}, {"offset": 1.7}, {"offset": -3.1}, {"fade": 0}, {"fade": 0, "offset": 0.6}],
 }
@@ -81,6 +82,7 @@ class Page:
             "bands": (self.bands, {"gamma": 1, "first": first, "last": last}),
             "octree": (self.octree, {"offset": 0, "fade": 1}),
             "decay": (self.decay, {"s_v": 1, "at_most": 0}),
+            "chunks": (self.chunks, {"distance_scale": 1}),
         }[self.rule]
         values = defaults | self.controls | given
         return {
@@ -95,6 +97,13 @@ class Page:
         border = {each: self.level_facts[each]["s_min"] / values["gamma"] * f for each in used}
         near = 0.0 if n == used[-1] else border[n]
         far = np.inf if n == used[0] else border[used[used.index(n) - 1]]
+        return ((np.float32(near) <= d) & (d < np.float32(far))).astype(float)
+
+    def chunks(self, n: int, d: np.ndarray, f: float, values: dict) -> np.ndarray:
+        place = self.numbers.index(n)
+        near = self.level_facts[n]["d_l"] if n != self.numbers[-1] else 0.0
+        far = self.level_facts[self.numbers[place - 1]]["d_l"] if place else np.inf
+        d = d * np.float32(values["distance_scale"])
         return ((np.float32(near) <= d) & (d < np.float32(far))).astype(float)
 
     def octree(self, n: int, d: np.ndarray, f: float, values: dict) -> np.ndarray:
@@ -155,7 +164,9 @@ def made(tmp_path):
     octree = Bundle("octree", of_octree, "octree", facts, controls, True)
     fading = Bundle("clod", levels({1: {}}, ("sigma_d",)), "decay", {"reference": 9.5, "tau": 0.004})
     farthest = Bundle("clod", fading.levels, "decay", {"reference": 0.0, "tau": 0.004})
-    bundles = {"bands": bands, "octree": octree, "decay": fading, "farthest": farthest}
+    begin = {1: 9.0, 3: 2.5, 4: 0.0}
+    chunks = Bundle("lodge", levels({n: {"d_l": d} for n, d in begin.items()}, ()), "chunks")
+    bundles = {"chunks": chunks, "bands": bands, "octree": octree, "decay": fading, "farthest": farthest}
 
     def make(name: str) -> Path:
         path, bundle = tmp_path / name, bundles[name.split(maxsplit=1)[0]]
@@ -175,6 +186,8 @@ WRITTEN_NOW = (
     "bands folder",
     "octree",
     "octree folder",
+    "chunks",
+    "chunks folder",
     "decay",
     "decay folder",
     "farthest",

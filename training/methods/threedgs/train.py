@@ -35,7 +35,7 @@ class Method(method.Method[ThreedgsParameters, Drawing]):
 
     def shrink(self, step: int) -> float:
         p = self.parameters
-        return shrink_at(step / self.steps, p.first_resolution, p.full_resolution)
+        return shrink_at(step / p.steps, p.first_resolution, p.full_resolution)
 
     def draw(self, view: TrainingView, step: int) -> list[Drawing]:
         return [Drawing(self.rasterize_model(view.camera, step))]

@@ -1,0 +1,190 @@
+"""LODGE: levels are the rule's and no finer than their filter, the finest stays, runs go on to the bit."""
+
+import io
+
+import numpy as np
+import pytest
+import torch
+
+from training.errors import LodgsError
+from training.lod.selection import select, settings
+from training.methods import create, method_info
+from training.methods.lodge.composite import composite, importance
+from training.methods.lodge.thresholds import Thresholds
+from training.methods.parameters import override
+from training.rasterize import Gaussians, rasterize
+from training.scenes.cameras import Camera
+from training.splats.bundle import Bundle
+from training.splats.gaussians import Splats
+
+
+def make(data, base=None, preset="draft", **values):
+    values = {
+        "steps": 12,
+        "densify_until": 0.4,
+        "prune_interval": 6,
+        "tune_steps": 3,
+        "margin": 0.0,
+        **values,
+    }
+    return create("lodge", data, override(method_info("lodge").preset(preset), values), 0, "cpu", base)
+
+
+def trained(lodge, begin=0, until=None):
+    levels = []
+    for step in range(begin, until or lodge.steps):
+        lodge.train_step(step)
+        levels += lodge.levels_after(step)
+    return levels
+
+
+def same(one: Splats, other: Splats) -> bool:
+    names = ("means", "quats", "log_scales", "opacity_logits", "sh")
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names)
+
+
+@pytest.fixture(scope="module")
+def base(data) -> Splats:
+    plain = create(
+        "3dgs", data, override(method_info("3dgs").preset("draft"), {"steps": 12, "margin": 0.0}), 0, "cpu"
+    )
+    return trained(plain)[-1].splats
+
+
+def test_levels_come_finest_first_and_each_keeps_its_distance(data):
+    lodge = make(data, levels=3)
+    assert lodge.steps == lodge.parameters.total_steps == 12 + 2 * 3 * 3
+    levels = trained(lodge)
+    assert [level.number for level in levels] == [3, 2, 1]
+    d_l = [level.facts["d_l"] for level in levels]
+    assert d_l[0] == 0 < d_l[1] < d_l[2]
+    for level in levels[1:]:
+        least = np.sqrt(0.2) * level.facts["d_l"] / data.focal
+        assert np.exp(level.splats.log_scales).min() >= 0.9999 * least
+        assert 0 < len(level.splats) <= len(levels[0].splats)
+
+
+def test_a_base_is_the_finest_level_to_the_bit(data, base):
+    lodge = make(data, base)
+    finest, *_ = levels = trained(lodge)
+    assert finest.number == 3 and same(finest.splats, base)
+    assert [level.number for level in levels] == [3, 2, 1] and lodge.steps == 18
+
+
+def test_one_level_is_the_base_alone(data, base):
+    lodge = make(data, levels=1)
+    [level] = trained(lodge)
+    assert (level.number, level.facts) == (1, {"d_l": 0.0})
+    with pytest.raises(LodgsError, match="distances"):
+        make(data, levels=2, distances=[1.0, 2.0])
+
+
+def test_distances_that_are_given_are_taken(data, base):
+    lodge = make(data, base, distances=[3.0, 0.5, 0.0])
+    d_l = {level.number: level.facts["d_l"] for level in trained(lodge)}
+    assert d_l == pytest.approx({3: 0.0, 2: 0.5 * data.median_depth, 1: 3.0 * data.median_depth})
+    assert lodge.costs == []
+
+
+def test_training_draws_what_the_bundle_shows(data, base):
+    """The composite of a step against the selection of the bundle that was written, picture by picture."""
+    lodge = make(data, base, distances=[1.3, 0.8, 0.0])
+    levels = sorted(trained(lodge), key=lambda level: level.number)
+    bundle, camera = Bundle("lodge", levels, "chunks"), data.train[2]
+    drawn = {level.number: Gaussians.of(level.splats) for level in reversed(levels)}
+    for scale in (1.0, 1.4):
+        splats, weights = select(
+            bundle, camera.center, camera.focal, settings(bundle, {"distance_scale": scale})
+        )
+        assert weights is None
+        gaussians, weights = composite(drawn, lodge.d_l, camera, scale)
+        assert int(weights.sum()) == len(splats)
+        one = rasterize(gaussians, camera, weights=weights, backend="reference").image
+        other = rasterize(Gaussians.of(splats), camera, backend="reference").image
+        torch.testing.assert_close(one, other)
+
+
+def test_tuning_moves_its_level_alone(data, base):
+    lodge = make(data, base)
+    trained(lodge, until=10)  # in the coarsest level
+    before = {number: [t.clone() for t in vars(g).values()] for number, g in lodge.finished.items()}
+    row = lodge.model["sh"].detach().clone()
+    trained(lodge, 10, 12)
+    assert sorted(before) == [2, 3] and not torch.equal(row, lodge.model["sh"].detach())
+    for number, tensors in before.items():
+        assert all(map(torch.equal, tensors, vars(lodge.finished[number]).values()))
+
+
+def test_importance_is_the_largest_weight_of_the_reference(data, base):
+    """Blending weights by the derivative of a picture of ones with respect to each splat's own colour."""
+    few = base.select(slice(0, 12))
+    gaussians, camera = Gaussians.of(few), data.train[0]
+    found = importance([(camera, gaussians, None)], 5, data.near, "cpu")
+    for row in range(7, 12):
+        lit = torch.zeros(12, 3)
+        lit[row] = 1.0
+        only = Gaussians(
+            gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.opacity_logits, lit
+        )
+        picture = rasterize(only, camera, near=data.near, backend="reference").image
+        assert found[row - 7] == pytest.approx(float(picture.max()), abs=2e-5)
+
+
+def test_what_hardly_shows_goes_and_what_shows_stays(data, base):
+    all_of_it = make(data, base, prune_weight=0.0, distances=[1.2, 0.8, 0.0])
+    some = make(data, base, prune_weight=0.3, distances=[1.2, 0.8, 0.0])
+    for lodge in (all_of_it, some):
+        trained(lodge, until=1)
+    assert len(all_of_it.model) == len(base)
+    weights = all_of_it.importance(2)
+    assert len(some.model) < len(base)
+    # the first of three prunings takes a fifth of the threshold; the step in between changes little
+    assert len(some.model) == pytest.approx(int((weights >= 0.06).sum()), abs=2)
+
+
+def test_the_cost_of_distances_by_hand():
+    """Two splats before a camera: with a distance between them the farther one is drawn smoothed."""
+    pose = np.eye(4)
+    camera = Camera("v", 64, 64, 64.0, 64.0, 32.0, 32.0, pose)
+    means = np.float32([[0, 0, 2], [0, 0, 8]])
+    splats = Splats(
+        means, np.tile(np.float32([1, 0, 0, 0]), (2, 1)), np.log(np.float32([[0.02] * 3, [0.55] * 3])),
+        np.full(2, 3.0, np.float32), np.zeros((2, 1, 3), np.float32),
+    )  # fmt: skip
+    thresholds = Thresholds([camera], 0.01, "cpu", prune_weight=0.001, std=lambda d: 0.5 * d / 64)
+    levels, d_l = {2: Gaussians.of(splats)}, {2: 0.0}
+    # each of the two splats, small ones in the picture, stands on the corner of four of the 16 tiles
+    assert thresholds.cost(levels, d_l, 5.0) == pytest.approx((4 + 4) / 16)
+    assert thresholds.cost(levels, d_l, 20.0) == pytest.approx((4 + 4) / 16)
+    # smoothed by 8 px the far one reaches the corners of the picture
+    wide = Thresholds([camera], 0.01, "cpu", prune_weight=0.0, std=lambda d: d / 5)
+    assert wide.cost(levels, d_l, 5.0) == pytest.approx((4 + 16) / 16)
+    # and where nothing of it is left, it costs nothing
+    gone = Thresholds([camera], 0.01, "cpu", prune_weight=0.9, std=lambda d: d / 5)
+    assert gone.cost(levels, d_l, 5.0) == pytest.approx(4 / 16)
+
+
+def test_the_distance_found_is_the_cheapest_that_was_tried(data, base):
+    lodge = make(data, base)
+    trained(lodge)
+    assert [cost["level"] for cost in lodge.costs] == [2, 1]
+    for cost in lodge.costs:
+        assert len(cost["distances"]) == len(cost["costs"]) >= 1
+        assert lodge.d_l[cost["level"]] == cost["distances"][int(np.argmin(cost["costs"]))]
+
+
+@pytest.mark.parametrize("stop", [11, 12, 14, 15, 21])
+def test_a_run_goes_on_to_the_bit(data, stop):
+    """Stopped in the finest level, at its end, within a round, at a round's and at a level's end."""
+    whole, first = make(data), make(data)
+    levels = trained(whole)
+    before = trained(first, until=stop)
+    file = io.BytesIO()
+    torch.save(first.state_dict(), file)
+    file.seek(0)
+    second = make(data)
+    second.load_state_dict(torch.load(file, weights_only=True))
+    after = before + trained(second, stop)
+    assert [level.number for level in after] == [level.number for level in levels]
+    assert all(same(one.splats, other.splats) for one, other in zip(levels, after, strict=True))
+    assert second.meta() == whole.meta()

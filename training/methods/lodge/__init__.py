@@ -1,0 +1,85 @@
+"""LODGE (2025): coarser levels from a finished model, smoothed for a distance, pruned and tuned."""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+from ...errors import LodgsError
+from ...splats.bundle import MOST_LEVELS
+from ..info import MethodInfo
+from ..parameters import PAPER, STANDARD, parameter
+from ..threedgs import ThreedgsParameters
+
+ROUNDS = (0.2, 0.6, 1.0)
+"""A level is pruned and tuned so often, with these shares of the pruning threshold (LODGE, A.2)."""
+
+
+@dataclass(frozen=True)
+class LodgeParameters(ThreedgsParameters):
+    """Those of LODGE; ``steps`` are the finest level's, which is 3DGS where there is no base.
+
+    A tuple has one entry for each level, coarse to fine.
+    """
+
+    levels: int = parameter(3, "Number of levels, the finest among them.", low=1, high=MOST_LEVELS)
+    distances: tuple[float, ...] = parameter(
+        (0.0,) * 3,
+        "Distance from which on each level is shown, in median depths of the scene, falling to 0 for the "
+        "finest (LODGE: d_l). 0 finds the one that leaves least to draw.",
+    )
+    prune_weight: float = parameter(
+        0.02,
+        "Splats of a coarser level that are nowhere more than this share of a pixel are removed (LODGE: γ, "
+        "without a number).",
+        high=1,
+    )
+    tune_steps: int = parameter(
+        120, "Steps after each of the three prunings of a level.", above=0, unit="steps"
+    )
+    tune_range: float = parameter(
+        0.3, "While a level is tuned, distances are random by this share of them, up or down.", high=0.9
+    )
+    tune_alone: float = parameter(
+        0.25,
+        "Share of these steps that draw the level alone, on photographs as small as they are from its "
+        "distance, so that it stands where no training view is as far away. Not in the paper.",
+        high=1,
+    )
+    filter_variance: float = parameter(
+        0.2,
+        "Variance of the filter that smooths a level, in squared pixels at its distance (LODGE: s, without a "
+        "number; Mip-Splatting's).",
+    )
+
+    @property
+    def total_steps(self) -> int:
+        return self.steps + self.level_steps * (self.levels - 1)
+
+    @property
+    def level_steps(self) -> int:
+        """Steps that tune one level."""
+        return len(ROUNDS) * self.tune_steps
+
+    def check(self) -> None:
+        given = [distance for distance in self.distances[:-1] if distance]
+        if self.distances[-1] or any(a <= b for a, b in pairwise(given)):
+            raise LodgsError(
+                f"distances = {list(self.distances)} is not possible.",
+                "Give falling numbers, coarse to fine, the last one 0.",
+            )
+
+
+_DRAFT = LodgeParameters()
+_STANDARD = replace(_DRAFT, **STANDARD, steps=30_000, densify_interval=100, tune_steps=1000)
+_PAPER = replace(_STANDARD, **PAPER, tune_alone=0.0)
+
+METHOD = MethodInfo(
+    name="lodge",
+    number=5,
+    label="LODGE",
+    about="coarser levels from a finished model, each for what is farther away",
+    parameters=LodgeParameters,
+    presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
+    rule="chunks",
+    offered=("levels", "max_splats", "prune_weight"),
+    from_base=True,
+)

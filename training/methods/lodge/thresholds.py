@@ -1,0 +1,89 @@
+"""From which distance on a coarser level is shown: what leaves least to draw (LODGE, Sec. 3, Fig. 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+import torch
+
+from ...rasterize import Gaussians, rasterize
+from ...rasterize.filter3d import smoothed
+from ...scenes.cameras import Camera, evenly
+from .composite import composite, importance
+
+VIEWS = 8
+"""So many training views tell the cost."""
+QUANTILES = np.linspace(0.05, 0.95, 13)
+"""Of the distances of splats in view: what is tried."""
+STANDING_APART = 1.25
+"""A level begins at least this many times farther away than the next finer one."""
+
+
+class Thresholds:
+    """Finds distances one after the other, finest first (the paper's greedy strategy).
+
+    Args:
+        cameras: the training views.
+        near: depth at which drawing begins, in scene units.
+        backend: the rasterizer's.
+        prune_weight: the least share of a pixel that keeps a splat of the coarser level.
+        std: the smoothing filter's standard deviation for a distance, both in scene units.
+    """
+
+    def __init__(
+        self,
+        cameras: Sequence[Camera],
+        near: float,
+        backend: str,
+        prune_weight: float,
+        std: Callable[[float], float],
+    ) -> None:
+        self._cameras = evenly(cameras, VIEWS)
+        self._near, self._backend, self._prune_weight, self._std = near, backend, prune_weight, std
+
+    @torch.no_grad()
+    def next(
+        self, levels: Mapping[int, Gaussians], d_l: Mapping[int, float]
+    ) -> tuple[float, dict[str, list[float]]]:
+        """The distance of the next coarser level.
+
+        Args:
+            levels: the levels that there are, by number, finest first.
+            d_l: their distances, in scene units.
+
+        Returns:
+            The distance; and for a report the ``distances`` that were tried with the ``costs`` of each.
+        """
+        tried = self._candidates(next(iter(levels.values())), STANDING_APART * max(d_l.values()))
+        costs = [self.cost(levels, d_l, distance) for distance in tried]
+        return tried[int(np.argmin(costs))], {"distances": tried, "costs": costs}
+
+    def cost(self, levels: Mapping[int, Gaussians], d_l: Mapping[int, float], distance: float) -> float:
+        """How many splats a tile of 16x16 pixels has to look at, on average, with one more level.
+
+        The level is the finest one smoothed and pruned, without the steps that tune it.
+        """
+        finest, number = next(iter(levels.values())), min(levels) - 1
+        scales, opacities = smoothed(finest.log_scales, finest.opacity_logits, self._std(distance))
+        coarser = Gaussians(finest.means, finest.quats, scales, opacities, finest.sh)
+        together, d_l = {**levels, number: coarser}, {**d_l, number: distance}
+        pictures = ((camera, *composite(together, d_l, camera)) for camera in self._cameras)
+        kept = importance(pictures, len(coarser), self._near, self._backend) >= self._prune_weight
+        together[number] = coarser.select(kept.to(coarser.means.device))
+        tiles = []
+        for camera in self._cameras:
+            gaussians, weights = composite(together, d_l, camera)
+            drawn = rasterize(gaussians, camera, weights=weights, near=self._near, backend=self._backend)
+            tiles.append(drawn.tile_counts.double().mean())
+        return float(torch.stack(tiles).mean())
+
+    def _candidates(self, finest: Gaussians, least: float) -> list[float]:
+        """Distances to try, of at least ``least``, in scene units."""
+        means = finest.means.cpu().numpy().astype(np.float64)
+        seen = [
+            np.linalg.norm(means[camera.sees(means, near=self._near)] - camera.center, axis=1)
+            for camera in self._cameras
+        ]
+        found = np.quantile(np.concatenate([*seen, [least]]), QUANTILES)
+        return [float(distance) for distance in found if distance >= least] or [max(least, float(found[-1]))]

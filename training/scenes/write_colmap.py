@@ -1,0 +1,86 @@
+"""COLMAP models of cameras and points that are known exactly: of scenes that a program renders."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from .cameras import Camera
+
+DEPTH_TOLERANCE = 0.01  # relative: a point this much behind the surface that a view sees is hidden there
+
+
+def visible_in(depths: np.ndarray, camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where a view sees points (N, 3): pixels (N, 2) and whether it does (N,).
+
+    The pixel that a point falls on must lie at its depth, and none of the pixels about it before it: at an
+    outline they show a mixture.
+
+    Args:
+        depths: (H, W) along the camera's z axis, of the surfaces in that view; its grid may be another one
+            than the camera's.
+    """
+    height, width = depths.shape
+    pixels, depth = camera.project(points)
+    with np.errstate(invalid="ignore"):
+        places = pixels * (width / camera.width)
+        inside = (depth > 0) & (places >= 1).all(1) & (places < [width - 1, height - 1]).all(1)
+    x, y = np.floor(np.where(inside[:, None], places, 1)).astype(int).T
+    around = np.stack([depths[y + dy, x + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
+    clear = around.min(axis=0) > depth * (1 - DEPTH_TOLERANCE)
+    there = np.abs(around[4] - depth) < depth * DEPTH_TOLERANCE
+    return pixels, inside & clear & there
+
+
+def thinned(visible: np.ndarray, longest: int) -> np.ndarray:
+    """At most so many views, at random, of the views (V, N) that see each point: it keeps models small."""
+    lottery = np.where(visible, np.random.default_rng(1).random(visible.shape), np.inf)
+    return visible & (lottery.argsort(axis=0).argsort(axis=0) < longest)
+
+
+def write_colmap(
+    scene: Path,
+    cameras: Sequence[Camera],
+    points: np.ndarray,
+    pixels: np.ndarray,
+    visible: np.ndarray,
+    colors: np.ndarray,
+) -> pycolmap.Reconstruction:
+    """Writes the model scene/sparse/0/*.bin; the images themselves are the caller's.
+
+    Args:
+        scene: its folder.
+        cameras: V views of one lens without distortion; their names are those of the images.
+        points: (N, 3) in the world.
+        pixels: (V, N, 2) where views see them.
+        visible: (V, N), which observations the tracks hold.
+        colors: (N, 3) in [0, 255].
+    """
+    model, lens = pycolmap.Reconstruction(), cameras[0]
+    camera = pycolmap.Camera(
+        model="PINHOLE", width=lens.width, height=lens.height,
+        params=[lens.fx, lens.fy, lens.cx, lens.cy], camera_id=1,
+    )  # fmt: skip
+    model.add_camera_with_trivial_rig(camera)
+    for view, each in enumerate(cameras):
+        image = pycolmap.Image(
+            name=each.name, keypoints=pixels[view, visible[view]], camera_id=1, image_id=view + 1
+        )
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(each.world_to_camera[:3]))
+    rows = np.cumsum(visible, axis=1) - 1  # number of each observation within its image
+    for index, (point, color) in enumerate(zip(points, np.round(colors).astype(np.uint8), strict=True)):
+        track = pycolmap.Track()
+        for view in np.flatnonzero(visible[:, index]):
+            track.add_element(int(view) + 1, int(rows[view, index]))
+        model.add_point3D(point, track, color)
+    model.update_point_3d_errors()
+
+    folder = scene / "sparse" / "0"
+    folder.mkdir(parents=True, exist_ok=True)
+    model.write_binary(folder)
+    for extra in ("rigs.bin", "frames.bin"):  # one camera without a rig: readers make these themselves
+        (folder / extra).unlink(missing_ok=True)
+    return model
