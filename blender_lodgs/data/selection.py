@@ -59,8 +59,7 @@ class Choice:
 def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Choice | None:
     """What the modifier of an evaluated level chooses by, as of the depsgraph; None where all is shown."""
     modifier = _modifier(evaluated)
-    render = depsgraph.mode == "RENDER"
-    if modifier is None or not (modifier.show_render if render else modifier.show_viewport):
+    if modifier is None or not _is_on(modifier, depsgraph):
         return None
     rule = groups.rule_of_group(modifier.node_group)
     assert rule is not None
@@ -87,13 +86,17 @@ def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Choic
     )
 
 
-def only_chosen(evaluated: bpy.types.Object) -> bool:
+def only_chosen(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
     """Whether an evaluated object shows its own splats as they are, chosen by nothing but :func:`choice`."""
     return all(
         modifier.type == "NODES" and (modifier.name == DISPLAY or groups.rule_of_group(modifier.node_group))
         for modifier in evaluated.modifiers
-        if modifier.show_viewport
+        if _is_on(modifier, depsgraph)
     )
+
+
+def _is_on(modifier: bpy.types.Modifier, depsgraph: bpy.types.Depsgraph) -> bool:
+    return modifier.show_render if depsgraph.mode == "RENDER" else modifier.show_viewport
 
 
 def read_json(text: str) -> dict:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import bpy
 
-from .. import compat
+from .. import compat, viewport
 from ..data import scenes
 from ..viewport import views
-from .parts import Panel, split_column
+from .parts import Panel, say, split_column
 
 
 class LODGS_PT_viewport(Panel):
@@ -31,6 +31,9 @@ class LODGS_PT_viewport(Panel):
             row = column.row()
             row.active = len(root.lodgs.levels) != 1  # one level has one colour
             row.prop(root.lodgs, "tell", expand=True)
+        if viewport.problem:
+            text = f"The viewport could not be drawn ({viewport.problem}). Untick Gaussian Splats for points."
+            say(layout, text, "ERROR")
         left_out = views.left_out()
         if settings.splats and left_out:
             layout.label(text=f"{left_out:,} splats left out to stay within that", icon="INFO")

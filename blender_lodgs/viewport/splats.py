@@ -400,6 +400,15 @@ def draw(
     gpu.state.blend_set("NONE")
 
 
+def reset_state() -> None:
+    """Gives Blender the state that it draws on with, after a drawing that was broken off."""
+    gpu.state.color_mask_set(True, True, True, True)
+    gpu.state.depth_test_set("NONE")
+    gpu.state.depth_mask_set(False)
+    gpu.state.program_point_size_set(False)
+    gpu.state.blend_set("NONE")
+
+
 def _placements(worlds: Sequence[np.ndarray], view: Matrix, projection: Matrix) -> gpu.types.GPUTexture:
     """Four texels a placement: three rows that take its splats to the camera's space, and the eye in its own.
 
