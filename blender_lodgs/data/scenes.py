@@ -85,7 +85,7 @@ def import_colmap(
             f"{len(scene.distorted)} of {len(scene.cameras)} views have lens distortion: their photographs "
             "fit the points only roughly here. Training undistorts them."
         )
-    extent = _extent(scene)
+    extent, near = _extent(scene), _near(scene)
     with _new_scene(context, scene.folder.name) as root:
         if upright:
             root.rotation_mode = "QUATERNION"
@@ -100,7 +100,7 @@ def import_colmap(
         _collection(root).children.link(root.lodgs.cameras)
         for camera in scene.cameras:
             distorted = camera.name in scene.distorted
-            view = new_camera(camera, extent, photograph=photographs, distorted=distorted)
+            view = new_camera(camera, extent, near, photograph=photographs, distorted=distorted)
             view.parent = root
             root.lodgs.cameras.objects.link(view)
             if context.scene.camera is None:
@@ -340,6 +340,14 @@ def _extent(scene: Scene) -> float:
         return scene.extent()
     except LodgsError:  # one place to stand, and no points: nothing tells the size
         return 1.0
+
+
+def _near(scene: Scene) -> float:
+    """The depth before which training and evaluation draw nothing."""
+    try:
+        return scene.near()
+    except LodgsError:  # no camera sees a point
+        return _extent(scene) / 1000
 
 
 def _set_controls(root: bpy.types.Object) -> dict[str, float]:

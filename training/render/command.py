@@ -65,7 +65,7 @@ class Source:
         """
         if scene is not None:
             cameras = read_scene(scene)
-            there, near = cameras.cameras, 0.01 * cameras.median_depth()
+            there, near = cameras.cameras, cameras.near()
         elif self.run is not None:
             data = training_data(Job.from_file(self.run.job), self.run)
             there, near = data.scene.cameras, data.near
