@@ -277,9 +277,7 @@ def _modifier_of(obj: bpy.types.Object, rule: Rule) -> bpy.types.NodesModifier:
     """The modifier with a rule's group, made where there is none, in the place of one with another rule."""
     modifier = _modifier(obj)
     place = len(obj.modifiers)
-    if modifier is not None and not groups.serves(
-        modifier.node_group, rule
-    ):  # of another method, or of an older version
+    if modifier is not None and not groups.serves(modifier.node_group, rule):  # another method's, or older
         place = obj.modifiers.find(modifier.name)
         _detach(obj)
         modifier = None

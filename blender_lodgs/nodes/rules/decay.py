@@ -11,8 +11,8 @@ FADES = True
 
 
 def weight(inputs: Inputs) -> Field:
-    """The attenuation where opacity times attenuation is above tau times the virtual scale, else 0; of several
-    levels the finest alone."""
+    """The attenuation where opacity times attenuation is above tau times the virtual scale, else 0; of
+    several levels the finest alone."""
     nodes, opacity = inputs.nodes, inputs.opacity()
     farthest = nodes.add("GeometryNodeAttributeStatistic", data_type="FLOAT", domain="POINT")
     nodes.link(inputs.points, farthest, "Geometry")

@@ -158,7 +158,7 @@ def half(bpy, lodgs, splat_scene):
     def made(name):
         root = splat_scene(name)
         rule, rng = rules()[name], np.random.default_rng(1)
-        facts, values = numbers(rule, rng)
+        _, values = numbers(rule, rng)
         root.lodgs.mode, root.lodgs.eye = "SELECTIVE", "TRAINING"
         camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
         camera.data.clip_start, camera.location = 0.01, (0, 0, 40)
