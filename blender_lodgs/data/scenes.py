@@ -18,7 +18,7 @@ from mathutils import Matrix
 
 from ...training.errors import LodgsError
 from ...training.lod.rule import Control, find_rule
-from ...training.lod.selection import complete, unknown_rule
+from ...training.lod.selection import complete, known_rule, unknown_rule
 from ...training.scenes.colmap import Scene, read_scene
 from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder
 from ...training.splats.gaussians import Splats
@@ -156,8 +156,11 @@ def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
 
     Controls take the values that it records, but for those that somebody has set. The bundle may have levels
     without splats, or none at all while they are on their way.
+
+    Raises:
+        LodgsError: a control's value is not possible, or the bundle contradicts its rule.
     """
-    settings, rule = root.lodgs, find_rule(bundle.rule)
+    settings, rule = root.lodgs, known_rule(bundle)
     if rule is not None and rule.always and settings.rule != bundle.rule:
         settings.mode = "SELECTIVE"
     settings.method, settings.rule, settings.cumulative = bundle.method, bundle.rule, bundle.cumulative

@@ -113,6 +113,18 @@ def test_levels_in_use_go_along_until_somebody_sets_them(bpy, lodgs, some):
     assert in_use(root) == {"gamma": 1, "first": 1, "last": 3}  # which was the rule's own again
 
 
+@pytest.mark.parametrize("rule", rules().values(), ids=lambda rule: rule.name)
+def test_levels_that_contradict_their_rule_are_refused_and_leave_nothing(bpy, lodgs, made, rule, tmp_path):
+    files, made = lodgs("training.splats.bundle"), made(rule, {})
+    bundle = files.read_bundle(tmp_path / "b.ply")
+    bundle.cumulative = not rule.cumulative
+    files.write_bundle(tmp_path / "other.ply", bundle)
+    before = len(bpy.data.objects)
+    with pytest.raises(lodgs("training.errors").LodgsError, match=f"but by their rule '{rule.name}'"):
+        lodgs("data.scenes").import_splats(bpy.context, tmp_path / "other.ply")
+    assert len(bpy.data.objects) == before
+
+
 def test_an_impossible_value_is_refused_and_leaves_nothing(bpy, lodgs, made):
     before = len(bpy.data.objects)
     with pytest.raises(lodgs("training.errors").LodgsError, match="offset = 99 is not possible"):

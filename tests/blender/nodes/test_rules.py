@@ -112,7 +112,8 @@ def splat_scene(bpy, lodgs):
                 {name: rng.uniform(*RANGES.get(name, (0.2, 2)), 60).astype(np.float32) for name in names},
             )  # fmt: skip
             levels.append(Level(number, splats, {fact: facts[fact] for fact in rule.level_facts}))
-        bundle = Bundle("any", levels, name, {fact: facts[fact] for fact in rule.scene_facts})
+        scene = {fact: facts[fact] for fact in rule.scene_facts}
+        bundle = Bundle("any", levels, name, scene, cumulative=rule.cumulative)
         with scenes._new_scene(bpy.context, "any") as root:
             for one in bundle.levels:
                 scenes._put_level(root, one)
