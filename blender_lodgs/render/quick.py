@@ -104,6 +104,8 @@ def _frame(
     projection = camera.calc_matrix_camera(
         depsgraph, x=width, y=height, scale_x=settings.pixel_aspect_x, scale_y=settings.pixel_aspect_y
     )
+    if projection[3][3] == 0:  # perspective: to any depth, as F12 has it
+        projection[2][2], projection[2][3] = -1.0, -2.0 * camera.data.clip_start
     background = None if settings.film_transparent else tuple(scene.lodgs_render.background)
     result = Picture.empty(width, height, background)
     view, screen = views.ViewState(), gpu.types.GPUOffScreen(width, height)

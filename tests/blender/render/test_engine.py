@@ -654,6 +654,14 @@ def test_viewport_quality_draws_the_border(bpy, scene, frame, tmp_path):
         assert alike(quickly(bpy, tmp_path / "quick.png"), f12(bpy, tmp_path))
 
 
+def test_viewport_quality_looks_beyond_the_clip_end(bpy, scene, frame, tmp_path):
+    scene.render.resolution_percentage = 50
+    scene.camera.data.clip_end = 4
+    shown = f12(bpy, tmp_path)
+    assert shown[..., :3].max() > 0.5
+    assert alike(quickly(bpy, tmp_path / "quick.png"), shown)
+
+
 def test_viewport_quality_refuses_to_hold_out(bpy, scene, frame, tmp_path):
     scene.lodgs_render.holdout = str(tmp_path / "depth_####.exr")
     with pytest.raises(RuntimeError, match=r"cannot leave out what meshes hide.*Clear Hold Out"):
