@@ -9,12 +9,14 @@ import bpy
 
 from . import commands, operators, panels, viewport
 from .data import older_files, properties, removal, scenes, updates
+from .nodes import building
 from .render import compare, engine, renderer
 from .runs import jobs
 from .viewport import wipe
 
 MODULES = (
     properties,
+    building,
     updates,
     *operators.MODULES,
     *panels.MODULES,

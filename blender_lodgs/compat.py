@@ -65,6 +65,14 @@ def _identifier(modifier: bpy.types.NodesModifier, name: str) -> str:
     )
 
 
+def has_input(modifier: bpy.types.NodesModifier, name: str) -> bool:
+    """Whether there is a group input called ``name``."""
+    return any(
+        item.item_type == "SOCKET" and item.in_out == "INPUT" and item.name == name
+        for item in modifier.node_group.interface.items_tree
+    )
+
+
 def input_path(modifier: bpy.types.NodesModifier, name: str) -> str:
     """The data path, from the modifier's object, of the group input called ``name``."""
     identifier, owner = _identifier(modifier, name), f'modifiers["{modifier.name}"]'

@@ -111,9 +111,7 @@ def _range(control: Control) -> str:
 
 def _default(rule: Rule, control: Control) -> str:
     value = _value(rule.defaults(_EXAMPLE)[control.name])
-    return (
-        f"of {len(_EXAMPLE)} levels {value}; in Blender the {control.follows}" if control.follows else value
-    )
+    return f"of {len(_EXAMPLE)} levels {value}" if control.follows else value
 
 
 def _value(value: object) -> str:

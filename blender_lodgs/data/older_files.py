@@ -7,6 +7,7 @@ from contextlib import suppress
 
 import bpy
 
+from ...training.lod.rule import find_rule
 from ...training.splats.bundle import rule_of_v1
 from .. import compat
 from . import selection
@@ -24,6 +25,10 @@ def bring_up_to_date(root: bpy.types.Object) -> None:
         _training_from_0_1_0(root, group["training"])
     if root.lodgs.itself is None:
         root.lodgs.itself = root
+    rule, levels = find_rule(root.lodgs.rule), [item.number for item in root.lodgs.levels if item.exists]
+    if rule is not None and levels and not root.lodgs.begun:  # as long as nobody had set it, it went along
+        finest = {control.name: levels[-1] for control in rule.controls if control.follows == "finest"}
+        root.lodgs.begun = json.dumps(finest)
     if selection.outdated(root):
         selection.attach(root)
 

@@ -31,12 +31,13 @@ class View(Protocol):
 
 
 def new_camera(
-    camera: Camera, extent: float, *, photograph: bool, distorted: bool = False
+    camera: Camera, extent: float, near: float, *, photograph: bool, distorted: bool = False
 ) -> bpy.types.Object:
     """A view as a camera object that is in no collection yet, placed in COLMAP's world.
 
     Args:
-        extent: the scene's, in its own units; sizes the object's display and its clipping range.
+        extent: the scene's, in its own units; sizes the object's display.
+        near: depth from which on splats are trained and measured, in the same units.
         photograph: show the view's photograph behind it.
         distorted: the lens bends lines in the photograph.
     """
@@ -55,7 +56,7 @@ def new_camera(
     view.photograph = str(camera.image) if camera.image else ""
     view.distorted = distorted
     data.display_size = extent / 20
-    data.clip_start, data.clip_end = extent / 1000, extent * 1000
+    data.clip_start, data.clip_end = near, extent * 1000
     if photograph and camera.image is not None:
         picture = data.background_images.new()
         picture.image = bpy.data.images.load(str(camera.image), check_existing=True)

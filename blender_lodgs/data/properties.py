@@ -154,6 +154,11 @@ class SplatScene(bpy.types.PropertyGroup):
         description="What the file or the run records of the rule's controls, as JSON",
         options={"HIDDEN"},
     )
+    begun: bpy.props.StringProperty(
+        name="Begun With",
+        description="What the rule's controls began with, recorded or by the levels, as JSON",
+        options={"HIDDEN"},
+    )
     cumulative: bpy.props.BoolProperty(
         name="Cumulative",
         description="Each level only holds what it adds to the coarser ones",

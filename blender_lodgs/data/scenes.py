@@ -18,7 +18,7 @@ from mathutils import Matrix
 
 from ...training.errors import LodgsError
 from ...training.lod.rule import Control, find_rule
-from ...training.lod.selection import complete, unknown_rule
+from ...training.lod.selection import complete, known_rule, unknown_rule
 from ...training.scenes.colmap import Scene, read_scene
 from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder
 from ...training.splats.gaussians import Splats
@@ -108,7 +108,7 @@ def import_colmap(
             f"{len(scene.distorted)} of {len(scene.cameras)} views have lens distortion: their photographs "
             "fit the points only roughly here. Training undistorts them."
         )
-    extent = _extent(scene)
+    extent, near = _extent(scene), _near(scene)
     with _new_scene(context, scene.folder.name) as root:
         if upright:
             root.rotation_mode = "QUATERNION"
@@ -123,7 +123,7 @@ def import_colmap(
         _collection(root).children.link(root.lodgs.cameras)
         for place, camera in enumerate(scene.cameras):
             distorted = camera.name in scene.distorted
-            view = new_camera(camera, extent, photograph=photographs, distorted=distorted)
+            view = new_camera(camera, extent, near, photograph=photographs, distorted=distorted)
             view.parent, view.data.lodgs.place = root, place
             root.lodgs.cameras.objects.link(view)
         if len(scene.points):
@@ -169,7 +169,6 @@ def import_splats(
             _put_level(root, level)
         set_bundle_facts(root, bundle)
         root.lodgs.single_level = bundle.levels[-1].number
-        _follow_finest(root)
     if bundle.rule and not root.lodgs.by_distance:
         warn(" ".join(unknown_rule(bundle.rule)))
     return root
@@ -182,16 +181,17 @@ def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
     without splats, or none at all while they are on their way.
 
     Raises:
-        LodgsError: a value that it records is not possible. Nothing is taken over in that case.
+        LodgsError: a value that it records is not possible, or it contradicts its rule. Nothing is taken over
+            in that case.
     """
-    settings, rule = root.lodgs, find_rule(bundle.rule)
+    settings, rule = root.lodgs, known_rule(bundle)
     for control in rule.controls if rule else ():
         control.checked(bundle.controls.get(control.name, control.default))
     if rule is not None and rule.always and settings.rule != bundle.rule:
         settings.mode = "SELECTIVE"
     settings.method, settings.rule, settings.cumulative = bundle.method, bundle.rule, bundle.cumulative
     settings.facts, settings.meta = json.dumps(bundle.facts), json.dumps(bundle.meta)
-    _record_controls(root, bundle.controls)
+    _begin_controls(root, bundle.controls)
     facts = {level.number: level.facts for level in bundle.levels}
     for item in settings.levels:
         if item.number in facts:
@@ -214,7 +214,6 @@ def set_level(root: bpy.types.Object, level: Level) -> bpy.types.Object:
     _levels_changed(root)
     if level.number == root.lodgs.levels[-1].number:
         root.lodgs.single_level = level.number
-        _follow_finest(root)
         root.lodgs.active_level = len(root.lodgs.levels) - 1
     if first and root.lodgs.points:  # the splats stand where the points were
         root.lodgs.points.hide_viewport = root.lodgs.points.hide_render = True
@@ -369,31 +368,53 @@ def _extent(scene: Scene) -> float:
         return 1.0
 
 
+def _near(scene: Scene) -> float:
+    """The depth before which training and evaluation draw nothing."""
+    try:
+        return scene.near()
+    except LodgsError:  # no camera sees a point
+        return _extent(scene) / 1000
+
+
 def _set_controls(root: bpy.types.Object) -> dict[str, float]:
     """The values of the rule's controls that are not the rule's own, by name."""
-    rule, controls = find_rule(root.lodgs.rule), root.lodgs.controls
-    if rule is None or controls is None:
+    rule = find_rule(root.lodgs.rule)
+    if rule is None:
         return {}
-    numbers = [item.number for item in root.lodgs.levels if item.exists]
-    following = {"finest": numbers[-1], "coarsest": numbers[0]}
-    values = {control: _value(root, control) for control in rule.controls}
-    return {
-        control.name: value
-        for control, value in values.items()
-        if value not in (control.default, following.get(control.follows))
-    }
+    own = rule.defaults([item.number for item in root.lodgs.levels if item.exists])
+    values = {control.name: _value(root, control) for control in rule.controls}
+    return {name: value for name, value in values.items() if value != own[name]}
 
 
-def _record_controls(root: bpy.types.Object, values: dict[str, float]) -> None:
-    """What a bundle or a run records of its rule's controls; those that nobody has set take these values."""
-    rule, before = find_rule(root.lodgs.rule), selection.read_facts(root.lodgs.recorded)
-    for control in rule.controls if rule else ():
-        begun, begins = (
-            control.checked(each.get(control.name, control.default)) for each in (before, values)
-        )
-        if begins != begun and _value(root, control) == _short(begun):
-            setattr(root.lodgs.controls, control.name, begins)
-    root.lodgs.recorded = json.dumps(values)
+def _begin_controls(root: bpy.types.Object, recorded: dict[str, float] | None = None) -> None:
+    """Controls that nobody has set take what a bundle or a run records, else the rule's own for these levels.
+
+    Args:
+        recorded: values by name; None: those of before.
+
+    Raises:
+        LodgsError: a value is not possible.
+    """
+    settings, rule = root.lodgs, find_rule(root.lodgs.rule)
+    before = selection.read_facts(settings.recorded)
+    recorded = before if recorded is None else recorded
+    if rule is not None:
+        numbers = [item.number for item in settings.levels if item.exists]
+        own = {control.name: control.default for control in rule.controls}
+        begun = own | before | selection.read_facts(settings.begun)
+        begins = (rule.defaults(numbers) if numbers else own) | recorded
+        begins = {control.name: control.checked(begins[control.name]) for control in rule.controls}
+        unset = [
+            control
+            for control in rule.controls
+            if begins[control.name] != begun[control.name]
+            and _value(root, control) == _short(begun[control.name])
+        ]
+        unset.sort(key=lambda control: control.follows != "finest")  # which takes the coarsest along
+        for control in unset:
+            setattr(settings.controls, control.name, begins[control.name])
+        settings.begun = json.dumps(begins)
+    settings.recorded = json.dumps(recorded)
 
 
 def _value(root: bpy.types.Object, control: Control) -> float:
@@ -404,14 +425,6 @@ def _value(root: bpy.types.Object, control: Control) -> float:
 def _short(value: float) -> float:
     """A number to as many digits as Blender's floats have, which are shorter than the files'."""
     return value if isinstance(value, int) else float(f"{value:.7g}")
-
-
-def _follow_finest(root: bpy.types.Object) -> None:
-    """Controls that name the finest level go along with it, where no other is recorded."""
-    rule, recorded = find_rule(root.lodgs.rule), selection.read_facts(root.lodgs.recorded)
-    for control in rule.controls if rule else ():
-        if control.follows == "finest" and control.name not in recorded:
-            setattr(root.lodgs.controls, control.name, root.lodgs.levels[-1].number)
 
 
 def _put_level(root: bpy.types.Object, level: Level) -> bpy.types.Object:
@@ -451,6 +464,7 @@ def _levels_changed(root: bpy.types.Object) -> None:
     if settings.levels:
         finest = settings.levels[-1].number
         settings.single_level = min(settings.single_level, finest)
+        _begin_controls(root)
         rule = find_rule(settings.rule)
         for control in rule.controls if rule else ():
             if control.follows and getattr(settings.controls, control.name) > finest:

@@ -9,8 +9,9 @@ modifier gives the rule's arguments back: :func:`choice`.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import bpy
 import numpy as np
@@ -19,6 +20,7 @@ from ...training.errors import LodgsError
 from ...training.lod.rule import Rule, facts_of, find_rule, rules
 from .. import compat
 from ..nodes import rules as groups
+from ..nodes.building import edited
 from ..nodes.display import NAME as DISPLAY
 
 
@@ -57,13 +59,16 @@ class Choice:
 
 
 def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Choice | None:
-    """What the modifier of an evaluated level chooses by, as of the depsgraph; None where all is shown."""
+    """What the modifier of an evaluated level chooses by, as of the depsgraph.
+
+    None where all is shown, or where somebody has changed its group: then it shows what the nodes leave.
+    """
     modifier = _modifier(evaluated)
-    render = depsgraph.mode == "RENDER"
-    if modifier is None or not (modifier.show_render if render else modifier.show_viewport):
+    if modifier is None or not _is_on(modifier, depsgraph):
         return None
     rule = groups.rule_of_group(modifier.node_group)
-    assert rule is not None
+    if rule is None:
+        return None
 
     def value(name: str):
         return compat.get_input(modifier, name)
@@ -87,13 +92,17 @@ def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Choic
     )
 
 
-def only_chosen(evaluated: bpy.types.Object) -> bool:
+def only_chosen(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
     """Whether an evaluated object shows its own splats as they are, chosen by nothing but :func:`choice`."""
     return all(
         modifier.type == "NODES" and (modifier.name == DISPLAY or groups.rule_of_group(modifier.node_group))
         for modifier in evaluated.modifiers
-        if modifier.show_viewport
+        if _is_on(modifier, depsgraph)
     )
+
+
+def _is_on(modifier: bpy.types.Modifier, depsgraph: bpy.types.Depsgraph) -> bool:
+    return modifier.show_render if depsgraph.mode == "RENDER" else modifier.show_viewport
 
 
 def read_json(text: str) -> dict:
@@ -165,11 +174,10 @@ def attach(root: bpy.types.Object) -> None:
 def outdated(root: bpy.types.Object) -> bool:
     """Whether a level's modifier is not the one that this version makes: its file is an older one's."""
     rule = find_rule(root.lodgs.rule)
-    group = groups.rule_group(rule) if rule else None
-    return any(
-        item.exists and (modifier.node_group if (modifier := _modifier(item.object)) else None) != group
-        for item in root.lodgs.levels
-    )
+    modifiers = [_modifier(item.object) for item in root.lodgs.levels if item.exists]
+    if rule is None:
+        return any(modifiers)
+    return not all(modifier and groups.serves(modifier.node_group, rule) for modifier in modifiers)
 
 
 def update_inputs(root: bpy.types.Object) -> None:
@@ -182,12 +190,16 @@ def update_inputs(root: bpy.types.Object) -> None:
                 (groups.EYE_OBJECT, root.lodgs.eye_object),
                 (groups.MATERIAL, slots[0].material if slots else None),
             ):
-                if compat.get_input(modifier, name) != value:  # setting evaluates anew
-                    compat.set_input(modifier, name, value)
+                _set(modifier, name, value, lambda there, value: there == value)
             held = root.lodgs.freeze or root.lodgs.eye == "VIEW"
             position = root.lodgs.held_eye if held else root.lodgs.camera_center
-            if tuple(compat.get_input(modifier, groups.EYE_POSITION)) != tuple(position):
-                compat.set_input(modifier, groups.EYE_POSITION, position)
+            _set(modifier, groups.EYE_POSITION, position, lambda there, value: tuple(there) == tuple(value))
+
+
+def _set(modifier: bpy.types.NodesModifier, name: str, value, same: Callable[[Any, Any], bool]) -> None:
+    """Sets an input that is another: setting evaluates anew. A changed group may have lost it."""
+    if compat.has_input(modifier, name) and not same(compat.get_input(modifier, name), value):
+        compat.set_input(modifier, name, value)
 
 
 def _drive_focal_length(root: bpy.types.Object) -> None:
@@ -268,27 +280,28 @@ def _drive_visibility(root: bpy.types.Object, index: int, item, rule: Rule | Non
 
 
 def _drive_level(root: bpy.types.Object, obj: bpy.types.Object, rule: Rule, facts: Mapping) -> None:
-    modifier = _modifier_of(obj, groups.rule_group(rule))
+    modifier = _modifier_of(obj, rule)
     for name, value in facts.items():
-        if compat.get_input(modifier, name) != np.float32(value):
-            compat.set_input(modifier, name, float(value))
+        _set(modifier, name, float(value), lambda there, value: there == np.float32(value))
     for path in ("show_viewport", "show_render"):
         _drive(obj, f'modifiers["{modifier.name}"].{path}', root, "mode", mode="mode")
     driven = {name: name for name in (groups.EYE, groups.FREEZE, groups.FOCAL, groups.HELD_FOCAL)}
     driven |= {control.name: f"{rule.name}.{control.name}" for control in rule.controls}
     for name, source in driven.items():
-        _drive(obj, compat.input_path(modifier, name), root, name, **{name: source})
+        if compat.has_input(modifier, name):
+            _drive(obj, compat.input_path(modifier, name), root, name, **{name: source})
 
 
-def _modifier_of(obj: bpy.types.Object, group: bpy.types.GeometryNodeTree) -> bpy.types.NodesModifier:
-    """The modifier with this group, made where there is none, in the place of one with another rule."""
+def _modifier_of(obj: bpy.types.Object, rule: Rule) -> bpy.types.NodesModifier:
+    """The modifier with a rule's group, made where there is none, in the place of one with another rule."""
     modifier = _modifier(obj)
     place = len(obj.modifiers)
-    if modifier is not None and modifier.node_group != group:  # of another method, or of an older version
+    if modifier is not None and not groups.serves(modifier.node_group, rule):  # another method's, or older
         place = obj.modifiers.find(modifier.name)
         _detach(obj)
         modifier = None
     if modifier is None:
+        group = groups.rule_group(rule)
         modifier = obj.modifiers.new(group.name, "NODES")
         assert isinstance(modifier, bpy.types.NodesModifier)
         modifier.node_group, modifier.show_expanded = group, False
@@ -297,7 +310,10 @@ def _modifier_of(obj: bpy.types.Object, group: bpy.types.GeometryNodeTree) -> bp
 
 
 def _detach(obj: bpy.types.Object) -> None:
-    """Takes away the modifier that chooses by distance, its drivers, and its group if it was the last."""
+    """Takes away the modifier that chooses by distance, its drivers, and its group if it was the last.
+
+    A group that somebody has changed is kept, for whoever wants it back.
+    """
     modifier = _modifier(obj)
     if modifier is None:
         return
@@ -306,7 +322,9 @@ def _detach(obj: bpy.types.Object) -> None:
             obj.animation_data.drivers.remove(driver)
     group = modifier.node_group
     obj.modifiers.remove(modifier)
-    if group is not None and not group.users:
+    if group is not None and edited(group):
+        group.use_fake_user = True
+    elif group is not None and not group.users:
         bpy.data.node_groups.remove(group)
 
 

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 
 import bpy
 
-VERSION = "lodgs_version"
-"""Custom property of our groups: a group of another version, from an older file, is made anew."""
+VERSION, AS_MADE = "lodgs_version", "lodgs_as_made"
+"""Custom properties of our groups: a group of another version, from an older file, is made anew; and what
+:func:`_fingerprint` said of it when it was made."""
+
+_SETTINGS = ("operation", "data_type", "domain", "transform_space", "input_type", "clamp", "mute")
+"""What tells nodes of one type apart, where they have it."""
 
 
 class Nodes:
@@ -132,6 +137,7 @@ def group(name: str, version: int, build: Callable[[Nodes], None]) -> bpy.types.
     Args:
         build: adds the nodes to a group that has geometry in and out, and nothing else yet. An older group
             of that name is renamed: sockets of the new one may differ, so its users are to be given it anew.
+            One of this version that somebody has changed (:func:`edited`) stays what it is.
     """
     there = bpy.data.node_groups.get(name)
     if isinstance(there, bpy.types.GeometryNodeTree) and there.get(VERSION) == version:
@@ -145,7 +151,74 @@ def group(name: str, version: int, build: Callable[[Nodes], None]) -> bpy.types.
     for way in ("INPUT", "OUTPUT"):
         tree.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
     build(Nodes(tree))
+    tree[AS_MADE] = _fingerprint(tree)
     return tree
+
+
+_edited: dict[int, bool] = {}
+"""What :func:`edited` has found, by ``session_uid``, until a group changes."""
+
+
+def edited(tree: bpy.types.NodeTree) -> bool:
+    """Whether somebody has changed one of our groups: it no longer does what the code says."""
+    original = tree.original
+    assert original is not None
+    uid = original.session_uid
+    if uid not in _edited:
+        made = original.get(AS_MADE)  # older files do not say it
+        _edited[uid] = made is not None and made != _fingerprint(original)
+    return _edited[uid]
+
+
+def _fingerprint(tree: bpy.types.NodeTree) -> str:
+    """Of what a group does: its nodes, their settings and numbers, and links; not of how it is laid out."""
+    said = []
+    for node in tree.nodes:
+        numbers = [
+            (socket.identifier, _plain(socket.default_value))
+            for socket in node.inputs
+            if hasattr(socket, "default_value") and not socket.is_linked
+        ]
+        said.append((node.name, node.bl_idname, [getattr(node, name, "") for name in _SETTINGS], numbers))
+    links = [
+        (link.from_node.name, link.from_socket.identifier, link.to_node.name, link.to_socket.identifier)
+        for link in tree.links
+    ]
+    sockets = [(item.name, item.item_type) for item in tree.interface.items_tree]
+    return hashlib.sha256(repr((sorted(said), sorted(links), sockets)).encode()).hexdigest()[:16]
+
+
+def _plain(value):
+    """A socket's number, numbers or text as Python has them; the name of a datablock."""
+    if isinstance(value, str | int | float | bool | None):
+        return value
+    return value.name if isinstance(value, bpy.types.ID) else tuple(value)
+
+
+@bpy.app.handlers.persistent
+def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    if depsgraph.id_type_updated("NODETREE"):
+        _edited.clear()
+
+
+@bpy.app.handlers.persistent
+def _on_load(*_) -> None:
+    _edited.clear()
+
+
+_ANEW = (bpy.app.handlers.load_post, bpy.app.handlers.undo_post, bpy.app.handlers.redo_post)
+
+
+def register() -> None:
+    bpy.app.handlers.depsgraph_update_post.append(_on_update)
+    for handlers in _ANEW:
+        handlers.append(_on_load)
+
+
+def unregister() -> None:
+    bpy.app.handlers.depsgraph_update_post.remove(_on_update)
+    for handlers in _ANEW:
+        handlers.remove(_on_load)
 
 
 def switched(obj: bpy.types.Object, group: bpy.types.GeometryNodeTree, where: str, by: str) -> None:

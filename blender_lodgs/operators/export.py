@@ -70,7 +70,12 @@ class LODGS_OT_export_plain(_Export, bpy.types.Operator):
         name="Splats",
         description="What is exported",
         items=[
-            ("SHOWN", "As Shown", "The splats that the viewport shows now, modifiers applied"),
+            (
+                "SHOWN",
+                "As Shown",
+                "The splats of the levels that the viewport shows now, modifiers applied. In the scene's own "
+                "coordinates: where objects stand, copies, and the viewport's limit do not count",
+            ),
             ("LEVEL", "One Level", "All splats of one level, modifiers not applied"),
         ],
     )
@@ -81,6 +86,8 @@ class LODGS_OT_export_plain(_Export, bpy.types.Operator):
         self.layout.prop(self, "source")
         if self.source == "LEVEL":
             self.layout.prop(self, "level")
+        self.layout.label(text="In the scene's own coordinates,", icon="INFO")
+        self.layout.label(text="wherever its objects stand; no copies", icon="BLANK1")
 
     @report_errors
     def execute(self, context):

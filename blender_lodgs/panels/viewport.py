@@ -5,10 +5,10 @@ from __future__ import annotations
 import bpy
 
 from ...training.lod.colors import level_color
-from .. import compat
+from .. import compat, viewport
 from ..data import scenes
 from ..viewport import views
-from .parts import Panel, split_column
+from .parts import Panel, say, split_column
 
 
 class LODGS_PT_viewport(Panel):
@@ -34,6 +34,9 @@ class LODGS_PT_viewport(Panel):
             row.prop(root.lodgs, "tell", expand=True)
             if root.lodgs.tell != "OWN" and row.active:
                 _legend(layout, [item.number for item in root.lodgs.levels if item.exists])
+        if viewport.problem:
+            text = f"The viewport could not be drawn ({viewport.problem}). Untick Gaussian Splats for points."
+            say(layout, text, "ERROR")
         left_out = views.left_out()
         if settings.splats and left_out:
             layout.label(text=f"{left_out:,} splats left out to stay within that", icon="INFO")

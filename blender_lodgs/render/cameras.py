@@ -25,14 +25,10 @@ def view_of(
     depsgraph: bpy.types.Depsgraph,
     width: int,
     height: int,
-    pixel: tuple[float, float] | None = None,
 ) -> tuple[Camera, float]:
     """What a camera object sees in a render of this size, and the depth at which it begins to see.
 
     Blender ignores a camera's scale, and so does this. The world is Blender's.
-
-    Args:
-        pixel: width and height of a pixel; None: the render's.
 
     Raises:
         LodgsError: the camera is no perspective one.
@@ -45,8 +41,9 @@ def view_of(
             "Change its lens type to Perspective.",
         )
     render = depsgraph.scene.render
-    across, up = pixel or (render.pixel_aspect_x, render.pixel_aspect_y)
-    p = obj.calc_matrix_camera(depsgraph, x=width, y=height, scale_x=across, scale_y=up)
+    p = obj.calc_matrix_camera(
+        depsgraph, x=width, y=height, scale_x=render.pixel_aspect_x, scale_y=render.pixel_aspect_y
+    )
     return Camera(
         name=obj.name,
         width=width,

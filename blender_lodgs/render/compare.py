@@ -6,12 +6,15 @@ them; what is compared are the splats that the scene shows now.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import bpy
 import numpy as np
 
 from ...training.errors import LodgsError
+from ...training.scenes.cameras import Camera
 from ...training.scenes.color import srgb_from_linear
 from .. import extension
 from ..data import photographs
@@ -37,7 +40,8 @@ def compare_view(
 ) -> Comparison | None:
     """Renders one view as its photograph was taken, and keeps its PSNR; None where ``on_progress`` ended it.
 
-    Levels by distance are chosen from this view, where they follow the scene's camera.
+    Levels by distance are chosen from this view and for the picture's size, where they follow the scene's
+    camera.
 
     Raises:
         LodgsError: the view has no photograph, or it cannot be read or rendered.
@@ -50,20 +54,16 @@ def compare_view(
             f"The lens of '{view.name}' bends lines; the splats were trained on a straightened photograph.",
             "Measure with training evaluate.",
         )
-    scale = root.lodgs.training.image_scale
-    width, height = max(int(facts.width * scale), 1), max(int(facts.height * scale), 1)
-    before = scene.camera
-    scene.camera = view
-    try:
+    whole = Camera(view.name, facts.width, facts.height, facts.fx, facts.fy, 0, 0, np.eye(4))
+    # as typed, and as a job has it: Blender keeps the nearest number of 32 bits
+    scale = float(str(np.float32(root.lodgs.training.image_scale)))
+    with _rendered_as(scene, view, whole.scaled(scale)) as (width, height):
         depsgraph = context.evaluated_depsgraph_get()
-        pixel = max(1.0, facts.fy / facts.fx), max(1.0, facts.fx / facts.fy)
-        camera, near = cameras.view_of(view.evaluated_get(depsgraph), depsgraph, width, height, pixel)
+        camera, near = cameras.view_of(view.evaluated_get(depsgraph), depsgraph, width, height)
         drawn = renderer.frame(
             engine.placed_splats(depsgraph), camera, near, on_progress, background=(0.0, 0.0, 0.0),
             photograph=Path(bpy.path.abspath(facts.photograph)),
         )  # fmt: skip
-    finally:
-        scene.camera = before
     if drawn is None:
         return None
     facts.psnr = drawn.psnr
@@ -72,6 +72,28 @@ def compare_view(
         for name in ("Photograph", "Combined")
     )
     return Comparison(view.session_uid, photograph, srgb_from_linear(linear).astype(np.float32), drawn.psnr)
+
+
+@contextmanager
+def _rendered_as(
+    scene: bpy.types.Scene, view: bpy.types.Object, size: photographs.View
+) -> Iterator[tuple[int, int]]:
+    """Has a scene look through a view, and its render of that size and focal length, in the block.
+
+    Distances count in pixels of the picture that is drawn, whatever was rendered last.
+    """
+    names = [
+        "resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y",
+    ]  # fmt: skip
+    camera, before = scene.camera, [getattr(scene.render, name) for name in names]
+    try:
+        scene.camera = view
+        photographs.match_render(scene, size)
+        yield size.width, size.height
+    finally:
+        scene.camera = camera
+        for name, value in zip(names, before, strict=True):
+            setattr(scene.render, name, value)
 
 
 def show(context: bpy.types.Context, root: bpy.types.Object, view: bpy.types.Object) -> Comparison:

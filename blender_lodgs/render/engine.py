@@ -7,6 +7,8 @@ which the compositor joins with this one by depth.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import bpy
@@ -43,7 +45,7 @@ class LodgsEngine(bpy.types.RenderEngine):
         size = self.resolution_x, self.resolution_y
         window = border(depsgraph.scene.render, *size)
         try:
-            drawn = frame(depsgraph, *size, window, self._on_progress)
+            drawn = _draw(depsgraph, *size, window, self._on_progress)
         except LodgsError as error:
             self.error_set(str(error))
             self.report({"ERROR"}, str(error))  # without it a black picture would be written
@@ -101,6 +103,21 @@ def frame(
         window=(left, height - bottom - up, across, up),
         holdout=holdout_file(scene, scene.frame_current),
     )
+
+
+_draw = frame
+"""What renders of this engine are drawn by."""
+
+
+@contextmanager
+def drawn_by(draw: Callable[..., renderer.Frame | None]) -> Iterator[None]:
+    """Has renders drawn by another function of the same arguments as :func:`frame`, in the block."""
+    global _draw
+    before, _draw = _draw, draw
+    try:
+        yield
+    finally:
+        _draw = before
 
 
 def holdout_file(scene: bpy.types.Scene, frame: int) -> Path | None:

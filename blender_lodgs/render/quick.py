@@ -1,8 +1,12 @@
-"""The camera's picture as viewports draw it: by the graphics card, quickly, and without a trainer."""
+"""The camera's picture as viewports draw it: by the graphics card, quickly, and without a trainer.
+
+It is a render like F12's, of the same depsgraph: only what draws the splats is another.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import bpy
@@ -13,35 +17,37 @@ from ...training.errors import LodgsError
 from ...training.render.picture import Picture
 from ..data import shown
 from ..viewport import views
-from . import engine
+from . import engine, renderer
 from .cameras import scene_camera
 
-IMAGE = "LODGS Viewport Quality"
+IMAGE = "Render Result"
 """The image that takes the picture."""
 
 EVERYTHING = 10**9
 
 
 def render(context: bpy.types.Context) -> bpy.types.Image:
-    """Draws what the scene's camera sees of the splats into an image, at the render's size.
+    """Renders what the scene's camera sees of the view layer's splats, without compositor and sequencer.
 
     Returns:
-        The image, in linear light; where an Image Editor is open, it shows it.
+        The image; where an Image Editor is open, it shows it.
 
     Raises:
-        LodgsError: there is no camera, or no graphics card can be used.
+        LodgsError: there is no camera, no graphics card can be used, or meshes are to hold out.
     """
-    linear = picture(context).linear()
-    height, width = linear.shape[:2]
-    image = bpy.data.images.get(IMAGE)
-    if image is None or tuple(image.size) != (width, height):
-        if image is not None:
-            bpy.data.images.remove(image)
-        image = bpy.data.images.new(IMAGE, width, height, alpha=True, float_buffer=True)
-        image.colorspace_settings.name = "Linear Rec.709"
-        image.alpha_mode = "PREMUL"
-    image.pixels.foreach_set(np.ascontiguousarray(linear[::-1]).reshape(-1))
-    image.update()
+    scene = context.scene
+    scene_camera(scene)
+    _require_graphics()
+    if scene.lodgs_render.holdout:
+        raise LodgsError(
+            "Viewport Quality cannot leave out what meshes hide.", "Clear Hold Out, or press Render Image."
+        )
+    with _splats_alone(scene), engine.drawn_by(_frame):
+        try:
+            bpy.ops.render.render(scene=scene.name, layer=context.view_layer.name)
+        except RuntimeError as error:
+            raise LodgsError(str(error).strip(), "Mend that, and press it again.") from error
+    image = bpy.data.images[IMAGE]
     for window in context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "IMAGE_EDITOR":
@@ -63,8 +69,9 @@ def render_animation(context: bpy.types.Context, frames: Iterable[int]) -> Itera
         for frame in frames:
             scene.frame_set(frame)
             path = scene.render.frame_path(frame=frame)
+            image = render(context)
             try:
-                render(context).save_render(path, scene=scene)
+                image.save_render(path, scene=scene)
             except RuntimeError as error:
                 raise LodgsError(f"{path} could not be written.", "Choose another output folder.") from error
             yield Path(path)
@@ -72,20 +79,33 @@ def render_animation(context: bpy.types.Context, frames: Iterable[int]) -> Itera
         scene.frame_set(before)
 
 
-def picture(context: bpy.types.Context) -> Picture:
-    """What the scene's camera sees of the splats, as viewports draw it.
+@contextmanager
+def _splats_alone(scene: bpy.types.Scene) -> Iterator[None]:
+    """Has renders of a scene go through the engine alone, for the time of the block."""
+    settings = scene.render
+    before = settings.engine, settings.use_compositing, settings.use_sequencer
+    settings.engine, settings.use_compositing, settings.use_sequencer = engine.ID, False, False
+    try:
+        yield
+    finally:
+        settings.engine, settings.use_compositing, settings.use_sequencer = before
 
-    Raises:
-        LodgsError: as :func:`render`.
-    """
-    scene = context.scene
-    camera = scene_camera(scene)
-    _require_graphics()
-    depsgraph = context.evaluated_depsgraph_get()
-    (width, height), settings = engine.size(scene.render), scene.render
+
+def _frame(
+    depsgraph: bpy.types.Depsgraph,
+    width: int,
+    height: int,
+    window: tuple[int, int, int, int],
+    on_progress: renderer.OnProgress,
+) -> renderer.Frame:
+    """As ``engine.frame``, with the passes of colours alone."""
+    scene = depsgraph.scene
+    camera, settings = scene_camera(scene).evaluated_get(depsgraph), scene.render
     projection = camera.calc_matrix_camera(
         depsgraph, x=width, y=height, scale_x=settings.pixel_aspect_x, scale_y=settings.pixel_aspect_y
     )
+    if projection[3][3] == 0:  # perspective: to any depth, as F12 has it
+        projection[2][2], projection[2][3] = -1.0, -2.0 * camera.data.clip_start
     background = None if settings.film_transparent else tuple(scene.lodgs_render.background)
     result = Picture.empty(width, height, background)
     view, screen = views.ViewState(), gpu.types.GPUOffScreen(width, height)
@@ -104,7 +124,10 @@ def picture(context: bpy.types.Context) -> Picture:
         result.image[:] = drawn[..., :3] + behind * result.image
         if background is None:
             result.alpha[:] = drawn[..., 3]
-    return result
+    left, bottom, across, up = window
+    rows, columns = slice(height - bottom - up, height - bottom), slice(left, left + across)
+    planes = {name: plane[rows, columns] for name, plane in result.passes().items()}
+    return renderer.Frame(planes, float("nan"))
 
 
 def _require_graphics() -> None:

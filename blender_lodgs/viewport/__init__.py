@@ -8,13 +8,14 @@ each viewport shows, and ``eye`` follows a viewport's view.
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import bpy
 
 from ...training.lod.colors import level_color
-from .. import compat
+from .. import compat, extension
 from ..data import scenes
 from . import discs, eye, splats, views
 
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
 
 _handle: Any = None
 
+problem = ""
+"""What went wrong when a viewport was drawn last; empty where nothing did."""
+
 
 def draws_splats(scene: bpy.types.Scene) -> bool:
     """Whether viewports draw a Blender scene's splats as Gaussians, by our own shaders."""
@@ -30,7 +34,22 @@ def draws_splats(scene: bpy.types.Scene) -> bool:
 
 
 def _draw() -> None:
-    context = bpy.context
+    """One drawing of one viewport. What goes wrong ends it, and the panel tells it; the next tries anew."""
+    global problem
+    try:
+        _draw_view(bpy.context)
+        failed = ""
+    except Exception as error:
+        failed = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        if failed != problem:  # once, not at every redraw
+            traceback.print_exc()
+        splats.reset_state()
+    if failed != problem:
+        problem = failed
+        bpy.app.timers.register(extension.redraw, first_interval=0)  # not while it is drawn
+
+
+def _draw_view(context: bpy.types.Context) -> None:
     space, region, view = context.space_data, context.region, context.region_data
     eye.on_draw(region, context.scene, view)
     with_splats = draws_splats(context.scene) and space.shading.type != "WIREFRAME"
@@ -45,16 +64,7 @@ def _draw() -> None:
             depsgraph = context.evaluated_depsgraph_get()
             discs.draw(points, depsgraph, view.view_matrix, view.window_matrix, region.height)
     if with_splats:
-        try:
-            views.draw(context)
-        except Exception as error:  # no splats rather than an error at every redraw
-            print(f"LODGS: this computer's graphics cannot draw splats, points are shown instead: {error}")
-            bpy.app.timers.register(_give_up, first_interval=0)
-
-
-def _give_up() -> None:
-    for scene in bpy.data.scenes:
-        scene.lodgs_viewport.splats = False
+        views.draw(context)
 
 
 def _points(
@@ -69,12 +79,16 @@ def _points(
 
 @bpy.app.handlers.persistent
 def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    if depsgraph.mode == "RENDER":  # a render's first evaluation: everything counts as new there
+        return
     discs.on_update(depsgraph)
     views.on_update(depsgraph)
 
 
 @bpy.app.handlers.persistent
 def _on_load(*_) -> None:
+    global problem
+    problem = ""
     discs.clear()
     views.clear()
     eye.clear()

@@ -22,8 +22,8 @@ from ...training.lod.rule import OPACITY, rules
 from .. import attributes
 from .arranging import WIDTH, Arrangement, Pool
 
-MOST_COEFFICIENTS = 15
-"""Coefficients beyond the first: degree 3."""
+MOST_COEFFICIENTS = 24
+"""Coefficients beyond the first: degree 4."""
 
 _FETCH = """
 vec4 texel(sampler2D data, int i) { return texelFetch(data, ivec2(i % WIDTH, i / WIDTH), 0); }
@@ -63,6 +63,18 @@ vec3 seen_color(int splat, vec3 base, vec3 d)
            * (d.y * coefficient(11, splat) + d.x * coefficient(13, splat));
       c += 0.3731763325901154 * d.z * (2.0 * q.z - 3.0 * q.x - 3.0 * q.y) * coefficient(12, splat);
       c += 1.445305721320277 * d.z * (q.x - q.y) * coefficient(14, splat);
+    }
+    if (degree >= 4) {
+      c += 2.5033429417967046 * d.x * d.y * (q.x - q.y) * coefficient(16, splat);
+      c -= 1.7701307697799304 * d.z * (d.y * (3.0 * q.x - q.y) * coefficient(17, splat)
+                                       + d.x * (q.x - 3.0 * q.y) * coefficient(23, splat));
+      c += 0.9461746957575601 * d.x * d.y * (7.0 * q.z - 1.0) * coefficient(18, splat);
+      c -= 0.6690465435572892 * d.z * (7.0 * q.z - 3.0)
+           * (d.y * coefficient(19, splat) + d.x * coefficient(21, splat));
+      c += 0.10578554691520431 * (q.z * (35.0 * q.z - 30.0) + 3.0) * coefficient(20, splat);
+      c += 0.47308734787878004 * (q.x - q.y) * (7.0 * q.z - 1.0) * coefficient(22, splat);
+      c += 0.6258357354491761 * (q.x * (q.x - 3.0 * q.y) - q.y * (3.0 * q.x - q.y))
+           * coefficient(24, splat);
     }
   }
   return max(c, 0.0);
@@ -205,7 +217,7 @@ class Uploaded:
         pool: see there.
         starts, counts: where each point cloud's splats begin, and how many they are, in the order given.
         textures: by the shader's names.
-        degree: of the harmonics, up to 3.
+        degree: of the harmonics, up to 4.
         total: how many splats.
     """
 
@@ -218,14 +230,17 @@ class Uploaded:
 
 
 def upload(clouds: Sequence[bpy.types.PointCloud]) -> Uploaded:
-    """Brings the splats of point clouds to the graphics card, as they are, one cloud after the other."""
+    """Brings the splats of point clouds to the graphics card, as they are, one cloud after the other.
+
+    Weights that modifiers have given them are factors on their opacities.
+    """
     counts = [len(cloud.points) for cloud in clouds]
     starts = [sum(counts[:i]) for i in range(len(counts))]
     total = max(sum(counts), 1)
     most = gpu.capabilities.max_texture_size_get() * WIDTH
     higher = max((_higher(cloud) for cloud in clouds), default=0)
     while 3 * higher * total > 4 * most:  # rather fewer harmonics than no splats
-        higher = {15: 8, 8: 3}.get(higher, 0)
+        higher = {24: 15, 15: 8, 8: 3}.get(higher, 0)
 
     buffers = {name: _Texels(total) for name in ("means", "quats", "scales", "bases")}
     stream = _Texels(3 * higher * total // 4 + 2)
@@ -240,6 +255,8 @@ def upload(clouds: Sequence[bpy.types.PointCloud]) -> Uploaded:
             _read(cloud, attribute, buffers[name].rows[part])
         for name, attribute in (("means", "position"), ("scales", attributes.SCALE)):
             buffers[name].rows[part, :3] = attributes.read_attribute(cloud, attribute)
+        if (weights := attributes.read_attribute(cloud, attributes.WEIGHT)) is not None:
+            buffers["bases"].rows[part, 3] *= weights
         for k in range(min(higher, _higher(cloud))):
             _read(cloud, attributes.SH.format(k + 1), coefficients[k, part])
         for name, values in columns.items():
@@ -257,7 +274,7 @@ def upload(clouds: Sequence[bpy.types.PointCloud]) -> Uploaded:
 
 
 def _higher(cloud: bpy.types.PointCloud) -> int:
-    """How many coefficients beyond the first a cloud has, of whole degrees up to 3."""
+    """How many coefficients beyond the first a cloud has, of whole degrees up to 4."""
     count = 0
     while count < MOST_COEFFICIENTS and attributes.SH.format(count + 1) in cloud.attributes:
         count += 1
@@ -380,6 +397,15 @@ def draw(
     shader.uniform_sampler("colors", canvas.colors)
     shader.uniform_sampler("overlay", overlay)
     quad.draw(shader)
+    gpu.state.blend_set("NONE")
+
+
+def reset_state() -> None:
+    """Gives Blender the state that it draws on with, after a drawing that was broken off."""
+    gpu.state.color_mask_set(True, True, True, True)
+    gpu.state.depth_test_set("NONE")
+    gpu.state.depth_mask_set(False)
+    gpu.state.program_point_size_set(False)
     gpu.state.blend_set("NONE")
 
 

@@ -143,7 +143,7 @@ def prepare(
     if not instances:
         view.uploaded = view.arrangement = view.instances = view.pending = None
         return Request((), (0.0, 0.0, 1.0), budget)
-    uploaded = _upload(instances)
+    uploaded = _upload(instances, depsgraph)
     request = Request(_placements(instances, uploaded, depsgraph), tuple(view_matrix[2][:3]), budget)
     _arrange(view, uploaded, request, wait)
     return request
@@ -154,26 +154,33 @@ def left_out() -> int:
     return max((view.arrangement.left_out for view in _views.values() if view.arrangement), default=0)
 
 
-def _key(instance: shown.SplatInstance) -> int:
+def _plain(instance: shown.SplatInstance, depsgraph: bpy.types.Depsgraph) -> bool:
+    return selection.only_chosen(instance.evaluated, depsgraph)
+
+
+def _key(instance: shown.SplatInstance, depsgraph: bpy.types.Depsgraph) -> int:
     """Whose splats are uploaded for an instance: the object's own, or what its modifiers make of them."""
-    plain = selection.only_chosen(instance.evaluated)
-    return (instance.object.data if plain else instance.object).session_uid
+    return (instance.object.data if _plain(instance, depsgraph) else instance.object).session_uid
 
 
-def _upload(instances: list[shown.SplatInstance]) -> splats.Uploaded:
+def _upload(instances: list[shown.SplatInstance], depsgraph: bpy.types.Depsgraph) -> splats.Uploaded:
     """The splats of all instances on the graphics card; they go there only where some have changed."""
     global _uploaded, _keys, uploads
     clouds: dict[int, bpy.types.PointCloud] = {}
+    changed: set[int] = set()
     for instance in instances:
-        plain = selection.only_chosen(instance.evaluated)
-        clouds.setdefault(_key(instance), instance.object.data if plain else instance.evaluated.data)
+        plain, key = _plain(instance, depsgraph), _key(instance, depsgraph)
+        clouds.setdefault(key, instance.object.data if plain else instance.evaluated.data)
+        if not plain and depsgraph.mode == "RENDER":  # modifiers may do otherwise in viewports
+            changed.add(key)
     missing = not clouds.keys() <= set(_keys)
-    if _uploaded is None or missing or _stale & clouds.keys():
+    if _uploaded is None or missing or (_stale | changed) & clouds.keys():
         # A level that is hidden just now stays: artists step through levels.
         there = {cloud.session_uid: cloud for cloud in bpy.data.pointclouds if shown.is_splats(cloud)}
         clouds |= {key: there[key] for key in _keys if key in there and key not in clouds}
         _uploaded, _keys = splats.upload(list(clouds.values())), tuple(clouds)
         _stale.clear()
+        _stale.update(changed)
         uploads += 1
     return _uploaded
 
@@ -186,8 +193,8 @@ def _placements(
     roots = {item.object: root for root in scenes.roots(depsgraph.scene) for item in root.lodgs.levels}
     found = []
     for instance in instances:
-        number = _keys.index(_key(instance))
-        plain, root = selection.only_chosen(instance.evaluated), roots.get(instance.object)
+        number = _keys.index(_key(instance, depsgraph))
+        plain, root = _plain(instance, depsgraph), roots.get(instance.object)
         found.append(
             Placement(
                 first=uploaded.starts[number],

@@ -42,8 +42,8 @@ class Control:
         unit: Blender's subtype of such a property: "NONE", "PIXEL", "FACTOR".
         whole: whether only whole numbers are possible; from 0 to 1 it is a box to tick.
         step: what the arrows of a whole number add.
-        follows: "coarsest" or "finest" where the value is a level's number that follows the levels that there
-            are, as long as nobody sets it.
+        follows: "coarsest" or "finest" where the value is the number of such a level in use, which follows
+            the levels that there are (``Rule.defaults``), as long as nobody sets it.
     """
 
     name: str

@@ -28,13 +28,32 @@ class Shown:
     weights: np.ndarray | None = None
 
 
+def known_rule(bundle: Bundle) -> Rule | None:
+    """The rule that a bundle's levels are chosen by; None where they have none, or it is not known here.
+
+    Raises:
+        LodgsError: the bundle contradicts it.
+    """
+    rule = find_rule(bundle.rule)
+    if rule is not None and rule.cumulative != bundle.cumulative:
+        says, knows = (
+            "add up" if adds else "replace one another" for adds in (bundle.cumulative, rule.cumulative)
+        )
+        raise LodgsError(
+            f"The levels are said to {says}, but by their rule '{rule.name}' they {knows}.",
+            "Another program may have changed the file; export it again.",
+        )
+    return rule
+
+
 def rule_of(bundle: Bundle) -> Rule:
     """The rule that a bundle's levels are chosen by.
 
     Raises:
-        LodgsError: they are not made for distances, or this version does not know the rule.
+        LodgsError: they are not made for distances, this version does not know the rule, or they contradict
+            it.
     """
-    rule = find_rule(bundle.rule)
+    rule = known_rule(bundle)
     if rule is None:
         raise LodgsError(*unknown_rule(bundle.rule))
     return rule

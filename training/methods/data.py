@@ -95,10 +95,10 @@ class TrainingData:
         """Where the training views leave room for splats."""
         return Support(self.train, self.scene.points)
 
-    @property
+    @cached_property
     def near(self) -> float:
         """Depth before which nothing is drawn, in scene units."""
-        return 0.01 * self.median_depth
+        return self.scene.near()
 
     @cached_property
     def threshold_scale(self) -> float:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import LodgsError
-from ..lod.rule import Values, find_rule
-from ..lod.selection import complete_levels, select_levels, settings
+from ..lod.rule import Values
+from ..lod.selection import complete_levels, known_rule, select_levels, settings
 from ..runs.data import training_data
 from ..runs.folder import RunFolder
 from ..runs.job import Job
@@ -65,7 +65,7 @@ class Source:
         """
         if scene is not None:
             cameras = read_scene(scene)
-            there, near = cameras.cameras, 0.01 * cameras.median_depth()
+            there, near = cameras.cameras, cameras.near()
         elif self.run is not None:
             data = training_data(Job.from_file(self.run.job), self.run)
             there, near = data.scene.cameras, data.near
@@ -108,13 +108,14 @@ def render(
         holdout: an EXR with the depth of what hides splats, as :func:`.picture.read_depth` reads it.
 
     Raises:
-        LodgsError: there is no such level or control, the holdout is not one, or the file cannot be written.
+        LodgsError: there is no such level or control, the bundle contradicts its rule, the holdout is not
+            one, or the file cannot be written.
     """
     bundle = source.bundle
     if out.suffix.lower() not in (".png", ".exr"):
         raise LodgsError(f"{out.name} is neither .png nor .exr.", "Choose one of these endings.")
     limit = None if holdout is None else read_depth(holdout, camera.width, camera.height, None)
-    rule = find_rule(bundle.rule)
+    rule = known_rule(bundle)
     if given is not None or (rule is not None and rule.always and not level):
         shown = select_levels(bundle, camera.center, camera.focal, settings(bundle, given or {}))
     else:

@@ -11,17 +11,17 @@ from scipy.special import expit, logit
 from ..errors import LodgsError
 from ..lod.rule import find_rule
 from ..lod.selection import complete, select, settings
-from ..splats.bundle import Bundle, read_bundle
+from ..splats.bundle import Bundle, read_bundle, read_folder
 from ..splats.dialects import Warn, silent
 from ..splats.gaussians import Splats
 from .folder import RunFolder
 
 
 def read_base(path: str | Path, warn: Warn = silent) -> Splats:
-    """The finest complete level of a finished run, of a bundle, or of a plain PLY of splats.
+    """The finest complete level of a finished run, of a bundle or an exported folder, or of a plain PLY.
 
     Args:
-        path: a run's folder or a PLY.
+        path: a run's folder, one of levels with its manifest, or a PLY.
         warn: as for ``read_bundle``.
 
     Raises:
@@ -31,14 +31,14 @@ def read_base(path: str | Path, warn: Warn = silent) -> Splats:
     path = Path(path)
     if not path.exists():
         raise LodgsError(f"There is no {path} to begin with.", "Choose a run's folder or a PLY of splats.")
-    if path.is_dir():
+    if path.is_dir() and not (path / "manifest.json").exists():
         path = RunFolder(path).bundle
         if not path.exists():
             raise LodgsError(
                 f"{path.parent} holds no finished run (no {path.name}).",
                 "Train it to the end first, or choose a PLY of splats.",
             )
-    bundle = read_bundle(path, warn)
+    bundle = (read_folder if path.is_dir() else read_bundle)(path, warn)
     splats = complete(bundle, bundle.levels[-1])
     rule = find_rule(bundle.rule)
     if rule is not None and rule.always and "camera_center" in bundle.meta:

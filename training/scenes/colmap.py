@@ -164,6 +164,14 @@ class Scene:
             raise LodgsError(f"No camera of {self.model} sees a point.", "Reconstruct the scene with points.")
         return float(np.median(medians))
 
+    def near(self) -> float:
+        """The depth from which on splats are drawn, in COLMAP units: a hundredth of the median depth.
+
+        Raises:
+            LodgsError: as :meth:`median_depth`.
+        """
+        return 0.01 * self.median_depth()
+
 
 def find_models(folder: Path) -> list[Path]:
     """Folders at or below `folder` that hold a COLMAP model (cameras and images, .bin or .txt).

@@ -18,7 +18,7 @@ import bpy
 
 from ....training.lod.rule import Rule, rules
 from ...attributes import OPACITY_LOGIT, WEIGHT
-from ..building import Field, Nodes, group
+from ..building import VERSION, Field, Nodes, edited, group
 
 EYE, FREEZE, EYE_OBJECT, EYE_POSITION = "eye", "freeze", "eye_object", "eye_position"
 FOCAL, HELD_FOCAL, MATERIAL = "focal_px", "held_focal", "material"
@@ -123,7 +123,16 @@ def rule_group(rule: Rule) -> bpy.types.GeometryNodeTree:
         nodes.link(inputs[MATERIAL].socket, material, "Material")
         nodes.link(material.outputs["Geometry"], nodes.add("NodeGroupOutput"), "Geometry")
 
-    return group(f"LODGS {rule.name.title()}", 100 * _SHARED_VERSION + module.VERSION, build)
+    return group(f"LODGS {rule.name.title()}", _version(rule), build)
+
+
+def serves(tree: bpy.types.NodeTree | None, rule: Rule) -> bool:
+    """Whether a modifier's group is of a rule and of this version, changed by somebody or not."""
+    return tree is not None and tree.get(RULE) == rule.name and tree.get(VERSION) == _version(rule)
+
+
+def _version(rule: Rule) -> int:
+    return 100 * _SHARED_VERSION + _modules()[rule.name].VERSION
 
 
 def fact_names(rule: Rule) -> list[str]:
@@ -133,8 +142,8 @@ def fact_names(rule: Rule) -> list[str]:
 
 
 def rule_of_group(tree: bpy.types.NodeTree | None) -> Rule | None:
-    """The rule that a modifier's group states; None for other groups."""
-    return rules().get(tree.get(RULE, "")) if tree is not None else None
+    """The rule that a modifier's group states and follows; None for other groups, and changed ones."""
+    return None if tree is None or RULE not in tree or edited(tree) else rules().get(tree[RULE])
 
 
 def _sockets(tree: bpy.types.GeometryNodeTree, rule: Rule) -> None:

@@ -6,12 +6,13 @@ from ....training.lod.rules.decay import CLEAR, EPSILON, NEWTON_STEPS, SIGMA
 from ..building import Field
 from . import Inputs
 
-VERSION = 1
+VERSION = 2
 FADES = True
 
 
 def weight(inputs: Inputs) -> Field:
-    """The attenuation where opacity times attenuation is above tau times the virtual scale, else 0."""
+    """The attenuation where opacity times attenuation is above tau times the virtual scale, else 0; of
+    several levels the finest alone."""
     nodes, opacity = inputs.nodes, inputs.opacity()
     farthest = nodes.add("GeometryNodeAttributeStatistic", data_type="FLOAT", domain="POINT")
     nodes.link(inputs.points, farthest, "Geometry")
@@ -26,7 +27,8 @@ def weight(inputs: Inputs) -> Field:
     s_v = s_v.maximum(inputs["s_v"])
     scaled = normalized * s_v
     attenuation = (scaled * scaled / variance * -1.0).exp()
-    return (opacity * attenuation > inputs["tau"] * s_v) * attenuation
+    seen = (opacity * attenuation > inputs["tau"] * s_v) & (inputs["level"] >= inputs["levels"])
+    return seen * attenuation
 
 
 def _for_budget(inputs: Inputs, opacity: Field, normalized: Field, variance: Field) -> Field:

@@ -49,7 +49,7 @@ def test_shifted_and_stretched_pixels(bpy, lodgs):
 
     for width, height in ((640, 480), (480, 640)):
         camera = Camera("a", width, height, 500.0, 550.0, 300.0, 260.0, np.eye(4))
-        obj = lodgs("data.photographs").new_camera(camera, 1.0, photograph=False)
+        obj = lodgs("data.photographs").new_camera(camera, 1.0, 0.01, photograph=False)
         bpy.context.scene.collection.objects.link(obj)
         lodgs("data.photographs").match_render(bpy.context.scene, camera)
         bpy.context.view_layer.update()

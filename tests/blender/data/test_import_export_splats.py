@@ -170,6 +170,22 @@ def test_one_level_and_what_is_shown(bpy, lodgs, bundle, file, tmp_path):
     assert not (tmp_path / "none.ply").exists()
 
 
+def test_as_shown_is_of_the_scene_itself_and_says_so(bpy, lodgs, file, tmp_path):
+    """A level that is moved and turned, and a copy of it, are drawn there; the export says that it is not."""
+    bpy.ops.lodgs.import_splats(filepath=str(file))
+    root, out = the_root(bpy), [tmp_path / "before.ply", tmp_path / "after.ply"]
+    bpy.ops.lodgs.export_plain(filepath=str(out[0]))
+    obj = root.lodgs.levels[2].object
+    obj.location, obj.rotation_euler, root.scale = (1, 2, 3), (0, 1, 0), (2, 2, 2)
+    copy = obj.copy()
+    bpy.context.scene.collection.objects.link(copy)
+    bpy.context.view_layer.update()
+    bpy.ops.lodgs.export_plain(filepath=str(out[1]))
+    assert out[0].read_bytes() == out[1].read_bytes()
+    shown = bpy.ops.lodgs.export_plain.get_rna_type().properties["source"].enum_items["SHOWN"]
+    assert "scene's own coordinates" in shown.description and "copies" in shown.description
+
+
 def test_only_this_one(bpy, file):
     bpy.ops.lodgs.import_splats(filepath=str(file))
     settings = the_root(bpy).lodgs

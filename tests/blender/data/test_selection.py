@@ -44,7 +44,7 @@ def root(bpy, lodgs):
         lodgs("data.scenes").set_bundle_facts(root, bundle.Bundle("flod", [], "bands"))
         for level in levels:
             lodgs("data.scenes").set_level(root, level)
-    root.lodgs.mode = "SELECTIVE"
+    root.lodgs.mode, root.lodgs.bands.first = "SELECTIVE", 1
     return root
 
 

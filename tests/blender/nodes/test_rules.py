@@ -16,6 +16,8 @@ RANGES = {
 def numbers(rule, rng):
     """Facts and values of a rule, drawn from what they may be."""
     facts = {"level": 2, "finer": 3, "coarser": 1, "levels": 4}
+    if not (rule.cumulative or rule.level_facts):  # made for one level
+        facts |= {"finer": 5, "levels": 2}
     names = [*rule.scene_facts, *rule.level_facts, *(f"coarser_{name}" for name in rule.level_facts)]
     facts |= {name: max(rng.uniform(*RANGES.get(name, (0.5, 6))), 0.0) for name in names}
     values = {}
@@ -103,12 +105,15 @@ def splat_scene(bpy, lodgs):
         facts, _ = numbers(rule, rng)
         levels = []
         for number in range(1, 4 if rule.cumulative or rule.level_facts else 2):
+            names = [name for name in rule.columns if name != "opacity"]
             splats = Splats(
-                rng.normal(0, 4, (9, 3)).astype(np.float32), np.ones((9, 4), np.float32),
-                np.zeros((9, 3), np.float32), np.zeros(9, np.float32), np.zeros((9, 1, 3), np.float32),
+                rng.normal(0, 4, (60, 3)).astype(np.float32), np.ones((60, 4), np.float32),
+                np.zeros((60, 3), np.float32), np.zeros(60, np.float32), np.zeros((60, 1, 3), np.float32),
+                {name: rng.uniform(*RANGES.get(name, (0.2, 2)), 60).astype(np.float32) for name in names},
             )  # fmt: skip
             levels.append(Level(number, splats, {fact: facts[fact] for fact in rule.level_facts}))
-        bundle = Bundle("any", levels, name, {fact: facts[fact] for fact in rule.scene_facts})
+        scene = {fact: facts[fact] for fact in rule.scene_facts}
+        bundle = Bundle("any", levels, name, scene, cumulative=rule.cumulative)
         with scenes._new_scene(bpy.context, "any") as root:
             for one in bundle.levels:
                 scenes._put_level(root, one)
@@ -132,6 +137,125 @@ def test_an_older_group_is_renewed_and_whoever_used_it_gets_the_new_one(bpy, lod
         groups_of_rules = [m.node_group for m in item.object.modifiers if groups.rule_of_group(m.node_group)]
         assert [group["lodgs_version"] for group in groups_of_rules] == [version]
     assert sum("lodgs_rule" in group for group in bpy.data.node_groups) == 1
+
+
+@pytest.fixture
+def change(bpy):
+    """``change(group)``: what an artist may do: a group's last choice is turned round."""
+
+    def changed(group):
+        keep = next(node for node in group.nodes if node.bl_idname == "GeometryNodeSeparateGeometry")
+        end = next(node for node in group.nodes if node.bl_idname == "GeometryNodeSetMaterial")
+        group.links.new(keep.outputs["Inverted"], end.inputs["Geometry"])
+        bpy.context.view_layer.update()
+
+    return changed
+
+
+@pytest.fixture
+def half(bpy, lodgs, splat_scene):
+    """``half(name)``: a scene by distance of which about half is shown, seen from its scene's camera."""
+
+    def made(name):
+        root = splat_scene(name)
+        rule, rng = rules()[name], np.random.default_rng(1)
+        _, values = numbers(rule, rng)
+        root.lodgs.mode, root.lodgs.eye = "SELECTIVE", "TRAINING"
+        camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+        camera.data.clip_start, camera.location = 0.01, (0, 0, 40)
+        bpy.context.scene.collection.objects.link(camera)
+        bpy.context.scene.camera = camera
+        for control in rule.controls:
+            if not control.follows:
+                setattr(root.lodgs.controls, control.name, values[control.name])
+        root.lodgs.camera_center = (0.5, 0.5, 0.5)
+        bpy.context.scene.render.resolution_percentage = 1
+        bpy.context.view_layer.update()
+        return root
+
+    return made
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_a_group_that_an_artist_has_changed_is_followed_by_all(bpy, lodgs, half, change, frame, name):
+    """The viewport's splats are those that F12 and exports have, with the rule's group and with a changed
+    one; and it is changed again once it is changed back."""
+    views, root = lodgs("viewport.views"), half(name)
+    views.clear()
+
+    def agree():
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        exported = sum(
+            len(item.object.evaluated_get(depsgraph).data.points) for item in root.lodgs.levels
+            if item.object.visible_get()
+        )  # fmt: skip
+        rendered = sum(len(one.splats) for one in lodgs("render.engine").placed_splats(depsgraph))
+        view, camera = views.ViewState(), bpy.context.scene.camera
+        instances = lodgs("data.shown").splat_instances(depsgraph)
+        drawn = []
+
+        def draw():
+            views.prepare(view, instances, depsgraph, camera.matrix_world.inverted(), 10**6, wait=True)
+            drawn.append(view.arrangement.count)
+
+        frame(8, draw)
+        assert drawn == [exported] == [rendered]
+        return exported
+
+    def everything():
+        return sum(len(item.object.data.points) for item in root.lodgs.levels if item.object.visible_get())
+
+    as_ruled = agree()
+    group = next(m.node_group for m in root.lodgs.levels[0].object.modifiers if "lodgs_rule" in m.node_group)
+    assert not lodgs("nodes.building").edited(group)
+    change(group)
+    assert lodgs("nodes.building").edited(group)
+    assert agree() == everything() - as_ruled
+    assert 0 < as_ruled < everything()
+    views.clear()
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_a_changed_group_stays_in_use_and_is_kept_when_it_is_renewed(lodgs, splat_scene, change, name):
+    selection, root = lodgs("data.selection"), splat_scene(name)
+    used = root.lodgs.levels[0].object.modifiers[-1].node_group
+    change(used)
+    selection.attach(root)
+    assert not selection.outdated(root)
+    assert {item.object.modifiers[-1].node_group for item in root.lodgs.levels} == {used}
+    used["lodgs_version"] = 0
+    lodgs("data.older_files").bring_up_to_date(root)
+    assert used not in {item.object.modifiers[-1].node_group for item in root.lodgs.levels}
+    assert used.name == f"LODGS {name.title()} (older)" and used.use_fake_user
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_a_group_is_as_made_after_saving(bpy, lodgs, splat_scene, change, tmp_path, name):
+    splat_scene(name)
+    path, group = str(tmp_path / "a.blend"), f"LODGS {name.title()}"
+    for changed in (False, True):
+        if changed:
+            change(bpy.data.node_groups[group])
+        bpy.ops.wm.save_as_mainfile(filepath=path, check_existing=False)
+        bpy.ops.wm.open_mainfile(filepath=path)
+        assert lodgs("nodes.building").edited(bpy.data.node_groups[group]) == changed
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_an_emptied_group_stops_nothing(bpy, lodgs, half, name, capfd):
+    root = half(name)
+    group = root.lodgs.levels[0].object.modifiers[-1].node_group
+    group.interface.clear()
+    group.nodes.clear()
+    bpy.context.view_layer.update()
+    root.lodgs.camera_center = (1, 2, 3)
+    root.lodgs.freeze = True
+    lodgs("data.selection").attach(root)
+    bpy.context.view_layer.update()
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    evaluated = root.lodgs.levels[0].object.evaluated_get(depsgraph)
+    assert lodgs("data.selection").choice(evaluated, depsgraph) is None
+    assert "Traceback" not in "".join(capfd.readouterr())
 
 
 @pytest.mark.parametrize("name", RULES)

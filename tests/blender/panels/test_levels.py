@@ -23,7 +23,8 @@ def root(bpy, lodgs, tmp_path):
             if rule
             else ({}, {})
         )
-        bundle = bundles.Bundle("any", [bundles.Level(1, splats, facts[1])], name, facts[0])
+        adds = bool(rule and rule.cumulative)
+        bundle = bundles.Bundle("any", [bundles.Level(1, splats, facts[1])], name, facts[0], cumulative=adds)
         bundles.write_bundle(tmp_path / "b.ply", bundle)
         return lodgs("data.scenes").import_splats(bpy.context, tmp_path / "b.ply")
 

@@ -69,6 +69,59 @@ def test_psnr_is_that_of_the_f12_picture(bpy, lodgs, root, renderer, tmp_path):
     np.testing.assert_allclose(found.rendered, rendered, atol=0.6 / 255)
 
 
+@pytest.fixture
+def measured(bpy, lodgs, tmp_path):
+    """``measured(name, scale)``: the root of levels by distance over the garden's views, and the PSNR of a
+    view as the trainer's evaluation finds it: only their files are shared."""
+    pytest.importorskip("torch", reason="the evaluation runs beside Blender here")
+    from training.evaluate.views import Evaluation
+    from training.lod.selection import Choice, settings
+    from training.methods.data import TrainingData
+    from training.scenes.colmap import read_scene
+
+    rng, levels = np.random.default_rng(3), []
+    for number, (size, s_min) in enumerate([(-1.5, 0.025), (-2.2, 0.014), (-3.0, 0.0)], 1):
+        splats = haze(0.4)
+        splats.log_scales[:] = size
+        splats.means[:] = rng.uniform((-4, -2, -4), (4, 2, 4), (300, 3))
+        splats.sh[:] = rng.normal(0, 1, (300, 1, 3))
+        levels.append(Level(number, splats, {"s_min": s_min}))
+    bundle = Bundle("flod", levels, "bands", {})
+
+    def made(index, scale):
+        evaluation = Evaluation(TrainingData(read_scene(GARDEN), scale, 8), backend="cpu")
+        camera = evaluation.cameras[index]
+        bundle.controls["gamma"] = 2.4 * scale
+        choice, values = Choice(bundle), settings(bundle, {})
+        weights = choice.weights(camera.center, camera.focal, values)
+        counts = np.unique(np.repeat([1, 2, 3], 300)[weights > 0], return_counts=True)
+        assert min(counts[1]) > 20 and len(counts[0]) == 3  # every level has its part
+        (psnr,) = evaluation.psnrs([camera], lambda camera: (choice.splats, weights))
+        root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+        lodgs("data.scenes").set_bundle_facts(root, bundle)
+        for level in levels:
+            lodgs("data.scenes").set_level(root, level)
+        lodgs("data.scenes").set_bundle_facts(root, bundle)
+        root.lodgs.mode, root.lodgs.training.image_scale = "SELECTIVE", scale
+        view = next(v for v in lodgs("data.photographs").views(root) if v.name == camera.name)
+        return root, view, psnr
+
+    return made
+
+
+@pytest.mark.parametrize(("rendered", "scale"), [((64, 1000), 0.7), ((4000, 100), 0.37)])
+def test_by_distance_it_is_what_evaluate_measures(bpy, lodgs, measured, renderer, rendered, scale):
+    """To a hundredth of a dB, whatever the size of the last render."""
+    root, view, psnr = measured(2, scale)
+    render = bpy.context.scene.render
+    render.resolution_x, render.resolution_y = rendered
+    render.resolution_percentage, render.pixel_aspect_x = 37, 1.5
+    found = lodgs("render.compare").compare_view(bpy.context, root, view)
+    assert found.psnr == pytest.approx(psnr, abs=0.01)
+    assert (render.resolution_x, render.resolution_y) == rendered
+    assert (render.resolution_percentage, render.pixel_aspect_x) == (37, 1.5)
+
+
 def test_measuring_all_finds_the_worst(bpy, lodgs, root, renderer):
     compare, photographs = lodgs("render.compare"), lodgs("data.photographs")
     assert not bpy.ops.lodgs.compare_worst.poll()

@@ -590,3 +590,80 @@ def test_viewport_quality_is_nearly_the_same(bpy, lodgs, scene, tmp_path, frame,
     error = (((quick - shown)[..., :3] * seen).astype(float) ** 2).mean()
     assert -10 * np.log10(error) > 35
     np.testing.assert_allclose(quick[..., 3], shown[..., 3], atol=0.03)
+
+
+def quickly(bpy, path: Path) -> np.ndarray:
+    """Viewport Quality's picture, as it is saved."""
+    assert bpy.ops.lodgs.render_quick() == {"FINISHED"}
+    bpy.data.images["Render Result"].save_render(str(path), scene=bpy.context.scene)
+    return pixels(bpy, path)
+
+
+def alike(one: np.ndarray, other: np.ndarray) -> bool:
+    """More than 35 dB."""
+    return one.shape == other.shape and ((one - other).astype(float)[..., :3] ** 2).mean() < 10**-3.5
+
+
+@pytest.fixture
+def two_walls(bpy, lodgs, tmp_path, frame):
+    """A green and a red wall beside each other before a camera; skipped where there are no graphics."""
+    add_red_cube(bpy).hide_render = True
+    lodgs("render.engine").use(bpy.context.scene)
+    green = import_wall(bpy, lodgs, tmp_path / "green.ply", 1.0, (0.1, 0.8, 0.2))
+    red = import_wall(bpy, lodgs, tmp_path / "red.ply", 0.0, (0.8, 0.2, 0.1))
+    red.location.x = 4
+    return green, red
+
+
+@pytest.mark.parametrize("of", ["object", "collection", "eye", "modifier"])
+def test_viewport_quality_shows_what_f12_shows_not_what_viewports_hide(bpy, two_walls, tmp_path, of):
+    before = f12(bpy, tmp_path)
+    for root, viewport, render in zip(two_walls, (True, False), (False, True), strict=True):
+        obj = root.lodgs.levels[0].object
+        if of == "object":
+            root.animation_data_clear()
+            obj.animation_data_clear()
+            obj.hide_viewport, obj.hide_render = viewport, render
+        elif of == "collection":
+            collection = root.users_collection[0]
+            collection.hide_viewport, collection.hide_render = viewport, render
+        elif of == "eye":
+            obj.hide_set(viewport)
+        else:
+            group = bpy.data.node_groups.get("nothing") or bpy.data.node_groups.new(
+                "nothing", "GeometryNodeTree"
+            )
+            if not group.interface.items_tree:
+                for way in ("INPUT", "OUTPUT"):
+                    group.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
+            modifier = obj.modifiers.new("nothing", "NODES")
+            modifier.node_group = group
+            modifier.show_viewport, modifier.show_render = viewport, render
+    shown = f12(bpy, tmp_path)
+    assert alike(shown, before) == (of == "eye")
+    assert alike(quickly(bpy, tmp_path / "quick.png"), shown)
+
+
+def test_viewport_quality_draws_the_border(bpy, scene, frame, tmp_path):
+    scene.render.resolution_percentage = 50
+    scene.render.use_border = True
+    scene.render.border_min_x, scene.render.border_max_x = 0.31, 0.66
+    scene.render.border_min_y, scene.render.border_max_y = 0.2, 0.81
+    for crop in (True, False):
+        scene.render.use_crop_to_border = crop
+        assert alike(quickly(bpy, tmp_path / "quick.png"), f12(bpy, tmp_path))
+
+
+def test_viewport_quality_looks_beyond_the_clip_end(bpy, scene, frame, tmp_path):
+    scene.render.resolution_percentage = 50
+    scene.camera.data.clip_end = 4
+    shown = f12(bpy, tmp_path)
+    assert shown[..., :3].max() > 0.5
+    assert alike(quickly(bpy, tmp_path / "quick.png"), shown)
+
+
+def test_viewport_quality_refuses_to_hold_out(bpy, scene, frame, tmp_path):
+    scene.lodgs_render.holdout = str(tmp_path / "depth_####.exr")
+    with pytest.raises(RuntimeError, match=r"cannot leave out what meshes hide.*Clear Hold Out"):
+        bpy.ops.lodgs.render_quick()
+    assert bpy.context.scene.render.engine == "LODGS" and bpy.context.scene.render.use_compositing

@@ -15,7 +15,7 @@ from training.splats.bundle import Bundle, Level, write_bundle
 from training.splats.gaussians import Splats
 
 DECAY = rules()["decay"]
-FACTS = {"reference": 8.0, "tau": 0.004}
+FACTS = {"reference": 8.0, "tau": 0.004, "level": 1, "levels": 1}
 
 
 def scene(count=4000, seed=0):
@@ -56,8 +56,8 @@ def test_a_focal_length_changes_nothing_and_the_eye_does():
 def test_without_a_reference_the_farthest_splat_is_at_1():
     means, columns = scene()
     farthest = np.linalg.norm(means, axis=1).max()
-    published = weights(means, columns, 2.0, facts={"reference": 0.0, "tau": 0.004})
-    stored = weights(means, columns, 2.0, facts={"reference": farthest, "tau": 0.004})
+    published = weights(means, columns, 2.0, facts=FACTS | {"reference": 0.0})
+    stored = weights(means, columns, 2.0, facts=FACTS | {"reference": farthest})
     np.testing.assert_allclose(published, stored, rtol=1e-5)
 
 
@@ -129,3 +129,21 @@ def test_as_a_base_and_as_full_detail_splats_have_the_weights_that_a_camera_sees
     seen, fixed = shown_at(bundle, bundle.levels[-1])(camera)
     np.testing.assert_allclose(fixed, weights(means, columns), rtol=1e-4)
     assert len(seen) == len(fixed) == 300
+
+
+def test_of_several_levels_the_finest_alone_is_drawn():
+    from training.lod.selection import select_levels, settings
+    from training.splats.bundle import Bundle, Level
+
+    means, columns = scene(50)
+    splats = Splats(
+        means, np.ones((50, 4), np.float32), np.zeros((50, 3), np.float32), np.zeros(50, np.float32),
+        np.zeros((50, 1, 3), np.float32), {"sigma_d": columns["sigma_d"]},
+    )  # fmt: skip
+    alone = Bundle("clod", [Level(3, splats)], "decay", {"reference": 8.0, "tau": 0.004})
+    several = Bundle("clod", [Level(1, splats), Level(3, splats)], "decay", alone.facts)
+    (wanted,), (coarse, fine) = (
+        select_levels(one, np.zeros(3), 500.0, settings(one, {})) for one in (alone, several)
+    )
+    assert len(coarse.splats) == 0 and len(fine.splats) == len(wanted.splats) > 0
+    np.testing.assert_array_equal(fine.weights, wanted.weights)

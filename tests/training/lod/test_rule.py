@@ -187,3 +187,13 @@ def test_files_of_version_0_1_0_choose_as_before(method, rule, form):
 
 def test_a_plain_file_of_version_0_1_0_has_no_rule():
     assert read_bundle(OLD / "plain.ply").rule == ""
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_levels_that_contradict_their_rule_are_refused(name):
+    bundle = bundle_of(name)
+    bundle.cumulative = not bundle.cumulative
+    with pytest.raises(LodgsError, match=f"but by their rule '{name}' they"):
+        settings(bundle, {})
+    with pytest.raises(LodgsError, match="export it again"):
+        Choice(bundle)

@@ -51,6 +51,8 @@ def last_seen_at(normalized: np.ndarray, sigma: np.ndarray, opacity: np.ndarray,
 class Decay(Rule):
     """The attenuation where α·attenuation > τ s_v, 0 elsewhere (Sec. 3.2).
 
+    Splats do without levels: of several, each complete, the finest alone is drawn.
+
     d′ is the distance over ``reference``, or where that is 0 over that of the farthest splat (in the paper,
     of those in view). With ``at_most`` the virtual scale is as much larger than ``s_v`` as leaves no more
     splats than that.
@@ -91,6 +93,8 @@ class Decay(Rule):
         return max(s_v, float(first_left_out) * (1 + CLEAR))
 
     def weights(self, means, eye, focal_px, columns, facts, values) -> np.ndarray:
+        if facts["level"] < facts["levels"]:
+            return np.zeros(len(means), np.float32)
         normalized, tau = self.normalized(means, eye, facts), facts["tau"]
         s_v = self.virtual_scale(normalized, columns, tau, values)
         weight = attenuation(normalized, columns[SIGMA], s_v).astype(np.float32)

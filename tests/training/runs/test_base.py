@@ -1,0 +1,34 @@
+"""What a training can begin with besides points."""
+
+import numpy as np
+import pytest
+
+from training.errors import LodgsError
+from training.runs.base import read_base
+from training.splats.bundle import Bundle, Level, write_bundle, write_folder
+from training.splats.gaussians import Splats
+
+
+def splats(count: int) -> Splats:
+    rng = np.random.default_rng(count)
+    return Splats(
+        rng.normal(size=(count, 3)).astype(np.float32), rng.normal(size=(count, 4)).astype(np.float32),
+        rng.normal(size=(count, 3)).astype(np.float32), rng.normal(size=count).astype(np.float32),
+        rng.normal(size=(count, 4, 3)).astype(np.float32),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("cumulative", [False, True])
+def test_an_exported_folder_is_as_good_as_its_bundle(tmp_path, cumulative):
+    bundle = Bundle("", [Level(1, splats(10)), Level(2, splats(30))], cumulative=cumulative)
+    write_bundle(tmp_path / "b.ply", bundle)
+    write_folder(tmp_path / "folder", bundle)
+    wanted, found = read_base(tmp_path / "b.ply"), read_base(tmp_path / "folder")
+    assert len(found) == (40 if cumulative else 30)
+    for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
+
+
+def test_a_folder_of_something_else_is_no_base(tmp_path):
+    with pytest.raises(LodgsError, match="holds no finished run"):
+        read_base(tmp_path)
