@@ -41,7 +41,7 @@ def spoiled(draw, seeds: list[bytes]) -> bytes:
     """One of the seeds after one to four of: a bit flipped, bytes odd, zeroed, cut, doubled, left out, put
     in, taken from another seed; a number in a text odd; brackets without an end."""
     data = draw(st.sampled_from(seeds))
-    for _ in range(draw(st.integers(1, 4))):
+    for _ in range(draw(st.sampled_from([1, 1, 2, 4]))):
         data = draw(_one_change(data, seeds))
     return data
 
