@@ -220,7 +220,7 @@ def test_the_networks_come_back_from_their_arrays(data, tmp_path):
         ("level", arrays["level"][:, None]),
         (network, arrays[network][:-1]),
     ):
-        with pytest.raises(ValueError, match=name):
+        with pytest.raises(ValueError, match=r" is \(.* not \("):
             other.load_arrays(arrays | {name: odd})
     with pytest.raises(KeyError, match="means"):
         other.load_arrays({})
