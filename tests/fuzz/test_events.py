@@ -15,8 +15,8 @@ from training.runs.folder import RunFolder
 pytest.importorskip("training.runs.events")
 
 LEVEL = {
-    "event": "level", "level": 1, "path": "levels/level_1.ply", "splats": 7, "psnr": 20.5, "facts": {"s_min": 0.1},
-    "rule": "bands", "scene_facts": {}, "controls": {"gamma": 1.0}, "cumulative": False, "again": False,
+    "event": "level", "level": 1, "path": "levels/level_1.ply", "splats": 7, "psnr": 20.5,
+    "facts": {"s_min": 0.1}, "rule": "bands", "scene_facts": {}, "controls": {"gamma": 1.0}, "cumulative": False, "again": False,
     "more": False, "meta": {"camera_center": [0, 0, 1], "up_rotation": [[1, 0, 0], [0, 0, 1], [0, -1, 0]]},
 }  # fmt: skip
 PROGRESS = {
@@ -54,7 +54,7 @@ def follow(run: RunFolder) -> None:
         json.dumps(event, allow_nan=False).encode()
         assert event["event"] in {told["event"] for told in EVENTS}
     for level in run.levels():
-        assert 1 <= level["level"] and level["splats"] >= 0
+        assert level["level"] >= 1 and level["splats"] >= 0
         assert (run.path / level["path"]).resolve().is_relative_to(run.path.resolve())
     assert run.state() in {"empty", "running", "done", "cancelled", "failed", "interrupted"}
     run.last("error", "done")

@@ -48,8 +48,8 @@ _FORBIDDEN = ("packed_", "f_rest_", "end_header", "element chunk")
 # Some viewers read no further than 10 KB to find the end of the header.
 _MAX_COMMENTS = 2560
 _LARGEST_FACT = 1e30
-# What readers rely on of meta, of which no number is beyond FARTHEST.
-_META_SHAPES = {"camera_center": (3,), "up_rotation": (3, 3), "view": (2, 3)}
+META_SHAPES = {"camera_center": (3,), "up_rotation": (3, 3), "view": (2, 3)}
+"""What readers rely on of meta, where it is there; none of its numbers is beyond FARTHEST."""
 # What reading others' descriptions raises where something in them is missing, or of another kind.
 _CONTRADICTIONS = (ValueError, KeyError, TypeError, AttributeError)
 
@@ -413,7 +413,7 @@ def _bundle(head: dict, lines: list[dict], meta: dict, path: str | Path) -> Bund
     if version > FORMAT_VERSION:
         raise LodgsError(f"{path} is a bundle of the newer version {version}.", "Update LODGS to read it.")
     _of_kind(meta, dict, "meta")
-    for name, shape in _META_SHAPES.items():
+    for name, shape in META_SHAPES.items():
         if name in meta:
             values = np.asarray(meta[name])
             if values.shape != shape or values.dtype.kind not in "if" or (np.abs(values) > FARTHEST).any():
