@@ -14,10 +14,11 @@ from training.runs.folder import RunFolder
 
 pytest.importorskip("training.runs.events")
 
+META = {"camera_center": [0, 0, 1], "up_rotation": [[1, 0, 0], [0, 0, 1], [0, -1, 0]]}
 LEVEL = {
-    "event": "level", "level": 1, "path": "levels/level_1.ply", "splats": 7, "psnr": 20.5,
-    "facts": {"s_min": 0.1}, "rule": "bands", "scene_facts": {}, "controls": {"gamma": 1.0}, "cumulative": False, "again": False,
-    "more": False, "meta": {"camera_center": [0, 0, 1], "up_rotation": [[1, 0, 0], [0, 0, 1], [0, -1, 0]]},
+    "event": "level", "level": 1, "path": "levels/level_1.ply", "splats": 7, "psnr": 20.5, "rule": "bands",
+    "facts": {"s_min": 0.1}, "scene_facts": {}, "controls": {"gamma": 1.0}, "cumulative": False,
+    "again": False, "more": False, "meta": META,
 }  # fmt: skip
 PROGRESS = {
     "event": "progress", "stage": "level 1 of 5", "level": 1, "levels": 5, "step": 3, "of": 9, "loss": 0.1,
