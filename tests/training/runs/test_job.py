@@ -105,6 +105,9 @@ def test_mistakes_are_named(tmp_path, text, said):
         ("octree", "grow_interval = 0", "grow_interval = 0 .* above 0"),
         ("octree", "max_splats = 0", "max_splats = 0 .* above 0"),
         ("octree_neural", "offsets = 0", "offsets = 0 .* above 0"),
+        ("octree_neural", "offsets = 101", "offsets = 101 .* at most 100"),
+        ("octree_neural", "features = 1025", "features = 1025 .* at most 1024"),
+        ("octree_neural", "appearance = 1025", "appearance = 1025 .* at most 1024"),
         ("octree_neural", "max_splats = 4", "max_splats = 4 .* 5 Gaussians"),
     ],
 )
