@@ -16,6 +16,8 @@ from ..methods.parameters import Parameters
 BACKENDS = ("auto", "cpu", "cuda", "reference")
 MOST_STOPS = 32
 """Most stops that a job lightens or darkens linear images by."""
+MOST_PATH = 2000
+"""Most characters of a path, so that a job with all of its paths is within the bounds of a TOML file."""
 _KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
     "str": (str, "a text; give it in quotation marks"),
     "int": (int, "a whole number"),
@@ -163,9 +165,12 @@ def _path(key: str, value: object, folder: Path) -> str:
     if not isinstance(value, str):
         raise LodgsError(f"{key} = {shown(value)} is not a path.", "Give it in quotation marks.")
     try:
-        return str((folder / value).expanduser().resolve())
+        path = str((folder / value).expanduser().resolve())
     except (OSError, ValueError, RuntimeError) as error:  # a NUL, an unknown ~name, links in a circle
         raise LodgsError(f"{key} = {shown(value)} is not a path: {error}.", "Correct it.") from error
+    if len(path) > MOST_PATH:
+        raise LodgsError(f"{key} is a path of {len(path)} characters.", f"Give at most {MOST_PATH}.")
+    return path
 
 
 def _toml_line(name: str, value) -> str:

@@ -84,6 +84,7 @@ def test_one_number_serves_every_level_and_fewer_levels_keep_the_finest():
             "max_splats = 2147483648 is more",
         ),
         ("[" * 2000, "is not valid"),
+        (f'scene = "{"x" * 2001}"\nout = "b"\n', "scene is a path of 2[0-9]+ characters"),
     ],
 )
 def test_mistakes_are_named(tmp_path, text, said):
