@@ -36,7 +36,7 @@ FLOORS = {
         ("rasterize",),
         ("lod", "scenes"),
         ("splats",),
-        ("files",),
+        ("documents", "files"),
         ("errors", "__init__"),
     ),
 }

@@ -285,7 +285,11 @@ class Method(ABC, Generic[P, D]):
         return {}
 
     def load_arrays(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Takes the model from what ``arrays`` gave."""
+        """Takes the model from what ``arrays`` gave, or stays as it is.
+
+        Raises:
+            KeyError, ValueError: an array is missing, or of another shape or type.
+        """
         raise NotImplementedError("the levels hold all")
 
     def picture(self, camera: Camera) -> torch.Tensor:

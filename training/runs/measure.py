@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
-
 from ..errors import LodgsError
 from ..evaluate.aside import veil
 from ..evaluate.distance import farther, jumps
@@ -20,6 +18,7 @@ from ..lod.selection import select, settings, unknown_rule
 from ..methods import create
 from ..scenes.aside import read_aside
 from ..splats.bundle import read_bundle
+from .arrays import damaged, read_arrays
 from .data import training_data
 from .folder import RunFolder
 from .job import Job
@@ -96,8 +95,11 @@ def evaluate_run(
         ]
     if folder.model.exists():
         method = create(job.method, data, job.resolved_parameters(), job.seed, job.backend)
-        with np.load(folder.model, allow_pickle=False) as arrays:
+        arrays = read_arrays(folder.model)
+        try:
             method.load_arrays(arrays)
+        except (KeyError, ValueError) as error:
+            raise damaged(folder.model, error) from error
         report["networks"] = evaluation.measure_pictures(method.picture)
     middle = evaluation.cameras[len(evaluation.cameras) // 2]
     if far and rule:

@@ -19,8 +19,8 @@ class NeuralOctreeParameters(OctreeParameters):
         0.005, "Anchors the sum of whose Gaussians' opacities is below this are removed.", high=1
     )
     lr_scales: float = parameter(7e-3, "Learning rate of the logs of the anchors' extents.")
-    offsets: int = parameter(5, "Gaussians of an anchor (Octree-GS: 10).", above=0)
-    features: int = parameter(32, "Length of an anchor's feature.")
+    offsets: int = parameter(5, "Gaussians of an anchor (Octree-GS: 10).", above=0, high=100)
+    features: int = parameter(32, "Length of an anchor's feature.", high=1024)
     direct: bool = parameter(
         True,
         "Whether each Gaussian has looks of its own too, which those of the networks are added to. Not in "
@@ -32,7 +32,9 @@ class NeuralOctreeParameters(OctreeParameters):
         "the photographs by heart where these are few, and baking cannot carry it.",
     )
     appearance: int = parameter(
-        0, "Length of each view's appearance, for photographs in changing light; 0: all are alike."
+        0,
+        "Length of each view's appearance, for photographs in changing light; 0: all are alike.",
+        high=1024,
     )
     lr_features: float = parameter(7.5e-3, "Learning rate of features.")
     lr_offsets: float = parameter(

@@ -180,6 +180,11 @@ class Method(method.Method[NeuralOctreeParameters, Drawing]):
         return {name: tensor.detach().cpu().numpy() for name, tensor in (model | networks).items()}
 
     def load_arrays(self, arrays: Mapping[str, np.ndarray]) -> None:
+        count = len(arrays["means"])
+        for name, ours in self.arrays().items():
+            shape = ours.shape if name.startswith("network.") else (count, *ours.shape[1:])
+            if arrays[name].shape != shape or arrays[name].dtype != ours.dtype:
+                raise ValueError(f"{name} is {arrays[name].shape} of {arrays[name].dtype}, not {shape}")
         rows = {name: torch.from_numpy(arrays[name]) for name in self.model.adam.tensors}
         self.model = self._new_model(rows, *(torch.from_numpy(arrays[name]) for name in ("level", "bias")))
         self.networks.load_state_dict(

@@ -10,6 +10,7 @@ from training.methods.octree_neural import METHOD
 from training.methods.octree_neural.train import Method
 from training.methods.parameters import override
 from training.rasterize import Gaussians, contributions, rasterize
+from training.runs.arrays import read_arrays
 
 
 def make(data, **values) -> Method:
@@ -207,11 +208,22 @@ def test_the_networks_come_back_from_their_arrays(data, tmp_path):
         method.train_step(step)
     np.savez(tmp_path / "model.npz", **method.arrays())  # pyright: ignore[reportArgumentType]
     other = make(data, appearance=2)
-    with np.load(tmp_path / "model.npz", allow_pickle=False) as arrays:
-        other.load_arrays(arrays)
+    arrays = read_arrays(tmp_path / "model.npz")
+    other.load_arrays(arrays)
     camera = data.test[0]
     assert torch.equal(other.picture(camera), method.picture(camera))
     other.train_step(4)  # and training can go on
+    network = next(name for name in arrays if name.startswith("network."))
+    for name, odd in (
+        ("means", arrays["means"][:-1]),
+        ("means", arrays["means"].astype("f8")),
+        ("level", arrays["level"][:, None]),
+        (network, arrays[network][:-1]),
+    ):
+        with pytest.raises(ValueError, match=r" is \(.* not \("):
+            other.load_arrays(arrays | {name: odd})
+    with pytest.raises(KeyError, match="means"):
+        other.load_arrays({})
 
 
 def test_new_anchors_come_where_steep_gaussians_are(data):
