@@ -37,7 +37,7 @@ def fetch_wheels(wheels: list[str]) -> None:
             if subprocess.run(command, check=False).returncode:
                 sys.exit(f"extension: {wheel.name} could not be downloaded; check the network.")
         if f"--hash=sha256:{hashlib.sha256(wheel.read_bytes()).hexdigest()}" not in lock:
-            sys.exit(f"extension: {wheel} is not the wheel of requirements/trainer.txt; remove it and try again.")
+            sys.exit(f"extension: {wheel} is not the wheel of requirements/trainer.txt; remove it.")
 
 
 def build(folder: Path) -> Path:
