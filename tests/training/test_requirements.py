@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tools import extension
+from tools import extension, setup
 
 ROOT = Path(__file__).resolve().parents[2]
 REQUIREMENTS = ROOT / "requirements"
@@ -75,3 +75,19 @@ def test_the_zip_carries_the_wheel_that_tests_use(tmp_path, monkeypatch):
     (tmp_path / wheel).write_bytes(b"another wheel")
     with pytest.raises(SystemExit, match="is not the wheel of"):
         extension.fetch_wheels([wheel])
+
+
+def test_setup_installs_a_lock_once_and_again_when_it_changes(tmp_path, monkeypatch):
+    (tmp_path / "requirements").mkdir()
+    lock, said = tmp_path / "requirements" / "some.txt", tmp_path / "said"
+    python = tmp_path / "python"  # makes an environment of itself
+    python.write_text(
+        '#!/bin/sh\nif [ "$2" = venv ]; then mkdir -p "$4/bin"; cp "$0" "$4/bin/python"; touch "$4/bin/pip"; fi'
+        f'\nif [ "$2" = pip ]; then echo "$@" >> {said}; fi\n'
+    )
+    python.chmod(0o755)
+    monkeypatch.setattr(setup, "ROOT", tmp_path)
+    for text, times in (("one", 1), ("one", 1), ("two", 2)):
+        lock.write_text(text)
+        setup.make(".venv", str(python), "some.txt")
+        assert said.read_text().count(f"--require-hashes --only-binary=:all: -r {lock}\n") == times
