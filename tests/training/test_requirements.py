@@ -82,8 +82,8 @@ def test_setup_installs_a_lock_once_and_again_when_it_changes(tmp_path, monkeypa
     lock, said = tmp_path / "requirements" / "some.txt", tmp_path / "said"
     python = tmp_path / "python"  # makes an environment of itself
     python.write_text(
-        '#!/bin/sh\nif [ "$2" = venv ]; then mkdir -p "$4/bin"; cp "$0" "$4/bin/python"; touch "$4/bin/pip"; fi'
-        f'\nif [ "$2" = pip ]; then echo "$@" >> {said}; fi\n'
+        '#!/bin/sh\nif [ "$2" = venv ]; then mkdir -p "$4/bin"; cp "$0" "$4/bin/python"; fi\n'
+        f'if [ "$2" = pip ]; then echo "$@" >> {said}; fi\n'
     )
     python.chmod(0o755)
     monkeypatch.setattr(setup, "ROOT", tmp_path)
