@@ -67,7 +67,7 @@ class Making:
 
     def _make(self) -> None:
         try:
-            _remove_all_but(self._before, self._parent)
+            self._remove_all_but(self._before)
             folder = _new_folder(self._parent)
             with processes.using(folder) as self._inherited:  # a killed Blender's pip works on for a while
                 try:
@@ -76,7 +76,7 @@ class Making:
                     shutil.rmtree(folder, ignore_errors=True)
                     raise
             self.message, self.fraction = "The environment is ready", 1.0
-            if not _remove_all_but([folder], self._parent):
+            if not self._remove_all_but([folder]):
                 self.message += "; what is running goes on with the one before it"
         except (LodgsError, OSError) as error:
             kept = " The environment that was there is kept." if self._before else ""
@@ -127,6 +127,26 @@ class Making:
                 f"{what} failed: {why}." if why else f"{what} failed.",
                 "Check the network and the free space, then try again.",
             )
+
+    def _remove_all_but(self, kept: list[Path]) -> bool:
+        """Remove older environments and what killed makings left; False where one stays, being in use."""
+        gone = True
+        for path in set(self._parent.iterdir()) - set(kept):
+            if path.is_symlink() or not path.is_dir():
+                path.unlink(missing_ok=True)
+            elif processes.in_use(path):
+                gone = False
+            else:
+                away = path.with_suffix(".old")
+                try:
+                    path.rename(away)  # Windows refuses where a program runs or a file is open
+                except OSError:
+                    gone = False
+                    continue
+                compiled = Path(self._environment["PYTHONPYCACHEPREFIX"], *path.parts[1:])
+                for folder in (away, compiled):
+                    shutil.rmtree(folder, ignore_errors=True)
+        return gone
 
     def _stop(self) -> None:
         """End the program that is at work, with the programs that it has started where the system can."""
@@ -204,22 +224,3 @@ def _new_folder(parent: Path) -> Path:
             break
     (parent / str(number) / processes.MARK).touch()
     return parent / str(number)
-
-
-def _remove_all_but(kept: list[Path], parent: Path) -> bool:
-    """Remove older environments and what killed makings have left; False where one stays that is in use."""
-    gone = True
-    for path in set(parent.iterdir()) - set(kept):
-        if path.is_symlink() or not path.is_dir():
-            path.unlink(missing_ok=True)
-        elif processes.in_use(path):
-            gone = False
-        else:
-            away = path.with_suffix(".old")
-            try:
-                path.rename(away)  # Windows refuses where a program runs or a file is open
-            except OSError:
-                gone = False
-                continue
-            shutil.rmtree(away, ignore_errors=True)
-    return gone

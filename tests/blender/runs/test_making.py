@@ -125,8 +125,12 @@ def test_the_environment_that_serves_survives_a_failed_making(bpy, lodgs, making
 def test_a_new_environment_takes_the_place_of_the_one_before(bpy, lodgs, making, fake, there, tmp_path):
     (tmp_path / "trainer" / "bin").mkdir(parents=True)  # as versions before this one made it
     (tmp_path / "trainer" / "pyvenv.cfg").touch()
+    cache = Path(lodgs("runs.processes").environment()["PYTHONPYCACHEPREFIX"])
+    compiled = cache / (tmp_path / "trainer" / "1" / "lib").relative_to("/")
+    compiled.mkdir(parents=True)
     for made in ("1", "2"):
         assert bpy.ops.lodgs.make_environment() == {"FINISHED"}
+        assert compiled.exists() == (made == "1")
         assert there() == [made] and lodgs("runs.environment").trainer_python().parts[-3] == made
 
 
