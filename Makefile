@@ -5,12 +5,15 @@ BLENDER_5_2 := .venv-blender-5.2/bin/python
 METHOD ?= flod
 INPUTS ?= 20000
 SCENES ?= examples/lantern_garden examples/lantern_walk
+# What is installed, from requirements/*.in, to the last dependency and for every system, with hashes.
+LOCK := .venv/bin/uv pip compile --quiet --universal --generate-hashes --no-build --custom-compile-command "make pins"
 # One worker a core. Kernels are compiled once, into the user's cache.
 PYTEST := -m pytest -n auto
 quick test test-5.0 fuzz: export OMP_NUM_THREADS := 1  # torch's threads would come on top of the workers
 export LODGS_TRAINER_PYTHON := $(CURDIR)/$(VENV)
 
-.PHONY: help setup demo check quick test test-5.0 fuzz lint docs tables bench bench-quality extension window interop clean
+.PHONY: help setup demo check quick test test-5.0 fuzz lint docs tables bench bench-quality extension pins window interop \
+	clean
 
 help:
 	@echo "make setup      environments from pinned packages (needs Python 3.11; 3.13 for Blender 5.2's tests)"
@@ -24,6 +27,7 @@ help:
 	@echo "make bench      how fast it is, as ratios from one run"
 	@echo "make bench-quality  PSNR and veil against seconds, all methods (SCENES=\"DIR ...\", BASE=another checkout)"
 	@echo "make extension  dist/lodgs-VERSION.zip, checked by Blender"
+	@echo "make pins       requirements/*.txt anew from requirements/*.in (UPGRADE=1 takes the newest of what these leave open)"
 	@echo "make window     a tour in a real Blender window, with pictures (METHOD=flod; needs Blender, Xvfb, ImageMagick)"
 	@echo "make interop    other programs read our files (needs Node)"
 
@@ -73,6 +77,11 @@ bench-quality: setup
 
 extension: setup
 	$(VENV) tools/extension.py
+
+pins: setup
+	for name in trainer cuda develop blender-5.0; do $(LOCK) $(if $(UPGRADE),--upgrade) --python-version 3.11 \
+		requirements/$$name.in -o requirements/$$name.txt || exit 1; done
+	$(LOCK) $(if $(UPGRADE),--upgrade) --python-version 3.13 requirements/blender-5.2.in -o requirements/blender-5.2.txt
 
 window: setup
 	$(VENV) tools/window.py --method $(METHOD) $(if $(LONG),--long)

@@ -5,6 +5,7 @@ Run from anywhere with a Python that has pip and the bpy wheel: ``python tools/e
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import subprocess
 import sys
@@ -24,17 +25,19 @@ def blender_tool() -> Path:
 
 
 def fetch_wheels(wheels: list[str]) -> None:
-    """Download the wheels that the manifest names, unchanged, unless they are there."""
-    for wheel in map(Path, wheels):
-        if (ROOT / wheel).exists():
-            continue
-        name, version, *_ = wheel.name.split("-")
-        command = [
-            sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:",
-            "--dest", str(ROOT / wheel.parent), f"{name}=={version}",
-        ]  # fmt: skip
-        if subprocess.run(command, check=False).returncode:
-            sys.exit(f"extension: {wheel.name} could not be downloaded; check the network.")
+    """Download the wheels that the manifest names unless they are there, and make sure of their hashes."""
+    lock = (ROOT / "requirements" / "trainer.txt").read_text(encoding="utf-8")
+    for wheel in (ROOT / name for name in wheels):
+        if not wheel.exists():
+            name, version, *_ = wheel.name.split("-")
+            command = [
+                sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:",
+                "--dest", str(wheel.parent), f"{name}=={version}",
+            ]  # fmt: skip
+            if subprocess.run(command, check=False).returncode:
+                sys.exit(f"extension: {wheel.name} could not be downloaded; check the network.")
+        if f"--hash=sha256:{hashlib.sha256(wheel.read_bytes()).hexdigest()}" not in lock:
+            sys.exit(f"extension: {wheel} is not the wheel of requirements/trainer.txt; remove it.")
 
 
 def build(folder: Path) -> Path:

@@ -15,7 +15,6 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-REQUIREMENTS = ROOT / "requirements"
 
 
 def find_python(version: str) -> str | None:
@@ -60,9 +59,10 @@ def find_python(version: str) -> str | None:
     return None
 
 
-def make(folder: str, python: str, requirements: str) -> None:
-    """A virtual environment with these pinned packages; nothing happens when it is as it should be."""
-    environment, wanted = ROOT / folder, digest(requirements)
+def make(folder: str, python: str, lock: str) -> None:
+    """A virtual environment with the packages of a lock; nothing happens when it is as it should be."""
+    environment, requirements = ROOT / folder, ROOT / "requirements" / lock
+    wanted = hashlib.sha256(requirements.read_bytes()).hexdigest()
     stamp = environment / "requirements.sha256"
     if stamp.exists() and stamp.read_text() == wanted:
         return
@@ -72,7 +72,7 @@ def make(folder: str, python: str, requirements: str) -> None:
         subprocess.run([python, "-m", "venv", "--clear", str(environment)], check=True)
     subprocess.run(
         [str(scripts / "python"), "-m", "pip", "install", "--quiet", "--disable-pip-version-check",
-         "-r", str(REQUIREMENTS / requirements)],
+         "--require-hashes", "--only-binary=:all:", "-r", str(requirements)],
         check=True,
     )  # fmt: skip
     loaded = subprocess.run(
@@ -89,16 +89,6 @@ def make(folder: str, python: str, requirements: str) -> None:
         print("setup: libxfixes3 libgl1 libxkbcommon0 libsm6 libice6.", file=sys.stderr)
         sys.exit(1)
     stamp.write_text(wanted)
-
-
-def digest(requirements: str) -> str:
-    """Changes when the pins do; included files count."""
-    text = "".join(
-        path.read_text()
-        for path in sorted(REQUIREMENTS.glob("*.txt"))
-        if path.name in (requirements, "trainer.txt")
-    )
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def main() -> int:

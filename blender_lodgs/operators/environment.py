@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import bpy
 
-from ..runs import environment, processes
+from ..runs import environment, making, processes
 from .parts import report_errors
 
 
 class LODGS_OT_make_environment(bpy.types.Operator):
     bl_idname = "lodgs.make_environment"
     bl_label = "Make Environment"
-    bl_description = "Download PyTorch and what else training needs into a folder of its own"
+    bl_description = (
+        "Download PyTorch and what else training needs into a folder of its own. The environment that is "
+        "there serves until the new one has been tried"
+    )
     bl_options = {"INTERNAL"}
 
     @report_errors
     def execute(self, context: bpy.types.Context):
-        setup = environment.make()
-        processes.follow(setup.step)
-        if setup.problem:
-            self.report({"ERROR"}, setup.problem)
+        work = making.make()
+        processes.follow(work.step)
+        if work.problem:
+            self.report({"ERROR"}, work.problem)
             return {"CANCELLED"}
         return {"FINISHED"}
 
@@ -32,11 +35,11 @@ class LODGS_OT_cancel_environment(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return environment.setup is not None and environment.setup.running
+        return making.current is not None and making.current.running
 
     def execute(self, context: bpy.types.Context):
-        if environment.setup is not None:
-            environment.setup.cancel()
+        if making.current is not None:
+            making.current.cancel()
         return {"FINISHED"}
 
 

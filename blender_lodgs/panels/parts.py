@@ -7,7 +7,7 @@ import textwrap
 import bpy
 
 from ..data import scenes
-from ..runs import environment
+from ..runs import making
 
 
 class Panel(bpy.types.Panel):
@@ -50,15 +50,15 @@ def draw_environment(layout: bpy.types.UILayout, missing: str = "") -> None:
     Args:
         missing: what one lacks without it, as a sentence.
     """
-    setup = environment.setup
-    if setup is not None and setup.running:
+    work = making.current
+    if work is not None and work.running:
         row = layout.row(align=True)
-        row.progress(text=setup.message, factor=setup.fraction)
+        row.progress(text=work.message, factor=work.fraction)
         row.operator("lodgs.cancel_environment", text="", icon="X")
         return
-    problem = (setup and setup.problem) or missing
+    problem = (work and work.problem) or missing
     if problem:
         say(layout, problem, "ERROR")
-    elif setup is not None:
-        say(layout, setup.message, "INFO")
+    elif work is not None:
+        say(layout, work.message, "INFO")
     layout.operator("lodgs.make_environment", icon="IMPORT")

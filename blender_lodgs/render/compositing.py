@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Iterable, Iterator
+from functools import cache
 from pathlib import Path
 
 import bpy
@@ -147,12 +148,18 @@ def render_mesh_depth(scene: bpy.types.Scene, frames: Iterable[int]) -> Iterator
 def depth_files(scene: bpy.types.Scene) -> Path:
     """The files of :func:`render_mesh_depth`, #### for the frame.
 
-    They lie in a folder beside the .blend, or in Blender's temporary one before that is saved.
+    They lie in a folder beside the .blend, or before that is saved in a temporary one that nobody else knows.
     """
     name = f"{bpy.path.clean_name(scene.name)}_####.exr"
     if bpy.data.filepath:
         return Path(bpy.path.abspath("//")) / f"{Path(bpy.data.filepath).stem}_depth" / name
-    return Path(bpy.app.tempdir or tempfile.gettempdir()) / "depth" / name
+    return Path(bpy.app.tempdir or _own_folder()) / "depth" / name
+
+
+@cache
+def _own_folder() -> str:
+    """A temporary folder of this process alone, for where Blender has none."""
+    return tempfile.mkdtemp(prefix="lodgs-")
 
 
 def _only_depth(scene: bpy.types.Scene) -> None:

@@ -6,7 +6,8 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,14 @@ import bpy
 
 from .. import extension
 
+if sys.platform != "win32":
+    import fcntl
+
 INTERVAL = 0.1
 """Seconds between two looks at a program."""
+
+MARK = "lodgs-in-use"
+"""File in an environment that the extension makes: locked by whatever is at work in it."""
 
 
 def environment() -> dict[str, str]:
@@ -40,19 +47,8 @@ def spawn(command: list[str], log: Path, output: Path) -> subprocess.Popen:
     Raises:
         OSError: the program or a file cannot be opened.
     """
-    detached: dict[str, Any] = {"start_new_session": True}
-    if sys.platform == "win32":
-        detached = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
     with open(log, "ab") as errors, open(output, "wb") as stdout:
-        return subprocess.Popen(
-            command,
-            cwd=extension.FOLDER,
-            env=environment(),
-            stdin=subprocess.DEVNULL,
-            stdout=stdout,
-            stderr=errors,
-            **detached,
-        )
+        return _start(command, stdin=subprocess.DEVNULL, stdout=stdout, stderr=errors)
 
 
 def converse(command: list[str], log: Path) -> subprocess.Popen[str]:
@@ -67,21 +63,47 @@ def converse(command: list[str], log: Path) -> subprocess.Popen[str]:
     Raises:
         OSError: the program or the file cannot be opened.
     """
-    detached: dict[str, Any] = {"start_new_session": True}  # Ctrl-C is for Blender, which may cancel politely
-    if sys.platform == "win32":
-        detached = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with open(log, "ab") as errors:
-        return subprocess.Popen(
-            command,
-            cwd=extension.FOLDER,
-            env=environment(),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=errors,
-            text=True,
-            encoding="utf-8",
-            **detached,
-        )
+        return _start(command, **pipes, stderr=errors, text=True, encoding="utf-8")
+
+
+@contextmanager
+def using(folder: Path) -> Iterator[tuple[int, ...]]:
+    """Hold the mark of an environment that the extension made, so that it is not removed.
+
+    Yields:
+        Descriptors that hold it as well for as long as a program lives that inherits them, also when Blender
+        has ended: none on Windows, which by itself keeps folders where a program runs or a file is open, and
+        none for a folder without the mark.
+    """
+    try:
+        mark = os.open(folder / MARK, os.O_RDONLY)
+    except OSError:
+        yield ()
+        return
+    try:
+        if sys.platform == "win32":
+            yield ()
+        else:
+            fcntl.flock(mark, fcntl.LOCK_SH)
+            yield (mark,)
+    finally:
+        os.close(mark)
+
+
+def in_use(folder: Path) -> bool:
+    """Whether anything holds an environment's mark; not on Windows, where it cannot be renamed then."""
+    if sys.platform == "win32":
+        return False
+    try:
+        with open(folder / MARK, "rb") as mark:
+            fcntl.flock(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:  # it has none: a part of one
+        return False
+    return False
 
 
 def follow(step: Callable[[], bool]) -> None:
@@ -95,3 +117,14 @@ def follow(step: Callable[[], bool]) -> None:
             time.sleep(INTERVAL)
     else:
         bpy.app.timers.register(lambda: INTERVAL if step() else None, persistent=True)
+
+
+def _start(command: list[str], **streams: Any) -> subprocess.Popen:
+    """A program beside Blender: Ctrl-C is for Blender, which may cancel politely."""
+    detached: dict[str, Any] = {"start_new_session": True}
+    if sys.platform == "win32":
+        detached = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
+    with using(Path(command[0]).parent.parent) as inherited:
+        return subprocess.Popen(
+            command, cwd=extension.FOLDER, env=environment(), pass_fds=inherited, **streams, **detached
+        )

@@ -1,0 +1,93 @@
+"""What is installed: locks answer what was asked for, with hashes, and the trainer is the same everywhere."""
+
+import hashlib
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from tools import extension, setup
+
+ROOT = Path(__file__).resolve().parents[2]
+REQUIREMENTS = ROOT / "requirements"
+LOCKS = ["trainer", "cuda", "develop", "blender-5.0", "blender-5.2"]
+
+PIN = r"(?P<name>[A-Za-z0-9._-]+)==(?P<version>[^\s;]+)(?P<marker> ; [^\\]+?)?"
+
+
+def asked(path: Path) -> set[tuple[str, str]]:
+    """(name, version) of each line of a .in file and those that it includes."""
+    found = set()
+    for line in path.read_text().splitlines():
+        if line.startswith("-r "):
+            found |= asked(path.parent / line[3:])
+        elif line and not line.startswith(("#", "-c ")):
+            pin = re.fullmatch(PIN, line)
+            assert pin, f"{path.name} pins no version: {line}"
+            found.add((pin["name"].lower(), pin["version"]))
+    return found
+
+
+def locked(path: Path) -> set[tuple[str, str]]:
+    """(name, version) of each package of a .txt file; each has a hash."""
+    found = set()
+    text = path.read_text().replace("\\\n", "")
+    for line in text.splitlines():
+        if not line.lstrip().startswith("#"):
+            pin = re.fullmatch(PIN + r"\s+(--hash=sha256:[0-9a-f]{64}\s*)+", line)
+            assert pin, f"{path.name} has no hash for: {line[:80]}"
+            found.add((pin["name"].lower(), pin["version"]))
+    return found
+
+
+def test_every_lock_comes_from_a_file_that_asks():
+    assert {path.stem for path in REQUIREMENTS.glob("*.txt")} == set(LOCKS)
+    assert {path.stem for path in REQUIREMENTS.glob("*.in")} == {*LOCKS, "tests"}
+
+
+@pytest.mark.parametrize("name", LOCKS)
+def test_a_lock_has_what_was_asked_for_and_hashes(name):
+    wanted = asked(REQUIREMENTS / f"{name}.in")
+    assert wanted and not wanted - locked(REQUIREMENTS / f"{name}.txt"), "run `make pins`"
+
+
+@pytest.mark.parametrize("name", ["cuda", "develop"])
+def test_the_trainer_is_the_same_everywhere(name):
+    """What artists install is what tests use, to the last dependency."""
+    trainer, other = locked(REQUIREMENTS / "trainer.txt"), locked(REQUIREMENTS / f"{name}.txt")
+    names = {package for package, _ in trainer}
+    assert {pin for pin in other if pin[0] in names} == trainer
+
+
+def test_the_zip_carries_the_wheel_that_tests_use(tmp_path, monkeypatch):
+    (wheel,) = tomllib.loads((ROOT / "blender_manifest.toml").read_text())["wheels"]
+    name, version, *_ = Path(wheel).name.split("-")
+    for lock in LOCKS:
+        assert (name, version) in locked(REQUIREMENTS / f"{lock}.txt")
+    monkeypatch.setattr(extension, "ROOT", tmp_path)
+    for folder in ("wheels", "requirements"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / wheel).write_bytes(b"a wheel")
+    lock = tmp_path / "requirements" / "trainer.txt"
+    lock.write_text(f"{name}=={version} \\\n    --hash=sha256:{hashlib.sha256(b'a wheel').hexdigest()}\n")
+    extension.fetch_wheels([wheel])
+    (tmp_path / wheel).write_bytes(b"another wheel")
+    with pytest.raises(SystemExit, match="is not the wheel of"):
+        extension.fetch_wheels([wheel])
+
+
+def test_setup_installs_a_lock_once_and_again_when_it_changes(tmp_path, monkeypatch):
+    (tmp_path / "requirements").mkdir()
+    lock, said = tmp_path / "requirements" / "some.txt", tmp_path / "said"
+    python = tmp_path / "python"  # makes an environment of itself
+    python.write_text(
+        '#!/bin/sh\nif [ "$2" = venv ]; then mkdir -p "$4/bin"; cp "$0" "$4/bin/python"; fi\n'
+        f'if [ "$2" = pip ]; then echo "$@" >> {said}; fi\n'
+    )
+    python.chmod(0o755)
+    monkeypatch.setattr(setup, "ROOT", tmp_path)
+    for text, times in (("one", 1), ("one", 1), ("two", 2)):
+        lock.write_text(text)
+        setup.make(".venv", str(python), "some.txt")
+        assert said.read_text().count(f"--require-hashes --only-binary=:all: -r {lock}\n") == times
