@@ -10,8 +10,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from ..errors import LodgsError
 from .cameras import Camera, read_camera
 from .images import image_size
+from .photographs import Photographs
 
 
 def read_aside(scene: Path) -> list[Camera]:
@@ -22,9 +24,14 @@ def read_aside(scene: Path) -> list[Camera]:
     Raises:
         LodgsError: a camera or its picture cannot be read.
     """
-    found = []
+    found, pictures = [], Photographs(scene / "aside", scene)
     for path in sorted((scene / "aside").glob("*.json")):
         camera, _ = read_camera(path)
-        image = path.parent / camera.name
+        try:
+            image = pictures.find(camera.name)
+        except LodgsError as error:
+            raise LodgsError(f"The picture that {path} names cannot be taken: {error.what}") from error
+        if image is None:
+            raise LodgsError(f"{path} names no picture beside it.", 'Give its file name as "name".')
         found.append(replace(camera.resized(*image_size(image)), image=image))
     return found
