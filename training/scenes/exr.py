@@ -84,6 +84,7 @@ def read_parts(path: Path) -> list[tuple[str, dict, dict[str, np.ndarray]]]:
 
     with OpenEXR.File(str(path), header_only=True) as file:
         needed = sum(_bytes_of(part.header) for part in file.parts)
+        promised = [len(part.header["channels"]) for part in file.parts]
     if needed > MOST_BYTES:
         raise LodgsError(
             f"{path} holds {needed / 2**30:.1f} GiB of pixels; {MOST_BYTES >> 30} are read at most.",
@@ -91,6 +92,8 @@ def read_parts(path: Path) -> list[tuple[str, dict, dict[str, np.ndarray]]]:
         )
     with OpenEXR.File(str(path), separate_channels=True) as file:
         found = [(part.name(), dict(part.header), part.channels) for part in file.parts]
+        if [len(channels) for _, _, channels in found] != promised:
+            raise ValueError("its pixels are damaged")  # of which OpenEXR only prints
         return [
             (name, header, {each: channel.pixels for each, channel in channels.items()})
             for name, header, channels in found

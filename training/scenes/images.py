@@ -150,7 +150,7 @@ def load_image(path: Path, width: int, height: int, exposure: float = 0.0) -> np
     Raises:
         LodgsError: the file cannot be read.
     """
-    with _opened(Path(path), width, height) as source:
+    with _opened(path, width, height, large=_LARGE) as source:
         result = np.empty((height, width, 3), np.float32)
         top = 0
         for strip in _strips(source, height):
@@ -173,12 +173,12 @@ def check_image(path: Path) -> None:
 
 
 @contextmanager
-def _opened(path: Path, width: int, height: int, large: int = _LARGE) -> Iterator[_Source]:
+def _opened(path: Path, width: int, height: int, large: int) -> Iterator[_Source]:
     """The decoded image, of which a size is wanted; whatever goes wrong with it is a LodgsError.
 
     Args:
-        large: a JPEG of more pixels is decoded at a half, a quarter or an eighth of its size where that is
-            still twice what is wanted.
+        large: an image of more pixels is first made as small as is still twice what is wanted: a JPEG where
+            it is decoded, others by whole numbers.
     """
     try:
         with open_file(path) as file:
@@ -191,6 +191,9 @@ def _opened(path: Path, width: int, height: int, large: int = _LARGE) -> Iterato
             with Image.open(file, formats=("JPEG", "PNG")) as image:
                 if image.width * image.height > large:
                     image.draft(None, (2 * width, 2 * height))
+                    times = min(image.width // (2 * width), image.height // (2 * height))
+                    if times > 1 and image.mode in ("L", "RGB"):
+                        image = image.reduce(times)
                 image.load()
                 yield _Source(image.width, image.height, lambda top, bottom: _pillow_rows(image, top, bottom))
     except LodgsError:
