@@ -3,19 +3,21 @@ PYTHON ?= python3
 VENV := .venv/bin/python
 BLENDER_5_2 := .venv-blender-5.2/bin/python
 METHOD ?= flod
+INPUTS ?= 20000
 SCENES ?= examples/lantern_garden examples/lantern_walk
 # One worker a core. Kernels are compiled once, into the user's cache.
 PYTEST := -m pytest -n auto
-quick test test-5.0: export OMP_NUM_THREADS := 1  # torch's threads would come on top of the workers
+quick test test-5.0 fuzz: export OMP_NUM_THREADS := 1  # torch's threads would come on top of the workers
 export LODGS_TRAINER_PYTHON := $(CURDIR)/$(VENV)
 
-.PHONY: help setup demo check quick test test-5.0 lint docs tables bench bench-quality extension window interop clean
+.PHONY: help setup demo check quick test test-5.0 fuzz lint docs tables bench bench-quality extension window interop clean
 
 help:
 	@echo "make setup      environments from pinned packages (needs Python 3.11; 3.13 for Blender 5.2's tests)"
 	@echo "make demo       import, train, select, measure and export the example scene (METHOD=flod)"
 	@echo "make check      style, types and the quick tests: about a minute, for every few minutes"
 	@echo "make test       all tests, in Blender 4.5 and, with Python 3.13, in Blender 5.2"
+	@echo "make fuzz       20,000 spoiled inputs at every door (INPUTS=20000, SEED=a number), some minutes"
 	@echo "make lint       style and types"
 	@echo "make docs       build/api: the trainer's functions and classes, from their docstrings"
 	@echo "make tables     docs/parameters.md and controls.md, from what methods and rules declare"
@@ -39,13 +41,16 @@ quick: setup
 	$(VENV) $(PYTEST) -q -m "not slow and not blender"
 
 test: setup
-	$(VENV) $(PYTEST) tests/training
+	$(VENV) $(PYTEST) tests/training tests/fuzz
 	$(VENV) $(PYTEST) tests/blender
 	@if [ -x $(BLENDER_5_2) ]; then set -x; $(BLENDER_5_2) $(PYTEST) tests/blender; fi
 
 test-5.0: setup
 	@$(PYTHON) tools/setup.py 5.0
 	.venv-blender-5.0/bin/python $(PYTEST) tests/blender
+
+fuzz: setup
+	LODGS_FUZZ=$(INPUTS) $(VENV) $(PYTEST) tests/fuzz --timeout 0 $(if $(SEED),--hypothesis-seed $(SEED))
 
 lint: setup
 	.venv/bin/ruff check .

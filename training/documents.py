@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import reprlib
 import tomllib
 from pathlib import Path
 from typing import IO, Any
@@ -26,6 +27,8 @@ LARGEST_WHOLE = 2**63 - 1
 """Largest whole number, as 64 bits hold it."""
 
 _NO_TEXT = re.compile("[\0\ud800-\udfff]")
+_QUOTES = reprlib.Repr()
+_QUOTES.maxstring = _QUOTES.maxother = 200
 
 
 def open_file(path: str | Path, what: str = "") -> IO[bytes]:
@@ -47,13 +50,18 @@ def open_file(path: str | Path, what: str = "") -> IO[bytes]:
     except ValueError:  # a NUL or half a surrogate pair
         reason = "its name is no name of a file"
     raise LodgsError(
-        f"{what or ascii_path(path)} could not be read: {reason}.", "Check the path and its rights."
+        f"{what or printable(path)} could not be read: {reason}.", "Check the path and its rights."
     )
 
 
-def ascii_path(path: str | Path) -> str:
-    """A path as a message can name it: what is no text in it is escaped."""
-    return _NO_TEXT.sub(lambda found: f"\\x{ord(found[0]):02x}", str(path))
+def printable(name: str | Path) -> str:
+    """A name or a path as a message can hold it: what is no text in it is escaped."""
+    return _NO_TEXT.sub(lambda found: f"\\x{ord(found[0]):02x}", str(name))
+
+
+def shown(value: Any) -> str:
+    """A value as a message can quote it: its begin where it is long, and nothing in it that is no text."""
+    return printable(_QUOTES.repr(value))
 
 
 def read_json(path: str | Path, what: str = "") -> dict:
@@ -62,7 +70,7 @@ def read_json(path: str | Path, what: str = "") -> dict:
     Raises:
         LodgsError: the file cannot be read, or as `json_object`.
     """
-    what = what or ascii_path(path)
+    what = what or printable(path)
     return json_object(_read(path, what, MOST_JSON), what)
 
 
@@ -72,7 +80,7 @@ def read_toml(path: str | Path, what: str = "") -> dict:
     Raises:
         LodgsError: the file cannot be read, is no TOML, or breaks a bound of this module.
     """
-    what = what or ascii_path(path)
+    what = what or printable(path)
     try:
         table = tomllib.loads(_text(_read(path, what, MOST_TOML), MOST_TOML))
         _check(table, DEEPEST)
@@ -92,7 +100,7 @@ def json_object(text: str | bytes, what: str) -> dict:
         LodgsError: it is no JSON, no object, or breaks a bound of this module.
     """
     try:
-        values = json.loads(_text(text, MOST_JSON), parse_constant=_no_number, parse_int=_whole)
+        values = json.loads(_text(text, MOST_JSON), parse_int=_whole)
         if not isinstance(values, dict):
             raise ValueError("it is no object")
         _check(values, DEEPEST)
@@ -115,38 +123,38 @@ def _text(text: str | bytes, most: int) -> str:
     return text.decode("utf-8-sig") if isinstance(text, bytes) else text
 
 
-def _check(value: Any, room: int) -> None:
-    """ValueError unless a value is one of those that this module lets in, at most so many levels deep."""
+def _check(value: Any, room: int, key: str = "a value") -> None:
+    """ValueError unless a value is one of those that this module lets in, at most so many levels deep.
+
+    Args:
+        key: the nearest one that the value stands under.
+    """
     match value:
         case dict() | list() if room == 0:
             raise ValueError(f"it nests deeper than {DEEPEST} levels")
         case dict():
-            for key, inside in value.items():
-                _check(key, room - 1)
-                _check(inside, room - 1)
+            for name, inside in value.items():
+                _check(name, room - 1, "a key")
+                _check(inside, room - 1, name)
         case list():
             for inside in value:
-                _check(inside, room - 1)
+                _check(inside, room - 1, key)
         case float() if not math.isfinite(value):
-            raise ValueError("a number in it is not finite")
+            raise ValueError(f"{key[:200]} = {value} is not a finite number")
         case int() if abs(value) > LARGEST_WHOLE:
-            raise ValueError("a whole number in it has too many digits")
+            raise ValueError(f"{key[:200]} has too many digits")
         case str() if _NO_TEXT.search(value):
-            raise ValueError("it holds characters that are none")
+            raise ValueError(f"{key[:200]} holds characters that are none")
         case None | bool() | int() | float() | str():
             pass
         case _:  # TOML's dates and times
-            raise ValueError(f"it holds a {type(value).__name__}")
+            raise ValueError(f"{key[:200]} is a {type(value).__name__}")
 
 
 def _whole(digits: str) -> int:
     if len(digits) > 20:
-        raise ValueError("a whole number in it has too many digits")
+        raise ValueError("a number in it has too many digits")
     return int(digits)
-
-
-def _no_number(constant: str) -> float:
-    raise ValueError(f"{constant} is no number")
 
 
 def _not_valid(what: str, error: Exception) -> LodgsError:

@@ -12,6 +12,7 @@ from importlib import import_module
 from pkgutil import iter_modules
 from typing import TYPE_CHECKING
 
+from ..documents import shown
 from ..errors import LodgsError
 from .info import PRESETS, MethodInfo
 from .parameters import Parameters, override
@@ -42,7 +43,7 @@ def method_info(name: str) -> MethodInfo:
         LodgsError: there is no such method.
     """
     if name not in METHODS:
-        raise LodgsError(f"There is no method '{name}'.", f"Choose one of: {', '.join(METHODS)}.")
+        raise LodgsError(f"There is no method {shown(name)}.", f"Choose one of: {', '.join(METHODS)}.")
     return METHODS[name]
 
 

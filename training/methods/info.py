@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from ..documents import shown
 from ..errors import LodgsError
 from .parameters import Parameters
 
@@ -53,5 +54,7 @@ class MethodInfo:
             LodgsError: there is no such preset.
         """
         if name not in self.presets:
-            raise LodgsError(f"There is no preset '{name}'.", f"Choose one of: {', '.join(self.presets)}.")
+            raise LodgsError(
+                f"There is no preset {shown(name)}.", f"Choose one of: {', '.join(self.presets)}."
+            )
         return self.presets[name]

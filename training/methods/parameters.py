@@ -7,10 +7,13 @@ from dataclasses import Field, dataclass, field, fields, replace
 from math import inf, isfinite
 from typing import Any
 
+from ..documents import shown
 from ..errors import LodgsError
 
 MARGIN_SHARE, MARGIN_SPLATS = 0.1, 4000
 """The most of all splats that may continue photographs beyond their edges, and the most at all."""
+MOST_WHOLE, MOST_NUMBER = 2**31 - 1, 1e9
+"""The largest whole number, and the largest other one, that any parameter takes."""
 
 
 def parameter(
@@ -31,7 +34,7 @@ def parameter(
             is the parameter's.
         about: help, one or two sentences.
         label: what a panel calls it; "" for its name in words.
-        low, high: bounds of a number, inclusive.
+        low, high: bounds of a number, inclusive; ``high`` is never above MOST_WHOLE or MOST_NUMBER.
         above: the number that it has to exceed, in place of ``low``.
         unit: "px", "steps", ...; "" for a pure number.
         choices: the texts that are possible.
@@ -197,7 +200,7 @@ def override(parameters: Parameters, values: dict) -> Parameters:
     known = {f.name: f for f in fields(parameters)}
     if unknown := sorted(set(values) - set(known)):
         raise LodgsError(
-            f"The job sets the unknown parameter '{unknown[0]}'.", f"Known are: {', '.join(known)}."
+            f"The job sets the unknown parameter {shown(unknown[0])}.", f"Known are: {', '.join(known)}."
         )
     given = {name: value for name, value in values.items() if value is not None}
     changed: dict[str, Any] = {name: getattr(parameters, name) for name in known} | given
@@ -238,8 +241,13 @@ def _valid(f: Field, value: Any) -> Any:
         whole = isinstance(value, int) and not isinstance(value, bool)
         valid = whole or (isinstance(default, float) and isinstance(value, float) and isfinite(value))
         valid = valid and value <= high and (value >= low if above is None else value > above)
+        most = MOST_WHOLE if isinstance(default, int) else MOST_NUMBER
+        if valid and value > most:
+            raise LodgsError(
+                f"{f.name} = {shown(value)} is more than any use of it.", f"Give at most {most:g}."
+            )
     if not valid:
-        raise LodgsError(f"{f.name} = {value!r} is not possible.", f"Give {possible(f)}.")
+        raise LodgsError(f"{f.name} = {shown(value)} is not possible.", f"Give {possible(f)}.")
     return type(default)(value)
 
 

@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 
+from ..documents import read_json, read_toml, shown
 from ..errors import LodgsError
 from ..files import atomic_write
 from ..methods import METHODS, method_info, parameters_of
 from ..methods.parameters import Parameters
 
 BACKENDS = ("auto", "cpu", "cuda", "reference")
+MOST_STOPS = 32
+"""Most stops that a job lightens or darkens linear images by."""
+_KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
+    "str": (str, "a text; give it in quotation marks"),
+    "int": (int, "a whole number"),
+    "float": ((int, float), "a number"),
+    "bool": (bool, "true or false"),
+    "dict": (dict, "a table; write it below a line with its name in brackets"),
+}
+"""What a key of each type takes, and how a message says it."""
 
 
 @dataclass(frozen=True)
@@ -61,18 +71,8 @@ class Job:
             LodgsError: if the file cannot be read, or a key or value in it is not possible.
         """
         path = Path(path)
-        try:
-            text = path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise LodgsError(f"The job file {path} cannot be read: {error}.") from error
-        try:
-            values = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
-        except ValueError as error:
-            raise LodgsError(
-                f"The job file {path} is not valid: {error}.", "Correct that line and start again."
-            ) from error
-        if not isinstance(values, dict):
-            raise LodgsError(f"The job file {path} holds no table of keys.")
+        read = read_json if path.suffix.lower() == ".json" else read_toml
+        values = read(path, f"The job file {path}")
         method, parameters = values.get("method", cls.method), values.get("parameters")
         if isinstance(method, str) and method in METHODS and isinstance(parameters, dict):
             retired = METHODS[method].retired
@@ -90,42 +90,42 @@ class Job:
         unknown = sorted(set(values) - set(known))
         if unknown:
             raise LodgsError(
-                f"The job has the unknown key '{unknown[0]}'.", f"Known are: {', '.join(known)}."
+                f"The job has the unknown key {shown(unknown[0])}.", f"Known are: {', '.join(known)}."
             )
         for key in ("scene", "out"):
             if not values.get(key):
                 raise LodgsError(f"The job does not say '{key}'.", f'Add a line: {key} = "..."')
         values = dict(values)
         for key in ("scene", "out", "base", "model", "images"):
-            if not isinstance(values.get(key, ""), str):
-                raise LodgsError(f"{key} = {values[key]!r} is not a path.", "Give it in quotation marks.")
             if values.get(key):
-                values[key] = str((folder / values[key]).expanduser().resolve())
+                values[key] = _path(key, values[key], folder)
         job = cls(**values)
         job._check()
         return job
 
     def _check(self) -> None:
-        whole = isinstance(self.seed, int) and isinstance(self.test_every, int)
-        if not whole or self.seed < 0 or self.test_every < 0 or self.test_every == 1:
+        for key in fields(self):
+            value, (kind, name) = getattr(self, key.name), _KINDS[str(key.type)]
+            if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+                raise LodgsError(f"{key.name} = {shown(value)} is not {name}.")
+        if not (0 <= self.seed < 2**31 and 0 <= self.test_every < 2**31) or self.test_every == 1:
             raise LodgsError(
                 f"seed = {self.seed!r}, test_every = {self.test_every!r} is not possible.",
-                "Both are whole numbers of at least 0, and test_every is not 1.",
+                f"Both are whole numbers from 0 to {2**31 - 1}, and test_every is not 1.",
             )
-        if not isinstance(self.validation, bool):
-            raise LodgsError(f"validation = {self.validation!r} is not possible.", "Give true or false.")
-        if not isinstance(self.image_scale, int | float) or not 0 < self.image_scale <= 1:
+        if not 0 < self.image_scale <= 1:
             raise LodgsError(
                 f"image_scale = {self.image_scale!r} is not possible.", "Give a number above 0, at most 1."
             )
-        if not isinstance(self.exposure, int | float):
-            raise LodgsError(f"exposure = {self.exposure!r} is not a number of stops.")
+        if not abs(self.exposure) <= MOST_STOPS:
+            raise LodgsError(
+                f"exposure = {self.exposure!r} is not possible.",
+                f"Give stops from {-MOST_STOPS} to {MOST_STOPS}.",
+            )
         if self.backend not in BACKENDS:
             raise LodgsError(
-                f"There is no backend '{self.backend}'.", f"Choose one of: {', '.join(BACKENDS)}."
+                f"There is no backend {shown(self.backend)}.", f"Choose one of: {', '.join(BACKENDS)}."
             )
-        if not isinstance(self.parameters, dict):
-            raise LodgsError("parameters is not a table.", "Write them below a line [parameters].")
         if self.base and not method_info(self.method).from_base:
             raise LodgsError(
                 f"The method '{self.method}' cannot begin with the splats of another run.",
@@ -156,6 +156,16 @@ class Job:
         lines += ["", "[parameters]"] + [_toml_line(name, value) for name, value in table.items()]
         with atomic_write(path) as temporary:
             Path(temporary).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _path(key: str, value: object, folder: Path) -> str:
+    """An absolute path; relative ones are relative to ``folder``."""
+    if not isinstance(value, str):
+        raise LodgsError(f"{key} = {shown(value)} is not a path.", "Give it in quotation marks.")
+    try:
+        return str((folder / value).expanduser().resolve())
+    except (OSError, ValueError, RuntimeError) as error:  # a NUL, an unknown ~name, links in a circle
+        raise LodgsError(f"{key} = {shown(value)} is not a path: {error}.", "Correct it.") from error
 
 
 def _toml_line(name: str, value) -> str:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 
+from ..documents import json_object, printable
 from ..errors import LodgsError
 from ..methods import METHODS, PRESETS
 from .job import BACKENDS, Job
@@ -72,10 +72,10 @@ def job_from(chosen: argparse.Namespace) -> Job:
 
 def _assignment(text: str) -> tuple[str, object]:
     """``name=value`` with a value as JSON has it: a number, a list of numbers."""
-    name, equals, value = text.partition("=")
+    name, _, value = text.partition("=")
     try:
-        if not equals:
-            raise ValueError
-        return name.strip(), json.loads(value)
-    except ValueError:
-        raise LodgsError(f"--set {text} is not NAME=VALUE.", "For example: --set max_splats=50000") from None
+        return name.strip(), json_object(f'{{"value": {value}}}', "--set")["value"]
+    except (LodgsError, KeyError):
+        raise LodgsError(
+            f"--set {printable(text[:200])} is not NAME=VALUE.", "For example: --set max_splats=50000"
+        ) from None

@@ -12,21 +12,24 @@ import json
 import re
 import shlex
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
+from ..documents import json_object, read_json, shown
 from ..errors import LodgsError
 from ..files import atomic_write
-from .dialects import Warn, as_3dgs, comments_of, meta_of, silent
+from .dialects import FARTHEST, Warn, as_3dgs, comments_of, drawable, meta_of, silent
 from .gaussians import Splats
 from .ply import (
     Columns,
     Element,
     columns_of,
     columns_of_extras,
+    read_comments,
     read_elements,
     read_ply,
     splats_from,
@@ -36,16 +39,21 @@ from .ply import (
 FORMAT_VERSION = 2
 MOST_LEVELS = 12
 """Levels that a job may ask for, or get from its scene: a header has no room for many more."""
+MOST_LEVELS_READ = 64
+"""Levels that are read of a file of anybody's making."""
 ORDERS = ("finest_first", "stream")
 _TAG = "lodsplat "
 # Some viewers search the whole header for these words, so no comment may hold one.
 _FORBIDDEN = ("packed_", "f_rest_", "end_header", "element chunk")
 # Some viewers read no further than 10 KB to find the end of the header.
 _MAX_COMMENTS = 2560
-# What readers rely on of meta.
+_LARGEST_FACT = 1e30
+# What readers rely on of meta, of which no number is beyond FARTHEST.
 _META_SHAPES = {"camera_center": (3,), "up_rotation": (3, 3), "view": (2, 3)}
-# What reading JSON of others' making raises where something in it is missing, of another type or too deep.
-_CONTRADICTIONS = (ValueError, KeyError, TypeError, AttributeError, RecursionError)
+# What reading others' descriptions raises where something in them is missing, or of another kind.
+_CONTRADICTIONS = (ValueError, KeyError, TypeError, AttributeError)
+
+Kind = TypeVar("Kind")
 
 
 @dataclass
@@ -156,6 +164,8 @@ def write_bundle(path: str | Path, bundle: Bundle, order: str = "finest_first") 
 def read_bundle(path: str | Path, warn: Warn = silent) -> Bundle:
     """Read a bundle as it was written, bit for bit; any other 3DGS PLY reads as one level of unknown method.
 
+    Splats that cannot be drawn are left out (`dialects.drawable`).
+
     Elements and comments that are not ours are passed over. Version 1, which names no rule, is read as well.
 
     Args:
@@ -171,23 +181,29 @@ def read_bundle(path: str | Path, warn: Warn = silent) -> Bundle:
         return Bundle("", [Level(1, splats)], meta=meta_of(comments, path, warn))
     try:
         begin = dict.fromkeys(elements, 0)
+        of_levels = {line["element"] for line in lines if "level" in line}
+        apart = {name: rows for name, rows in elements.items() if name not in of_levels}  # each is taken once
         for line in lines:
             if "table" in line:
-                rows = elements[line["element"]]
-                bundle.tables[line["table"]] = {name: np.array(rows[name]) for name in rows.dtype.names or ()}
+                name = _of_kind(line["table"], str, "table")
+                if line["element"] != f"lod_{name}":
+                    raise ValueError(f"the table {shown(name)} is in another element")
+                rows = apart.pop(line["element"])
+                bundle.tables[name] = {column: np.array(rows[column]) for column in rows.dtype.names or ()}
             if "level" not in line:
                 continue
             name, count = line["element"], line["count"]
             rows = elements[name][begin[name] : begin[name] + count]
             begin[name] += count
             splats = splats_from(rows, path)
-            extras = elements[line["extras"]] if "extras" in line else None
+            extras = apart.pop(line["extras"]) if "extras" in line else None
             if len(rows) != count or (extras is not None and len(extras) != count):
                 raise ValueError(f"level {line['level']} should have {count} splats")
             if extras is not None:
                 splats.extras |= {column: np.array(extras[column]) for column in extras.dtype.names or ()}
-            next(level for level in bundle.levels if level.number == line["level"]).splats = splats
-        for name in {line["element"] for line in lines if "level" in line}:
+            level = next(level for level in bundle.levels if level.number == line["level"])
+            level.splats = drawable(splats, path, warn)
+        for name in of_levels:
             if begin[name] != len(elements[name]):
                 raise ValueError(f"{name} has more splats than its levels")
         return bundle
@@ -203,7 +219,7 @@ def read_head(path: str | Path) -> Bundle:
     Raises:
         LodgsError: as `read_bundle`.
     """
-    comments = read_elements(path)[1]
+    comments = read_comments(path)
     return _parse(comments, path)[0] or Bundle("", [Level(1, NO_SPLATS)], meta=meta_of(comments, path))
 
 
@@ -211,7 +227,8 @@ def write_folder(folder: str | Path, bundle: Bundle) -> str:
     """Write every level as a complete plain PLY, ``lod0.ply`` the finest, and ``manifest.json``.
 
     All files have the same columns, as splat-transform wants it: extras that not every level has are left
-    out. The manifest is moved into place last.
+    out. Nothing is replaced before all is written; the manifest is moved into place last. Then the levels of
+    an earlier export that this one has no place for (``lodN.ply``) are removed, and nothing else.
 
     Returns:
         The command line that makes streamed LOD for the web of the folder with splat-transform.
@@ -261,6 +278,10 @@ def write_folder(folder: str | Path, bundle: Bundle) -> str:
         manifest_file.write_text(
             json.dumps(manifest, indent=1, default=_plain, allow_nan=False) + "\n", "ascii"
         )
+    for file in folder.glob("lod*.ply"):
+        if (found := re.fullmatch(r"lod(\d+)\.ply", file.name)) and int(found[1]) >= len(bundle.levels):
+            with suppress(OSError):  # the manifest does not name it
+                file.unlink()
     return shlex.join([*command, str(folder / "web" / "lod-meta.json")])
 
 
@@ -279,18 +300,19 @@ def read_folder(folder: str | Path, warn: Warn = silent) -> Bundle:
     manifest_file = folder / "manifest.json"
     if manifest_file.exists():
         try:
-            manifest = json.loads(manifest_file.read_bytes())
+            manifest = read_json(manifest_file)
             bundle = _bundle(manifest, manifest["levels"], manifest["meta"], manifest_file)
             lines = sorted(manifest["levels"], key=lambda line: line["level"])
             begin = 0
             for level, line in zip(bundle.levels, lines, strict=True):
                 file = folder / Path(line["file"]).name
-                level.splats = splats_from(read_elements(file)[0]["vertex"], file)  # ours: every row counts
+                splats = splats_from(read_elements(file)[0]["vertex"], file)
+                if not begin <= line["count"] == len(splats):
+                    raise ValueError(f"level {level.number} should have {line['count']} splats")
                 if bundle.cumulative:
-                    if not begin <= line["count"] == len(level.splats):
-                        raise ValueError(f"level {level.number} should have {line['count']} splats")
-                    level.splats = level.splats.select(slice(begin, None))
+                    splats = splats.select(slice(begin, None))
                     begin = line["count"]
+                level.splats = drawable(splats, file, warn)
             return bundle
         except _CONTRADICTIONS as error:
             raise _contradiction(manifest_file, error) from error
@@ -304,6 +326,10 @@ def read_folder(folder: str | Path, warn: Warn = silent) -> Bundle:
             "Choose a folder with one series, or a single PLY.",
         )
     coarse_first = [file for _, file in sorted(next(iter(series.values())), reverse=True)]
+    if len(coarse_first) > MOST_LEVELS_READ:
+        raise LodgsError(
+            f"{folder} has {len(coarse_first)} levels.", f"Leave at most {MOST_LEVELS_READ} of them there."
+        )
     levels = [Level(i, read_ply(file, warn)) for i, file in enumerate(coarse_first, 1)]
     return Bundle("", levels, meta=read_head(coarse_first[-1]).meta)
 
@@ -374,7 +400,7 @@ def _parse(comments: list[str], path: str | Path) -> tuple[Bundle | None, list[d
     if not ours:
         return None, []
     try:
-        head, *lines = [json.loads(text) for text in ours]
+        head, *lines = [json_object(text, f"A comment of {path}") for text in ours]
         meta = next((line["meta"] for line in lines if "meta" in line), {})
         return _bundle(head, [line for line in lines if "level" in line], meta, path), lines
     except _CONTRADICTIONS as error:
@@ -383,32 +409,50 @@ def _parse(comments: list[str], path: str | Path) -> tuple[Bundle | None, list[d
 
 def _bundle(head: dict, lines: list[dict], meta: dict, path: str | Path) -> Bundle:
     """A bundle without splats, of what a header or a manifest says; raises what a contradiction raises."""
-    if head["v"] > FORMAT_VERSION:
-        raise LodgsError(f"{path} is a bundle of the newer version {head['v']}.", "Update LODGS to read it.")
-    if not isinstance(meta, dict):
-        raise TypeError("meta is no object")
+    version = _whole(head["v"], "v")
+    if version > FORMAT_VERSION:
+        raise LodgsError(f"{path} is a bundle of the newer version {version}.", "Update LODGS to read it.")
+    _of_kind(meta, dict, "meta")
     for name, shape in _META_SHAPES.items():
         if name in meta:
             values = np.asarray(meta[name])
-            if values.shape != shape or values.dtype.kind not in "if" or not np.isfinite(values).all():
+            if values.shape != shape or values.dtype.kind not in "if" or (np.abs(values) > FARTHEST).any():
                 raise ValueError(f"{name} is not {shape} numbers")
-    if head["v"] == 1:
-        head, lines = _from_v1(head, lines, meta)
+    if not 1 <= len(_of_kind(lines, list, "levels")) <= MOST_LEVELS_READ:
+        raise ValueError(f"{len(lines)} levels")
     for line in lines:
-        if type(line["level"]) is not int or not 1 <= line["level"] < 2**15:
-            raise ValueError(f"{line['level']!r} is no level's number")
-    if not isinstance(head["rule"], str) or not isinstance(head["cumulative"], bool):
-        raise TypeError("rule is no text, or cumulative neither true nor false")
+        _whole(line["count"], "count")
+        if not 1 <= _whole(line["level"], "level") < 2**15:
+            raise ValueError(f"{line['level']} is no level's number")
+    if version == 1:
+        head, lines = _from_v1(head, lines, meta)
     levels = [Level(line["level"], NO_SPLATS, _numbers(line.get("facts", {}))) for line in lines]
-    if not levels:
-        raise ValueError("no levels")
     levels.sort(key=lambda level: level.number)
     if len({level.number for level in levels}) < len(levels):
         raise ValueError("a level is there twice")
     return Bundle(
-        str(head["method"]), levels, head["rule"], _numbers(head["facts"]), _numbers(head["controls"]),
-        head["cumulative"], meta,
-    )  # fmt: skip
+        _of_kind(head["method"], str, "method"),
+        levels,
+        _of_kind(head["rule"], str, "rule"),
+        _numbers(head["facts"]),
+        _numbers(head["controls"]),
+        _of_kind(head["cumulative"], bool, "cumulative"),
+        meta,
+    )
+
+
+def _of_kind(value: Kind, kind: type[Kind], name: str) -> Kind:
+    """The value, or a TypeError where it is of another kind."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} = {shown(value)} is no {kind.__name__}")
+    return value
+
+
+def _whole(value: int, name: str) -> int:
+    """The value, or an error where it is no count."""
+    if type(value) is not int or value < 0:
+        raise ValueError(f"{name} = {shown(value)} is no whole number")
+    return value
 
 
 def rule_of_v1(
@@ -444,22 +488,24 @@ def _from_v1(head: dict, lines: list[dict], meta: dict) -> tuple[dict, list[dict
 
 
 def _numbers(values: dict) -> dict[str, float]:
-    """Facts as they are; ValueError or TypeError where one is no finite number."""
-    if not all(isinstance(value, int | float) and np.isfinite(value) for value in values.values()):
-        raise ValueError("a fact is no number")
+    """Facts as they are; ValueError or TypeError where one is no number that single precision holds."""
+    for name, value in _of_kind(values, dict, "facts").items():
+        if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > _LARGEST_FACT:
+            raise ValueError(f"{name} = {shown(value)} is no such number")
     return dict(values)
 
 
 def _contradiction(path: str | Path, error: Exception) -> LodgsError:
     return LodgsError(
-        f"{path} describes its levels in a way that cannot be followed ({type(error).__name__}: {error}).",
+        f"{path} describes its levels in a way that cannot be followed "
+        f"({type(error).__name__}: {str(error)[:300]}).",
         "Another program may have changed it; export it again.",
     )
 
 
 def _bounds(splats: list[Splats]) -> list[list[float]]:
-    """Smallest and largest x, y, z of the means."""
-    parts = [x.means for x in splats if len(x)]
+    """Smallest and largest x, y, z of the means that are numbers."""
+    parts = [means for x in splats if len(means := x.means[np.isfinite(x.means).all(1)])]
     if not parts:
         return [[0.0] * 3] * 2
     return [

@@ -18,6 +18,11 @@ from .gaussians import Splats
 Warn = Callable[[str], object]
 """Receives one sentence for each thing that was left out or is shown otherwise than its maker shows it."""
 
+FARTHEST, BRIGHTEST = 1e12, 1e6
+"""The largest coordinate and size, and the largest coefficient of a colour, that are read of a splat: single
+precision then holds whatever a renderer makes of them."""
+
+_BLOCK = 1 << 16
 _OFFSETS = ("f_offset_0", "f_offset_1", "f_offset_2")
 _ANCHOR_SCALES = ("scale_3", "scale_4", "scale_5")
 # Columns of time: Spacetime Gaussians, 4D Gaussian Splatting (rotor and two-quaternion forms).
@@ -46,12 +51,11 @@ def as_3dgs(splats: Splats, path: str | Path, warn: Warn = silent) -> Splats:
     """Splats of any dialect that `refuse` lets pass, in the meaning of the 3DGS columns.
 
     The columns that are worked into others are gone, so that nothing is applied twice when the splats are
-    written and read again. What has no finite place, shape or colour cannot be drawn and is left out.
+    written and read again. What cannot be drawn is left out (`drawable`).
 
     - ``filter_3D`` (Mip-Splatting, before fusing): widened and fainter by its Eq. 9.
     - ``f_offset_0..2`` and six scales (Octree-AnyGS, explicit): mean = anchor + offset · exp(scale_0..2), and
       scale_3..5 are the splat's own.
-    - Rotations of length zero are none, as the original renderer has them.
     """
     extras = dict(splats.extras)
     if set(_OFFSETS) <= extras.keys():
@@ -66,17 +70,36 @@ def as_3dgs(splats: Splats, path: str | Path, warn: Warn = silent) -> Splats:
     if "filter_3D" in extras:
         log_scales, logits = _smoothed(splats.log_scales, splats.opacity_logits, extras.pop("filter_3D"))
         splats = replace(splats, log_scales=log_scales, opacity_logits=logits)
-    quats = splats.quats
-    if not (turned := quats.any(axis=1)).all():
-        quats = np.where(turned[:, None], quats, np.array([1, 0, 0, 0], np.float32))
-    splats = replace(splats, quats=quats, extras=extras)
-    drawable = np.isfinite(splats.means).all(1) & np.isfinite(quats).all(1)
-    drawable &= (splats.log_scales < np.inf).all(1) & ~np.isnan(splats.opacity_logits)
-    drawable &= np.isfinite(splats.sh).all((1, 2))
-    if not drawable.all():
-        warn(f"{np.count_nonzero(~drawable):,} splats of {path} have values that are no numbers: left out.")
-        splats = splats.select(drawable)
-    return splats
+    return drawable(replace(splats, extras=extras), path, warn)
+
+
+@np.errstate(invalid="ignore")
+def drawable(splats: Splats, path: str | Path, warn: Warn = silent) -> Splats:
+    """The splats that can be drawn; the others are left out with a warning.
+
+    Those have a place, shape or colour that is no number or beyond FARTHEST and BRIGHTEST, or an opacity that
+    is no number. Rotations of length zero are none, as the original renderer has them.
+
+    Args:
+        path: for the warning.
+    """
+    kept, turned = np.empty((2, len(splats)), bool)
+    for start in range(0, len(splats), _BLOCK):  # what is compared takes little memory then
+        block = slice(start, start + _BLOCK)
+        quats = np.abs(splats.quats[block])
+        kept[block] = (np.abs(splats.means[block]) <= FARTHEST).all(1) & (quats <= FARTHEST).all(1)
+        kept[block] &= (splats.log_scales[block] <= np.log(FARTHEST)).all(1)
+        kept[block] &= ~np.isnan(splats.opacity_logits[block])
+        kept[block] &= (np.abs(splats.sh[block]) <= BRIGHTEST).all((1, 2))
+        turned[block] = (quats > 1 / FARTHEST).any(1)
+    if not (turned | ~kept).all():
+        quats = np.where((turned | ~kept)[:, None], splats.quats, np.array([1, 0, 0, 0], np.float32))
+        splats = replace(splats, quats=quats)
+    if kept.all():
+        return splats
+    left_out = np.count_nonzero(~kept)
+    warn(f"{left_out:,} splats of {path} have values that are no numbers, or too large to draw: left out.")
+    return splats.select(kept)
 
 
 def _smoothed(

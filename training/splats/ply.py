@@ -7,19 +7,25 @@ coefficients first, then green, then blue), opacity, scale_0..2, rot_0..3 (Kerbl
 from __future__ import annotations
 
 import io
+import os
 import re
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 import numpy as np
-from plyfile import PlyData, PlyListProperty, PlyParseError
+from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
+from ..documents import open_file
 from ..errors import LodgsError
 from ..files import atomic_write
 from .dialects import Warn, as_3dgs, meta_of, refuse, silent
 from .gaussians import Splats
 
+MOST_HEADER, MOST_COLUMNS = 1 << 20, 1000
+"""Most bytes of a header, and most columns of all elements; ours have 70 columns a level."""
 NORMALS = ("nx", "ny", "nz")
 # PLY names its types as C does; viewers know no others.
 _TYPES = {
@@ -138,10 +144,12 @@ def splats_from(rows: np.ndarray, path: str | Path) -> Splats:
         name: np.empty(len(rows), rows.dtype[name].newbyteorder("=")) for name in names if name not in columns
     }
     moves = [(column, np.asarray(rows[name])) for name, column in (columns | extras).items()]
-    for block in _blocks(len(rows)):
-        for column, source in moves:
-            column[block] = source[block]
-    if not any(extras[name].any() for name in NORMALS if name in extras):
+    with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite or no number is left out later
+        for block in _blocks(len(rows)):
+            for column, source in moves:
+                column[block] = source[block]
+        meant = any(extras[name].any() for name in NORMALS if name in extras)
+    if not meant:
         extras = {name: column for name, column in extras.items() if name not in NORMALS}
     splats.extras = extras
     return splats
@@ -150,16 +158,49 @@ def splats_from(rows: np.ndarray, path: str | Path) -> Splats:
 def read_elements(path: str | Path) -> tuple[dict[str, np.ndarray], list[str]]:
     """Elements of a PLY as structured rows (memory-mapped when binary), and its comments in order.
 
+    Elements without columns are passed over. So is everything from the first list on, such as a mesh's
+    faces: where a list ends stands in its rows alone, and no splats are made of any.
+
     Raises:
         LodgsError: not a PLY, no ``vertex`` of splats, a dialect that cannot be read, or cut short.
     """
     path = Path(path)
-    _check_header(path)
-    try:
-        data = PlyData.read(str(path))
-    except (PlyParseError, ValueError, MemoryError) as error:
-        raise LodgsError(f"{path} is damaged: {error}.", "Export or copy it again.") from error
-    return {element.name: element.data for element in data.elements}, _comments(data)
+    with open_file(path) as file:
+        header, counts = _read_header(file, path)
+        begin, size = file.tell(), os.fstat(file.fileno()).st_size
+        found: list[tuple[str, np.dtype, int]] = []
+        for element, count in zip(header.elements, counts, strict=True):
+            if count and _has_lists(element):
+                break
+            if element.properties:
+                kinds = [(column.name, column.dtype(header.byte_order)) for column in element.properties]
+                found.append((element.name, np.dtype(kinds), count))
+        if "vertex" not in (name for name, _, _ in found):
+            raise LodgsError(f"{path} has lists before its vertices.", "Choose a .ply of Gaussian splats.")
+        if header.text:
+            return _read_text(file, found, size - begin, path), _comments(header)
+        promised = begin + sum(count * row.itemsize for _, row, count in found)
+        if size < promised:
+            raise LodgsError(
+                f"{path} is cut short: {promised - size} of its {promised} bytes are missing.",
+                "Export or copy it again.",
+            )
+        elements: dict[str, np.ndarray] = {}
+        for name, row, count in found:
+            mapped = np.memmap(file, row, "c", begin, (count,)) if count else np.empty(0, row)
+            elements[name] = mapped
+            begin += count * row.itemsize
+    return elements, _comments(header)
+
+
+def read_comments(path: str | Path) -> list[str]:
+    """The comments of a PLY of splats, in the time that its header takes.
+
+    Raises:
+        LodgsError: not a PLY, no ``vertex`` of splats, or a dialect that cannot be read.
+    """
+    with open_file(path) as file:
+        return _comments(_read_header(file, Path(path))[0])
 
 
 def write_elements(path: str | Path, elements: Iterable[Element], comments: Sequence[str] = ()) -> None:
@@ -204,49 +245,79 @@ def _header_of(element: Element) -> list[str]:
     return lines
 
 
-def _check_header(path: Path) -> None:
-    """Raise a LodgsError unless the header is that of splats and the file as long as the header promises."""
-    try:
-        with open(path, "rb") as file:
-            start = file.read(1 << 20)
-            size = file.seek(0, io.SEEK_END)
-    except OSError as error:
-        raise LodgsError(
-            f"{path} could not be read: {error.strerror}.", "Check the path and its rights."
-        ) from error
-    if not re.match(rb"ply[ \t]*[\r\n]", start):
+def _read_header(file: IO[bytes], path: Path) -> tuple[PlyData, list[int]]:
+    """The header of a PLY of splats, with no rows, and the rows that each element should have.
+
+    The file is left where the rows begin.
+
+    Raises:
+        LodgsError: as `read_comments`.
+    """
+    start = file.read(MOST_HEADER)
+    begin = re.match(rb"ply[ \t]*(\r\n|\n|\r)", start)
+    if begin is None:
         raise LodgsError(f"{path} is not a PLY file.", "Choose a .ply of Gaussian splats.")
     end = re.search(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)", start)
     if end is None:
+        if len(start) == MOST_HEADER:
+            raise LodgsError(
+                f"{path} has a header of more than {MOST_HEADER:,} bytes.",
+                "Export it again, with less in it.",
+            )
         raise LodgsError(f"{path} is cut short: its header does not end.", "Export or copy it again.")
-    counts = [
-        int(count) for count in re.findall(rb"(?m)^[ \t]*element[ \t]+\S+[ \t]+(\d+)", start[: end.end()])
-    ]
-    # plyfile reads headers only together with the data; a header that promises no rows has none.
-    without_rows = re.sub(rb"(?m)^([ \t]*element[ \t]+\S+[ \t]+)\d+", rb"\g<1>0", start[: end.end()])
+    file.seek(end.end())
+    lines = start[: end.end()].decode("ascii", "replace").split(begin[1].decode())
+    counts: list[int] = []
     try:
-        header = PlyData.read(io.BytesIO(without_rows))
+        for place, line in enumerate(lines):
+            match line.split():
+                case ["element", name, *count]:
+                    if len(count) != 1 or not re.fullmatch("[0-9]{1,15}", count[0]):
+                        raise ValueError(f"{line[:200]!r} says no number of rows")
+                    counts.append(int(count[0]))
+                    lines[place] = f"element {name} 0"  # plyfile reads a header only together with rows
+        if sum(line.lstrip().startswith("property") for line in lines) > MOST_COLUMNS:
+            raise ValueError(f"it has more than {MOST_COLUMNS:,} columns")
+        header = PlyData.read(io.BytesIO("\n".join(lines).encode("ascii", "replace")))
     except (PlyParseError, ValueError) as error:
-        raise LodgsError(f"{path} has a damaged header: {error}.", "Export or copy it again.") from error
+        raise LodgsError(
+            f"{path} has a damaged header: {str(error)[:300]}.", "Export or copy it again."
+        ) from error
     if "vertex" not in header:
         raise LodgsError(f"{path} has no element vertex.", "Choose a .ply of Gaussian splats.")
     vertex = header["vertex"]
-    if any(isinstance(column, PlyListProperty) for column in vertex.properties):
+    if _has_lists(vertex):
         raise LodgsError(f"{path} has lists in its vertices.", "Choose a .ply of Gaussian splats.")
     refuse([column.name for column in vertex.properties], _comments(header), path)
     splats_from(vertex.data, path)
-    lists = any(
-        isinstance(column, PlyListProperty) for element in header.elements for column in element.properties
-    )
-    if header.text or lists:
-        return  # only reading tells how long these should be
-    rows = zip(header.elements, counts, strict=True)
-    promised = end.end() + sum(element.dtype().itemsize * count for element, count in rows)
-    if size < promised:
-        raise LodgsError(
-            f"{path} is cut short: {promised - size} of its {promised} bytes are missing.",
-            "Export or copy it again.",
-        )
+    return header, counts
+
+
+def _read_text(
+    file: IO[bytes], found: list[tuple[str, np.dtype, int]], size: int, path: Path
+) -> dict[str, np.ndarray]:
+    """The rows of elements (name, row, count) of a PLY in ASCII, which take so many bytes at most."""
+    try:
+        if (
+            sum(count * 2 * len(row.names or ()) for _, row, count in found) > size + 1
+        ):  # a digit and a space each
+            raise ValueError("it is too short for its rows")
+        elements: dict[str, np.ndarray] = {}
+        lines = io.TextIOWrapper(file, "ascii", "replace")
+        for name, row, count in found:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of a file that ends here: its rows are counted
+                rows = np.loadtxt(lines, row, comments=None, ndmin=1, max_rows=count) if count else []
+            if len(rows) != count:
+                raise ValueError(f"{count - len(rows):,} of {count:,} rows of {name} are missing")
+            elements[name] = np.asarray(rows, row)
+    except (ValueError, OverflowError) as error:
+        raise LodgsError(f"{path} is damaged: {str(error)[:300]}.", "Export or copy it again.") from error
+    return elements
+
+
+def _has_lists(element: PlyElement) -> bool:
+    return any(isinstance(column, PlyListProperty) for column in element.properties)
 
 
 def _comments(data: PlyData) -> list[str]:

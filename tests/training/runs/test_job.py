@@ -66,6 +66,24 @@ def test_one_number_serves_every_level_and_fewer_levels_keep_the_finest():
         ('scene = "a"\nout = "b"\n[parameters]\nmax_splats = true\n', "max_splats = True"),
         ('scene = "a"\nout = "b"\n[parameters]\nrejoin_points = 1\n', "rejoin_points = 1"),
         ("scene = \n", "is not valid"),
+        ('scene = "a"\nout = "b"\nexposure = nan\n', "exposure = nan is not a finite number"),
+        ('scene = "a"\nout = "b"\nexposure = 33\n', "exposure = 33 is not possible"),
+        ('scene = "a"\nout = "b"\nexposure = true\n', "exposure = True is not a number"),
+        ('scene = "a"\nout = "b"\nseed = true\n', "seed = True is not a whole number"),
+        ('scene = "a"\nout = "b"\nseed = 2147483648\n', "seed = 2147483648"),
+        (
+            'scene = "a"\nout = "b"\nmethod = ["flod"]\n',
+            r"method = \['flod'\] is not a text",
+        ),
+        ('scene = "a"\nout = "b"\npreset = {}\n', "preset = {} is not a text"),
+        ('scene = "a"\nout = "b"\nparameters = 3\n', "parameters = 3 is not a table"),
+        ('scene = "a\\u0000b"\nout = "b"\n', "scene holds characters that are none"),
+        ('scene = "a"\nout = "b"\n[parameters]\nlr_sh = 1e300\n', "lr_sh = 1e\\+300 is more than any use"),
+        (
+            'scene = "a"\nout = "b"\n[parameters]\nmax_splats = 2147483648\n',
+            "max_splats = 2147483648 is more",
+        ),
+        ("[" * 2000, "is not valid"),
     ],
 )
 def test_mistakes_are_named(tmp_path, text, said):

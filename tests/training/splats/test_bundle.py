@@ -83,12 +83,17 @@ def test_reads_back_bit_for_bit(tmp_path, bundle, same, order, cumulative):
 
 
 def test_unusual_bits_survive(tmp_path, bundle):
-    """NaN payloads, infinities, negative zeros and denormals are values like others."""
-    bits = np.array([0x7FC01234, 0xFF800000, 0x80000000, 0x00000001], np.uint32)
-    bundle.levels[2].splats.means.reshape(-1)[:4] = bits.view("f4")
+    """Negative zeros and denormals are values like others; NaN payloads and infinities are in columns."""
+    bits = np.array([0x80000000, 0x00000001, 0x7FC01234, 0xFF800000], np.uint32)
+    finest = bundle.levels[2].splats
+    finest.means.reshape(-1)[:2] = bits[:2].view("f4")
+    finest.opacity_logits[0] = finest.log_scales[1, 2] = -np.inf  # clear; flat
+    finest.extras["odd"] = np.resize(bits, len(finest)).view("f4")
     write_bundle(tmp_path / "b.ply", bundle)
-    back = read_bundle(tmp_path / "b.ply").levels[2].splats.means
-    np.testing.assert_array_equal(back.reshape(-1)[:4].view(np.uint32), bits)
+    back = read_bundle(tmp_path / "b.ply").levels[2].splats
+    for name in ("means", "opacity_logits", "log_scales"):
+        assert getattr(back, name).tobytes() == getattr(finest, name).tobytes()
+    assert back.extras["odd"].tobytes() == finest.extras["odd"].tobytes()
 
 
 def test_plyfile_finds_the_finest_level_first(tmp_path, bundle):
@@ -247,6 +252,16 @@ def test_a_bundle_cut_short_says_what_is_missing(tmp_path, bundle, missing):
         (b'"camera_center":[', b'"camera_center":[NaN,0,0],"was":['),
         (b'"camera_center":[', b'"camera_center":["1","2","3"],"was":['),
         (b'"facts":{},', b'"facts":' + b"[" * 5000 + b","),
+        (b'"facts":{},', b'"facts":{"a":1' + b"0" * 400 + b"},"),
+        (b'"facts":{},', b'"facts":{"a":1e31},'),
+        (b'"facts":{},', b'"facts":{"a":true},'),
+        (b'"facts":{},', b'"facts":["a"],'),
+        (b'"v":2,', b'"v":2.0,'),
+        (b'"v":2,', b'"v":[2],'),
+        (b'"v":2,"method":"flod"', b'"v":2,"method":["flod"]'),
+        (b'"camera_center":[', b'"camera_center":[1e13,0,0],"was":['),
+        (b'"count":20,', b'"count":-20,'),
+        (b'"count":20,', b'"count":20.0,'),
     ],
 )
 def test_a_header_that_contradicts_itself_is_one_sentence(tmp_path, bundle, old, new):
@@ -255,7 +270,7 @@ def test_a_header_that_contradicts_itself_is_one_sentence(tmp_path, bundle, old,
     assert data.count(old) == 1
     (tmp_path / "b.ply").write_bytes(data.replace(old, new))
     with pytest.raises(
-        LodgsError, match=r"b\.ply (describes its levels|is a bundle of the newer version 99)"
+        LodgsError, match=r"b\.ply (describes its levels|is not valid|is a bundle of the newer version 99)"
     ):
         read_bundle(tmp_path / "b.ply")
 
@@ -320,6 +335,66 @@ def test_folder_reads_back_and_its_manifest_tells_the_truth(tmp_path, bundle, sa
     check_same(bundle, read_folder(tmp_path / "f"), same)
 
 
+def test_a_folder_that_is_replaced_keeps_no_level_of_before_and_all_that_is_not_ours(tmp_path, bundle):
+    write_folder(tmp_path, bundle)
+    others = ["lod9.txt", "lod.ply", "my_lod7.ply", "lod2_old.ply", "scene.ply"]
+    for name in others:
+        (tmp_path / name).write_text("mine")
+    write_folder(tmp_path, Bundle("flod", bundle.levels[1:], meta=bundle.meta))
+    assert sorted(x.name for x in tmp_path.iterdir()) == sorted(
+        [*others, "lod0.ply", "lod1.ply", "manifest.json"]
+    )
+    assert [level.number for level in read_folder(tmp_path).levels] == [2, 3]
+
+
+def test_a_folder_that_cannot_be_written_whole_stays_as_it_was(tmp_path, bundle, monkeypatch):
+    write_folder(tmp_path, bundle)
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    bundle.levels[1].splats.extras["two words"] = np.zeros(20)  # of which no PLY can be made
+    for level in bundle.levels:
+        level.splats.extras["two words"] = np.zeros(len(level.splats), "f4")
+    with pytest.raises(LodgsError, match="two words"):
+        write_folder(tmp_path, Bundle("flod", bundle.levels[1:]))
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
+
+
+def test_a_level_of_another_export_is_told(tmp_path, bundle, make_splats):
+    write_folder(tmp_path, bundle)
+    write_ply(tmp_path / "lod1.ply", make_splats(19))
+    with pytest.raises(LodgsError, match="level 2 should have 20 splats"):
+        read_folder(tmp_path)
+
+
+def test_an_element_serves_one_level_or_table_and_levels_are_few(tmp_path, bundle, make_splats):
+    """A header's line costs a few bytes, and must not cost the memory of an element each."""
+    bundle.tables = {"a": {"x": np.zeros(7, "f4")}, "b": {"x": np.zeros(7, "f4")}}
+    write_bundle(tmp_path / "b.ply", bundle)
+    data = (tmp_path / "b.ply").read_bytes()
+    for old, new in (
+        (b'"table":"b","element":"lod_b"', b'"table":"a","element":"lod_a"'),
+        (b'"table":"b","element":"lod_b"', b'"table":"2_vertex","element":"lod_2_vertex"'),
+        (b'"table":"b"', b'"table":"c"'),
+        (b'"extras":"lod_extra_2"', b'"extras":"lod_2_vertex"'),
+    ):
+        assert old in data
+        (tmp_path / "c.ply").write_bytes(data.replace(old, new))
+        with pytest.raises(LodgsError, match=r"c\.ply describes its levels"):
+            read_bundle(tmp_path / "c.ply")
+    levels = [Level(number, make_splats(0, 0)) for number in range(1, 66)]
+    for number in range(65):
+        write_ply(tmp_path / "many" / f"lod{number}.ply", levels[0].splats)
+    with pytest.raises(LodgsError, match="65 levels"):
+        read_folder(tmp_path / "many")
+
+
+def test_bounds_of_means_that_are_no_numbers_are_those_of_the_others(tmp_path, bundle):
+    bundle.levels[0].splats.means[0, 1] = np.nan
+    expected = bundle.levels[0].splats.means[1:]
+    write_folder(tmp_path, bundle)
+    bounds = json.loads((tmp_path / "manifest.json").read_text())["levels"][2]["bounds"]
+    assert bounds == [expected.min(0).tolist(), expected.max(0).tolist()]
+
+
 def test_folder_of_a_cumulative_bundle_holds_complete_scenes_and_reads_back(tmp_path, bundle, same):
     bundle.cumulative = True
     for level in bundle.levels:
@@ -369,7 +444,7 @@ def test_folder_without_levels(tmp_path):
         read_folder(tmp_path)
     for text in ('{"v": 1, "levels": [{}]}', '{"v": 1, "method": "", "meta": {}, "levels": []}', "[]", "{"):
         (tmp_path / "manifest.json").write_text(text)
-        with pytest.raises(LodgsError, match=r"manifest\.json describes its levels"):
+        with pytest.raises(LodgsError, match=r"manifest\.json (describes its levels|is not valid)"):
             read_folder(tmp_path)
 
 

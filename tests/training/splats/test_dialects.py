@@ -245,11 +245,35 @@ def test_splats_that_are_no_numbers_are_left_out(write):
     assert len(warnings) == 1 and warnings[0].startswith("5 splats of ")
 
 
-def test_our_own_levels_keep_every_row(tmp_path, make_splats, same):
-    """Where levels add up, rows are counted: nothing of what we wrote is left out."""
-    splats = make_splats(5, 1)
-    splats.opacity_logits[2] = splats.sh[3, 0, 0] = np.nan
-    write_bundle(tmp_path / "b.ply", Bundle("flod", [Level(1, splats)]))
-    assert same(splats, read_bundle(tmp_path / "b.ply").levels[0].splats)
-    write_folder(tmp_path / "f", Bundle("flod", [Level(1, splats)]))
-    assert same(splats, read_folder(tmp_path / "f").levels[0].splats)
+@pytest.mark.parametrize("cumulative", [False, True])
+def test_of_our_own_levels_too_and_the_others_stay_in_their_level(tmp_path, make_splats, same, cumulative):
+    """Where levels add up, a file's rows are counted before any is left out."""
+    coarse, fine = make_splats(5, 1), make_splats(7, 1, mark=np.arange(7, dtype="u1"))
+    coarse.opacity_logits[2] = coarse.sh[3, 0, 0] = fine.quats[0, 1] = np.nan
+    coarse.extras["mark"] = np.arange(5, dtype="u1")
+    bundle = Bundle("octree", [Level(1, coarse), Level(2, fine)], cumulative=cumulative)
+    write_bundle(tmp_path / "b.ply", bundle)
+    write_folder(tmp_path / "f", bundle)
+    for read, path in ((read_bundle, tmp_path / "b.ply"), (read_folder, tmp_path / "f")):
+        warnings = []
+        levels = read(path, warnings.append).levels
+        assert same(coarse.select([0, 1, 4]), levels[0].splats)
+        assert same(fine.select(slice(1, None)), levels[1].splats)
+        assert sorted(text.split(" splats of ")[0] for text in warnings) == ["1", "2"]
+
+
+def test_splats_too_large_for_single_precision_are_left_out(write):
+    """Squares of places, sizes and rotations must be finite, sums of colours too; faint and far ones stay."""
+    count = 10
+    values = {name: np.zeros(count) for name in PLAIN} | {"rot_0": np.ones(count)}
+    values["x"] = 10.0 ** np.arange(count)
+    values["y"][0] = values["rot_3"][1] = values["f_dc_0"][2] = 1e30
+    values["scale_0"][3] = 44.5  # its square is infinite
+    values["rot_0"][4] = 1e-30  # its square is zero: a rotation that nobody can norm is none
+    values["opacity"][5] = -1e30
+    values["f_dc_1"][6] = -1e5
+    splats = read_ply(write(PLAIN, values, count=count))
+    np.testing.assert_array_equal(splats.means[:, 0], 10.0 ** np.arange(4, count, dtype="f4"))
+    assert splats.quats[0].tolist() == [1, 0, 0, 0]
+    variance = np.exp(splats.log_scales) ** 2
+    assert np.isfinite(variance).all() and np.isfinite(splats.means**2).all()

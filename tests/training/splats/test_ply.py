@@ -7,9 +7,9 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from training.errors import LodgsError
-from training.splats.ply import read_ply, write_ply
+from training.splats.ply import read_elements, read_ply, splats_from, write_ply
 
-# Degree 1, two splats; value = 100 * splat + place of the column.
+# Degree 1, two splats; value = splat / 2 + place of the column.
 GOLDEN_COLUMNS = [
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
     *(
@@ -28,7 +28,7 @@ GOLDEN_COLUMNS = [
 
 
 def golden_values(splat):
-    return [0.0 if name in ("nx", "ny", "nz") else 100.0 * splat + i for i, name in enumerate(GOLDEN_COLUMNS)]
+    return [0.0 if name in ("nx", "ny", "nz") else 0.5 * splat + i for i, name in enumerate(GOLDEN_COLUMNS)]
 
 
 def header(kind="binary_little_endian", columns=GOLDEN_COLUMNS, count=2):
@@ -42,7 +42,7 @@ GOLDEN = header() + struct.pack("<52f", *golden_values(0), *golden_values(1))
 def check_golden(splats):
     """The columns by hand: places 0-2 means, 6-8 DC, 9-17 rest by channel, 18 opacity, 19-21, 22-25."""
     for i in range(2):
-        o = 100.0 * i
+        o = 0.5 * i
         assert splats.means[i].tolist() == [o, o + 1, o + 2]
         assert splats.sh[i].tolist() == [
             [o + 6, o + 7, o + 8],
@@ -173,7 +173,18 @@ def test_a_selection_is_written_as_it_is(tmp_path, make_splats):
         (header().replace(b"float z", b"quad z"), "damaged header"),
         (header().replace(b"element vertex", b"element point") + bytes(208), "no element vertex"),
         (header().replace(b"property float x", b"property list uchar int x"), "lists in its vertices"),
-        (header("ascii") + b"1 2 3\n", "is damaged"),
+        (header("ascii") + b"1 2 3\n", "is damaged: it is too short"),
+        (header("ascii") + b"1 2 3\n" * 26, "is damaged: .* requires 26 columns"),
+        (header("ascii") + b"1 " * 25 + b"one\n" + b"2 " * 26, "is damaged: could not convert"),
+        (header("ascii") + b"1 " * 26 + b"\n" * 60, "is damaged: 1 of 2 rows of vertex are missing"),
+        (header(count="-0") + bytes(208), "damaged header: 'element vertex -0'"),
+        (header(count="2 2") + bytes(208), "damaged header"),
+        (header(count="9" * 5000) + bytes(208), "damaged header"),
+        (header(count=2**60) + bytes(208), "damaged header"),
+        (header(count=10**14), "cut short: [0-9]+ of its [0-9]+ bytes are missing"),
+        (header("ascii", count=10**14) + bytes(208), "is damaged: it is too short"),
+        (header(columns=[f"c{i}" for i in range(1001)]), "damaged header: it has more than 1,000 columns"),
+        (header()[:-11] + b"comment " + b"x" * (1 << 20), "has a header of more than 1,048,576 bytes"),
     ],
 )
 def test_a_bad_file_is_one_sentence(tmp_path, content, sentence):
@@ -181,6 +192,49 @@ def test_a_bad_file_is_one_sentence(tmp_path, content, sentence):
     with pytest.raises(LodgsError, match=sentence) as caught:
         read_ply(tmp_path / "a.ply")
     assert "a.ply" in caught.value.what and caught.value.remedy
+
+
+FACES = b"element face %d\nproperty list uchar int vertex_indices\n"
+
+
+@pytest.mark.parametrize("kind", ["binary_little_endian", "ascii"])
+def test_lists_are_not_read_however_many_are_promised(tmp_path, kind):
+    """No splats are made of faces; to read 10^8 lists one by one would take minutes."""
+    text = "\n".join(" ".join(map(str, golden_values(i))) for i in range(2)).encode() + b"\n"
+    body = text if kind == "ascii" else GOLDEN[len(header()) :]
+    head = header(kind)
+    behind = head.replace(b"end_header", FACES % 10**8 + b"end_header") + body
+    (tmp_path / "a.ply").write_bytes(behind)
+    check_golden(read_ply(tmp_path / "a.ply"))
+    empty = head.replace(b"element vertex", FACES % 0 + b"element vertex") + body
+    (tmp_path / "a.ply").write_bytes(empty)
+    check_golden(read_ply(tmp_path / "a.ply"))
+    (tmp_path / "a.ply").write_bytes(
+        head.replace(b"element vertex", FACES % 10**8 + b"element vertex") + body
+    )
+    with pytest.raises(LodgsError, match="lists before its vertices"):
+        read_ply(tmp_path / "a.ply")
+
+
+def test_ascii_of_several_elements_with_any_line_ends(tmp_path):
+    text = (
+        " ".join(map(str, golden_values(0))) + "\n\n" + " ".join(map(str, golden_values(1))) + "\n7\n8\n9\n"
+    )
+    other = b"element other 1\nproperty int a\nelement none 3\nelement third 2\nproperty uchar b\nend_header"
+    data = header("ascii").replace(b"end_header", other) + text.encode()
+    for ends in (b"\n", b"\r\n", b"\r"):
+        (tmp_path / "a.ply").write_bytes(data.replace(b"\n", ends))
+        elements, _ = read_elements(tmp_path / "a.ply")
+        check_golden(splats_from(elements["vertex"], "a"))
+        assert (elements["other"]["a"].tolist(), elements["third"]["b"].tolist()) == ([7], [8, 9])
+        assert list(elements) == ["vertex", "other", "third"]
+
+
+def test_comments_in_other_letters_are_passed_over(tmp_path):
+    (tmp_path / "a.ply").write_bytes(
+        GOLDEN.replace(b"end_header", "comment von Jürgen\nend_header".encode(), 1)
+    )
+    check_golden(read_ply(tmp_path / "a.ply"))
 
 
 def test_a_missing_file_is_one_sentence(tmp_path):

@@ -1,0 +1,72 @@
+"""The doors of jobs: files in TOML and JSON, and what the command line sets."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import asdict
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.fuzz.doors import attempt
+from tests.fuzz.mutations import ODD_VALUES, spoiled, spoiled_value
+from training.methods import METHODS
+from training.runs.job import Job
+from training.runs.options import add_options, job_from
+
+JOBS = [
+    asdict(Job.from_dict({"scene": "/scene", "out": "/run", "method": method, "seed": 3}).resolved())
+    for method in METHODS
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("jobs")
+
+
+@pytest.fixture(scope="module")
+def texts(folder) -> dict[str, list[bytes]]:
+    """Jobs as their two kinds of files have them."""
+    toml = []
+    for values in JOBS:
+        Job.from_dict(values).write(folder / "good.toml")
+        toml.append((folder / "good.toml").read_bytes())
+    return {".toml": toml, ".json": [json.dumps(values).encode() for values in JOBS]}
+
+
+def check(path, given: object) -> None:
+    """A job that is taken can be written, and says the same again."""
+    if job := attempt("job", lambda: Job.from_file(path).resolved(), given):
+        job.write(path.with_name("again.toml"))
+        assert Job.from_file(path.with_name("again.toml")) == job
+
+
+@pytest.mark.cases(short=150, weight=2)
+@given(data=st.data(), suffix=st.sampled_from([".toml", ".json"]))
+def test_job_files(folder, texts, data, suffix):
+    text = data.draw(spoiled(texts[suffix]))
+    path = folder / f"job{suffix}"
+    path.write_bytes(text)
+    check(path, text)
+
+
+@pytest.mark.cases(short=150, weight=2)
+@given(values=st.sampled_from(JOBS).flatmap(spoiled_value))
+def test_jobs_with_odd_values(folder, values):
+    path = folder / "values.json"
+    path.write_text(json.dumps(values))
+    check(path, values)
+
+
+@given(
+    name=st.sampled_from(sorted(JOBS[0]["parameters"])),
+    value=st.one_of(ODD_VALUES.map(json.dumps), st.text(max_size=20)),
+)
+def test_parameters_of_the_command_line(name, value):
+    parser = argparse.ArgumentParser()
+    add_options(parser)
+    chosen = parser.parse_args(["--scene", "s", "--out", "o", "--set", f"{name}={value}"])
+    attempt("--set", lambda: job_from(chosen).resolved(), value)
