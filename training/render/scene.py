@@ -59,17 +59,20 @@ class SplatSet:
         matrix = matrix.to(own.means.device)
         linear = matrix[:3, :3]
         means = (own.means.double() @ linear.T + matrix[:3, 3]).float()
-        # an ellipsoid's axes A = L Q diag(s) stay no axes where L is no similarity: those of A Aᵀ are
-        axes = linear @ rotation_matrices(own.quats.double()) * own.log_scales.double().exp()[:, None]
+        turned, lengths = rotation_matrices(own.quats.double()), own.log_scales.double().exp()
         if similarity(matrix.cpu().numpy()):
-            lengths = axes.norm(dim=1).clamp_min(1e-30)
-            turned = axes / lengths[:, None]
+            unit = torch.linalg.det(linear) ** (1 / 3)
+            turned, lengths = linear @ turned / unit, lengths * unit
         else:
-            turned, lengths, _ = torch.linalg.svd(axes)
+            # an ellipsoid's axes A = L Q diag(s) stay no axes then: those of A Aᵀ are
+            turned, lengths, _ = torch.linalg.svd(linear @ turned * lengths[:, None])
             turned = turned * torch.linalg.det(turned).sign()[:, None, None]
         quats = Rotation.from_matrix(turned.cpu().numpy()).as_quat()[:, [3, 0, 1, 2]]
         return replace(
-            own, means=means, quats=torch.from_numpy(quats).to(means), log_scales=lengths.log().float()
+            own,
+            means=means,
+            quats=torch.from_numpy(quats).to(means),
+            log_scales=lengths.clamp_min(1e-30).log().float(),
         )
 
     def colours(self, matrix: np.ndarray, eye: np.ndarray) -> torch.Tensor:

@@ -38,9 +38,8 @@ from ..errors import LodgsError, out_of_memory
 from ..evaluate.metrics import psnr
 from ..rasterize import resolve
 from ..runs.folder import event_line
-from ..scenes.cameras import FARTHEST
 from ..scenes.images import load_image
-from ..splats.gaussians import Splats
+from ..splats.dialects import drawable
 from . import wire
 from .picture import read_depth
 from .requests import Cancel, FrameRequest, NamedSet, frame_of, read_line, read_request
@@ -164,23 +163,12 @@ class _Server:
     def _read_set(self, frame: int, one: NamedSet) -> SplatSet:
         """A set from its file, without what cannot be drawn."""
         splats, weights = wire.read_set(self._folder / one.file, one.count)
-        kept = _drawable(splats) & np.isfinite(weights)
-        if not kept.all():
-            what = "have values that are no numbers, or too large to draw: left out."
-            self.say("warning", frame=frame, message=f"{np.sum(~kept):,} splats {what}")
-            splats, weights = splats.select(kept), weights[kept]
-        return SplatSet(splats, weights, self._backend)
+        splats.extras["weight"] = np.nan_to_num(weights)
+        splats = drawable(splats, "the scene", lambda text: self.say("warning", frame=frame, message=text))
+        return SplatSet(splats, splats.extras["weight"], self._backend)
 
     def _end(self) -> None:
         """Clean up and go, whatever the other threads are at."""
         wire.release(self._folder)
         sys.stderr.flush()
         os._exit(0)
-
-
-def _drawable(splats: Splats) -> np.ndarray:
-    """Which splats have a place, a shape and a colour, (N,); opacities may be infinite as logits, sizes 0."""
-    placed = (np.abs(splats.means) <= FARTHEST).all(1) & ~np.isnan(splats.opacity_logits)
-    shaped = np.isfinite(splats.quats).all(1) & splats.quats.any(1)
-    sized = (splats.log_scales <= np.log(FARTHEST)).all(1)
-    return placed & shaped & sized & np.isfinite(splats.sh).all((1, 2))

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from ..documents import printable
 from ..errors import LodgsError
 from .cameras import Camera, read_camera
 from .images import image_size
@@ -32,6 +33,9 @@ def read_aside(scene: Path) -> list[Camera]:
         except LodgsError as error:
             raise LodgsError(f"The picture that {path} names cannot be taken: {error.what}") from error
         if image is None:
-            raise LodgsError(f"{path} names no picture beside it.", 'Give its file name as "name".')
+            raise LodgsError(
+                f"{path.with_name(printable(camera.name)[:200])} cannot be read: there is no such file.",
+                f"{path.name} names it.",
+            )
         found.append(replace(camera.resized(*image_size(image)), image=image))
     return found

@@ -190,7 +190,7 @@ def camera_from_dict(values: dict) -> tuple[Camera, float]:
     except KeyError as error:
         raise LodgsError(f"The camera lacks {error}.", remedy) from error
     except (TypeError, ValueError, OverflowError, AttributeError) as error:
-        raise LodgsError(f"The camera is not valid: {error}.", remedy) from error
+        raise LodgsError(f"The camera is not valid: {str(error)[:200]}.", remedy) from error
     if camera.world_to_camera.shape != (4, 4):
         raise LodgsError("The camera's world_to_camera is no 4x4 matrix of numbers.", remedy)
     if not (0 < camera.width <= LARGEST and 0 < camera.height <= LARGEST):

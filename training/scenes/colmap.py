@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..documents import ascii_path
+from ..documents import printable
 from ..errors import LodgsError
 from .cameras import FARTHEST, Camera
 from .images import image_size
@@ -250,8 +250,8 @@ def _absolute(path: Path | str) -> Path:
         LodgsError: it is no text, so that neither jobs nor Blender could name it.
     """
     path = Path(os.path.abspath(path))
-    if ascii_path(path) != str(path):
-        raise LodgsError(f"The path {ascii_path(path)} is not UTF-8.", "Give its folders other names.")
+    if printable(path) != str(path):
+        raise LodgsError(f"The path {printable(path)} is not UTF-8.", "Give its folders other names.")
     return path
 
 
@@ -356,7 +356,7 @@ def _told(left_out: Sequence[tuple[str, str]]) -> list[str]:
 
 def _shown(name: str) -> str:
     """A view's name for a message: any text, and not too long."""
-    return ascii_path(name if len(name) <= 200 else f"{name[:200]}...")
+    return printable(name if len(name) <= 200 else f"{name[:200]}...")
 
 
 def _astray(points: np.ndarray, cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:

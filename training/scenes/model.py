@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..documents import ascii_path, open_file
+from ..documents import open_file, printable
 from ..errors import LodgsError
 
 DAMAGED = "Copy the model again, or write it anew with COLMAP's model_converter."
@@ -232,7 +232,7 @@ def _pose(name: bytes, camera_id: int, pose: list[float]) -> Pose:
     quaternion, translation = np.array(pose[:4]), np.array(pose[4:])
     text = name.decode("utf-8", "surrogateescape")
     if not (np.isfinite(pose).all() and quaternion.any()):
-        raise ValueError(f"image {ascii_path(text)} has no pose")
+        raise ValueError(f"image {printable(text)} has no pose")
     # by a power of two, which rounds nothing, so that no square overflows
     quaternion = np.ldexp(quaternion, -np.frexp(np.abs(quaternion).max())[1])
     w, x, y, z = quaternion / np.linalg.norm(quaternion)

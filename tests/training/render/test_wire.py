@@ -76,9 +76,10 @@ def test_a_request_is_what_was_asked(good, camera):
 @pytest.mark.parametrize(
     "change",
     [
-        {"cancel": {}}, {"cancel": True}, {"frame": "1"}, {"frame": None}, {"out": "../x"}, {"out": ".lodgs-renderer"},
+        {"cancel": {}}, {"cancel": True}, {"frame": "1"}, {"frame": None}, {"out": "../x"}, {"out": ".x"},
         {"out": ""}, {"out": 3}, {"camera": []}, {"sets": {}}, {"sets": [3]}, {"sets": None},
-        {"background": [1, 2]}, {"background": [1, 2, 1e30]}, {"background": "red"}, {"background": [True] * 3},
+        {"background": [1, 2]}, {"background": [1, 2, 1e30]}, {"background": "red"},
+        {"background": [True] * 3},
         {"window": [0, 0, 65, 1]}, {"window": [0, 0, 0, 0]}, {"window": [0.5, 0, 1, 1]}, {"window": 3},
         {"window": [0, 0, 1, 1], "photograph": "a.png"}, {"holdout": 3}, {"photograph": ["a"]},
     ],
@@ -93,7 +94,8 @@ def test_impossible_requests_are_a_sentence(good, change):
     [
         {"count": -1}, {"count": 1 << 40}, {"count": 1.5}, {"matrix": [[1, 0], [0, 1]]}, {"matrix": 1},
         {"matrix": np.full((4, 4), 1e300).tolist()}, {"matrix": np.ones((4, 4)).tolist()}, {"level": -1},
-        {"level": None}, {"file": "/etc/passwd"}, {"file": "a\0"}, {"file": "C:x"}, {"matrix": [["a"] * 4] * 4},
+        {"level": None}, {"file": "/etc/passwd"}, {"file": "a\0"}, {"file": "C:x"},
+        {"matrix": [["a"] * 4] * 4},
         {"matrix": [[1, 0, 0, [0]], *np.eye(4)[1:].tolist()]},
     ],
 )  # fmt: skip

@@ -143,7 +143,7 @@ def test_a_picture_aside_lies_beside_its_camera(scene):
     write_text_model(scene / "sparse", views("a.png", "b.png"), grid())
     camera = read_scene(scene).cameras[0]
     write_camera(scene / "aside" / "a.json", camera, 0.1)
-    with pytest.raises(LodgsError, match="names no picture"):
+    with pytest.raises(LodgsError, match="there is no such file"):
         read_aside(scene)
     (scene / "aside" / "a.png").write_bytes((scene / "images" / "a.png").read_bytes())
     assert [view.image for view in read_aside(scene)] == [scene / "aside" / "a.png"]
