@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from . import VERSION
-from .errors import LodgsError
+from .errors import LodgsError, out_of_memory
 
 PROGRAM = "lodgs" if __package__ == "lodgs" else "python -m training"
 _INSTALL = "Install the packages of requirements/trainer.txt."
@@ -41,6 +41,11 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     except LodgsError as error:
         print(f"error: {error}", file=sys.stderr)
+        return 2
+    except (MemoryError, RuntimeError) as error:
+        if not out_of_memory(error):
+            raise
+        print("error: There is not enough memory. Close other programs, or ask for less.", file=sys.stderr)
         return 2
     except ModuleNotFoundError:
         if not (problems := _environment()["problems"]):
@@ -118,7 +123,7 @@ def _parser() -> argparse.ArgumentParser:
     capture.add_argument("--backend", default="auto", help="auto, cpu, cuda or reference")
 
     serve = commands.add_parser("serve", help="draw frame after frame for Blender")
-    serve.add_argument("folder", type=Path, help="folder for arrays; removed at the end")
+    serve.add_argument("folder", type=Path, help="folder for arrays, new or empty; removed at the end")
     serve.add_argument("--backend", default="auto", help="auto, cpu, cuda or reference")
 
     info = commands.add_parser("info", help="say what a bundle or any 3DGS PLY holds")
@@ -204,8 +209,10 @@ def _render(chosen: argparse.Namespace) -> int:
     from .lod.rule import find_rule
     from .lod.selection import unknown_rule
     from .render.command import Source, render
-    from .scenes.cameras import read_camera
+    from .scenes.cameras import check_size, read_camera
 
+    if chosen.size:
+        check_size(*chosen.size)
     given = _controls(chosen)
     if (given or chosen.by_distance) and chosen.level:
         raise LodgsError("--level draws one level, the other options levels by distance.", "Choose one.")
@@ -256,7 +263,7 @@ def _warn(message: str) -> None:
 def _serve(chosen: argparse.Namespace) -> int:
     from .render.serve import serve
 
-    return serve(chosen.folder, chosen.backend, sys.stdin, sys.stdout)
+    return serve(chosen.folder, chosen.backend, sys.stdin.buffer, sys.stdout)
 
 
 def _info(chosen: argparse.Namespace) -> int:

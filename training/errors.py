@@ -13,3 +13,13 @@ class LodgsError(Exception):
         super().__init__(f"{what} {remedy}".strip())
         self.what = what
         self.remedy = remedy
+
+
+def out_of_memory(error: BaseException) -> bool:
+    """Whether an exception says that memory does not suffice: Python's, numpy's or torch's, of CPU or GPU."""
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
+        return True
+    return isinstance(error, RuntimeError) and any(words in str(error) for words in _NO_MEMORY)
+
+
+_NO_MEMORY = ("can't allocate memory", "not enough memory", "can't start new thread")

@@ -87,6 +87,7 @@ class Renderer:
         python = environment.trainer_python()
         environment.require(python)
         self._folder = Path(tempfile.mkdtemp(prefix="lodgs-render-", dir=bpy.app.tempdir or None))
+        wire.claim(self._folder)
         self._log = self._folder / "renderer.log"
         self._fresh = True  # the first frame on a computer compiles, for some seconds
         self._known: dict[int, Path] = {}

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import torch
 
+MOST_PSNR = 100.0
+"""What equal images count as, in dB, so that means over views stay numbers."""
+
 
 def to_8_bit(image: torch.Tensor) -> torch.Tensor:
     """Clamped to [0, 1] and rounded to the 256 values that a file holds, still float32."""
@@ -11,10 +14,10 @@ def to_8_bit(image: torch.Tensor) -> torch.Tensor:
 
 
 def psnr(image: torch.Tensor, target: torch.Tensor) -> float:
-    """Peak signal-to-noise ratio in dB of two images (H, W, 3), display-coded; inf when they are equal."""
+    """Peak signal-to-noise ratio in dB of two images (H, W, 3), display-coded; MOST_PSNR at most."""
     from torchmetrics.functional.image import peak_signal_noise_ratio
 
-    return float(peak_signal_noise_ratio(to_8_bit(image), to_8_bit(target), data_range=1.0))
+    return min(float(peak_signal_noise_ratio(to_8_bit(image), to_8_bit(target), data_range=1.0)), MOST_PSNR)
 
 
 def ssim(image: torch.Tensor, target: torch.Tensor) -> float:

@@ -67,7 +67,7 @@ class Source:
             cameras = read_scene(scene)
             there, near = cameras.cameras, cameras.near()
         elif self.run is not None:
-            data = training_data(Job.from_file(self.run.job), self.run)
+            data = training_data(Job.from_file(self.run.job), self.run, pixels=False)
             there, near = data.scene.cameras, data.near
         else:
             raise LodgsError(

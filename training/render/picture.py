@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 from ..errors import LodgsError
 from ..files import atomic_write
 from ..scenes.color import linear_from_srgb
+from ..scenes.exr import read_parts
 from ..scenes.images import write_png
 
 NOTHING = 1e10
@@ -18,6 +20,9 @@ NOTHING = 1e10
 
 _DEPTH = re.compile(r"(.*\.)?depth(\.[a-z])?|z|v", re.IGNORECASE)
 """Names of channels that hold a depth: a layer's Depth.Z or Depth.V, or a file's own Z or V."""
+
+_STRIP = 1 << 20
+"""Pixels that are coded at a time, about."""
 
 _CLEAR = 0.02
 """Part of an 8-bit step that linear colours keep from the borders between two 8-bit values."""
@@ -75,9 +80,11 @@ class Picture:
 
     def eight_bit(self) -> np.ndarray:
         """(H, W, 3) uint8, or (H, W, 4) where something is transparent; colours not multiplied by alpha."""
-        codes = np.concatenate([self._straight(), self.alpha[..., None]], 2).astype(np.float64)
-        codes = np.floor(codes.clip(0, 1) * 255 + 0.5).astype(np.uint8)
-        return codes[..., :3] if (self.alpha == 1).all() else codes
+        codes = np.empty((*self.alpha.shape, 3 if (self.alpha == 1).all() else 4), np.uint8)
+        for rows in self._strips():
+            values = np.concatenate([self._straight(rows), self.alpha[rows, :, None]], 2).astype(np.float64)
+            codes[rows] = np.floor(values.clip(0, 1) * 255 + 0.5)[..., : codes.shape[2]]
+        return codes
 
     def linear(self) -> np.ndarray:
         """(H, W, 4) float32, colours in linear light multiplied by alpha, and alpha.
@@ -86,9 +93,12 @@ class Picture:
         are first moved away, by 0.02 of an 8-bit step at most, from where rounding to 8 bits turns over: so
         whoever codes them again has the 8 bits of :meth:`eight_bit`, however exact their arithmetic is.
         """
-        alpha = _clear(self.alpha[..., None].astype(np.float64)).clip(0, 1)
-        linear = linear_from_srgb(_clear(self._straight().astype(np.float64)).clip(0)) * alpha
-        return np.concatenate([linear, alpha], 2).astype(np.float32)
+        linear = np.empty((*self.alpha.shape, 4), np.float32)
+        for rows in self._strips():
+            alpha = _clear(self.alpha[rows, :, None].astype(np.float64)).clip(0, 1)
+            colours = _clear(self._straight(rows).astype(np.float64)).clip(0)
+            linear[rows, :, :3], linear[rows, :, 3:] = linear_from_srgb(colours) * alpha, alpha
+        return linear
 
     def passes(self) -> dict[str, np.ndarray]:
         """Planes (H, W) by name as Blender calls them: Combined.R to .A, Depth.Z, Level.X, Level 1.X, ..."""
@@ -101,10 +111,16 @@ class Picture:
             planes |= {f"Level {n}.X": mask for n, mask in zip(self.levels, self.masks, strict=True) if n}
         return planes
 
-    def _straight(self) -> np.ndarray:
-        """Colours (H, W, 3) not multiplied by alpha, float32."""
-        alpha = self.alpha[..., None]
-        return np.divide(self.image, alpha, out=np.zeros_like(self.image), where=alpha > 0)
+    def _straight(self, rows: slice) -> np.ndarray:
+        """Colours (H, W, 3) of some rows not multiplied by alpha, float32."""
+        image, alpha = self.image[rows], self.alpha[rows, :, None]
+        return np.divide(image, alpha, out=np.zeros_like(image), where=alpha > 0)
+
+    def _strips(self) -> Iterator[slice]:
+        """Rows that are worked on together, which takes some 200 bytes a pixel for a while."""
+        height, width = self.alpha.shape
+        step = max(_STRIP // width, 1)
+        return (slice(top, top + step) for top in range(0, height, step))
 
 
 def _clear(values: np.ndarray) -> np.ndarray:
@@ -140,20 +156,17 @@ def read_depth(path: Path, width: int, height: int, window: tuple[int, int, int,
     Raises:
         LodgsError: it cannot be read, has no depth, or is of another size.
     """
-    import OpenEXR
-
-    if not path.exists():
+    if not path.is_file():
         raise LodgsError(f"There is no mesh depth {path}.", "Render it, or take the holdout away.")
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            parts = [(part.name(), part.channels) for part in file.parts]
-            found = [
-                np.asarray(channel.pixels, np.float32)
-                for part, channels in parts
-                for name, channel in channels.items()
-                if _DEPTH.fullmatch(name) and (len(name) > 1 or len(parts) == 1 or _DEPTH.fullmatch(part))
-            ]
-    except (RuntimeError, OSError, ValueError) as error:
+        parts = read_parts(path)
+        found = [
+            np.asarray(plane, np.float32)
+            for part, _, planes in parts
+            for name, plane in planes.items()
+            if _DEPTH.fullmatch(name) and (len(name) > 1 or len(parts) == 1 or _DEPTH.fullmatch(part))
+        ]
+    except (RuntimeError, OSError, ValueError, KeyError, TypeError) as error:
         raise LodgsError(f"{path.name} cannot be read as an EXR: {error}.", "Render it anew.") from error
     if not found or any(plane.shape != found[0].shape for plane in found):
         raise LodgsError(

@@ -10,11 +10,11 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch.nn.functional import normalize, pad
 
-from ..errors import LodgsError
+from ..errors import LodgsError, out_of_memory
 from ..rasterize import Gaussians, device_of, strips
 from ..rasterize.features import rotation_matrices
 from ..rasterize.sh import basis, degree_of
-from ..scenes.cameras import Camera
+from ..scenes.cameras import Camera, check_size
 from ..splats.gaussians import Splats
 from .picture import NOTHING, Picture
 
@@ -59,17 +59,20 @@ class SplatSet:
         matrix = matrix.to(own.means.device)
         linear = matrix[:3, :3]
         means = (own.means.double() @ linear.T + matrix[:3, 3]).float()
-        # an ellipsoid's axes A = L Q diag(s) stay no axes where L is no similarity: those of A Aᵀ are
-        axes = linear @ rotation_matrices(own.quats.double()) * own.log_scales.double().exp()[:, None]
+        turned, lengths = rotation_matrices(own.quats.double()), own.log_scales.double().exp()
         if similarity(matrix.cpu().numpy()):
-            lengths = axes.norm(dim=1).clamp_min(1e-30)
-            turned = axes / lengths[:, None]
+            unit = torch.linalg.det(linear) ** (1 / 3)
+            turned, lengths = linear @ turned / unit, lengths * unit
         else:
-            turned, lengths, _ = torch.linalg.svd(axes)
+            # an ellipsoid's axes A = L Q diag(s) stay no axes then: those of A Aᵀ are
+            turned, lengths, _ = torch.linalg.svd(linear @ turned * lengths[:, None])
             turned = turned * torch.linalg.det(turned).sign()[:, None, None]
         quats = Rotation.from_matrix(turned.cpu().numpy()).as_quat()[:, [3, 0, 1, 2]]
         return replace(
-            own, means=means, quats=torch.from_numpy(quats).to(means), log_scales=lengths.log().float()
+            own,
+            means=means,
+            quats=torch.from_numpy(quats).to(means),
+            log_scales=lengths.clamp_min(1e-30).log().float(),
         )
 
     def colours(self, matrix: np.ndarray, eye: np.ndarray) -> torch.Tensor:
@@ -130,23 +133,24 @@ def draw(
         The picture, or None where it was cancelled.
 
     Raises:
-        LodgsError: a set's transform is flat, or there is not enough memory.
+        LodgsError: a set's transform is flat, the picture too large, or there is not enough memory.
     """
+    width, height = window[2:] if window else (camera.width, camera.height)
+    check_size(width, height)
     for one in instances:
         linear = one.matrix[:3, :3]
         if not np.isfinite(one.matrix).all() or np.linalg.cond(linear) > FLAT or not linear.any():
             raise LodgsError("A set of splats is scaled to nothing.", "Give its object a scale above 0.")
-    width, height = window[2:] if window else (camera.width, camera.height)
     numbers = sorted({one.level for one in instances}) if levels else []
-    picture = Picture.empty(width, height, background, depth, numbers)
-    behind = background or (0.0, 0.0, 0.0)
-    if limit is not None:  # the background, too, is behind meshes: drawn over black, it is added elsewhere
-        picture.image[limit < NOTHING], picture.alpha[limit < NOTHING] = 0, 0
-        behind = 0.0, 0.0, 0.0
-    instances = [one for one in instances if len(one.splats)]
-    if not instances:
-        return picture
     try:
+        picture = Picture.empty(width, height, background, depth, numbers)
+        behind = background or (0.0, 0.0, 0.0)
+        if limit is not None:  # the background, too, is behind meshes: over black here, added elsewhere
+            picture.image[limit < NOTHING], picture.alpha[limit < NOTHING] = 0, 0
+            behind = 0.0, 0.0, 0.0
+        instances = [one for one in instances if len(one.splats)]
+        if not instances:
+            return picture
         gaussians, weights, camera, near, unit = _in_one_frame(instances, camera, near)
         features = _membership(instances, picture) if levels else None
         for top, drawn in strips(
@@ -168,7 +172,9 @@ def draw(
                 picture.masks[:, rows] = drawn.features.permute(2, 0, 1).cpu().numpy()
             if not progress((top + len(drawn.alpha)) / height):
                 return None
-    except (MemoryError, torch.cuda.OutOfMemoryError) as error:
+    except Exception as error:
+        if not out_of_memory(error):
+            raise
         raise LodgsError(
             f"There is not enough memory to draw {sum(len(x.splats) for x in instances):,} splats "
             f"at {width}x{height}.",

@@ -1,8 +1,8 @@
 """``python -m training serve``: pictures of splats for another program, one frame after the other.
 
 Requests are JSON objects, one a line, on standard input, answers (``runs.folder.event_line``) on standard
-output; arrays lie in files of one folder (``wire``), which belongs to this process: it is removed when
-standard input ends, however the other program ended.
+output; arrays lie in files of one folder (``wire``), which belongs to this process, as a mark in it says: it
+is removed when standard input ends, however the other program ended.
 
     {"frame": 7, "out": NAME, "camera": {...}, "near": 0.1, "background": [r, g, b] or null,
      "depth": true, "levels": true, "window": [left, top, width, height] or null,
@@ -10,20 +10,19 @@ standard input ends, however the other program ended.
      "sets": [{"file": NAME, "count": N, "matrix": 4x4, "level": 3}, ...]}
     {"cancel": 7}
 
-answer ``progress`` (frame, share), then one of ``frame`` (frame, passes, height, width, seconds; the planes
-are in the file OUT), ``cancelled`` (frame) and ``error`` (frame, what, remedy). A photograph is read in the
-frame's size and its planes follow the others, display-coded; ``psnr`` then says how alike both are. A holdout
-is an EXR with the depth of what hides splats, of the camera's size or the window's.
+answer ``progress`` (frame, share) and ``warning`` (frame, message), then one of ``frame`` (frame, passes,
+height, width, seconds; the planes are in the file OUT), ``cancelled`` (frame) and ``error`` (frame, what,
+remedy). A photograph is read in the frame's size and its planes follow the others, display-coded; ``psnr``
+then says how alike both are. A holdout is an EXR with the depth of what hides splats, of the camera's size or
+the window's.
 
 A set is read when its file is first named, and forgotten when a frame does not name it.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import queue
-import shutil
 import sys
 import threading
 import time
@@ -35,26 +34,32 @@ import numpy as np
 import torch
 
 from .. import VERSION
-from ..errors import LodgsError
+from ..errors import LodgsError, out_of_memory
 from ..evaluate.metrics import psnr
 from ..rasterize import resolve
 from ..runs.folder import event_line
-from ..scenes.cameras import Camera, camera_from_dict
 from ..scenes.images import load_image
+from ..splats.dialects import drawable
 from . import wire
 from .picture import read_depth
+from .requests import Cancel, FrameRequest, NamedSet, frame_of, read_line, read_request
 from .scene import Instance, SplatSet, draw
 
+LONGEST = 1 << 20
+"""Bytes of a line that asks for something."""
 
-def serve(folder: Path, backend: str, requests: IO[str], answers: IO[str]) -> int:
+
+def serve(folder: Path, backend: str, requests: IO[bytes], answers: IO[str]) -> int:
     """Answers until ``requests`` ends; then ``folder`` is removed. Returns an exit code.
 
     Raises:
-        LodgsError: for a backend that does not work here.
+        LodgsError: for a backend that does not work here, or a folder with other things in it.
     """
     torch.set_num_threads(1)
+    backend = resolve(backend)
+    wire.claim(folder)
     server = _Server(folder, backend, answers)
-    server.say("hello", protocol=wire.PROTOCOL, version=VERSION, backend=resolve(backend), pid=os.getpid())
+    server.say("hello", protocol=wire.PROTOCOL, version=VERSION, backend=backend, pid=os.getpid())
     threading.Thread(target=server.listen, args=(requests,), daemon=True).start()
     server.work()
     return 0
@@ -64,7 +69,7 @@ class _Server:
     def __init__(self, folder: Path, backend: str, answers: IO[str]) -> None:
         self._folder, self._backend, self._answers = folder, backend, answers
         self._sets: dict[str, SplatSet] = {}
-        self._requests: queue.SimpleQueue[dict | None] = queue.SimpleQueue()
+        self._requests: queue.SimpleQueue[FrameRequest] = queue.SimpleQueue()
         self._cancelled: set[int] = set()
 
     def say(self, kind: str, **values) -> None:
@@ -74,19 +79,22 @@ class _Server:
         except OSError:
             self._end()
 
-    def listen(self, requests: IO[str]) -> None:
+    def listen(self, requests: IO[bytes]) -> None:
         """In a thread of its own, so that a frame that is being drawn can be cancelled."""
         try:
-            for line in requests:
+            while line := requests.readline(LONGEST + 1):
+                frame = None
                 try:
-                    request = json.loads(line)
-                    if not isinstance(request, dict):
-                        raise ValueError("no object")
-                except ValueError as error:
-                    self.say("error", frame=None, what=f"A request is not valid: {error}.", remedy="")
+                    values = read_line(line)
+                    frame = frame_of(values)
+                    request = read_request(values)
+                except LodgsError as error:
+                    while line and not line.endswith(b"\n"):  # the rest of one that is too long
+                        line = requests.readline(LONGEST)
+                    self.say("error", frame=frame, what=error.what, remedy=error.remedy)
                     continue
-                if "cancel" in request:
-                    self._cancelled.add(request["cancel"])
+                if isinstance(request, Cancel):
+                    self._cancelled.add(request.frame)
                 else:
                     self._requests.put(request)
         finally:
@@ -96,24 +104,25 @@ class _Server:
         """Draws what is asked for, in order."""
         while True:
             request = self._requests.get()
-            frame = request.get("frame") if request else None
-            assert request is not None
             try:
-                self._answer(request, frame)
+                self._answer(request)
             except LodgsError as error:
-                self.say("error", frame=frame, what=error.what, remedy=error.remedy)
-            except (KeyError, TypeError, ValueError, OSError) as error:
+                self.say("error", frame=request.frame, what=error.what, remedy=error.remedy)
+            except Exception as error:
                 traceback.print_exc()
                 what = f"The renderer could not use what it was given ({type(error).__name__}: {error})."
-                self.say("error", frame=frame, what=what, remedy="Please report it with the log.")
+                remedy = "Please report it with the log."
+                if out_of_memory(error):
+                    what, remedy = "There is not enough memory for this picture.", "Render a smaller one."
+                self.say("error", frame=request.frame, what=what, remedy=remedy)
 
-    def _answer(self, request: dict, frame: int | None) -> None:
+    def _answer(self, request: FrameRequest) -> None:
         started = time.perf_counter()
-        camera, near = camera_from_dict(request["camera"])
-        background, holdout = request.get("background"), request.get("holdout")
-        window = _window(request["window"], camera) if request.get("window") else None
-        limit = read_depth(Path(holdout), camera.width, camera.height, window) if holdout else None
-        instances = self._instances(request["sets"])
+        frame, camera, window = request.frame, request.camera, request.window
+        limit = None
+        if request.holdout:
+            limit = read_depth(request.holdout, camera.width, camera.height, window)
+        instances = self._instances(frame, request.sets)
         if frame in self._cancelled:
             self.say("cancelled", frame=frame)
             return
@@ -123,50 +132,43 @@ class _Server:
             return frame not in self._cancelled
 
         picture = draw(
-            instances, camera, near=near, background=tuple(background) if background else None,
-            depth=bool(request.get("depth")), levels=bool(request.get("levels")),
-            window=window, limit=limit, backend=self._backend, progress=progress,
+            instances, camera, near=request.near, background=request.background, depth=request.depth,
+            levels=request.levels, window=window, limit=limit, backend=self._backend, progress=progress,
         )  # fmt: skip
         if picture is None or frame in self._cancelled:
-            self._cancelled.discard(frame)  # type: ignore[arg-type]
+            self._cancelled.discard(frame)
             self.say("cancelled", frame=frame)
             return
         passes, (height, width), measured = picture.passes(), picture.alpha.shape, {}
-        if request.get("photograph"):
-            photograph = load_image(Path(request["photograph"]), camera.width, camera.height)
+        if request.photograph:
+            photograph = load_image(request.photograph, camera.width, camera.height)
             passes |= {f"Photograph.{channel}": photograph[..., i] for i, channel in enumerate("RGB")}
             measured["psnr"] = psnr(torch.from_numpy(picture.image), torch.from_numpy(photograph))
-        wire.write_planes(self._folder / Path(request["out"]).name, np.stack(list(passes.values())))
+        wire.write_planes(self._folder / request.out, list(passes.values()))
         self.say(
             "frame", frame=frame, passes=list(passes), height=height, width=width,
             seconds=round(time.perf_counter() - started, 4), **measured,
         )  # fmt: skip
 
-    def _instances(self, sets: list[dict]) -> list[Instance]:
+    def _instances(self, frame: int, sets: list[NamedSet]) -> list[Instance]:
         """The sets of a frame; those of the last frame that are named again stay as they are."""
         kept, instances = {}, []
         for one in sets:
-            name = Path(one["file"]).name
-            if name not in kept:
-                kept[name] = self._sets.get(name) or SplatSet(
-                    *wire.read_set(self._folder / name, int(one["count"])), self._backend
-                )
-            matrix = np.array(one["matrix"], np.float64).reshape(4, 4)
-            instances.append(Instance(kept[name], matrix, int(one["level"])))
+            if one.file not in kept:
+                kept[one.file] = self._sets.get(one.file) or self._read_set(frame, one)
+            instances.append(Instance(kept[one.file], one.matrix, one.level))
         self._sets = kept
         return instances
 
+    def _read_set(self, frame: int, one: NamedSet) -> SplatSet:
+        """A set from its file, without what cannot be drawn."""
+        splats, weights = wire.read_set(self._folder / one.file, one.count)
+        splats.extras["weight"] = np.nan_to_num(weights)
+        splats = drawable(splats, "the scene", lambda text: self.say("warning", frame=frame, message=text))
+        return SplatSet(splats, splats.extras["weight"], self._backend)
+
     def _end(self) -> None:
         """Clean up and go, whatever the other threads are at."""
-        shutil.rmtree(self._folder, ignore_errors=True)
+        wire.release(self._folder)
         sys.stderr.flush()
         os._exit(0)
-
-
-def _window(given: list, camera: Camera) -> tuple[int, int, int, int]:
-    """A request's window; ValueError where it is no part of the camera's image."""
-    left, top, width, height = map(int, given)
-    inside = 0 <= left < left + width <= camera.width and 0 <= top < top + height <= camera.height
-    if not inside:
-        raise ValueError(f"the window {given} is not in the image")
-    return left, top, width, height

@@ -2,27 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from ..errors import LodgsError
 from ..methods.data import TrainingData
-from ..scenes.colmap import read_scene
+from ..scenes.cameras import Camera
+from ..scenes.colmap import read_scene, without
+from ..scenes.images import check_image
 from ..scenes.undistort import undistorted
 from .folder import RunFolder
 from .job import Job
 
+DECODERS = 4
+"""Photographs that are decoded at once to see whether they can be."""
 
-def training_data(job: Job, folder: RunFolder, tell: Callable[..., None] | None = None) -> TrainingData:
+
+def training_data(
+    job: Job, folder: RunFolder, tell: Callable[..., None] | None = None, *, pixels: bool = True
+) -> TrainingData:
     """The job's scene, read and where needed undistorted (once, into the run folder).
 
     Args:
         tell: called with an event's kind and values (status, warning) while this goes on.
+        pixels: leave out views whose photograph cannot be decoded; to be saved where none is looked at.
 
     Raises:
         LodgsError: if the scene cannot be read, or has too little to train on.
     """
     model, images = (Path(path) if path else None for path in (job.model, job.images))
     scene = read_scene(Path(job.scene), model=model, images=images)
+    if pixels:
+        scene = without(scene, _undecodable(scene.cameras))
     warnings = list(scene.warnings)
     if scene.distorted:
         if tell:
@@ -33,3 +45,19 @@ def training_data(job: Job, folder: RunFolder, tell: Callable[..., None] | None 
         if tell:
             tell("warning", message=warning)
     return TrainingData(scene, job.image_scale, job.test_every, job.exposure, job.validation)
+
+
+def _undecodable(cameras: Sequence[Camera]) -> dict[str, str]:
+    """Why a photograph cannot be decoded, by the names of the views of which that is so."""
+
+    def trouble(camera: Camera) -> str:
+        assert camera.image is not None
+        try:
+            check_image(camera.image)
+        except LodgsError as error:
+            return error.what
+        return ""
+
+    with ThreadPoolExecutor(DECODERS) as pool:  # Pillow decodes without holding Python's lock
+        found = zip(cameras, pool.map(trouble, cameras), strict=True)
+        return {camera.name: why for camera, why in found if why}

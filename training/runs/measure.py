@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 from ..errors import LodgsError
@@ -108,8 +109,21 @@ def evaluate_run(
     if picture is not None:
         level_picture(picture, bundle, evaluation, middle, values)
     with atomic_write(folder.metrics) as temporary:
-        Path(temporary).write_text(json.dumps(report, indent=1), encoding="utf-8")
+        Path(temporary).write_text(json.dumps(_finite(report), indent=1, allow_nan=False), encoding="utf-8")
     return report
+
+
+def _finite(value):
+    """A report as JSON has it: null where a number is none, as after a training that went astray."""
+    match value:
+        case dict():
+            return {key: _finite(each) for key, each in value.items()}
+        case list() | tuple():
+            return [_finite(each) for each in value]
+        case float() if not math.isfinite(value):
+            return None
+        case _:
+            return value
 
 
 def table(report: dict) -> str:

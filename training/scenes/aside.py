@@ -10,8 +10,11 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from ..documents import printable
+from ..errors import LodgsError
 from .cameras import Camera, read_camera
 from .images import image_size
+from .photographs import Photographs
 
 
 def read_aside(scene: Path) -> list[Camera]:
@@ -22,9 +25,17 @@ def read_aside(scene: Path) -> list[Camera]:
     Raises:
         LodgsError: a camera or its picture cannot be read.
     """
-    found = []
+    found, pictures = [], Photographs(scene / "aside", scene)
     for path in sorted((scene / "aside").glob("*.json")):
         camera, _ = read_camera(path)
-        image = path.parent / camera.name
+        try:
+            image = pictures.find(camera.name)
+        except LodgsError as error:
+            raise LodgsError(f"The picture that {path} names cannot be taken: {error.what}") from error
+        if image is None:
+            raise LodgsError(
+                f"{path.with_name(printable(camera.name)[:200])} cannot be read: there is no such file.",
+                f"{path.name} names it.",
+            )
         found.append(replace(camera.resized(*image_size(image)), image=image))
     return found

@@ -9,11 +9,18 @@ from pathlib import Path
 
 import numpy as np
 
+from ..documents import read_json
 from ..errors import LodgsError
 from ..files import atomic_write
 
 LARGEST = 32768
 """Pixels on the longest side of an image that is drawn."""
+MOST_PIXELS = 1 << 27
+"""Pixels of a picture, or of the window of one, that is drawn: a 16k frame has fewer."""
+FARTHEST = 1e12
+"""No coordinate is larger, in any unit: float32 holds the squares of such lengths."""
+_FOCALS = 1e-3, 1e6
+"""Focal lengths that there are, in the longer side of their image."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +50,23 @@ class Camera:
         """The eye in world coordinates, (3,) float64."""
         rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
         return -rotation.T @ translation
+
+    @property
+    def flaw(self) -> str:
+        """Why there can be no such camera, as what follows "its"; "" where there can."""
+        pose, side = self.world_to_camera, max(self.width, self.height)
+        if not (np.isfinite(pose).all() and np.abs(pose).max() <= FARTHEST):
+            return f"pose has a number beyond {FARTHEST:g}"
+        rotation = pose[:3, :3]
+        turns = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
+        if not turns or not np.allclose(pose[3], (0, 0, 0, 1)):
+            return "pose is no rotation and translation"
+        shortest, longest = (times * side for times in _FOCALS)
+        if not (shortest <= self.fx <= longest and shortest <= self.fy <= longest):
+            return f"focal length of {self.fx:g}, {self.fy:g} pixels is impossible for an image of {side}"
+        if not (abs(self.cx) <= longest and abs(self.cy) <= longest):
+            return f"principal point at {self.cx:g}, {self.cy:g} is impossible for an image of {side}"
+        return ""
 
     @property
     def focal(self) -> float:
@@ -140,10 +164,7 @@ def read_camera(path: Path) -> tuple[Camera, float]:
     Raises:
         LodgsError: the file cannot be read, or describes no camera.
     """
-    try:
-        values = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise LodgsError(f"The camera {path} cannot be read: {error}.") from error
+    values = read_json(path, f"The camera {path}")
     try:
         return camera_from_dict(values)
     except LodgsError as error:
@@ -168,19 +189,26 @@ def camera_from_dict(values: dict) -> tuple[Camera, float]:
         near = float(values.get("near", 0.01))
     except KeyError as error:
         raise LodgsError(f"The camera lacks {error}.", remedy) from error
-    except (TypeError, ValueError, AttributeError) as error:
-        raise LodgsError(f"The camera is not valid: {error}.", remedy) from error
-    pose = camera.world_to_camera
-    numbers = [camera.fx, camera.fy, camera.cx, camera.cy, near, *pose.ravel()]
-    if pose.shape != (4, 4) or not np.isfinite(numbers).all():
+    except (TypeError, ValueError, OverflowError, AttributeError) as error:
+        raise LodgsError(f"The camera is not valid: {str(error)[:200]}.", remedy) from error
+    if camera.world_to_camera.shape != (4, 4):
         raise LodgsError("The camera's world_to_camera is no 4x4 matrix of numbers.", remedy)
     if not (0 < camera.width <= LARGEST and 0 < camera.height <= LARGEST):
         raise LodgsError(
             f"The camera's image of {camera.width}x{camera.height} pixels cannot be drawn.",
             f"Choose from 1 to {LARGEST} pixels a side.",
         )
-    rotation = pose[:3, :3]
-    turns = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
-    if not turns or camera.fx <= 0 or camera.fy <= 0 or near < 0:
-        raise LodgsError("The camera's pose is no rotation, or a length is below 0.", remedy)
+    if flaw := camera.flaw:
+        raise LodgsError(f"The camera's {flaw}.", remedy)
+    if not 0 <= near <= FARTHEST:
+        raise LodgsError(f"The camera's near depth of {near:g} is impossible.", "Give 0 or more.")
     return camera, near
+
+
+def check_size(width: int, height: int) -> None:
+    """Raises LodgsError where a picture of so many pixels is not drawn."""
+    if not (0 < width <= LARGEST and 0 < height <= LARGEST and width * height <= MOST_PIXELS):
+        raise LodgsError(
+            f"A picture of {width}x{height} pixels is not drawn.",
+            f"Choose at most {LARGEST} pixels a side, and {MOST_PIXELS:,} in all.",
+        )

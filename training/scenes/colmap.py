@@ -1,96 +1,31 @@
-"""COLMAP models and the photographs that belong to them. numpy only, so that Blender can read scenes.
-
-File formats: https://colmap.github.io/format.html. rigs and frames of newer COLMAP versions are not needed:
-images.bin and images.txt hold each view's own pose there too.
-"""
+"""COLMAP scenes: a model and its photographs. numpy only, so that Blender can read scenes."""
 
 from __future__ import annotations
 
 import os
-import struct
-import unicodedata
-from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
+from ..documents import printable
 from ..errors import LodgsError
-from .cameras import Camera
+from .cameras import FARTHEST, Camera
 from .images import image_size
+from .model import DAMAGED, Intrinsics, Pose, model_suffix, read_cameras, read_points, read_poses, registered
 from .orientation import up_rotation
+from .photographs import Photographs, image_folder
 
-_DAMAGED = "Copy the model again, or write it anew with COLMAP's model_converter."
+ASTRAY = 1000
+"""What lies so many times as far from the middle of the cameras as most cameras or points is an error."""
+NAMED = 5
+"""Of so many views that are odd in one way each is named; more are summed up."""
+MOST_FOLDERS = 20_000
+"""Folders that models are looked for in."""
 
-
-@dataclass(frozen=True)
-class _Lens:
-    """A COLMAP camera model: its parameters are focal length(s), cx, cy, then those of the distortion."""
-
-    name: str
-    parameters: int
-    focals: int
-    perspective: bool = True  # a pinhole when the distortion is zero; fisheyes never are
-
-
-# By COLMAP's model id (colmap/src/colmap/sensor/models.h).
-_LENSES = dict(
-    enumerate(
-        [
-            _Lens("SIMPLE_PINHOLE", 3, 1),
-            _Lens("PINHOLE", 4, 2),
-            _Lens("SIMPLE_RADIAL", 4, 1),
-            _Lens("RADIAL", 5, 1),
-            _Lens("OPENCV", 8, 2),
-            _Lens("OPENCV_FISHEYE", 8, 2, perspective=False),
-            _Lens("FULL_OPENCV", 12, 2),
-            _Lens("FOV", 5, 2),
-            _Lens("SIMPLE_RADIAL_FISHEYE", 4, 1, perspective=False),
-            _Lens("RADIAL_FISHEYE", 5, 1, perspective=False),
-            _Lens("THIN_PRISM_FISHEYE", 12, 2, perspective=False),
-            _Lens("RAD_TAN_THIN_PRISM_FISHEYE", 16, 2, perspective=False),
-            _Lens("SIMPLE_DIVISION", 4, 1),
-            _Lens("DIVISION", 5, 2),
-            _Lens("SIMPLE_FISHEYE", 3, 1, perspective=False),
-            _Lens("FISHEYE", 4, 2, perspective=False),
-            _Lens("EUCM", 6, 2),
-            _Lens("EQUIRECTANGULAR", 2, 0, perspective=False),
-        ]
-    )
-)
-_LENS_BY_NAME = {lens.name: lens for lens in _LENSES.values()}
-
-
-@dataclass(frozen=True)
-class _Intrinsics:
-    """One record of cameras.bin or cameras.txt."""
-
-    lens: _Lens
-    width: int
-    height: int
-    parameters: np.ndarray
-
-    @property
-    def distorted(self) -> bool:
-        distortion = self.parameters[self.lens.focals + 2 :]
-        if self.lens.name == "EUCM":  # alpha, beta: a pinhole at alpha = 0, whatever beta
-            distortion = distortion[:1]
-        return not self.lens.perspective or bool(np.any(np.abs(distortion) > 1e-8))  # as COLMAP has it
-
-    @property
-    def pinhole(self) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy."""
-        fx, fy = self.parameters[0], self.parameters[self.lens.focals - 1]
-        cx, cy = self.parameters[self.lens.focals : self.lens.focals + 2]
-        return float(fx), float(fy), float(cx), float(cy)
-
-
-@dataclass(frozen=True)
-class _Pose:
-    """One record of images.bin or images.txt, without its 2D points."""
-
-    name: str
-    camera_id: int
-    world_to_camera: np.ndarray
+Progress = Callable[[float], object]
+"""Called with the share of a scene that is read, from 0 to 1."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +112,8 @@ def find_models(folder: Path) -> list[Path]:
     """Folders at or below `folder` that hold a COLMAP model (cameras and images, .bin or .txt).
 
     The model with the most registered images comes first; among equals the one nearest to `folder`, then by
-    name. Looks four levels deep, which covers `sparse/`, `sparse/0` and `dense/0/sparse`.
+    name. Looks four levels deep, which covers `sparse/`, `sparse/0` and `dense/0/sparse`, through links too,
+    and in MOST_FOLDERS at most, the nearest first.
 
     Raises:
         LodgsError: there is no such folder.
@@ -185,24 +121,46 @@ def find_models(folder: Path) -> list[Path]:
     folder = _absolute(folder)
     if not folder.is_dir():
         raise LodgsError(f"There is no folder {folder}.", "Choose the folder of a COLMAP scene.")
-    found = []
-    for path, subfolders, _ in os.walk(folder):
-        here = Path(path)
-        depth = len(here.relative_to(folder).parts)
-        subfolders[:] = sorted(name for name in subfolders if not name.startswith(".") and depth < 4)
-        if _suffix(here):
-            found.append((-_registered(here), depth, here.parts, here))
+    found, level, seen = [], [folder], {os.path.realpath(folder)}
+    around = [str(parent) for parent in Path(os.path.realpath(folder)).parents]
+    seen.update(around)  # a link upwards leads out of the scene
+    for depth in range(5):
+        found += [(-registered(here), depth, here.parts, here) for here in level if model_suffix(here)]
+        below = []
+        for here in level if depth < 4 else ():
+            for path in _subfolders(here):
+                real = os.path.realpath(path)
+                if real not in seen and len(seen) < MOST_FOLDERS:
+                    seen.add(real)
+                    below.append(path)
+        level = below
     return [entry[-1] for entry in sorted(found)]
 
 
-def read_scene(folder: Path, model: Path | None = None, images: Path | None = None) -> Scene:
+def _subfolders(folder: Path) -> list[Path]:
+    """By name, without hidden ones and those that may not be read."""
+    try:
+        with os.scandir(folder) as entries:
+            names = [entry.name for entry in entries if not entry.name.startswith(".") and entry.is_dir()]
+    except OSError:
+        return []
+    return [folder / name for name in sorted(names)]
+
+
+def read_scene(
+    folder: Path, model: Path | None = None, images: Path | None = None, progress: Progress | None = None
+) -> Scene:
     """Read a COLMAP scene: cameras, points, and which photographs are there.
+
+    A view whose photograph cannot be used, or that cannot be, is left out with a warning, as is a point
+    without a place or astray (see ASTRAY).
 
     Args:
         folder: the scene, or a model folder within it.
         model: the folder of the model; by default the largest one found.
         images: the folder of the photographs; by default `images/`, or another folder in or beside the scene
             where the model's names are found.
+        progress: called now and then.
 
     Raises:
         LodgsError: there is no folder, model or photograph, or a file of the model is damaged.
@@ -210,74 +168,99 @@ def read_scene(folder: Path, model: Path | None = None, images: Path | None = No
     folder = _absolute(folder)
     warnings: list[str] = []
     model = _largest_model(folder, warnings) if model is None else _absolute(model)
-    suffix = _suffix(model)
-    if not suffix:
+    if not model_suffix(model):
         raise LodgsError(
             f"{model} holds no cameras and images files.", "Choose the folder of a COLMAP model."
         )
-    read_cameras, read_images, read_points = _READERS[suffix]
-    intrinsics = _read(model / f"cameras{suffix}", read_cameras)
-    poses = sorted(_read(model / f"images{suffix}", read_images), key=lambda pose: pose.name)
+    intrinsics = read_cameras(model)
+    poses = sorted(read_poses(model), key=lambda pose: pose.name)
     if not poses:
         raise LodgsError(f"{model} has no registered images.", "Choose a model that COLMAP has registered.")
-    points, colors = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-    if (model / f"points3D{suffix}").is_file():
-        points, colors = _read(model / f"points3D{suffix}", read_points)
-    else:
-        warnings.append(f"{model} has no points3D{suffix}: the scene has no points.")
-    with np.errstate(over="ignore"):
-        points = points.astype(np.float32)
-    finite = np.isfinite(points).all(axis=1)
-    if not finite.all():
-        warnings.append(f"{int((~finite).sum())} points of {model} have no finite position and are left out.")
-
-    images_folder = _absolute(images) if images is not None else _images_folder(folder, model, poses)
-    if not images_folder.is_dir():
-        raise LodgsError(
-            f"There is no image folder {images_folder}.", "Choose the folder of the photographs."
-        )
-    cameras, distorted = [], []
-    files = _Files(images_folder)
     for pose in poses:
-        lens = intrinsics.get(pose.camera_id)
-        if lens is None:
+        if pose.camera_id not in intrinsics:
             raise LodgsError(
-                f"{model / f'cameras{suffix}'} lacks camera {pose.camera_id}, which {pose.name} uses.",
-                _DAMAGED,
+                f"{model / f'cameras{model_suffix(model)}'} lacks camera {pose.camera_id}, "
+                f"which {_shown(pose.name)} uses.",
+                DAMAGED,
             )
-        try:
-            camera = _camera(pose, lens, files)
-        except LodgsError as error:
-            warnings.append(f"{pose.name} is left out: {error.what}")
-            continue
-        cameras.append(camera)
-        if lens.distorted:
-            distorted.append(camera.name)
-        if _reshaped(camera, lens):
-            warnings.append(
-                f"{pose.name} is {camera.width}x{camera.height}, of other proportions than the model's "
-                f"{lens.width}x{lens.height}: make sure that it is neither turned nor cropped."
-            )
-    if not cameras:
+    if images is None:
+        images = image_folder(folder, model, [pose.name for pose in poses])
+    images = _absolute(images)
+    if not images.is_dir():
+        raise LodgsError(f"There is no image folder {images}.", "Choose the folder of the photographs.")
+    views = _Views(Photographs(images, folder))
+    for number, pose in enumerate(poses):
+        if progress and number % 50 == 0:
+            progress(0.5 * number / len(poses))
+        views.add(pose, intrinsics[pose.camera_id])
+    if not views.cameras:
         raise LodgsError(
-            f"None of the {len(poses)} views in {model} has a usable photograph in {images_folder}.",
+            f"None of the {len(poses)} views in {model} has a usable photograph in {images}."
+            + "".join(f" {_shown(name)}: {why}" for name, why in views.left_out[:1]),
             "Choose the folder that holds the images under the names that the model uses.",
         )
+
+    points, colors = read_points(model)
+    if not len(points):
+        warnings.append(f"{model} has no points in points3D{model_suffix(model)}: the scene has no points.")
+    possible = (np.abs(points) <= FARTHEST).all(axis=1)
+    far, cameras = _astray(points[possible], views.cameras)
+    possible[possible] = ~far
+    if not possible.all():
+        warnings.append(
+            f"{np.sum(~possible):,} points of {model} have no place, or lie over {ASTRAY:,} times as far "
+            "off as most, and are left out."
+        )
+    views.keep(cameras)
+    if progress:
+        progress(1.0)
     return Scene(
         folder=folder,
         model=model,
-        images_folder=images_folder,
-        cameras=cameras,
-        points=points[finite],
-        point_colors=colors[finite],
-        distorted=distorted,
-        warnings=warnings,
+        images_folder=images,
+        cameras=views.cameras,
+        points=points[possible],
+        point_colors=colors[possible],
+        distorted=views.distorted,
+        warnings=[*warnings, *views.warnings(images)],
+    )
+
+
+def without(scene: Scene, reasons: dict[str, str]) -> Scene:
+    """The scene without some of its views, and a warning of them.
+
+    Args:
+        reasons: by the view's name, a sentence that follows "it is left out:".
+
+    Raises:
+        LodgsError: no view is left.
+    """
+    if not reasons:
+        return scene
+    kept = [camera for camera in scene.cameras if camera.name not in reasons]
+    if not kept:
+        name, why = next(iter(reasons.items()))
+        raise LodgsError(
+            f"No view of {scene.folder} can be used. {_shown(name)}: {why}", "Check the photographs."
+        )
+    return replace(
+        scene,
+        cameras=kept,
+        distorted=[name for name in scene.distorted if name not in reasons],
+        warnings=[*scene.warnings, *_told(list(reasons.items()))],
     )
 
 
 def _absolute(path: Path | str) -> Path:
-    """Whole, so that it means the same in another process; links are kept as they are."""
-    return Path(os.path.abspath(path))
+    """Whole, so that it means the same in another process; links are kept as they are.
+
+    Raises:
+        LodgsError: it is no text, so that neither jobs nor Blender could name it.
+    """
+    path = Path(os.path.abspath(path))
+    if printable(path) != str(path):
+        raise LodgsError(f"The path {printable(path)} is not UTF-8.", "Give its folders other names.")
+    return path
 
 
 def _largest_model(folder: Path, warnings: list[str]) -> Path:
@@ -288,259 +271,108 @@ def _largest_model(folder: Path, warnings: list[str]) -> Path:
             f"{folder} holds no COLMAP model.",
             "Choose a folder with sparse/0/cameras.bin, images.bin and points3D.bin (or .txt).",
         )
-    views = [_registered(model) for model in models]
+    views = [registered(model) for model in models]
     for model, count in zip(models, views, strict=True):
         if count < views[0]:
             warnings.append(f"{model} is a smaller model of {count} views, not read.")
     return models[0]
 
 
-def _reshaped(camera: Camera, lens: _Intrinsics) -> bool:
-    """Whether a photograph has other proportions than the model says, beyond rounding to whole pixels."""
-    stretch = camera.width * lens.height / (camera.height * lens.width)
-    return bool(abs(np.log(stretch)) > 0.01 + 1 / min(camera.width, camera.height))
+class _Views:
+    """The views of a model that can be used, and what is odd about the others.
 
+    Attributes:
+        left_out: names, and a sentence each.
+    """
 
-def _camera(pose: _Pose, lens: _Intrinsics, files: _Files) -> Camera:
-    """The view at the size of its photograph; LodgsError where there is none that serves."""
-    if not lens.lens.focals:
-        raise LodgsError(f"its camera model {lens.lens.name} is a panorama, not a perspective view.")
-    image = files.find(pose.name)
-    width, height = image_size(image)
-    fx, fy, cx, cy = lens.pinhole
-    name = pose.name.replace("\\", "/")
-    camera = Camera(name, lens.width, lens.height, fx, fy, cx, cy, pose.world_to_camera, image)
-    return camera if (width, height) == (lens.width, lens.height) else camera.resized(width, height)
+    def __init__(self, files: Photographs) -> None:
+        self._files = files
+        self._missing: list[str] = []
+        self._reshaped: list[str] = []
+        self.cameras: list[Camera] = []
+        self.distorted: list[str] = []
+        self.left_out: list[tuple[str, str]] = []
 
+    def add(self, pose: Pose, lens: Intrinsics) -> None:
+        """Takes a view, at the size of its photograph, or leaves it out."""
+        name = pose.name.replace("\\", "/")
+        try:
+            if not lens.lens.focals:
+                raise LodgsError(f"its camera model {lens.lens.name} is a panorama, not a perspective view.")
+            if self.cameras and self.cameras[-1].name == name:
+                raise LodgsError("the model has another view of that name.")
+            image = self._files.find(pose.name)
+            if image is None:
+                self._missing.append(name)
+                return
+            width, height = image_size(image)
+            camera = Camera(name, lens.width, lens.height, *lens.pinhole, pose.world_to_camera, image)
+            if (width, height) != (lens.width, lens.height):
+                camera = camera.resized(width, height)
+            if flaw := camera.flaw:
+                raise LodgsError(f"its {flaw}.")
+        except LodgsError as error:
+            self.left_out.append((name, error.what))
+            return
+        self.cameras.append(camera)
+        if lens.distorted:
+            self.distorted.append(name)
+        # beyond rounding to whole pixels
+        stretch = np.log(width) + np.log(lens.height) - np.log(height) - np.log(lens.width)
+        if abs(stretch) > 0.01 + 1 / min(width, height):
+            self._reshaped.append(
+                f"{_shown(name)} is {width}x{height}, of other proportions than the model's "
+                f"{lens.width}x{lens.height}: make sure that it is neither turned nor cropped."
+            )
 
-class _Files:
-    """The files of an image folder, by the names that a model gives them."""
+    def keep(self, which: np.ndarray) -> None:
+        """Leaves out the cameras that are astray, all but ``which`` (V,)."""
+        astray = [camera.name for camera, kept in zip(self.cameras, which, strict=True) if not kept]
+        self.left_out += [
+            (name, f"it stands over {ASTRAY:,} times as far off as most of the model.") for name in astray
+        ]
+        self.cameras = [camera for camera in self.cameras if camera.name not in astray]
+        self.distorted = [name for name in self.distorted if name not in astray]
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._normal: dict[str, Path] | None = None
-
-    def find(self, name: str) -> Path:
-        """The file of that name; other Unicode forms (macOS) and backslashes (Windows) find it too."""
-        path = PurePosixPath(name.replace("\\", "/"))
-        if path.is_absolute() or ".." in path.parts:
-            raise LodgsError("its name leads out of the image folder.")
-        if os.path.isfile(self._folder / name):  # not Path.is_file, which raises for names too long
-            return self._folder / name
-        if self._normal is None:
-            files = (Path(where) / file for where, _, names in os.walk(self._folder) for file in names)
-            self._normal = {_normal(file.relative_to(self._folder).as_posix()): file for file in files}
-        found = self._normal.get(_normal(str(path)))
-        if found is None:
-            raise LodgsError(f"there is no such file in {self._folder}.")
+    def warnings(self, folder: Path) -> list[str]:
+        """What is odd, in few sentences however many views there are."""
+        found = _told(self.left_out)
+        match self._missing:
+            case []:
+                pass
+            case [name]:
+                found.append(f"{_shown(name)} is left out: there is no such file in {folder}.")
+            case names:
+                more = ", ..." if len(names) > NAMED else ""
+                found.append(
+                    f"{len(names):,} views are left out: {folder} has no files of their names "
+                    f"({', '.join(map(_shown, names[:NAMED]))}{more})."
+                )
+        found += self._reshaped[:NAMED]
+        if len(self._reshaped) > NAMED:
+            found.append(f"{len(self._reshaped) - NAMED:,} more photographs have other proportions.")
         return found
 
 
-def _normal(name: str) -> str:
-    return unicodedata.normalize("NFC", name)
+def _told(left_out: Sequence[tuple[str, str]]) -> list[str]:
+    """Names and reasons as sentences; many are summed up."""
+    found = [f"{_shown(name)} is left out: {why}" for name, why in left_out[:NAMED]]
+    if len(left_out) > NAMED:
+        found.append(f"{len(left_out) - NAMED:,} more views are left out for reasons like these.")
+    return found
 
 
-def _images_folder(folder: Path, model: Path, poses: list[_Pose]) -> Path:
-    """The folder where most of the model's names are files, looked for around the model in the scene."""
-    roots = [folder, *(parent for parent in model.parents if folder in parent.parents)]
-    if folder == model or folder.name == "sparse":  # only the model was chosen: the scene is around it
-        roots += folder.parents[:2]
-    places = []
-    for root in roots:
-        usual = [root / name for name in ("images", "input", "image", "rgb", "photos")]
-        places += [*usual, *sorted(root.glob("images*")), root]
-    counts = [sum(os.path.isfile(place / pose.name) for pose in poses) for place in places]
-    return places[int(np.argmax(counts))]
+def _shown(name: str) -> str:
+    """A view's name for a message: any text, and not too long."""
+    return printable(name if len(name) <= 200 else f"{name[:200]}...")
 
 
-def _suffix(folder: Path) -> str:
-    """The form in which the folder holds a model, .bin before .txt, or an empty string."""
-    for suffix in (".bin", ".txt"):
-        if (folder / f"cameras{suffix}").is_file() and (folder / f"images{suffix}").is_file():
-            return suffix
-    return ""
-
-
-def _registered(model: Path) -> int:
-    """How many images a model says or has; 0 where that cannot be read."""
-    suffix = _suffix(model)
-    path = model / f"images{suffix}"
-    try:
-        if suffix == ".bin":
-            with path.open("rb") as file:
-                return struct.unpack("<Q", file.read(8))[0]
-        return len(_read(path, _images_txt))
-    except (OSError, struct.error, LodgsError):
-        return 0
-
-
-def _read(path: Path, parse):
-    """Parse a file of a model, or say that it is damaged."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise LodgsError(f"{path} cannot be read: {error.strerror}.", "Check the folder.") from error
-    try:
-        return parse(data)
-    except (ValueError, IndexError, KeyError, struct.error) as error:
-        raise LodgsError(f"{path} is damaged or cut short ({error}).", _DAMAGED) from error
-
-
-def _cameras_bin(data: bytes) -> dict[int, _Intrinsics]:
-    (count,), at, cameras = struct.unpack_from("<Q", data), 8, {}
-    for _ in range(count):
-        camera_id, model_id, width, height = struct.unpack_from("<iiQQ", data, at)
-        lens = _LENSES.get(model_id)
-        if lens is None:
-            raise ValueError(f"camera model {model_id} is unknown")
-        parameters = np.frombuffer(data, "<f8", lens.parameters, at + 24)
-        at += 24 + 8 * lens.parameters
-        cameras[camera_id] = _intrinsics(lens, width, height, parameters)
-    return cameras
-
-
-def _cameras_txt(data: bytes) -> dict[int, _Intrinsics]:
-    cameras = {}
-    for line in _lines(data):
-        camera_id, model_name, width, height, *parameters = line.split()
-        lens = _LENS_BY_NAME.get(model_name)
-        if lens is None:
-            raise ValueError(f"camera model {model_name} is unknown")
-        cameras[int(camera_id)] = _intrinsics(lens, int(width), int(height), np.array(parameters, float))
-    _expect(len(cameras), data, "cameras")
-    return cameras
-
-
-def _intrinsics(lens: _Lens, width: int, height: int, parameters: np.ndarray) -> _Intrinsics:
-    if len(parameters) != lens.parameters:
-        raise ValueError(f"{lens.name} has {lens.parameters} parameters, not {len(parameters)}")
-    if width < 1 or height < 1 or not np.isfinite(parameters).all() or (parameters[: lens.focals] <= 0).any():
-        raise ValueError("a camera has no size or focal length")
-    return _Intrinsics(lens, width, height, parameters)
-
-
-def _images_bin(data: bytes) -> list[_Pose]:
-    (count,), at, poses = struct.unpack_from("<Q", data), 8, []
-    for _ in range(count):
-        _, *pose, camera_id = struct.unpack_from("<i7di", data, at)
-        end = data.index(b"\0", at + 64)
-        name = data[at + 64 : end]
-        (points2d,) = struct.unpack_from("<Q", data, end + 1)
-        at = end + 9 + 24 * points2d
-        if at > len(data):
-            raise ValueError(f"it ends within image {len(poses) + 1} of {count}")
-        poses.append(_pose(name, camera_id, pose))
-    return poses
-
-
-def _images_txt(data: bytes) -> list[_Pose]:
-    """Two lines an image, the second (its 2D points, possibly none) passed over."""
-    poses, lines = [], iter(data.split(b"\n"))
-    for line in lines:
-        line = line.strip()
-        if not line or line.startswith(b"#"):
-            continue
-        # NAME is everything after the ninth field: it may hold spaces.
-        _, *pose, camera_id, name = line.split(maxsplit=9)
-        next(lines, None)
-        poses.append(_pose(name, int(camera_id), [float(number) for number in pose]))
-    _expect(len(poses), data, "images")
-    return poses
-
-
-def _pose(name: bytes, camera_id: int, pose: list[float]) -> _Pose:
-    """Rotation from a unit quaternion (w, x, y, z) and translation, both world to camera."""
-    quaternion, translation = np.array(pose[:4]), np.array(pose[4:])
-    norm = np.linalg.norm(quaternion)
-    text = name.decode("utf-8", "surrogateescape")  # as the file system's names are decoded
-    if not (np.isfinite(pose).all() and norm > 0):
-        raise ValueError(f"image {text} has no pose")
-    w, x, y, z = quaternion / norm
-    world_to_camera = np.eye(4)
-    world_to_camera[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    world_to_camera[:3, 3] = translation
-    return _Pose(text, camera_id, world_to_camera)
-
-
-# A record of points3D.bin, packed; `track` pairs of 4-byte integers follow it.
-_POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
-_TRACK_AT = 43
-
-
-def _points_bin(data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    (count,) = struct.unpack_from("<Q", data)
-    body = np.frombuffer(data, np.uint8, offset=8)
-    starts = _point_starts(body)
-    if len(starts) != count:
-        raise ValueError(f"it should hold {count} points")
-    if not count:
-        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-    records = np.lib.stride_tricks.sliding_window_view(body, _POINT.itemsize)[starts].view(_POINT)[:, 0]
-    return records["xyz"], records["rgb"]
-
-
-def _point_starts(body: np.ndarray) -> np.ndarray:
-    """Where the records of points3D.bin begin.
-
-    Each record tells its own length, so that a straight reading would take one step of Python a point.
-    Instead: a track length is a small number in 8 bytes, so a record can only begin where the right five
-    bytes are zero (tracks below 2^24 views). Of these places all are dropped, again and again, that no other
-    place leads to; what the first record does not reach has no beginning and soon goes. What remains is
-    exactly the chain from the first record on.
-    """
-    zero = body == 0
-    run = zero[:-1] & zero[1:]
-    run = run[:-2] & run[2:]
-    run = run[:-1] & zero[4 : len(run) + 3]
-    starts = np.flatnonzero(run[_TRACK_AT + 3 :])
-    low, middle, high = (body[starts + _TRACK_AT + byte].astype(np.int64) for byte in range(3))
-    lengths = low + (middle << 8) + (high << 16)
-    ends = starts + _POINT.itemsize + 8 * lengths
-    inside = ends <= len(body)
-    starts, ends = starts[inside], ends[inside]
-    while True:
-        reached = np.zeros(len(body) + 1, bool)
-        reached[0] = True
-        reached[ends] = True
-        kept = reached[starts]
-        if kept.all():
-            break
-        starts, ends = starts[kept], ends[kept]
-    if len(body) and (not len(ends) or ends[-1] != len(body)):
-        raise ValueError(f"it ends within point {len(starts) + 1}")
-    return starts
-
-
-def _points_txt(data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    lines = _lines(data)
-    _expect(len(lines), data, "points")
-    if not lines:
-        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-    table = np.loadtxt(lines, usecols=range(1, 7), ndmin=2)
-    return table[:, :3], table[:, 3:].astype(np.uint8)
-
-
-def _lines(data: bytes) -> list[str]:
-    """Lines that are neither blank nor comments."""
-    lines = (line.strip() for line in data.decode("utf-8", "surrogateescape").split("\n"))
-    return [line for line in lines if line and not line.startswith("#")]
-
-
-def _expect(count: int, data: bytes, what: str) -> None:
-    """COLMAP writes the number of records as a comment: fewer of them means that the file was cut."""
-    for line in data[:1000].split(b"\n"):
-        before, _, after = line.partition(b":")
-        if before.strip() == f"# Number of {what}".encode():
-            expected = int(after.split(b",")[0])
-            if count < expected:
-                raise ValueError(f"it should hold {expected} {what} and holds {count}")
-
-
-_READERS = {
-    ".bin": (_cameras_bin, _images_bin, _points_bin),
-    ".txt": (_cameras_txt, _images_txt, _points_txt),
-}
+def _astray(points: np.ndarray, cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
+    """Which points (P, 3) are too far off to be true (P,), and which cameras are not (V,)."""
+    eyes = np.array([camera.center for camera in cameras])
+    middle = np.median(eyes, axis=0)
+    away, eyes_away = (np.linalg.norm(places - middle, axis=1) for places in (points, eyes))
+    reach = max(np.median(eyes_away), np.median(away) if len(away) else 0.0)
+    if reach == 0:
+        return np.zeros(len(points), bool), np.ones(len(cameras), bool)
+    return away > ASTRAY * reach, eyes_away <= ASTRAY * reach

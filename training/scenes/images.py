@@ -4,12 +4,26 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
+from ..documents import open_file
 from ..errors import LodgsError
 from .color import srgb_from_linear
+from .exr import MAGIC, Truncated, exr_size, read_parts
+
+MOST_PIXELS = 178_956_970
+"""Pixels of an image that is read: Pillow opens no larger ones, which take it 4 bytes a pixel."""
+
+_LARGE = 1 << 25
+"""Pixels from which on a JPEG is not decoded larger than twice the size that is needed."""
+_STRIP = 1 << 20
+"""Pixels that are averaged at a time, about; each takes some 100 bytes."""
 
 # JPEG markers that carry the size: every start of frame, which excludes DHT (C4), JPG (C8) and DAC (CC).
 _START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -21,29 +35,43 @@ def image_size(path: Path) -> tuple[int, int]:
     The kind is told by the file's content, not by its name. The size of an EXR is its display window.
 
     Raises:
-        LodgsError: the file is missing, empty, of another kind, or cut short.
+        LodgsError: the file is missing, no regular file, empty, of another kind, cut short, or of no size
+            or more than MOST_PIXELS.
     """
-    path = Path(path)
-    try:
-        with path.open("rb") as file:
-            head = file.read(8)
-            if not head:
-                raise LodgsError(f"{path} is empty.", "Copy the image again.")
-            if head[:2] == b"\xff\xd8":
-                return _jpeg_size(file)
-            if head == b"\x89PNG\r\n\x1a\n":
-                return _png_size(file)
-            if head[:4] == b"\x76\x2f\x31\x01":
-                return _exr_size(file)
-    except OSError as error:
-        raise LodgsError(f"{path} cannot be read: {error.strerror}.", "Check the image folder.") from error
-    except (struct.error, IndexError, KeyError, ValueError, _Truncated) as error:
-        raise LodgsError(f"{path} is cut short.", "Copy the image again.") from error
+    with open_file(path) as file:
+        try:
+            return _checked(path, _size(path, file))
+        except OSError as error:
+            raise LodgsError(
+                f"{path} cannot be read: {error.strerror}.", "Check the image folder."
+            ) from error
+        except (struct.error, IndexError, KeyError, ValueError, Truncated) as error:
+            raise LodgsError(f"{path} is cut short.", "Copy the image again.") from error
+
+
+def _size(path: Path, file: IO[bytes]) -> tuple[int, int]:
+    head = file.read(8)
+    if not head:
+        raise LodgsError(f"{path} is empty.", "Copy the image again.")
+    if head[:2] == b"\xff\xd8":
+        return _jpeg_size(file)
+    if head == b"\x89PNG\r\n\x1a\n":
+        return _png_size(file)
+    if head[:4] == MAGIC:
+        return exr_size(file)
     raise LodgsError(f"{path} is not a JPEG, PNG or EXR image.", "Convert it to one of these.")
 
 
-class _Truncated(Exception):
-    """The file ends before its end marker."""
+def _checked(path: Path, size: tuple[int, int]) -> tuple[int, int]:
+    """The size, where it is one that is read."""
+    width, height = size
+    if width < 1 or height < 1:
+        raise LodgsError(f"{path} has no pixels.", "Export the image again.")
+    if width * height > MOST_PIXELS:
+        raise LodgsError(
+            f"{path} has {width}x{height} pixels; {MOST_PIXELS:,} are read at most.", "Make it smaller."
+        )
+    return size
 
 
 def _jpeg_size(file) -> tuple[int, int]:
@@ -52,19 +80,19 @@ def _jpeg_size(file) -> tuple[int, int]:
     file.seek(2)
     while True:
         if file.read(1) != b"\xff":
-            raise _Truncated
+            raise Truncated
         marker = file.read(1)[0]
         while marker == 0xFF:  # fill bytes
             marker = file.read(1)[0]
         if marker == 0x01 or 0xD0 <= marker <= 0xD7:  # markers without a segment
             continue
         if marker == 0xD9:
-            raise _Truncated
+            raise Truncated
         (length,) = struct.unpack(">H", file.read(2))
         if marker == 0xDA:
             _expect_end(file, b"\xff\xd9")
             if size is None:
-                raise _Truncated
+                raise Truncated
             return size
         segment = file.tell()
         if marker in _START_OF_FRAME:
@@ -76,7 +104,7 @@ def _jpeg_size(file) -> tuple[int, int]:
 def _png_size(file) -> tuple[int, int]:
     length, kind, width, height = struct.unpack(">I4sII", file.read(16))
     if kind != b"IHDR" or length != 13:
-        raise _Truncated
+        raise Truncated
     _expect_end(file, b"IEND\xae\x42\x60\x82")
     return width, height
 
@@ -90,55 +118,22 @@ def _expect_end(file, marker: bytes) -> None:
         return
     file.seek(here)
     if marker not in file.read():
-        raise _Truncated
+        raise Truncated
 
 
-def _exr_size(file) -> tuple[int, int]:
-    """The displayWindow of the (first) header, after a look at the chunks that follow it.
+@dataclass(frozen=True)
+class _Source:
+    """An image whose rows are had when they are needed.
 
-    File layout: https://openexr.com/en/latest/OpenEXRFileLayout.html
+    Attributes:
+        rows: (bottom - top, width, 3) float32 from ``top`` to ``bottom``.
+        linear: whether values are light rather than coded.
     """
-    file.seek(4)
-    (version,) = struct.unpack("<I", file.read(4))
-    attributes = {}
-    while name := _exr_string(file):
-        _exr_string(file)  # its type
-        (size,) = struct.unpack("<I", file.read(4))
-        attributes[name] = file.read(size)
-    left, top, right, bottom = struct.unpack("<4i", attributes[b"displayWindow"])
-    _, first, _, last = struct.unpack("<4i", attributes[b"dataWindow"])
-    lines = _EXR_LINES.get(attributes[b"compression"][0])
-    if lines and not version & _EXR_NOT_SCANLINES:
-        _expect_chunks(file, -(-(last - first + 1) // lines))
-    return right - left + 1, bottom - top + 1
 
-
-# Lines in a chunk by compression: none, RLE, ZIPS, ZIP, PIZ, PXR24, B44, B44A, DWAA, DWAB.
-_EXR_LINES = dict(enumerate([1, 1, 1, 16, 32, 16, 32, 32, 32, 256]))
-_EXR_NOT_SCANLINES = 0x200 | 0x800 | 0x1000  # tiles, deep data, several parts
-
-
-def _expect_chunks(file, count: int) -> None:
-    """The table of chunk offsets is filled in, and the chunk that is last in the file is whole."""
-    table = file.read(8 * count)
-    offsets = np.frombuffer(table, "<u8")
-    end = file.seek(0, 2)
-    if len(table) < 8 * count or not offsets.all() or offsets.max() + 8 > end:
-        raise _Truncated
-    file.seek(int(offsets.max()) + 4)
-    (size,) = struct.unpack("<I", file.read(4))
-    if file.tell() + size > end:
-        raise _Truncated
-
-
-def _exr_string(file) -> bytes:
-    """A null-terminated name of at most 255 bytes."""
-    text = b""
-    while (byte := file.read(1)) != b"\0":
-        if not byte or len(text) > 255:
-            raise _Truncated
-        text += byte
-    return text
+    width: int
+    height: int
+    rows: Callable[[int, int], np.ndarray]
+    linear: bool = False
 
 
 def load_image(path: Path, width: int, height: int, exposure: float = 0.0) -> np.ndarray:
@@ -155,52 +150,92 @@ def load_image(path: Path, width: int, height: int, exposure: float = 0.0) -> np
     Raises:
         LodgsError: the file cannot be read.
     """
-    path = Path(path)
+    with _opened(path, width, height, large=_LARGE) as source:
+        result = np.empty((height, width, 3), np.float32)
+        top = 0
+        for strip in _strips(source, height):
+            pixels = _area_average(strip, width, 1)
+            if source.linear:
+                pixels = srgb_from_linear(np.clip(pixels * 2.0**exposure, 0.0, 1.0))
+            result[top : top + len(pixels)] = np.clip(pixels, 0.0, 1.0)
+            top += len(pixels)
+        return result
+
+
+def check_image(path: Path) -> None:
+    """Decodes an image, as small as its kind lets it, and forgets it.
+
+    Raises:
+        LodgsError: the file cannot be read.
+    """
+    with _opened(path, 1, 1, large=0):
+        pass
+
+
+@contextmanager
+def _opened(path: Path, width: int, height: int, large: int) -> Iterator[_Source]:
+    """The decoded image, of which a size is wanted; whatever goes wrong with it is a LodgsError.
+
+    Args:
+        large: an image of more pixels is first made as small as is still twice what is wanted: a JPEG where
+            it is decoded, others by whole numbers.
+    """
     try:
-        with path.open("rb") as file:
-            is_exr = file.read(4) == b"\x76\x2f\x31\x01"
-        pixels = _exr_pixels(path) if is_exr else _pillow_pixels(path)
+        with open_file(path) as file:
+            if file.read(4) == MAGIC:
+                yield _exr(path)
+                return
+            from PIL import Image
+
+            file.seek(0)
+            with Image.open(file, formats=("JPEG", "PNG")) as image:
+                if image.width * image.height > large:
+                    image.draft(None, (2 * width, 2 * height))
+                    times = min(image.width // (2 * width), image.height // (2 * height))
+                    if times > 1 and image.mode in ("L", "RGB"):
+                        image = image.reduce(times)
+                image.load()
+                yield _Source(image.width, image.height, lambda top, bottom: _pillow_rows(image, top, bottom))
     except LodgsError:
         raise
     except Exception as error:  # the libraries raise many kinds for damaged files
         raise LodgsError(
             f"{path} cannot be read as an image: {error}.", "Copy or export it again."
         ) from error
-    pixels = _area_average(_area_average(pixels, height, 0), width, 1)
-    if is_exr:
-        pixels = srgb_from_linear(np.clip(pixels * 2.0**exposure, 0.0, 1.0))
-    return np.clip(pixels, 0.0, 1.0).astype(np.float32)
 
 
-def _pillow_pixels(path: Path) -> np.ndarray:
-    """(H, W, 3) float32 in [0, 1]."""
-    from PIL import Image
-
-    with Image.open(path) as image:
-        if image.mode.startswith("I"):  # 16-bit grey, which convert("RGB") would clip
-            grey = np.asarray(image, np.float32) / 65535
-            return np.repeat(grey[..., None], 3, axis=2)
-        return np.asarray(image.convert("RGB"), np.float32) / 255
+def _pillow_rows(image, top: int, bottom: int) -> np.ndarray:
+    """Rows of a Pillow image, (H, W, 3) float32 in [0, 1]."""
+    rows = image.crop((0, top, image.width, bottom))
+    if rows.mode.startswith("I"):  # 16-bit grey, which convert("RGB") would clip
+        grey = np.asarray(rows, np.float32) / 65535
+        return np.repeat(grey[..., None], 3, axis=2)
+    return np.asarray(rows.convert("RGB"), np.float32) / 255
 
 
-def _exr_pixels(path: Path) -> np.ndarray:
-    """(H, W, 3) float32, linear, over the display window; black where the data window leaves it empty."""
-    import OpenEXR
-
+def _exr(path: Path) -> _Source:
+    """Linear light over the display window; black where the data window leaves it empty."""
     image_size(path)  # refuses a file cut short, of which OpenEXR would print and give nothing
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        part = next((p for p in file.parts if _rgb_names(p.channels)), None)
-        if part is None:
-            raise LodgsError(f"{path} has no R, G and B channels.", "Export the combined pass.")
-        data = np.stack([part.channels[name].pixels for name in _rgb_names(part.channels)], axis=2)
-        (left, top), _ = part.header["dataWindow"]
-        display_low, display_high = (np.asarray(corner) for corner in part.header["displayWindow"])
-    width, height = display_high - display_low + 1
-    x, y = int(left - display_low[0]), int(top - display_low[1])
-    pixels = np.zeros((height, width, 3), np.float32)
-    seen = pixels[max(y, 0) : max(y + data.shape[0], 0), max(x, 0) : max(x + data.shape[1], 0)]
-    seen[:] = data[max(-y, 0) :, max(-x, 0) :][: seen.shape[0], : seen.shape[1]]
-    return np.nan_to_num(pixels, posinf=float(np.finfo(np.float32).max))
+    part = next((part for part in read_parts(path) if _rgb_names(part[2])), None)
+    if part is None:
+        raise LodgsError(f"{path} has no R, G and B channels.", "Export the combined pass.")
+    _, header, channels = part
+    (left, above), _ = header["dataWindow"]
+    low, high = (np.asarray(corner) for corner in header["displayWindow"])
+    across, down = high - low + 1
+    width, height = _checked(path, (int(across), int(down)))
+    x, y = int(left - low[0]), int(above - low[1])
+    planes = [channels[name] for name in _rgb_names(channels)]
+
+    def rows(top: int, bottom: int) -> np.ndarray:
+        pixels = np.zeros((bottom - top, width, 3), np.float32)
+        for plane, channel in zip(planes, np.moveaxis(pixels, 2, 0), strict=True):
+            data = plane[max(top - y, 0) : max(bottom - y, 0), max(-x, 0) :]
+            seen = channel[max(y - top, 0) :, max(x, 0) :][: data.shape[0], : data.shape[1]]
+            seen[:] = data[: seen.shape[0], : seen.shape[1]]
+        return np.nan_to_num(pixels, posinf=float(np.finfo(np.float32).max))
+
+    return _Source(width, height, rows, linear=True)
 
 
 def _rgb_names(channels) -> list[str]:
@@ -211,6 +246,28 @@ def _rgb_names(channels) -> list[str]:
         if all(layer + channel in channels for channel in "RGB"):
             return [layer + channel for channel in "RGB"]
     return ["Y"] * 3 if "Y" in channels else []
+
+
+def _strips(source: _Source, height: int) -> Iterator[np.ndarray]:
+    """The image at another height, strip by strip: rows as :func:`_area_average` makes them, to the bit."""
+    most, old = max(_STRIP // source.width, 1), source.height
+    if old % height == 0:
+        each = old // height
+        step = max(most // each, 1)
+        for top in range(0, height, step):
+            bottom = min(top + step, height)
+            yield _area_average(source.rows(top * each, bottom * each), bottom - top, 0)
+        return
+    below, part = _edges(old, height)
+    step = max(most * height // old, 1)
+    before = np.zeros((source.width, 3))  # the sum of all rows before the strip's first
+    for top in range(0, height, step):
+        place = slice(top, min(top + step, height) + 1)
+        first, last = below[place][0], below[place][-1]
+        total = np.concatenate([before[None], source.rows(first, last + 1)], dtype=np.float64)
+        np.cumsum(total, axis=0, out=total)
+        before = total[last - first]
+        yield _between(total, below[place] - first, part[place]) * (height / old)
 
 
 def _area_average(pixels: np.ndarray, size: int, axis: int) -> np.ndarray:
@@ -224,11 +281,20 @@ def _area_average(pixels: np.ndarray, size: int, axis: int) -> np.ndarray:
     else:
         total = np.zeros((old + 1, *pixels.shape[1:]))
         np.cumsum(pixels, axis=0, out=total[1:])
-        edges = np.arange(size + 1) * (old / size)
-        below = np.minimum(edges.astype(int), old - 1)
-        part = (edges - below).reshape(-1, *[1] * (pixels.ndim - 1))
-        mean = np.diff(total[below] * (1 - part) + total[below + 1] * part, axis=0) * (size / old)
+        mean = _between(total, *_edges(old, size)) * (size / old)
     return np.moveaxis(mean, 0, axis)
+
+
+def _edges(old: int, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where each of `size` cells begins and the last one ends: the old cell, and the part of it before."""
+    edges = np.arange(size + 1) * (old / size)
+    below = np.minimum(edges.astype(int), old - 1)
+    return below, (edges - below).reshape(-1, 1, 1)
+
+
+def _between(total: np.ndarray, below: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """Differences of a running sum, linear between its cells, from edge to edge."""
+    return np.diff(total[below] * (1 - part) + total[below + 1] * part, axis=0)
 
 
 def write_png(path: Path, codes: np.ndarray) -> None:

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 from collections import defaultdict
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -106,8 +107,9 @@ def _main() -> None:
     model = pycolmap.Reconstruction(request["model"])
     sizes = defaultdict(set)
     for image in model.images.values():
-        if image.name in request["sizes"]:
-            sizes[image.camera_id].add(tuple(request["sizes"][image.name]))
+        with suppress(UnicodeDecodeError):  # a name that is no text has no size
+            if image.name in request["sizes"]:
+                sizes[image.camera_id].add(tuple(request["sizes"][image.name]))
     for camera_id, found in sizes.items():
         if len(found) > 1:
             sys.exit(f"the photographs of camera {camera_id} have several sizes: {sorted(found)}.")

@@ -101,6 +101,9 @@ def test_a_holdout(bundle, camera, tmp_path):
         (["--gamma", "1", "--level", "1"], "Choose one."),
         (["--out", "a.gif"], "neither .png nor .exr"),
         (["--holdout", "gone.exr"], "There is no mesh depth gone.exr."),
+        (["--size", "99999999x9"], "A picture of 99999999x9 pixels is not drawn."),
+        (["--size", "32768x32768"], "A picture of 32768x32768 pixels is not drawn."),
+        (["--size", "1" + 400 * "0" + "x9"], "is not drawn."),
         (["--backend", "magic"], 'There is no rasterizer backend "magic".'),
     ],
 )
@@ -121,7 +124,14 @@ def test_mistakes_are_told(bundle, camera, tmp_path, monkeypatch, capsys, option
         ({"width": 10**6}, "cannot be drawn"),
         ({"world_to_camera": np.zeros((4, 4)).tolist()}, "pose is no rotation"),
         ({"world_to_camera": [[1, 0], [0, 1]]}, "no 4x4 matrix"),
-        ({"near": float("nan")}, "no 4x4 matrix of numbers"),
+        ({"width": 10**400}, "too many digits"),
+        ({"fx": 10**30}, "too many digits"),
+        ({"fx": 1e-300}, "focal length of 1e-300, 62 pixels is impossible"),
+        ({"cx": 1e300}, "principal point"),
+        ({"near": -1}, "near depth"),
+        ({"world_to_camera": (1e300 * np.eye(4)).tolist()}, "beyond 1e+12"),
+        ({"world_to_camera": json.loads("[" * 900 + "]" * 900)}, "nests"),
+        ({"near": float("nan")}, "NaN is no number"),
     ],
 )
 def test_impossible_cameras_are_told(bundle, camera, tmp_path, capsys, change, sentence):
@@ -132,6 +142,31 @@ def test_impossible_cameras_are_told(bundle, camera, tmp_path, capsys, change, s
     file.write_text(json.dumps({"width": 3}))
     assert main(["render", str(bundle[0]), "--camera", str(file), "--out", str(tmp_path / "a.png")]) == 2
     assert "lacks 'height'" in capsys.readouterr().err
+
+
+def test_little_memory_is_a_sentence(bundle, camera, tmp_path, capsys, monkeypatch):
+    """Wherever it runs out: before drawing, on the way, and as torch says it of its own."""
+    write_camera(tmp_path / "camera.json", camera, 0.01)
+    words = [
+        "render",
+        str(bundle[0]),
+        "--camera",
+        str(tmp_path / "camera.json"),
+        "--out",
+        str(tmp_path / "a.png"),
+    ]
+    torchs = RuntimeError("[enforce fail at alloc_cpu.cpp:117] DefaultCPUAllocator: can't allocate memory: 9")
+    for place in ("picture.Picture.empty", "picture.Picture.eight_bit", "scene.strips", "command.SplatSet"):
+        for error in (MemoryError(), torchs):
+
+            def fail(*_, error=error, **__):
+                raise error
+
+            with monkeypatch.context() as patched:
+                patched.setattr(f"training.render.{place}", fail)
+                assert main(words) == 2
+            assert "There is not enough memory" in capsys.readouterr().err
+    assert not (tmp_path / "a.png").exists()
 
 
 def test_what_has_no_views_says_so(bundle, tmp_path, capsys):

@@ -1,5 +1,7 @@
 """Pictures as files, and in linear light."""
 
+import tracemalloc
+
 import numpy as np
 import OpenEXR
 import pytest
@@ -30,6 +32,26 @@ def test_linear_colours_become_the_same_bytes_whoever_codes_them():
         again = np.floor((coded(linear[..., :3].astype(float)) + wrong).clip(0, 1) * 255 + 0.5)
         np.testing.assert_array_equal(again, shown.eight_bit())
     assert np.abs(coded(linear[0, :, 0].astype(float)) - values).max() < 0.03 / 255
+
+
+def test_strips_change_nothing(monkeypatch):
+    rng = np.random.default_rng(5)
+    alpha = rng.uniform(0, 1, (31, 17)).astype(np.float32)
+    shown = picture(rng.uniform(0, 1, (31, 17, 3)) * alpha[..., None], alpha)
+    whole = shown.eight_bit(), shown.linear()
+    monkeypatch.setattr("training.render.picture._STRIP", 50)
+    for now, before in zip((shown.eight_bit(), shown.linear()), whole, strict=True):
+        assert now.dtype == before.dtype
+        np.testing.assert_array_equal(now, before)
+
+
+def test_large_pictures_are_coded_in_little_memory():
+    shown = picture(np.full((2000, 2000, 3), 0.5, np.float32))
+    tracemalloc.start()
+    shown.eight_bit(), shown.linear()
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 4e6 * (4 + 16) + 300e6
 
 
 def test_colours_are_decoded_under_their_alpha():

@@ -61,6 +61,22 @@ def test_sets_in_several_places_keep_their_colours(make_splats, camera):
     np.testing.assert_allclose(there.image, here.image, atol=1e-4)
 
 
+def test_flat_splats_are_drawn_wherever_they_stand(make_splats, camera):
+    """A size of 0 along an axis, whose direction no length tells: beside another set, turned, and sheared."""
+    splats, other = make_splats(50), make_splats(1)
+    splats.log_scales[::2, 0] = -np.inf
+    splats.log_scales[::5] = -np.inf
+    thin = replace(splats, log_scales=splats.log_scales.clip(-60, None))
+    behind = transform(translation=(0, 0, -1e4))
+    for matrix in (transform((1, 0.5, -2), 0.5), np.eye(4) + 0.4 * np.eye(4, k=1) * np.array([1, 1, 0, 0])):
+        drawn = [
+            draw([Instance(SplatSet(each), matrix), Instance(SplatSet(other), behind)], camera).image
+            for each in (splats, thin)
+        ]
+        np.testing.assert_allclose(*drawn, atol=1e-5)
+        assert np.ptp(drawn[0]) > 0.1
+
+
 def test_two_sets_are_sorted_together(make_splats, camera):
     """Moved by hand in float64 and drawn as one set; constant colours, which no rotation changes."""
     first, second = make_splats(100, degree=0), make_splats(100, degree=0, seed=1)

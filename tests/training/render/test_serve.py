@@ -107,11 +107,60 @@ def test_mistakes_are_answered_and_survived(client, make_splats, camera):
     client.say_line("no json")
     assert "not valid" in client.hear("error")["what"]
     client.say(**request(camera, [{"file": "gone", "count": 3, "matrix": np.eye(4).tolist(), "level": 0}]))
-    assert "could not use what it was given" in client.hear("error")["what"]
+    assert "There is no set of splats gone" in client.hear("error")["what"]
     client.say(**(request(camera, []) | {"camera": {}}))
     assert client.hear("error")["what"] == "The camera lacks 'width'."
     client.say(**request(camera, [], 9))
     assert client.hear("frame", "error")["frame"] == 9
+
+
+def test_odd_requests_end_nothing(client, make_splats, camera):
+    """What was no hashable number to cancel ended the program; so did transforms that no splat survives."""
+    client.hear("hello")
+    client.say(cancel={})
+    assert "not valid" in client.hear("error")["what"]
+    client.say_line("[" * 100_000)
+    assert "not valid" in client.hear("error")["what"]
+    client.say_line("x" * (3 << 20))  # answered once, however long
+    assert "not valid" in client.hear("error")["what"]
+    splats = make_splats(50)
+    spoiled = make_splats(50)
+    for place, value in enumerate((np.nan, np.inf, 1e30)):
+        for column in (spoiled.means, spoiled.quats, spoiled.log_scales):
+            column[place] = value
+        spoiled.sh[place, 1, 2] = value
+    spoiled.sh[3, 4, 1], spoiled.opacity_logits[4] = np.nan, np.nan
+    shear = np.eye(4)
+    shear[0, 1] = 0.5
+    for name, each in (("good", splats.select(slice(5, None))), ("bad", spoiled)):
+        wire.write_set(client.folder / name, wire.packed(each, None))
+    planes = []
+    for frame, (name, count) in enumerate((("good", 45), ("bad", 50))):
+        one = {"file": name, "count": count, "matrix": shear.tolist(), "level": 0}
+        client.say(**request(camera, [one], frame))
+        if name == "bad":
+            assert client.hear("warning")["message"].startswith("5 splats of the scene have values")
+        answer = client.hear("frame", "error")
+        planes.append(wire.read_planes(client.folder / "frame", len(answer["passes"]), 48, 64))
+    np.testing.assert_array_equal(*planes)
+    assert np.ptp(planes[0]) > 0.1
+
+
+def test_a_folder_of_somebodys_is_left_alone(tmp_path):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "a.jpg").write_text("dear")
+    command = [sys.executable, "-m", "training", "serve", str(tmp_path / "photos"), "--backend", "cpu"]
+    done = subprocess.run(command, cwd=ROOT, input="", capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and "is not empty" in done.stderr and not done.stdout
+    assert (tmp_path / "photos" / "a.jpg").read_text() == "dear"
+    done = subprocess.run(
+        [*command[:4], str(tmp_path / "new"), *command[5:]],
+        cwd=ROOT,
+        input="",
+        capture_output=True,
+        check=False,
+    )
+    assert done.returncode == 0 and not (tmp_path / "new").exists()
 
 
 @pytest.mark.slow

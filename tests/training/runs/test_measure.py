@@ -124,3 +124,20 @@ def test_views_off_the_path_are_measured_where_the_scene_has_some(finished, scen
 def test_a_run_that_is_not_finished_is_refused_in_a_sentence(tmp_path):
     with pytest.raises(LodgsError, match=r"holds no finished run.*Train it to the end"):
         evaluate_run(tmp_path)
+
+
+def test_metrics_are_valid_json_whatever_was_measured(finished, monkeypatch):
+    """A number that is none is null; equal pictures, from far away, are a number."""
+    run = finished(test_every=4)
+    report = evaluate_run(run, far=True)
+    assert all(np.isfinite(row["psnr"]) for row in report["farther"])
+    monkeypatch.setattr("training.evaluate.views.ssim", lambda *_: float("nan"))
+    report = evaluate_run(run)
+    assert np.isnan(report["levels"][0]["ssim"]) and "nan" in table(report)
+
+    def refuse(constant):
+        raise ValueError(f"{constant} is no JSON")
+
+    written = json.loads((run / "metrics.json").read_text(), parse_constant=refuse)
+    assert written["levels"][0]["ssim"] is None
+    assert written["levels"][0]["psnr"] == report["levels"][0]["psnr"]

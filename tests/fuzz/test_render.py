@@ -1,0 +1,83 @@
+"""The doors of the render process: lines that ask for frames, and files of splats."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.fuzz.doors import attempt
+from tests.fuzz.mutations import spoiled, spoiled_value
+from training.render import wire
+from training.render.requests import FrameRequest, read_line, read_request
+from training.render.scene import Instance, SplatSet, draw
+from training.scenes.cameras import MOST_PIXELS, Camera, camera_as_dict
+from training.splats.dialects import drawable
+from training.splats.gaussians import Splats
+
+POSE = np.eye(4)
+POSE[2, 3] = 4
+ONE = {"file": "set-1", "count": 20, "matrix": np.diag([2.0, 1.0, 1.0, 1.0]).tolist(), "level": 2}
+REQUEST = {
+    "frame": 7, "out": "frame-7", "background": [0.1, 0.2, 0.3], "depth": True, "levels": True,
+    "camera": camera_as_dict(Camera("", 32, 24, 30.0, 30.0, 16.0, 12.0, POSE), 0.1),
+    "window": [2, 3, 20, 16], "photograph": None, "holdout": None,
+    "sets": [ONE, ONE | {"matrix": np.eye(4).tolist(), "level": 0}],
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("render")
+
+
+@pytest.fixture(scope="module")
+def splats() -> Splats:
+    rng = np.random.default_rng(0)
+    columns = [rng.normal(0, 0.7, (20, width)).astype(np.float32) for width in (3, 4, 3, 1, 12)]
+    means, quats, log_scales, logits, sh = columns
+    return Splats(means, quats, log_scales - 2, logits[:, 0], sh.reshape(20, 4, 3))
+
+
+def answer(request, splats: Splats) -> None:
+    """Draws what was asked for, where that is a small picture."""
+    if isinstance(request, FrameRequest):
+        width, height = (
+            request.window[2:] if request.window else (request.camera.width, request.camera.height)
+        )
+        assert 1 <= width * height <= MOST_PIXELS
+        if width * height <= 10_000:
+            held = SplatSet(splats, backend="cpu")
+            instances = [Instance(held, one.matrix, one.level) for one in request.sets]
+            picture = draw(
+                instances, request.camera, near=request.near, background=request.background,
+                depth=request.depth, levels=request.levels, window=request.window, backend="cpu",
+            )  # fmt: skip
+            assert picture is not None and picture.alpha.shape == (height, width)
+
+
+@pytest.mark.cases(short=120, weight=2)
+@given(values=spoiled_value(REQUEST))
+def test_requests(splats, values):
+    line = json.dumps(values).encode()
+    attempt("render request", lambda: answer(read_request(read_line(line)), splats), values)
+
+
+@given(data=st.data())
+def test_lines(data):
+    line = data.draw(spoiled([json.dumps(REQUEST).encode(), b'{"cancel": 7}']))
+    attempt("render request", lambda: read_request(read_line(line)), line)
+
+
+@pytest.mark.cases(short=60, weight=1)
+@given(data=st.data(), count=st.sampled_from([20, 20, 20, 0, 1, 19, 21, 1 << 29]))
+def test_sets(folder, splats, data, count):
+    path = folder / "set-1"
+    wire.write_set(path, wire.packed(splats, None))
+    content = data.draw(spoiled([path.read_bytes()]))
+    path.write_bytes(content)
+    request = read_request(REQUEST)
+    attempt("render set", lambda: answer(request, drawable(wire.read_set(path, count)[0], path)), content)

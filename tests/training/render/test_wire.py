@@ -1,0 +1,113 @@
+"""Folders and files that Blender and the renderer share, and what is asked with them."""
+
+import json
+
+import numpy as np
+import pytest
+
+from training.errors import LodgsError
+from training.render import wire
+from training.render.requests import Cancel, frame_of, read_line, read_request
+from training.scenes.cameras import camera_as_dict
+
+
+def test_only_what_was_claimed_is_removed(tmp_path):
+    """A folder of somebody's is neither claimed nor removed; one without the mark stays, whatever was."""
+    theirs = tmp_path / "photos"
+    theirs.mkdir()
+    (theirs / "a.jpg").write_text("dear")
+    with pytest.raises(LodgsError, match="is not empty"):
+        wire.claim(theirs)
+    wire.release(theirs)
+    assert [path.name for path in theirs.iterdir()] == ["a.jpg"]
+    for folder in (tmp_path / "new", tmp_path / "empty"):
+        if folder.name == "empty":
+            folder.mkdir()
+        wire.claim(folder)
+        (folder / "set-1").write_bytes(b"1234")
+        wire.claim(folder)  # whose it is already
+        (folder / "theirs").mkdir()
+        (folder / "theirs" / "b.jpg").write_text("dear")
+        wire.release(folder)
+        assert [path.name for path in folder.iterdir()] == ["theirs"]
+    wire.claim(tmp_path / "gone")
+    wire.release(tmp_path / "gone")
+    assert not (tmp_path / "gone").exists()
+    with pytest.raises(LodgsError, match="cannot be made"):
+        wire.claim(theirs / "a.jpg")
+
+
+def test_a_set_is_of_its_size(make_splats, tmp_path):
+    path = tmp_path / "set"
+    for count, degree in ((5, 3), (1, 0), (0, 0)):
+        splats, weights = make_splats(count, degree), np.linspace(0, 1, count, dtype=np.float32)
+        wire.write_set(path, wire.packed(splats, weights))
+        again, same = wire.read_set(path, count)
+        np.testing.assert_array_equal(again.means, splats.means)
+        assert np.array_equal(same, weights) and again.sh.shape[0] == count
+        for wrong in (count + 1, 1 << 29):
+            with pytest.raises(LodgsError, match="does not hold"):
+                wire.read_set(path, wrong)
+    path.write_bytes(b"12345")
+    with pytest.raises(LodgsError, match="cannot be read"):
+        wire.read_set(path, 1)
+    for name in ("absent", "."):
+        with pytest.raises(LodgsError, match="no set"):
+            wire.read_set(tmp_path / name, 1)
+
+
+@pytest.fixture
+def good(camera) -> dict:
+    one = {"file": "set-1", "count": 3, "matrix": np.eye(4).tolist(), "level": 2}
+    return {"frame": 1, "out": "frame-1", "camera": camera_as_dict(camera, 0.1), "sets": [one]}
+
+
+def test_a_request_is_what_was_asked(good, camera):
+    found = read_request(
+        read_line(json.dumps(good | {"window": [1, 2, 3, 4], "background": [0, 1, 2]}).encode())
+    )
+    assert found.window == (1, 2, 3, 4) and found.background == (0.0, 1.0, 2.0) and found.near == 0.1
+    assert found.sets[0].file == "set-1" and found.sets[0].level == 2 and not found.depth
+    assert camera_as_dict(found.camera, 0.1) == camera_as_dict(camera, 0.1)
+    assert read_request({"cancel": 3}) == Cancel(3)
+    assert frame_of(good) == 1 and frame_of({"frame": []}) is None
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"cancel": {}}, {"cancel": True}, {"frame": "1"}, {"frame": None}, {"out": "../x"}, {"out": ".x"},
+        {"out": ""}, {"out": 3}, {"camera": []}, {"sets": {}}, {"sets": [3]}, {"sets": None},
+        {"background": [1, 2]}, {"background": [1, 2, 1e30]}, {"background": "red"},
+        {"background": [True] * 3},
+        {"window": [0, 0, 65, 1]}, {"window": [0, 0, 0, 0]}, {"window": [0.5, 0, 1, 1]}, {"window": 3},
+        {"window": [0, 0, 1, 1], "photograph": "a.png"}, {"holdout": 3}, {"photograph": ["a"]},
+    ],
+)  # fmt: skip
+def test_impossible_requests_are_a_sentence(good, change):
+    with pytest.raises(LodgsError, match="is not valid"):
+        read_request(good | change)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"count": -1}, {"count": 1 << 40}, {"count": 1.5}, {"matrix": [[1, 0], [0, 1]]}, {"matrix": 1},
+        {"matrix": np.full((4, 4), 1e300).tolist()}, {"matrix": np.ones((4, 4)).tolist()}, {"level": -1},
+        {"level": None}, {"file": "/etc/passwd"}, {"file": "a\0"}, {"file": "C:x"},
+        {"matrix": [["a"] * 4] * 4},
+        {"matrix": [[1, 0, 0, [0]], *np.eye(4)[1:].tolist()]},
+    ],
+)  # fmt: skip
+def test_impossible_sets_are_a_sentence(good, change):
+    good["sets"][0] |= change
+    with pytest.raises(LodgsError, match="is not valid"):
+        read_request(good)
+
+
+@pytest.mark.parametrize(
+    "line", [b"no json", b"[]", b"[" * 5000, b"\xff", b'{"a": 1e999}', b'{"frame": NaN}', b""]
+)
+def test_lines_that_are_no_request(line):
+    with pytest.raises(LodgsError, match="A request is not valid"):
+        read_line(line)

@@ -1,0 +1,192 @@
+"""What other programs ask ``serve`` for: the one place where a request is read and checked."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeGuard
+
+import numpy as np
+
+from ..documents import json_object
+from ..errors import LodgsError
+from ..scenes.cameras import FARTHEST, Camera, camera_from_dict, check_size
+
+BRIGHTEST = 1e6
+"""No colour of a background is larger."""
+MOST_SPLATS = 1 << 30
+"""Splats of one set."""
+LAST_LEVEL = 1 << 15
+
+_NAME = re.compile(r"[\w-][\w.-]{0,99}", re.ASCII)
+
+
+@dataclass(frozen=True)
+class Cancel:
+    """Do not draw a frame, or stop drawing it."""
+
+    frame: int
+
+
+@dataclass(frozen=True)
+class NamedSet:
+    """A set of splats in a file, and where it stands; see ``scene.Instance``.
+
+    Attributes:
+        file: a name in the folder of arrays.
+        count: of its splats.
+    """
+
+    file: str
+    count: int
+    matrix: np.ndarray
+    level: int
+
+
+@dataclass(frozen=True)
+class FrameRequest:
+    """A picture that is asked for: the arguments of ``scene.draw``, and
+
+    Attributes:
+        frame: its number.
+        out: the file for its planes, a name in the folder of arrays.
+        photograph: to compare with, or None.
+        holdout: EXR of meshes' depths, or None.
+    """
+
+    frame: int
+    out: str
+    camera: Camera
+    near: float
+    background: tuple[float, float, float] | None
+    depth: bool
+    levels: bool
+    window: tuple[int, int, int, int] | None
+    photograph: Path | None
+    holdout: Path | None
+    sets: list[NamedSet]
+
+
+def frame_of(values: dict) -> int | None:
+    """The number of the frame that a request is about, if it has one."""
+    frame = values.get("frame")
+    return frame if _is_whole(frame) else None
+
+
+def read_line(line: bytes) -> dict:
+    """A request as it came.
+
+    Raises:
+        LodgsError: it is no JSON object, or breaks a bound of ``documents``.
+    """
+    return json_object(line, "A request")
+
+
+def read_request(values: dict) -> FrameRequest | Cancel:
+    """A request, checked.
+
+    Raises:
+        LodgsError: it lacks something, or something in it is impossible.
+    """
+    if "cancel" in values:
+        return Cancel(_whole(values, "cancel"))
+    frame = _whole(values, "frame")
+    camera, near = camera_from_dict(_of_kind(values, "camera", dict))
+    window = _window(values, camera)
+    check_size(*(window[2:] if window else (camera.width, camera.height)))
+    photograph, background = _path(values, "photograph"), None
+    if photograph and window:
+        raise _refused("photograph", "given beside a window")
+    if values.get("background") is not None:
+        red, green, blue = _numbers(values, "background", 3, BRIGHTEST)
+        background = red, green, blue
+    return FrameRequest(
+        frame=frame,
+        out=_name(values, "out"),
+        camera=camera,
+        near=near,
+        background=background,
+        depth=bool(values.get("depth")),
+        levels=bool(values.get("levels")),
+        window=window,
+        photograph=photograph,
+        holdout=_path(values, "holdout"),
+        sets=[_named_set(one) for one in _of_kind(values, "sets", list)],
+    )
+
+
+def _named_set(values: Any) -> NamedSet:
+    if not isinstance(values, dict):
+        raise _refused("sets", values)
+    matrix = np.array(_of_kind(values, "matrix", list), object)
+    if matrix.shape != (4, 4):
+        raise _refused("matrix", values["matrix"])
+    matrix = np.reshape(_numbers({"matrix": matrix.ravel().tolist()}, "matrix", 16, FARTHEST), (4, 4))
+    if matrix[3].tolist() != [0, 0, 0, 1]:
+        raise _refused("matrix", values["matrix"])
+    return NamedSet(
+        file=_name(values, "file"),
+        count=_whole(values, "count", 0, MOST_SPLATS),
+        matrix=matrix,
+        level=_whole(values, "level", 0, LAST_LEVEL),
+    )
+
+
+def _window(values: dict, camera: Camera) -> tuple[int, int, int, int] | None:
+    if not values.get("window"):
+        return None
+    given = _of_kind(values, "window", list)
+    if len(given) != 4 or not all(_is_whole(value) for value in given):
+        raise _refused("window", given)
+    left, top, width, height = given
+    if not (0 <= left < left + width <= camera.width and 0 <= top < top + height <= camera.height):
+        raise _refused("window", given)
+    return left, top, width, height
+
+
+def _numbers(values: dict, key: str, count: int, largest: float) -> list[float]:
+    given = _of_kind(values, key, list)
+    fine = len(given) == count and all(
+        isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= largest
+        for value in given
+    )
+    if not fine:
+        raise _refused(key, given)
+    return [float(value) for value in given]
+
+
+def _whole(values: dict, key: str, least: int = -(1 << 62), most: int = 1 << 62) -> int:
+    value = values.get(key)
+    if not (_is_whole(value) and least <= value <= most):
+        raise _refused(key, value)
+    return int(value)
+
+
+def _is_whole(value: Any) -> TypeGuard[int]:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _name(values: dict, key: str) -> str:
+    """A file's plain name: one that leads nowhere else."""
+    name = _of_kind(values, key, str)
+    if not _NAME.fullmatch(name):
+        raise _refused(key, name)
+    return name
+
+
+def _path(values: dict, key: str) -> Path | None:
+    return Path(_of_kind(values, key, str)) if values.get(key) is not None else None
+
+
+def _of_kind(values: dict, key: str, kind: type) -> Any:
+    value = values.get(key)
+    if not isinstance(value, kind):
+        raise _refused(key, value)
+    return value
+
+
+def _refused(key: str, value: Any) -> LodgsError:
+    text = "nothing" if value is None else repr(value)
+    text = text if len(text) < 100 else f"{text[:100]}..."
+    return LodgsError(f'A request is not valid: "{key}" cannot be {text}.')
