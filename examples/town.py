@@ -268,7 +268,8 @@ def _sky(plan: Plan, count: int) -> Discs:
     clouds = shapes.noise(across * 0.8, along * 0.8, 20.0, 4) * 0.9 - 0.05
     white = clouds.clip(0, 0.85)[:, None]
     color = color * (1 - white) + 0.97 * white
-    return Discs(out * radius, np.negative(out), np.cross(out, [0.31, 0.52, 0.79]), size, color, np.zeros(count))
+    tangents = np.cross(out, [0.31, 0.52, 0.79])
+    return Discs(out * radius, np.negative(out), tangents, size, color, np.zeros(count))
 
 
 def _lit(plan: Plan, means: np.ndarray, normals: np.ndarray, albedo: np.ndarray) -> np.ndarray:

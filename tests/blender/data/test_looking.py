@@ -57,7 +57,7 @@ def test_photographs_are_looked_at_from_the_view_in_the_middle(bpy, lodgs):
 def test_an_impossible_control_changes_nothing(bpy, lodgs, tmp_path):
     write_bundle(tmp_path / "b.ply", Bundle("mine", [Level(1, ball(5, 0))]))
     root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "b.ply")
-    odd = Bundle("flod", [], "bands", controls={"gamma": -1.0}, meta={"a": 1}, cumulative=True)
+    odd = Bundle("flod", [], "bands", controls={"gamma": -1.0}, meta={"a": 1})
     before = {name: getattr(root.lodgs, name) for name in ("method", "rule", "cumulative", "meta", "mode")}
     with pytest.raises(lodgs("training.errors").LodgsError, match="gamma = -1"):
         lodgs("data.scenes").set_bundle_facts(root, odd)

@@ -31,9 +31,10 @@ os._exit(0)
 
 @pytest.mark.parametrize("cumulative", [False, True])
 def test_the_finest_level_is_there_as_points(bpy, lodgs, tmp_path, cumulative):
-    levels = [Level(number, splats(count), {"s_min": 0.1 / number}) for number, count in COUNTS.items()]
-    levels[-1].facts["s_min"] = 0.0
-    write_bundle(tmp_path / "b.ply", Bundle("flod", levels, "bands", cumulative=cumulative))
+    s_min = {1: 0.1, 2: 0.05, 3: 0.0}
+    levels = [Level(number, splats(count), {"s_min": s_min[number]}) for number, count in COUNTS.items()]
+    rule, facts = ("octree", {"d_max": 9.0, "d_max_focal": 500.0}) if cumulative else ("bands", {})
+    write_bundle(tmp_path / "b.ply", Bundle("made", levels, rule, facts, cumulative=cumulative))
     root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "b.ply")
     root.lodgs.mode, root.lodgs.levels[2].show = "SELECTIVE", False
     bpy.context.view_layer.update()

@@ -151,7 +151,7 @@ def test_measuring_is_cancelled(bpy, lodgs, root, renderer):
     assert not measurement.step() and measurement.done == 1
 
 
-def measured(bpy) -> dict[str, float]:
+def recorded(bpy) -> dict[str, float]:
     return {
         obj.name: round(obj.data.lodgs.psnr, 3)
         for obj in bpy.data.objects
@@ -171,16 +171,16 @@ def test_undoing_something_else_loses_no_measure(bpy, lodgs, root, renderer):
     bpy.ops.ed.undo_push(message="Add")
     assert measurement.step()
     bpy.ops.ed.undo()
-    assert len(measured(bpy)) < 2
+    assert len(recorded(bpy)) < 2
     assert not measurement.step()
-    found = measured(bpy)
+    found = recorded(bpy)
     assert len(found) == 3
     bpy.context.scene.collection.objects.link(bpy.data.objects.new("the artist's", None))
     bpy.ops.ed.undo_push(message="Add")
     bpy.ops.ed.undo()
-    assert "the artist's" not in bpy.data.objects and measured(bpy) == found
+    assert "the artist's" not in bpy.data.objects and recorded(bpy) == found
     bpy.ops.ed.undo()
-    assert not measured(bpy)
+    assert not recorded(bpy)
 
 
 @pytest.mark.parametrize("look", ["compare_view", "compare_worst", "look_through"])
