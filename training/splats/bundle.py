@@ -42,8 +42,8 @@ _TAG = "lodsplat "
 _FORBIDDEN = ("packed_", "f_rest_", "end_header", "element chunk")
 # Some viewers read no further than 10 KB to find the end of the header.
 _MAX_COMMENTS = 2560
-# What readers rely on of meta.
-_META_SHAPES = {"camera_center": (3,), "up_rotation": (3, 3), "view": (2, 3)}
+META_SHAPES = {"camera_center": (3,), "up_rotation": (3, 3), "view": (2, 3)}
+"""What readers rely on of meta, where it is there."""
 # What reading JSON of others' making raises where something in it is missing, of another type or too deep.
 _CONTRADICTIONS = (ValueError, KeyError, TypeError, AttributeError, RecursionError)
 
@@ -387,7 +387,7 @@ def _bundle(head: dict, lines: list[dict], meta: dict, path: str | Path) -> Bund
         raise LodgsError(f"{path} is a bundle of the newer version {head['v']}.", "Update LODGS to read it.")
     if not isinstance(meta, dict):
         raise TypeError("meta is no object")
-    for name, shape in _META_SHAPES.items():
+    for name, shape in META_SHAPES.items():
         if name in meta:
             values = np.asarray(meta[name])
             if values.shape != shape or values.dtype.kind not in "if" or not np.isfinite(values).all():
