@@ -9,7 +9,8 @@ PYTEST := -m pytest -n auto
 quick test test-5.0: export OMP_NUM_THREADS := 1  # torch's threads would come on top of the workers
 export LODGS_TRAINER_PYTHON := $(CURDIR)/$(VENV)
 
-.PHONY: help setup demo check quick test test-5.0 lint docs tables bench bench-quality extension window interop clean
+.PHONY: help setup demo check quick test test-5.0 lint docs tables bench bench-quality extension window interop \
+	attacks clean
 
 help:
 	@echo "make setup      environments from pinned packages (needs Python 3.11; 3.13 for Blender 5.2's tests)"
@@ -24,6 +25,7 @@ help:
 	@echo "make extension  dist/lodgs-VERSION.zip, checked by Blender"
 	@echo "make window     a tour in a real Blender window, with pictures (METHOD=flod; needs Blender, Xvfb, ImageMagick)"
 	@echo "make interop    other programs read our files (needs Node)"
+	@echo "make attacks    trainers killed at random moments, disks that fill up: about a quarter of an hour"
 
 setup:
 	@command -v $(PYTHON) >/dev/null || { echo "setup: Python is missing; install Python 3.11 with pip." >&2; exit 1; }
@@ -74,6 +76,9 @@ window: setup
 
 interop: setup
 	$(VENV) tools/interop.py
+
+attacks: setup
+	$(VENV) tools/attacks.py
 
 clean:
 	rm -rf build dist .venv .venv-blender-5.2 .venv-blender-5.0

@@ -21,6 +21,7 @@ from ..errors import LodgsError
 from .colmap import Scene, read_scene
 
 _VERSION = b"1"  # of what is kept in the cache
+_ROOM = 1 << 18  # bytes that are still free on a disk that is not full
 
 
 def undistorted(scene: Scene, cache: Path) -> Scene:
@@ -42,7 +43,7 @@ def undistorted(scene: Scene, cache: Path) -> Scene:
             _undistort_into(target, scene)
     except OSError as error:
         raise LodgsError(
-            f"The lens distortion of {scene.folder} could not be undone: {error}.",
+            f"The lens distortion of {scene.folder} could not be undone: {error.strerror or error}.",
             "Check the images and the free space.",
         ) from error
     result = read_scene(target, model=target / "sparse", images=target / "images")
@@ -97,11 +98,20 @@ def _undistort_into(target: Path, scene: Scene) -> None:
                 "Check the trainer's environment and the free space, or give an undistorted scene "
                 "(colmap image_undistorter).",
             )
+        _require_room(Path(work))
         try:
             os.replace(Path(work) / "undistorted", target)
         except OSError:
             if not target.is_dir():  # else another process was quicker, with the same content
                 raise
+
+
+def _require_room(folder: Path) -> None:
+    """Raises OSError where a disk is full: COLMAP writes half a photograph then, and says nothing of it."""
+    with tempfile.TemporaryFile(dir=folder) as file:
+        file.write(os.urandom(_ROOM))
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def _converse(child: subprocess.Popen[str], request: str) -> str:
