@@ -244,7 +244,7 @@ def test_an_unresponsive_trainer_is_reported_and_can_be_ended(lodgs, jobs, fake,
 
 
 def test_cancel_is_not_lost_before_the_trainer_is_ready(bpy, jobs, fake, root, tmp_path):
-    """What was asked of an earlier trainer is forgotten; what is asked of this one is heard, however early."""
+    """What was asked of an earlier trainer is forgotten; what is asked of this one is heard."""
     fake("slow")
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "cancel").touch()
@@ -302,8 +302,9 @@ def test_following_a_run_never_raises_whatever_its_files_say(bpy, jobs, fake, ro
     second = (level % "{}").replace('"level": 1', '"level": 2')
     (tmp_path / "secret.ply").write_bytes((run / "levels" / "level_1.ply").read_bytes())
     lines = [
+        '{"event": "hello", "method": 3}',
         level % "3", level % '{"camera_center": "here"}', level % '{"a": "\\ud800"}', level % ("[" * 20_000),
-        (level % "{}").replace('"level": 1', f'"level": {2**31}'), '{"event": "hello", "method": 3}',
+        (level % "{}").replace('"level": 1', f'"level": {2**31}'),
         second.replace("levels/level_1.ply", str(tmp_path / "secret.ply")),
         second.replace("levels/level_1.ply", "../secret.ply"),
         second.replace("levels/level_1.ply", "events.jsonl"),

@@ -42,8 +42,8 @@ def holder(run):
 @pytest.mark.parametrize(
     "name",
     [
-        "events.jsonl", "trainer.log", "trainer.out", "lock", "job.toml", "bundle.ply", "levels", "checkpoints",
-        "undistorted", "reserve", "metrics.json", "levels/level_1.ply",
+        "events.jsonl", "trainer.log", "trainer.out", "lock", "job.toml", "bundle.ply", "levels",
+        "checkpoints", "undistorted", "reserve", "metrics.json", "levels/level_1.ply",
     ],
 )  # fmt: skip
 def test_links_in_a_run_are_refused(run, tmp_path, name):
