@@ -12,8 +12,8 @@ PYTEST := -m pytest -n auto
 quick test test-5.0 fuzz: export OMP_NUM_THREADS := 1  # torch's threads would come on top of the workers
 export LODGS_TRAINER_PYTHON := $(CURDIR)/$(VENV)
 
-.PHONY: help setup demo check quick test test-5.0 fuzz lint docs tables bench bench-quality extension pins window interop \
-	clean
+.PHONY: help setup demo check quick test test-5.0 fuzz attacks lint docs tables bench bench-quality extension pins \
+	window interop clean
 
 help:
 	@echo "make setup      environments from pinned packages (needs Python 3.11; 3.13 for Blender 5.2's tests)"
@@ -30,6 +30,7 @@ help:
 	@echo "make pins       requirements/*.txt anew from requirements/*.in (UPGRADE=1 takes the newest of what these leave open)"
 	@echo "make window     a tour in a real Blender window, with pictures (METHOD=flod; needs Blender, Xvfb, ImageMagick)"
 	@echo "make interop    other programs read our files (needs Node)"
+	@echo "make attacks    trainers killed at random moments, disks that fill up: about a quarter of an hour"
 
 setup:
 	@command -v $(PYTHON) >/dev/null || { echo "setup: Python is missing; install Python 3.11 with pip." >&2; exit 1; }
@@ -88,6 +89,9 @@ window: setup
 
 interop: setup
 	$(VENV) tools/interop.py
+
+attacks: setup
+	$(VENV) tools/attacks.py
 
 clean:
 	rm -rf build dist .venv .venv-blender-5.2 .venv-blender-5.0

@@ -6,8 +6,10 @@ import argparse
 import json
 import os
 import re
+import signal
 import sys
 import tomllib
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 from typing import NoReturn
@@ -34,7 +36,8 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         chosen = _parser().parse_args(arguments)
         code = _COMMANDS[chosen.command](chosen)
-        sys.stdout.flush()
+        if chosen.command != "train":  # whose run's folder has all that it prints
+            sys.stdout.flush()
         return code
     except BrokenPipeError:  # whoever read our output has seen enough
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115
@@ -47,6 +50,12 @@ def main(arguments: list[str] | None = None) -> int:
             raise
         print("error: There is not enough memory. Close other programs, or ask for less.", file=sys.stderr)
         return 2
+    except OSError as error:
+        about = f" ({error.filename})" if error.filename else ""
+        print(f"error: {error.strerror or error}{about}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 3
     except ModuleNotFoundError:
         if not (problems := _environment()["problems"]):
             raise
@@ -175,7 +184,10 @@ def _colour(text: str) -> tuple[float, float, float] | None:
 
 
 def _train(chosen: argparse.Namespace) -> int:
-    from .runs.folder import event_line
+    for name in ("SIGINT", "SIGTERM", "SIGBREAK"):  # the last is Windows' CTRL_BREAK_EVENT
+        if hasattr(signal, name):  # heard also while torch loads, which takes seconds
+            signal.signal(getattr(signal, name), signal.default_int_handler)
+    from .runs.events import event_line
     from .runs.options import job_from
 
     try:
@@ -183,11 +195,13 @@ def _train(chosen: argparse.Namespace) -> int:
         problems = _environment()["problems"]
         if problems:
             raise LodgsError(problems[0], _INSTALL)
+        from .runs.train import train
     except LodgsError as error:
         print(event_line("error", what=error.what, remedy=error.remedy), flush=True)
         return 2
-    from .runs.train import train
-
+    except KeyboardInterrupt:
+        print(event_line("cancelled", message="Stopped before training began."), flush=True)
+        return 3
     return train(job, sys.stdout)
 
 
@@ -323,8 +337,9 @@ _COMMANDS = {
 def run() -> NoReturn:
     """The command ``lodgs``: ends the process with :func:`main`'s code."""
     code = main()
-    sys.stdout.flush()
-    sys.stderr.flush()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError):  # a full disk, of which all was said that could be
+            stream.flush()
     os._exit(code)  # native thread pools can hang a normal exit
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from .errors import LodgsError
+from .files import open_regular
 
 MOST_JSON = 1 << 20
 """Most bytes of one JSON text: a file, or a line where each is an object. All of ours have a few thousand."""
@@ -41,10 +42,7 @@ def open_file(path: str | Path, what: str = "") -> IO[bytes]:
         LodgsError: there is no such file, it is not a file, or it may not be read.
     """
     try:
-        if Path(path).exists() and not Path(path).is_file():
-            reason = "it is not a file"
-        else:
-            return open(path, "rb")
+        return open_regular(path)
     except OSError as error:
         reason = error.strerror or str(error)
     except ValueError:  # a NUL or half a surrogate pair

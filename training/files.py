@@ -1,12 +1,16 @@
-"""Files that appear whole or not at all."""
+"""Files that appear whole or not at all, and files that are really files."""
 
 from __future__ import annotations
 
+import errno
 import os
+import re
+import stat
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
 from .errors import LodgsError
 
@@ -17,12 +21,12 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
     The file is flushed to the disk and then moved into place, so whoever looks finds the old file or the new
     one, never a part. When the block raises, the temporary file is removed and ``path`` stays as it was. The
-    parent folder is made if it is missing.
+    parent folder is made if it is missing. A link is followed: what it points to is replaced.
 
     Raises:
         LodgsError: the disk is full, or the place cannot be written.
     """
-    path = Path(path)
+    path = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -42,6 +46,27 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             temporary.unlink()
+
+
+def remove_temporaries(folder: Path) -> None:
+    """Removes what killed processes left of :func:`atomic_write` in a folder. Nobody may be writing there."""
+    for path in folder.glob(".*.tmp"):
+        if re.fullmatch(r"\..+\.[0-9a-f]{8}\.tmp", path.name):
+            with suppress(OSError):
+                path.unlink()
+
+
+def open_regular(path: str | Path) -> BinaryIO:
+    """Opens a file for reading; unlike ``open`` it never waits for a pipe's other end, or reads a device.
+
+    Raises:
+        OSError: it cannot be read, or is no file.
+    """
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "not a file", str(path))
+    return open(descriptor, "rb")
 
 
 def _sync_folder(folder: Path) -> None:

@@ -6,14 +6,11 @@ A run goes on when Blender closes, and is found again by its folder when the .bl
 from __future__ import annotations
 
 import itertools
-import os
-import signal
-import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import fields, replace
 from functools import lru_cache
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import TYPE_CHECKING, Any
 
 import bpy
@@ -27,7 +24,7 @@ from ...training.runs.job import Job
 from .. import extension
 from ..data.training import hold_out, offered
 from . import environment, processes
-from .watch import OUTPUT, Watch, begin, root_by_uid, watch_of, watches
+from .watch import Watch, begin, root_by_uid, watch_of, watches
 
 if TYPE_CHECKING:
     from ..data.training import TrainingSettings
@@ -86,7 +83,7 @@ def resume(root: bpy.types.Object) -> Watch:
         raise LodgsError(f"The run in {run.path} is already at work.", "Wait for it or cancel it.")
     if state == "done":
         raise LodgsError(f"The run in {run.path} is finished.", "Press Train for a new one.")
-    job = Job.from_file(run.job)
+    job = replace(Job.from_file(run.job), out=str(run.path))
     backend = extension.preferences().backend  # what this computer has, and what its user wants now
     return _launch(root, run, None if job.backend == backend else replace(job, backend=backend))
 
@@ -104,7 +101,7 @@ def start_or_resume(root: bpy.types.Object, job: Job) -> Watch:
     if state in {"empty", "running"}:
         return _begin(root, run, job)
     before, now = Job.from_file(run.job).resolved(), job.resolved()
-    names = [f.name for f in fields(Job) if f.name != "backend"]
+    names = [f.name for f in fields(Job) if f.name not in ("backend", "out")]
     changed = [name for name in names if getattr(before, name) != getattr(now, name)]
     if changed:
         raise LodgsError(
@@ -138,9 +135,8 @@ def cancel(root: bpy.types.Object) -> None:
             ) from error
     elif watch.process is not None:
         watch.process.kill()
-    elif (hello := watch.folder.last("hello")) and watch.folder.state() == "running":
-        with suppress(OSError):
-            os.kill(int(hello["pid"]), signal.SIGTERM if sys.platform == "win32" else signal.SIGKILL)
+    else:
+        watch.folder.end()
     extension.redraw()
 
 
@@ -304,8 +300,9 @@ def _launch(root: bpy.types.Object, run: RunFolder, job: Job | None) -> Watch:
     if job is not None:
         job.resolved().write(run.job)
     try:
-        command = [str(python), "-m", "training", "train", str(run.job)]
-        process = processes.spawn(command, log=run.log, output=run.path / OUTPUT)
+        run.take_cancel()  # what was asked of an earlier trainer; from now on it is for this one
+        command = [str(python), "-m", "training", "train", str(run.job), "--out", str(run.path)]
+        process = processes.spawn(command, log=run.log, output=run.output)
     except OSError as error:
         raise LodgsError(
             f"The trainer's Python {python} cannot be started: {error.strerror or error}.",
@@ -349,10 +346,19 @@ def _new_folder(root: bpy.types.Object) -> Path:
     return next(parent / n for n in names if not (parent / n).exists())
 
 
+def _far(folder: str) -> bool:
+    """Whether a folder is on another computer than the .blend: it is looked for there on request only.
+
+    Opening somebody's file must not make Windows introduce itself to a computer of their choice.
+    """
+    share = PureWindowsPath(folder).drive
+    return share.startswith(("\\\\", "//")) and share != PureWindowsPath(bpy.data.filepath).drive
+
+
 def reattach() -> None:
     """Attach to the run of every scene root that has one and is not watched: after loading, undo and redo."""
     for root in [obj for obj in bpy.data.objects if obj.lodgs.training.run]:
-        if watch_of(root) is None:
+        if watch_of(root) is None and not _far(bpy.path.abspath(root.lodgs.training.run)):
             with suppress(LodgsError):  # the folder is gone: the panel says so
                 watch = attach(root, root.lodgs.training.run, again=False)
                 if bpy.app.background:

@@ -6,15 +6,15 @@ there.
 
 from __future__ import annotations
 
-import json
 import subprocess
 import time
+import traceback
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import bpy
 
 from ...training.errors import LodgsError
+from ...training.runs.endings import ending
 from ...training.runs.folder import RunFolder
 from ...training.splats.bundle import Bundle, Level, read_head
 from ...training.splats.ply import read_ply
@@ -23,16 +23,6 @@ from ..data import scenes
 
 UNRESPONSIVE_AFTER = 60.0
 """Seconds without an event after which the panel says that the trainer does not answer."""
-
-
-NUMBERS = {
-    "progress": ("level", "levels", "step", "of", "loss", "psnr", "splats", "steps_per_s", "eta_s"),
-    "level": ("level", "splats"),
-}
-"""What an event must hold as numbers to be shown."""
-
-OUTPUT = "trainer.out"
-"""File in the run's folder that takes the trainer's standard output, for what it says outside its events."""
 
 
 @dataclass
@@ -101,37 +91,44 @@ class Watch:
                 self._set_end()
             if events or not alive:
                 extension.redraw()
-        except OSError as error:
-            self.problem = f"The run folder {self.folder.path} cannot be read: {error.strerror}."
+        except Exception as error:
+            self.problem = self._trouble(error)
+            if not alive:  # nothing will say how it ended
+                self.state, self.message = "interrupted", "Stopped"
         return alive
 
     def _handle_event(self, root: bpy.types.Object, event: dict) -> None:
         self.last_event = time.time()
-        if not _is_complete(event):
-            self.problem = f"The trainer sent a '{event['event']}' that this version does not understand."
-            return
         try:
             self._apply(root, event)
-        except LodgsError as error:
-            self.problem = str(error)
+        except Exception as error:  # the next events are worth as much without this one
+            self.problem = self._trouble(error)
+
+    def _trouble(self, error: Exception) -> str:
+        if isinstance(error, LodgsError):
+            return str(error)
+        if isinstance(error, OSError):
+            return f"The run folder {self.folder.path} cannot be read: {error.strerror or error}."
+        traceback.print_exc()
+        return f"What the trainer sent could not be shown: {error}."
 
     def _alive(self) -> bool:
         if self.process is not None and self.process.poll() is None:
             return True
-        return self.folder.state() == "running"
+        return self.folder.running
 
     def _apply(self, root: bpy.types.Object, event: dict) -> None:
         match event["event"]:
             case "hello":
                 self.problem, self.message = "", "Reading the scene"
-                self.method = str(event.get("method", ""))
+                self.method = event.get("method", "")
                 self.warnings.clear()
             case "status":
-                self.message = str(event.get("message", ""))
+                self.message = event["message"]
             case "progress":
-                self.progress, self.message = event, str(event.get("stage", "")).capitalize()
+                self.progress, self.message = event, event.get("stage", "").capitalize()
             case "warning":
-                self.warnings.append(str(event.get("message", "")))
+                self.warnings.append(event["message"])
             case "level":
                 self._add_level(root, event)
             case "done":
@@ -152,14 +149,14 @@ class Watch:
         self.levels[event["level"]] = event
 
     def _read_level(self, event: dict) -> Level:
-        splats = read_ply(self.folder.path / str(event.get("path")))
+        splats = read_ply(self.folder.file(event["path"]))
         return Level(event["level"], splats, event.get("facts", {}))
 
     def _described(self, event: dict) -> Bundle:
         """What a level's event says of all levels, without them."""
         return Bundle(
-            self.method, [], str(event.get("rule", "")), event.get("scene_facts", {}),
-            event.get("controls", {}), bool(event.get("cumulative")), event["meta"],
+            self.method, [], event.get("rule", ""), event.get("scene_facts", {}),
+            event.get("controls", {}), event.get("cumulative", False), event["meta"],
         )  # fmt: skip
 
     def _finish(self, root: bpy.types.Object) -> None:
@@ -174,17 +171,9 @@ class Watch:
 
     def _set_end(self) -> None:
         """Say how the run ended."""
-        self.state = self.folder.state()
         code = None if self.process is None else self.process.poll()
-        error = self.folder.last("error") if self.state == "failed" else None
-        if code == 2 and error is None:  # it could not even open its run
-            error = _last_error(self.folder.path / OUTPUT)
-        if error:
-            self.state = "failed"
-            self.problem = f"{error.get('what', '')} {error.get('remedy', '')}".strip()
-        elif self.state in {"interrupted", "empty"} or code not in {None, 0, 3}:
-            self.state = "interrupted"
-            self.problem = _exit_reason(code, self.folder.log_tail(1))
+        self.state, problem = ending(self.folder, code)
+        self.problem = problem or self.problem
         self.message = {
             "done": "Finished",
             "cancelled": "Cancelled; it can be resumed",
@@ -203,8 +192,6 @@ def watch_of(root: bpy.types.Object | None) -> Watch | None:
 def begin(watch: Watch) -> Watch:
     """Follows a run from now on, with what is known of it already."""
     for event in watch.folder.events()[0]:
-        if not _is_complete(event):
-            continue
         if event["event"] == "progress":
             watch.progress = event
         elif event["event"] == "level":
@@ -213,32 +200,6 @@ def begin(watch: Watch) -> Watch:
             watch.summary = event
     watches[watch.root] = watch
     return watch
-
-
-def _last_error(output: Path) -> dict | None:
-    """The ``error`` event that ends a trainer's standard output, if one does."""
-    try:
-        event = json.loads(output.read_bytes().splitlines()[-1])
-    except (OSError, ValueError, IndexError):
-        return None
-    return event if isinstance(event, dict) and event.get("event") == "error" else None
-
-
-def _is_complete(event: dict) -> bool:
-    numbers = NUMBERS.get(str(event["event"]), ())
-    return all(isinstance(event.get(name), int | float) for name in numbers)
-
-
-def _exit_reason(code: int | None, last_line: str) -> str:
-    """Why a trainer that sent no error has ended, as far as one can know."""
-    if code is not None and code < 0:
-        how = f"was killed (signal {-code}); often that means too little memory"
-    elif code:
-        how = f"stopped with exit code {code}"
-    else:
-        how = "stopped without a word: killed, or the computer was switched off"
-    last = f" Its last words: {last_line.strip()}" if last_line.strip() else ""
-    return f"The trainer {how}.{last}"
 
 
 def root_by_uid(uid: int) -> bpy.types.Object | None:

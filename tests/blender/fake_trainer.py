@@ -26,7 +26,8 @@ sys.path.insert(0, os.getcwd())
 import numpy as np
 
 from training.methods import METHODS
-from training.runs.folder import PROTOCOL, Events, RunFolder
+from training.runs.events import PROTOCOL, Events
+from training.runs.folder import RunFolder
 from training.runs.job import Job
 from training.splats.bundle import Bundle, Level, write_bundle
 from training.splats.gaussians import Splats
@@ -63,7 +64,7 @@ def main() -> int:
         print(json.dumps({"event": "error", "what": what, "remedy": remedy}))
         return 2
     with folder.hold():
-        return run(mode, job, folder, Events(folder, sys.stdout))
+        return run(mode, job, folder, Events(folder.events_file, folder.reserve, sys.stdout))
 
 
 def run(mode: str, job: Job, folder: RunFolder, say: Events) -> int:

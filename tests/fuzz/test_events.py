@@ -12,7 +12,7 @@ from tests.fuzz.doors import attempt
 from tests.fuzz.mutations import spoiled, spoiled_value
 from training.runs.folder import RunFolder
 
-pytest.importorskip("training.runs.events")
+XX
 
 META = {"camera_center": [0, 0, 1], "up_rotation": [[1, 0, 0], [0, 0, 1], [0, -1, 0]]}
 LEVEL = {

@@ -89,7 +89,7 @@ def test_only_files_are_opened(tmp_path):
     pipe = tmp_path / "pipe.json"
     os.mkfifo(pipe)
     for path in (pipe, tmp_path, "/dev/zero"):
-        with pytest.raises(LodgsError, match="could not be read: it is not a file"):
+        with pytest.raises(LodgsError, match="could not be read: not a file"):
             read_json(path)
     with pytest.raises(LodgsError, match="No such file"):
         open_file(tmp_path / "none.json")

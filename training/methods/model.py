@@ -127,17 +127,27 @@ class Model:
         }
 
     def load_state_dict(self, state: dict) -> None:
-        """Becomes what ``state_dict`` gave.
+        """Becomes what ``state_dict`` gave, or stays as it is.
 
         Raises:
-            ValueError: it lacks a column, as an earlier version's may.
+            ValueError: it is of another model, or its parts do not fit together.
         """
-        if missing := set(self.columns) - set(state["columns"]):
-            raise ValueError(f"columns {sorted(missing)} are missing")
-        for name, tensor in state["tensors"].items():
+        tensors, columns, stats, adam = (state[name] for name in ("tensors", "columns", "stats", "adam"))
+        count = len(tensors["means"])
+        for ours, theirs in (
+            (self.adam.tensors, tensors),
+            ({name: first for name, (first, _) in self.adam.state.items()}, adam["m"]),
+            ({name: second for name, (_, second) in self.adam.state.items()}, adam["v"]),
+            (self.columns, columns),
+            (self.stats, stats),
+        ):
+            _check_alike(ours, theirs, count)
+        if not tensors.keys() == adam["steps"].keys() == self.adam.steps.keys():
+            raise ValueError(f"there are steps of {sorted(adam['steps'])}, tensors {sorted(tensors)}")
+        for name, tensor in tensors.items():
             self.adam.replace(name, tensor.requires_grad_(True))
-        self.columns, self.stats = state["columns"], state["stats"]
-        self.adam.load_state_dict(state["adam"])
+        self.columns, self.stats = columns, stats
+        self.adam.load_state_dict(adam)
 
     def splats(self, min_scale: float = 0.0) -> Splats:
         """A copy as plain arrays, with ``min_scale`` (FLoD, Eq. 4) baked into the scales.
@@ -162,3 +172,15 @@ def splat_rates(parameters: Parameters, extent: float) -> dict[str, LearningRate
         "opacity_logits": p.lr_opacities,
         "sh": torch.tensor([[p.lr_sh], *further]),
     }
+
+
+def _check_alike(ours: Mapping[str, torch.Tensor], theirs: Mapping[str, torch.Tensor], count: int) -> None:
+    """Raises ValueError unless tensors have ``count`` rows each, and those that others have are like them."""
+    if missing := ours.keys() - theirs.keys():
+        raise ValueError(f"{sorted(missing)} are missing")
+    for name, tensor in theirs.items():
+        like = ours.get(name, tensor)
+        if tensor.shape != (count, *like.shape[1:]) or tensor.dtype != like.dtype:
+            raise ValueError(f"{name} is {tuple(tensor.shape)} of {tensor.dtype}, for {count} rows")
+        if not tensor.is_contiguous():
+            raise ValueError(f"{name} is not contiguous")

@@ -1,6 +1,6 @@
 """``python -m training serve``: pictures of splats for another program, one frame after the other.
 
-Requests are JSON objects, one a line, on standard input, answers (``runs.folder.event_line``) on standard
+Requests are JSON objects, one a line, on standard input, answers (``runs.events.event_line``) on standard
 output; arrays lie in files of one folder (``wire``), which belongs to this process, as a mark in it says: it
 is removed when standard input ends, however the other program ended.
 
@@ -37,7 +37,7 @@ from .. import VERSION
 from ..errors import LodgsError, out_of_memory
 from ..evaluate.metrics import psnr
 from ..rasterize import resolve
-from ..runs.folder import event_line
+from ..runs.events import event_line
 from ..scenes.images import load_image
 from ..splats.dialects import drawable
 from . import wire

@@ -2,26 +2,35 @@
 
     run/  job.toml  events.jsonl  checkpoints/  levels/level_1.ply ..  bundle.ply  metrics.json
           model.npz (what a method with networks has beside its levels)
-          trainer.log, trainer.out (what a trainer that Blender started printed)  lock  cancel
+          undistorted/ (photographs without their lens's distortion, where they had some)
+          trainer.log, trainer.out (what a trainer that Blender started printed)  lock  cancel  reserve
 
-``events.jsonl`` holds one JSON object a line, the same lines that the trainer prints. While a trainer runs,
-it holds an operating-system lock on ``lock``, which vanishes with its process however that ends.
+A run is its folder, wherever that lies. ``events.jsonl`` holds one JSON object a line, the same lines that
+the trainer prints. While a trainer runs, it holds an operating-system lock on ``lock``, which vanishes with
+its process however that ends, and says there which process it is.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import shutil
+import stat
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
 from ..errors import LodgsError
+from ..files import open_regular, remove_temporaries
+from . import processes
+from .events import read_events
 
-PROTOCOL = 1
-"""Version of the events; raised when a reader of older ones would misunderstand."""
+_BEGUN = time.time()
+_LATE = 10.0
+"""Seconds before this process: whoever cancelled earlier meant another one, that ended without hearing it."""
+_LOG_TAIL = 1 << 16  # bytes
 
 
 class RunFolder:
@@ -37,57 +46,101 @@ class RunFolder:
         self.metrics = self.path / "metrics.json"
         self.model = self.path / "model.npz"
         self.log = self.path / "trainer.log"
+        self.output = self.path / "trainer.out"
+        self.undistorted = self.path / "undistorted"
+        self.reserve = self.path / "reserve"
         self._lock = self.path / "lock"
         self._cancel = self.path / "cancel"
+        self._held: IO[bytes] | None = None
 
     def make(self) -> None:
-        """Makes the folder and those inside it.
+        """Makes the folder and those inside it, to write there.
 
         Raises:
-            LodgsError: if it cannot be written.
+            LodgsError: if it cannot be written, or as ``require_own_files``.
         """
         try:
-            for folder in (self.path, self.checkpoints, self.levels_folder):
-                folder.mkdir(parents=True, exist_ok=True)
+            self.path.mkdir(parents=True, exist_ok=True)
+            self.require_own_files()
+            for folder in (self.checkpoints, self.levels_folder):
+                folder.mkdir(exist_ok=True)
         except OSError as error:
             raise LodgsError(
                 f"The run folder {self.path} cannot be made: {error.strerror}.",
                 "Choose a folder that you may write to.",
             ) from error
 
+    def require_own_files(self) -> None:
+        """Makes sure that what is written here is written here: whoever sends a run may have put links in it.
+
+        Raises:
+            LodgsError: one of the run's files is a link or a special file.
+            OSError: the folder cannot be read.
+        """
+        places = [place for place in vars(self).values() if isinstance(place, Path) and place != self.path]
+        for folder in (self.checkpoints, self.levels_folder):
+            if folder.is_dir() and not folder.is_symlink():
+                places += folder.iterdir()
+        for place in places:
+            if os.path.lexists(place) and stat.S_IFMT(place.lstat().st_mode) not in (
+                stat.S_IFREG,
+                stat.S_IFDIR,
+            ):
+                raise LodgsError(
+                    f"{place} is a link or a special file, which a run does not have.",
+                    "Remove it, or choose another run folder.",
+                )
+
+    @property
+    def begun(self) -> bool:
+        """Whether a trainer has been at work here."""
+        return self.events_file.exists() or any(self.checkpoints.glob("step_*.pt"))
+
     # -- reading ---------------------------------------------------------------------------------------
 
     def events(self, since: int = 0) -> tuple[list[dict], int]:
         """The whole lines after byte ``since``, as objects, and the byte to go on from next time.
 
-        A last line without its end is left for later; a line that is no JSON object (from a killed
-        trainer) is passed over.
+        What they look like, and what is passed over, is said in ``runs.events``.
+
+        Raises:
+            LodgsError: the file is too long to be a run's.
+            OSError: it cannot be read, or is no file.
         """
-        try:
-            with self.events_file.open("rb") as file:
-                file.seek(since)
-                data = file.read()
-        except FileNotFoundError:
-            return [], 0
-        whole = data[: data.rfind(b"\n") + 1]
-        events = []
-        for line in whole.splitlines():
-            try:
-                event = json.loads(line)
-            except ValueError:
-                continue
-            if isinstance(event, dict) and "event" in event:
-                events.append(event)
-        return events, since + len(whole)
+        return read_events(self.events_file, since)
+
+    def file(self, path: str) -> Path:
+        """A file of the run by the path that an event or a checkpoint gives, relative to the run.
+
+        Raises:
+            LodgsError: it is not there, is no file, or does not lie in the run's folder.
+        """
+        place = self.path / path
+        if not place.is_file() or not place.resolve().is_relative_to(self.path.resolve()):
+            raise LodgsError(f"The run {self.path} holds no file {path}.", "Resume it, or train it anew.")
+        return place
 
     def last(self, *kinds: str) -> dict | None:
         """The newest event of one of these kinds, or None."""
         return next((e for e in reversed(self.events()[0]) if e["event"] in kinds), None)
 
+    def end_event(self) -> dict | None:
+        """The event that tells how the run stands where no trainer is at work; None before the first one."""
+        return self.last("hello", "error", "cancelled", "done")
+
     def levels(self) -> list[dict]:
         """The newest ``level`` event of each level, coarse to fine."""
         newest = {e["level"]: e for e in self.events()[0] if e["event"] == "level"}
         return [newest[level] for level in sorted(newest)]
+
+    @property
+    def running(self) -> bool:
+        """Whether a trainer is at work here."""
+        try:
+            with open_regular(self._lock) as file:
+                return not _try_lock(file)
+        except OSError:
+            return False
 
     def state(self) -> str:
         """One of
@@ -99,9 +152,9 @@ class RunFolder:
         - ``failed``: stopped with an ``error`` event, can be resumed when its cause is gone
         - ``interrupted``: the trainer ended without a word (killed, power cut), can be resumed
         """
-        if self._locked():
+        if self.running:
             return "running"
-        last = self.last("hello", "error", "cancelled", "done")
+        last = self.end_event()
         if last is None:
             return "interrupted" if self.job.exists() else "empty"
         return {"error": "failed", "cancelled": "cancelled", "done": "done"}.get(last["event"], "interrupted")
@@ -109,7 +162,9 @@ class RunFolder:
     def log_tail(self, lines: int = 20) -> str:
         """The last lines of what the trainer wrote outside the protocol (its standard error)."""
         try:
-            text = self.log.read_text(encoding="utf-8", errors="replace")
+            with open_regular(self.log) as file:
+                file.seek(max(file.seek(0, os.SEEK_END) - _LOG_TAIL, 0))
+                text = file.read().decode("utf-8", "replace")
         except OSError:
             return ""
         return "\n".join(text.splitlines()[-lines:])
@@ -121,20 +176,37 @@ class RunFolder:
         self._cancel.touch()
 
     def take_cancel(self) -> bool:
-        """For the trainer: whether it was asked to stop since the last call."""
-        if not self._cancel.exists():
+        """For the trainer, and for who starts one: whether it was asked to stop since the last call."""
+        try:
+            self._cancel.unlink()
+        except FileNotFoundError:
             return False
-        self._cancel.unlink(missing_ok=True)
         return True
+
+    def end(self) -> None:
+        """Ends the trainer that is at work here by force, if it is a process of this computer.
+
+        Raises:
+            LodgsError: it is not, or nothing tells.
+        """
+        holder = self._holder() if self.running else {}
+        pid, identity = holder.get("pid"), holder.get("identity")
+        if type(pid) is not int or not isinstance(identity, str) or not processes.end(pid, identity):
+            raise LodgsError(
+                f"The trainer in {self.path} cannot be ended from here: it is not known as a process of this "
+                "computer.",
+                "End it where it was started.",
+            )
 
     @contextmanager
     def hold(self) -> Iterator[None]:
-        """For the trainer: holds the run's lock.
+        """For the trainer: holds the run's lock, and removes what killed trainers left half-done.
 
         Raises:
             LodgsError: if another trainer holds it.
+            OSError: if it cannot be written.
         """
-        with self._lock.open("a+b") as file:
+        with self._lock.open("a+b", buffering=0) as file:
             for _ in range(10):  # somebody who asks for the state holds the lock for an instant
                 if _try_lock(file):
                     break
@@ -144,48 +216,48 @@ class RunFolder:
                     f"Another training is already at work in {self.path}.",
                     "Wait for it, cancel it, or choose another run folder.",
                 )
-            self._cancel.unlink(missing_ok=True)
-            yield
-
-    def _locked(self) -> bool:
-        try:
-            with self._lock.open("r+b") as file:
-                return not _try_lock(file)
-        except OSError:
-            return False
-
-
-def event_line(kind: str, **values) -> str:
-    """One event of the protocol as a line of JSON; ``time`` (seconds since 1970) is added."""
-    return json.dumps({"event": kind, "time": round(time.time(), 3), **values}, ensure_ascii=False)
-
-
-class Events:
-    """Speaks the protocol: one JSON object a line, to ``events.jsonl`` and to a stream."""
-
-    def __init__(self, folder: RunFolder, stream: IO[str] | None) -> None:
-        self._stream = stream
-        self._file = folder.events_file.open("a+b")
-        self._file.seek(0, os.SEEK_END)
-        if self._file.tell():
-            self._file.seek(-1, os.SEEK_END)
-            if self._file.read(1) != b"\n":  # a killed trainer's last line has no end
-                self._file.write(b"\n")
-
-    def __call__(self, kind: str, **values) -> None:
-        """Writes one event."""
-        line = event_line(kind, **values)
-        if self._stream is not None:
+            file.truncate(0)
+            file.write(json.dumps({"pid": os.getpid(), "identity": processes.identity(os.getpid())}).encode())
+            self._clean()
+            self._held = file
             try:
-                print(line, file=self._stream, flush=True)
-            except OSError:  # the reader is gone; the run goes on without it
-                self._stream = None
-        self._file.write(line.encode() + b"\n")
-        self._file.flush()
+                yield
+            finally:
+                self._held = None
 
-    def close(self) -> None:
-        """Closes the file; nothing can be said after it."""
-        self._file.close()
+    def require_held(self) -> None:
+        """For the trainer: makes sure that the folder is still where it was, and its own.
+
+        Raises:
+            LodgsError: it was moved or deleted, or its lock was.
+        """
+        assert self._held is not None, "only within hold()"
+        with suppress(OSError):
+            if os.path.samestat(os.stat(self._lock), os.fstat(self._held.fileno())):
+                return
+        raise LodgsError(
+            f"The run folder {self.path} was moved or deleted, or its lock was, while it was trained.",
+            "Resume the run where it lies now, or train it anew.",
+        )
+
+    def _clean(self) -> None:
+        for folder in (self.path, self.checkpoints, self.levels_folder):
+            remove_temporaries(folder)
+        self.reserve.unlink(missing_ok=True)
+        for left in self.undistorted.glob("undistorting-*"):
+            shutil.rmtree(left, ignore_errors=True)
+        with suppress(FileNotFoundError):
+            if self._cancel.stat().st_mtime < _BEGUN - _LATE:
+                self._cancel.unlink()
+
+    def _holder(self) -> dict:
+        """What the trainer says of itself in the lock."""
+        try:
+            with open_regular(self._lock) as file:
+                holder = json.loads(file.read(1000))
+        except (OSError, ValueError):
+            return {}
+        return holder if isinstance(holder, dict) else {}
 
 
 def _try_lock(file: IO[bytes]) -> bool:
@@ -194,7 +266,7 @@ def _try_lock(file: IO[bytes]) -> bool:
         if os.name == "nt":
             import msvcrt
 
-            file.seek(0)
+            file.seek(1 << 30)  # what is locked cannot be read there, and the beginning says who holds it
             msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
         else:
             import fcntl

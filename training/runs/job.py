@@ -12,6 +12,7 @@ from ..errors import LodgsError
 from ..files import atomic_write
 from ..methods import METHODS, method_info, parameters_of
 from ..methods.parameters import Parameters
+from .folder import RunFolder
 
 BACKENDS = ("auto", "cpu", "cuda", "reference")
 MOST_STOPS = 32
@@ -69,6 +70,8 @@ class Job:
     def from_file(cls, path: Path) -> Job:
         """Reads a job; relative paths in it are relative to its folder.
 
+        A run is its folder, wherever that lies: one that has begun goes on there, whatever its job says.
+
         Raises:
             LodgsError: if the file cannot be read, or a key or value in it is not possible.
         """
@@ -79,6 +82,9 @@ class Job:
         if isinstance(method, str) and method in METHODS and isinstance(parameters, dict):
             retired = METHODS[method].retired
             values["parameters"] = {k: value for k, value in parameters.items() if k not in retired}
+        run = RunFolder(path.parent)
+        if path == run.job and run.begun:
+            values["out"] = "."
         return cls.from_dict(values, folder=path.parent)
 
     @classmethod
@@ -151,8 +157,10 @@ class Job:
         )
 
     def write(self, path: Path) -> None:
-        """Writes the job as TOML."""
+        """Writes the job as TOML; in its own run, it says that it is there."""
         values = asdict(self)
+        if Path(self.out) == path.parent:
+            values["out"] = "."
         table = values.pop("parameters")
         lines = [_toml_line(name, value) for name, value in values.items()]
         lines += ["", "[parameters]"] + [_toml_line(name, value) for name, value in table.items()]

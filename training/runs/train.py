@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import ctypes
-import errno
 import math
 import os
 import signal
 import sys
+import threading
 import time
 import traceback
+from _thread import interrupt_main
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from typing import IO
@@ -33,15 +34,16 @@ from ..scenes.orientation import up_rotation
 from ..splats.bundle import Bundle, Level, write_bundle
 from ..splats.ply import read_ply, write_ply
 from .base import read_base
+from .checkpoints import read_newest, remove_checkpoints, write_checkpoint
 from .data import training_data
-from .folder import PROTOCOL, Events, RunFolder, event_line
+from .events import PROTOCOL, Events, event_line
+from .failures import CANCELLED, CRASHED, DONE, in_words
+from .folder import RunFolder
 from .job import Job
 
-DONE, CRASHED, BAD_INPUT, CANCELLED = 0, 1, 2, 3
-"""Exit codes of ``python -m training train``."""
-
 CHECKPOINT_SECONDS = float(os.environ.get("LODGS_CHECKPOINT_SECONDS", "60"))
-PROGRESS_SECONDS = 0.25
+PROGRESS_SECONDS = 0.25, 10.0
+"""Between two ``progress`` events, at first and at most: a thousandth of the time that it has taken."""
 
 
 def train(job: Job, stream: IO[str] | None = None) -> int:
@@ -55,32 +57,47 @@ def train(job: Job, stream: IO[str] | None = None) -> int:
         An exit code. Mistakes end in an ``error`` event, never in a traceback on the stream.
     """
     folder = RunFolder(job.out)
-    events = None
     try:
         folder.make()
         with folder.hold():
-            job = job.resolved()
-            _keep_job(job, folder)
-            events = Events(folder, stream)  # from here on the run itself records what happens
-            return _train(job, folder, events)
-    except BaseException as error:
-        if isinstance(error, KeyboardInterrupt):
-            code = CANCELLED
-            event = {"kind": "cancelled", "step": 0, "message": "Stopped before training began."}
-        else:
-            what, remedy, code = _in_words(error)
-            event = {"kind": "error", "what": what, "remedy": remedy}
-        if code == CRASHED:
-            traceback.print_exc(file=sys.stderr)
-        with suppress(OSError):
-            if events is not None:
-                events(**event)
-            elif stream is not None:  # the run is not ours to write into
+            return _go_on(job.resolved(), folder, stream)
+    except BaseException as error:  # the run is not ours to write into
+        code, event = _last_words(error)
+        if stream is not None:
+            with suppress(OSError):
                 print(event_line(**event), file=stream, flush=True)
         return code
+
+
+def _go_on(job: Job, folder: RunFolder, stream: IO[str] | None) -> int:
+    """Begins, resumes or only repeats the end of the run in a folder that is held; returns an exit code."""
+    _keep_job(job, folder)
+    end = folder.end_event()
+    if end is not None and end["event"] == "done" and folder.bundle.exists():
+        remove_checkpoints(folder)  # a trainer that was killed after its last word has left them
+        if stream is not None:
+            print(event_line(end.pop("event"), **end), file=stream, flush=True)
+        return DONE
+    events = Events(folder.events_file, folder.reserve, stream)  # from here on the run says what happens
+    try:
+        return _train(job, folder, events)
+    except BaseException as error:
+        code, event = _last_words(error)
+        events.last(**event)
+        return code
     finally:
-        if events is not None:
-            events.close()
+        events.close()
+
+
+def _last_words(error: BaseException) -> tuple[int, dict]:
+    """Exit code and last event of a training that ends with an exception."""
+    if isinstance(error, KeyboardInterrupt):
+        return CANCELLED, {"kind": "cancelled", "message": "Stopped; it can be resumed."}
+    what, remedy, code = in_words(error)
+    if code == CRASHED:
+        with suppress(OSError):
+            traceback.print_exc(file=sys.stderr)
+    return code, {"kind": "error", "what": what, "remedy": remedy}
 
 
 def _train(job: Job, folder: RunFolder, events: Events) -> int:
@@ -89,15 +106,16 @@ def _train(job: Job, folder: RunFolder, events: Events) -> int:
         "hello", protocol=PROTOCOL, version=VERSION, method=job.method, preset=job.preset,
         scene=job.scene, out=str(folder.path), pid=os.getpid(),
     )  # fmt: skip
-    events("status", message="Reading the scene")
-    data = training_data(job, folder, events)
-    events("status", message="Preparing to train (the first time on a computer up to a minute)")
-    torch.set_num_threads(1)  # torch's thread pool beside the kernels' slows both
-    _keep_freed_memory()
-    backend = resolve(job.backend)
-    warm_up(backend)
-    _tell_backend(backend, events)
-    run = _Run(job, backend, folder, events, data)
+    with _interrupted_by_cancel(folder):
+        events("status", message="Reading the scene")
+        data = training_data(job, folder, events)
+        events("status", message="Preparing to train (the first time on a computer up to a minute)")
+        torch.set_num_threads(1)  # torch's thread pool beside the kernels' slows both
+        _keep_freed_memory()
+        backend = resolve(job.backend)
+        warm_up(backend)
+        _tell_backend(backend, events)
+        run = _Run(job, backend, folder, events, data)
     with _stop_signals() as stopped:
         if not run.to_the_end(stopped):
             return CANCELLED
@@ -105,6 +123,7 @@ def _train(job: Job, folder: RunFolder, events: Events) -> int:
     seconds = round(time.monotonic() - started, 1)
     events("status", message="Measuring the result")
     events("done", bundle=folder.bundle.name, seconds=seconds, **summary(run.evaluation, bundle))
+    remove_checkpoints(folder)
     return DONE
 
 
@@ -147,6 +166,7 @@ class _Run:
         self._started, self._started_step = time.monotonic(), self.step
         last_checkpoint = last_progress = self._started
         while self.step < method.steps:
+            self.folder.require_held()
             if stopped or self.folder.take_cancel():
                 self._save()
                 message = f"Stopped at step {self.step} of {method.steps}; it can be resumed."
@@ -161,9 +181,11 @@ class _Run:
             level = method.level_at(self.step)
             levels = method.levels_after(self.step)
             self.step += 1
-            if time.monotonic() - last_progress >= PROGRESS_SECONDS or self.step == method.steps:
+            now = time.monotonic()
+            pause = min(max(PROGRESS_SECONDS[0], (now - self._started) / 1000), PROGRESS_SECONDS[1])
+            if now - last_progress >= pause or self.step == method.steps:
                 self._tell_progress(level, loss, psnr(image.cpu(), target.image.cpu()))
-                last_progress = time.monotonic()
+                last_progress = now
             self._write_levels(levels)
             if levels or time.monotonic() - last_checkpoint >= CHECKPOINT_SECONDS:
                 self._save()
@@ -172,8 +194,9 @@ class _Run:
 
     def write_bundle(self) -> Bundle:
         """All levels, as they were written one by one, in one file."""
+        self.folder.require_held()
         levels = [
-            Level(record["level"], read_ply(self.folder.path / record["path"]), record["facts"])
+            Level(record["level"], read_ply(self.folder.file(record["path"])), record["facts"])
             for record in self.levels
         ]
         up = up_rotation(self.data.scene.cameras).round(6)
@@ -208,11 +231,11 @@ class _Run:
         )
 
     def _tell_progress(self, level: int, loss: float, quality: float) -> None:
-        of, levels = self.method.steps, self.method.levels
+        of, levels, quality = self.method.steps, self.method.levels, round(min(quality, 100.0), 2)
         speed = (self.step - self._started_step) / max(time.monotonic() - self._started, 1e-6)
         self.events(
             "progress", stage=f"level {level} of {levels}", level=level, levels=levels,
-            step=self.step, of=of, loss=round(loss, 5), psnr=round(quality, 2), splats=self.method.splats,
+            step=self.step, of=of, loss=round(loss, 5), psnr=quality, splats=self.method.splats,
             steps_per_s=round(speed, 2), eta_s=round((of - self.step) / speed, 1),
         )  # fmt: skip
         if time.monotonic() - self._started > 10:  # the speed of about the last ten seconds
@@ -241,36 +264,31 @@ class _Run:
         self.levels = [known[number] for number in sorted(known)]
 
     def _save(self) -> None:
-        """Writes a checkpoint, then drops all but it and the one before."""
-        folder = self.folder.checkpoints
-        with atomic_write(folder / f"step_{self.step:07d}.pt") as temporary:
-            torch.save(
-                {"step": self.step, "levels": self.levels, "method": self.method.state_dict()}, temporary
-            )
-        for old in sorted(folder.glob("step_*.pt"))[:-2]:
-            old.unlink(missing_ok=True)
+        write_checkpoint(self.folder, self.step, self.levels, self.method.state_dict())
 
     def _resume(self) -> None:
-        """Takes up the newest checkpoint that can be read; without one the run begins."""
-        for path in sorted(self.folder.checkpoints.glob("step_*.pt"), reverse=True):
-            try:
-                state = torch.load(path, map_location=self._device, weights_only=True)
-                self.method.load_state_dict(state["method"])
-            except Exception as error:
-                print(f"passing over the checkpoint {path}: {error!r}", file=sys.stderr)
-                self._warn(f"The checkpoint {path.name} cannot be read; what it held is trained again.")
-                self.method = self._fresh_method()  # it may have taken part of it
-                continue
-            self.step, self.levels = state["step"], state["levels"]
+        """Takes up the newest checkpoint that can be read; where there is none the run begins."""
+        found = read_newest(self.folder, self._device, self._take, self._warn)
+        if found is not None:
+            self.step, self.levels = found
             self.events("status", message=f"Going on from step {self.step} of {self.method.steps}")
-            return
+        elif self.folder.levels():
+            self._warn("There is no checkpoint to go on from: the run begins anew.")
+
+    def _take(self, state: dict) -> None:
+        try:
+            self.method.load_state_dict(state)
+        except Exception:
+            self.method = self._fresh_method()  # it may have taken part of it
+            raise
 
 
 def _keep_job(job: Job, folder: RunFolder) -> None:
     """Writes the job into the run; a run folder keeps to the job that it began with, but for the backend."""
     if folder.job.exists():
         before = asdict(Job.from_file(folder.job).resolved())
-        changed = [key for key, value in asdict(job).items() if key != "backend" and before[key] != value]
+        same = {**asdict(job), "backend": before["backend"], "out": before["out"]}
+        changed = [key for key, value in same.items() if before[key] != value]
         if changed:
             raise LodgsError(
                 f"The run folder {folder.path} belongs to another job (different: {', '.join(changed)}).",
@@ -298,7 +316,36 @@ def _keep_freed_memory() -> None:
             mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD: and the heap stays
 
 
-# -- when things go wrong ------------------------------------------------------------
+# -- being stopped ------------------------------------------------------------
+
+
+@contextmanager
+def _interrupted_by_cancel(folder: RunFolder):
+    """A request to cancel, which only the training's loop looks for, ends the block as Ctrl-C does."""
+    over = threading.Event()
+
+    def watch() -> None:
+        while not over.wait(0.1):
+            with suppress(OSError):
+                if folder.take_cancel():
+                    _interrupt()
+                    return
+
+    watching = threading.Thread(target=watch, daemon=True)
+    watching.start()
+    try:
+        yield
+    finally:
+        over.set()
+        watching.join()
+
+
+def _interrupt() -> None:
+    """Ctrl-C for the main thread, also where it waits for another program."""
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+    else:
+        interrupt_main()
 
 
 @contextmanager
@@ -317,23 +364,3 @@ def _stop_signals():
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _in_words(error: BaseException) -> tuple[str, str, int]:
-    """What to tell the user of an exception: what, remedy, exit code."""
-    if isinstance(error, LodgsError):
-        return error.what, error.remedy, BAD_INPUT
-    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
-        return "The disk is full; training stopped.", "Free some space and resume the run.", BAD_INPUT
-    if isinstance(error, MemoryError | torch.cuda.OutOfMemoryError):
-        return (
-            "There is not enough memory.",
-            "Lower max_splats or image_scale, or close other programs.",
-            BAD_INPUT,
-        )
-    kind = type(error).__name__
-    return (
-        f"Training stopped on an unexpected {kind}: {error}.",
-        "Its details are in the log; please report it.",
-        CRASHED,
-    )

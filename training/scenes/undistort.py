@@ -11,6 +11,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import threading
 from collections import defaultdict
 from contextlib import suppress
 from dataclasses import replace
@@ -20,6 +21,7 @@ from ..errors import LodgsError
 from .colmap import Scene, read_scene
 
 _VERSION = b"1"  # of what is kept in the cache
+_ROOM = 1 << 18  # bytes that are still free on a disk that is not full
 
 
 def undistorted(scene: Scene, cache: Path) -> Scene:
@@ -41,7 +43,7 @@ def undistorted(scene: Scene, cache: Path) -> Scene:
             _undistort_into(target, scene)
     except OSError as error:
         raise LodgsError(
-            f"The lens distortion of {scene.folder} could not be undone: {error}.",
+            f"The lens distortion of {scene.folder} could not be undone: {error.strerror or error}.",
             "Check the images and the free space.",
         ) from error
     result = read_scene(target, model=target / "sparse", images=target / "images")
@@ -75,22 +77,28 @@ def _undistort_into(target: Path, scene: Scene) -> None:
     with tempfile.TemporaryDirectory(dir=target.parent, prefix="undistorting-") as work:
         request["work"] = work
         package = Path(__file__).resolve().parents[1]  # training, or lodgs where pip has installed it
-        child = subprocess.run(
+        with subprocess.Popen(
             [sys.executable, "-m", f"{package.name}.scenes.undistort"],
             cwd=package.parent,
-            input=json.dumps(request),
-            capture_output=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
             encoding="utf-8",
             errors="replace",
-            check=False,
-        )
+        ) as child:
+            try:
+                problems = _converse(child, json.dumps(request))
+            except BaseException:
+                child.kill()
+                raise
         if child.returncode:
-            lines = child.stderr.strip().splitlines() or [f"exit code {child.returncode}"]
+            lines = problems.strip().splitlines() or [f"exit code {child.returncode}"]
             raise LodgsError(
                 f"The lens distortion of {scene.folder} could not be undone: {lines[-1]}",
                 "Check the trainer's environment and the free space, or give an undistorted scene "
                 "(colmap image_undistorter).",
             )
+        _require_room(Path(work))
         try:
             os.replace(Path(work) / "undistorted", target)
         except OSError:
@@ -98,8 +106,45 @@ def _undistort_into(target: Path, scene: Scene) -> None:
                 raise
 
 
+def _require_room(folder: Path) -> None:
+    """Raises OSError where a disk is full: COLMAP writes half a photograph then, and says nothing of it."""
+    with tempfile.TemporaryFile(dir=folder) as file:
+        file.write(os.urandom(_ROOM))
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _converse(child: subprocess.Popen[str], request: str) -> str:
+    """Sends a program its request in a line and returns what it said on standard error when it has ended.
+
+    Its standard input stays open until then: the program ends when that is closed, as it is however this
+    process ends.
+    """
+    assert child.stdin is not None and child.stderr is not None
+    with suppress(OSError):  # it has ended already, and said why
+        child.stdin.write(request + "\n")
+        child.stdin.flush()
+    problems = child.stderr.read()
+    child.wait()
+    with suppress(OSError):
+        child.stdin.close()
+    return problems
+
+
+def _end_with_parent() -> None:
+    """Ends this process as soon as its standard input is closed."""
+
+    def wait() -> None:
+        while os.read(0, 4096):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
 def _main() -> None:
-    request = json.load(sys.stdin)
+    request = json.loads(sys.stdin.readline())
+    _end_with_parent()
     try:
         import pycolmap
     except ImportError as error:

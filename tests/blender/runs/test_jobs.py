@@ -243,6 +243,103 @@ def test_an_unresponsive_trainer_is_reported_and_can_be_ended(lodgs, jobs, fake,
     assert watch.state == "interrupted"
 
 
+def test_cancel_is_not_lost_before_the_trainer_is_ready(bpy, jobs, fake, root, tmp_path):
+    """What was asked of an earlier trainer is forgotten; what is asked of this one is heard."""
+    fake("slow")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "cancel").touch()
+    watch = jobs.start(root, str(tmp_path / "run"))
+    _wait(watch, lambda: watch.progress.get("step", 0) > 3)
+    jobs.cancel(root)
+    _wait(watch, lambda: not watch.running)
+    watch = jobs.resume(root)
+    jobs.cancel(root)
+    _wait(watch, lambda: not watch.running)
+    assert watch.state == "cancelled"
+
+
+def test_only_the_runs_own_trainer_is_ended_by_force(lodgs, jobs, fake, root, tmp_path):
+    fake("slow")
+    first = jobs.start(root, str(tmp_path / "run"))
+    _wait(first, lambda: first.progress)
+    found = jobs.attach(root, str(tmp_path / "run"))  # as another Blender finds it
+    assert found.process is None and found.running
+    lock = tmp_path / "run" / "lock"
+    said = lock.read_text()
+    lock.write_text(said.replace(f'"pid": {first.process.pid}', f'"pid": {os.getpid()}'))
+    found.cancel_requested = True
+    with pytest.raises(lodgs("training.errors").LodgsError, match="cannot be ended from here"):
+        jobs.cancel(root)
+    assert first.process.poll() is None
+    lock.write_text(said)
+    jobs.cancel(root)
+    assert first.process.wait(20) == -9
+    _wait(found, lambda: not found.running)
+
+
+def test_a_moved_run_is_resumed_where_it_is(bpy, watch_of, fake, root, tmp_path):
+    fake("killed")
+    with pytest.raises(RuntimeError):
+        bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
+    (tmp_path / "run").rename(tmp_path / "moved")
+    job = tmp_path / "moved" / "job.toml"  # as it was written before a run was its own folder
+    job.write_text(job.read_text().replace('out = "."', f'out = "{tmp_path / "run"}"'))
+    with pytest.raises(RuntimeError, match="holds no run"):
+        bpy.ops.lodgs.open_run(directory=str(tmp_path / "run"))
+    bpy.ops.lodgs.open_run(directory=str(tmp_path / "moved"))
+    fake()
+    assert bpy.ops.lodgs.resume_training() == {"FINISHED"}
+    assert watch_of(root).state == "done" and (tmp_path / "moved" / "bundle.ply").exists()
+    assert not (tmp_path / "run").exists()
+
+
+def test_following_a_run_never_raises_whatever_its_files_say(bpy, jobs, fake, root, tmp_path):
+    fake("killed")
+    with pytest.raises(RuntimeError):
+        bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
+    run = tmp_path / "run"
+    level = '{"event": "level", "level": 1, "path": "levels/level_1.ply", "splats": 5, "meta": %s}'
+    second = (level % "{}").replace('"level": 1', '"level": 2')
+    (tmp_path / "secret.ply").write_bytes((run / "levels" / "level_1.ply").read_bytes())
+    lines = [
+        '{"event": "hello", "method": 3}',
+        level % "3", level % '{"camera_center": "here"}', level % '{"a": "\\ud800"}', level % ("[" * 20_000),
+        (level % "{}").replace('"level": 1', f'"level": {2**31}'),
+        second.replace("levels/level_1.ply", str(tmp_path / "secret.ply")),
+        second.replace("levels/level_1.ply", "../secret.ply"),
+        second.replace("levels/level_1.ply", "events.jsonl"),
+        '{"event": "done"}',
+    ]  # fmt: skip
+    with (run / "events.jsonl").open("a") as file:
+        file.write("\n".join(lines) + "\n")
+    watch = jobs.attach(root, str(run))
+    while watch.step():
+        pass
+    assert list(_levels(root)) == [1] and watch.problem
+    assert any("does not understand" in warning for warning in watch.warnings)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names here")
+def test_opening_a_file_waits_for_no_pipe_and_asks_no_other_computer(
+    bpy, lodgs, watch_of, root, tmp_path, monkeypatch
+):
+    (tmp_path / "run").mkdir()
+    for name in ("events.jsonl", "lock", "trainer.log"):
+        os.mkfifo(tmp_path / "run" / name)
+    (tmp_path / "run" / "job.toml").write_text("")
+    root.lodgs.training.run = str(tmp_path / "run")
+    far = root.copy()
+    root.users_collection[0].objects.link(far)
+    far.lodgs.training.run = r"\\server\share\run"
+    asked, folder = [], lodgs("training.runs.folder").RunFolder
+    state = folder.state
+    monkeypatch.setattr(folder, "state", lambda run: asked.append(run.path.name) or state(run))
+    blend = str(tmp_path / "scene.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=blend)
+    bpy.ops.wm.open_mainfile(filepath=blend)
+    assert asked == ["run"] and watch_of(bpy.data.objects["tiny"]) is None
+
+
 def test_one_trainer_a_folder_but_several_at_once(bpy, lodgs, jobs, fake, root, tmp_path):
     error = lodgs("training.errors").LodgsError
     other = root.copy()

@@ -16,6 +16,7 @@ import torch
 
 from training.methods import METHODS
 from training.runs import train as training_loop
+from training.runs.events import Events
 from training.runs.folder import RunFolder
 from training.runs.job import Job
 from training.scenes.colmap import read_scene
@@ -307,29 +308,148 @@ def test_a_full_disk_is_said_and_the_run_resumes(unbroken, tmp_path, monkeypatch
     assert folder.bundle.read_bytes() == unbroken["bundle"]
 
 
-def test_a_damaged_checkpoint_falls_back_to_the_one_before(unbroken, tmp_path):
+@pytest.fixture
+def stopped(unbroken, tmp_path, monkeypatch) -> dict:
+    """The keys of a run with two checkpoints that was cancelled after 40 of its 70 steps."""
     keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
-    assert run_in_process(keys)[0] == 0
-    folder = RunFolder(keys["out"])
-    newest = max(folder.checkpoints.glob("*.pt"))
-    newest.write_bytes(newest.read_bytes()[:1000])
-    folder.bundle.unlink()
-    assert run_in_process(keys)[0] == 0
+    method, folder = method_of(keys), RunFolder(keys["out"])
+    real = method.train_step
+
+    def ask_to_stop(self, step):
+        if step in (33, 39):
+            folder.request_cancel()
+        return real(self, step)
+
+    monkeypatch.setattr(method, "train_step", ask_to_stop)
+    assert [run_in_process(keys)[0] for _ in range(2)] == [training_loop.CANCELLED] * 2
+    monkeypatch.undo()
+    assert [path.name for path in sorted(folder.checkpoints.iterdir())] == [
+        "step_0000034.pt", "step_0000040.pt",
+    ]  # fmt: skip
+    return keys
+
+
+def test_a_damaged_checkpoint_falls_back_to_the_one_before_and_that_is_told(unbroken, stopped):
+    folder = RunFolder(stopped["out"])
+    newest = folder.checkpoints / "step_0000040.pt"
+    data = bytearray(newest.read_bytes())
+    data[len(data) // 2] ^= 1
+    newest.write_bytes(data)
+    code, events = run_in_process(stopped)
+    assert code == 0 and folder.bundle.read_bytes() == unbroken["bundle"]
+    assert any("Going on from step 34" in event.get("message", "") for event in events)
+    (warning,) = [event["message"] for event in events if event["event"] == "warning"][-1:]
+    assert "step_0000040.pt cannot be read" in warning
+
+
+def test_where_no_checkpoint_can_be_read_the_run_says_so_and_does_not_begin_anew(stopped):
+    folder = RunFolder(stopped["out"])
+    for path in folder.checkpoints.iterdir():
+        path.write_bytes(path.read_bytes()[:1000])
+    code, events = run_in_process(stopped)
+    assert code == 2 and "No checkpoint of the run" in events[-1]["what"]
+    assert "deleting checkpoints" in events[-1]["remedy"]
+    assert not [event for event in events if event["event"] == "level" and event["level"] == 3]
+
+
+def test_a_checkpoint_of_another_version_is_not_gone_on_from(stopped):
+    folder = RunFolder(stopped["out"])
+    for path in folder.checkpoints.iterdir():
+        state = torch.load(path, weights_only=True)
+        torch.save({**state, "format": 0, "version": "0.0.9"}, path)
+    code, events = run_in_process(stopped)
+    assert code == 2 and "was made by LODGS 0.0.9" in events[-1]["what"]
+
+
+def test_a_checkpoint_that_does_not_fit_leaves_nothing_behind(unbroken, stopped):
+    folder = RunFolder(stopped["out"])
+    newest = folder.checkpoints / "step_0000040.pt"
+    state = torch.load(newest, weights_only=True)
+    state["method"]["exposure"] = {}
+    state["method"]["model"]["tensors"]["means"] += 1
+    torch.save(state, newest)
+    assert run_in_process(stopped)[0] == 0
     assert folder.bundle.read_bytes() == unbroken["bundle"]
 
 
-def test_a_checkpoint_of_another_version_leaves_nothing_behind(unbroken, tmp_path):
+def test_a_moved_run_goes_on_where_it_is(unbroken, stopped, tmp_path):
+    """Also one whose job was written when it named its folder: a stranger's names any."""
+    moved = tmp_path / "elsewhere" / "run"
+    moved.parent.mkdir()
+    os.rename(stopped["out"], moved)
+    folder = RunFolder(moved)
+    assert 'out = "."' in folder.job.read_text()
+    folder.job.write_text(folder.job.read_text().replace('out = "."', f'out = "{stopped["out"]}"'))
+    assert training_loop.train(Job.from_file(folder.job)) == 0
+    assert folder.bundle.read_bytes() == unbroken["bundle"]
+    assert not Path(stopped["out"]).exists()
+
+
+def test_a_finished_run_keeps_no_checkpoints_and_says_its_end_again(unbroken, capsys):
+    folder = RunFolder(unbroken["keys"]["out"])
+    assert not list(folder.checkpoints.iterdir())
+    before = folder.events_file.read_bytes()
+    assert training_loop.train(Job.from_dict(unbroken["keys"]), sys.stdout) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["event"] == "done" and said["bundle"] == "bundle.ply"
+    assert folder.events_file.read_bytes() == before
+
+
+def test_cancel_is_heard_while_the_trainer_starts(unbroken, tmp_path, monkeypatch):
     keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
-    assert run_in_process(keys)[0] == 0
     folder = RunFolder(keys["out"])
-    for path in folder.checkpoints.glob("*.pt"):
-        state = torch.load(path, weights_only=True)
-        del state["method"]["model"]["stats"]  # 0.1.0 kept them elsewhere
-        torch.save(state, path)
-    folder.bundle.unlink()
+    folder.make()
+    folder.request_cancel()  # pressed before the trainer had the run's lock
+    assert run_in_process(keys)[0] == training_loop.CANCELLED and folder.state() == "cancelled"
+
+    def slow(*_):
+        folder.request_cancel()
+        time.sleep(60)
+
+    monkeypatch.setattr(training_loop, "warm_up", slow)
+    assert run_in_process(keys)[0] == training_loop.CANCELLED
+    assert not folder.take_cancel()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows does not delete what is open")
+@pytest.mark.parametrize("lost", ["run", "run/lock"])
+def test_a_run_that_is_deleted_while_it_trains_is_not_made_again(
+    unbroken, tmp_path, monkeypatch, capsys, lost
+):
+    keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
+    method = method_of(keys)
+    real = method.train_step
+
+    def lose(self, step):
+        if step == 5:
+            os.rename(tmp_path / lost, tmp_path / "gone")
+        return real(self, step)
+
+    monkeypatch.setattr(method, "train_step", lose)
+    assert training_loop.train(Job.from_dict(keys), sys.stdout) == 2
+    said = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert said["event"] == "error" and "moved or deleted" in said["what"]
+    assert lost == "run/lock" or not (tmp_path / "run").exists()
+    assert not list(tmp_path.glob("run/checkpoints/*"))
+
+
+def test_a_disk_that_is_full_for_events_too_still_takes_the_last_words(unbroken, tmp_path, monkeypatch):
+    keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
+    folder = RunFolder(keys["out"])
+    real = Events._append
+
+    def full(self, data):
+        if b"progress" in data:
+            self._file.write(data[:20])  # as much as there was room for
+            self._torn = True
+        if folder.reserve.exists() and (self._torn or b"progress" in data):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        real(self, data)
+
+    monkeypatch.setattr(Events, "_append", full)
     code, events = run_in_process(keys)
-    assert code == 0 and folder.bundle.read_bytes() == unbroken["bundle"]
-    assert any("cannot be read" in event.get("message", "") for event in events)
+    assert code == 2 and events[-1]["what"] == "The disk is full; training stopped."
+    assert folder.state() == "failed" and not folder.reserve.exists()
 
 
 def test_an_unexpected_error_is_an_event_and_its_details_go_to_the_log(
@@ -373,11 +493,11 @@ def test_scenes_that_cannot_be_trained_on_say_why(tiny_scene, tmp_path, change, 
 
 def test_reading_events_goes_on_where_it_stopped_and_leaves_half_lines(tmp_path):
     folder = RunFolder(tmp_path)
-    folder.events_file.write_bytes(b'{"event": "hello"}\nnot json\n{"event": "prog')
+    folder.events_file.write_bytes(b'{"event": "hello"}\nnot json\n{"event": "can')
     events, offset = folder.events()
     assert [event["event"] for event in events] == ["hello"]
     with folder.events_file.open("ab") as file:
-        file.write(b'ress"}\n')
+        file.write(b'celled"}\n')
     events, end = folder.events(offset)
-    assert [event["event"] for event in events] == ["progress"]
+    assert [event["event"] for event in events] == ["cancelled"]
     assert folder.events(end) == ([], end)

@@ -1,7 +1,11 @@
 """Undistortion, checked on what the pictures show against pycolmap's camera models."""
 
 import os
+import signal
 import subprocess
+import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -84,7 +88,7 @@ def test_the_cache_is_known_by_content(tmp_path, monkeypatch):
     second = undistorted(read_scene(tmp_path), cache)
     assert second.folder != first.folder
 
-    monkeypatch.setattr(subprocess, "run", None)  # whatever starts a process now, fails
+    monkeypatch.setattr(subprocess, "Popen", None)  # whatever starts a process now, fails
     assert undistorted(read_scene(tmp_path), cache).cameras[0].image == second.cameras[0].image
 
 
@@ -144,3 +148,31 @@ def test_real_lens_keeps_points_on_their_features(shared_scenes, tmp_path):
         local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
         projected = local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
         assert np.median(np.linalg.norm(projected - expected, axis=1)) < 1
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="asks Linux for a process's children")
+def test_nobody_undistorts_for_a_process_that_was_killed(tmp_path):
+    names = [f"{number}.png" for number in range(120)]
+    synthetic.write_scene(tmp_path, synthetic.camera("OPENCV"), names=names)
+    large = np.kron(ramps(), np.ones((20, 20, 1), np.uint8))
+    synthetic.write_image(tmp_path / "large.png", large)
+    for name in names:
+        (tmp_path / "images" / name).unlink()
+        os.link(tmp_path / "large.png", tmp_path / "images" / name)
+    program = (
+        "import sys; from pathlib import Path; from training.scenes.colmap import read_scene;"
+        "from training.scenes.undistort import undistorted;"
+        "undistorted(read_scene(Path(sys.argv[1])), Path(sys.argv[1]) / 'cache')"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], cwd=Path(__file__).parents[3])
+    while not (made := list(tmp_path.glob("cache/undistorting-*/undistorted/images/*"))):
+        assert parent.poll() is None
+        time.sleep(0.01)
+    (child,) = Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    while Path(f"/proc/{child}").exists() and "Z" not in Path(f"/proc/{child}/stat").read_text().split()[2]:
+        time.sleep(0.01)
+    made = list(tmp_path.glob("cache/undistorting-*/undistorted/images/*"))
+    assert len(made) < len(names)
