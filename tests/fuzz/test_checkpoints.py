@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 from tests.fuzz.doors import attempt
 from tests.fuzz.mutations import spoiled
 from training.errors import LodgsError
+from training.runs import checkpoints
 from training.runs.arrays import read_arrays
 from training.runs.folder import RunFolder
-
-checkpoints = pytest.importorskip("training.runs.checkpoints")
 
 STATE = {
     "model": {"means": torch.arange(600.0).reshape(200, 3), "level": torch.ones(200, dtype=torch.uint8)},

@@ -12,8 +12,6 @@ from tests.fuzz.doors import attempt
 from tests.fuzz.mutations import spoiled, spoiled_value
 from training.runs.folder import RunFolder
 
-XX
-
 META = {"camera_center": [0, 0, 1], "up_rotation": [[1, 0, 0], [0, 0, 1], [0, -1, 0]]}
 LEVEL = {
     "event": "level", "level": 1, "path": "levels/level_1.ply", "splats": 7, "psnr": 20.5, "rule": "bands",
