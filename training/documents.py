@@ -15,7 +15,7 @@ import tomllib
 from pathlib import Path
 from typing import IO, Any
 
-from .errors import LodgsError
+from .errors import LodgsError, printable
 from .files import open_regular
 
 MOST_JSON = 1 << 20
@@ -50,11 +50,6 @@ def open_file(path: str | Path, what: str = "") -> IO[bytes]:
     raise LodgsError(
         f"{what or printable(path)} could not be read: {reason}.", "Check the path and its rights."
     )
-
-
-def printable(name: str | Path) -> str:
-    """A name or a path as a message can hold it: what is no text in it is escaped."""
-    return _NO_TEXT.sub(lambda found: f"\\x{ord(found[0]):02x}", str(name))
 
 
 def shown(value: Any) -> str:

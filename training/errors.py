@@ -1,6 +1,11 @@
 """The one error that users are meant to see."""
 
 import errno
+import re
+
+MOST_TEXT = 1000
+"""Characters of a sentence, which may quote what others have written; the middle of more is left out."""
+_NO_TEXT = re.compile("[\0\ud800-\udfff]")
 
 
 class LodgsError(Exception):
@@ -12,9 +17,19 @@ class LodgsError(Exception):
     """
 
     def __init__(self, what: str, remedy: str = "") -> None:
-        super().__init__(f"{what} {remedy}".strip())
-        self.what = what
-        self.remedy = remedy
+        self.what, self.remedy = _shortened(printable(what)), _shortened(printable(remedy))
+        super().__init__(f"{self.what} {self.remedy}".strip())
+
+
+def printable(text: object) -> str:
+    """A name, a path or a sentence as anything can show it: what is no text in it is escaped."""
+    return _NO_TEXT.sub(lambda found: f"\\x{ord(found[0]):02x}", str(text))
+
+
+def _shortened(text: str) -> str:
+    if len(text) <= MOST_TEXT:
+        return text
+    return f"{text[: MOST_TEXT // 2]} ... {text[-MOST_TEXT // 2 :]}"
 
 
 def out_of_memory(error: BaseException) -> bool:

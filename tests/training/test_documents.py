@@ -97,3 +97,10 @@ def test_only_files_are_opened(tmp_path):
         with pytest.raises(LodgsError, match="could not be read") as told:
             open_file(tmp_path / name)
         told.value.what.encode()  # a message can be shown
+
+
+def test_an_error_can_be_printed_whatever_it_quotes():
+    error = LodgsError("a\udce9\0b" + 5000 * "(" + "end", "Do\0 it.")
+    assert str(error).encode() and "\0" not in str(error)
+    assert error.what.startswith(r"a\xdce9\x00b(((") and error.what.endswith("end")
+    assert len(error.what) < 1100 and error.remedy == r"Do\x00 it."

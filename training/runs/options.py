@@ -6,8 +6,8 @@ import argparse
 from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 
-from ..documents import json_object, printable
-from ..errors import LodgsError
+from ..documents import json_object
+from ..errors import LodgsError, printable
 from ..methods import METHODS, PRESETS
 from .job import BACKENDS, Job
 

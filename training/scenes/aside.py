@@ -10,8 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from ..documents import printable
-from ..errors import LodgsError
+from ..errors import LodgsError, printable
 from .cameras import Camera, read_camera
 from .images import image_size
 from .photographs import Photographs

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..documents import printable
-from ..errors import LodgsError
+from ..errors import LodgsError, printable
 from .cameras import FARTHEST, Camera
 from .images import image_size
 from .model import DAMAGED, Intrinsics, Pose, model_suffix, read_cameras, read_points, read_poses, registered

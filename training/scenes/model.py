@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..documents import open_file, printable
-from ..errors import LodgsError
+from ..documents import open_file
+from ..errors import LodgsError, printable
 
 DAMAGED = "Copy the model again, or write it anew with COLMAP's model_converter."
 

@@ -13,6 +13,7 @@ from training.errors import LodgsError
 from training.methods.method import Method
 from training.runs import train as training_loop
 from training.runs.base import read_base
+from training.runs.failures import BAD_INPUT
 from training.runs.folder import RunFolder
 from training.runs.job import Job
 from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
@@ -182,7 +183,7 @@ def test_a_base_is_refused_where_a_method_cannot_begin_with_one_and_where_there_
     with pytest.raises(LodgsError, match=r"'flod' cannot begin.*Leave out 'base'"):
         job(tiny_scene, tmp_path / "run", method="flod", base=str(tmp_path / "base.ply"))
     made = job(tiny_scene, tmp_path / "run", base=str(tmp_path / "absent.ply"))
-    assert training_loop.train(made) == training_loop.BAD_INPUT
+    assert training_loop.train(made) == BAD_INPUT
     event = RunFolder(made.out).events()[0][-1]
     assert event["event"] == "error" and "absent.ply" in event["what"] and event["remedy"]
 

@@ -131,7 +131,7 @@ def test_mistakes_are_told(bundle, camera, tmp_path, monkeypatch, capsys, option
         ({"near": -1}, "near depth"),
         ({"world_to_camera": (1e300 * np.eye(4)).tolist()}, "beyond 1e+12"),
         ({"world_to_camera": json.loads("[" * 900 + "]" * 900)}, "nests"),
-        ({"near": float("nan")}, "NaN is no number"),
+        ({"near": float("nan")}, "near = nan is not a finite number"),
     ],
 )
 def test_impossible_cameras_are_told(bundle, camera, tmp_path, capsys, change, sentence):
