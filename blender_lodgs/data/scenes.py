@@ -382,7 +382,7 @@ def _set_controls(root: bpy.types.Object) -> dict[str, float]:
     if rule is None:
         return {}
     own = rule.defaults([item.number for item in root.lodgs.levels if item.exists])
-    values = {control.name: _value(root, control) for control in rule.controls}
+    values = {control.name: control.checked(_value(root, control)) for control in rule.controls}
     return {name: value for name, value in values.items() if value != own[name]}
 
 

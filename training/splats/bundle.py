@@ -426,6 +426,9 @@ def _bundle(head: dict, lines: list[dict], meta: dict, path: str | Path) -> Bund
             raise ValueError(f"{line['level']} is no level's number")
     if version == 1:
         head, lines = _from_v1(head, lines, meta)
+    controls = _of_kind(head["controls"], dict, "controls")
+    # earlier exports from Blender have boxes to tick as true and false
+    controls = {name: int(value) if isinstance(value, bool) else value for name, value in controls.items()}
     levels = [Level(line["level"], NO_SPLATS, _numbers(line.get("facts", {}))) for line in lines]
     levels.sort(key=lambda level: level.number)
     if len({level.number for level in levels}) < len(levels):
@@ -435,7 +438,7 @@ def _bundle(head: dict, lines: list[dict], meta: dict, path: str | Path) -> Bund
         levels,
         _of_kind(head["rule"], str, "rule"),
         _numbers(head["facts"]),
-        _numbers(head["controls"]),
+        _numbers(controls),
         _of_kind(head["cumulative"], bool, "cumulative"),
         meta,
     )
