@@ -51,9 +51,10 @@ def evaluate_run(
 
     Raises:
         LodgsError: if the run is not finished, its rule has no such control, or a view off the path cannot be
-            read.
+            read; or something in the run is a link.
     """
     folder = RunFolder(run)
+    folder.require_own_files()
     if not folder.bundle.exists():
         raise LodgsError(f"{run} holds no finished run (no bundle.ply).", "Train it to the end first.")
     job = Job.from_file(folder.job)
