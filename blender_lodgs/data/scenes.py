@@ -100,7 +100,13 @@ def import_colmap(
     Raises:
         LodgsError: the folder holds no scene that can be read. Nothing is left behind in that case.
     """
-    scene = read_scene(Path(folder), Path(model) if model else None, Path(images) if images else None)
+    manager = context.window_manager
+    manager.progress_begin(0, 1)  # at the mouse pointer
+    try:
+        model, images = (Path(path) if path else None for path in (model, images))
+        scene = read_scene(Path(folder), model, images, manager.progress_update)
+    finally:
+        manager.progress_end()
     for message in scene.warnings:
         warn(message)
     if scene.distorted:
