@@ -10,6 +10,7 @@ from mathutils import Matrix, Vector
 
 from ...training.errors import LodgsError
 from ...training.scenes.cameras import Camera
+from ...training.splats.dialects import Warn, silent
 from ..attributes import read_attribute
 from . import selection
 
@@ -111,12 +112,20 @@ def look_through(context: bpy.types.Context, root: bpy.types.Object, step: int =
     return through(context, cameras[(index + step) % len(cameras)])
 
 
-def look_at_scene(context: bpy.types.Context, root: bpy.types.Object) -> None:
+def look_at_scene(context: bpy.types.Context, root: bpy.types.Object, warn: Warn = silent) -> None:
     """Turns the window's viewports to a splat scene, to orbit there: as it was photographed, where that is
-    known, else from where they look already, with most of it in sight."""
+    known, else from where they look already, with most of it in sight.
+
+    Args:
+        warn: told of meshes that stand about the place where it was photographed, such as a new file's cube:
+            they are hidden there, or there would be nothing else to see.
+    """
+    photographed = photographed_from(root)
+    for obj in _around(context, photographed[0]) if photographed is not None else ():
+        obj.hide_set(True)
+        warn(f"'{obj.name}' stands about the cameras and is hidden; Alt+H shows it.")
     if context.screen is None:
         return
-    photographed = photographed_from(root)
     for area in context.screen.areas:
         if area.type == "VIEW_3D":
             looks = area.spaces.active.region_3d
@@ -128,6 +137,17 @@ def look_at_scene(context: bpy.types.Context, root: bpy.types.Object) -> None:
             elif (bounds := bounds_of_most(root)) is not None:
                 looks.view_location, size = bounds
                 looks.view_distance = 1.5 * size
+
+
+def _around(context: bpy.types.Context, eye: Vector) -> list[bpy.types.Object]:
+    """The meshes in whose box an eye is, that can be seen."""
+    found = []
+    for obj in context.view_layer.objects:
+        if obj.type == "MESH" and obj.visible_get():
+            place, corners = np.array(obj.matrix_world.inverted_safe() @ eye), np.array(obj.bound_box)
+            if (corners.min(0) <= place).all() and (place <= corners.max(0)).all():
+                found.append(obj)
+    return found
 
 
 def photographed_from(root: bpy.types.Object) -> tuple[Vector, Vector] | None:

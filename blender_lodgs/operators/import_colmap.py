@@ -38,16 +38,19 @@ class LODGS_OT_import_colmap(bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
+        def warn(message: str) -> None:
+            self.report({"WARNING"}, message)
+
         first = not scenes.roots(context.scene)
         root = scenes.import_colmap(
             context,
             Path(bpy.path.abspath(self.directory)),
             upright=self.upright,
             photographs=self.photographs,
-            warn=lambda message: self.report({"WARNING"}, message),
+            warn=warn,
         )
         if first:  # otherwise the artist is looking at something
-            photographs.look_at_scene(context, root)
+            photographs.look_at_scene(context, root, warn)
         self.report({"INFO"}, f"'{root.name}': {scenes.contents(root)}")
         return {"FINISHED"}
 

@@ -40,16 +40,20 @@ class LODGS_OT_import_splats(bpy.types.Operator):
     @report_errors
     def execute(self, context):
         paths = [Path(self.directory, file.name) for file in self.files if file.name]
+
+        def warn(message: str) -> None:
+            self.report({"WARNING"}, message)
+
         first = not scenes.roots(context.scene)
         for path in paths or [Path(self.filepath)]:
             root = scenes.import_splats(
                 context,
                 bpy.path.abspath(str(path)),
                 upright=self.upright,
-                warn=lambda message: self.report({"WARNING"}, message),
+                warn=warn,
             )
             if first:  # otherwise the artist is looking at something
-                photographs.look_at_scene(context, root)
+                photographs.look_at_scene(context, root, warn)
                 first = False
             self.report({"INFO"}, f"'{root.name}': {scenes.contents(root)}")
         return {"FINISHED"}
