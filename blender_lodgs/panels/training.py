@@ -11,7 +11,7 @@ from ..data import scenes
 from ..data.training import hold_out, offered
 from ..runs import environment, jobs
 from ..runs.watch import Watch, watch_of
-from ..runs.words import level_line, progress_facts
+from ..runs.words import measured_on, progress_facts, short_level_line
 from .parts import Panel, draw_environment, say, split_column
 
 
@@ -138,8 +138,11 @@ def _draw_ended(layout: bpy.types.UILayout, watch: Watch, root: bpy.types.Object
     box.label(text=watch.message, icon="CHECKMARK" if watch.state == "done" else "PAUSE")
     column = box.column(align=True)
     column.scale_y = 0.8
-    for number in sorted(watch.levels.keys() & there):
-        column.label(text=level_line(watch.levels[number]), icon="BLANK1")
+    shown = [watch.levels[number] for number in sorted(watch.levels.keys() & there)]
+    if views := next(filter(None, map(measured_on, shown)), ""):
+        column.label(text=f"On {views}:", icon="BLANK1")
+    for event in shown:
+        column.label(text=short_level_line(event), icon="BLANK1")
     if missing := sorted(watch.levels.keys() - there):
         say(box, f"The run has more than is here: level {', '.join(map(str, missing))}.", "INFO")
         load = box.operator("lodgs.open_run", text="Load Its Levels", icon="IMPORT")

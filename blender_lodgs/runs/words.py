@@ -20,11 +20,23 @@ def progress_facts(progress: dict) -> dict[str, str]:
 
 def level_line(event: dict) -> str:
     """A ``level`` event in one line."""
-    quality = ""
-    for name, views in (("train_psnr", " on training views"), ("psnr", " on held-out views")):
-        if isinstance(event.get(name), float):
-            quality = f", {event[name]:.1f} dB{views}"
+    views = measured_on(event)
+    return short_level_line(event) + (f" on {views}" if views else "")
+
+
+def short_level_line(event: dict) -> str:
+    """The same without what its quality was measured on (`measured_on`), for narrow places."""
+    views = measured_on(event)
+    quality = f", {event[_MEASURED[views]]:.1f} dB" if views else ""
     return f"Level {event['level']}: {event['splats']:,} splats{quality}"
+
+
+def measured_on(event: dict) -> str:
+    """What a ``level`` event's quality is of: "held-out views", "training views", or "" for none."""
+    return next((views for views, name in _MEASURED.items() if isinstance(event.get(name), float)), "")
+
+
+_MEASURED = {"held-out views": "psnr", "training views": "train_psnr"}
 
 
 def duration(seconds: float) -> str:

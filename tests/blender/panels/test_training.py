@@ -129,8 +129,8 @@ def test_after_training(bpy, lodgs, root, draw, watch, fake):
     for number in (1, 2):
         lodgs("data.scenes").set_level(root, levels.Level(number, levels.NO_SPLATS))
     notes = draw()
-    first = "Level 1: 1,234 splats, 20.0 dB on held-out views"
-    assert {"Finished", first, "Level 2: 5 splats"} <= set(notes.texts)
+    first = "Level 1: 1,234 splats, 20.0 dB"
+    assert {"Finished", "On held-out views:", first, "Level 2: 5 splats"} <= set(notes.texts)
     assert notes.operators == ["lodgs.train"]
     bpy.data.objects.remove(root.lodgs.levels[0].object)
     notes = draw()
