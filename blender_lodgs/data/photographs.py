@@ -117,13 +117,13 @@ def look_at_scene(context: bpy.types.Context, root: bpy.types.Object, warn: Warn
     known, else from where they look already, with most of it in sight.
 
     Args:
-        warn: told of meshes that stand about the place where it was photographed, such as a new file's cube:
-            they are hidden there, or there would be nothing else to see.
+        warn: told of meshes that stand between where it was photographed from and what was seen there, such
+            as a new file's cube: they are hidden, or there would be nothing else to see.
     """
     photographed = photographed_from(root)
-    for obj in _around(context, photographed[0]) if photographed is not None else ():
+    for obj in _in_the_way(context, *photographed) if photographed is not None else ():
         obj.hide_set(True)
-        warn(f"'{obj.name}' stands about the cameras and is hidden; Alt+H shows it.")
+        warn(f"'{obj.name}' stands before the cameras and is hidden; Alt+H shows it.")
     if context.screen is None:
         return
     for area in context.screen.areas:
@@ -139,13 +139,17 @@ def look_at_scene(context: bpy.types.Context, root: bpy.types.Object, warn: Warn
                 looks.view_distance = 1.5 * size
 
 
-def _around(context: bpy.types.Context, eye: Vector) -> list[bpy.types.Object]:
-    """The meshes in whose box an eye is, that can be seen."""
+def _in_the_way(context: bpy.types.Context, eye: Vector, target: Vector) -> list[bpy.types.Object]:
+    """The meshes that can be seen, through whose box the way from an eye to a target leads."""
     found = []
     for obj in context.view_layer.objects:
         if obj.type == "MESH" and obj.visible_get():
-            place, corners = np.array(obj.matrix_world.inverted_safe() @ eye), np.array(obj.bound_box)
-            if (corners.min(0) <= place).all() and (place <= corners.max(0)).all():
+            to_local = obj.matrix_world.inverted_safe()
+            begin, end = np.array(to_local @ eye), np.array(to_local @ target)
+            corners, way = np.array(obj.bound_box), end - begin
+            way[way == 0] = 1e-30
+            enters, leaves = np.sort([(corners.min(0) - begin) / way, (corners.max(0) - begin) / way], axis=0)
+            if max(enters.max(), 0) <= min(leaves.min(), 1):
                 found.append(obj)
     return found
 

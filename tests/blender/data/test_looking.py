@@ -54,24 +54,30 @@ def test_photographs_are_looked_at_from_the_view_in_the_middle(bpy, lodgs):
     np.testing.assert_allclose((target - eye).normalized(), ahead, atol=1e-4)
 
 
-def test_what_stands_about_the_cameras_is_hidden_and_that_is_said(bpy, lodgs):
-    """A new file's cube, in the midst of which some scenes were photographed."""
-    eye, _ = lodgs("data.photographs").photographed_from(
+def test_what_stands_before_the_cameras_is_hidden_and_that_is_said(bpy, lodgs):
+    """A new file's cube, in which some scenes were photographed, and before which others."""
+    eye, target = lodgs("data.photographs").photographed_from(
         lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
     )
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    for name, place in (("about", eye), ("beside", eye + eye.normalized() * 3)):
-        bpy.ops.mesh.primitive_cube_add(location=place)
+    ahead = target - eye
+    aside = ahead.cross((0, 0, 1)).normalized()
+    places = {
+        "about": eye, "before": eye + 0.6 * ahead, "behind": eye - ahead.normalized(),
+        "beyond": eye + 1.4 * ahead, "aside": eye + 0.5 * ahead + aside,
+    }  # fmt: skip
+    for name, place in places.items():
+        bpy.ops.mesh.primitive_cube_add(location=place, size=0.4, rotation=(0.3, 0.2, 0.1))
         bpy.context.object.name = name
     bpy.ops.lodgs.import_colmap(directory=str(GARDEN), photographs=False)
     cubes = bpy.data.objects
-    assert not cubes["about"].visible_get() and cubes["beside"].visible_get()
+    assert [name for name in places if not cubes[name].visible_get()] == ["about", "before"]
     assert not cubes["about"].hide_render and not cubes["about"].hide_viewport
     told = []
     cubes["about"].hide_set(False)
     root = lodgs("data.scenes").roots(bpy.context.scene)[0]
     lodgs("data.photographs").look_at_scene(bpy.context, root, told.append)
-    assert told == ["'about' stands about the cameras and is hidden; Alt+H shows it."]
+    assert told == ["'about' stands before the cameras and is hidden; Alt+H shows it."]
 
 
 def test_an_impossible_control_changes_nothing(bpy, lodgs, tmp_path):
