@@ -48,7 +48,7 @@ KINDS = ("undistort", "checkpoint", "level", "bundle", "event", "step")
 """What a trainer is busy with when it is killed."""
 KILLS_A_RUN = 3
 FORK = get_context("fork")
-FULL_SAYS = "space"
+FULL_SAYS = ("No space left on device", "disk is full")
 
 
 # -- the victim ------------------------------------------------------------------------------------------
@@ -216,7 +216,8 @@ class Bench:
                 except LodgsError as error:
                     state, problem = "failed", str(error)
                 text = log.read_text() if log.exists() else ""
-                if state == "failed" and FULL_SAYS in problem and "Traceback" not in text:
+                told = any(words in problem for words in FULL_SAYS)
+                if state == "failed" and told and "Traceback" not in text:
                     found["full"] += 1
                     words = problem.replace(str(place), "RUN")
                     found["told"][words] = found["told"].get(words, 0) + 1

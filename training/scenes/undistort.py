@@ -91,6 +91,7 @@ def _undistort_into(target: Path, scene: Scene) -> None:
             except BaseException:
                 child.kill()
                 raise
+        _require_room(Path(work))
         if child.returncode:
             lines = problems.strip().splitlines() or [f"exit code {child.returncode}"]
             raise LodgsError(
@@ -98,7 +99,6 @@ def _undistort_into(target: Path, scene: Scene) -> None:
                 "Check the trainer's environment and the free space, or give an undistorted scene "
                 "(colmap image_undistorter).",
             )
-        _require_room(Path(work))
         try:
             os.replace(Path(work) / "undistorted", target)
         except OSError:
@@ -107,7 +107,7 @@ def _undistort_into(target: Path, scene: Scene) -> None:
 
 
 def _require_room(folder: Path) -> None:
-    """Raises OSError where a disk is full: COLMAP writes half a photograph then, and says nothing of it."""
+    """Raises OSError where a disk is full: COLMAP crashes then, or writes half a photograph silently."""
     with tempfile.TemporaryFile(dir=folder) as file:
         file.write(os.urandom(_ROOM))
         file.flush()
