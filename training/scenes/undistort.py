@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections import defaultdict
 from contextlib import suppress
 from dataclasses import replace
@@ -22,6 +23,8 @@ from .colmap import Scene, read_scene
 
 _VERSION = b"1"  # of what is kept in the cache
 _ROOM = 1 << 18  # bytes that are still free on a disk that is not full
+LOOKS = 2.0
+"""Seconds between two looks at whether the disk is full."""
 
 
 def undistorted(scene: Scene, cache: Path) -> Scene:
@@ -86,6 +89,7 @@ def _undistort_into(target: Path, scene: Scene) -> None:
             encoding="utf-8",
             errors="replace",
         ) as child:
+            threading.Thread(target=_end_without_room, args=(child, Path(work)), daemon=True).start()
             try:
                 problems = _converse(child, json.dumps(request))
             except BaseException:
@@ -106,8 +110,18 @@ def _undistort_into(target: Path, scene: Scene) -> None:
                 raise
 
 
+def _end_without_room(child: subprocess.Popen[str], folder: Path) -> None:
+    """Ends a program when the disk that it writes to is full: COLMAP's threads may wait for good then."""
+    while child.poll() is None:
+        try:
+            _require_room(folder)
+        except OSError:
+            child.kill()
+        time.sleep(LOOKS)
+
+
 def _require_room(folder: Path) -> None:
-    """Raises OSError where a disk is full: COLMAP crashes then, or writes half a photograph silently."""
+    """Raises OSError where a disk is full: COLMAP crashes then, or hangs, or writes half a photograph."""
     with tempfile.TemporaryFile(dir=folder) as file:
         file.write(os.urandom(_ROOM))
         file.flush()

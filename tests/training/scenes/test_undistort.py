@@ -1,5 +1,6 @@
 """Undistortion, checked on what the pictures show against pycolmap's camera models."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -13,6 +14,7 @@ import pytest
 
 from tests.training.scenes import synthetic
 from training.errors import LodgsError
+from training.scenes import undistort
 from training.scenes.colmap import read_scene
 from training.scenes.images import load_image
 from training.scenes.undistort import undistorted
@@ -152,6 +154,29 @@ def test_real_lens_keeps_points_on_their_features(shared_scenes, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="asks Linux for a process's children")
+def test_a_program_that_hangs_on_a_full_disk_is_ended_and_that_is_said(monkeypatch, tmp_path):
+    """COLMAP's threads wait for each other for good when one of them has met a full disk."""
+    synthetic.write_scene(tmp_path, synthetic.camera("OPENCV"), names=["a.png"], pixels=ramps())
+    scene = read_scene(tmp_path)
+    assert scene.distorted
+    real, room = subprocess.Popen, undistort._require_room
+    hangs = [sys.executable, "-c", "import sys, time; sys.stdin.readline(); time.sleep(600)"]
+    monkeypatch.setattr(undistort.subprocess, "Popen", lambda _, **settings: real(hangs, **settings))
+    monkeypatch.setattr(undistort, "LOOKS", 0.05)
+    full = []
+
+    def looks(folder):
+        full.append(folder)
+        if len(full) > 3:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        room(folder)
+
+    monkeypatch.setattr(undistort, "_require_room", looks)
+    with pytest.raises(LodgsError, match="No space left on device"):
+        undistorted(scene, tmp_path / "cache")
+    assert not list((tmp_path / "cache").iterdir())
+
+
 def test_nobody_undistorts_for_a_process_that_was_killed(tmp_path):
     names = [f"{number}.png" for number in range(120)]
     synthetic.write_scene(tmp_path, synthetic.camera("OPENCV"), names=names)
