@@ -27,7 +27,7 @@ class LodgeParameters(ThreedgsParameters):
         "finest (LODGE: d_l). 0 finds the one that leaves least to draw.",
     )
     prune_weight: float = parameter(
-        0.02,
+        0.12,
         "Splats of a coarser level that are nowhere more than this share of a pixel are removed (LODGE: γ, "
         "without a number).",
         high=1,
@@ -70,7 +70,7 @@ class LodgeParameters(ThreedgsParameters):
 
 _DRAFT = LodgeParameters()
 _STANDARD = replace(_DRAFT, **STANDARD, steps=30_000, densify_interval=100, tune_steps=1000)
-_PAPER = replace(_STANDARD, **PAPER, tune_alone=0.0)
+_PAPER = replace(_STANDARD, **PAPER, tune_alone=0.0, prune_weight=0.02)
 
 METHOD = MethodInfo(
     name="lodge",
