@@ -16,10 +16,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from training.rasterize.sh import basis, coefficients
 from training.render.capture import write_scene
-from training.scenes.cameras import Camera, write_camera
+from training.scenes.cameras import Camera, look_at, write_camera
 from training.splats.gaussians import SH_C0, Splats
 from training.splats.ply import write_ply
 
@@ -309,27 +310,11 @@ def _splats(discs: Discs, sh_degree: int, rng: np.random.Generator) -> Splats:
     lobe = np.repeat([1.5703, 1.1788, 0.6862, 0.3211], [1, 3, 5, 7])[: len(about)]
     shine = (gloss + 0.03) * lobe[:, None] * about
     sh[:, 1:] = shine[1:].T[..., None] * np.array([1.0, 0.97, 0.9])
+    quats = Rotation.from_matrix(frame).as_quat(scalar_first=True)
     return Splats(
-        means.astype(np.float32), quaternions(frame).astype(np.float32), np.log(scales).astype(np.float32),
+        means.astype(np.float32), quats.astype(np.float32), np.log(scales).astype(np.float32),
         np.log(opacity / (1 - opacity)).astype(np.float32), sh,
     )  # fmt: skip
-
-
-def quaternions(frames: np.ndarray) -> np.ndarray:
-    """Rotation matrices (N, 3, 3) as unit quaternions (N, 4) wxyz."""
-    trace = np.trace(frames, axis1=1, axis2=2)
-    diagonal = np.diagonal(frames, axis1=1, axis2=2)
-    squares = np.concatenate([1 + trace[:, None], 1 + 2 * diagonal - trace[:, None]], axis=1)
-    largest = squares.argmax(axis=1)
-    m = {(i, j): frames[:, i, j] for i in range(3) for j in range(3)}
-    w = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
-    xy, xz, yz = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
-    rows = np.array([
-        [squares[:, 0], *w], [w[0], squares[:, 1], xy, xz], [w[1], xy, squares[:, 2], yz],
-        [w[2], xz, yz, squares[:, 3]],
-    ])  # fmt: skip
-    found = rows[largest, :, np.arange(len(frames))]
-    return found / np.linalg.norm(found, axis=1, keepdims=True)
 
 
 # -- where to stand ------------------------------------------------------------------------------------
@@ -337,12 +322,7 @@ def quaternions(frames: np.ndarray) -> np.ndarray:
 
 def looking(name: str, eye: np.ndarray, at: np.ndarray) -> Camera:
     """A camera at an eye (3,) that looks at a point (3,), level."""
-    ahead = (at - eye) / np.linalg.norm(at - eye)
-    right = np.cross(ahead, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = right, np.cross(ahead, right), ahead
-    pose[:3, 3] = -pose[:3, :3] @ eye
+    pose = look_at(eye, at, (0.0, 0.0, 1.0))
     return Camera(name, WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose)
 
 

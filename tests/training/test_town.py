@@ -28,12 +28,6 @@ def test_more_splats_are_more_blocks_once_walls_are_fine(plan):
     assert town.plan_for(10_000_000).blocks > 3
 
 
-def test_quaternions_are_those_of_scipy():
-    frames = Rotation.from_quat(np.random.default_rng(0).normal(size=(500, 4))).as_matrix()
-    back = Rotation.from_quat(town.quaternions(frames), scalar_first=True).as_matrix()
-    np.testing.assert_allclose(back, frames, atol=1e-12)
-
-
 def test_walls_and_ground_are_flat_discs_on_their_surfaces(plan):
     splats = town.build(plan, 40_000)
     ground = np.abs(splats.means[:, 2]) < 1e-6

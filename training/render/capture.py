@@ -12,7 +12,7 @@ from PIL import Image
 
 from ..errors import LodgsError
 from ..rasterize import Gaussians, rasterize
-from ..scenes.cameras import Camera
+from ..scenes.cameras import Camera, look_at
 from ..scenes.write_colmap import thinned, visible_in, write_colmap
 from ..splats.gaussians import Splats
 
@@ -25,6 +25,8 @@ INSIDE = 0.9
 OPAQUE = 0.5
 DOMES = (1.1, 2.2)
 """Radii of a dome's two shells, in multiples of the distance from which the splats fill the picture."""
+UP = (0.0, -1.0, 0.0)
+"""As in most COLMAP worlds."""
 NEAR = 0.01
 """Depth at which drawing begins, as a share of the distance to the splats' middle."""
 
@@ -51,19 +53,8 @@ def dome(splats: Splats, count: int, width: int = 960, height: int = 640) -> tup
     away = np.stack([ring * np.cos(turn), z, ring * np.sin(turn)], axis=1)
     eyes = middle + fills * np.where(number % 2, *DOMES)[:, None] * away
     lens = (width, height, focal, focal, width / 2, height / 2)
-    views = [Camera(f"dome_{n:03d}", *lens, _looking(eye, middle)) for n, eye in enumerate(eyes)]
+    views = [Camera(f"dome_{n:03d}", *lens, look_at(eye, middle, UP)) for n, eye in enumerate(eyes)]
     return views, NEAR * fills
-
-
-def _looking(eye: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """world_to_camera (4, 4) of an eye that looks at a point; y is down, as in most COLMAP worlds."""
-    ahead = (at - eye) / np.linalg.norm(at - eye)
-    right = np.cross([0.0, 1.0, 0.0], ahead)
-    right = right / np.linalg.norm(right) if np.linalg.norm(right) > 1e-6 else np.array([1.0, 0.0, 0.0])
-    pose = np.eye(4)
-    pose[:3, :3] = right, np.cross(ahead, right), ahead
-    pose[:3, 3] = -pose[:3, :3] @ eye
-    return pose
 
 
 def write_scene(

@@ -135,6 +135,23 @@ class Camera:
         return replace(self, world_to_camera=pose), scale
 
 
+def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray | tuple[float, float, float]) -> np.ndarray:
+    """world_to_camera (4, 4), OpenCV axes, of an eye (3,) that looks at a point (3,) of the world.
+
+    Args:
+        up: (3,) what is up in the picture; where the eye looks along it, anything level is to the right.
+    """
+    ahead = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(ahead, up)
+    if np.linalg.norm(right) < 1e-6 * np.linalg.norm(up):
+        right = np.cross(ahead, np.eye(3)[np.abs(ahead).argmin()])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = right, np.cross(ahead, right), ahead
+    pose[:3, 3] = -pose[:3, :3] @ eye
+    return pose
+
+
 def evenly(cameras: Sequence[Camera], most: int) -> list[Camera]:
     """At most so many of the cameras, evenly chosen, the first and the last among them."""
     chosen = np.linspace(0, len(cameras) - 1, min(most, len(cameras)))

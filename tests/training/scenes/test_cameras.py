@@ -2,9 +2,10 @@
 
 import numpy as np
 import pycolmap
+import pytest
 from scipy.spatial.transform import Rotation
 
-from training.scenes.cameras import Camera
+from training.scenes.cameras import Camera, look_at
 
 POSE = np.array([[0.0, 1, 0, -2], [-1, 0, 0, 3], [0, 0, 1, 4], [0, 0, 0, 1]])
 """A quarter turn about z, then a step: a world point (x, y, z) is (y - 2, 3 - x, z + 4) to the camera."""
@@ -51,3 +52,16 @@ def test_projections_are_colmaps():
     seen = camera.sees(points)
     assert 0 < seen.sum() < len(seen)
     assert np.array_equal(seen, ((uv >= 0) & (uv < (96, 72))).all(1))
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, -1, 0), (3, 2, 1)])
+def test_an_eye_looks_at_its_target_with_up_above(up):
+    """(3, 2, 1) is the way that it looks itself: then any picture is upright."""
+    eye, target = np.array([1.0, -2.0, 0.5]), np.array([4.0, 0.0, 1.5])
+    pose = look_at(eye, target, up)
+    np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(pose) == pytest.approx(1)
+    np.testing.assert_allclose(pose @ [*eye, 1], [0, 0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(pose @ [*target, 1], [0, 0, np.sqrt(14), 1], atol=1e-12)
+    x, y, _ = pose[:3, :3] @ up
+    assert abs(x) < 1e-12 and (y < -0.5 or up == (3, 2, 1))  # y is down

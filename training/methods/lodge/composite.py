@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -10,7 +11,14 @@ import torch
 from ...lod.rule import facts_of
 from ...lod.rules.chunks import RULE
 from ...rasterize import Gaussians, contributions
+from ...rasterize.filter3d import smoothed
 from ...scenes.cameras import Camera
+
+
+def filtered(gaussians: Gaussians, std: float) -> Gaussians:
+    """Splats with LODGE's filter of that standard deviation, in scene units (Eq. 3)."""
+    scales, opacities = smoothed(gaussians.log_scales, gaussians.opacity_logits, std)
+    return replace(gaussians, log_scales=scales, opacity_logits=opacities)
 
 
 def composite(

@@ -8,9 +8,8 @@ import numpy as np
 import torch
 
 from ...rasterize import Gaussians, rasterize
-from ...rasterize.filter3d import smoothed
 from ...scenes.cameras import Camera, evenly
-from .composite import composite, importance
+from .composite import composite, filtered, importance
 
 VIEWS = 8
 """So many training views tell the cost."""
@@ -65,8 +64,7 @@ class Thresholds:
         The level is the finest one smoothed and pruned, without the steps that tune it.
         """
         finest, number = next(iter(levels.values())), min(levels) - 1
-        scales, opacities = smoothed(finest.log_scales, finest.opacity_logits, self._std(distance))
-        coarser = Gaussians(finest.means, finest.quats, scales, opacities, finest.sh)
+        coarser = filtered(finest, self._std(distance))
         together, d_l = {**levels, number: coarser}, {**d_l, number: distance}
         pictures = ((camera, *composite(together, d_l, camera)) for camera in self._cameras)
         kept = importance(pictures, len(coarser), self._near, self._backend) >= self._prune_weight

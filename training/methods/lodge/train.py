@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from ...errors import LodgsError
 from ...rasterize import Gaussians
-from ...rasterize.filter3d import smoothed
 from ...splats.bundle import Level
 from ...splats.gaussians import Splats
 from ..data import TrainingView
@@ -22,7 +22,7 @@ from ..model import NAMES, Model, splat_rates
 from ..start import from_splats
 from ..threedgs import train as threedgs_train
 from . import ROUNDS, LodgeParameters
-from .composite import composite, importance
+from .composite import composite, filtered, importance
 from .thresholds import Thresholds
 
 
@@ -40,6 +40,8 @@ class Method(threedgs_train.Method):
 
     def setup(self, base: Splats | None) -> None:
         p = self.parameters
+        if base is not None and p.levels == 1:
+            raise LodgsError("A base is the one level itself: there is nothing to train.", "Give levels = 2.")
         self.finest_steps = 0 if base is not None else p.steps
         if base is None:
             super().setup(None)
@@ -67,7 +69,8 @@ class Method(threedgs_train.Method):
         )
 
     def ends_level(self, step: int) -> bool:
-        return step + 1 == self.finest_steps or self._local(step + 1) == 0
+        done = step + 1
+        return done == self.finest_steps or (done > self.finest_steps and self._local(done) == 0)
 
     def levels_after(self, step: int) -> list[Level]:
         """The finest as soon as it is there, each coarser one when it is tuned."""
@@ -158,11 +161,8 @@ class Method(threedgs_train.Method):
 
     def smoothed(self, number: int) -> Gaussians:
         """The model as a level: with the filter of its distance (Eq. 3), which no step can undo."""
-        g = self.model.gaussians
-        if not self.d_l[number]:
-            return g
-        scales, opacities = smoothed(g.log_scales, g.opacity_logits, self._std(self.d_l[number]))
-        return Gaussians(g.means, g.quats, scales, opacities, g.sh)
+        gaussians, d_l = self.model.gaussians, self.d_l[number]
+        return filtered(gaussians, self._std(d_l)) if d_l else gaussians
 
     def _levels_to(self, number: int) -> dict[int, Gaussians]:
         """The finished levels and the one in training, finest first."""

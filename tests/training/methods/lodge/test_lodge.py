@@ -71,6 +71,22 @@ def test_a_base_is_the_finest_level_to_the_bit(data, base):
     assert [level.number for level in levels] == [3, 2, 1] and lodge.steps == 18
 
 
+def test_until_the_coarser_levels_begin_it_is_3dgs(data):
+    values = {"steps": 12, "densify_until": 0.4, "prune_interval": 6, "margin": 0.0}
+    plain = create("3dgs", data, override(method_info("3dgs").preset("draft"), values), 0, "cpu")
+    lodge = make(data, tune_steps=1)  # levels of three steps, whose ends would come within these
+    ends = [step for step in range(12) if lodge.ends_level(step)]
+    assert ends == [step for step in range(12) if plain.ends_level(step)] == [11]
+    for step in range(12):  # to the last digits, which depend on how many threads add up
+        assert lodge.train_step(step)[0] == pytest.approx(plain.train_step(step)[0], rel=1e-5)
+    torch.testing.assert_close(lodge.model["means"], plain.model["means"])
+
+
+def test_one_level_of_a_base_is_refused(data, base):
+    with pytest.raises(LodgsError, match="nothing to train"):
+        make(data, base, levels=1)
+
+
 def test_one_level_is_the_base_alone(data, base):
     lodge = make(data, levels=1)
     [level] = trained(lodge)
