@@ -15,7 +15,7 @@ VIEWS = 8
 """So many training views tell the cost."""
 TRIED, BETWEEN = 9, (0.01, 0.9)
 """So many distances are tried, in equal ratios between these quantiles of the splats' distances in view."""
-STANDING_APART = 1.25
+STANDING_APART = 2.0
 """A level begins at least this many times farther away than the next finer one."""
 
 

@@ -84,6 +84,7 @@ class Method(threedgs_train.Method):
         self.sets: dict[int, list[np.ndarray]] = {}
         self._blocks: Blocks | None = None  # of the level in training, as it was at its last pruning
         self._alone_share = p.tune_alone
+        self._threshold = p.prune_weight  # the least share of a pixel after the last pruning
         self._optimizer: SeenRows | None = None
 
     @property
@@ -123,6 +124,7 @@ class Method(threedgs_train.Method):
         if done > self.tuned_steps:
             return [self._level(number) for number in sorted(self.finished)] if done == self.steps else []
         if done == max(self.finest_steps, 1):
+            self._finish(self.levels)
             found.append(self._level(self.levels))
         if step >= self.finest_steps and self._local(done) == 0:
             found.insert(0, self._level(self.level_at(step)))
@@ -205,11 +207,14 @@ class Method(threedgs_train.Method):
 
     def begin_round(self, step: int) -> None:
         """Before a step: what hardly shows leaves the level; a new level begins as a copy of the finest."""
-        number, local = self.level_at(step), self._local(step)
+        p, number, local = self.parameters, self.level_at(step), self._local(step)
         if local == 0:
             self._begin_level(number)
-        threshold = self.parameters.prune_weight * ROUNDS[local // self.parameters.tune_steps]
-        self.model.keep(self.importance(number) >= threshold)
+        found = self.importance(number)
+        if local == 0:
+            share = p.keep ** (self.levels - number)
+            self._threshold = max(p.prune_weight, float(np.quantile(found.numpy(), 1 - share)))
+        self.model.keep(found >= self._threshold * ROUNDS[local // p.tune_steps])
         require_rows(self.model, step, "prune_weight")
         self._blocks = self._smoothed(number).blocks
 
@@ -233,6 +238,8 @@ class Method(threedgs_train.Method):
 
     def _finish(self, number: int) -> None:
         """The level in training is what it is from now on."""
+        if number in self.finished:
+            return
         level = self._smoothed(number)
         if number == self.levels and self.finest_steps:
             order = torch.from_numpy(spatial_order(level.means))
@@ -334,6 +341,7 @@ class Method(threedgs_train.Method):
         return {
             **super().state_dict(),
             "d_l": self.d_l, "finished": finished, "costs": self.costs, "alone": self._alone_share,
+            "threshold": self._threshold,
             "blocks": {} if blocks is None else {
                 "count": blocks.count, "low": torch.from_numpy(blocks.low),
                 "high": torch.from_numpy(blocks.high), "reach": torch.from_numpy(blocks.reach),
@@ -348,6 +356,7 @@ class Method(threedgs_train.Method):
     def load_state_dict(self, state: dict) -> None:
         super().load_state_dict(state)
         self.d_l, self.costs, self._alone_share = state["d_l"], state["costs"], state["alone"]
+        self._threshold = state["threshold"]
         self.finished = {
             number: IndexedLevel.of(Gaussians(**tensors)) for number, tensors in state["finished"].items()
         }
