@@ -11,7 +11,7 @@ import hashlib
 import json
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -161,7 +161,12 @@ def write_bundle(path: str | Path, bundle: Bundle, order: str = "finest_first") 
     write_elements(path, everything, comments + comments_of(bundle.meta))
 
 
-def read_bundle(path: str | Path, warn: Warn = silent) -> Bundle:
+RowsOf = Callable[[Bundle], Mapping[int, np.ndarray]]
+"""Of a bundle with its tables, but without splats yet: which rows (M,) of each level to read, by number. Those
+beyond its last one do not count."""
+
+
+def read_bundle(path: str | Path, warn: Warn = silent, rows_of: RowsOf | None = None) -> Bundle:
     """Read a bundle as it was written, bit for bit; any other 3DGS PLY reads as one level of unknown method.
 
     Splats that cannot be drawn are left out (`dialects.drawable`).
@@ -170,6 +175,7 @@ def read_bundle(path: str | Path, warn: Warn = silent) -> Bundle:
 
     Args:
         warn: as for `read_ply`.
+        rows_of: where not all splats are wanted: of a binary file no others are read then.
 
     Raises:
         LodgsError: not a PLY of splats, cut short, from a newer version, or a header that contradicts itself.
@@ -190,16 +196,21 @@ def read_bundle(path: str | Path, warn: Warn = silent) -> Bundle:
                     raise ValueError(f"the table {shown(name)} is in another element")
                 rows = apart.pop(line["element"])
                 bundle.tables[name] = {column: np.array(rows[column]) for column in rows.dtype.names or ()}
+        wanted = {} if rows_of is None else rows_of(bundle)
+        for line in lines:
             if "level" not in line:
                 continue
             name, count = line["element"], line["count"]
             rows = elements[name][begin[name] : begin[name] + count]
             begin[name] += count
-            splats = splats_from(rows, path)
             extras = apart.pop(line["extras"]) if "extras" in line else None
             if len(rows) != count or (extras is not None and len(extras) != count):
                 raise ValueError(f"level {line['level']} should have {count} splats")
+            some = wanted.get(line["level"], slice(None))
+            some = some if isinstance(some, slice) else some[some < count]
+            splats = splats_from(rows[some], path)
             if extras is not None:
+                extras = extras[some]
                 splats.extras |= {column: np.array(extras[column]) for column in extras.dtype.names or ()}
             level = next(level for level in bundle.levels if level.number == line["level"])
             level.splats = drawable(splats, path, warn)

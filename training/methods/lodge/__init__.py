@@ -34,9 +34,9 @@ class LodgeParameters(ThreedgsParameters):
     )
     keep: float = parameter(
         0.3,
-        "Where more than about this share of the next finer level would stay, more is removed, so that levels "
-        "are worth drawing in scenes of many small splats, too. 1 goes by the share of a pixel alone. Not in "
-        "the paper.",
+        "Where more than about this share of the next finer level would stay, more is removed, so that "
+        "levels are worth drawing in scenes of many small splats, too. 1 goes by the share of a pixel alone. "
+        "Not in the paper.",
         above=0,
         high=1,
     )
@@ -59,7 +59,7 @@ class LodgeParameters(ThreedgsParameters):
         high=96,
     )
     visible_weight: float = parameter(
-        0.005,
+        0.01,
         "Splats that no view in a chunk, turned anywhere, shows by so large a share of a pixel are not in "
         "its set (LODGE: a fixed threshold, without a number). 0 keeps all.",
         high=1,

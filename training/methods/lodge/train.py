@@ -14,7 +14,8 @@ import torch
 
 from ...errors import LodgsError
 from ...lod.blocks import Blocks, spatial_order
-from ...lod.rules.chunks import TABLE, member_columns
+from ...lod.rules.chunks import RULE, TABLE, member_columns
+from ...lod.streaming import BLOCKS, table_of_blocks
 from ...rasterize import Adam, Gaussians, Target, photometric_loss
 from ...splats.bundle import Level
 from ...splats.gaussians import Splats
@@ -46,9 +47,11 @@ class SeenRows:
         self._adam, self._rows, self._leaves = adam, rows, leaves
 
     def step(self) -> None:
+        """One step of these rows."""
         self._adam.step_rows(self._rows, {name: leaf.grad for name, leaf in self._leaves.items()})
 
     def zero_grad(self) -> None:
+        """The rows go with their gradients: the next picture has others."""
         self._leaves = {}
 
 
@@ -131,11 +134,15 @@ class Method(threedgs_train.Method):
         return found
 
     def tables(self) -> dict[str, Columns]:
-        """The chunks, where there are any."""
+        """The chunks, where there are any, and which blocks of rows have splats of them."""
         if not len(self.centres):
             return {}
         x, y, z = self.centres.T
-        return {TABLE: {"x": x, "y": y, "z": z, "radius": self.radii}}
+        splats = {number: self._level(number).splats for number in sorted(self.sets)}
+        return {
+            TABLE: {"x": x, "y": y, "z": z, "radius": self.radii},
+            BLOCKS: table_of_blocks(RULE, splats),
+        }
 
     def meta(self) -> dict:
         return {**super().meta(), "filter_variance": self.parameters.filter_variance, "costs": self.costs}
