@@ -109,6 +109,7 @@ class Method(ABC, Generic[P, D]):
             "focal_width": data.train[0].width,
             "scene_extent": data.extent,
             "median_depth": data.median_depth,
+            **({"antialias": True} if self.parameters.antialias else {}),
         }
 
     # -- a step ----------------------------------------------------------------------------------------
@@ -261,6 +262,7 @@ class Method(ABC, Generic[P, D]):
             min_scale=min_scale,
             sh_degree=self.sh_degree(step),
             near=self.data.near,
+            antialias=self.parameters.antialias,
             background=self.background(step),
             backend=self.backend,
         )

@@ -52,11 +52,17 @@ def composite(
 
 
 def importance(
-    pictures: Iterable[tuple[Camera, Gaussians, torch.Tensor | None]], count: int, near: float, backend: str
+    pictures: Iterable[tuple[Camera, Gaussians, torch.Tensor | None]],
+    count: int,
+    near: float,
+    backend: str,
+    antialias: bool = False,
 ) -> torch.Tensor:
     """The largest share (count,) of a pixel that each of the last ``count`` splats of pictures has."""
     largest = torch.zeros(count)
     for camera, gaussians, weights in pictures:
-        found = contributions(gaussians, [camera], weights=weights, near=near, backend=backend)
+        found = contributions(
+            gaussians, [camera], weights=weights, near=near, antialias=antialias, backend=backend
+        )
         largest = torch.maximum(largest.to(found.largest), found.largest[-count:])
     return largest

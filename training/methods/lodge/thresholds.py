@@ -28,6 +28,7 @@ class Thresholds:
         backend: the rasterizer's.
         prune_weight: the least share of a pixel that keeps a splat of the coarser level.
         std: the smoothing filter's standard deviation for a distance, both in scene units.
+        antialias: as of ``rasterize``.
     """
 
     def __init__(
@@ -37,9 +38,11 @@ class Thresholds:
         backend: str,
         prune_weight: float,
         std: Callable[[float], float],
+        antialias: bool = False,
     ) -> None:
         self._cameras = evenly(cameras, VIEWS)
         self._near, self._backend, self._prune_weight, self._std = near, backend, prune_weight, std
+        self._antialias = antialias
 
     @torch.no_grad()
     def next(
@@ -67,12 +70,16 @@ class Thresholds:
         coarser = filtered(finest, self._std(distance))
         together, d_l = {**levels, number: coarser}, {**d_l, number: distance}
         pictures = ((camera, *composite(together, d_l, camera)) for camera in self._cameras)
-        kept = importance(pictures, len(coarser), self._near, self._backend) >= self._prune_weight
+        share = importance(pictures, len(coarser), self._near, self._backend, self._antialias)
+        kept = share >= self._prune_weight
         together[number] = coarser.select(kept.to(coarser.means.device))
         tiles = []
         for camera in self._cameras:
             gaussians, weights = composite(together, d_l, camera)
-            drawn = rasterize(gaussians, camera, weights=weights, near=self._near, backend=self._backend)
+            drawn = rasterize(
+                gaussians, camera, weights=weights, near=self._near, antialias=self._antialias,
+                backend=self._backend,
+            )  # fmt: skip
             tiles.append(drawn.tile_counts.double().mean())
         return float(torch.stack(tiles).mean())
 

@@ -18,7 +18,7 @@ from ...splats.gaussians import Splats
 from ..data import TrainingView
 from ..density import require_rows
 from ..method import Drawing
-from ..model import NAMES, Model, splat_rates
+from ..model import NAMES
 from ..start import from_splats
 from ..threedgs import train as threedgs_train
 from . import ROUNDS, LodgeParameters
@@ -47,7 +47,7 @@ class Method(threedgs_train.Method):
             super().setup(None)
         else:
             tensors = from_splats(base, p.sh_degree, self.device)
-            self.model = Model(tensors, splat_rates(p, self.data.extent))
+            self.model = self.new_model(tensors)
             self._densify_until = 0
         self.d_l = {p.levels: 0.0}
         self.finished: dict[int, Gaussians] = {}
@@ -153,11 +153,13 @@ class Method(threedgs_train.Method):
         if given:
             self.d_l[number] = given
         else:
-            thresholds = Thresholds(data.train, data.near, self.backend, p.prune_weight, self._std)
+            thresholds = Thresholds(
+                data.train, data.near, self.backend, p.prune_weight, self._std, p.antialias
+            )
             self.d_l[number], costs = thresholds.next(self.finished, self.d_l)
             self.costs.append({"level": number, **costs})
         tensors = {name: getattr(finest, name).clone() for name in NAMES}
-        self.model = Model(tensors, splat_rates(p, data.extent))
+        self.model = self.new_model(tensors)
 
     def smoothed(self, number: int) -> Gaussians:
         """The model as a level: with the filter of its distance (Eq. 3), which no step can undo."""
@@ -178,12 +180,13 @@ class Method(threedgs_train.Method):
         data, count, backend = self.data, len(self.model), self.backend
         levels, alone, farther = self._levels_to(number), self.smoothed(number), self._farther(number)
         beside = ((camera, *composite(levels, self.d_l, camera)) for camera in data.train)
-        found = importance(beside, count, data.near, backend)
+        antialias = self.parameters.antialias
+        found = importance(beside, count, data.near, backend, antialias)
         if not self.parameters.tune_alone:
             return found
         margin = self.parameters.margin
         away = ((camera.widened(margin).scaled(1 / farther), alone, None) for camera in data.train)
-        return torch.maximum(found, importance(away, count, data.near, backend))
+        return torch.maximum(found, importance(away, count, data.near, backend, antialias))
 
     def _level(self, number: int) -> Level:
         g = self.finished[number] if number in self.finished else self.smoothed(number).detach()
