@@ -1,6 +1,7 @@
 """LODGE: levels are the rule's and no finer than their filter, the finest stays, runs go on to the bit."""
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,10 +10,12 @@ import torch
 from training.errors import LodgsError
 from training.lod.selection import select, settings
 from training.methods import create, method_info
+from training.methods.lodge import LodgeParameters
 from training.methods.lodge.composite import composite, importance
 from training.methods.lodge.thresholds import Thresholds
 from training.methods.parameters import override
-from training.rasterize import Gaussians, rasterize
+from training.methods.threedgs.train import WEIGHED_AT
+from training.rasterize import Gaussians, contributions, rasterize
 from training.scenes.cameras import Camera
 from training.splats.bundle import Bundle
 from training.splats.gaussians import Splats
@@ -144,6 +147,35 @@ def test_importance_is_the_largest_weight_of_the_reference(data, base):
         )
         picture = rasterize(only, camera, near=data.near, backend="reference").image
         assert found[row - 7] == pytest.approx(float(picture.max()), abs=2e-5)
+
+
+def test_the_papers_preset_trains_as_its_appendix_says():
+    p = method_info("lodge").preset("paper")
+    assert isinstance(p, LodgeParameters)
+    assert (p.antialias, p.densify_by, p.max_threshold, p.least_weight) == (True, "max", 0.015, 0.02)
+    assert (p.steps, p.densify_interval, p.densify_from, p.densify_until) == (30_000, 300, 600, 0.5)
+    assert p.opacity_reset_interval == 3000 and round(WEIGHED_AT[0] * p.steps) == 8000
+
+
+def test_levels_of_an_antialiased_base_are_found_and_drawn_so(data, base):
+    """Its importance and its pictures are of Mip-Splatting's filter, of splats smaller than a pixel."""
+    small = replace(base, log_scales=base.log_scales - np.float32(2))
+    given = {"distances": [1.2, 0.8, 0.0], "prune_weight": 0.0, "tune_alone": 0.0}
+    lodge = make(data, small, antialias=True, **given)
+    trained(lodge, until=1)
+    own, found = lodge.smoothed(2).detach(), lodge.importance(2)
+    pictures = [(camera, *composite(lodge._levels_to(2), lodge.d_l, camera)) for camera in data.train]
+    for flag in (True, False):
+        largest = torch.stack(
+            [
+                contributions(
+                    gaussians, [camera], weights=weights, near=data.near, antialias=flag, backend="reference"
+                ).largest[-len(own) :]
+                for camera, gaussians, weights in pictures
+            ]
+        ).amax(0)
+        assert ((found - largest).abs().max() < 1e-4) == flag
+    assert lodge.meta()["antialias"] is True
 
 
 def test_what_hardly_shows_goes_and_what_shows_stays(data, base):
