@@ -92,7 +92,7 @@ class Parameters:
     antialias: bool = parameter(
         False,
         "Whether splats are drawn through Mip-Splatting's 2D filter, which keeps the light of those that are "
-        "smaller than a pixel, instead of 3DGS's dilation; a base that is trained so decides it.",
+        "smaller than a pixel, instead of 3DGS's dilation. Where a run begins with a base, the base decides.",
     )
     lr_exposure: float = parameter(
         0.0,
