@@ -15,8 +15,8 @@ from .rule import Region, Rule
 from .selection import columns_of, rule_of
 
 BLOCKS = "blocks"
-"""The table of blocks, SIZE rows of a level each, in the order of their rows: ``level``, and the rule's columns
-of bits, those of all rows of the block together."""
+"""The table of blocks, SIZE rows of a level each, in the order of their rows: ``level``, and the rule's
+columns of bits, those of all rows of the block together."""
 
 
 def table_of_blocks(rule: Rule, levels: dict[int, Splats]) -> dict[str, np.ndarray]:

@@ -28,7 +28,8 @@ def bundle():
         sets = np.abs(means[:, 0] - np.arange(30)[:, None] - 0.5) < 1
         splats = Splats(
             means, rng.normal(size=(count, 4)).astype(np.float32),
-            rng.normal(size=(count, 3)).astype(np.float32), rng.normal(size=count).astype(np.float32), rng.normal(size=(count, 1, 3)).astype(np.float32),
+            rng.normal(size=(count, 3)).astype(np.float32), rng.normal(size=count).astype(np.float32),
+            rng.normal(size=(count, 1, 3)).astype(np.float32),
             member_columns(sets),
         )  # fmt: skip
         levels.append(Level(number, splats, {"d_l": 4.0 - number if number < 3 else 0.0}))
