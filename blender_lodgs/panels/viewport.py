@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ...training.lod.colors import level_color
+from ...training.lod.rule import find_rule
 from .. import compat, viewport
 from ..data import scenes
 from ..viewport import views
@@ -31,8 +32,10 @@ class LODGS_PT_viewport(Panel):
         if root is not None:
             row = column.row()
             row.active = len(root.lodgs.levels) != 1  # one level has one colour
-            row.prop(root.lodgs, "tell", expand=True)
-            if root.lodgs.tell != "OWN" and row.active:
+            rule = find_rule(root.lodgs.rule)
+            for tell in ("OWN", "LEVELS", "BANDS", *(["CHUNKS"] if rule and rule.tables else [])):
+                row.prop_enum(root.lodgs, "tell", tell)
+            if root.lodgs.tell in ("LEVELS", "BANDS") and row.active:
                 _legend(layout, [item.number for item in root.lodgs.levels if item.exists])
         if viewport.problem:
             text = f"The viewport could not be drawn ({viewport.problem}). Untick Gaussian Splats for points."

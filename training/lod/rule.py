@@ -147,6 +147,19 @@ class Rule(ABC):
         """(N,) bool, which splats of a level an eye in a region may be shown."""
         raise NotImplementedError("this rule has no regions")
 
+    def where(self, eye: np.ndarray, values: Values, tables: Tables) -> str:
+        """Where an eye is, in a few words for people; empty where the rule tells no regions apart."""
+        return ""
+
+    def idle(self, eye: np.ndarray, values: Values, tables: Tables) -> Mapping[str, str]:
+        """The controls that change nothing for an eye, by name, each with the reason in a sentence."""
+        return {}
+
+    def parts(self, means: np.ndarray, tables: Tables) -> np.ndarray:
+        """The number (N,), from 1 on, of that part of space where each place is, for pictures that tell
+        them apart; 0 where the rule has no such parts."""
+        return np.zeros(len(means), np.float32)
+
     def wanted_level(
         self,
         means: np.ndarray,

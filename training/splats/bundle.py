@@ -219,6 +219,19 @@ def read_head(path: str | Path) -> Bundle:
     return _parse(comments, path)[0] or Bundle("", [Level(1, NO_SPLATS)], meta=meta_of(comments, path))
 
 
+def read_tables(path: str | Path) -> dict[str, Columns]:
+    """The tables of a bundle alone: its splats are not read. Any other 3DGS PLY has none.
+
+    Raises:
+        LodgsError: as `read_bundle`.
+    """
+    elements, comments = read_elements(path)
+    try:
+        return _read_tables([line for line in _parse(comments, path)[1] if "table" in line], elements)
+    except _CONTRADICTIONS as error:
+        raise _contradiction(path, error) from error
+
+
 def write_folder(folder: str | Path, bundle: Bundle) -> str:
     """Write every level as a complete plain PLY, ``lod0.ply`` the finest, and ``manifest.json``.
 

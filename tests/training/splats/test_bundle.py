@@ -452,7 +452,7 @@ def test_a_folder_that_contradicts_its_tables_is_refused(tmp_path, bundle):
             read_folder(tmp_path)
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
     (tmp_path / "tables.ply").unlink()
-    with pytest.raises(LodgsError, match="tables.ply"):
+    with pytest.raises(LodgsError, match=r"tables\.ply"):
         read_folder(tmp_path)
 
 

@@ -18,6 +18,8 @@ MEMBERS = tuple(f"chunks_{number}" for number in range(MOST_CHUNKS // BITS))
 """Columns of splats: bit c % BITS of column c // BITS is set where chunk c has the splat in its set."""
 TABLE = "chunks"
 """The table of chunks, one a row: centres x, y, z, and radius, in scene units."""
+_BLOCK = 1 << 14
+"""Places that are compared with all centres at a time."""
 LEAVING = 0.25
 """Beyond its radius a chunk's set counts less and less, until nothing after this share of the radius."""
 
@@ -84,6 +86,40 @@ class Chunks(Rule):
             found |= members(columns, chunk)
         return found
 
+    def where(self, eye, values: Values, tables: Tables) -> str:
+        if not values["chunks"] or not _rows(tables):
+            return ""
+        near_chunks = self.near_chunks(eye, values, tables)
+        inside = sum(share for _, share in near_chunks)
+        if not inside:
+            return "Outside the chunks"
+        said = " and ".join(str(number) for number, _ in near_chunks)
+        if len(near_chunks) > 1:
+            said += f", {100 * near_chunks[1][1] / inside:.0f} %"
+        if inside < 1:
+            said += f", {100 * (1 - inside):.0f} % outside"
+        return f"Chunk{'s'[: len(near_chunks) > 1]} {said}"
+
+    def idle(self, eye, values: Values, tables: Tables) -> Mapping[str, str]:
+        if not _rows(tables):
+            return dict.fromkeys(("chunks", "fade"), "These splats have no chunks.")
+        if not values["chunks"]:
+            return {"fade": "Only chunks fade into each other."}
+        if self.region(eye, values, tables) is None:
+            return {}
+        return {"distance_scale": "The sets of chunks are fixed: a distance scale counts outside of them."}
+
+    def parts(self, means, tables: Tables) -> np.ndarray:
+        if not _rows(tables):
+            return super().parts(means, tables)
+        centres = np.stack([tables[TABLE][axis] for axis in "xyz"]).astype(np.float32)
+        squares = (centres * centres).sum(axis=0)
+        found = np.empty(len(means), np.float32)
+        for start in range(0, len(means), _BLOCK):
+            block = means[start : start + _BLOCK]
+            found[start : start + _BLOCK] = (squares - 2 * block @ centres).argmin(axis=1) + 1
+        return found
+
     def near_chunks(self, eye, values: Values, tables: Tables) -> list[tuple[int, float]]:
         """The nearest chunk A and, where sets fade, the next one B, each as its number and its share.
 
@@ -94,9 +130,9 @@ class Chunks(Rule):
 
         Shares sum up to 1 within the radius of one of the two, to 0 far from both; none without chunks.
         """
-        table = tables.get(TABLE, {})
-        if not values["chunks"] or not len(table.get("x", ())):
+        if not values["chunks"] or not _rows(tables):
             return []
+        table = tables[TABLE]
         centres = np.stack([table[axis] for axis in "xyz"], axis=1).astype(np.float64)
         eye, radii = np.asarray(eye, np.float64), np.asarray(table["radius"], np.float64)
         away = np.linalg.norm(centres - eye, axis=1)
@@ -108,7 +144,7 @@ class Chunks(Rule):
         if values["fade"] and t[second] > 0:
             s = max(2 * float(t[third[0]]) - float(t[second]), 0.0) if third else 0.0
             near.append(int(second))
-            share = (float(t[second]) - s) / max(1 - 2 * s, 1e-20)
+            share = min((float(t[second]) - s) / max(1 - 2 * s, 1e-20), 0.5)  # which rounding might pass
         left = (away[near] / np.maximum(radii[near], 1e-20) - 1) / LEAVING
         inside = float(np.clip(1 - left, 0, 1).max()) if values["fade"] else float(left.min() <= 0)
         shares = [inside * (1 - share), inside * share]
@@ -119,6 +155,11 @@ class Chunks(Rule):
             return {**values, "chunks": 0}
         scale = values["distance_scale"] * STEP
         return {**values, "distance_scale": scale} if scale <= self.controls[0].high else None
+
+
+def _rows(tables: Tables) -> int:
+    """How many chunks there are."""
+    return len(tables.get(TABLE, {}).get("x", ()))
 
 
 def members(columns: Mapping[str, np.ndarray], chunk: int) -> np.ndarray:
