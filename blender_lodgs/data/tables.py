@@ -6,6 +6,8 @@ it. Nothing of it is ever drawn; rows that are places with a radius have spheres
 
 from __future__ import annotations
 
+import json
+
 import bpy
 import numpy as np
 
@@ -14,6 +16,8 @@ from ..attributes import COLUMN
 from .objects import read_column, write_column
 
 _SPHERE = ("x", "y", "z", "radius")
+_COLUMNS = "lodgs_columns"
+"""Custom property of a table's mesh: its columns in their order, as JSON."""
 
 
 def set_tables(root: bpy.types.Object, tables: Tables) -> None:
@@ -39,19 +43,18 @@ def remove_tables(root: bpy.types.Object) -> None:
     """Takes all tables off a splat scene."""
     objects = parts(root)
     meshes = {obj.data for obj in objects} - {None}
-    collections = {
-        part for obj in objects for part in obj.users_collection if part in bpy.data.collections[:]
-    }
+    collections = {item.collection for item in root.lodgs.tables} - {None}
     bpy.data.batch_remove(objects)
     bpy.data.batch_remove([mesh for mesh in meshes if not mesh.users])
-    bpy.data.batch_remove([part for part in collections if not part.objects and not part.children])
     root.lodgs.tables.clear()
+    bpy.data.batch_remove([part for part in collections if not part.objects and not part.children])
 
 
 def parts(root: bpy.types.Object) -> list[bpy.types.Object]:
     """The objects of a splat scene's tables: their meshes, and the spheres. A copy of a root has none."""
     collections = [item.collection for item in root.lodgs.tables if item.collection]
-    return [obj for collection in collections for obj in collection.objects if obj.parent == root]
+    known = {item.object for item in root.lodgs.tables} | {obj for one in collections for obj in one.objects}
+    return [obj for obj in known if obj is not None and obj.parent == root]
 
 
 def read_tables(root: bpy.types.Object) -> dict[str, dict[str, np.ndarray]]:
@@ -61,14 +64,15 @@ def read_tables(root: bpy.types.Object) -> dict[str, dict[str, np.ndarray]]:
 
 def read_table(obj: bpy.types.Object) -> dict[str, np.ndarray]:
     """The columns (rows,) of a table's object by name."""
-    start, mesh = COLUMN.format(""), obj.data
-    names = [attribute.name for attribute in mesh.attributes if attribute.name.startswith(start)]
-    columns = {name.removeprefix(start): read_column(mesh, name, mesh) for name in names}
+    mesh = obj.data
+    names = json.loads(mesh.get(_COLUMNS, "[]"))
+    columns = {name: read_column(mesh, COLUMN.format(name), mesh) for name in names}
     return {name: values for name, values in columns.items() if values is not None}
 
 
 def _new_table(name: str, columns: dict[str, np.ndarray]) -> bpy.types.Object:
     mesh = bpy.data.meshes.new(name)
+    mesh[_COLUMNS] = json.dumps(list(columns))
     mesh.vertices.add(len(next(iter(columns.values()), ())))
     for column, values in columns.items():
         write_column(mesh, COLUMN.format(column), values)
