@@ -143,3 +143,39 @@ def test_the_bits_of_96_chunks_are_exact_in_single_precision():
         np.testing.assert_array_equal(members(columns, chunk), one)
     assert list(member_columns(sets[:24])) == ["chunks_0"]
     assert list(member_columns(sets[:25])) == ["chunks_0", "chunks_1"]
+
+
+def test_where_an_eye_is_in_words():
+    def said(eye, tables=TABLES, **values):
+        return CHUNKS.where(np.array(eye, float), CHUNKS.defaults([1]) | values, tables)
+
+    assert said([2.5, 0, 0]) == "Chunks 0 and 1, 25 %"
+    assert said([26.0, 0, 0]) == "Chunks 2 and 1, 15 %"  # the nearest first; t is 0.2, t' 2 / 15
+    assert said([-3.0, 0, 0]) == said([2.5, 0, 0], fade=0) == "Chunk 0"
+    assert said([0, -11.25, 0]) == "Chunk 0, 50 % outside"
+    assert said([0, -50.0, 0]) == "Outside the chunks"
+    assert said([2.5, 0, 0], NO_TABLES) == said([2.5, 0, 0], chunks=0) == ""
+
+
+def test_controls_that_change_nothing_say_why():
+    """And they do change nothing: weights stay whatever their values."""
+    for eye in ([2.5, 3, 0], [0, -11.25, 0], [0, 88, 0]):
+        for tables in (TABLES, NO_TABLES):
+            for chunks in (0, 1):
+                values = CHUNKS.defaults([1]) | {"chunks": chunks}
+                idle = CHUNKS.idle(np.array(eye, float), values, tables)
+                before = chunk_weights(eye, tables, **values)
+                for name in idle:
+                    for other in (0.02, 9.0) if name == "distance_scale" else (0, 1):
+                        assert chunk_weights(eye, tables, **values | {name: other}) == before
+                assert ("distance_scale" in idle) == (tables is TABLES and chunks == 1 and eye[1] == 3)
+                assert ("fade" in idle) == (tables is NO_TABLES or chunks == 0)
+                assert ("chunks" in idle) == (tables is NO_TABLES)
+
+
+def test_places_belong_to_the_nearest_chunk():
+    means = np.random.default_rng(0).normal(10, 15, (40_000, 3)).astype(np.float32)
+    centres = np.stack([TABLES["chunks"][axis] for axis in "xyz"], axis=1)
+    nearest = np.linalg.norm(means[:, None] - centres, axis=2).argmin(axis=1)
+    assert (CHUNKS.parts(means, TABLES) == nearest + 1).mean() > 0.9999  # halfway, a bit decides
+    assert not CHUNKS.parts(means, NO_TABLES).any()

@@ -144,7 +144,7 @@ class Chunks(Rule):
         if values["fade"] and t[second] > 0:
             s = max(2 * float(t[third[0]]) - float(t[second]), 0.0) if third else 0.0
             near.append(int(second))
-            share = min((float(t[second]) - s) / max(1 - 2 * s, 1e-20), 0.5)  # which rounding might pass
+            share = (float(t[second]) - s) / max(1 - 2 * s, 1e-20)
         left = (away[near] / np.maximum(radii[near], 1e-20) - 1) / LEAVING
         inside = float(np.clip(1 - left, 0, 1).max()) if values["fade"] else float(left.min() <= 0)
         shares = [inside * (1 - share), inside * share]
