@@ -87,6 +87,6 @@ def _new_spheres(name: str, columns: dict[str, np.ndarray]) -> list[bpy.types.Ob
     for number, (*place, radius) in enumerate(zip(*(columns[column] for column in _SPHERE), strict=True)):
         sphere = bpy.data.objects.new(f"{name} {number:02}", None)
         sphere.location, sphere.empty_display_size = place, radius
-        sphere.empty_display_type, sphere.hide_select = "SPHERE", True
+        sphere.empty_display_type, sphere.hide_select, sphere.show_name = "SPHERE", True, True
         spheres.append(sphere)
     return spheres

@@ -94,10 +94,10 @@ class LODGS_PT_detail(LevelsPanel):
                 column.prop(settings, "camera_center", text="Position")
             if context.scene.camera is None and settings.eye != "VIEW":
                 layout.label(text="The scene has no camera", icon="ERROR")
-            for item in settings.tables:
-                if item.collection and len(item.collection.objects) > 1:  # the first holds its rows
-                    text = f"Show {item.name.title()}"
-                    column.prop(item.collection, "hide_viewport", text=text, invert_checkbox=True)
+        for item in settings.tables:
+            if item.collection and len(item.collection.objects) > 1:  # the first holds its rows
+                text, spheres = f"Show {item.name.title()}", item.collection
+                layout.prop(spheres, "hide_viewport", text=text, toggle=True, invert_checkbox=True)
         _counts(layout, context, root)
 
 
