@@ -160,13 +160,14 @@ class Watch:
         )  # fmt: skip
 
     def _finish(self, root: bpy.types.Object) -> None:
-        head, tables = read_head(self.folder.bundle), read_tables(self.folder.bundle)
+        head = read_head(self.folder.bundle)
+        head.tables = read_tables(self.folder.bundle)
         with extension.in_window():
             there = {item.number for item in root.lodgs.levels if item.exists}
             for number in {level.number for level in head.levels} & self.levels.keys() - there:
                 scenes.set_level(root, self._read_level(self.levels[number]))  # an undo took it away
             scenes.set_bundle_facts(root, head)
-            scenes.set_tables(root, tables)
+            scenes.set_tables(root, head.tables)
             root.lodgs.training.read = self.offset
             extension.undo_step("Training finished")
 

@@ -5,8 +5,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from training.errors import LodgsError
 from training.lod.rule import NO_TABLES, facts_of, rules
 from training.lod.rules.chunks import member_columns, members
+from training.lod.selection import known_rule
+from training.splats.bundle import NO_SPLATS, Bundle, Level
 
 CHUNKS = rules()["chunks"]
 LEVELS = [(1, {"d_l": 20.0}), (2, {"d_l": 5.0}), (3, {"d_l": 0.0})]
@@ -179,3 +182,23 @@ def test_places_belong_to_the_nearest_chunk():
     nearest = np.linalg.norm(means[:, None] - centres, axis=2).argmin(axis=1)
     assert (CHUNKS.parts(means, TABLES) == nearest + 1).mean() > 0.9999  # halfway, a bit decides
     assert not CHUNKS.parts(means, NO_TABLES).any()
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda table: table.pop("radius"), "its table 'chunks' has no radius"),
+        (lambda table: table.update(y=np.float32([0, np.nan, 0])), "a chunk is nowhere"),
+        (lambda table: table.update({name: np.zeros(97) for name in table}), "97 chunks, of at most 96"),
+    ],
+)
+def test_a_table_of_no_chunks_is_refused(change, says):
+    table = dict(TABLES["chunks"])
+    levels = [Level(number, NO_SPLATS, facts) for number, facts in LEVELS]
+    bundle = Bundle("lodge", levels, "chunks", tables={"chunks": table})
+    assert known_rule(bundle) is CHUNKS
+    change(table)
+    with pytest.raises(LodgsError, match=says):
+        known_rule(bundle)
+    bundle.tables = {"chunks": {}}
+    assert known_rule(bundle) is CHUNKS

@@ -7,11 +7,14 @@ from math import inf
 
 import numpy as np
 
+from ...splats.dialects import FARTHEST
 from ..rule import NO_FINER, NO_TABLES, Control, Region, Rule, Tables, Values, distances
 
 STEP = 1.25
 """Factor by which a viewer's budget raises the distance scale at a time."""
 
+COLUMNS = ("x", "y", "z", "radius")
+"""Of the table of chunks."""
 BITS, MOST_CHUNKS = 24, 96
 """Chunks that one column tells of, as single precision holds so many bits; and chunks of a scene."""
 MEMBERS = tuple(f"chunks_{number}" for number in range(MOST_CHUNKS // BITS))
@@ -56,10 +59,10 @@ class Chunks(Rule):
         ),
     )  # fmt: skip
 
-    def band(self, facts: Mapping[str, float]) -> tuple[float, float]:
-        """The nearest distance of a level, in scene units, and the distance from which on it is not shown."""
-        near = 0.0 if facts["finer"] == NO_FINER else facts["d_l"]
-        return near, facts["coarser_d_l"] if facts["coarser"] else inf
+    def band(self, focal_px: float, facts: Mapping[str, float], values: Values) -> tuple[float, float]:
+        """Near and far end of a level's distances from the eye, in scene units."""
+        near, far = _ends(facts)
+        return near / values["distance_scale"], far / values["distance_scale"]
 
     def weights(self, means, eye, focal_px, columns, facts, values, tables=NO_TABLES) -> np.ndarray:
         near_chunks = self.near_chunks(eye, values, tables)
@@ -68,11 +71,20 @@ class Chunks(Rule):
         for chunk, share in near_chunks:
             weights += np.float32(share) * members(columns, chunk)
         if inside < 1:
-            near, far = self.band(facts)
+            near, far = _ends(facts)
             away = distances(means, eye) * np.float32(values["distance_scale"])
             seen = (away >= np.float32(near)) & (away < np.float32(far))
             weights += np.float32(1 - inside) * seen
         return np.minimum(weights, 1, out=weights)
+
+    def check(self, tables: Tables) -> None:
+        table = tables.get(TABLE, {})
+        if missing := [name for name in COLUMNS if table and name not in table]:
+            raise ValueError(f"its table '{TABLE}' has no {', '.join(missing)}")
+        if _rows(tables) > MOST_CHUNKS:
+            raise ValueError(f"there are {_rows(tables):,} chunks, of at most {MOST_CHUNKS}")
+        if not all((np.abs(table[name]) <= FARTHEST).all() for name in COLUMNS if table):
+            raise ValueError("a chunk is nowhere")
 
     def region(self, eye, values: Values, tables: Tables) -> Region | None:
         near_chunks = self.near_chunks(eye, values, tables)
@@ -160,6 +172,12 @@ class Chunks(Rule):
 def _rows(tables: Tables) -> int:
     """How many chunks there are."""
     return len(tables.get(TABLE, {}).get("x", ()))
+
+
+def _ends(facts: Mapping[str, float]) -> tuple[float, float]:
+    """The distance from which on a level is shown, and that from which on it is not, before any scale."""
+    near = 0.0 if facts["finer"] == NO_FINER else facts["d_l"]
+    return near, facts["coarser_d_l"] if facts["coarser"] else inf
 
 
 def members(columns: Mapping[str, np.ndarray], chunk: int) -> np.ndarray:
