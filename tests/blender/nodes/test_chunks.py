@@ -44,6 +44,8 @@ def weights(bpy, lodgs):
             found[read(evaluated.data, "row")] = read(evaluated.data, "lod_weight")
         choice = lodgs("data.selection").choice(evaluated, depsgraph)
         np.testing.assert_allclose(choice.weights(fine.means, fine.extras), found, atol=1e-6)
+        again = lodgs("data.selection").choice(evaluated, depsgraph)
+        assert choice == again and hash(choice) == hash(again)
         region = choice.region()
         assert region is None or (choice.loaded(fine.extras) >= (found > 0)).all()
         return found.tolist()
