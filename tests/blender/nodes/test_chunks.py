@@ -148,3 +148,34 @@ def test_it_follows_an_animated_camera_and_files_without_handlers(bpy, lodgs, we
         for kind, functions in zip(handlers, kept, strict=True):
             kind.extend(functions)
     assert shown == [[FIRST, BOTH], [SECOND, BOTH]]
+
+
+def test_a_render_evaluates_them_although_they_are_hidden(bpy, lodgs, weights):
+    seen = []
+
+    class Recorder(bpy.types.RenderEngine):
+        bl_idname, bl_label = "LODGS_TEST_RECORDER", "Recorder"
+
+        def render(self, depsgraph):
+            cloud = weights.root.lodgs.levels[1].object.evaluated_get(depsgraph).data
+            read = lodgs("attributes").read_attribute
+            seen.append((depsgraph.mode, read(cloud, "row").tolist(), read(cloud, "lod_weight").tolist()))
+
+    camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
+    bpy.context.scene.collection.objects.link(camera)
+    bpy.context.scene.camera = camera
+    camera.location = weights.root.matrix_world @ camera.location.__class__((2.5, 3, 0))
+    bpy.context.view_layer.update()
+    camera.location = weights.root.matrix_world @ camera.location.__class__((2.5, 3, 0))
+    weights.root.lodgs.eye = "CAMERA"
+    bpy.utils.register_class(Recorder)
+    try:
+        bpy.context.scene.render.engine = Recorder.bl_idname
+        bpy.context.scene.render.resolution_x = bpy.context.scene.render.resolution_y = 8
+        bpy.ops.render.render()
+    finally:
+        bpy.context.scene.render.engine = "LODGS"
+        bpy.utils.unregister_class(Recorder)
+    ((mode, rows, found),) = seen
+    assert (mode, rows) == ("RENDER", [FIRST, SECOND, BOTH])
+    assert found == pytest.approx([0.75, 0.25, 1], abs=1e-5)
