@@ -12,7 +12,7 @@ import bpy
 import numpy as np
 
 from ...training.lod.rule import Tables, find_rule
-from ...training.lod.rules.chunks import COLUMNS
+from ...training.lod.rules.chunks import COLUMNS as SPHERE
 from ..attributes import COLUMN
 from .objects import read_column, write_column
 
@@ -32,7 +32,7 @@ def set_tables(root: bpy.types.Object, tables: Tables) -> None:
         item.name, item.collection = name, collection
         item.object = _new_table(f"{root.name} {name}", columns)
         objects = [item.object]
-        if rule is not None and name in rule.tables and all(column in columns for column in COLUMNS):
+        if rule is not None and name in rule.tables and all(column in columns for column in SPHERE):
             objects += _new_spheres(f"{root.name} {name.removesuffix('s')}", columns)
         for obj in objects:
             obj.parent = root
@@ -84,7 +84,7 @@ def _new_table(name: str, columns: dict[str, np.ndarray]) -> bpy.types.Object:
 def _new_spheres(name: str, columns: dict[str, np.ndarray]) -> list[bpy.types.Object]:
     """An empty for each row, which shows where it is and how far it reaches, by its number."""
     spheres = []
-    for number, (*place, radius) in enumerate(zip(*(columns[column] for column in COLUMNS), strict=True)):
+    for number, (*place, radius) in enumerate(zip(*(columns[column] for column in SPHERE), strict=True)):
         sphere = bpy.data.objects.new(f"{name} {number:02}", None)
         sphere.location, sphere.empty_display_size = place, radius
         sphere.empty_display_type, sphere.hide_select, sphere.show_name = "SPHERE", True, True
