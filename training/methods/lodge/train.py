@@ -8,6 +8,7 @@ the sets of chunks, one a step.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -77,6 +78,7 @@ class Method(threedgs_train.Method):
         if base is None:
             super().setup(None)
         else:
+            p = self.parameters = replace(p, sh_degree=min(p.sh_degree, base.sh_degree))  # as they come
             tensors = from_splats(base.select(spatial_order(base.means)), p.sh_degree, self.device)
             self.model = self.new_model(tensors)
             self._densify_until = 0
