@@ -8,8 +8,8 @@ import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ...training.scenes.cameras import write_camera
-from ..data import scenes
-from ..render import cameras, compositing, engine, quick
+from ..data import cameras, scenes
+from ..render import compositing, engine, quick
 from .frames import FrameByFrame
 from .parts import report_errors
 
