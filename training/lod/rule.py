@@ -28,6 +28,13 @@ OPACITY = "opacity"
 Values = Mapping[str, float]
 """A number for each control of a rule, by name."""
 
+Tables = Mapping[str, Mapping[str, np.ndarray]]
+"""Tables of a bundle, of columns (rows,) by name."""
+NO_TABLES: Tables = {}
+
+Region = tuple[int, ...]
+"""Names a part of space; what it is made of is the rule's."""
+
 
 @dataclass(frozen=True)
 class Control:
@@ -90,6 +97,7 @@ class Rule(ABC):
         level_facts: names of numbers that each level has.
         columns: names of per-splat columns, (N,) float32; zeros where splats lack one. OPACITY is each
             splat's own.
+        tables: names of tables of the bundle; where one is missing, the rule does without it.
         always: whether its weights belong to the picture at full detail, too: without them a level is not
             what was trained.
         sweep: a control, and values of it that a report measures one by one; None: it needs no such curve.
@@ -101,6 +109,7 @@ class Rule(ABC):
     scene_facts: ClassVar[tuple[str, ...]] = ()
     level_facts: ClassVar[tuple[str, ...]] = ()
     columns: ClassVar[tuple[str, ...]] = ()
+    tables: ClassVar[tuple[str, ...]] = ()
     always: ClassVar[bool] = False
     sweep: ClassVar[tuple[str, tuple[float, ...]] | None] = None
 
@@ -113,6 +122,7 @@ class Rule(ABC):
         columns: Mapping[str, np.ndarray],
         facts: Mapping[str, float],
         values: Values,
+        tables: Tables = NO_TABLES,
     ) -> np.ndarray:
         """Weights (N,) in [0, 1] of the splats of one level; those of weight 0 are not drawn at all.
 
@@ -123,7 +133,19 @@ class Rule(ABC):
             columns: (N,) of each of the rule's columns.
             facts: of the scene and of the level, see :func:`facts_of`.
             values: of every control.
+            tables: of the bundle, those of the rule at least; coordinates are in the same space.
         """
+
+    def region(self, eye: np.ndarray, values: Values, tables: Tables) -> Region | None:
+        """Where an eye is, for rules whose splats can be told beforehand for a whole region; else None.
+
+        As long as the eye stays in the region, no splat has a weight that :meth:`loaded` leaves out.
+        """
+        return None
+
+    def loaded(self, columns: Mapping[str, np.ndarray], region: Region) -> np.ndarray:
+        """(N,) bool, which splats of a level an eye in a region may be shown."""
+        raise NotImplementedError("this rule has no regions")
 
     def wanted_level(
         self,

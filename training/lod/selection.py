@@ -124,7 +124,7 @@ class Choice:
     """
 
     def __init__(self, bundle: Bundle) -> None:
-        self._rule, self._levels = rule_of(bundle), bundle.levels
+        self._rule, self._levels, self._tables = rule_of(bundle), bundle.levels, bundle.tables
         numbered = [(level.number, level.facts) for level in bundle.levels]
         self._known = [
             (_columns(self._rule, level.splats), facts_of(self._rule, bundle.facts, numbered, level.number))
@@ -140,7 +140,7 @@ class Choice:
         """The weights of each level's splats; arguments as of :func:`select`."""
         eye = np.asarray(eye, np.float32)
         return [
-            self._rule.weights(level.splats.means, eye, focal_px, columns, facts, values)
+            self._rule.weights(level.splats.means, eye, focal_px, columns, facts, values, self._tables)
             for level, (columns, facts) in zip(self._levels, self._known, strict=True)
         ]
 
@@ -151,7 +151,8 @@ class Choice:
 
 def _columns(rule: Rule, splats: Splats) -> dict[str, np.ndarray]:
     """What a rule needs to know of splats."""
-    columns = {name: splats.extras.get(name, np.zeros(len(splats), np.float32)) for name in rule.columns}
+    nothing = np.broadcast_to(np.float32(0), len(splats))
+    columns = {name: splats.extras.get(name, nothing) for name in rule.columns}
     if OPACITY in columns:
         with np.errstate(over="ignore"):
             columns[OPACITY] = 1 / (1 + np.exp(-splats.opacity_logits))

@@ -52,6 +52,7 @@ def rasterize(
     features: torch.Tensor | None = None,
     limit: torch.Tensor | None = None,
     window: tuple[int, int, int, int] | None = None,
+    rows: torch.Tensor | None = None,
     backend: str = "auto",
 ) -> Rendering:
     """Draw N Gaussians as a camera sees them; differentiable by every tensor given.
@@ -77,6 +78,8 @@ def rasterize(
             lie beyond it have no part in the pixel, whatever is asked for. For pictures only: without
             gradients.
         window: left, top, width and height in pixels of the part of the camera's image to draw; None: all.
+        rows: (M,) int32, ascending, those of the N that are looked at, as if the others had weight 0; None:
+            all. What is known to be out of sight costs nothing then.
         backend: one of :data:`BACKENDS`, or "auto": cuda for tensors on a GPU, else cpu.
 
     Raises:
@@ -105,7 +108,7 @@ def rasterize(
     red, green, blue = (float(value) for value in background)
     settings = Settings(
         view, float(min_scale), bool(antialias), (red, green, blue), _degree(gaussians.sh, sh_degree),
-        median="median_depth" in outputs, absolute="absgrad2d" in outputs, limit=limit,
+        median="median_depth" in outputs, absolute="absgrad2d" in outputs, limit=limit, rows=rows,
     )  # fmt: skip
     drawn = _backend(backend, means).rasterize(
         gaussians, weights, torch.cat(blended, 1) if blended else means.new_zeros(count, 0), settings
@@ -201,6 +204,7 @@ def contributions(
     min_scale: float = 0.0,
     near: float = 0.01,
     antialias: bool = False,
+    rows: torch.Tensor | None = None,
     backend: str = "auto",
 ) -> Contributions:
     """What each splat gives to the pixels of some views; no picture is kept, nothing is differentiated.
@@ -213,7 +217,7 @@ def contributions(
     largest, total, radius = (torch.zeros(count, dtype=torch.float32, device=device) for _ in range(3))
     pixels, views = (torch.zeros(count, dtype=torch.int64, device=device) for _ in range(2))
     for camera in cameras:
-        settings = Settings(View.of(camera, near), float(min_scale), bool(antialias))
+        settings = Settings(View.of(camera, near), float(min_scale), bool(antialias), rows=rows)
         found = _backend(backend, gaussians.means).contributions(gaussians, weights, settings)
         largest = torch.maximum(largest, found[0])
         total += found[1]

@@ -162,6 +162,7 @@ class Visible(NamedTuple):
             ValueError: tensors that are not float32 or not on the GPU.
         """
         _check(*vars(gaussians).values(), weights)
+        weights = settings.weights(weights, gaussians.means)
         seen = ellipses(gaussians, weights, settings)
         inside = seen.inside.nonzero()[:, 0]
         some = inside[seen.depth[inside].argsort(stable=True)]

@@ -36,6 +36,7 @@ def rasterize(
     """See :func:`training.rasterize.rasterize`."""
     means, view = gaussians.means, settings.view
     kind = {"dtype": means.dtype, "device": means.device}
+    weights = settings.weights(weights, gaussians.means)
     seen = ellipses(gaussians, weights, settings)
     drawn, mean2d, (xx, xy, yy), opacity = seen.drawn, seen.mean2d, seen.covariance, seen.opacity
     grad2d = torch.zeros(len(means), 2, dtype=torch.float32, device=means.device)

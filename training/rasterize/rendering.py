@@ -79,6 +79,7 @@ class Settings:
     Attributes:
         degree: of the harmonics to draw with.
         median, absolute: whether ``Drawn.median`` and ``Drawn.absgrad2d`` are wanted.
+        rows: (M,) int32, those that are looked at; None: all.
     """
 
     view: View
@@ -89,6 +90,14 @@ class Settings:
     median: bool = False
     absolute: bool = False
     limit: torch.Tensor | None = None
+    rows: torch.Tensor | None = None
+
+    def weights(self, weights: torch.Tensor | None, like: torch.Tensor) -> torch.Tensor | None:
+        """The weights (N,) with those of rows that are not looked at 0, for backends that look at all."""
+        if self.rows is None:
+            return weights
+        looked_at = torch.zeros_like(like[:, 0]).index_fill_(0, self.rows.long(), 1)
+        return looked_at if weights is None else weights * looked_at
 
 
 @dataclass

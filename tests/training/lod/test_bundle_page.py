@@ -8,6 +8,7 @@ import pytest
 from plyfile import PlyData
 
 from training.lod.rule import rules
+from training.lod.rules.chunks import member_columns
 from training.lod.selection import select_levels, settings
 from training.splats.bundle import Bundle, Level, read_bundle, read_folder, write_bundle, write_folder
 from training.splats.gaussians import Splats
@@ -18,7 +19,7 @@ EYES = ((0, 0, 0), (1.5, -2, 3), (9, 0, 1), (40.25, 3, -8), (-3000, 0, 0))
 FOCAL = (60.0, 500.0, 1333.3)
 CHOICES = {
     "bands": [{}, {"gamma": 0.3}, {"gamma": 4, "first": 1}, {"first": 2, "last": 4}, {"first": 1, "last": 1}],
-    "chunks": [{}, {"distance_scale": 0.3}, {"distance_scale": 7.7}],
+    "chunks": [{}, {"distance_scale": 0.3}, {"distance_scale": 7.7, "chunks": 0}, {"fade": 0}],
     "decay": [{}, {"s_v": 1.7}, {"s_v": 4}, {"at_most": 120}, {"at_most": 17, "s_v": 2}],
     "octree": [{}, {"offset": 1.7}, {"offset": -3.1}, {"fade": 0}, {"fade": 0, "offset": 0.6}],
 }
@@ -32,7 +33,7 @@ class Page:
             self.head = json.loads((path / "manifest.json").read_text())
             self.meta, lines = self.head["meta"], self.head["levels"]
             rows = {line["level"]: PlyData.read(path / line["file"])["vertex"].data for line in lines}
-            extras = rows
+            extras, self.tables = rows, {}
         else:
             ply = PlyData.read(path)
             elements, begin, rows, extras = {e.name: e.data for e in ply.elements}, {}, {}, {}
@@ -45,6 +46,7 @@ class Page:
                 begin[line["element"]] = start + line["count"]
                 rows[line["level"]] = elements[line["element"]][start : begin[line["element"]]]
                 extras[line["level"]] = elements[line["extras"]] if "extras" in line else None
+            self.tables = {line["table"]: elements[line["element"]] for line in others if "table" in line}
         lines.sort(key=lambda line: line["level"])
         self.numbers = [line["level"] for line in lines]
         self.conclude(lines)
@@ -82,8 +84,9 @@ class Page:
             "bands": (self.bands, {"gamma": 1, "first": first, "last": last}),
             "octree": (self.octree, {"offset": 0, "fade": 1}),
             "decay": (self.decay, {"s_v": 1, "at_most": 0}),
-            "chunks": (self.chunks, {"distance_scale": 1}),
+            "chunks": (self.chunks, {"distance_scale": 1, "chunks": 1, "fade": 1}),
         }[self.rule]
+        self.eye = np.array(eye, float)
         values = defaults | self.controls | given
         return {
             n: formula(n, np.sqrt(((means - np.float32(eye)) ** 2).sum(axis=1)), f, values)
@@ -104,7 +107,29 @@ class Page:
         near = self.level_facts[n]["d_l"] if n != self.numbers[-1] else 0.0
         far = self.level_facts[self.numbers[place - 1]]["d_l"] if place else np.inf
         d = d * np.float32(values["distance_scale"])
-        return ((np.float32(near) <= d) & (d < np.float32(far))).astype(float)
+        w = ((np.float32(near) <= d) & (d < np.float32(far))).astype(float)
+        if not values["chunks"] or "chunks" not in self.tables:
+            return w
+        table = self.tables["chunks"]
+        centres = np.array([table[axis] for axis in "xyz"], float).T
+        away = [float(np.linalg.norm(self.eye - c)) for c in centres]
+        a = away.index(min(away))
+        t = {
+            c: (self.eye - centres[a]) @ (centre - centres[a]) / ((centre - centres[a]) ** 2).sum()
+            for c, centre in enumerate(centres)
+            if c != a
+        }
+        b, *others = sorted(t, key=lambda c: -t[c])
+        s = max([2 * t[c] - t[b] for c in others] + [0])
+        with_b = values["fade"] and t[b] > 0
+        share = (t[b] - s) / (1 - 2 * s) if with_b else 0
+        u = [1 - (away[c] / float(table["radius"][c]) - 1) / 0.25 for c in ((a, b) if with_b else (a,))]
+        u = min(max(*u, 0), 1) if values["fade"] else float(away[a] <= table["radius"][a])
+
+        def inside(c: int) -> np.ndarray:
+            return (self.columns[n][f"chunks_{c // 24}"].astype(int) >> c % 24) % 2
+
+        return u * ((1 - share) * inside(a) + share * inside(b)) + (1 - u) * w
 
     def octree(self, n: int, d: np.ndarray, f: float, values: dict) -> np.ndarray:
         bias = self.columns[n].get("lod_bias", np.zeros(len(d), np.float32)) + np.float32(values["offset"])
@@ -165,8 +190,24 @@ def made(tmp_path):
     fading = Bundle("clod", levels({1: {}}, ("sigma_d",)), "decay", {"reference": 9.5, "tau": 0.004})
     farthest = Bundle("clod", fading.levels, "decay", {"reference": 0.0, "tau": 0.004})
     begin = {1: 9.0, 3: 2.5, 4: 0.0}
-    chunks = Bundle("lodge", levels({n: {"d_l": d} for n, d in begin.items()}, ()), "chunks")
-    bundles = {"chunks": chunks, "bands": bands, "octree": octree, "decay": fading, "farthest": farthest}
+    distances = Bundle("lodge", levels({n: {"d_l": d} for n, d in begin.items()}, ()), "chunks")
+    rng = np.random.default_rng(6)
+    in_chunks = levels({n: {"d_l": d} for n, d in begin.items()}, ())
+    for level in in_chunks:
+        level.splats.extras |= member_columns(rng.random((30, len(level.splats))) < 0.3)
+    centres = {
+        name: column.astype(np.float32) for name, column in zip("xyz", rng.normal(0, 3, (3, 30)), strict=True)
+    }
+    table = {"chunks": centres | {"radius": np.full(30, 2, np.float32)}}
+    chunks = Bundle("lodge", in_chunks, "chunks", tables=table)
+    bundles = {
+        "distances": distances,
+        "chunks": chunks,
+        "bands": bands,
+        "octree": octree,
+        "decay": fading,
+        "farthest": farthest,
+    }
 
     def make(name: str) -> Path:
         path, bundle = tmp_path / name, bundles[name.split(maxsplit=1)[0]]
@@ -186,8 +227,9 @@ WRITTEN_NOW = (
     "bands folder",
     "octree",
     "octree folder",
+    "distances",
+    "distances folder",
     "chunks",
-    "chunks folder",
     "decay",
     "decay folder",
     "farthest",
@@ -222,5 +264,5 @@ def test_the_page_states_every_rule_and_control(name):
     section = page.split(f"## Rule `{name}`")[1].split("\n#")[0]
     rule = rules()[name]
     controls = [control.name for control in rule.controls]
-    names = [*rule.scene_facts, *rule.level_facts, *rule.columns, *controls]
+    names = [*rule.scene_facts, *rule.level_facts, *rule.columns, *rule.tables, *controls]
     assert [each for each in names if f"`{each}`" not in section] == []

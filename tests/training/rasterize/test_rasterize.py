@@ -372,6 +372,24 @@ def test_weight_zero_is_as_if_the_splat_were_not_there(backend, make_splats, odd
     assert some.radii[weights == 0].max() == 0
 
 
+def test_rows_that_are_not_looked_at_are_as_if_they_had_weight_zero(backend, make_splats, odd_camera):
+    splats = make_splats(300).to(dtype=torch.float32)
+    weights = torch.rand(300, generator=torch.Generator().manual_seed(1))
+    rows = torch.arange(0, 300, 3, dtype=torch.int32)
+    some = torch.zeros(300)
+    some[rows.long()] = 1
+    for given in (None, weights):
+        zeroed = some if given is None else some * given
+        ours = rasterize(splats, odd_camera, weights=given, rows=rows, backend=backend)
+        theirs = rasterize(splats, odd_camera, weights=zeroed, backend=backend)
+        assert torch.equal(ours.image, theirs.image) and torch.equal(ours.radii, theirs.radii)
+        found = [
+            contributions(splats, [odd_camera], weights=w, rows=r, backend=backend).largest
+            for w, r in ((given, rows), (zeroed, None))
+        ]
+        assert torch.equal(*found) and found[0].any()
+
+
 def everything(splats, camera, truth):
     leaves = splats.map(lambda tensor: tensor.float().clone().requires_grad_())
     drawn = rasterize(leaves, camera)

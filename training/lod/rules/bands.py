@@ -8,7 +8,7 @@ from math import inf
 import numpy as np
 
 from ...errors import LodgsError
-from ..rule import Control, Rule, Values, distances
+from ..rule import NO_TABLES, Control, Rule, Values, distances
 
 MOST = 64
 """The largest number of a level that can be asked for: more than any scene has."""
@@ -61,7 +61,7 @@ class Bands(Rule):
         far = facts["coarser_s_min"] / values["gamma"] * focal_px if facts["coarser"] >= first else inf
         return near, far
 
-    def weights(self, means, eye, focal_px, columns, facts, values) -> np.ndarray:
+    def weights(self, means, eye, focal_px, columns, facts, values, tables=NO_TABLES) -> np.ndarray:
         near, far = self.band(focal_px, facts, values)
         if near == inf:
             return np.zeros(len(means), np.float32)

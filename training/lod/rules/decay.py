@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ..rule import OPACITY, Control, Rule, Values, distances
+from ..rule import NO_TABLES, OPACITY, Control, Rule, Values, distances
 
 SIGMA = "sigma_d"
 """Column of each splat's decay, the paper's σ_d."""
@@ -92,7 +92,7 @@ class Decay(Rule):
         first_left_out = np.partition(limits, len(limits) - at_most - 1)[len(limits) - at_most - 1]
         return max(s_v, float(first_left_out) * (1 + CLEAR))
 
-    def weights(self, means, eye, focal_px, columns, facts, values) -> np.ndarray:
+    def weights(self, means, eye, focal_px, columns, facts, values, tables=NO_TABLES) -> np.ndarray:
         if facts["level"] < facts["levels"]:
             return np.zeros(len(means), np.float32)
         normalized, tau = self.normalized(means, eye, facts), facts["tau"]

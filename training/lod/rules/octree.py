@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ..rule import Control, Rule, Values, distances
+from ..rule import NO_TABLES, Control, Rule, Values, distances
 
 BIAS = "lod_bias"
 """Column of each splat's bias, in levels."""
@@ -62,7 +62,7 @@ class Octree(Rule):
         ),
     )  # fmt: skip
 
-    def weights(self, means, eye, focal_px, columns, facts, values) -> np.ndarray:
+    def weights(self, means, eye, focal_px, columns, facts, values, tables=NO_TABLES) -> np.ndarray:
         found = self._wanted(means, eye, focal_px, columns[BIAS], facts, values)
         weight = faded(found, np.float32(facts["level"])).astype(np.float32)
         return weight if values["fade"] else (weight >= 0.5).astype(np.float32)

@@ -64,12 +64,17 @@ def rasterize(
     if limit is not None:  # the kernels know no infinity
         limit = limit.to(torch.float32).clamp_max(torch.finfo(torch.float32).max).contiguous()
     behind, most = np.array(settings.background, np.float32), None if limit is None else limit.numpy()
-    planes, alpha, blended = _Rasterize.apply(*tensors, _of_kernels(settings), view, behind, most, side)
+    drawn = _Rasterize.apply(*tensors, _rows(settings), _of_kernels(settings), view, behind, most, side)
+    planes, alpha, blended = drawn
     return Drawn(
         image=planes.permute(1, 2, 0), alpha=alpha, radii=side.radii, grad2d=side.grad2d,
         tile_counts=side.tile_counts, absgrad2d=side.absgrad2d, features=blended.permute(1, 2, 0),
         median=side.median,
     )  # fmt: skip
+
+
+def _rows(settings: Settings) -> np.ndarray | None:
+    return None if settings.rows is None else settings.rows.to(torch.int32).contiguous().numpy()
 
 
 def _of_kernels(settings: Settings) -> tuple:
@@ -91,14 +96,18 @@ class _SideOutputs:
 
 
 def _project_and_bin(
-    splats: list, settings: tuple, view: View, radii: torch.Tensor, buffers: Buffers
+    splats: list, rows: np.ndarray | None, settings: tuple, view: View, radii: torch.Tensor, buffers: Buffers
 ) -> tuple[np.ndarray, np.ndarray, Pairs]:
     """The M splats that have a weight; these projected, (M, COLUMNS); and their pairs with tiles.
 
-    All that follows counts only these M. Fills the radii, which are zeros. The last two live in ``buffers``.
+    Where there are ``rows``, the M are of these. All that follows counts only these M. Fills the radii,
+    which are zeros. The last two live in ``buffers``.
     """
     weights = splats[-1]
-    some = (np.flatnonzero(weights > 0) if len(weights) else np.arange(len(radii))).astype(np.int32)
+    if rows is None:
+        some = (np.flatnonzero(weights > 0) if len(weights) else np.arange(len(radii))).astype(np.int32)
+    else:
+        some = rows[weights[rows] > 0] if len(weights) else rows
     projected = buffers.take("projected", np.float32, len(some), COLUMNS)
     depths = np.empty(len(some), np.float32)
     in_parallel(project_forward, len(some), GRAIN, *splats, *settings, some, depths, projected, radii.numpy())
@@ -112,12 +121,13 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @serialised
     def forward(
-        ctx, means, quats, log_scales, logits, sh, weights, features, settings, view, background, limit, side
-    ):
+        ctx, means, quats, log_scales, logits, sh, weights, features,
+        rows, settings, view, background, limit, side,
+    ):  # fmt: skip
         tensors = [tensor.contiguous() for tensor in (means, quats, log_scales, logits, sh, weights)]
         splats = [tensor.detach().numpy() for tensor in tensors]
         buffers = Buffers()
-        some, projected, pairs = _project_and_bin(splats, settings, view, side.radii, buffers)
+        some, projected, pairs = _project_and_bin(splats, rows, settings, view, side.radii, buffers)
         counts = side.tile_counts.numpy()
         counts[:] = np.diff(pairs.tile_start).reshape(counts.shape)
 
@@ -199,7 +209,7 @@ class _Rasterize(torch.autograd.Function):
             some, passes[0], *of_pairs, pair_sums,
             *(gradient.numpy() for gradient in gradients), side.grad2d.numpy(),
         )  # fmt: skip
-        return *gradients, torch.from_numpy(by_features[:, : len(by_blended)]), *(None,) * 5
+        return *gradients, torch.from_numpy(by_features[:, : len(by_blended)]), *(None,) * 6
 
 
 def _as_colours(features: np.ndarray, projected: np.ndarray) -> list[np.ndarray]:
@@ -226,7 +236,9 @@ def contributions(
     splats = [tensor.detach().contiguous().numpy() for tensor in tensors]
     radii = torch.zeros(count)
     buffers = Buffers()
-    some, projected, pairs = _project_and_bin(splats, _of_kernels(settings), view, radii, buffers)
+    some, projected, pairs = _project_and_bin(
+        splats, _rows(settings), _of_kernels(settings), view, radii, buffers
+    )
     pair_weights = buffers.take("pair_weights", np.float32, len(pairs.splat), 3)
     found, everywhere = np.empty((len(some), 3), np.float32), np.zeros((count, 3), np.float32)
     in_parallel(

@@ -1,0 +1,101 @@
+"""Splats that stand together in blocks of rows, so that much can be decided for many at once. numpy only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..scenes.cameras import Camera
+
+SIZE = 512
+"""Rows of a block."""
+REACH = 3.4
+"""Standard deviations that a splat reaches: farther out its alpha is below 1/255."""
+SLANT = 1.3
+"""A projected splat is spread as if it were seen at most so much farther out than the image's border."""
+PIXELS = 2.0
+"""What the image's filter adds to a projected splat's reach."""
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """N splats in B blocks of SIZE consecutive rows, the last one shorter.
+
+    Attributes:
+        count: N.
+        low, high: (B, 3) float32, bounds of the means.
+        reach: (B,) float32, how far the largest splat reaches from its mean.
+    """
+
+    count: int
+    low: np.ndarray
+    high: np.ndarray
+    reach: np.ndarray
+
+    @classmethod
+    def of(cls, means: np.ndarray, log_scales: np.ndarray) -> Blocks:
+        """The blocks of splats, (N, 3) each; few are tight unless rows are in :func:`spatial_order`."""
+        begins = np.arange(0, len(means), SIZE)
+        if not len(begins):
+            return cls(0, *np.zeros((2, 0, 3), np.float32), np.zeros(0, np.float32))
+        largest = np.maximum.reduceat(log_scales.max(axis=1), begins).astype(np.float64)
+        return cls(
+            len(means),
+            np.minimum.reduceat(means, begins, axis=0),
+            np.maximum.reduceat(means, begins, axis=0),
+            (REACH * np.exp(np.minimum(largest, 60))).astype(np.float32),
+        )
+
+    def in_view(self, camera: Camera, near: float) -> np.ndarray:
+        """(B,) bool, False where no splat of a block is in a camera's image.
+
+        Args:
+            near: depth at which drawing begins, in world units.
+        """
+        low, high = self.low.astype(np.float64), self.high.astype(np.float64)
+        middle, radius = (low + high) / 2, np.linalg.norm(high - low, axis=1) / 2
+        x, y, z = camera.view_space(middle).T
+        seen = z + radius > near
+        far = np.maximum(z + radius, 0)
+        for at, focal, least, most in (
+            (x, camera.fx, -camera.cx, camera.width - camera.cx),
+            (y, camera.fy, -camera.cy, camera.height - camera.cy),
+        ):
+            for side, border in ((at, most / focal), (-at, -least / focal)):
+                spread = self.reach * np.hypot(1, SLANT * border)
+                room = radius * np.hypot(1, border) + spread + PIXELS / focal * far
+                seen &= side - z * border <= room
+        return seen
+
+    def distances(self, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The least and the greatest distance, (B,) float64 each, of a block's means from an eye (3,)."""
+        eye = np.asarray(eye, np.float64)
+        below, above = self.low.astype(np.float64) - eye, eye - self.high.astype(np.float64)
+        nearest = np.maximum(np.maximum(below, above), 0)
+        farthest = np.maximum(np.abs(below), np.abs(above))
+        return np.linalg.norm(nearest, axis=1), np.linalg.norm(farthest, axis=1)
+
+    def rows(self, which: np.ndarray) -> np.ndarray:
+        """The rows (M,) int32 of the blocks that are True in (B,), ascending."""
+        begins = np.flatnonzero(which).astype(np.int32) * SIZE
+        rows = (begins[:, None] + np.arange(SIZE, dtype=np.int32)).reshape(-1)
+        return rows[: len(rows) - max(int(begins[-1]) + SIZE - self.count, 0)] if len(begins) else rows
+
+
+def spatial_order(means: np.ndarray) -> np.ndarray:
+    """(N,) int64, an order of rows in which neighbours in space come near each other (a Z-order curve)."""
+    if not len(means):
+        return np.zeros(0, np.int64)
+    low, high = np.quantile(means[:: max(len(means) // 100_000, 1)], (0.01, 0.99), axis=0)
+    low, high = low - (high - low) / 4, high + (high - low) / 4  # the few beyond crowd at the border
+    cells = (means - low) * (((1 << 21) - 1) / max(float((high - low).max()), 1e-30))
+    code = np.zeros(len(means), np.uint64)
+    for axis, cell in enumerate(np.clip(cells, 0, (1 << 21) - 1).astype(np.uint64).T):
+        for shift, mask in (
+            (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
+            (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249),
+        ):  # fmt: skip
+            cell = (cell | (cell << np.uint64(shift))) & np.uint64(mask)
+        code |= cell << np.uint64(axis)
+    return np.argsort(code, kind="stable")
