@@ -190,6 +190,12 @@ def follow(watch: Watch, show: Callable[[Watch], None] | None = None) -> None:
         processes.follow(step)
 
 
+def cost_plot(root: bpy.types.Object) -> Path | None:
+    """The picture of what finding the levels' distances has told, where the root's run has one."""
+    run = run_folder(root)
+    return run.costs if run is not None and run.costs.is_file() else None
+
+
 def log_text(root: bpy.types.Object) -> bpy.types.Text:
     """The end of the trainer's log, as a text block.
 

@@ -1,6 +1,7 @@
 """A run's folder and what can be read from it, by anyone, at any time. No torch: Blender polls it.
 
     run/  job.toml  events.jsonl  checkpoints/  levels/level_1.ply ..  bundle.ply  metrics.json
+          costs.png (what finding the distances of levels has told)
           model.npz (what a method with networks has beside its levels)
           undistorted/ (photographs without their lens's distortion, where they had some)
           captured/ (the pictures of splats that had no photographs, as a COLMAP scene)
@@ -47,6 +48,7 @@ class RunFolder:
         self.bundle = self.path / "bundle.ply"
         self.metrics = self.path / "metrics.json"
         self.model = self.path / "model.npz"
+        self.costs = self.path / "costs.png"
         self.log = self.path / "trainer.log"
         self.output = self.path / "trainer.out"
         self.undistorted = self.path / "undistorted"

@@ -1,5 +1,7 @@
 """What the Detail panel offers for every rule, and says where there is none."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -65,3 +67,30 @@ def test_what_has_no_known_rule_is_shown_level_by_level_and_says_so(root, draw):
     assert "These levels are not made for distances." in draw().texts
     root("weave")
     assert any("'weave', which this version does not know." in text for text in draw().texts)
+
+
+def test_distances_and_what_they_cost_are_told_in_blenders_units(bpy, lodgs, draw_panel, tmp_path):
+    from training.evaluate.costs import write_cost_plot
+
+    collection = bpy.data.collections.new("town")
+    bpy.context.scene.collection.children.link(collection)
+    root = bpy.data.objects.new("town", None)
+    collection.objects.link(root)
+    root.lodgs.is_root, root.scale = True, (2, 2, 2)
+    bundles, scenes = lodgs("training.splats.bundle"), lodgs("data.scenes")
+    scenes.set_level(root, bundles.Level(1, bundles.NO_SPLATS))
+    bpy.context.view_layer.update()
+    panel = lodgs("panels.levels_costs").LODGS_PT_costs
+    assert not panel.poll(bpy.context)
+    meta = {"costs": [{"level": 2, "distances": [3, 7.1], "costs": [812, 301], "before": 900}]}
+    root.lodgs.meta = json.dumps(meta)
+    assert panel.poll(bpy.context)
+    notes = draw_panel("levels_costs", "LODGS_PT_costs")
+    assert notes.texts == ["Level 2 from 14.2 m: 900 → 301 splats a tile"] and not notes.operators
+    with pytest.raises(RuntimeError, match="No run with a cost curve"):
+        bpy.ops.lodgs.show_costs()
+    root.lodgs.training.run = str(tmp_path)
+    write_cost_plot(tmp_path / "costs.png", meta)
+    assert draw_panel("levels_costs", "LODGS_PT_costs").operators == ["lodgs.show_costs"]
+    assert bpy.ops.lodgs.show_costs() == {"FINISHED"}
+    assert tuple(bpy.data.images["costs.png"].size) == (960, 540)

@@ -8,6 +8,7 @@ import pytest
 
 from training.__main__ import main
 from training.errors import LodgsError
+from training.evaluate.costs import cost_curves
 from training.rasterize import Gaussians, rasterize
 from training.runs import capture
 from training.runs.capture import read_views, write_scene
@@ -137,6 +138,7 @@ def test_from_a_ply_alone_to_levels_in_a_shell(ball, cameras, tmp_path, capsys):
         np.testing.assert_array_equal(getattr(finest, name), getattr(ball, name))
     np.testing.assert_array_equal(finest.sh[:, :1], ball.sh)
     np.testing.assert_array_equal(one.levels[0].splats.means, two.levels[0].splats.means)
+    assert len(cost_curves(one.meta)) == 1 and (tmp_path / "one" / "costs.png").stat().st_size > 1000
     drawn = [e for e in RunFolder(tmp_path / "one").events()[0] if e.get("of") == 8]
     assert [e["step"] for e in drawn] == list(range(1, 9)) and drawn[2]["message"] == "Drawing view 3 of 8"
 
