@@ -7,7 +7,7 @@ import bpy
 from ...training.evaluate.costs import cost_lines
 from ..data import scenes, selection
 from ..runs import jobs
-from .parts import LevelsPanel, say
+from .parts import LevelsPanel
 
 
 class LODGS_PT_costs(LevelsPanel):
@@ -22,8 +22,10 @@ class LODGS_PT_costs(LevelsPanel):
 
     def draw(self, context):
         root = scenes.active_root(context)
+        column = self.layout.column(align=True)
+        column.label(text="Splats in a tile of the picture:")
         for line in _lines(context, root):
-            say(self.layout, line, "BLANK1")
+            column.label(text=line)
         if jobs.cost_plot(root) is not None:
             self.layout.operator("lodgs.show_costs", icon="GRAPH")
 

@@ -91,7 +91,9 @@ def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object, resumable:
         parameters = jobs.parameters(settings)
         levels = parameters.levels  # 0: the scene decides
         text = f" in {levels} levels" if levels > 1 else ""
-        column.label(text=f"{parameters.total_steps:,} steps{text}")
+        begun = alone or (info.from_base and settings.start_from != "POINTS")
+        steps = parameters.base_steps if begun else parameters.total_steps
+        column.label(text=f"{steps:,} steps{text}")
         if not hold_out(root) and not alone:
             say(layout, "No photographs are held out: quality will be of training views.", "INFO")
     except LodgsError as error:

@@ -64,7 +64,7 @@ def _curve(entry: object) -> Curve | None:
 
 
 def cost_lines(meta: dict, length: Callable[[float], str] = "{:.3g}".format) -> list[str]:
-    """A sentence for each level whose distance was found by its cost.
+    """A line for each level whose distance was found by its cost: from where, and the splats in a tile.
 
     Args:
         length: says a length in scene units.
@@ -73,7 +73,7 @@ def cost_lines(meta: dict, length: Callable[[float], str] = "{:.3g}".format) -> 
     for curve in cost_curves(meta):
         distance, cost = curve.chosen
         from_to = f"{cost:,.0f}" if curve.before is None else f"{curve.before:,.0f} → {cost:,.0f}"
-        lines.append(f"Level {curve.level} from {length(distance)}: {from_to} splats a tile")
+        lines.append(f"Level {curve.level} from {length(distance)}: {from_to}")
     return lines
 
 

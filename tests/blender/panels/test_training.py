@@ -56,6 +56,7 @@ def test_splats_alone_ask_for_views_of_them(bpy, lodgs, root, draw, fake):
     settings.method = "lodge"
     begin = ["method", "preset", "image_scale", "views_from"]
     assert draw().properties == [*begin, "views", "view_width"] and draw().operators == ["lodgs.train"]
+    assert "720 steps in 3 levels" in draw().texts  # none of them are the finest level's
     settings.views_from = "CURVE"
     assert draw().properties == [*begin, "curve", "views", "view_width"]
     settings.views_from = "CAMERAS"

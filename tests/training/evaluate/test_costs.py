@@ -16,8 +16,8 @@ FOUND = [
 
 def test_each_level_has_a_line():
     assert cost_lines({"costs": FOUND}, "{:.1f} m".format) == [
-        "Level 2 from 10.0 m: 830 → 301 splats a tile",
-        "Level 1 from 20.0 m: 290 splats a tile",
+        "Level 2 from 10.0 m: 830 → 301",
+        "Level 1 from 20.0 m: 290",
     ]
     assert cost_curves({"costs": FOUND})[0].chosen == (10.0, 301.2)
 
