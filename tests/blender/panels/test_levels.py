@@ -70,7 +70,7 @@ def test_what_has_no_known_rule_is_shown_level_by_level_and_says_so(root, draw):
 
 
 def test_distances_and_what_they_cost_are_told_in_blenders_units(bpy, lodgs, draw_panel, tmp_path):
-    from training.evaluate.costs import write_cost_plot
+    from training.scenes.images import write_png
 
     collection = bpy.data.collections.new("town")
     bpy.context.scene.collection.children.link(collection)
@@ -90,7 +90,7 @@ def test_distances_and_what_they_cost_are_told_in_blenders_units(bpy, lodgs, dra
     with pytest.raises(RuntimeError, match="No run with a cost curve"):
         bpy.ops.lodgs.show_costs()
     root.lodgs.training.run = str(tmp_path)
-    write_cost_plot(tmp_path / "costs.png", meta)
+    write_png(tmp_path / "costs.png", np.zeros((540, 960, 3), np.uint8))
     assert draw_panel("levels_costs", "LODGS_PT_costs").operators == ["lodgs.show_costs"]
     assert bpy.ops.lodgs.show_costs() == {"FINISHED"}
     assert tuple(bpy.data.images["costs.png"].size) == (960, 540)
