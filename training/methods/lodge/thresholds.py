@@ -12,12 +12,12 @@ from ...rasterize import rasterize
 from ...scenes.cameras import Camera, evenly
 from .composite import IndexedLevel, Rows, Stack, filtered, rows_seen
 
+MOST_CURVES = 5
+"""Of more levels than this, a bundle's head has no room for what was tried."""
 VIEWS = 8
 """So many training views tell the cost."""
 TRIED, BETWEEN = 9, (0.01, 0.9)
 """So many distances are tried, in equal ratios between these quantiles of the splats' distances in view."""
-MOST_CURVES = 5
-"""Of more levels than this, a bundle's head has no room for what was tried."""
 STANDING_APART = 1.25
 """A level begins at least this many times farther away than the next finer one."""
 
