@@ -8,7 +8,7 @@ unregistered in reverse.
 import bpy
 
 from . import commands, operators, panels, viewport
-from .data import older_files, properties, removal, scenes, updates
+from .data import loaded, older_files, properties, removal, scenes, updates
 from .nodes import building
 from .render import compare, engine, renderer
 from .runs import jobs
@@ -22,6 +22,7 @@ MODULES = (
     *panels.MODULES,
     older_files,
     scenes,
+    loaded,
     removal,
     viewport,
     renderer,

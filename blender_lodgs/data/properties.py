@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from typing import Any
 
 import bpy
 
 from ...training.lod.rule import Control, Rule, rules
+from .selection import read_json
 from .training import PARAMETERS, TrainingSettings
 
 ON_CHANGE: dict[str, Callable[[Any, bpy.types.Context], None]] = {}
@@ -46,6 +48,16 @@ def _became_root(self, context) -> None:
     self.itself = self.id_data if self.is_root else None
 
 
+def _antialias(self) -> bool:
+    return bool(read_json(self.meta).get("antialias"))
+
+
+def _set_antialias(self, value: bool) -> None:
+    meta = {name: each for name, each in read_json(self.meta).items() if name != "antialias"}
+    self.meta = json.dumps(meta | ({"antialias": True} if value else {}))
+    _changed(self, bpy.context)
+
+
 def _can_be_eye(self, obj: bpy.types.Object) -> bool:
     return not obj.lodgs.is_root
 
@@ -74,6 +86,23 @@ class SplatLevel(bpy.types.PropertyGroup):
         its type."""
         obj = self.object
         return obj is not None and obj.type == "POINTCLOUD" and bool(obj.users_collection)
+
+
+class SplatTable(bpy.types.PropertyGroup):
+    """A table that came with a splat scene, by its name; see ``tables``."""
+
+    object: bpy.props.PointerProperty(
+        name="Object", description="The mesh that holds the table's rows", type=bpy.types.Object
+    )
+    collection: bpy.props.PointerProperty(
+        name="Collection", description="What is to be seen of the table", type=bpy.types.Collection
+    )
+
+    @property
+    def exists(self) -> bool:
+        """False once an artist has deleted the table's object."""
+        obj = self.object
+        return obj is not None and obj.type == "MESH" and bool(obj.users_collection)
 
 
 def _level_set(rule: Rule, control: Control):
@@ -165,6 +194,14 @@ class SplatScene(bpy.types.PropertyGroup):
         update=_changed,
         options=set(),
     )
+    antialias: bpy.props.BoolProperty(
+        name="Antialiased",
+        description="Draw the splats through Mip-Splatting's 2D filter, as those need it that were trained "
+        "with it: what is smaller than a pixel then grows no thicker than it is",
+        get=_antialias,
+        set=_set_antialias,
+        options=set(),
+    )
     camera_center: bpy.props.FloatVectorProperty(
         name="Mean Training Camera",
         description="Mean position of the training cameras, in the scene's own units",
@@ -186,6 +223,9 @@ class SplatScene(bpy.types.PropertyGroup):
     levels: bpy.props.CollectionProperty(type=SplatLevel)
     active_level: bpy.props.IntProperty(
         name="Chosen Level", description="Line of the list of levels", options=set()
+    )
+    tables: bpy.props.CollectionProperty(
+        type=SplatTable, name="Tables", description="What the rule knows besides the splats"
     )
 
     mode: bpy.props.EnumProperty(
@@ -271,6 +311,7 @@ class SplatScene(bpy.types.PropertyGroup):
                 "Bands",
                 "Which level is wanted at which distance from the eye, in the same colours",
             ),
+            ("CHUNKS", "Chunks", "Which chunk is the nearest where, in colours that repeat"),
         ],
         options=set(),
     )
@@ -412,8 +453,8 @@ SplatScene.__annotations__ |= {
 }
 
 CLASSES = (
-    ViewSettings, ViewportSettings, *PARAMETERS.values(), TrainingSettings, SplatLevel, *CONTROLS.values(),
-    SplatScene, RenderSettings,
+    ViewSettings, ViewportSettings, *PARAMETERS.values(), TrainingSettings, SplatLevel, SplatTable,
+    *CONTROLS.values(), SplatScene, RenderSettings,
 )  # fmt: skip
 
 

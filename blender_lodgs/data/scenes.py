@@ -17,13 +17,13 @@ import numpy as np
 from mathutils import Matrix
 
 from ...training.errors import LodgsError
-from ...training.lod.rule import Control, find_rule
+from ...training.lod.rule import Control, Tables, find_rule
 from ...training.lod.selection import complete, known_rule, unknown_rule
 from ...training.scenes.colmap import Scene, read_scene
 from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder
 from ...training.splats.gaussians import Splats
 from ..nodes import ellipsoids
-from . import objects, selection
+from . import objects, selection, tables
 from .photographs import match_render, new_camera, views
 
 LINKED = (
@@ -39,13 +39,16 @@ def roots(scene: bpy.types.Scene) -> list[bpy.types.Object]:
 
 def active_root(context: bpy.types.Context) -> bpy.types.Object | None:
     """The splat scene that is meant: the active object's, else the only one there is."""
-    obj = context.active_object
-    while obj is not None:
-        if obj.lodgs.is_root:
-            return obj
-        obj = obj.parent
-    found = roots(context.scene)
+    root = root_of(context.active_object)
+    found = [root] if root is not None else roots(context.scene)
     return found[0] if len(found) == 1 else None
+
+
+def root_of(obj: bpy.types.Object | None) -> bpy.types.Object | None:
+    """The root of the splat scene that an object is in: itself, or what it is a child of; None outside."""
+    while obj is not None and not obj.lodgs.is_root:
+        obj = obj.parent
+    return obj
 
 
 def shows_splats(scene: bpy.types.Scene) -> bool:
@@ -174,6 +177,7 @@ def import_splats(
         for level in bundle.levels:
             _put_level(root, level)
         set_bundle_facts(root, bundle)
+        set_tables(root, bundle.tables)
         root.lodgs.single_level = bundle.levels[-1].number
         root.lodgs.training.method = "lodge"  # the one that gives levels to splats that are there
     if bundle.rule and not root.lodgs.by_distance:
@@ -208,6 +212,15 @@ def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
     _levels_changed(root)
 
 
+def set_tables(root: bpy.types.Object, given: Tables) -> None:
+    """Gives a splat scene the tables of its bundle, in place of those that it has.
+
+    Apart from :func:`set_bundle_facts`: while levels are on their way, there are none yet.
+    """
+    tables.set_tables(root, given)
+    selection.update_inputs(root)
+
+
 def set_level(root: bpy.types.Object, level: Level) -> bpy.types.Object:
     """Adds a level to a splat scene, or replaces the one of its number; a new finest one is shown.
 
@@ -240,11 +253,12 @@ def contents(root: bpy.types.Object) -> str:
 
 
 def make_room(root: bpy.types.Object, number: int) -> None:
-    """Removes all levels but one, whose object the next set's first level takes over.
+    """Removes tables and all levels but one, whose object the next set's first level takes over.
 
     Args:
         number: of that level. Where there is none of this number, the finest of those here takes it.
     """
+    tables.remove_tables(root)
     there = [item for item in root.lodgs.levels if item.exists]
     kept = next((item for item in there if item.number == number), there[-1] if there else None)
     for item in there:
@@ -278,7 +292,8 @@ def read_levels(root: bpy.types.Object) -> Bundle:
     settings = root.lodgs
     facts, meta = selection.read_facts(settings.facts), selection.read_json(settings.meta)
     return Bundle(
-        settings.method, levels, settings.rule, facts, _set_controls(root), settings.cumulative, meta
+        settings.method, levels, settings.rule, facts, _set_controls(root), settings.cumulative, meta,
+        tables.read_tables(root),
     )  # fmt: skip
 
 

@@ -17,11 +17,12 @@ import bpy
 import numpy as np
 
 from ...training.errors import LodgsError
-from ...training.lod.rule import Rule, facts_of, find_rule, rules
+from ...training.lod.rule import Region, Rule, Tables, facts_of, find_rule, rules
 from .. import compat
 from ..nodes import rules as groups
 from ..nodes.building import edited
 from ..nodes.display import NAME as DISPLAY
+from .tables import read_table
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,7 @@ class Choice:
         eye: in the splats' own space.
         focal_px: the eye's focal length in pixels.
         facts, values: see ``training.lod.rule``, as pairs.
+        tables: those that the rule reads: name, columns by name, each as its type and its bytes.
     """
 
     rule: str
@@ -40,12 +42,35 @@ class Choice:
     focal_px: float
     facts: tuple[tuple[str, float], ...]
     values: tuple[tuple[str, float], ...]
+    tables: tuple[tuple[str, tuple[tuple[str, str, bytes], ...]], ...] = ()
 
     def weights(self, means: np.ndarray, columns: Mapping[str, np.ndarray]) -> np.ndarray:
         """(N,) weights of splats at means (N, 3) with the rule's columns (N,) by name."""
         rule = rules()[self.rule]
         eye, facts, values = np.float32(self.eye), dict(self.facts), dict(self.values)
-        return rule.weights(means, eye, self.focal_px, columns, facts, values)
+        return rule.weights(means, eye, self.focal_px, columns, facts, values, self._tables())
+
+    def region(self) -> Region | None:
+        """See ``Rule.region``."""
+        return rules()[self.rule].region(np.float32(self.eye), dict(self.values), self._tables())
+
+    def loaded(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+        """(N,) bool: see ``Rule.loaded``, of the region that there must be."""
+        region = self.region()
+        assert region is not None
+        return rules()[self.rule].loaded(columns, region)
+
+    def where(self) -> str:
+        """See ``Rule.where``."""
+        return rules()[self.rule].where(np.float32(self.eye), dict(self.values), self._tables())
+
+    def idle(self) -> Mapping[str, str]:
+        """See ``Rule.idle``."""
+        return rules()[self.rule].idle(np.float32(self.eye), dict(self.values), self._tables())
+
+    def parts(self, means: np.ndarray) -> np.ndarray:
+        """(N,) numbers of the parts of space where places are: see ``Rule.parts``."""
+        return rules()[self.rule].parts(means, self._tables())
 
     def wanted_level(self, means: np.ndarray) -> np.ndarray:
         """(N,) the level that is wanted at each place."""
@@ -56,6 +81,12 @@ class Choice:
         """The next coarser choice, where there is one."""
         values = rules()[self.rule].coarser(dict(self.values), levels)
         return None if values is None else replace(self, values=tuple(values.items()))
+
+    def _tables(self) -> Tables:
+        return {
+            name: {column: np.frombuffer(rows, kind) for column, kind, rows in columns}
+            for name, columns in self.tables
+        }
 
 
 def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Choice | None:
@@ -89,7 +120,14 @@ def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Choic
         value(groups.HELD_FOCAL if held else groups.FOCAL),
         tuple((name, value(name)) for name in groups.fact_names(rule)),
         tuple((control.name, value(control.name)) for control in rule.controls),
+        tuple((name, _frozen(value(groups.table_socket(name)))) for name in rule.tables),
     )
+
+
+def _frozen(obj: bpy.types.Object | None) -> tuple[tuple[str, str, bytes], ...]:
+    """A table's columns as :class:`Choice` keeps them."""
+    columns = read_table(obj.original) if obj is not None else {}
+    return tuple((name, values.dtype.str, values.tobytes()) for name, values in columns.items())
 
 
 def only_chosen(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
@@ -181,15 +219,17 @@ def outdated(root: bpy.types.Object) -> bool:
 
 
 def update_inputs(root: bpy.types.Object) -> None:
-    """Hands on to the modifiers what cannot be driven: the chosen or held eye, and each level's material."""
+    """Hands on to the modifiers what cannot be driven: the held or chosen eye, tables, a level's material."""
+    tables = {
+        groups.table_socket(item.name): item.object if item.exists else None for item in root.lodgs.tables
+    }
     for item in root.lodgs.levels:
         modifier = item.exists and _modifier(item.object)
         if modifier:
             slots = item.object.material_slots
-            for name, value in (
-                (groups.EYE_OBJECT, root.lodgs.eye_object),
-                (groups.MATERIAL, slots[0].material if slots else None),
-            ):
+            given = {groups.EYE_OBJECT: root.lodgs.eye_object} | tables
+            given[groups.MATERIAL] = slots[0].material if slots else None
+            for name, value in given.items():
                 _set(modifier, name, value, lambda there, value: there == value)
             held = root.lodgs.freeze or root.lodgs.eye == "VIEW"
             position = root.lodgs.held_eye if held else root.lodgs.camera_center

@@ -157,8 +157,8 @@ def placed_splats(depsgraph: bpy.types.Depsgraph) -> list[renderer.PlacedSplats]
             known[key] = objects.splats_of(cloud), attributes.read_attribute(cloud, attributes.WEIGHT)
         splats, weights = known[key]
         if splats is not None and len(splats):
-            matrix, level = instance.matrix_world, instance.level
-            found.append(renderer.PlacedSplats(key, splats, weights, matrix, level))
+            matrix, level, antialias = instance.matrix_world, instance.level, instance.antialias
+            found.append(renderer.PlacedSplats(key, splats, weights, matrix, level, antialias))
     return found
 
 

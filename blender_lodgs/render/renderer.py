@@ -63,6 +63,7 @@ class PlacedSplats:
         weights: (N,), or None for ones.
         matrix: (4, 4) to the world.
         level: 0 where they are no level.
+        antialias: see ``SplatScene.antialias``.
     """
 
     key: int
@@ -70,6 +71,7 @@ class PlacedSplats:
     weights: np.ndarray | None
     matrix: np.ndarray
     level: int
+    antialias: bool = False
 
 
 class Stopped(Exception):
@@ -199,6 +201,7 @@ class Renderer:
                     "count": len(one.splats),
                     "matrix": one.matrix.tolist(),
                     "level": one.level,
+                    "antialias": one.antialias,
                 }
             )
         self._known = known

@@ -47,6 +47,7 @@ class Placement:
         choice: what weights its splats; None: all 1.
         scene: of which splat scene it is a level, a number.
         tell: what its colours tell, see ``SplatScene.tell``.
+        antialias: see ``SplatScene.antialias``.
     """
 
     first: int
@@ -56,6 +57,7 @@ class Placement:
     choice: Choice | None
     scene: int
     tell: str
+    antialias: bool = False
 
     @property
     def world(self) -> np.ndarray:
@@ -203,4 +205,6 @@ def _color_levels(placement: Placement, means: np.ndarray, index: np.ndarray) ->
     """Which level's colour each splat gets."""
     if placement.tell == "BANDS" and placement.choice is not None:
         return placement.choice.wanted_level(means[index, :3]).astype(np.float32)
-    return np.full(len(index), placement.level if placement.tell != "OWN" else 0, np.float32)
+    if placement.tell == "CHUNKS" and placement.choice is not None:
+        return placement.choice.parts(means[index, :3]).astype(np.float32)
+    return np.full(len(index), placement.level if placement.tell in ("LEVELS", "BANDS") else 0, np.float32)

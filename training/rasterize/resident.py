@@ -75,7 +75,8 @@ class Resident:
             near: depth at which drawing begins, in scene units.
             options: as for :func:`training.rasterize.rasterize`. Rows are those of the splats loaded.
         """
-        self._enter(self._rule.region(camera.center, values, self._tables))
+        eye = camera.center.astype(np.float32)  # as weights take it: on a border between regions it counts
+        self._enter(self._rule.region(eye, values, self._tables))
         rows, weights = [], []
         for level in self._levels:
             some, found = self._shown(level, camera, near, values)

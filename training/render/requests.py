@@ -36,12 +36,14 @@ class NamedSet:
     Attributes:
         file: a name in the folder of arrays.
         count: of its splats.
+        antialias: see ``scene.Instance``.
     """
 
     file: str
     count: int
     matrix: np.ndarray
     level: int
+    antialias: bool
 
 
 @dataclass(frozen=True)
@@ -130,6 +132,7 @@ def _named_set(values: Any) -> NamedSet:
         count=_whole(values, "count", 0, MOST_SPLATS),
         matrix=matrix,
         level=_whole(values, "level", 0, LAST_LEVEL),
+        antialias=bool(values.get("antialias")),
     )
 
 

@@ -93,11 +93,13 @@ class Instance:
     Attributes:
         matrix: (4, 4) float64, from the set's coordinates to the world.
         level: number of the level of detail that it is; 0 where it is none.
+        antialias: how it is drawn, see ``Bundle.antialias``.
     """
 
     splats: SplatSet
     matrix: np.ndarray = field(default_factory=lambda: np.eye(4))
     level: int = 0
+    antialias: bool = False
 
 
 def draw(
@@ -154,7 +156,7 @@ def draw(
         gaussians, weights, camera, near, unit = _in_one_frame(instances, camera, near)
         features = _membership(instances, picture) if levels else None
         for top, drawn in strips(
-            gaussians, camera, weights=weights, background=behind, near=near,
+            gaussians, camera, weights=weights, background=behind, near=near, antialias=_filtered(instances),
             outputs=("depth", "median_depth") if depth else (), features=features, window=window,
             limit=None if limit is None else torch.from_numpy(limit / unit).to(gaussians.means),
             strip=STRIP, backend=backend,
@@ -213,6 +215,14 @@ def _in_one_frame(
         for one in instances
     ]
     return Gaussians.concatenated(there), weights, camera, near, 1.0
+
+
+def _filtered(instances: list[Instance]) -> bool | torch.Tensor:
+    """Whether splats are antialiased: all or none, or (N,) of each where sets differ."""
+    flags = {one.antialias for one in instances}
+    if len(flags) == 1:
+        return flags.pop()
+    return torch.cat([torch.full_like(one.splats.weights, one.antialias).bool() for one in instances])
 
 
 def _membership(instances: list[Instance], picture: Picture) -> torch.Tensor:

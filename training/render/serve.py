@@ -156,7 +156,7 @@ class _Server:
         for one in sets:
             if one.file not in kept:
                 kept[one.file] = self._sets.get(one.file) or self._read_set(frame, one)
-            instances.append(Instance(kept[one.file], one.matrix, one.level))
+            instances.append(Instance(kept[one.file], one.matrix, one.level, one.antialias))
         self._sets = kept
         return instances
 

@@ -55,12 +55,14 @@ def capture(
     Raises:
         LodgsError: the base or the camera files cannot be read, or as :func:`write_scene`.
     """
-    splats = read_base(base, warn)
+    splats, antialias = read_base(base, warn)
     if where == DOME:
         cameras, near = dome(splats, views, width, round(width * 2 / 3))
     else:
         cameras, near = read_views(Path(where))
-    return len(cameras), write_scene(scene, splats, cameras, near, backend=backend, tell=tell)
+    return len(cameras), write_scene(
+        scene, splats, cameras, near, backend=backend, antialias=antialias, tell=tell
+    )
 
 
 def read_views(folder: Path) -> tuple[list[Camera], float]:
@@ -84,6 +86,7 @@ def write_scene(
     near: float,
     points: int = POINTS,
     backend: str = "auto",
+    antialias: bool = False,
     tell: Tell = lambda number, count: None,
 ) -> int:
     """Writes scene/images/*.jpg and scene/sparse/0/*.bin; nothing is left of it when something goes wrong.
@@ -96,6 +99,7 @@ def write_scene(
         cameras: the views, in the splats' world.
         near: depth at which drawing begins, in world units.
         points: how many to look for.
+        antialias: how the splats are drawn, see ``Bundle.antialias``.
         tell: is told before each view which one it is and how many there are.
 
     Returns:
@@ -112,7 +116,7 @@ def write_scene(
         shutil.rmtree(beside, ignore_errors=True)
         for folder in ("images", "depths"):
             (beside / folder).mkdir(parents=True)
-        count = _write(beside, splats, cameras, near, points, backend, tell)
+        count = _write(beside, splats, cameras, near, points, backend, antialias, tell)
         shutil.rmtree(beside / "depths")
         beside.rename(scene)
     except OSError as error:
@@ -132,6 +136,7 @@ def _write(
     near: float,
     points: int,
     backend: str,
+    antialias: bool,
     tell: Tell,
 ) -> int:
     gaussians, rng = Gaussians.of(splats), np.random.default_rng(0)
@@ -139,7 +144,9 @@ def _write(
     found, colors = [], []
     for number, view in enumerate(views):
         tell(number + 1, len(views))
-        drawn = rasterize(gaussians, view, near=near, outputs=("median_depth",), backend=backend)
+        drawn = rasterize(
+            gaussians, view, near=near, antialias=antialias, outputs=("median_depth",), backend=backend
+        )
         assert drawn.median_depth is not None  # as asked for
         picture = (drawn.image.cpu().numpy().clip(0, 1) * 255).round().astype(np.uint8)
         depth = drawn.median_depth.cpu().numpy()

@@ -16,9 +16,10 @@ MOST_CURVES = 5
 """Of more levels than this, a bundle's head has no room for what was tried."""
 VIEWS = 8
 """So many training views tell the cost."""
-TRIED, BETWEEN = 9, (0.01, 0.9)
-"""So many distances are tried, in equal ratios between these quantiles of the splats' distances in view."""
-STANDING_APART = 1.25
+TRIED, NEAREST, FARTHEST = 9, 0.05, 0.9
+"""So many distances are tried, in equal ratios: from that which this share of the splats of some view are
+nearer than, to that which this share of the splats of all views are nearer than."""
+STANDING_APART = 2.0
 """A level begins at least this many times farther away than the next finer one."""
 
 
@@ -31,6 +32,7 @@ class Thresholds:
         backend: the rasterizer's.
         prune_weight: the least share of a pixel that keeps a splat of the coarser level.
         std: the smoothing filter's standard deviation for a distance, both in scene units.
+        antialias: as of ``rasterize``.
     """
 
     def __init__(
@@ -40,9 +42,11 @@ class Thresholds:
         backend: str,
         prune_weight: float,
         std: Callable[[float], float],
+        antialias: bool = False,
     ) -> None:
         self._cameras = evenly(cameras, VIEWS)
         self._near, self._backend, self._prune_weight, self._std = near, backend, prune_weight, std
+        self._antialias = antialias
 
     @torch.no_grad()
     def next(
@@ -61,7 +65,7 @@ class Thresholds:
         tried = self._candidates(next(iter(levels.values())), STANDING_APART * max(d_l.values()))
         costs = [_short(self.cost(levels, d_l, distance)) for distance in tried]
         alone = [(camera, rows_seen(levels, d_l, camera, self._near)) for camera in self._cameras]
-        before = _short(self._mean_in_tiles(Stack(levels), alone))
+        before = _short(self._mean_in_tiles(Stack(levels, self._antialias), alone))
         return tried[int(np.argmin(costs))], {"distances": tried, "costs": costs, "before": before}
 
     def cost(self, levels: Mapping[int, IndexedLevel], d_l: Mapping[int, float], distance: float) -> float:
@@ -72,7 +76,7 @@ class Thresholds:
         finest, number = next(iter(levels.values())), min(levels) - 1
         coarser = IndexedLevel.of(filtered(finest.gaussians, self._std(distance)))
         levels, d_l = {**levels, number: coarser}, {**d_l, number: distance}
-        stack = Stack(levels)
+        stack = Stack(levels, self._antialias)
         pictures = [(camera, rows_seen(levels, d_l, camera, self._near)) for camera in self._cameras]
         found = stack.importance(pictures, self._near, self._backend)[stack.part[number]].numpy()
         kept = found >= self._prune_weight
@@ -84,7 +88,10 @@ class Thresholds:
         tiles = []
         for camera, rows in pictures:
             some = stack.rows(rows)
-            drawn = rasterize(stack.gaussians, camera, near=self._near, rows=some, backend=self._backend)
+            drawn = rasterize(
+                stack.gaussians, camera, near=self._near, antialias=self._antialias, rows=some,
+                backend=self._backend,
+            )  # fmt: skip
             tiles.append(drawn.tile_counts.double().mean())
         return float(torch.stack(tiles).mean())
 
@@ -94,8 +101,10 @@ class Thresholds:
         for camera in self._cameras:
             means = finest.means[finest.in_view(camera, self._near)]
             seen.append(np.linalg.norm(means[camera.sees(means, self._near)] - camera.center, axis=1))
-        near, far = np.quantile(np.concatenate([*seen, [least]]), BETWEEN)
-        return [_short(d) for d in np.geomspace(max(near, least), max(far, least * 1.01), TRIED)]
+        seen = [distances for distances in seen if len(distances)] or [np.array([least])]
+        near = max(min(float(np.quantile(distances, NEAREST)) for distances in seen), least)
+        far = float(np.quantile(np.concatenate(seen), FARTHEST))
+        return [_short(d) for d in np.geomspace(near, max(far, near), TRIED)]
 
 
 def _short(number: float) -> float:

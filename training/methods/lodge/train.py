@@ -14,7 +14,8 @@ import torch
 
 from ...errors import LodgsError
 from ...lod.blocks import Blocks, spatial_order
-from ...lod.rules.chunks import TABLE, member_columns
+from ...lod.rules.chunks import RULE, TABLE, member_columns
+from ...lod.streaming import BLOCKS, table_of_blocks
 from ...rasterize import Adam, Gaussians, Target, photometric_loss
 from ...splats.bundle import Level
 from ...splats.gaussians import Splats
@@ -22,7 +23,7 @@ from ...splats.ply import Columns
 from ..data import TrainingView
 from ..density import require_rows
 from ..method import Drawing
-from ..model import NAMES, Model, splat_rates
+from ..model import NAMES
 from ..start import from_splats
 from ..threedgs import train as threedgs_train
 from . import ROUNDS, LodgeParameters, chunks
@@ -46,9 +47,11 @@ class SeenRows:
         self._adam, self._rows, self._leaves = adam, rows, leaves
 
     def step(self) -> None:
+        """One step of these rows."""
         self._adam.step_rows(self._rows, {name: leaf.grad for name, leaf in self._leaves.items()})
 
     def zero_grad(self) -> None:
+        """The rows go with their gradients: the next picture has others."""
         self._leaves = {}
 
 
@@ -75,7 +78,7 @@ class Method(threedgs_train.Method):
             super().setup(None)
         else:
             tensors = from_splats(base.select(spatial_order(base.means)), p.sh_degree, self.device)
-            self.model = Model(tensors, splat_rates(p, self.data.extent))
+            self.model = self.new_model(tensors)
             self._densify_until = 0
         self.d_l = {p.levels: 0.0}
         self.finished: dict[int, IndexedLevel] = {}
@@ -84,6 +87,7 @@ class Method(threedgs_train.Method):
         self.sets: dict[int, list[np.ndarray]] = {}
         self._blocks: Blocks | None = None  # of the level in training, as it was at its last pruning
         self._alone_share = p.tune_alone
+        self._threshold = p.prune_weight  # the least share of a pixel after the last pruning
         self._optimizer: SeenRows | None = None
 
     @property
@@ -123,17 +127,22 @@ class Method(threedgs_train.Method):
         if done > self.tuned_steps:
             return [self._level(number) for number in sorted(self.finished)] if done == self.steps else []
         if done == max(self.finest_steps, 1):
+            self._finish(self.levels)
             found.append(self._level(self.levels))
         if step >= self.finest_steps and self._local(done) == 0:
             found.insert(0, self._level(self.level_at(step)))
         return found
 
     def tables(self) -> dict[str, Columns]:
-        """The chunks, where there are any."""
+        """The chunks, where there are any, and which blocks of rows have splats of them."""
         if not len(self.centres):
             return {}
         x, y, z = self.centres.T
-        return {TABLE: {"x": x, "y": y, "z": z, "radius": self.radii}}
+        splats = {number: self._level(number).splats for number in sorted(self.sets)}
+        return {
+            TABLE: {"x": x, "y": y, "z": z, "radius": self.radii},
+            BLOCKS: table_of_blocks(RULE, splats),
+        }
 
     def meta(self) -> dict:
         found = {"costs": self.costs} if self.levels <= MOST_CURVES else {}
@@ -206,11 +215,14 @@ class Method(threedgs_train.Method):
 
     def begin_round(self, step: int) -> None:
         """Before a step: what hardly shows leaves the level; a new level begins as a copy of the finest."""
-        number, local = self.level_at(step), self._local(step)
+        p, number, local = self.parameters, self.level_at(step), self._local(step)
         if local == 0:
             self._begin_level(number)
-        threshold = self.parameters.prune_weight * ROUNDS[local // self.parameters.tune_steps]
-        self.model.keep(self.importance(number) >= threshold)
+        found = self.importance(number)
+        if local == 0:
+            share = p.keep ** (self.levels - number)
+            self._threshold = max(p.prune_weight, float(np.quantile(found.numpy(), 1 - share)))
+        self.model.keep(found >= self._threshold * ROUNDS[local // p.tune_steps])
         require_rows(self.model, step, "prune_weight")
         self._blocks = self._smoothed(number).blocks
 
@@ -222,7 +234,9 @@ class Method(threedgs_train.Method):
         if given:
             self.d_l[number] = given
         else:
-            thresholds = Thresholds(data.train, data.near, self.backend, p.prune_weight, self._std)
+            thresholds = Thresholds(
+                data.train, data.near, self.backend, p.prune_weight, self._std, p.antialias
+            )
             self.d_l[number], costs = thresholds.next(self.finished, self.d_l)
             self.costs.append({"level": number, **costs})
         if number == self.levels - 1:
@@ -230,10 +244,12 @@ class Method(threedgs_train.Method):
         known = seen_from_afar(finest, data.train, data.near, self.d_l[number], FAR_VIEWS)
         self._alone_share = p.tune_alone * float((~known).mean())
         tensors = {name: getattr(finest.gaussians, name).clone() for name in NAMES}
-        self.model = Model(tensors, splat_rates(p, data.extent))
+        self.model = self.new_model(tensors)
 
     def _finish(self, number: int) -> None:
         """The level in training is what it is from now on."""
+        if number in self.finished:
+            return
         level = self._smoothed(number)
         if number == self.levels and self.finest_steps:
             order = torch.from_numpy(spatial_order(level.means))
@@ -257,7 +273,7 @@ class Method(threedgs_train.Method):
         data, backend = self.data, self.backend
         level, farther, near = self._smoothed(number), self._farther(number), data.near
         levels = {**self.finished, number: level}
-        stack = Stack(levels)
+        stack = Stack(levels, self.parameters.antialias)
         beside = ((camera, rows_seen(levels, self.d_l, camera, near)) for camera in data.train)
         found = stack.importance(beside, near, backend)[stack.part[number]]
         if not self.parameters.tune_alone:
@@ -267,7 +283,7 @@ class Method(threedgs_train.Method):
             return found
         views = (camera.widened(self.parameters.margin).scaled(1 / farther) for camera in data.train)
         away = ((view, {number: level.in_view(view, near)}) for view in views)
-        alone = Stack({number: level}).importance(away, near, backend)
+        alone = Stack({number: level}, self.parameters.antialias).importance(away, near, backend)
         return torch.where(torch.from_numpy(known), found, torch.maximum(found, alone))
 
     # -- chunks ----------------------------------------------------------------------------------------
@@ -291,7 +307,7 @@ class Method(threedgs_train.Method):
         if p.visible_weight:
             rng = np.random.default_rng([self.seed, number, 11])
             views = [*near, *chunks.turned(near, rng)]
-            rows = chunks.visible(levels, rows, views, p.visible_weight, data.near, self.backend)
+            rows = chunks.visible(levels, rows, views, p.visible_weight, data.near, self.backend, p.antialias)
         for level, some in rows.items():
             members = np.zeros(len(levels[level]), bool)
             members[some] = True
@@ -335,6 +351,7 @@ class Method(threedgs_train.Method):
         return {
             **super().state_dict(),
             "d_l": self.d_l, "finished": finished, "costs": self.costs, "alone": self._alone_share,
+            "threshold": self._threshold,
             "blocks": {} if blocks is None else {
                 "count": blocks.count, "low": torch.from_numpy(blocks.low),
                 "high": torch.from_numpy(blocks.high), "reach": torch.from_numpy(blocks.reach),
@@ -349,6 +366,7 @@ class Method(threedgs_train.Method):
     def load_state_dict(self, state: dict) -> None:
         super().load_state_dict(state)
         self.d_l, self.costs, self._alone_share = state["d_l"], state["costs"], state["alone"]
+        self._threshold = state["threshold"]
         self.finished = {
             number: IndexedLevel.of(Gaussians(**tensors)) for number, tensors in state["finished"].items()
         }
