@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import signal
 import sys
 from contextlib import contextmanager
@@ -14,6 +15,8 @@ import bpy
 from ..training.errors import LodgsError
 from ..training.evaluate.words import summary_lines
 from ..training.methods.describe import describe_method, describe_methods
+from ..training.runs.folder import RunFolder
+from ..training.runs.job import Job
 from ..training.runs.options import add_options, job_from
 from ..training.splats.bundle import describe, write_bundle
 from . import extension
@@ -90,7 +93,7 @@ def _train(args: argparse.Namespace) -> int:
     if job.backend == "auto":
         job = replace(job, backend=extension.preferences().backend)
     _empty_file()
-    root = scenes.import_colmap(bpy.context, Path(job.scene), warn=lambda m: _print(f"warning: {m}"))
+    root = _imported(job)
     jobs.show(root.lodgs.training, job)  # when the .blend is opened
     watch = jobs.start_or_resume(root, job)
     with _interrupts():
@@ -113,6 +116,18 @@ def _train(args: argparse.Namespace) -> int:
     if args.export:
         write_bundle(args.export, scenes.read_levels(root))
     return DONE
+
+
+def _imported(job: Job) -> bpy.types.Object:
+    """What a job trains on, as a splat scene: its photographs, or its splats alone."""
+
+    def warn(message: str) -> None:
+        _print(f"warning: {message}")
+
+    if not job.capture:
+        return scenes.import_colmap(bpy.context, Path(job.scene), warn=warn)
+    run = RunFolder(job.base)
+    return scenes.import_splats(bpy.context, run.bundle if run.bundle.exists() else run.path, warn=warn)
 
 
 def _methods(args: argparse.Namespace) -> int:
@@ -183,8 +198,10 @@ class _Bar:
                 f"{duration(progress['eta_s'])} left",
                 end="", file=sys.stderr, flush=True,
             )  # fmt: skip
-        elif watch.message != self._message:
-            self._message = watch.message
+        elif (
+            message := re.sub(r"\d+", "", watch.message)
+        ) != self._message:  # a line for all that is counted
+            self._message = message
             self._line(watch.message)
 
     def _line(self, text: str) -> None:

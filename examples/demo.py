@@ -41,6 +41,8 @@ def main() -> int:
         shutil.rmtree(run.path)
     os.environ.setdefault("LODGS_TRAINER_PYTHON", sys.executable)
 
+    method = METHODS[chosen.method]
+    print(f"{method.label}, {method.about}: trained as a draft on {os.path.relpath(chosen.scene)}.")
     start_blender()
     commands = importlib.import_module(f"{EXTENSION}.blender_lodgs.commands")
     code = commands.main(
@@ -73,6 +75,8 @@ def main() -> int:
     (out / "report.json").write_text(json.dumps(report, indent=1))
     print(f"{time.monotonic() - started:.0f} seconds. In {os.path.relpath(out)}: scene.blend, bundle.ply,")
     print("levels.png (the levels side by side), report.json")
+    if run.costs.exists():
+        print(f"In {os.path.relpath(run.path)}: costs.png (what finding the levels' distances has told)")
     return 0
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from training.rasterize.sh import basis, coefficients
-from training.render.capture import write_scene
+from training.runs.capture import write_scene
 from training.scenes.cameras import Camera, look_at, write_camera
 from training.splats.gaussians import SH_C0, Splats
 from training.splats.ply import write_ply

@@ -88,7 +88,7 @@ def write_model(rendered: Path, scene: Path, cameras: str, quality: int) -> pyco
         x, y = np.floor(place[sees].T).astype(int)
         colors[sees] += picture[y, x]
     colors /= visible.sum(axis=0)[:, None]
-    return write_colmap(scene, views, points, pixels, visible, colors)
+    return write_colmap(scene, views, points, visible, colors)
 
 
 def main():

@@ -33,7 +33,7 @@ from training.methods.lodge.chunks import members
 from training.methods.lodge.composite import IndexedLevel
 from training.rasterize import Gaussians, Rendering
 from training.rasterize.resident import Resident
-from training.render.capture import write_scene
+from training.runs.capture import write_scene
 from training.scenes.cameras import Camera
 from training.splats.bundle import Bundle, Level, read_bundle
 from training.splats.ply import columns_of, columns_of_extras, read_ply, write_ply

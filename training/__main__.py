@@ -129,6 +129,9 @@ def _parser() -> argparse.ArgumentParser:
         "--cameras", type=Path, metavar="DIR", help="camera files (*.json) to draw; otherwise from all around"
     )
     capture.add_argument("--views", type=int, default=64, help="how many from all around (default 64)")
+    capture.add_argument(
+        "--view-width", type=int, default=960, help="pixels that these are wide (default 960)"
+    )
     capture.add_argument("--backend", default="auto", help="auto, cpu, cuda or reference")
 
     serve = commands.add_parser("serve", help="draw frame after frame for Blender")
@@ -246,27 +249,15 @@ def _render(chosen: argparse.Namespace) -> int:
 
 
 def _capture(chosen: argparse.Namespace) -> int:
-    from .lod.selection import complete
-    from .render.capture import dome, write_scene
-    from .render.command import Source
-    from .scenes.cameras import read_camera
+    from .runs.capture import capture
+    from .runs.job import DOME, check_views
 
-    bundle = Source.read(chosen.source, _warn).bundle
-    splats = complete(bundle, bundle.levels[-1])
-    if chosen.cameras:
-        files = sorted(chosen.cameras.glob("*.json"))
-        if len(files) < 2:
-            raise LodgsError(
-                f"{chosen.cameras} holds no two camera files (*.json).", "Choose another folder."
-            )
-        views, nears = zip(*map(read_camera, files), strict=True)
-        near = min(nears)
-    elif chosen.views < 2:
-        raise LodgsError("A scene takes two views or more.", "Give --views 64.")
-    else:
-        views, near = dome(splats, chosen.views)
-    points = write_scene(chosen.out, splats, views, near, backend=chosen.backend, antialias=bundle.antialias)
-    print(f"{chosen.out}: {len(views)} views, {points:,} points")
+    check_views(chosen.views, chosen.view_width)
+    views, points = capture(
+        chosen.source, chosen.out, chosen.cameras or DOME, chosen.views, chosen.view_width,
+        backend=chosen.backend, warn=_warn,
+    )  # fmt: skip
+    print(f"{chosen.out}: {views} views, {points:,} points")
     return 0
 
 

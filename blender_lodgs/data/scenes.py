@@ -179,6 +179,7 @@ def import_splats(
         set_bundle_facts(root, bundle)
         set_tables(root, bundle.tables)
         root.lodgs.single_level = bundle.levels[-1].number
+        root.lodgs.training.method = "lodge"  # the one that gives levels to splats that are there
     if bundle.rule and not root.lodgs.by_distance:
         warn(" ".join(unknown_rule(bundle.rule)))
     return root
@@ -251,15 +252,25 @@ def contents(root: bpy.types.Object) -> str:
     return ", ".join(f"{count:,} {what}{'s' * (count != 1)}" for count, what in counts if count)
 
 
-def remove_finer_levels(root: bpy.types.Object) -> None:
-    """Removes tables and all levels but the coarsest, whose object the next set's coarsest takes over."""
+def make_room(root: bpy.types.Object, number: int) -> None:
+    """Removes tables and all levels but one, whose object the next set's first level takes over.
+
+    Args:
+        number: of that level. Where there is none of this number, the finest of those here takes it.
+    """
     tables.remove_tables(root)
-    for item in root.lodgs.levels:
-        if item.exists and item.number > 1:
+    there = [item for item in root.lodgs.levels if item.exists]
+    kept = next((item for item in there if item.number == number), there[-1] if there else None)
+    for item in there:
+        if item != kept:
             cloud = item.object.data
             bpy.data.objects.remove(item.object)
             if not cloud.users:
                 bpy.data.pointclouds.remove(cloud)
+    if kept is not None:
+        if kept.object.name == _level_name(root, kept.number):
+            kept.object.name = _level_name(root, number)
+        kept.number = number
     _levels_changed(root)
 
 
@@ -451,7 +462,7 @@ def _short(value: float) -> float:
 def _put_level(root: bpy.types.Object, level: Level) -> bpy.types.Object:
     """The level's object in the scene and its entry in the list, without what depends on the whole list."""
     settings = root.lodgs
-    fresh = objects.new_splats(f"{root.name} level {level.number}", level.splats)
+    fresh = objects.new_splats(_level_name(root, level.number), level.splats)
     item = next((entry for entry in settings.levels if entry.number == level.number), None)
     if item is None:
         item = settings.levels.add()
@@ -474,6 +485,10 @@ def _put_level(root: bpy.types.Object, level: Level) -> bpy.types.Object:
     item.object = fresh
     item.facts = json.dumps(level.facts)
     return fresh
+
+
+def _level_name(root: bpy.types.Object, number: int) -> str:
+    return f"{root.name} level {number}"
 
 
 def _levels_changed(root: bpy.types.Object) -> None:

@@ -8,15 +8,15 @@ from typing import Any
 import bpy
 
 from ...training.methods import METHODS, PRESETS, MethodInfo, method_info
-from ...training.runs.job import Job
-from . import photographs
+from ...training.runs.job import VIEW_WIDTHS, VIEWS, Job
+from . import photographs, viewpoints
 
 _WHOLE_MOST, _MOST = 2**31 - 1, 3.4e38
 _LEAST = 1e-6
 """The smallest number above 0 that Blender shows."""
 
 FEW = 40
-"""Photographs below which every one is needed to train on."""
+"""Photographs, or views in their place, below which every one is needed to train on."""
 
 
 def hold_out(root: bpy.types.Object) -> int:
@@ -26,7 +26,9 @@ def hold_out(root: bpy.types.Object) -> int:
 
 
 def _affordable(settings: bpy.types.PropertyGroup) -> int:
-    return 0 if len(photographs.views(settings.id_data)) < FEW else Job.test_every
+    root = settings.id_data
+    views = viewpoints.count(settings) if viewpoints.alone(root) else len(photographs.views(root))
+    return 0 if views < FEW else Job.test_every
 
 
 def offered(method: str) -> list[Field]:
@@ -34,6 +36,10 @@ def offered(method: str) -> list[Field]:
     info = method_info(method)
     known = {f.name: f for f in fields(info.parameters)}
     return [known[name] for name in info.offered if not isinstance(known[name].default, tuple)]
+
+
+def _is_curve(settings: bpy.types.PropertyGroup, obj: bpy.types.Object) -> bool:
+    return obj.type == "CURVE"
 
 
 def _preset_value(f: Field, method: str):
@@ -129,7 +135,39 @@ class TrainingSettings(bpy.types.PropertyGroup):
                 "Splat File",
                 "The finest level of a finished run, of a bundle or of any splat PLY",
             ),
+            ("SCENE", "These Splats", "The finest level of this scene, with all that was changed in it"),
         ],
+    )
+    views_from: bpy.props.EnumProperty(
+        name="Views From",
+        description="From where pictures of these splats are drawn, which take the place of photographs",
+        items=[
+            (
+                "DOME",
+                "All Around",
+                "A dome of views around the splats: for a thing that is seen from outside",
+            ),
+            ("CAMERAS", "Cameras", "Every camera of the Blender scene"),
+            ("ANIMATION", "Animation", "The scene's camera in frames that are evenly chosen from its range"),
+            ("CURVE", "Along Curve", "A walk along a curve that looks ahead, to both sides and back in turn"),
+        ],
+    )
+    views: bpy.props.IntProperty(
+        name="Views", description="How many views there are", default=Job.views, min=VIEWS[0], max=VIEWS[1]
+    )
+    view_width: bpy.props.IntProperty(
+        name="View Width",
+        description="How wide their pictures are; training makes them smaller by Image Scale",
+        default=Job.view_width,
+        min=VIEW_WIDTHS[0],
+        max=VIEW_WIDTHS[1],
+        subtype="PIXEL",
+    )
+    curve: bpy.props.PointerProperty(
+        name="Curve",
+        description="What to walk along, at the height of the eyes",
+        type=bpy.types.Object,
+        poll=_is_curve,
     )
     base: bpy.props.StringProperty(
         name="Splats",

@@ -29,6 +29,21 @@ def report_errors(execute):
     return wrapper
 
 
+def show_image(context: bpy.types.Context, image: bpy.types.Image) -> None:
+    """Shows an image where Blender shows renders, unless an Image Editor is open already."""
+    editors = _image_editors(context)
+    if not editors and not bpy.app.background:
+        bpy.ops.render.view_show("INVOKE_DEFAULT")
+        editors = _image_editors(context)
+    for editor in editors:
+        editor.image = image
+
+
+def _image_editors(context: bpy.types.Context) -> list[bpy.types.SpaceImageEditor]:
+    areas = [area for window in context.window_manager.windows for area in window.screen.areas]
+    return [area.spaces.active for area in areas if area.type == "IMAGE_EDITOR"]  # type: ignore[misc]
+
+
 class OnScene:
     """An operator that acts on the active splat scene."""
 

@@ -8,10 +8,10 @@ import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ...training.scenes.cameras import write_camera
-from ..data import scenes
-from ..render import cameras, compositing, engine, quick
+from ..data import cameras, scenes
+from ..render import compositing, engine, quick
 from .frames import FrameByFrame
-from .parts import report_errors
+from .parts import report_errors, show_image
 
 
 class LODGS_OT_use_engine(bpy.types.Operator):
@@ -95,28 +95,13 @@ class LODGS_OT_render_quick(FrameByFrame, bpy.types.Operator):
             yield from quick.render_animation(context, self.frames(context))
         else:
             image = quick.render(context)
-            _show(context, image)
+            show_image(context, image)
             yield image
 
     def done(self, count):
         if self.animation:
             return f"{'1 frame' if count == 1 else f'{count} frames'} saved"
         return f"Drawn into the image '{quick.IMAGE}'; the Image Editor shows it"
-
-
-def _show(context: bpy.types.Context, image: bpy.types.Image) -> None:
-    """Shows an image where Blender shows renders, unless an Image Editor is open already."""
-    editors = _image_editors(context)
-    if not editors and not bpy.app.background:
-        bpy.ops.render.view_show("INVOKE_DEFAULT")
-        editors = _image_editors(context)
-    for editor in editors:
-        editor.image = image
-
-
-def _image_editors(context: bpy.types.Context) -> list[bpy.types.SpaceImageEditor]:
-    areas = [area for window in context.window_manager.windows for area in window.screen.areas]
-    return [area.spaces.active for area in areas if area.type == "IMAGE_EDITOR"]  # type: ignore[misc]
 
 
 class LODGS_OT_export_camera(bpy.types.Operator, ExportHelper):

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import bpy
 
+from ...training.errors import LodgsError
 from ..data import scenes
 from ..runs import jobs
 from ..runs.watch import Watch
-from .parts import OnScene, report_errors
+from .parts import OnScene, report_errors, show_image
 
 
 def _follow(operator: bpy.types.Operator, watch: Watch):
@@ -103,10 +104,27 @@ class LODGS_OT_show_log(OnScene, bpy.types.Operator):
             self.layout.label(text=line.body)
 
 
+class LODGS_OT_show_costs(OnScene, bpy.types.Operator):
+    bl_idname = "lodgs.show_costs"
+    bl_label = "Show Cost Curve"
+    bl_description = "Show what each distance would have cost in an Image Editor"
+
+    @report_errors
+    def execute(self, context):
+        plot = jobs.cost_plot(scenes.active_root(context))
+        if plot is None:
+            raise LodgsError("No run with a cost curve is here.", "Open the run that made these levels.")
+        image = bpy.data.images.load(str(plot), check_existing=True)
+        image.reload()  # the run goes on
+        show_image(context, image)
+        return {"FINISHED"}
+
+
 CLASSES = (
     LODGS_OT_train,
     LODGS_OT_resume_training,
     LODGS_OT_cancel_training,
     LODGS_OT_open_run,
     LODGS_OT_show_log,
+    LODGS_OT_show_costs,
 )

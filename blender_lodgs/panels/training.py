@@ -7,7 +7,7 @@ import bpy
 from ...training.errors import LodgsError
 from ...training.evaluate.words import summary_lines
 from ...training.methods import method_info
-from ..data import scenes
+from ..data import scenes, viewpoints
 from ..data.training import hold_out, offered
 from ..runs import environment, jobs
 from ..runs.watch import Watch, watch_of
@@ -48,7 +48,8 @@ class LODGS_PT_training_advanced(Panel):
     def poll(cls, context: bpy.types.Context) -> bool:
         root = scenes.active_root(context)
         watch = watch_of(root)
-        return bool(root and root.lodgs.scene_folder) and not (watch and watch.running)
+        trains = root is not None and (root.lodgs.scene_folder or viewpoints.alone(root))
+        return bool(trains) and not (watch and watch.running)
 
     def draw(self, context: bpy.types.Context) -> None:
         root = scenes.active_root(context)
@@ -60,22 +61,29 @@ class LODGS_PT_training_advanced(Panel):
         _draw_parameter(layout, settings, "test_every")
         for f in offered(settings.method):
             _draw_parameter(layout, settings.parameters, f.name)
-        layout.prop(settings, "model")
-        layout.prop(settings, "images")
+        if root.lodgs.scene_folder:
+            layout.prop(settings, "model")
+            layout.prop(settings, "images")
         layout.prop(settings, "output")
         layout.operator("lodgs.open_run", icon="FILE_FOLDER", text="Open Run…")
 
 
 def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object, resumable: bool) -> None:
     settings = root.lodgs.training
-    if not root.lodgs.scene_folder:
+    alone, info = viewpoints.alone(root), method_info(settings.method)
+    if not root.lodgs.scene_folder and not alone:
         say(layout, "Not imported from photographs: nothing to train on.", "INFO")
         return
     column = split_column(layout)
     column.prop(settings, "method")
+    if alone and not info.from_base:
+        say(layout, f"{info.label} needs photographs, and these splats have none.", "INFO")
+        return
     column.prop(settings, "preset")
     column.prop(settings, "image_scale")
-    if method_info(settings.method).from_base:
+    if alone:
+        _draw_views(column, settings)
+    elif info.from_base:
         column.prop(settings, "start_from")
         if settings.start_from == "FILE":
             column.prop(settings, "base")
@@ -83,8 +91,10 @@ def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object, resumable:
         parameters = jobs.parameters(settings)
         levels = parameters.levels  # 0: the scene decides
         text = f" in {levels} levels" if levels > 1 else ""
-        column.label(text=f"{parameters.total_steps:,} steps{text}")
-        if not hold_out(root):
+        begun = alone or (info.from_base and settings.start_from != "POINTS")
+        steps = parameters.base_steps if begun else parameters.total_steps
+        column.label(text=f"{steps:,} steps{text}")
+        if not hold_out(root) and not alone:
             say(layout, "No photographs are held out: quality will be of training views.", "INFO")
     except LodgsError as error:
         say(layout, str(error), "ERROR")
@@ -103,6 +113,19 @@ def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object, resumable:
         layout.operator("lodgs.train", icon="PLAY")
 
 
+def _draw_views(column: bpy.types.UILayout, settings: bpy.types.PropertyGroup) -> None:
+    """From where splats without photographs are looked at."""
+    column.separator()
+    column.prop(settings, "views_from")
+    if settings.views_from == "CURVE":
+        column.prop(settings, "curve")
+    if settings.views_from == "CAMERAS":
+        column.label(text=f"{viewpoints.count(settings)} cameras")
+    else:
+        column.prop(settings, "views")
+    column.prop(settings, "view_width")
+
+
 def _draw_parameter(layout: bpy.types.UILayout, group: bpy.types.PropertyGroup, name: str) -> None:
     """A box to tick before the artist's value, or before that which is taken without one, greyed."""
     row = layout.row(align=True, heading=group.bl_rna.properties[name].name)
@@ -113,11 +136,10 @@ def _draw_parameter(layout: bpy.types.UILayout, group: bpy.types.PropertyGroup, 
 
 
 def _draw_running(layout: bpy.types.UILayout, watch: Watch) -> None:
-    progress = watch.progress
-    share = progress.get("step", 0) / max(progress.get("of", 0), 1)
+    progress, share = watch.progress, watch.share
     row = layout.row(align=True)
     message, _, aside = watch.message.partition(" (")  # the bar has room for a few words
-    row.progress(text=f"{message} · {share:.0%}" if progress else message, factor=share)
+    row.progress(text=f"{message} · {share:.0%}" if share else message, factor=share)
     row.operator("lodgs.cancel_training", text="", icon="X")
     if aside:
         say(layout, aside.rstrip(")").capitalize(), "INFO")

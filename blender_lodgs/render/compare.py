@@ -17,10 +17,10 @@ from ...training.errors import LodgsError
 from ...training.scenes.cameras import Camera
 from ...training.scenes.color import srgb_from_linear
 from .. import extension
-from ..data import photographs
+from ..data import cameras, photographs
 from ..viewport import wipe
 from ..viewport.wipe import Comparison
-from . import cameras, engine, renderer
+from . import engine, renderer
 
 
 def measurable(root: bpy.types.Object) -> list[bpy.types.Object]:

@@ -13,8 +13,8 @@ import bpy
 from ...training.errors import LodgsError
 from .. import compat
 from ..data import scenes, selection
+from ..data.cameras import scene_camera
 from . import engine
-from .cameras import scene_camera
 
 _COPIED = (
     "resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y",

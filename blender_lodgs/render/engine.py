@@ -17,8 +17,8 @@ import numpy as np
 from ...training.errors import LodgsError
 from .. import attributes
 from ..data import objects, scenes, shown
+from ..data.cameras import scene_camera, view_of
 from . import renderer
-from .cameras import scene_camera, view_of
 
 ID = "LODGS"
 LEVEL, LEVEL_MASK, DEPTH, COMBINED = "Level", "Level {}", "Depth", "Combined"

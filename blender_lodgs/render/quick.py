@@ -16,9 +16,9 @@ import numpy as np
 from ...training.errors import LodgsError
 from ...training.render.picture import Picture
 from ..data import shown
+from ..data.cameras import scene_camera
 from ..viewport import views
 from . import engine, renderer
-from .cameras import scene_camera
 
 IMAGE = "Render Result"
 """The image that takes the picture."""

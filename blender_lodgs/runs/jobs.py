@@ -17,11 +17,15 @@ import bpy
 import numpy as np
 
 from ...training.errors import LodgsError
+from ...training.lod.selection import complete
 from ...training.methods import method_info, parameters_of
 from ...training.methods.parameters import Parameters
 from ...training.runs.folder import RunFolder
-from ...training.runs.job import Job
+from ...training.runs.job import DOME, Job
+from ...training.scenes.cameras import write_camera
+from ...training.splats.bundle import write_bundle
 from .. import extension
+from ..data import scenes, viewpoints
 from ..data.training import hold_out, offered
 from . import environment, processes
 from .watch import Watch, begin, root_by_uid, watch_of, watches
@@ -43,7 +47,8 @@ def start(root: bpy.types.Object, folder: str = "", parameters: dict | None = No
     """Train a scene root with its settings (``root.lodgs.training``) in a new run folder.
 
     Args:
-        root: a scene root that was imported from a COLMAP folder.
+        root: a scene root that was imported from a COLMAP folder; or one with splats alone, which are handed
+            over as they are here, with the views of them that the settings ask for.
         folder: the run's folder; empty makes a new one where the settings say.
         parameters: further parameters of the method by name (``training.methods.parameters``).
 
@@ -66,7 +71,7 @@ def _begin(root: bpy.types.Object, run: RunFolder, job: Job) -> Watch:
             f"{run.path} already holds a run.", "Choose another folder, or open it as a run and resume it."
         )
     root.lodgs.training.read = 0
-    return _launch(root, run, job)
+    return _launch(root, run, job, hand_over=Path(job.base) == run.base)
 
 
 def resume(root: bpy.types.Object) -> Watch:
@@ -185,6 +190,12 @@ def follow(watch: Watch, show: Callable[[Watch], None] | None = None) -> None:
         processes.follow(step)
 
 
+def cost_plot(root: bpy.types.Object) -> Path | None:
+    """The picture of what finding the levels' distances has told, where the root's run has one."""
+    run = run_folder(root)
+    return run.costs if run is not None and run.costs.is_file() else None
+
+
 def log_text(root: bpy.types.Object) -> bpy.types.Text:
     """The end of the trainer's log, as a text block.
 
@@ -207,19 +218,11 @@ def make_job(root: bpy.types.Object, out: Path, parameters: dict) -> Job:
         LodgsError: the root has no COLMAP folder, nothing to start from, or a setting is impossible.
     """
     settings = root.lodgs.training
-    if not root.lodgs.scene_folder:
-        raise LodgsError(
-            f"'{root.name}' was not imported from photographs, so there is nothing to train on.",
-            "Import a COLMAP folder.",
-        )
     values = {
-        "scene": bpy.path.abspath(root.lodgs.scene_folder),
+        **(_captured(root, out) if viewpoints.alone(root) else _photographed(root, out)),
         "out": str(out),
-        "model": bpy.path.abspath(settings.model),
-        "images": bpy.path.abspath(settings.images),
         "method": settings.method,
         "preset": settings.preset,
-        "base": base_of(root),
         "seed": settings.seed,
         "test_every": hold_out(root),
         "image_scale": _as_typed(settings.image_scale),
@@ -227,6 +230,50 @@ def make_job(root: bpy.types.Object, out: Path, parameters: dict) -> Job:
         "parameters": changes(settings) | parameters,
     }
     return Job.from_dict(values)
+
+
+def _photographed(root: bpy.types.Object, out: Path) -> dict:
+    """What a job says of a scene that was imported from photographs."""
+    settings = root.lodgs.training
+    if not root.lodgs.scene_folder:
+        raise LodgsError(
+            f"'{root.name}' was not imported from photographs, so there is nothing to train on.",
+            "Import a COLMAP folder.",
+        )
+    return {
+        "scene": bpy.path.abspath(root.lodgs.scene_folder),
+        "model": bpy.path.abspath(settings.model),
+        "images": bpy.path.abspath(settings.images),
+        "base": base_of(root, out),
+    }
+
+
+def _captured(root: bpy.types.Object, out: Path) -> dict:
+    """What a job says of splats alone."""
+    settings, run = root.lodgs.training, RunFolder(out)
+    info = method_info(settings.method)
+    if not info.from_base:
+        raise LodgsError(
+            f"{info.label} needs photographs, and '{root.name}' has none.", "Choose the method LODGE."
+        )
+    return {
+        "base": str(run.base),
+        "capture": DOME if settings.views_from == "DOME" else str(run.cameras),
+        "views": settings.views,
+        "view_width": settings.view_width,
+    }
+
+
+def _hand_over(root: bpy.types.Object, run: RunFolder, job: Job) -> None:
+    """Write into a run what it takes of this file: splats as they are now, and the views of them."""
+    bundle = scenes.read_levels(root)
+    views = []
+    if job.capture:
+        views = viewpoints.placed(bpy.context, root, complete(bundle, bundle.levels[-1]))
+    run.make()
+    write_bundle(run.base, bundle)
+    for number, (camera, near) in enumerate(views):
+        write_camera(run.cameras / f"{number:04d}.json", camera, near)
 
 
 def changes(settings: TrainingSettings) -> dict:
@@ -270,8 +317,11 @@ def show(settings: TrainingSettings, job: Job) -> None:
             setattr(settings.parameters, f.name, getattr(own, f.name))
 
 
-def base_of(root: bpy.types.Object) -> str:
+def base_of(root: bpy.types.Object, out: Path) -> str:
     """What the root's next training begins with, as a job's ``base``; "" for the scene's points.
+
+    Args:
+        out: the folder of its run.
 
     Raises:
         LodgsError: the root has no finished run, or no file is chosen.
@@ -285,6 +335,8 @@ def base_of(root: bpy.types.Object) -> str:
                 "No splats are chosen to start from.", "Choose a PLY or a run's folder, or start from points."
             )
         return bpy.path.abspath(settings.base)
+    if settings.start_from == "SCENE":
+        return str(RunFolder(out).base)
     run = run_folder(root)
     if run is None or _state(run) != "done":
         raise LodgsError(
@@ -293,9 +345,11 @@ def base_of(root: bpy.types.Object) -> str:
     return str(run.path)
 
 
-def _launch(root: bpy.types.Object, run: RunFolder, job: Job | None) -> Watch:
+def _launch(root: bpy.types.Object, run: RunFolder, job: Job | None, hand_over: bool = False) -> Watch:
     python = environment.trainer_python()
     environment.require(python)
+    if job is not None and hand_over:
+        _hand_over(root, run, job)
     run.make()
     if job is not None:
         job.resolved().write(run.job)

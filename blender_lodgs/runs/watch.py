@@ -35,6 +35,7 @@ class Watch:
         process: the trainer, when this Blender started it.
         state: as ``RunFolder.state``.
         message: what the trainer is doing, or how the run ended.
+        share: how much of that is done, 0 to 1.
         problem: why the run failed, as a sentence with its remedy; empty when it did not.
         progress: the newest ``progress`` event.
         levels: the newest ``level`` event of each level.
@@ -51,6 +52,7 @@ class Watch:
     process: subprocess.Popen | None = None
     state: str = "running"
     message: str = "Starting the trainer"
+    share: float = 0.0
     problem: str = ""
     progress: dict = field(default_factory=dict)
     levels: dict[int, dict] = field(default_factory=dict)
@@ -124,9 +126,10 @@ class Watch:
                 self.method = event.get("method", "")
                 self.warnings.clear()
             case "status":
-                self.message = event["message"]
+                self.message, self.share = event["message"], _share(event)
             case "progress":
                 self.progress, self.message = event, event.get("stage", "").capitalize()
+                self.share = _share(event)
             case "warning":
                 self.warnings.append(event["message"])
             case "level":
@@ -138,8 +141,8 @@ class Watch:
     def _add_level(self, root: bpy.types.Object, event: dict) -> None:
         level = self._read_level(event)
         with extension.in_window():
-            if event["level"] == 1 and not event.get("again"):
-                scenes.remove_finer_levels(root)  # they are of an earlier run: two runs never mix
+            if not root.lodgs.training.read:  # what is here is not this run's, and two never mix
+                scenes.make_room(root, event["level"])
             if "meta" in event:
                 scenes.set_bundle_facts(root, self._described(event))
             scenes.set_level(root, level)
@@ -180,6 +183,10 @@ class Watch:
             "done": "Finished",
             "cancelled": "Cancelled; it can be resumed",
         }.get(self.state, "Stopped; it can be resumed")
+
+
+def _share(event: dict) -> float:
+    return min(event.get("step", 0) / max(event.get("of", 0), 1), 1.0)
 
 
 watches: dict[int, Watch] = {}

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.blender.fake_trainer import COUNTS
+from tests.blender.fake_trainer import COUNTS, splats
 
 SCENE = Path(__file__).resolve().parents[2] / "examples" / "lantern_garden"
 
@@ -74,6 +74,24 @@ def test_train_from_a_base_is_what_the_panel_then_shows(
     assert (settings.start_from, settings.parameters.max_splats) == ("FILE", 500)
     panels = lodgs("runs.jobs").make_job(root, tmp_path / "second", {})
     assert panels.resolved() == written, "the panel asks for the same"
+
+
+def test_splats_alone_are_trained_in_one_command(bpy, lodgs, lodgs_command, fake, tmp_path, capfd):
+    fake("killed")
+    bundles = lodgs("training.splats.bundle")
+    bundles.write_bundle(tmp_path / "some.ply", bundles.Bundle("", [bundles.Level(1, splats(7))]))
+    train = ("train", "--base", tmp_path / "some.ply", "--capture", "dome", "--views", 5, "--method", "lodge")
+    train = (*train, "--out", tmp_path / "run", "--blend", tmp_path / "out.blend")
+    assert lodgs_command(*train) == 1
+    fake()
+    assert lodgs_command(*train) == 0, "resumed"
+    assert "Finished" in capfd.readouterr().err
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "out.blend"))
+    (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
+    assert {i.number: len(i.object.data.points) for i in root.lodgs.levels} == COUNTS
+    assert (root.lodgs.training.views, root.lodgs.training.views_from) == (5, "DOME")
+    again = ("train", "--base", tmp_path / "run", "--capture", "dome", "--method", "lodge")
+    assert lodgs_command(*again, "--out", tmp_path / "next") == 0, "a finished run's finest level"
 
 
 def test_a_stopped_run_is_gone_on_with(lodgs_command, fake, tmp_path, capfd):

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from examples import town, town_shapes
-from training.render.capture import write_scene
+from training.runs.capture import write_scene
 from training.scenes.colmap import read_scene
 
 

@@ -121,6 +121,11 @@ class Parameters:
         """Training steps of a whole run."""
         return self.steps
 
+    @property
+    def base_steps(self) -> int:
+        """Training steps of a run that begins with a base, where the method can."""
+        return self.total_steps
+
     def margin_room(self, budget: int) -> int:
         """How many of at most so many splats may continue photographs."""
         return min(int(MARGIN_SHARE * budget), MARGIN_SPLATS) if self.margin else 0

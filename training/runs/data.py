@@ -12,6 +12,7 @@ from ..scenes.cameras import Camera
 from ..scenes.colmap import read_scene, without
 from ..scenes.images import check_image
 from ..scenes.undistort import undistorted
+from .capture import capture
 from .folder import RunFolder
 from .job import Job
 
@@ -22,7 +23,7 @@ DECODERS = 4
 def training_data(
     job: Job, folder: RunFolder, tell: Callable[..., None] | None = None, *, pixels: bool = True
 ) -> TrainingData:
-    """The job's scene, read and where needed undistorted (once, into the run folder).
+    """The job's scene, read and where needed captured and undistorted (once, into the run folder).
 
     Args:
         tell: called with an event's kind and values (status, warning) while this goes on.
@@ -32,7 +33,7 @@ def training_data(
         LodgsError: if the scene cannot be read, or has too little to train on.
     """
     model, images = (Path(path) if path else None for path in (job.model, job.images))
-    scene = read_scene(Path(job.scene), model=model, images=images)
+    scene = read_scene(_scene_folder(job, folder, tell), model=model, images=images)
     if pixels:
         scene = without(scene, _undecodable(scene.cameras))
     warnings = list(scene.warnings)
@@ -45,6 +46,23 @@ def training_data(
         if tell:
             tell("warning", message=warning)
     return TrainingData(scene, job.image_scale, job.test_every, job.exposure, job.validation)
+
+
+def _scene_folder(job: Job, folder: RunFolder, tell: Callable[..., None] | None) -> Path:
+    """Where the job's scene is; it is made of the base's own pictures, where the job says so."""
+    if not job.capture:
+        return Path(job.scene)
+    if not folder.captured.exists():
+
+        def tell_view(number: int, count: int) -> None:
+            if tell:
+                tell("status", message=f"Drawing view {number} of {count}", step=number, of=count)
+
+        capture(
+            job.base, folder.captured, job.capture, job.views, job.view_width,
+            backend=job.backend, tell=tell_view,
+        )  # fmt: skip
+    return folder.captured
 
 
 def _undecodable(cameras: Sequence[Camera]) -> dict[str, str]:

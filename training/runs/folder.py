@@ -1,8 +1,11 @@
 """A run's folder and what can be read from it, by anyone, at any time. No torch: Blender polls it.
 
     run/  job.toml  events.jsonl  checkpoints/  levels/level_1.ply ..  bundle.ply  metrics.json
+          costs.png (what finding the distances of levels has told)
           model.npz (what a method with networks has beside its levels)
           undistorted/ (photographs without their lens's distortion, where they had some)
+          captured/ (the pictures of splats that had no photographs, as a COLMAP scene)
+          base.ply, cameras/ (the splats, and the views of them, that Blender has handed over)
           trainer.log, trainer.out (what a trainer that Blender started printed)  lock  cancel  reserve
 
 A run is its folder, wherever that lies. ``events.jsonl`` holds one JSON object a line, the same lines that
@@ -45,9 +48,13 @@ class RunFolder:
         self.bundle = self.path / "bundle.ply"
         self.metrics = self.path / "metrics.json"
         self.model = self.path / "model.npz"
+        self.costs = self.path / "costs.png"
         self.log = self.path / "trainer.log"
         self.output = self.path / "trainer.out"
         self.undistorted = self.path / "undistorted"
+        self.captured = self.path / "captured"
+        self.base = self.path / "base.ply"
+        self.cameras = self.path / "cameras"
         self.reserve = self.path / "reserve"
         self._lock = self.path / "lock"
         self._cancel = self.path / "cancel"
@@ -78,7 +85,7 @@ class RunFolder:
             OSError: the folder cannot be read.
         """
         places = [place for place in vars(self).values() if isinstance(place, Path) and place != self.path]
-        for folder in (self.checkpoints, self.levels_folder):
+        for folder in (self.checkpoints, self.levels_folder, self.cameras):
             if folder.is_dir() and not folder.is_symlink():
                 places += folder.iterdir()
         for place in places:

@@ -17,6 +17,10 @@ from .folder import RunFolder
 BACKENDS = ("auto", "cpu", "cuda", "reference")
 MOST_STOPS = 32
 """Most stops that a job lightens or darkens linear images by."""
+DOME = "dome"
+"""What ``capture`` is for views from all around."""
+VIEWS, VIEW_WIDTHS = (2, 2000), (32, 8192)
+"""Bounds of how many views a dome has, and of the pixels that their pictures are wide."""
 MOST_PATH = 2000
 """Most characters of a path, so that a job with all of its paths is within the bounds of a TOML file."""
 _KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
@@ -34,11 +38,14 @@ class Job:
     """What to train, from what, into which folder.
 
     Attributes:
-        scene: folder of the COLMAP scene.
+        scene: folder of the COLMAP scene; "" where there is none: see ``capture``.
         out: the run's folder; made if it does not exist.
         method, preset: names from ``training.methods``, METHODS and PRESETS.
         base: a run, a bundle or a PLY of splats to begin with instead of the scene's points, for methods that
             can; "" for none.
+        capture: where there is no scene, from where the base is drawn, so that its pictures are the
+            photographs: DOME, from all around, or a folder of camera files; "" for nowhere.
+        views, view_width: how many views a dome has, and the width of their pictures in pixels.
         seed: makes two runs of one job equal to the bit on one machine, but not with the cuda backend.
         backend: rasterizer, one of BACKENDS; auto is cuda where that works, else cpu. A run may go on with
             another one.
@@ -56,6 +63,9 @@ class Job:
     method: str = "flod"
     preset: str = "draft"
     base: str = ""
+    capture: str = ""
+    views: int = 64
+    view_width: int = 960
     seed: int = 0
     backend: str = "auto"
     image_scale: float = 0.5
@@ -100,12 +110,12 @@ class Job:
             raise LodgsError(
                 f"The job has the unknown key {shown(unknown[0])}.", f"Known are: {', '.join(known)}."
             )
-        for key in ("scene", "out"):
+        values = {"scene": "", **values} if values.get("capture") else dict(values)
+        for key in ("out",) if values.get("capture") else ("scene", "out"):
             if not values.get(key):
                 raise LodgsError(f"The job does not say '{key}'.", f'Add a line: {key} = "..."')
-        values = dict(values)
-        for key in ("scene", "out", "base", "model", "images"):
-            if values.get(key):
+        for key in ("scene", "out", "base", "capture", "model", "images"):
+            if values.get(key) and (key, values[key]) != ("capture", DOME):
                 values[key] = _path(key, values[key], folder)
         job = cls(**values)
         job._check()
@@ -139,7 +149,22 @@ class Job:
                 f"The method '{self.method}' cannot begin with the splats of another run.",
                 "Leave out 'base', or choose another method.",
             )
+        if self.capture:
+            self._check_capture()
         self.resolved_parameters()
+
+    def _check_capture(self) -> None:
+        if not self.base:
+            raise LodgsError(
+                "There are no splats to capture views of.", "Say 'base', or leave out 'capture'."
+            )
+        for key in ("scene", "model", "images"):
+            if getattr(self, key):
+                raise LodgsError(
+                    f"The job says both 'capture' and '{key}'.",
+                    "Leave out one of them: photographs are taken, or they are there.",
+                )
+        check_views(self.views, self.view_width)
 
     def resolved_parameters(self) -> Parameters:
         """The preset's parameters with this job's changes."""
@@ -157,15 +182,25 @@ class Job:
         )
 
     def write(self, path: Path) -> None:
-        """Writes the job as TOML; in its own run, it says that it is there."""
+        """Writes the job as TOML; in its own run, it says that it is there, and so is what lies in it."""
         values = asdict(self)
         if Path(self.out) == path.parent:
             values["out"] = "."
+            for key in ("base", "capture"):
+                if values[key] != DOME and path.parent in Path(values[key]).parents:
+                    values[key] = f"./{Path(values[key]).relative_to(path.parent).as_posix()}"
         table = values.pop("parameters")
         lines = [_toml_line(name, value) for name, value in values.items()]
         lines += ["", "[parameters]"] + [_toml_line(name, value) for name, value in table.items()]
         with atomic_write(path) as temporary:
             Path(temporary).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def check_views(views: int, width: int) -> None:
+    """Raises LodgsError where so many views, or pictures so many pixels wide, are not captured."""
+    for name, value, (low, high) in (("views", views, VIEWS), ("view_width", width, VIEW_WIDTHS)):
+        if not low <= value <= high:
+            raise LodgsError(f"{name} = {value} is not possible.", f"Give a number from {low} to {high}.")
 
 
 def _path(key: str, value: object, folder: Path) -> str:

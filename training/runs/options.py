@@ -24,6 +24,12 @@ _OPTIONS: dict[str, dict] = {
     "method": {"choices": list(METHODS), "help": "what to train, see the command methods"},
     "preset": {"choices": list(PRESETS), "help": "how long to train"},
     "base": {"metavar": "PATH", "help": "run, bundle or PLY to begin with instead of the scene's points"},
+    "capture": {
+        "metavar": "dome|DIR",
+        "help": "instead of a scene, draw the base's own pictures: from all around, or from camera files",
+    },
+    "views": {"metavar": "N", "type": _whole, "help": "how many from all around"},
+    "view_width": {"metavar": "N", "type": _whole, "help": "pixels that these are wide; they are 3:2"},
     "image_scale": {"metavar": "SHARE", "type": float, "help": "size of training images over photographs"},
     "test_every": {"metavar": "N", "type": _whole, "help": "hold out every N-th view; 0 holds out none"},
     "validation": {
@@ -64,7 +70,8 @@ def job_from(chosen: argparse.Namespace) -> Job:
     """
     given = {name: value for name, value in vars(chosen).items() if name in _OPTIONS}
     values = asdict(Job.from_file(chosen.job)) if chosen.job else {}
-    if not {"scene", "out"} <= values.keys() | given.keys():
+    said = values.keys() | given.keys()
+    if "out" not in said or not said & {"scene", "capture"}:
         raise LodgsError("It is not said what to train.", "Give a job file, or --scene DIR and --out RUN.")
     parameters = values.get("parameters", {}) | dict(map(_assignment, chosen.set))
     return Job.from_dict(values | given | {"parameters": parameters})

@@ -20,6 +20,7 @@ import torch
 
 from .. import VERSION
 from ..errors import LodgsError
+from ..evaluate.costs import cost_curves, write_cost_plot
 from ..evaluate.metrics import psnr
 from ..evaluate.summary import summary
 from ..evaluate.views import Evaluation
@@ -266,6 +267,8 @@ class _Run:
             )  # fmt: skip
             known[level.number] = record
         self.levels = [known[number] for number in sorted(known)]
+        if levels and cost_curves(bundle.meta):
+            write_cost_plot(self.folder.costs, bundle.meta)
 
     def _save(self) -> None:
         write_checkpoint(self.folder, self.step, self.levels, self.method.state_dict())

@@ -45,7 +45,6 @@ def write_colmap(
     scene: Path,
     cameras: Sequence[Camera],
     points: np.ndarray,
-    pixels: np.ndarray,
     visible: np.ndarray,
     colors: np.ndarray,
 ) -> pycolmap.Reconstruction:
@@ -53,22 +52,26 @@ def write_colmap(
 
     Args:
         scene: its folder.
-        cameras: V views of one lens without distortion; their names are those of the images.
+        cameras: V views; their names are those of the images.
         points: (N, 3) in the world.
-        pixels: (V, N, 2) where views see them.
         visible: (V, N), which observations the tracks hold.
         colors: (N, 3) in [0, 255].
     """
-    model, lens = pycolmap.Reconstruction(), cameras[0]
-    camera = pycolmap.Camera(
-        model="PINHOLE", width=lens.width, height=lens.height,
-        params=[lens.fx, lens.fy, lens.cx, lens.cy], camera_id=1,
-    )  # fmt: skip
-    model.add_camera_with_trivial_rig(camera)
-    for view, each in enumerate(cameras):
+    model, lenses = pycolmap.Reconstruction(), {}
+    for number, each in enumerate(cameras):
+        lens = each.width, each.height, each.fx, each.fy, each.cx, each.cy
+        if lens not in lenses:
+            lenses[lens] = len(lenses) + 1
+            model.add_camera_with_trivial_rig(
+                pycolmap.Camera(
+                    model="PINHOLE", width=each.width, height=each.height, params=lens[2:],
+                    camera_id=lenses[lens],
+                )
+            )  # fmt: skip
+        pixels, _ = each.project(points[visible[number]])
         image = pycolmap.Image(
-            name=each.name, keypoints=pixels[view, visible[view]], camera_id=1, image_id=view + 1
-        )
+            name=each.name, keypoints=pixels, camera_id=lenses[lens], image_id=number + 1
+        )  # fmt: skip
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(each.world_to_camera[:3]))
     rows = np.cumsum(visible, axis=1) - 1  # number of each observation within its image
     for index, (point, color) in enumerate(zip(points, np.round(colors).astype(np.uint8), strict=True)):
@@ -81,6 +84,6 @@ def write_colmap(
     folder = scene / "sparse" / "0"
     folder.mkdir(parents=True, exist_ok=True)
     model.write_binary(folder)
-    for extra in ("rigs.bin", "frames.bin"):  # one camera without a rig: readers make these themselves
+    for extra in ("rigs.bin", "frames.bin"):  # cameras without rigs: readers make these themselves
         (folder / extra).unlink(missing_ok=True)
     return model

@@ -163,7 +163,7 @@ def test_a_deleted_table_is_no_table(bpy, lodgs, root):
 
 
 def test_another_training_begins_without_them(lodgs, root):
-    lodgs("data.scenes").remove_finer_levels(root)
+    lodgs("data.scenes").make_room(root, 1)
     assert not root.lodgs.tables and lodgs("data.scenes").read_levels(root).tables == {}
 
 

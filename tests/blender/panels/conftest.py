@@ -33,6 +33,9 @@ class Notes:
         self.buttons.append(text)
         return SimpleNamespace()
 
+    def separator(self, **_):
+        pass
+
     def template_list(self, *_, **__):
         pass
 

@@ -1,5 +1,7 @@
 """What the Detail panel offers for every rule, and says where there is none; and what it says of chunks."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -142,3 +144,30 @@ def test_splats_without_chunks_say_so(bpy, root, draw):
     bpy.context.view_layer.update()
     notes = draw()
     assert "These splats have no chunks." in notes.texts and "hide_viewport" not in notes.properties
+
+
+def test_distances_and_what_they_cost_are_told_in_blenders_units(bpy, lodgs, draw_panel, tmp_path):
+    from training.scenes.images import write_png
+
+    collection = bpy.data.collections.new("town")
+    bpy.context.scene.collection.children.link(collection)
+    root = bpy.data.objects.new("town", None)
+    collection.objects.link(root)
+    root.lodgs.is_root, root.scale = True, (2, 2, 2)
+    bundles, scenes = lodgs("training.splats.bundle"), lodgs("data.scenes")
+    scenes.set_level(root, bundles.Level(1, bundles.NO_SPLATS))
+    bpy.context.view_layer.update()
+    panel = lodgs("panels.levels_costs").LODGS_PT_costs
+    assert not panel.poll(bpy.context)
+    meta = {"costs": [{"level": 2, "distances": [3, 7.1], "costs": [812, 301], "before": 900}]}
+    root.lodgs.meta = json.dumps(meta)
+    assert panel.poll(bpy.context)
+    notes = draw_panel("levels_costs", "LODGS_PT_costs")
+    assert notes.texts[1:] == ["Level 2 from 14.2 m: 900 → 301"] and not notes.operators
+    with pytest.raises(RuntimeError, match="No run with a cost curve"):
+        bpy.ops.lodgs.show_costs()
+    root.lodgs.training.run = str(tmp_path)
+    write_png(tmp_path / "costs.png", np.zeros((540, 960, 3), np.uint8))
+    assert draw_panel("levels_costs", "LODGS_PT_costs").operators == ["lodgs.show_costs"]
+    assert bpy.ops.lodgs.show_costs() == {"FINISHED"}
+    assert tuple(bpy.data.images["costs.png"].size) == (960, 540)

@@ -46,6 +46,25 @@ def test_before_training(root, draw, fake):
     assert "3,000 steps" in draw().texts
 
 
+def test_splats_alone_ask_for_views_of_them(bpy, lodgs, root, draw, fake):
+    root.lodgs.scene_folder = ""
+    assert draw().operators == [] and "Not imported from photographs: nothing to train on." in draw().texts
+    splats = lodgs("training.splats.bundle").NO_SPLATS
+    lodgs("data.scenes").set_level(root, lodgs("training.splats.bundle").Level(1, splats))
+    assert "FLoD needs photographs, and these splats have none." in draw().texts and not draw().operators
+    settings = root.lodgs.training
+    settings.method = "lodge"
+    begin = ["method", "preset", "image_scale", "views_from"]
+    assert draw().properties == [*begin, "views", "view_width"] and draw().operators == ["lodgs.train"]
+    assert "720 steps in 3 levels" in draw().texts  # none of them are the finest level's
+    settings.views_from = "CURVE"
+    assert draw().properties == [*begin, "curve", "views", "view_width"]
+    settings.views_from = "CAMERAS"
+    assert draw().properties == [*begin, "view_width"] and "0 cameras" in draw().texts
+    advanced = draw("LODGS_PT_training_advanced").properties
+    assert "model" not in advanced and "images" not in advanced and "seed" in advanced
+
+
 def test_a_parameter_shows_the_presets_number_until_it_is_set(root, draw):
     settings = root.lodgs.training
     common = ["seed", "use_test_every", "preset_test_every", "model", "images", "output"]
@@ -98,7 +117,7 @@ def test_while_training(draw, watch):
     assert "Starting the trainer" in draw().texts
     watch.message = "Preparing to train (the first time on a computer)"
     assert {"Preparing to train", "The first time on a computer"} <= set(draw().texts)
-    watch.message = "Level 2 of 5"
+    watch.message, watch.share = "Level 2 of 5", 1500 / 4300
     watch.progress = {
         "level": 2, "levels": 5, "step": 1500, "of": 4300, "loss": 0.1234, "psnr": 21.5, "splats": 12345,
         "steps_per_s": 12.34, "eta_s": 227.0,

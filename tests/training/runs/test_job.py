@@ -46,6 +46,16 @@ def test_one_number_serves_every_level_and_fewer_levels_keep_the_finest():
     assert parameters.steps == Job("s", "o").resolved_parameters().steps[-3:]
 
 
+def test_what_lies_in_the_run_is_found_where_the_run_lies(tmp_path):
+    run = tmp_path / "run"
+    values = {"out": str(run), "method": "lodge", "base": str(run / "base.ply"), "capture": str(run / "dome")}
+    Job.from_dict(values).write(run / "job.toml")
+    moved = Job.from_file((run.rename(tmp_path / "moved")) / "job.toml")
+    places = [str(tmp_path / "moved" / name) for name in ("base.ply", "dome")]
+    assert [moved.base, moved.capture] == places and moved.out == str(tmp_path / "moved")
+    assert (moved.scene, Job.from_dict(values | {"capture": "dome"}).capture) == ("", "dome")
+
+
 @pytest.mark.parametrize(
     "text, said",
     [
@@ -65,6 +75,18 @@ def test_one_number_serves_every_level_and_fewer_levels_keep_the_finest():
         ('scene = "a"\nout = "b"\n[parameters]\nrho = "four"\n', "rho = 'four'"),
         ('scene = "a"\nout = "b"\n[parameters]\nmax_splats = true\n', "max_splats = True"),
         ('scene = "a"\nout = "b"\n[parameters]\nrejoin_points = 1\n', "rejoin_points = 1"),
+        ('out = "b"\ncapture = "dome"\n', "no splats to capture views of"),
+        (
+            'scene = "a"\nout = "b"\ncapture = "dome"\nbase = "c"\nmethod = "lodge"\n',
+            "both 'capture' and 'scene'",
+        ),
+        ('out = "b"\ncapture = "dome"\nbase = "c"\n', "method 'flod' cannot begin with the splats"),
+        ('out = "b"\ncapture = 3\nbase = "c"\n', "capture = 3 is not a path"),
+        ('out = "b"\ncapture = "dome"\nbase = "c"\nmethod = "lodge"\nviews = 1\n', "views = 1"),
+        (
+            'out = "b"\ncapture = "dome"\nbase = "c"\nmethod = "lodge"\nview_width = 9000\n',
+            "view_width = 9000",
+        ),
         ("scene = \n", "is not valid"),
         ('scene = "a"\nout = "b"\nexposure = nan\n', "exposure = nan is not a finite number"),
         ('scene = "a"\nout = "b"\nexposure = 33\n', "exposure = 33 is not possible"),

@@ -72,7 +72,11 @@ class LodgeParameters(ThreedgsParameters):
 
     @property
     def total_steps(self) -> int:
-        return self.steps + self.level_steps * (self.levels - 1)
+        return self.steps + self.base_steps
+
+    @property
+    def base_steps(self) -> int:
+        return self.level_steps * (self.levels - 1)
 
     @property
     def level_steps(self) -> int:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
 
 from ...rasterize import rasterize
 from ...scenes.cameras import Camera, evenly
-from .composite import IndexedLevel, Stack, filtered, rows_seen
+from .composite import IndexedLevel, Rows, Stack, filtered, rows_seen
 
+MOST_CURVES = 5
+"""Of more levels than this, a bundle's head has no room for what was tried."""
 VIEWS = 8
 """So many training views tell the cost."""
 TRIED, NEAREST, FARTHEST = 9, 0.05, 0.9
@@ -48,7 +51,7 @@ class Thresholds:
     @torch.no_grad()
     def next(
         self, levels: Mapping[int, IndexedLevel], d_l: Mapping[int, float]
-    ) -> tuple[float, dict[str, list[float]]]:
+    ) -> tuple[float, dict[str, Any]]:
         """The distance of the next coarser level.
 
         Args:
@@ -56,11 +59,14 @@ class Thresholds:
             d_l: their distances, in scene units.
 
         Returns:
-            The distance; and for a report the ``distances`` that were tried with the ``costs`` of each.
+            The distance; and for a report the ``distances`` that were tried with the ``costs`` of each, and
+            the cost ``before``, without the level; in few digits, because the bundle's head has little room.
         """
         tried = self._candidates(next(iter(levels.values())), STANDING_APART * max(d_l.values()))
-        costs = [self.cost(levels, d_l, distance) for distance in tried]
-        return tried[int(np.argmin(costs))], {"distances": tried, "costs": costs}
+        costs = [_short(self.cost(levels, d_l, distance)) for distance in tried]
+        alone = [(camera, rows_seen(levels, d_l, camera, self._near)) for camera in self._cameras]
+        before = _short(self._mean_in_tiles(Stack(levels, self._antialias), alone))
+        return tried[int(np.argmin(costs))], {"distances": tried, "costs": costs, "before": before}
 
     def cost(self, levels: Mapping[int, IndexedLevel], d_l: Mapping[int, float], distance: float) -> float:
         """How many splats a tile of 16x16 pixels has to look at, on average, with one more level.
@@ -74,9 +80,14 @@ class Thresholds:
         pictures = [(camera, rows_seen(levels, d_l, camera, self._near)) for camera in self._cameras]
         found = stack.importance(pictures, self._near, self._backend)[stack.part[number]].numpy()
         kept = found >= self._prune_weight
+        pruned = [(camera, {**rows, number: rows[number][kept[rows[number]]]}) for camera, rows in pictures]
+        return self._mean_in_tiles(stack, pruned)
+
+    def _mean_in_tiles(self, stack: Stack, pictures: Iterable[tuple[Camera, Rows]]) -> float:
+        """How many splats a tile has to look at, on average over pictures."""
         tiles = []
         for camera, rows in pictures:
-            some = stack.rows({**rows, number: rows[number][kept[rows[number]]]})
+            some = stack.rows(rows)
             drawn = rasterize(
                 stack.gaussians, camera, near=self._near, antialias=self._antialias, rows=some,
                 backend=self._backend,
@@ -93,4 +104,9 @@ class Thresholds:
         seen = [distances for distances in seen if len(distances)] or [np.array([least])]
         near = max(min(float(np.quantile(distances, NEAREST)) for distances in seen), least)
         far = float(np.quantile(np.concatenate(seen), FARTHEST))
-        return [float(d) for d in np.geomspace(near, max(far, near), TRIED)]
+        return [_short(d) for d in np.geomspace(near, max(far, near), TRIED)]
+
+
+def _short(number: float) -> float:
+    """The number in four digits."""
+    return float(f"{number:.4g}")

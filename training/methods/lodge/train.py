@@ -29,7 +29,7 @@ from ..start import from_splats
 from ..threedgs import train as threedgs_train
 from . import ROUNDS, LodgeParameters, chunks
 from .composite import IndexedLevel, Stack, filtered, rows_seen, seen_from_afar, together
-from .thresholds import Thresholds
+from .thresholds import MOST_CURVES, Thresholds
 
 FAR_VIEWS = 2
 """A place that so many training views have from a level's distance or farther is tuned and pruned by them."""
@@ -99,7 +99,7 @@ class Method(threedgs_train.Method):
     @property
     def tuned_steps(self) -> int:
         """So many steps come before the chunks."""
-        return self.finest_steps + self.parameters.level_steps * (self.levels - 1)
+        return self.finest_steps + self.parameters.base_steps
 
     @property
     def levels(self) -> int:
@@ -147,7 +147,8 @@ class Method(threedgs_train.Method):
         }
 
     def meta(self) -> dict:
-        return {**super().meta(), "filter_variance": self.parameters.filter_variance, "costs": self.costs}
+        found = {"costs": self.costs} if self.levels <= MOST_CURVES else {}
+        return {**super().meta(), "filter_variance": self.parameters.filter_variance, **found}
 
     # -- a step ----------------------------------------------------------------------------------------
 

@@ -13,12 +13,12 @@ from training.lod.selection import select, settings
 from training.methods import create, method_info
 from training.methods.lodge import LodgeParameters
 from training.methods.lodge.composite import IndexedLevel, Stack, rows_seen, together
-from training.methods.lodge.thresholds import Thresholds
+from training.methods.lodge.thresholds import MOST_CURVES, TRIED, Thresholds
 from training.methods.parameters import override
 from training.methods.threedgs.train import WEIGHED_AT
 from training.rasterize import Gaussians, contributions, rasterize
 from training.scenes.cameras import Camera
-from training.splats.bundle import Bundle
+from training.splats.bundle import MOST_LEVELS, Bundle, Level, read_bundle, write_bundle
 from training.splats.gaussians import Splats
 
 
@@ -214,6 +214,7 @@ def test_the_cost_of_distances_by_hand():
     # smoothed by 8 px the far one reaches the corners of the picture
     wide = Thresholds([camera], 0.01, "cpu", prune_weight=0.0, std=lambda d: d / 5)
     assert wide.cost(levels, d_l, 5.0) == pytest.approx((4 + 16) / 16)
+    assert thresholds.next(levels, d_l)[1]["before"] == pytest.approx((4 + 4) / 16)
     # and where nothing of it is left, it costs nothing
     gone = Thresholds([camera], 0.01, "cpu", prune_weight=0.9, std=lambda d: d / 5)
     assert gone.cost(levels, d_l, 5.0) == pytest.approx(4 / 16)
@@ -226,6 +227,22 @@ def test_the_distance_found_is_the_cheapest_that_was_tried(data, base):
     for cost in lodge.costs:
         assert len(cost["distances"]) == len(cost["costs"]) >= 1
         assert lodge.d_l[cost["level"]] == cost["distances"][int(np.argmin(cost["costs"]))]
+
+
+@pytest.mark.parametrize("count", [MOST_CURVES, MOST_LEVELS])
+def test_the_head_of_a_bundle_has_room_for_what_was_tried(data, base, tmp_path, count):
+    lodge = make(data, base, levels=count)
+    odd = [123.4] * TRIED
+    lodge.costs = [
+        {"level": number, "distances": odd, "costs": odd, "before": 123.4} for number in range(1, count)
+    ]
+    splats = replace(base, extras={"chunks_0": np.zeros(len(base), np.float32)})
+    levels = [Level(number, splats, {"d_l": 100 / 3 * number}) for number in range(1, count + 1)]
+    meta = lodge.meta() | {"up_rotation": np.full((3, 3), -0.123456).tolist(), "seed": 1, "held_out": [0, 8]}
+    tables = {"chunks": {"x": np.zeros(1, np.float32)}}
+    write_bundle(tmp_path / "bundle.ply", Bundle("lodge", levels, "chunks", meta=meta, tables=tables))
+    read = read_bundle(tmp_path / "bundle.ply").meta
+    assert read.get("costs", []) == (lodge.costs if count == MOST_CURVES else [])
 
 
 @pytest.mark.parametrize("stop", [11, 12, 14, 15, 21])

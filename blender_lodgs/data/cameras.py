@@ -69,21 +69,38 @@ def _world_to_camera(obj: bpy.types.Object) -> np.ndarray:
 
 
 def view_from(
-    root: bpy.types.Object, depsgraph: bpy.types.Depsgraph, width: int, height: int
+    root: bpy.types.Object,
+    depsgraph: bpy.types.Depsgraph,
+    width: int,
+    height: int,
+    obj: bpy.types.Object | None = None,
 ) -> tuple[Camera, float]:
-    """What the scene's camera sees, in the coordinates of a splat scene, which are those of its files.
+    """What a camera sees, in the coordinates of a splat scene, which are those of its files.
+
+    Args:
+        obj: a camera; None for the one that the scene is rendered through.
 
     Raises:
         LodgsError: there is no camera to render through, or the root is stretched.
     """
-    obj = scene_camera(depsgraph.scene).evaluated_get(depsgraph)
-    camera, near = view_of(obj, depsgraph, width, height)
-    matrix = np.array(root.evaluated_get(depsgraph).matrix_world, np.float64)
+    obj = obj or scene_camera(depsgraph.scene)
+    camera, near = view_of(obj.evaluated_get(depsgraph), depsgraph, width, height)
+    matrix = matrix_of(root.evaluated_get(depsgraph))
+    inside, unit = camera.within(matrix)
+    return inside, near / unit
+
+
+def matrix_of(root: bpy.types.Object) -> np.ndarray:
+    """(4, 4) float64 from the coordinates of a splat scene to Blender's world.
+
+    Raises:
+        LodgsError: the root is stretched.
+    """
+    matrix = np.array(root.matrix_world, np.float64)
     scales = np.linalg.norm(matrix[:3, :3], axis=0)
     if scales.min() <= 0 or scales.max() > 1.0001 * scales.min() or np.linalg.det(matrix[:3, :3]) <= 0:
         raise LodgsError(
             f"'{root.name}' is stretched, which no camera of its files can show.",
             "Give it one scale for all axes.",
         )
-    inside, unit = camera.within(matrix)
-    return inside, near / unit
+    return matrix

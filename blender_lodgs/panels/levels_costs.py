@@ -1,0 +1,45 @@
+"""From where on each level is shown, and what that saves: below the list of levels, registered after it."""
+
+from __future__ import annotations
+
+import bpy
+
+from ...training.evaluate.costs import cost_lines
+from ..data import scenes, selection
+from ..runs import jobs
+from .parts import LevelsPanel
+
+
+class LODGS_PT_costs(LevelsPanel):
+    bl_label = "Distances"
+    bl_parent_id = "LODGS_PT_levels"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context):
+        root = scenes.root_with_levels(context)
+        return root is not None and bool(_lines(context, root))
+
+    def draw(self, context):
+        root = scenes.active_root(context)
+        column = self.layout.column(align=True)
+        column.label(text="Splats in a tile of the picture:")
+        for line in _lines(context, root):
+            column.label(text=line)
+        if jobs.cost_plot(root) is not None:
+            self.layout.operator("lodgs.show_costs", icon="GRAPH")
+
+
+def _lines(context: bpy.types.Context, root: bpy.types.Object) -> list[str]:
+    """What the distances are and cost, in Blender's units."""
+    units, scale = context.scene.unit_settings, max(root.matrix_world.to_scale())
+
+    def length(value: float) -> str:
+        return bpy.utils.units.to_string(
+            units.system, "LENGTH", value * scale * units.scale_length, precision=3
+        )
+
+    return cost_lines(selection.read_json(root.lodgs.meta), length)
+
+
+CLASSES = (LODGS_PT_costs,)

@@ -1,0 +1,215 @@
+"""Splats alone become a scene: its pictures are theirs, its points lie on them, and LODGE trains from it."""
+
+import json
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from training.__main__ import main
+from training.errors import LodgsError
+from training.evaluate.costs import cost_curves
+from training.rasterize import Gaussians, rasterize
+from training.runs import capture
+from training.runs.capture import read_views, write_scene
+from training.runs.folder import RunFolder
+from training.scenes.cameras import write_camera
+from training.scenes.colmap import read_scene
+from training.scenes.images import load_image
+from training.scenes.viewpoints import dome, walk
+from training.splats.bundle import read_bundle
+from training.splats.gaussians import Splats
+from training.splats.ply import write_ply
+
+
+@pytest.fixture(scope="module")
+def ball() -> Splats:
+    """Opaque splats on a sphere of radius 2 about (5, -1, 3), and one astray far away."""
+    rng = np.random.default_rng(1)
+    out = rng.normal(size=(600, 3))
+    means = 2 * out / np.linalg.norm(out, axis=1, keepdims=True) + [5, -1, 3]
+    means[0] = [900, 0, 0]
+    return Splats(
+        means.astype(np.float32), np.tile(np.float32([1, 0, 0, 0]), (600, 1)),
+        np.full((600, 3), np.log(0.12), np.float32), np.full(600, 4.0, np.float32),
+        rng.normal(0, 1, (600, 1, 3)).astype(np.float32),
+    )  # fmt: skip
+
+
+def test_a_dome_shows_all_that_is_not_astray_from_all_sides(ball):
+    views, near = dome(ball, 24, 96, 64)
+    eyes = np.array([view.center for view in views]) - [5, -1, 3]
+    assert np.linalg.norm(eyes.mean(axis=0)) < 0.25 * np.linalg.norm(eyes, axis=1).mean()
+    for view in views:
+        assert view.sees(ball.means[1:], near=near).all()
+    assert 0 < near < np.linalg.norm(eyes, axis=1).min() - 2
+
+
+def test_the_scene_has_the_splats_own_pictures_and_points_on_them(ball, tmp_path):
+    views, near = dome(ball, 12, 96, 64)
+    count = write_scene(tmp_path / "scene", ball, views, near, points=2000)
+    scene = read_scene(tmp_path / "scene")
+    assert len(scene.points) == count > 100 and len(scene.cameras) == 12
+    away = np.linalg.norm(scene.points - [5, -1, 3], axis=1)
+    assert np.quantile(np.abs(away - 2), 0.95) < 0.25
+    for view, camera in zip(views, scene.cameras, strict=True):
+        np.testing.assert_allclose(camera.world_to_camera, view.world_to_camera, atol=1e-9)
+        drawn = rasterize(Gaussians.of(ball), view, near=near, backend="reference").image.numpy().clip(0, 1)
+        photograph = load_image(camera.image, 96, 64)
+        assert np.abs(photograph - drawn).mean() < 0.02  # it is a JPEG
+
+
+def test_pictures_of_antialiased_splats_are_so(ball, tmp_path):
+    views, near = dome(ball, 6, 96, 64)
+    small = replace(ball, log_scales=ball.log_scales - np.float32(1))
+    for view in views:
+        write_camera(tmp_path / "cameras" / f"{view.name}.json", view, near)
+    write_ply(tmp_path / "small.ply", small, ["SplatRenderMode: mip"])
+    command = ["capture", str(tmp_path / "small.ply"), "--cameras", str(tmp_path / "cameras")]
+    assert main([*command, "--out", str(tmp_path / "scene")]) == 0
+    for view, camera in zip(views, read_scene(tmp_path / "scene").cameras, strict=True):
+        photograph = load_image(camera.image, 96, 64)
+        errors = [
+            np.abs(
+                rasterize(Gaussians.of(small), view, near=near, antialias=flag, backend="reference")
+                .image.numpy()
+                .clip(0, 1)
+                - photograph
+            ).mean()
+            for flag in (True, False)
+        ]
+        assert errors[0] < 0.02 and errors[0] < errors[1] / 2
+
+
+def test_nothing_is_overwritten_and_nothing_half_is_left(ball, tmp_path):
+    views, near = dome(ball, 4, 48, 32)
+    (tmp_path / "there").mkdir()
+    with pytest.raises(LodgsError, match="exists already"):
+        write_scene(tmp_path / "there", ball, views, near)
+    unseen = Splats(**{**vars(ball), "means": ball.means + np.float32(1e4)})
+    with pytest.raises(LodgsError, match="No two views"):
+        write_scene(tmp_path / "new", unseen, views, near)
+    assert [path.name for path in tmp_path.iterdir()] == ["there"] and not any((tmp_path / "there").iterdir())
+    faint = Splats(**{**vars(ball), "opacity_logits": np.full(600, -3, np.float32)})
+    with pytest.raises(LodgsError, match="no opaque splat"):
+        dome(faint, 4)
+
+
+def test_views_along_a_way_are_level_and_look_all_around(ball):
+    way = np.array([[0, 0, 0], [3, 0, 0], [3, 0, 0], [3, 0.6, 9]], float)  # -y is up: it leads down a little
+    views, near = walk(ball, way, np.array([0.0, -2, 0]), 24, 96, 64)
+    eyes = np.array([view.center for view in views])
+    on_first = eyes[:, 2] < 1e-9
+    np.testing.assert_allclose(eyes[on_first, 1:], 0, atol=1e-9)
+    np.testing.assert_allclose(eyes[~on_first, 0], 3, atol=1e-9)
+    steps = np.linalg.norm(np.diff(eyes, axis=0), axis=1)
+    assert np.median(steps) == pytest.approx((3 + np.hypot(0.6, 9)) / 24)
+    _, down, ahead = np.array([view.world_to_camera[:3, :3] for view in views]).transpose(1, 0, 2)
+    np.testing.assert_allclose(ahead[:, 1], 0, atol=1e-9)
+    np.testing.assert_allclose(down, np.tile([0, 1, 0], (24, 1)), atol=1e-9)
+    np.testing.assert_allclose(ahead[0], [1, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(ahead[-6], [0, 0, 1], atol=1e-9)
+    about = np.sort(np.degrees(np.arctan2(ahead[-6:, 0], ahead[-6:, 2])) % 360)
+    np.testing.assert_allclose(np.diff(about), 60, atol=1e-9)
+    turned = np.cross(ahead[-6], ahead[-5])  # the first side is the left one, seen with -y up
+    assert turned[1] < 0 < near < 1
+    for odd in (way[:1], np.array([[0, 0, 0], [0, 5, 0]], float)):
+        with pytest.raises(LodgsError, match="no length, or leads straight up"):
+            walk(ball, odd, np.array([0.0, -1, 0]), 6)
+
+
+@pytest.fixture
+def cameras(ball, tmp_path):
+    """A folder of camera files, of two lenses."""
+    views, near = dome(ball, 8, 96, 64)
+    for number, view in enumerate(views):
+        write_camera(
+            tmp_path / "cameras" / f"{view.name}.json", view.resized(48, 32) if number % 2 else view, near
+        )
+    return tmp_path / "cameras"
+
+
+def test_views_may_have_lenses_of_their_own(ball, cameras, tmp_path):
+    views, near = read_views(cameras)
+    assert near > 0 and len({view.focal for view in views}) == 2
+    assert write_scene(tmp_path / "scene", ball, views, near, points=2000) > 10
+    for view, camera in zip(views, read_scene(tmp_path / "scene").cameras, strict=True):
+        assert camera.name == f"{view.name}.jpg"
+        assert (camera.width, camera.fx, camera.cy) == (view.width, view.fx, view.cy)
+        np.testing.assert_allclose(camera.world_to_camera, view.world_to_camera, atol=1e-9)
+
+
+QUICK = ["--set", "tune_steps=4", "--set", "levels=2", "--image-scale", "1"]
+
+
+@pytest.mark.slow
+def test_from_a_ply_alone_to_levels_in_a_shell(ball, cameras, tmp_path, capsys):
+    """In two commands, and in one: the same views give the same levels."""
+    write_ply(tmp_path / "ball.ply", ball)
+    source, scene = str(tmp_path / "ball.ply"), str(tmp_path / "scene")
+    assert main(["capture", source, "--out", scene, "--cameras", str(cameras)]) == 0
+    assert "8 views" in capsys.readouterr().out
+    training = ["train", *QUICK, "--method", "lodge", "--base", source]
+    for name, where in (("two", ["--scene", scene]), ("one", ["--capture", str(cameras)])):
+        assert main([*training, *where, "--out", str(tmp_path / name)]) == 0
+        assert json.loads(capsys.readouterr().out.splitlines()[-1])["event"] == "done"
+    two, one = (read_bundle(RunFolder(tmp_path / name).bundle) for name in ("two", "one"))
+    assert [level.number for level in one.levels] == [1, 2] and one.rule == "chunks"
+    finest = one.levels[-1].splats
+    finest, base = (splats.select(np.lexsort(splats.means.T)) for splats in (finest, ball))
+    for name in ("means", "quats", "log_scales", "opacity_logits"):
+        np.testing.assert_array_equal(getattr(finest, name), getattr(base, name))
+    np.testing.assert_array_equal(finest.sh[:, :1], base.sh)
+    np.testing.assert_array_equal(one.levels[0].splats.means, two.levels[0].splats.means)
+    assert len(cost_curves(one.meta)) == 1 and (tmp_path / "one" / "costs.png").stat().st_size > 1000
+    drawn = [e for e in RunFolder(tmp_path / "one").events()[0] if e.get("of") == 8]
+    assert [e["step"] for e in drawn] == list(range(1, 9)) and drawn[2]["message"] == "Drawing view 3 of 8"
+
+
+@pytest.mark.slow
+def test_a_capture_that_is_cancelled_leaves_nothing_and_goes_on_where_the_run_lies_now(
+    ball, tmp_path, capsys, monkeypatch
+):
+    run = RunFolder(tmp_path / "run")
+    run.make()
+    write_ply(run.base, ball)
+    words = [
+        "--base",
+        str(run.base),
+        "--capture",
+        "dome",
+        "--views",
+        "6",
+        "--view-width",
+        "48",
+        "--seed",
+        "1",
+    ]
+    draw = capture.rasterize
+
+    def cancelled(*arguments, **options):
+        run.request_cancel()
+        time.sleep(10)
+        raise AssertionError("nobody has heard it")
+
+    monkeypatch.setattr(capture, "rasterize", cancelled)
+    assert main(["train", *QUICK, "--method", "lodge", *words, "--out", str(run.path)]) == 3
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["event"] == "cancelled"
+    assert not run.captured.exists() and not list(run.path.glob(".captured*"))
+    monkeypatch.setattr(capture, "rasterize", draw)
+    moved = RunFolder(run.path.rename(tmp_path / "elsewhere"))
+    assert main(["train", str(moved.job)]) == 0
+    assert len(list((moved.captured / "images").iterdir())) == 6 and read_bundle(moved.bundle).levels
+    assert main(["evaluate", str(moved.path)]) == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [(["--cameras", "."], "no two camera files"), (["--views", "1"], "views = 1 is not possible")],
+)
+def test_a_capture_says_what_it_lacks(ball, tmp_path, capsys, monkeypatch, words, what):
+    monkeypatch.chdir(tmp_path)
+    write_ply(tmp_path / "ball.ply", ball)
+    assert main(["capture", "ball.ply", "--out", "scene", *words]) == 2
+    assert what in capsys.readouterr().err and not (tmp_path / "scene").exists()

@@ -1,0 +1,98 @@
+"""Where to look at splats from that no photograph shows: from all around, or along a way. numpy only."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import LodgsError
+from ..splats.gaussians import Splats
+from .cameras import Camera, look_at
+
+INSIDE = 0.9
+"""The share of opaque splats that a dome is to show whole."""
+OPAQUE = 0.5
+DOMES = (1.1, 2.2)
+"""Radii of a dome's two shells, in multiples of the distance from which the splats fill the picture."""
+UP = (0.0, -1.0, 0.0)
+"""As in most COLMAP worlds."""
+NEAR = 0.01
+"""Depth at which drawing begins, as a share of the distance to the splats' middle."""
+FOCAL = 1.2
+"""Focal length of the views, in heights of their picture."""
+TURNS = (0, 60, -60, 180, 120, -120)
+"""Where views along a way look, one after the other, in degrees from ahead: together all around."""
+
+
+def dome(splats: Splats, count: int, width: int = 960, height: int = 640) -> tuple[list[Camera], float]:
+    """Views of splats from all around, on two shells, and the depth at which drawing begins.
+
+    Which way is up, and whether splats are to be seen from inside, they do not say: for a room or a street
+    give a way to walk, or cameras of your own.
+
+    Raises:
+        LodgsError: there is no opaque splat to look at.
+    """
+    opaque = _opaque(splats)
+    middle = np.median(opaque, axis=0)
+    radius = max(float(np.quantile(np.linalg.norm(opaque - middle, axis=1), INSIDE)), 1e-6)
+    fills = radius * np.hypot(1, 2 * FOCAL)  # a ball of that radius meets the upper and lower edge
+    number = np.arange(count)
+    z, turn = 1 - (2 * number + 1) / count, number * 2.399963  # evenly, along a spiral
+    ring = np.sqrt(1 - z**2)
+    away = np.stack([ring * np.cos(turn), z, ring * np.sin(turn)], axis=1)
+    eyes = middle + fills * np.where(number % 2, *DOMES)[:, None] * away
+    lens = _lens(width, height)
+    views = [Camera(f"dome_{n:04d}", *lens, look_at(eye, middle, UP)) for n, eye in enumerate(eyes)]
+    return views, NEAR * fills
+
+
+def walk(
+    splats: Splats, way: np.ndarray, up: np.ndarray, count: int, width: int = 960, height: int = 640
+) -> tuple[list[Camera], float]:
+    """Views evenly along a way, level, that look ahead, to both sides and back in turn.
+
+    Args:
+        way: (P, 3) its corners, in the splats' world.
+        up: (3,) what is up in the pictures, in the splats' world.
+
+    Returns:
+        The views and, as for a dome, the depth at which drawing begins.
+
+    Raises:
+        LodgsError: the way has no length or leads straight up, or there is no opaque splat to look at.
+    """
+    lengths = np.linalg.norm(np.diff(way, axis=0), axis=1)
+    along = np.concatenate([[0], np.cumsum(lengths)])
+    places = (np.arange(count) + 0.5) / count * along[-1]
+
+    def at(places: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(places, along, coordinate) for coordinate in way.T], axis=1)
+
+    pause = along[-1] / count / 2
+    eyes, ahead = at(places), at(places + pause) - at(places - pause)
+    up = up / np.linalg.norm(up)
+    level = ahead - (ahead @ up)[:, None] * up
+    if not (np.linalg.norm(level, axis=1) > 1e-6 * pause).all():
+        raise LodgsError("The way to walk has no length, or leads straight up.", "Choose another curve.")
+    level /= np.linalg.norm(level, axis=1)[:, None]
+    turn = np.radians(np.resize(TURNS, count))[:, None]
+    looks = np.cos(turn) * level + np.sin(turn) * np.cross(up, level)
+    lens = _lens(width, height)
+    views = [
+        Camera(f"walk_{n:04d}", *lens, look_at(eye, eye + look, up))
+        for n, (eye, look) in enumerate(zip(eyes, looks, strict=True))
+    ]
+    away = np.linalg.norm(_opaque(splats) - np.median(eyes, axis=0), axis=1)
+    return views, NEAR * float(np.median(away))
+
+
+def _opaque(splats: Splats) -> np.ndarray:
+    """Where opaque splats are, (N, 3) float64."""
+    means = splats.means[splats.opacity_logits > np.log(OPAQUE / (1 - OPAQUE))].astype(np.float64)
+    if not len(means):
+        raise LodgsError("There is no opaque splat to look at.", "Give cameras of your own.")
+    return means
+
+
+def _lens(width: int, height: int) -> tuple[int, int, float, float, float, float]:
+    return width, height, FOCAL * height, FOCAL * height, width / 2, height / 2
