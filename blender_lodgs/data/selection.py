@@ -9,53 +9,19 @@ modifier gives the rule's arguments back: :func:`choice`.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import bpy
 import numpy as np
 
 from ...training.errors import LodgsError
-from ...training.lod.rule import Rule, facts_of, find_rule, rules
+from ...training.lod.choice import Choice
+from ...training.lod.rule import Rule, fact_names, facts_of, find_rule
 from .. import compat
 from ..nodes import rules as groups
 from ..nodes.building import edited
 from ..nodes.display import NAME as DISPLAY
-
-
-@dataclass(frozen=True)
-class Choice:
-    """By what a level's splats are chosen: a rule with all its arguments but the splats. Choices compare.
-
-    Attributes:
-        rule: its name.
-        eye: in the splats' own space.
-        focal_px: the eye's focal length in pixels.
-        facts, values: see ``training.lod.rule``, as pairs.
-    """
-
-    rule: str
-    eye: tuple[float, float, float]
-    focal_px: float
-    facts: tuple[tuple[str, float], ...]
-    values: tuple[tuple[str, float], ...]
-
-    def weights(self, means: np.ndarray, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-        """(N,) weights of splats at means (N, 3) with the rule's columns (N,) by name."""
-        rule = rules()[self.rule]
-        eye, facts, values = np.float32(self.eye), dict(self.facts), dict(self.values)
-        return rule.weights(means, eye, self.focal_px, columns, facts, values)
-
-    def wanted_level(self, means: np.ndarray) -> np.ndarray:
-        """(N,) the level that is wanted at each place."""
-        eye, facts, values = np.float32(self.eye), dict(self.facts), dict(self.values)
-        return rules()[self.rule].wanted_level(means, eye, self.focal_px, facts, values)
-
-    def coarser(self, levels: Sequence[int]) -> Choice | None:
-        """The next coarser choice, where there is one."""
-        values = rules()[self.rule].coarser(dict(self.values), levels)
-        return None if values is None else replace(self, values=tuple(values.items()))
 
 
 def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Choice | None:
@@ -87,7 +53,7 @@ def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Choic
         rule.name,
         eye,
         value(groups.HELD_FOCAL if held else groups.FOCAL),
-        tuple((name, value(name)) for name in groups.fact_names(rule)),
+        tuple((name, value(name)) for name in fact_names(rule)),
         tuple((control.name, value(control.name)) for control in rule.controls),
     )
 

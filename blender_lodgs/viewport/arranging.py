@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ...training.lod.choice import Choice
 from ...training.lod.rule import OPACITY
-from ..data.selection import Choice
 
 WIDTH = 8192
 """Texels in a row of every texture that holds one texel for each of many splats."""

@@ -1,0 +1,76 @@
+"""By what one eye's splats of a level are chosen, as plain values: they compare, and travel as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .rule import Region, Tables, rules
+
+Column = tuple[str, str, bytes]
+"""A column of a table: its name, its type, its rows."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """By what a level's splats are chosen: a rule with all its arguments but the splats. Choices compare.
+
+    Attributes:
+        rule: its name.
+        eye: in the splats' own space.
+        focal_px: the eye's focal length in pixels.
+        facts, values: see ``rule.Rule.weights``, as pairs.
+        tables: those that the rule reads: name, columns by name, each as its type and its bytes.
+    """
+
+    rule: str
+    eye: tuple[float, float, float]
+    focal_px: float
+    facts: tuple[tuple[str, float], ...]
+    values: tuple[tuple[str, float], ...]
+    tables: tuple[tuple[str, tuple[Column, ...]], ...] = ()
+
+    def weights(self, means: np.ndarray, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+        """(N,) weights of splats at means (N, 3) with the rule's columns (N,) by name."""
+        rule = rules()[self.rule]
+        eye, facts, values = np.array(self.eye, np.float32), dict(self.facts), dict(self.values)
+        return rule.weights(means, eye, self.focal_px, columns, facts, values, self._tables())
+
+    def region(self) -> Region | None:
+        """See ``Rule.region``."""
+        return rules()[self.rule].region(np.array(self.eye, np.float32), dict(self.values), self._tables())
+
+    def loaded(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+        """(N,) bool: see ``Rule.loaded``, of the region that there must be."""
+        region = self.region()
+        assert region is not None
+        return rules()[self.rule].loaded(columns, region)
+
+    def wanted_level(self, means: np.ndarray) -> np.ndarray:
+        """(N,) the level that is wanted at each place."""
+        eye, facts, values = np.array(self.eye, np.float32), dict(self.facts), dict(self.values)
+        return rules()[self.rule].wanted_level(means, eye, self.focal_px, facts, values)
+
+    def coarser(self, levels: Sequence[int]) -> Choice | None:
+        """The next coarser choice, where there is one."""
+        values = rules()[self.rule].coarser(dict(self.values), levels)
+        return None if values is None else replace(self, values=tuple(values.items()))
+
+    def _tables(self) -> Tables:
+        return {
+            name: {column: np.frombuffer(rows, kind) for column, kind, rows in columns}
+            for name, columns in self.tables
+        }
+
+    def as_dict(self) -> dict:
+        """The same as JSON has it."""
+        tables = {
+            name: {column: rows.tolist() for column, rows in columns.items()}
+            for name, columns in self._tables().items()
+        }
+        return {
+            "rule": self.rule, "eye": list(self.eye), "focal_px": self.focal_px,
+            "facts": dict(self.facts), "values": dict(self.values), "tables": tables,
+        }  # fmt: skip
