@@ -3,8 +3,8 @@
 Import: a plain PLY of SH degree 3 from file to a level's object, against plyfile reading the same rows.
 Selection: evaluating two levels after the eye moved, against numpy's masks and copies of the same splats.
 Every ratio is of two times from one run.
-F12: frames of two levels by distance along a camera's way, what comes before drawing where the renderer chooses
-by itself, against splats copied out of Blender's evaluation, as where artists have modifiers of their own.
+F12: tiny frames of two levels by distance along a camera's way, where the renderer chooses by itself, against
+splats copied out of Blender's evaluation, as where artists have modifiers of their own.
 Viewport, where this Blender has graphics in background: what the main thread does after a camera move beside
 Blender's own evaluation (the rules, the list of splats onto the graphics card), what the thread beside it
 does (choosing and sorting), and how long all splats take onto the card, from their attributes.
@@ -19,6 +19,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import patch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
@@ -115,20 +116,19 @@ def two_levels(bpy, splats):
 def f12_seconds(bpy, count: int) -> tuple[float, float]:
     """Of a small frame after the camera moved, median of five: chosen by the renderer, and by Blender."""
     camera, seconds = two_levels(bpy, random_splats(count)), []
-    engine, scene = load("blender_lodgs.render.engine"), bpy.context.scene
-    camera.data.clip_start, root = 1.0, load("blender_lodgs.data.scenes").roots(scene)[0]
-    root.lodgs.eye, by_rule = "CAMERA", engine._chosen_by_rule
-    for chosen in (by_rule, lambda *args: False):
-        engine._chosen_by_rule, frames = chosen, []
-        for _ in range(6):
-            camera.location.x += 0.05
-            bpy.context.view_layer.update()
-            depsgraph = bpy.context.evaluated_depsgraph_get()
-            frames.append(
-                least(lambda depsgraph=depsgraph: engine.frame(depsgraph, 32, 18, (0, 0, 32, 18)), 1)
-            )
+    engine = load("blender_lodgs.render.engine")
+
+    def frame() -> None:
+        engine.frame(bpy.context.evaluated_depsgraph_get(), 32, 18, (0, 0, 32, 18))
+
+    for chosen in (engine._chosen_by_rule, lambda *args: False):
+        frames = []
+        with patch.object(engine, "_chosen_by_rule", chosen):
+            for _ in range(6):
+                camera.location.x += 0.05
+                bpy.context.view_layer.update()
+                frames.append(least(frame, 1))
         seconds.append(float(np.median(frames[1:])))
-    engine._chosen_by_rule = by_rule
     load("blender_lodgs.render.renderer").close()
     return seconds[0], seconds[1]
 
@@ -195,8 +195,8 @@ def main() -> None:
     if os.environ.get("LODGS_TRAINER_PYTHON"):
         chosen, copied = f12_seconds(bpy, COUNTS[-1])
         print(
-            f"F12, two levels of {COUNTS[-1]:,} splats, 32x18: {1e3 * chosen:.0f} ms a frame chosen by the renderer, "
-            f"{1e3 * copied:.0f} ms copied from Blender, ratio {chosen / copied:.2f}"
+            f"F12, two levels of {COUNTS[-1]:,} splats, 32x18: {1e3 * chosen:.0f} ms a frame chosen by the"
+            f" renderer, {1e3 * copied:.0f} ms copied from Blender, ratio {chosen / copied:.2f}"
         )
     else:
         print("F12: not measured, set LODGS_TRAINER_PYTHON")
