@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .rule import Region, Tables, rules
+from .rule import OPACITY, Region, Tables, every_column, rules
 
 Column = tuple[str, str, bytes]
 """A column of a table: its name, its type, its rows."""
@@ -74,3 +74,44 @@ class Choice:
             "rule": self.rule, "eye": list(self.eye), "focal_px": self.focal_px,
             "facts": dict(self.facts), "values": dict(self.values), "tables": tables,
         }  # fmt: skip
+
+
+class Chooser:
+    """The splats of one set, from which one choice after the other is made.
+
+    While the eye stays in a region (``Rule.region``), only what may be shown there is looked at.
+
+    Args:
+        means: (N, 3).
+        columns: (N,) by name, OPACITY among them; those that are missing are zeros.
+    """
+
+    def __init__(self, means: np.ndarray, columns: Mapping[str, np.ndarray]) -> None:
+        nothing = np.broadcast_to(np.float32(0), len(means))
+        self._means, self._columns = means, dict.fromkeys([*every_column(), OPACITY], nothing) | dict(columns)
+        self._near: tuple[str, Region, np.ndarray, np.ndarray, dict[str, np.ndarray]] | None = None
+        self._last: tuple[Choice, tuple[np.ndarray, np.ndarray]] | None = None
+
+    def chosen(self, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
+        """The splats that have a weight, (M,) ascending, and their weights (M,) float32.
+
+        Those of one choice are found once.
+        """
+        if self._last is None or self._last[0] != choice:
+            self._last = choice, self._choose(choice)
+        return self._last[1]
+
+    def _choose(self, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
+        region = choice.region()
+        if region is None:
+            weights = choice.weights(self._means, self._columns)
+            some = np.flatnonzero(weights > 0)
+            return some, weights[some].astype(np.float32)
+        if self._near is None or self._near[:2] != (choice.rule, region):
+            rows = np.flatnonzero(choice.loaded(self._columns))
+            columns = {name: self._columns[name][rows] for name in rules()[choice.rule].columns}
+            self._near = choice.rule, region, rows, self._means[rows], columns
+        _, _, rows, means, columns = self._near
+        weights = choice.weights(means, columns)
+        some = np.flatnonzero(weights > 0)
+        return rows[some], weights[some].astype(np.float32)

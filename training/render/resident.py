@@ -2,24 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import numpy as np
 
-from ..lod.choice import Choice
-from ..lod.rule import Region, rules
-from ..lod.selection import columns_of
+from ..lod.choice import Choice, Chooser
+from ..lod.rule import OPACITY
 from ..splats.gaussians import Splats
 from .scene import SplatSet
-
-
-@dataclass(frozen=True)
-class _Part:
-    """What a rule looks at of a set: which of its splats, ascending, their means, and its columns of them."""
-
-    rows: np.ndarray
-    means: np.ndarray
-    columns: dict[str, np.ndarray]
 
 
 class Resident:
@@ -35,35 +23,16 @@ class Resident:
     """
 
     def __init__(self, splats: Splats, weights: np.ndarray, backend: str) -> None:
-        self.drawn = SplatSet(splats, weights, backend)
-        self._weights = weights
-        nothing = np.zeros((len(splats), 0, 3), np.float32)
-        self._told = replace(splats, quats=nothing, log_scales=nothing, sh=nothing)  # on a GPU, all else is
-        self._whole: tuple[str, _Part] | None = None
-        self._near: tuple[str, Region, _Part] | None = None
-        self._last: tuple[Choice, np.ndarray] | None = None
+        self.drawn, self._weights = SplatSet(splats, weights, backend), weights
+        with np.errstate(over="ignore"):
+            opacities = 1 / (1 + np.exp(-splats.opacity_logits))
+        self._chooser = Chooser(splats.means, splats.extras | {OPACITY: opacities})
 
     def weights(self, choice: Choice | None) -> np.ndarray | None:
-        """The weights (N,) of a frame; None: the set's own. Those of one choice are found once."""
+        """The weights (N,) of a frame; None: the set's own."""
         if choice is None:
             return None
-        if self._last is None or self._last[0] != choice:
-            part, found = self._part(choice), np.zeros(len(self.drawn), np.float32)
-            found[part.rows] = choice.weights(part.means, part.columns)
-            self._last = choice, found * self._weights
-        return self._last[1]
-
-    def _part(self, choice: Choice) -> _Part:
-        """What a choice need look at: while the eye stays in a region, only what may be shown there."""
-        region, rule = choice.region(), rules()[choice.rule]
-        if self._whole is None or self._whole[0] != rule.name:
-            rows, columns = np.arange(len(self.drawn)), columns_of(rule, self._told)
-            self._whole = rule.name, _Part(rows, self._told.means, columns)
-        whole = self._whole[1]
-        if region is None:
-            return whole
-        if self._near is None or self._near[:2] != (rule.name, region):
-            rows = np.flatnonzero(choice.loaded(whole.columns))
-            columns = {name: column[rows] for name, column in whole.columns.items()}
-            self._near = rule.name, region, _Part(rows, whole.means[rows], columns)
-        return self._near[2]
+        some, found = self._chooser.chosen(choice)
+        weights = np.zeros(len(self.drawn), np.float32)
+        weights[some] = found * self._weights[some]
+        return weights

@@ -206,8 +206,8 @@ def test_a_group_that_an_artist_has_changed_is_followed_by_all(bpy, lodgs, half,
         splats, _ = placed.read()
         if placed.choice is None:
             return len(splats)
-        columns = lodgs("training.lod.selection").columns_of(rules()[placed.choice.rule], splats)
-        return np.count_nonzero(placed.choice.weights(splats.means, columns))
+        columns = splats.extras | {"opacity": 1 / (1 + np.exp(-splats.opacity_logits))}
+        return len(lodgs("training.lod.choice").Chooser(splats.means, columns).chosen(placed.choice)[0])
 
     def everything():
         return sum(len(item.object.data.points) for item in root.lodgs.levels if item.object.visible_get())
