@@ -17,6 +17,9 @@ SLANT = 1.3
 PIXELS = 2.0
 """What the image's filter adds to a projected splat's reach."""
 
+ROUNDING = 1e-4
+"""Share of a distance that single precision may get wrong."""
+
 
 @dataclass(frozen=True)
 class Blocks:
@@ -38,7 +41,8 @@ class Blocks:
         """The blocks of splats, (N, 3) each; few are tight unless rows are in :func:`spatial_order`."""
         begins = np.arange(0, len(means), SIZE)
         if not len(begins):
-            return cls(0, *np.zeros((2, 0, 3), np.float32), np.zeros(0, np.float32))
+            none = np.zeros((0, 3), np.float32)
+            return cls(0, none, none, none[:, 0])
         largest = np.maximum.reduceat(log_scales.max(axis=1), begins).astype(np.float64)
         return cls(
             len(means),
@@ -75,6 +79,11 @@ class Blocks:
         nearest = np.maximum(np.maximum(below, above), 0)
         farthest = np.maximum(np.abs(below), np.abs(above))
         return np.linalg.norm(nearest, axis=1), np.linalg.norm(farthest, axis=1)
+
+    def between(self, eye: np.ndarray, near: float, far: float) -> np.ndarray:
+        """(B,) bool, False where no mean of a block is at a distance near <= d < far from an eye (3,)."""
+        least, most = self.distances(eye)
+        return (most * (1 + ROUNDING) >= near) & (least * (1 - ROUNDING) < far)
 
     def rows(self, which: np.ndarray) -> np.ndarray:
         """The rows (M,) int32 of the blocks that are True in (B,), ascending."""

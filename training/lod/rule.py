@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
+from math import inf
 from pkgutil import iter_modules
 from typing import Any, ClassVar
 
@@ -100,6 +101,7 @@ class Rule(ABC):
         tables: names of tables of the bundle; where one is missing, the rule does without it.
         always: whether its weights belong to the picture at full detail, too: without them a level is not
             what was trained.
+        apart: whether the weight of a splat does not depend on other splats, so that a few can be asked for.
         sweep: a control, and values of it that a report measures one by one; None: it needs no such curve.
     """
 
@@ -111,6 +113,7 @@ class Rule(ABC):
     columns: ClassVar[tuple[str, ...]] = ()
     tables: ClassVar[tuple[str, ...]] = ()
     always: ClassVar[bool] = False
+    apart: ClassVar[bool] = True
     sweep: ClassVar[tuple[str, tuple[float, ...]] | None] = None
 
     @abstractmethod
@@ -135,6 +138,14 @@ class Rule(ABC):
             values: of every control.
             tables: of the bundle, those of the rule at least; coordinates are in the same space.
         """
+
+    def band(self, focal_px: float, facts: Mapping[str, float], values: Values) -> tuple[float, float]:
+        """The distances near <= d < far from the eye outside which no splat of a level has a weight.
+
+        For whoever can leave out many splats at once. Where a region counts (:meth:`region`), that does
+        instead.
+        """
+        return 0.0, inf
 
     def region(self, eye: np.ndarray, values: Values, tables: Tables) -> Region | None:
         """Where an eye is, for rules whose splats can be told beforehand for a whole region; else None.

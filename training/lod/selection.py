@@ -127,7 +127,7 @@ class Choice:
         self._rule, self._levels, self._tables = rule_of(bundle), bundle.levels, bundle.tables
         numbered = [(level.number, level.facts) for level in bundle.levels]
         self._known = [
-            (_columns(self._rule, level.splats), facts_of(self._rule, bundle.facts, numbered, level.number))
+            (columns_of(self._rule, level.splats), facts_of(self._rule, bundle.facts, numbered, level.number))
             for level in bundle.levels
         ]
 
@@ -149,8 +149,8 @@ class Choice:
         return np.concatenate(self.of_levels(eye, focal_px, values))
 
 
-def _columns(rule: Rule, splats: Splats) -> dict[str, np.ndarray]:
-    """What a rule needs to know of splats."""
+def columns_of(rule: Rule, splats: Splats) -> dict[str, np.ndarray]:
+    """What a rule needs to know of splats, (N,) float32 by name; zeros where they lack it."""
     nothing = np.broadcast_to(np.float32(0), len(splats))
     columns = {name: splats.extras.get(name, nothing) for name in rule.columns}
     if OPACITY in columns:

@@ -14,6 +14,7 @@ from ..rasterize import Adam, Gaussians, Rendering, Target, device_of, photometr
 from ..scenes.cameras import Camera
 from ..splats.bundle import Level
 from ..splats.gaussians import Splats
+from ..splats.ply import Columns
 from .data import TrainingData, TrainingView
 from .density import require_rows
 from .exposure import Exposure
@@ -85,12 +86,20 @@ class Method(ABC, Generic[P, D]):
         """The finest level (1-based) that a step trains."""
         return 1
 
+    def stage(self, step: int) -> str:
+        """What a step is part of, in a few words."""
+        return f"level {self.level_at(step)} of {self.levels}"
+
     @abstractmethod
     def levels_after(self, step: int) -> list[Level]:
         """The levels to hand over after a step, finished or newer than before, coarse to fine."""
 
     def facts(self) -> dict[str, float]:
         """What the method's rule has to know of the scene, by the names that the rule declares."""
+        return {}
+
+    def tables(self) -> dict[str, Columns]:
+        """What the method's rule has to know besides, as tables of the bundle."""
         return {}
 
     def controls(self) -> dict[str, float]:

@@ -73,6 +73,30 @@ class Adam:
             else:
                 update_in_torch(*arrays, *rest)
 
+    @torch.no_grad()
+    def step_rows(self, rows: torch.Tensor, grads: Mapping[str, torch.Tensor | None]) -> None:
+        """One step in place for these rows (M,) int64 alone, by their gradients (M, ...); others stay.
+
+        What is out of sight costs nothing, and keeps its moments.
+        """
+        from .cpu.adam import update_rows
+
+        for name, tensor in self.tensors.items():
+            gradient = grads.get(name)
+            if gradient is None:
+                continue
+            self.steps[name] += 1
+            rest = self.lr[name], self.betas, self.eps, self.steps[name]
+            if tensor.device.type == "cpu":
+                arrays = tensor.detach(), rows, gradient.contiguous(), *self.state[name]
+                update_rows(*(array.numpy() for array in arrays), *rest)
+            else:
+                m, v = (moment[rows] for moment in self.state[name])
+                values = tensor.detach()[rows]
+                update_in_torch(values, gradient, m, v, *rest)
+                for whole, part in zip((tensor.detach(), *self.state[name]), (values, m, v), strict=True):
+                    whole[rows] = part
+
     def zero_grad(self) -> None:
         """Forget the gradients, so that the next ``backward`` starts from nothing."""
         for tensor in self.tensors.values():

@@ -203,7 +203,7 @@ class _Run:
         meta = {**self.method.meta(), "up_rotation": up, "seed": self.job.seed}
         if self.job.test_every:
             meta["held_out"] = [self.job.test_every // 2 if self.job.validation else 0, self.job.test_every]
-        bundle = replace(self._without_splats(), levels=levels, meta=meta)
+        bundle = replace(self._without_splats(), levels=levels, meta=meta, tables=self.method.tables())
         if arrays := self.method.arrays():
             with atomic_write(self.folder.model) as temporary, open(temporary, "wb") as file:
                 np.savez(file, **arrays)
@@ -234,7 +234,7 @@ class _Run:
         of, levels, quality = self.method.steps, self.method.levels, round(min(quality, 100.0), 2)
         speed = (self.step - self._started_step) / max(time.monotonic() - self._started, 1e-6)
         self.events(
-            "progress", stage=f"level {level} of {levels}", level=level, levels=levels,
+            "progress", stage=self.method.stage(self.step - 1), level=level, levels=levels,
             step=self.step, of=of, loss=round(loss, 5), psnr=quality, splats=self.method.splats,
             steps_per_s=round(speed, 2), eta_s=round((of - self.step) / speed, 1),
         )  # fmt: skip

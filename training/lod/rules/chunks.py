@@ -54,10 +54,10 @@ class Chunks(Rule):
         ),
     )  # fmt: skip
 
-    def band(self, facts: Mapping[str, float]) -> tuple[float, float]:
-        """The nearest distance of a level, in scene units, and the distance from which on it is not shown."""
-        near = 0.0 if facts["finer"] == NO_FINER else facts["d_l"]
-        return near, facts["coarser_d_l"] if facts["coarser"] else inf
+    def band(self, focal_px: float, facts: Mapping[str, float], values: Values) -> tuple[float, float]:
+        """Near and far end of a level's distances from the eye, in scene units."""
+        near, far = _ends(facts)
+        return near / values["distance_scale"], far / values["distance_scale"]
 
     def weights(self, means, eye, focal_px, columns, facts, values, tables=NO_TABLES) -> np.ndarray:
         near_chunks = self.near_chunks(eye, values, tables)
@@ -66,7 +66,7 @@ class Chunks(Rule):
         for chunk, share in near_chunks:
             weights += np.float32(share) * members(columns, chunk)
         if inside < 1:
-            near, far = self.band(facts)
+            near, far = _ends(facts)
             away = distances(means, eye) * np.float32(values["distance_scale"])
             seen = (away >= np.float32(near)) & (away < np.float32(far))
             weights += np.float32(1 - inside) * seen
@@ -119,6 +119,12 @@ class Chunks(Rule):
             return {**values, "chunks": 0}
         scale = values["distance_scale"] * STEP
         return {**values, "distance_scale": scale} if scale <= self.controls[0].high else None
+
+
+def _ends(facts: Mapping[str, float]) -> tuple[float, float]:
+    """The distance from which on a level is shown, and that from which on it is not, before any scale."""
+    near = 0.0 if facts["finer"] == NO_FINER else facts["d_l"]
+    return near, facts["coarser_d_l"] if facts["coarser"] else inf
 
 
 def members(columns: Mapping[str, np.ndarray], chunk: int) -> np.ndarray:

@@ -73,6 +73,7 @@ class Decay(Rule):
         ),
     )  # fmt: skip
     always = True
+    apart = False
     sweep = ("s_v", (1.0, 1.5, 2.0, 3.0, 5.0))
 
     def normalized(self, means: np.ndarray, eye: np.ndarray, facts: Mapping[str, float]) -> np.ndarray:

@@ -44,6 +44,18 @@ class LodgeParameters(ThreedgsParameters):
         "distance, so that it stands where no training view is as far away. Not in the paper.",
         high=1,
     )
+    chunks: int = parameter(
+        0,
+        "Number of chunks, whose fixed sets of splats fade into each other as the eye moves. 0: as many as "
+        "LODGE's Eq. 5 asks for, and none where that would be fewer than 8; 1: none.",
+        high=96,
+    )
+    visible_weight: float = parameter(
+        0.005,
+        "Splats that no view in a chunk, turned anywhere, shows by so large a share of a pixel are not in "
+        "its set (LODGE: a fixed threshold, without a number). 0 keeps all.",
+        high=1,
+    )
     filter_variance: float = parameter(
         0.2,
         "Variance of the filter that smooths a level, in squared pixels at its distance (LODGE: s, without a "
@@ -80,6 +92,6 @@ METHOD = MethodInfo(
     parameters=LodgeParameters,
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     rule="chunks",
-    offered=("levels", "max_splats", "prune_weight"),
+    offered=("levels", "max_splats", "prune_weight", "chunks"),
     from_base=True,
 )

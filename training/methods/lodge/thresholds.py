@@ -7,14 +7,14 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import torch
 
-from ...rasterize import Gaussians, rasterize
+from ...rasterize import rasterize
 from ...scenes.cameras import Camera, evenly
-from .composite import composite, filtered, importance
+from .composite import IndexedLevel, Stack, filtered, rows_seen
 
 VIEWS = 8
 """So many training views tell the cost."""
-QUANTILES = np.linspace(0.05, 0.95, 13)
-"""Of the distances of splats in view: what is tried."""
+TRIED, BETWEEN = 9, (0.01, 0.9)
+"""So many distances are tried, in equal ratios between these quantiles of the splats' distances in view."""
 STANDING_APART = 1.25
 """A level begins at least this many times farther away than the next finer one."""
 
@@ -43,7 +43,7 @@ class Thresholds:
 
     @torch.no_grad()
     def next(
-        self, levels: Mapping[int, Gaussians], d_l: Mapping[int, float]
+        self, levels: Mapping[int, IndexedLevel], d_l: Mapping[int, float]
     ) -> tuple[float, dict[str, list[float]]]:
         """The distance of the next coarser level.
 
@@ -58,30 +58,30 @@ class Thresholds:
         costs = [self.cost(levels, d_l, distance) for distance in tried]
         return tried[int(np.argmin(costs))], {"distances": tried, "costs": costs}
 
-    def cost(self, levels: Mapping[int, Gaussians], d_l: Mapping[int, float], distance: float) -> float:
+    def cost(self, levels: Mapping[int, IndexedLevel], d_l: Mapping[int, float], distance: float) -> float:
         """How many splats a tile of 16x16 pixels has to look at, on average, with one more level.
 
         The level is the finest one smoothed and pruned, without the steps that tune it.
         """
         finest, number = next(iter(levels.values())), min(levels) - 1
-        coarser = filtered(finest, self._std(distance))
-        together, d_l = {**levels, number: coarser}, {**d_l, number: distance}
-        pictures = ((camera, *composite(together, d_l, camera)) for camera in self._cameras)
-        kept = importance(pictures, len(coarser), self._near, self._backend) >= self._prune_weight
-        together[number] = coarser.select(kept.to(coarser.means.device))
+        coarser = IndexedLevel.of(filtered(finest.gaussians, self._std(distance)))
+        levels, d_l = {**levels, number: coarser}, {**d_l, number: distance}
+        stack = Stack(levels)
+        pictures = [(camera, rows_seen(levels, d_l, camera, self._near)) for camera in self._cameras]
+        found = stack.importance(pictures, self._near, self._backend)[stack.part[number]].numpy()
+        kept = found >= self._prune_weight
         tiles = []
-        for camera in self._cameras:
-            gaussians, weights = composite(together, d_l, camera)
-            drawn = rasterize(gaussians, camera, weights=weights, near=self._near, backend=self._backend)
+        for camera, rows in pictures:
+            some = stack.rows({**rows, number: rows[number][kept[rows[number]]]})
+            drawn = rasterize(stack.gaussians, camera, near=self._near, rows=some, backend=self._backend)
             tiles.append(drawn.tile_counts.double().mean())
         return float(torch.stack(tiles).mean())
 
-    def _candidates(self, finest: Gaussians, least: float) -> list[float]:
+    def _candidates(self, finest: IndexedLevel, least: float) -> list[float]:
         """Distances to try, of at least ``least``, in scene units."""
-        means = finest.means.cpu().numpy().astype(np.float64)
-        seen = [
-            np.linalg.norm(means[camera.sees(means, near=self._near)] - camera.center, axis=1)
-            for camera in self._cameras
-        ]
-        found = np.quantile(np.concatenate([*seen, [least]]), QUANTILES)
-        return [float(distance) for distance in found if distance >= least] or [max(least, float(found[-1]))]
+        seen = []
+        for camera in self._cameras:
+            means = finest.means[finest.in_view(camera, self._near)]
+            seen.append(np.linalg.norm(means[camera.sees(means, self._near)] - camera.center, axis=1))
+        near, far = np.quantile(np.concatenate([*seen, [least]]), BETWEEN)
+        return [float(d) for d in np.geomspace(max(near, least), max(far, least * 1.01), TRIED)]

@@ -1,7 +1,8 @@
-"""LODGE (2025): levels from the finest to the coarsest, each a copy of the finest for a distance.
+"""LODGE (2025): levels, finest first, each a copy of the finest for a distance; then chunks.
 
 A level is smoothed as its distance allows, pruned of what hardly shows, and tuned beside the finer ones,
-which stay as they are (Sec. 3, A.2). The finest is a base, or 3DGS in the first steps.
+which stay as they are (Sec. 3, A.2). The finest is a base, or 3DGS in the first steps. The last steps make
+the sets of chunks, one a step.
 """
 
 from __future__ import annotations
@@ -12,18 +13,43 @@ import numpy as np
 import torch
 
 from ...errors import LodgsError
-from ...rasterize import Gaussians
+from ...lod.blocks import Blocks, spatial_order
+from ...lod.rules.chunks import TABLE, member_columns
+from ...rasterize import Adam, Gaussians, Target, photometric_loss
 from ...splats.bundle import Level
 from ...splats.gaussians import Splats
+from ...splats.ply import Columns
 from ..data import TrainingView
 from ..density import require_rows
 from ..method import Drawing
 from ..model import NAMES, Model, splat_rates
 from ..start import from_splats
 from ..threedgs import train as threedgs_train
-from . import ROUNDS, LodgeParameters
-from .composite import composite, filtered, importance
+from . import ROUNDS, LodgeParameters, chunks
+from .composite import IndexedLevel, Stack, filtered, rows_seen, seen_from_afar, together
 from .thresholds import Thresholds
+
+FAR_VIEWS = 2
+"""A place that so many training views have from a level's distance or farther is tuned and pruned by them."""
+
+
+class SeenRows:
+    """Adam's step for the rows alone that a picture was made of.
+
+    Args:
+        adam: of all rows.
+        rows: (M,) int64 of them.
+        leaves: these rows of each tensor, from which the picture was made.
+    """
+
+    def __init__(self, adam: Adam, rows: torch.Tensor, leaves: dict[str, torch.Tensor]) -> None:
+        self._adam, self._rows, self._leaves = adam, rows, leaves
+
+    def step(self) -> None:
+        self._adam.step_rows(self._rows, {name: leaf.grad for name, leaf in self._leaves.items()})
+
+    def zero_grad(self) -> None:
+        self._leaves = {}
 
 
 class Method(threedgs_train.Method):
@@ -32,8 +58,10 @@ class Method(threedgs_train.Method):
     Attributes:
         finest_steps: so many steps come before the coarser levels; none with a base.
         d_l: the distance from which on each level is shown, in scene units, by number; those known so far.
-        finished: the levels that no step changes any more, as they are drawn, by number.
+        finished: the levels that no step changes any more, as they are drawn, by number, finest first.
         costs: what finding the distances has told, see ``Thresholds``.
+        centres, radii: of the chunks, (K, 3) and (K,) float32, as soon as their number is known.
+        sets: which splats of each level (N,) are in the set of each of the chunks so far, by number.
     """
 
     parameters: LodgeParameters
@@ -46,15 +74,25 @@ class Method(threedgs_train.Method):
         if base is None:
             super().setup(None)
         else:
-            tensors = from_splats(base, p.sh_degree, self.device)
+            tensors = from_splats(base.select(spatial_order(base.means)), p.sh_degree, self.device)
             self.model = Model(tensors, splat_rates(p, self.data.extent))
             self._densify_until = 0
         self.d_l = {p.levels: 0.0}
-        self.finished: dict[int, Gaussians] = {}
+        self.finished: dict[int, IndexedLevel] = {}
         self.costs: list[dict] = []
+        self.centres, self.radii = np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
+        self.sets: dict[int, list[np.ndarray]] = {}
+        self._blocks: Blocks | None = None  # of the level in training, as it was at its last pruning
+        self._alone_share = p.tune_alone
+        self._optimizer: SeenRows | None = None
 
     @property
     def steps(self) -> int:
+        return self.tuned_steps + len(self.centres)
+
+    @property
+    def tuned_steps(self) -> int:
+        """So many steps come before the chunks."""
         return self.finest_steps + self.parameters.level_steps * (self.levels - 1)
 
     @property
@@ -70,16 +108,32 @@ class Method(threedgs_train.Method):
 
     def ends_level(self, step: int) -> bool:
         done = step + 1
+        if done > self.tuned_steps:
+            return done == self.steps
         return done == self.finest_steps or (done > self.finest_steps and self._local(done) == 0)
 
+    def stage(self, step: int) -> str:
+        if step < self.tuned_steps:
+            return super().stage(step)
+        return f"chunk {step - self.tuned_steps + 1} of {len(self.centres)}"
+
     def levels_after(self, step: int) -> list[Level]:
-        """The finest as soon as it is there, each coarser one when it is tuned."""
-        found = []
-        if step + 1 == max(self.finest_steps, 1):
+        """The finest as soon as it is there, each coarser one when it is tuned; all with the last chunk."""
+        done, found = step + 1, []
+        if done > self.tuned_steps:
+            return [self._level(number) for number in sorted(self.finished)] if done == self.steps else []
+        if done == max(self.finest_steps, 1):
             found.append(self._level(self.levels))
-        if step >= self.finest_steps and self._local(step + 1) == 0:
+        if step >= self.finest_steps and self._local(done) == 0:
             found.insert(0, self._level(self.level_at(step)))
         return found
+
+    def tables(self) -> dict[str, Columns]:
+        """The chunks, where there are any."""
+        if not len(self.centres):
+            return {}
+        x, y, z = self.centres.T
+        return {TABLE: {"x": x, "y": y, "z": z, "radius": self.radii}}
 
     def meta(self) -> dict:
         return {**super().meta(), "filter_variance": self.parameters.filter_variance, "costs": self.costs}
@@ -96,17 +150,31 @@ class Method(threedgs_train.Method):
             self.begin_round(step)
         return super().choose_view(step)
 
+    def train_step(self, step: int) -> tuple[float, torch.Tensor, Target]:
+        return super().train_step(step) if step < self.tuned_steps else self._chunk_step(step)
+
     def draw(self, view: TrainingView, step: int) -> list[Drawing]:
         if step < self.finest_steps:
             return super().draw(view, step)
-        number = self.level_at(step)
+        number, near = self.level_at(step), self.data.near
+        level = IndexedLevel.of(self.model.gaussians, self._blocks)
         if self._alone(step):
-            gaussians, weights = self.smoothed(number), None
+            rows = {number: level.in_view(view.camera, near)}
         else:
             rng, spread = np.random.default_rng([self.seed, step, 8]), self.parameters.tune_range
             scale = 1 / rng.uniform(1 - spread, 1 + spread)
-            gaussians, weights = composite(self._levels_to(number), self.d_l, view.camera, scale)
-        return [Drawing(self.rasterize_model(view.camera, step, weights, gaussians=gaussians))]
+            rows = rows_seen({**self.finished, number: level}, self.d_l, view.camera, near, scale)
+        own = torch.from_numpy(rows[number]).long().to(self.device)
+        leaves = {name: tensor.requires_grad_() for name, tensor in self.model.rows(own).items()}
+        self._optimizer = SeenRows(self.model.adam, own, leaves)
+        shown = [filtered(Gaussians(**leaves), self._std(self.d_l[number]))]
+        if len(rows) > 1:
+            shown.insert(0, together(self.finished, {n: some for n, some in rows.items() if n != number}))
+        drawn = self.rasterize_model(view.camera, step, gaussians=Gaussians.concatenated(shown))
+        return [Drawing(drawn)]
+
+    def optimizers(self) -> Sequence[Adam | SeenRows]:
+        return super().optimizers() if self._optimizer is None else (self._optimizer,)
 
     def background(self, step: int) -> tuple[float, float, float]:
         """Black for the coarser levels, which the finest covers for: what is nothing may be black."""
@@ -143,11 +211,11 @@ class Method(threedgs_train.Method):
         threshold = self.parameters.prune_weight * ROUNDS[local // self.parameters.tune_steps]
         self.model.keep(self.importance(number) >= threshold)
         require_rows(self.model, step, "prune_weight")
+        self._blocks = self._smoothed(number).blocks
 
     def _begin_level(self, number: int) -> None:
         p, data = self.parameters, self.data
-        above = number + 1
-        self.finished[above] = self.smoothed(above).detach()
+        self._finish(number + 1)
         finest = self.finished[self.levels]
         given = p.distances[number - 1] * data.median_depth
         if given:
@@ -156,38 +224,90 @@ class Method(threedgs_train.Method):
             thresholds = Thresholds(data.train, data.near, self.backend, p.prune_weight, self._std)
             self.d_l[number], costs = thresholds.next(self.finished, self.d_l)
             self.costs.append({"level": number, **costs})
-        tensors = {name: getattr(finest, name).clone() for name in NAMES}
+        if number == self.levels - 1:
+            self._place_chunks()
+        known = seen_from_afar(finest, data.train, data.near, self.d_l[number], FAR_VIEWS)
+        self._alone_share = p.tune_alone * float((~known).mean())
+        tensors = {name: getattr(finest.gaussians, name).clone() for name in NAMES}
         self.model = Model(tensors, splat_rates(p, data.extent))
 
-    def smoothed(self, number: int) -> Gaussians:
-        """The model as a level: with the filter of its distance (Eq. 3), which no step can undo."""
-        gaussians, d_l = self.model.gaussians, self.d_l[number]
-        return filtered(gaussians, self._std(d_l)) if d_l else gaussians
+    def _finish(self, number: int) -> None:
+        """The level in training is what it is from now on."""
+        level = self._smoothed(number)
+        if number == self.levels and self.finest_steps:
+            order = torch.from_numpy(spatial_order(level.means))
+            level = IndexedLevel.of(level.gaussians.select(order))
+        self.finished[number] = level
 
-    def _levels_to(self, number: int) -> dict[int, Gaussians]:
-        """The finished levels and the one in training, finest first."""
-        return {**self.finished, number: self.smoothed(number)}
+    @torch.no_grad()
+    def _smoothed(self, number: int) -> IndexedLevel:
+        """The model as a level: with the filter of its distance (Eq. 3), which no step can undo."""
+        gaussians, d_l = self.model.gaussians.detach(), self.d_l[number]
+        return IndexedLevel.of(filtered(gaussians, self._std(d_l)) if d_l else gaussians)
 
     @torch.no_grad()
     def importance(self, number: int) -> torch.Tensor:
         """The largest share (N,) of a pixel that each splat of the level in training has.
 
-        In the training views, beside the finer levels; and alone in views as far away as its distance, which
-        see what continues the photographs, too.
+        In the training views, beside the finer levels. Those of its splats that too few training views see
+        from its distance are also asked for in views from as far away, of the level alone, which see what
+        continues the photographs, too.
         """
-        data, count, backend = self.data, len(self.model), self.backend
-        levels, alone, farther = self._levels_to(number), self.smoothed(number), self._farther(number)
-        beside = ((camera, *composite(levels, self.d_l, camera)) for camera in data.train)
-        found = importance(beside, count, data.near, backend)
+        data, backend = self.data, self.backend
+        level, farther, near = self._smoothed(number), self._farther(number), data.near
+        levels = {**self.finished, number: level}
+        stack = Stack(levels)
+        beside = ((camera, rows_seen(levels, self.d_l, camera, near)) for camera in data.train)
+        found = stack.importance(beside, near, backend)[stack.part[number]]
         if not self.parameters.tune_alone:
             return found
-        margin = self.parameters.margin
-        away = ((camera.widened(margin).scaled(1 / farther), alone, None) for camera in data.train)
-        return torch.maximum(found, importance(away, count, data.near, backend))
+        known = seen_from_afar(level, data.train, near, self.d_l[number], FAR_VIEWS)
+        if known.all():
+            return found
+        views = (camera.widened(self.parameters.margin).scaled(1 / farther) for camera in data.train)
+        away = ((view, {number: level.in_view(view, near)}) for view in views)
+        alone = Stack({number: level}).importance(away, near, backend)
+        return torch.where(torch.from_numpy(known), found, torch.maximum(found, alone))
+
+    # -- chunks ----------------------------------------------------------------------------------------
+
+    def _place_chunks(self) -> None:
+        """Where chunks are, as soon as it is known where the finest level ends (Eq. 5)."""
+        centers = np.array([camera.center for camera in self.data.train])
+        wanted = self.parameters.chunks or chunks.chunk_count(centers, self.d_l[self.levels - 1])
+        if wanted >= (2 if self.parameters.chunks else chunks.FEWEST):
+            self.centres, self.radii = chunks.place_chunks(centers, wanted, self.seed)
+
+    @torch.no_grad()
+    def _chunk_step(self, step: int) -> tuple[float, torch.Tensor, Target]:
+        """One chunk's set; what is told of the step is how a photograph in it looks by the set alone."""
+        p, data, number = self.parameters, self.data, step - self.tuned_steps
+        if number == 0:
+            self._finish(1)
+        levels, centre, radius = self.finished, self.centres[number], float(self.radii[number])
+        rows = chunks.members(levels, self.d_l, centre, radius)
+        near = chunks.cameras_near(data.train, self.centres, number)
+        if p.visible_weight:
+            rng = np.random.default_rng([self.seed, number, 11])
+            views = [*near, *chunks.turned(near, rng)]
+            rows = chunks.visible(levels, rows, views, p.visible_weight, data.near, self.backend)
+        for level, some in rows.items():
+            members = np.zeros(len(levels[level]), bool)
+            members[some] = True
+            self.sets.setdefault(level, []).append(members)
+        nearest = min(near or data.train, key=lambda camera: np.linalg.norm(camera.center - centre))
+        view = data.view(data.train.index(nearest))
+        drawn = self.rasterize_model(view.camera, step, gaussians=together(levels, rows))
+        loss = photometric_loss(drawn.image, view.target, p.ssim_weight, backend=self.backend)
+        return float(loss), drawn.image, view.target
+
+    # -- levels ----------------------------------------------------------------------------------------
 
     def _level(self, number: int) -> Level:
-        g = self.finished[number] if number in self.finished else self.smoothed(number).detach()
-        splats = Splats(*(tensor.cpu().numpy().copy() for tensor in vars(g).values()))
+        level = self.finished[number] if number in self.finished else self._smoothed(number)
+        splats = Splats(*(tensor.cpu().numpy().copy() for tensor in vars(level.gaussians).values()))
+        if number in self.sets:
+            splats.extras = member_columns(np.stack(self.sets[number]))
         return Level(number, splats, {"d_l": self.d_l[number]})
 
     def _local(self, step: int) -> int:
@@ -204,15 +324,41 @@ class Method(threedgs_train.Method):
 
     def _alone(self, step: int) -> bool:
         draw = np.random.default_rng([self.seed, step, 9]).random()
-        return draw < self.parameters.tune_alone
+        return draw < self._alone_share
 
     # -- what lasts ------------------------------------------------------------------------------------
 
     def state_dict(self) -> dict:
-        finished = {number: dict(vars(gaussians)) for number, gaussians in self.finished.items()}
-        return {**super().state_dict(), "d_l": self.d_l, "finished": finished, "costs": self.costs}
+        finished = {number: dict(vars(level.gaussians)) for number, level in self.finished.items()}
+        blocks = self._blocks
+        return {
+            **super().state_dict(),
+            "d_l": self.d_l, "finished": finished, "costs": self.costs, "alone": self._alone_share,
+            "blocks": {} if blocks is None else {
+                "count": blocks.count, "low": torch.from_numpy(blocks.low),
+                "high": torch.from_numpy(blocks.high), "reach": torch.from_numpy(blocks.reach),
+            },
+            "centres": torch.from_numpy(self.centres), "radii": torch.from_numpy(self.radii),
+            "sets": {
+                number: torch.from_numpy(np.packbits(np.stack(sets), axis=1))
+                for number, sets in self.sets.items()
+            },
+        }  # fmt: skip
 
     def load_state_dict(self, state: dict) -> None:
         super().load_state_dict(state)
-        self.d_l, self.costs = state["d_l"], state["costs"]
-        self.finished = {number: Gaussians(**tensors) for number, tensors in state["finished"].items()}
+        self.d_l, self.costs, self._alone_share = state["d_l"], state["costs"], state["alone"]
+        self.finished = {
+            number: IndexedLevel.of(Gaussians(**tensors)) for number, tensors in state["finished"].items()
+        }
+        self._blocks = None
+        if blocks := state["blocks"]:
+            self._blocks = Blocks(blocks["count"], *(blocks[n].numpy() for n in ("low", "high", "reach")))
+        self.centres, self.radii = state["centres"].numpy(), state["radii"].numpy()
+        self.sets = {
+            number: [
+                one.astype(bool)
+                for one in np.unpackbits(bits.numpy(), axis=1, count=len(self.finished[number]))
+            ]
+            for number, bits in state["sets"].items()
+        }

@@ -6,13 +6,25 @@ import math
 
 import numpy as np
 
-from .compile import STRICT, f32, in_parallel, kernel, serialised
+from .compile import STRICT, f32, in_parallel, inlined, kernel, serialised
 
 ROW = 1024
 VALUES = 1 << 16
 """How many a thread takes at a time."""
 M_TINY = f32(1e-30)
 V_TINY = f32(1e-36)
+
+
+@inlined(STRICT)
+def _moved(i, g, m, v, rate, keep_m, keep_v, scale_v, eps):
+    """Updates the moments of a value and returns by how much it gets smaller."""
+    first = keep_m * m[i] + (f32(1) - keep_m) * g
+    second = keep_v * v[i] + (f32(1) - keep_v) * (g * g)
+    first = first if abs(first) > M_TINY else f32(0)
+    second = second if second > V_TINY else f32(0)
+    m[i] = first
+    v[i] = second
+    return rate * first / (math.sqrt(second * scale_v) + eps)
 
 
 @kernel(STRICT)
@@ -28,14 +40,31 @@ def _update(begin, end, parameter, gradient, m, v, lr, keep_m, keep_v, scale_v, 
         start = row * width
         for j in range(min(width, total - start)):
             i = start + j
-            g = gradient[i]
-            first = keep_m * m[i] + (f32(1) - keep_m) * g
-            second = keep_v * v[i] + (f32(1) - keep_v) * (g * g)
-            first = first if abs(first) > M_TINY else f32(0)
-            second = second if second > V_TINY else f32(0)
-            m[i] = first
-            v[i] = second
-            parameter[i] -= lr[j] * first / (math.sqrt(second * scale_v) + eps)
+            parameter[i] -= _moved(i, gradient[i], m, v, lr[j], keep_m, keep_v, scale_v, eps)
+
+
+@kernel(STRICT)
+def _update_rows(begin, end, parameter, rows, gradient, m, v, lr, keep_m, keep_v, scale_v, eps):
+    """The same for ``rows`` of the flat arrays, of the gradient's ``lr.shape[0]`` values each."""
+    width = lr.shape[0]
+    for k in range(begin, end):
+        start = rows[k] * width
+        for j in range(width):
+            i = start + j
+            parameter[i] -= _moved(i, gradient[k * width + j], m, v, lr[j], keep_m, keep_v, scale_v, eps)
+
+
+@serialised
+def update_rows(parameter, rows, gradient, m, v, lr, betas, eps, step) -> None:
+    """One Adam step in place for ``rows`` (M,) int64; ``lr`` is a number or broadcasts against one row."""
+    width = int(np.prod(parameter.shape[1:], dtype=int))
+    rate = np.asarray(lr, np.float32) / np.float32(1 - betas[0] ** step)
+    row = np.ascontiguousarray(np.broadcast_to(rate, parameter.shape[1:])).reshape(-1)
+    in_parallel(
+        _update_rows, len(rows), max(VALUES // width, 1),
+        parameter.reshape(-1), rows, gradient.reshape(-1), m.reshape(-1), v.reshape(-1), row,
+        f32(betas[0]), f32(betas[1]), f32(1 / (1 - betas[1] ** step)), f32(eps),
+    )  # fmt: skip
 
 
 @serialised

@@ -206,37 +206,58 @@ def add_lanes(sums, offset_x, out):
 
 @kernel(FAST)
 def blend_weights(begin, end, projected, splat, tile_start, tiles_x, width, height, pair_weights):
-    """Fill pair_weights (P, 3): the largest weight, their sum, and the number of pixels of each pair."""
-    state = np.empty(256, np.float32)
+    """Fill pair_weights (P, 3): the largest weight, their sum, and the number of pixels of each pair.
+
+    What lies behind pixels that are all dark already is not looked at.
+    """
+    state = np.empty((16, 16), np.float32)
+    lanes = np.empty(48, np.float32)  # of each column of pixels the three
     for tile in range(begin, end):
         x0, y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
         rows, columns = min(TILE, height - y0), min(TILE, width - x0)
         left, top = f32(x0) + HALF, f32(y0) + HALF
         for r in range(16):
             for j in range(16):
-                state[16 * r + j] = ONE if r < rows and j < columns else -ONE
-        for pair in range(tile_start[tile], tile_start[tile + 1]):
-            row = projected[splat[pair]]
-            first, last = rows_of_strip(row, left, SPAN, top, rows)
-            offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
-            largest, total, pixels = ZERO, ZERO, ZERO
-            for r in range(first, last):
-                dy = f32(r) + offset_y
-                xy_dy = row[CONIC_XY] * dy
-                rest = row[LOG2_OPACITY] - row[CONIC_YY] * dy * dy
+                state[r, j] = ONE if r < rows and j < columns else -ONE
+        pair, last_pair = tile_start[tile], tile_start[tile + 1]
+        lit = 1
+        while lit > 0 and pair < last_pair:
+            stop = min(pair + LOOK_EVERY, last_pair)
+            for k in range(pair, stop):
+                row = projected[splat[k]]
+                first, last = rows_of_strip(row, left, SPAN, top, rows)
+                xx, xy, yy, log2_opacity = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY], row[LOG2_OPACITY]
+                offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
+                for j in range(48):
+                    lanes[j] = ZERO
+                for r in range(first, last):
+                    dy = f32(r) + offset_y
+                    xy_dy, rest = xy * dy, log2_opacity - yy * dy * dy
+                    ts = state[r]
+                    for j in range(16):
+                        dx = f32(j) + offset_x
+                        alpha = alpha_of(rest - (xx * dx + xy_dy) * dx)
+                        t = ts[j]
+                        behind = t - alpha * t
+                        takes = behind > T_MIN
+                        w = alpha * t if takes else ZERO
+                        ts[j] = behind if takes else -abs(t)
+                        lanes[j] = max(lanes[j], w)
+                        lanes[16 + j] += w
+                        lanes[32 + j] += ONE if w > ZERO else ZERO
+                largest, total, pixels = ZERO, ZERO, ZERO
                 for j in range(16):
-                    dx = f32(j) + offset_x
-                    log2_alpha = rest - (row[CONIC_XX] * dx + xy_dy) * dx
-                    alpha = alpha_of(log2_alpha)
-                    t = state[16 * r + j]
-                    behind = t - alpha * t
-                    takes = behind > T_MIN
-                    w = alpha * t if takes else ZERO
-                    state[16 * r + j] = behind if takes else -abs(t)
-                    largest = max(largest, w)
-                    total += w
-                    pixels += ONE if w > ZERO else ZERO
-            pair_weights[pair, 0], pair_weights[pair, 1], pair_weights[pair, 2] = largest, total, pixels
+                    largest = max(largest, lanes[j])
+                    total += lanes[16 + j]
+                    pixels += lanes[32 + j]
+                pair_weights[k, 0], pair_weights[k, 1], pair_weights[k, 2] = largest, total, pixels
+            pair = stop
+            lit = 0
+            for r in range(16):
+                for j in range(16):
+                    lit += state[r, j] > ZERO
+        for k in range(pair, last_pair):
+            pair_weights[k, 0], pair_weights[k, 1], pair_weights[k, 2] = ZERO, ZERO, ZERO
 
 
 def _backward(absolute: bool):

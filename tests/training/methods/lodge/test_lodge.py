@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from training.errors import LodgsError
+from training.lod.blocks import spatial_order
 from training.lod.selection import select, settings
 from training.methods import create, method_info
-from training.methods.lodge.composite import composite, importance
+from training.methods.lodge.composite import IndexedLevel, Stack, rows_seen, together
 from training.methods.lodge.thresholds import Thresholds
 from training.methods.parameters import override
 from training.rasterize import Gaussians, rasterize
@@ -67,7 +68,8 @@ def test_levels_come_finest_first_and_each_keeps_its_distance(data):
 def test_a_base_is_the_finest_level_to_the_bit(data, base):
     lodge = make(data, base)
     finest, *_ = levels = trained(lodge)
-    assert finest.number == 3 and same(finest.splats, base)
+    ordered = base.select(spatial_order(base.means))
+    assert finest.number == 3 and same(finest.splats, ordered)
     assert [level.number for level in levels] == [3, 2, 1] and lodge.steps == 18
 
 
@@ -107,15 +109,15 @@ def test_training_draws_what_the_bundle_shows(data, base):
     lodge = make(data, base, distances=[1.3, 0.8, 0.0])
     levels = sorted(trained(lodge), key=lambda level: level.number)
     bundle, camera = Bundle("lodge", levels, "chunks"), data.train[2]
-    drawn = {level.number: Gaussians.of(level.splats) for level in reversed(levels)}
+    drawn = {level.number: IndexedLevel.of(Gaussians.of(level.splats)) for level in reversed(levels)}
     for scale in (1.0, 1.4):
         splats, weights = select(
             bundle, camera.center, camera.focal, settings(bundle, {"distance_scale": scale})
         )
         assert weights is None
-        gaussians, weights = composite(drawn, lodge.d_l, camera, scale)
-        assert int(weights.sum()) == len(splats)
-        one = rasterize(gaussians, camera, weights=weights, backend="reference").image
+        rows = rows_seen(drawn, lodge.d_l, camera, 0.01, scale)
+        assert sum(map(len, rows.values())) <= len(splats)
+        one = rasterize(together(drawn, rows), camera, backend="reference").image
         other = rasterize(Gaussians.of(splats), camera, backend="reference").image
         torch.testing.assert_close(one, other)
 
@@ -123,19 +125,25 @@ def test_training_draws_what_the_bundle_shows(data, base):
 def test_tuning_moves_its_level_alone(data, base):
     lodge = make(data, base)
     trained(lodge, until=10)  # in the coarsest level
-    before = {number: [t.clone() for t in vars(g).values()] for number, g in lodge.finished.items()}
+    before = {n: [t.clone() for t in vars(level.gaussians).values()] for n, level in lodge.finished.items()}
     row = lodge.model["sh"].detach().clone()
     trained(lodge, 10, 12)
     assert sorted(before) == [2, 3] and not torch.equal(row, lodge.model["sh"].detach())
     for number, tensors in before.items():
-        assert all(map(torch.equal, tensors, vars(lodge.finished[number]).values()))
+        assert all(map(torch.equal, tensors, vars(lodge.finished[number].gaussians).values()))
 
 
 def test_importance_is_the_largest_weight_of_the_reference(data, base):
     """Blending weights by the derivative of a picture of ones with respect to each splat's own colour."""
     few = base.select(slice(0, 12))
     gaussians, camera = Gaussians.of(few), data.train[0]
-    found = importance([(camera, gaussians, None)], 5, data.near, "cpu")
+    level = IndexedLevel.of(gaussians)
+    stack = Stack({2: level, 1: level})
+    assert stack.part == {2: slice(0, 12), 1: slice(12, 24)}
+    rows = {2: np.zeros(0, np.int32), 1: np.arange(12, dtype=np.int32)}
+    found = stack.importance([(camera, rows)], data.near, "cpu")
+    assert (found[:12] == 0).all()
+    found = found[12 + 7 :]
     for row in range(7, 12):
         lit = torch.zeros(12, 3)
         lit[row] = 1.0
@@ -168,7 +176,7 @@ def test_the_cost_of_distances_by_hand():
         np.full(2, 3.0, np.float32), np.zeros((2, 1, 3), np.float32),
     )  # fmt: skip
     thresholds = Thresholds([camera], 0.01, "cpu", prune_weight=0.001, std=lambda d: 0.5 * d / 64)
-    levels, d_l = {2: Gaussians.of(splats)}, {2: 0.0}
+    levels, d_l = {2: IndexedLevel.of(Gaussians.of(splats))}, {2: 0.0}
     # each of the two splats, small ones in the picture, stands on the corner of four of the 16 tiles
     assert thresholds.cost(levels, d_l, 5.0) == pytest.approx((4 + 4) / 16)
     assert thresholds.cost(levels, d_l, 20.0) == pytest.approx((4 + 4) / 16)
