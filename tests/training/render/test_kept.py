@@ -9,8 +9,8 @@ import torch
 from training.lod.choice import Choice
 from training.lod.rule import NO_FINER, fact_names, rules
 from training.lod.rules.chunks import TABLE, member_columns
+from training.render.kept import KeptSet
 from training.render.requests import read_request
-from training.render.resident import Resident
 from training.render.scene import Instance, SplatSet, draw
 from training.scenes.cameras import camera_as_dict
 from training.splats.gaussians import Splats
@@ -59,16 +59,16 @@ def by_rule(choice: Choice, splats: Splats) -> np.ndarray:
 
 @pytest.mark.parametrize("name", sorted(rules()))
 def test_weights_are_the_rules(splats, name):
-    resident = Resident(splats, np.full(COUNT, 0.5, np.float32), "cpu")
+    kept_set = KeptSet(splats, np.full(COUNT, 0.5, np.float32), "cpu")
     for eye in np.random.default_rng(3).uniform(-1, 4, (20, 3)):
         choice = choice_of(name, eye)
         wanted = by_rule(choice, splats)
-        np.testing.assert_array_equal(resident.weights(choice), wanted * np.float32(0.5))
+        np.testing.assert_array_equal(kept_set.weights(choice), wanted * np.float32(0.5))
     assert 0.1 < (by_rule(choice_of(name, (0.5, 0, 0)), splats) > 0).mean() < 0.9
 
 
 def test_while_the_eye_stays_in_a_region_only_what_is_loaded_there_is_looked_at(splats, monkeypatch):
-    resident = Resident(splats, np.ones(COUNT, np.float32), "cpu")
+    kept_set = KeptSet(splats, np.ones(COUNT, np.float32), "cpu")
     looked_at, found = [], []
     rule = rules()["chunks"]
     weights, loaded = type(rule).weights, type(rule).loaded
@@ -86,8 +86,8 @@ def test_while_the_eye_stays_in_a_region_only_what_is_loaded_there_is_looked_at(
     monkeypatch.setattr(type(rule), "weights", counted)
     monkeypatch.setattr(type(rule), "loaded", once)
     for eye, weight in zip(eyes, wanted, strict=True):
-        np.testing.assert_array_equal(resident.weights(choice_of("chunks", eye)), weight)
-        resident.weights(choice_of("chunks", eye))  # the same frame again
+        np.testing.assert_array_equal(kept_set.weights(choice_of("chunks", eye)), weight)
+        kept_set.weights(choice_of("chunks", eye))  # the same frame again
     assert found == [(0, 1)] and len(looked_at) == len(eyes)
     either = (splats.extras["chunks_0"].astype(int) & 3) > 0
     assert set(looked_at) == {either.sum()} and either.sum() < COUNT
@@ -100,7 +100,7 @@ def test_the_picture_is_that_of_the_chosen_alone(splats, make_splats, camera, ap
     matrix = np.eye(4)
     matrix[:3, 3] = 0.2, 0.1, 0.3
     here = [np.diag([1.5, 1.5, 1.5, 1])] * 2 if not apart else [np.eye(4), matrix]
-    sets = [Resident(each, np.ones(COUNT, np.float32), "cpu") for each in (splats, further)]
+    sets = [KeptSet(each, np.ones(COUNT, np.float32), "cpu") for each in (splats, further)]
     for eye in ((9, 9, 9), (0, 0.7, 0), (0.5, 0, 0)):
         weights = [each.weights(choice_of("octree", eye)) for each in sets]
         for kept in ([0, 1], [1], [1, 0]):

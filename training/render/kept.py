@@ -10,7 +10,7 @@ from ..splats.gaussians import Splats
 from .scene import SplatSet
 
 
-class Resident:
+class KeptSet:
     """A set of splats that frames choose from: no splat is copied, drawn or not.
 
     Args:
