@@ -265,7 +265,7 @@ def _capture(chosen: argparse.Namespace) -> int:
         raise LodgsError("A scene takes two views or more.", "Give --views 64.")
     else:
         views, near = dome(splats, chosen.views)
-    points = write_scene(chosen.out, splats, views, near, backend=chosen.backend)
+    points = write_scene(chosen.out, splats, views, near, backend=chosen.backend, antialias=bundle.antialias)
     print(f"{chosen.out}: {len(views)} views, {points:,} points")
     return 0
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from typing import Any
 
 import bpy
 
 from ...training.lod.rule import Control, Rule, rules
+from .selection import read_json
 from .training import PARAMETERS, TrainingSettings
 
 ON_CHANGE: dict[str, Callable[[Any, bpy.types.Context], None]] = {}
@@ -44,6 +46,16 @@ def _single_changed(self, context) -> None:
 
 def _became_root(self, context) -> None:
     self.itself = self.id_data if self.is_root else None
+
+
+def _antialias(self) -> bool:
+    return bool(read_json(self.meta).get("antialias"))
+
+
+def _set_antialias(self, value: bool) -> None:
+    meta = {name: each for name, each in read_json(self.meta).items() if name != "antialias"}
+    self.meta = json.dumps(meta | ({"antialias": True} if value else {}))
+    _changed(self, bpy.context)
 
 
 def _can_be_eye(self, obj: bpy.types.Object) -> bool:
@@ -163,6 +175,14 @@ class SplatScene(bpy.types.PropertyGroup):
         name="Cumulative",
         description="Each level only holds what it adds to the coarser ones",
         update=_changed,
+        options=set(),
+    )
+    antialias: bpy.props.BoolProperty(
+        name="Antialiased",
+        description="Draw the splats through Mip-Splatting's 2D filter, as those need it that were trained "
+        "with it: what is smaller than a pixel then grows no thicker than it is",
+        get=_antialias,
+        set=_set_antialias,
         options=set(),
     )
     camera_center: bpy.props.FloatVectorProperty(

@@ -39,13 +39,16 @@ def roots(scene: bpy.types.Scene) -> list[bpy.types.Object]:
 
 def active_root(context: bpy.types.Context) -> bpy.types.Object | None:
     """The splat scene that is meant: the active object's, else the only one there is."""
-    obj = context.active_object
-    while obj is not None:
-        if obj.lodgs.is_root:
-            return obj
-        obj = obj.parent
-    found = roots(context.scene)
+    root = root_of(context.active_object)
+    found = [root] if root is not None else roots(context.scene)
     return found[0] if len(found) == 1 else None
+
+
+def root_of(obj: bpy.types.Object | None) -> bpy.types.Object | None:
+    """The root of the splat scene that an object is in: itself, or what it is a child of; None outside."""
+    while obj is not None and not obj.lodgs.is_root:
+        obj = obj.parent
+    return obj
 
 
 def shows_splats(scene: bpy.types.Scene) -> bool:

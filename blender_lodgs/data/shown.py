@@ -25,12 +25,14 @@ class SplatInstance:
         evaluated: the same as its modifiers leave it; only valid as long as the depsgraph is not evaluated.
         matrix_world: (4, 4) float64, from the splats' space to Blender's world.
         level: number of the level in its splat scene, 1 is the coarsest; 0 for splats that are no level.
+        antialias: see ``SplatScene.antialias``.
     """
 
     object: bpy.types.Object
     evaluated: bpy.types.Object
     matrix_world: np.ndarray
     level: int
+    antialias: bool
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ def splat_instances(
     if not any(is_splats(cloud) for cloud in bpy.data.pointclouds):
         return []
     levels = {
-        item.object: item.number
+        item.object: (item.number, root)
         for root in scenes.roots(depsgraph.scene)
         for item in root.lodgs.levels
         if item.object is not None
@@ -87,7 +89,9 @@ def splat_instances(
         matrix = np.array(instance.matrix_world, np.float64)
         original = obj.original
         evaluated = original.evaluated_get(depsgraph)
-        found.append(SplatInstance(original, evaluated, matrix, levels.get(original, 0)))
+        level, root = levels.get(original) or (0, scenes.root_of(original))
+        antialias = root is not None and root.lodgs.antialias
+        found.append(SplatInstance(original, evaluated, matrix, level, antialias))
     return sorted(found, key=lambda instance: (instance.level, instance.object.name))
 
 

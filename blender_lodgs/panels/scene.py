@@ -28,6 +28,8 @@ class LODGS_PT_scene(Panel):
         row.operator("lodgs.remove_scene", text="", icon="TRASH")
         if root.lodgs.scene_folder:
             column.prop(root.lodgs, "scene_folder", text="Photographs")
+        if root.lodgs.levels:
+            column.prop(root.lodgs, "antialias")
         row = layout.row(align=True)
         for name, part in (("Cameras", root.lodgs.cameras), ("Points", root.lodgs.points)):
             if part is not None:

@@ -159,16 +159,16 @@ def placed_splats(depsgraph: bpy.types.Depsgraph) -> list[renderer.PlacedSplats]
     found = []
     for instance in shown.splat_instances(depsgraph):
         evaluated, matrix, level = instance.evaluated, instance.matrix_world, instance.level
-        empty = not len(evaluated.data.points)
+        place, empty = (matrix, level, instance.antialias), not len(evaluated.data.points)
         if not _chosen_by_rule(instance, depsgraph):
             if not empty:
                 read = partial(_splats_of, evaluated.data)
-                found.append(renderer.PlacedSplats(instance.object.session_uid, read, matrix, level))
+                found.append(renderer.PlacedSplats(instance.object.session_uid, read, *place))
             continue
         own = instance.object.data
         read = partial(_splats_of, own.evaluated_get(depsgraph), every_column())
         version, choice = changes.version(own), selection.choice(evaluated, depsgraph)
-        found.append(renderer.PlacedSplats(own.session_uid, read, matrix, level, version, choice, empty))
+        found.append(renderer.PlacedSplats(own.session_uid, read, *place, version, choice, empty))
     return found
 
 

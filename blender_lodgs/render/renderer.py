@@ -66,6 +66,7 @@ class PlacedSplats:
             called where they are not known already.
         matrix: (4, 4) to the world.
         level: 0 where they are no level.
+        antialias: see ``SplatScene.antialias``.
         version: the splats with this key do not change as long as it stays; None: nobody knows.
         choice: by what splats are weighted; None: all are drawn.
         empty: whether nothing is seen of them. What has not been seen so far is not even read.
@@ -75,6 +76,7 @@ class PlacedSplats:
     read: Callable[[], tuple[Splats, np.ndarray | None]]
     matrix: np.ndarray
     level: int
+    antialias: bool = False
     version: Version | None = None
     choice: Choice | None = None
     empty: bool = False
@@ -215,7 +217,7 @@ class Renderer:
             named.append(
                 {
                     "file": file.name, "count": count, "columns": columns,
-                    "matrix": one.matrix.tolist(), "level": one.level,
+                    "matrix": one.matrix.tolist(), "level": one.level, "antialias": one.antialias,
                     "choice": None if one.choice is None else one.choice.as_dict(),
                 }
             )  # fmt: skip

@@ -82,6 +82,7 @@ class Placement:
         choice: what weights its splats; None: all 1.
         scene: of which splat scene it is a level, a number.
         tell: what its colours tell, see ``SplatScene.tell``.
+        antialias: see ``SplatScene.antialias``.
     """
 
     first: int
@@ -91,6 +92,7 @@ class Placement:
     choice: Choice | None
     scene: int
     tell: str
+    antialias: bool = False
 
     @property
     def world(self) -> np.ndarray:

@@ -25,6 +25,10 @@ from .arranging import WIDTH, Arrangement, Pool
 MOST_COEFFICIENTS = 24
 """Coefficients beyond the first: degree 4."""
 
+DILATION, MIP_FILTER = (0.3, 0.0), (0.1, 1.0)
+"""Variance added to projected splats, in square pixels, and whether their opacity pays for it: 3DGS's, and
+Mip-Splatting's 2D filter."""
+
 _FETCH = """
 vec4 texel(sampler2D data, int i) { return texelFetch(data, ivec2(i % WIDTH, i / WIDTH), 0); }
 """
@@ -87,7 +91,7 @@ void main()
   color_opacity = vec4(0.0);
 
   vec4 instance = texel(instances, gl_InstanceID);  // splat, weight, placement, level whose colour it gets
-  int splat = int(instance.x), row = int(instance.z) * 4;
+  int splat = int(instance.x), row = int(instance.z) * 5;
   vec4 base = texel(bases, splat);
   float opacity = base.w * instance.y;
   if (opacity <= 1.0 / 255.0) {
@@ -117,14 +121,23 @@ void main()
   mat3 to_view = transpose(mat3(to_view_x.xyz, to_view_y.xyz, to_view_z.xyz));
   mat3 half_covariance = to_view * turn * mat3(s.x, 0.0, 0.0, 0.0, s.y, 0.0, 0.0, 0.0, s.z);
   vec3 row_x = by_x * half_covariance, row_y = by_y * half_covariance;
-  float xx = dot(row_x, row_x) + 0.3, xy = dot(row_x, row_y), yy = dot(row_y, row_y) + 0.3;
+  vec2 filtered = texel(placements, row + 4).xy;  // variance that is added; whether opacity pays for it
+  float xx = dot(row_x, row_x) + filtered.x, xy = dot(row_x, row_y), yy = dot(row_y, row_y) + filtered.x;
+  if (filtered.y > 0.0) {
+    vec3 area = cross(row_x, row_y);
+    float before = dot(area, area);
+    opacity *= sqrt(before / (before + filtered.x * (xx + yy - filtered.x)));
+    if (opacity <= 1.0 / 255.0) {
+      return;
+    }
+  }
 
   // The ellipse where alpha falls to 1/255, along its own axes.
   float middle = 0.5 * (xx + yy);
   float apart = length(vec2(0.5 * (xx - yy), xy));
   vec2 axis = abs(xy) > 1e-6 * middle ? normalize(vec2(xy, middle + apart - xx))
                                       : (xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0));
-  float longer = sqrt(middle + apart), shorter = sqrt(max(middle - apart, 0.3));
+  float longer = sqrt(middle + apart), shorter = sqrt(max(middle - apart, filtered.x));
   float reach = sqrt(2.0 * log(255.0 * opacity));
   vec2 offset = corner.x * longer * reach * axis + corner.y * shorter * reach * vec2(-axis.y, axis.x);
   place = corner * reach;
@@ -339,6 +352,7 @@ def draw(
     projection: Matrix,
     canvas: Canvas,
     *,
+    antialias: Sequence[bool] = (),
     resolution: float = 1.0,
     under_overlays: bool = True,
 ) -> None:
@@ -348,6 +362,7 @@ def draw(
         instances, count: the arrangement's.
         worlds: each placement's ``matrix_world``, (4, 4) float64.
         view, projection: from the world to the camera's space, and on to clip space.
+        antialias: of each placement, see ``SplatScene.antialias``; none: no one is.
         resolution: of the splats, over that of the framebuffer.
         under_overlays: leave what the framebuffer shows already on top, where it has alpha; it is coded in
             sRGB, as a viewport's is.
@@ -360,7 +375,8 @@ def draw(
         overlay = gpu.types.GPUTexture(
             (width, height), format="RGBA8", data=frame.read_color(0, 0, width, height, 4, 0, "FLOAT")
         )
-    placements = _placements(worlds, view, projection)  # a texture is freed with its last name
+    flags = antialias or [False] * len(worlds)
+    placements = _placements(worlds, flags, view, projection)  # a texture is freed with its last name
     size = max(1, round(width * resolution)), max(1, round(height * resolution))
     canvas.resize(size)
     with canvas.frame.bind():  # type: ignore[union-attr]
@@ -408,8 +424,11 @@ def reset_state() -> None:
     gpu.state.blend_set("NONE")
 
 
-def _placements(worlds: Sequence[np.ndarray], view: Matrix, projection: Matrix) -> gpu.types.GPUTexture:
-    """Four texels a placement: three rows that take its splats to the camera's space, and the eye in its own.
+def _placements(
+    worlds: Sequence[np.ndarray], antialias: Sequence[bool], view: Matrix, projection: Matrix
+) -> gpu.types.GPUTexture:
+    """Five texels a placement: three rows that take its splats to the camera's space, the eye in its own, and
+    the filter.
 
     The eye's fourth number is 1; without perspective it is 0, and the rest the direction against the view.
     """
@@ -417,9 +436,10 @@ def _placements(worlds: Sequence[np.ndarray], view: Matrix, projection: Matrix) 
     perspective = projection[3][3] == 0
     back = np.linalg.inv(view_matrix)
     eye = back[:, 3] if perspective else back[:, 2]
-    data = np.zeros((-(-4 * len(worlds) // WIDTH) * WIDTH, 4), np.float32)
-    for number, world in enumerate(worlds):
-        rows = data[4 * number : 4 * number + 4]
+    data = np.zeros((-(-5 * len(worlds) // WIDTH) * WIDTH, 4), np.float32)
+    for number, (world, filtered) in enumerate(zip(worlds, antialias, strict=True)):
+        rows = data[5 * number : 5 * number + 5]
+        rows[4, :2] = MIP_FILTER if filtered else DILATION
         rows[:3] = (view_matrix @ world)[:3]
         rows[3, :3] = (np.linalg.pinv(world) @ eye)[:3]
         rows[3, 3] = perspective

@@ -119,7 +119,8 @@ def draw_splats(
         placements = request.placements
     splats.draw(
         view.uploaded, view.instances, view.arrangement.count, [placement.world for placement in placements],
-        view_matrix, projection, view.canvas, resolution=view.resolution, under_overlays=under_overlays,
+        view_matrix, projection, view.canvas, antialias=[placement.antialias for placement in placements],
+        resolution=view.resolution, under_overlays=under_overlays,
     )  # fmt: skip
 
 
@@ -204,6 +205,7 @@ def _placements(
                 choice=selection.choice(instance.evaluated, depsgraph) if plain else None,
                 scene=(root or instance.object).session_uid,
                 tell=root.lodgs.tell if root else "OWN",
+                antialias=instance.antialias,
             )
         )
     return tuple(found)

@@ -20,5 +20,13 @@ camera = Camera("view", *map(int, given["size"]), *map(float, given["intrinsics"
 names = ("means", "quats", "log_scales", "opacity_logits", "sh")
 tensors = [torch.tensor(given[name], dtype=torch.float32) for name in names]
 weights = torch.tensor(given["weights"], dtype=torch.float32) if "weights" in given else None
-drawn = rasterize(Gaussians(*tensors), camera, weights=weights, near=float(given["near"]), backend="cpu")
+antialias = torch.tensor(given["antialias"]) if "antialias" in given else False
+drawn = rasterize(
+    Gaussians(*tensors),
+    camera,
+    weights=weights,
+    near=float(given["near"]),
+    antialias=antialias,
+    backend="cpu",
+)
 np.save(sys.argv[2], drawn.image.numpy())

@@ -47,14 +47,16 @@ class Evaluation:
     Args:
         data: the scene at training size.
         backend: rasterizer.
+        antialias: how splats are drawn, see ``Bundle.antialias``.
 
     Attributes:
         cameras: the held-out views; where none are, training views, ``MOST_TRAINING_VIEWS`` at most.
         prefix: of the names that quality on ``cameras`` goes by: none, or ``train_`` for training views.
     """
 
-    def __init__(self, data: TrainingData, backend: str = "auto") -> None:
+    def __init__(self, data: TrainingData, backend: str = "auto", antialias: bool = False) -> None:
         self.data, self.backend, self.device = data, backend, device_of(backend)
+        self.antialias = antialias
         self.cameras = data.test or evenly(data.train, MOST_TRAINING_VIEWS)
         self.prefix = "" if data.test else "train_"
         self._training = {camera.image: index for index, camera in enumerate(data.train)}
@@ -88,6 +90,7 @@ class Evaluation:
                 camera,
                 weights=None if weights is None else torch.as_tensor(weights).to(self.device, torch.float32),
                 near=self.data.near,
+                antialias=self.antialias,
                 backend=self.backend,
             )
 

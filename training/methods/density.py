@@ -11,7 +11,7 @@ import torch
 
 from ..errors import LodgsError
 from ..rasterize.features import rotation_matrices
-from .model import Model
+from .model import PEAKS, Model
 
 RESET_OPACITY = 0.01
 """What an opacity reset leaves at most."""
@@ -25,6 +25,15 @@ NARROWER = sqrt(1 - SHORTER**2)
 """The children's share of the parent's other two."""
 FAINTER = 0.6
 """The children's share of its opacity."""
+
+
+def peak_scores(model: Model) -> torch.Tensor:
+    """What decides by maxima (N,): the largest gradient times the largest radius times opacity^(1/5).
+
+    LODGE, Eq. 6, after H3DGS: gradients in 3DGS units, radii of three standard deviations in pixels.
+    """
+    gradient, radius = (model.stats[name] for name in PEAKS)
+    return gradient * radius * model["opacity_logits"].detach().sigmoid() ** 0.2
 
 
 @torch.no_grad()
@@ -43,8 +52,9 @@ def densify(
     Children have their parent's other values; of the model's columns they begin with zeros.
 
     Args:
-        gradients: (N,) mean norm of the image-plane gradient over the views that saw each splat.
-        threshold: the gradient above which a splat is densified.
+        gradients: (N,) mean norm of the image-plane gradient over the views that saw each splat, or
+            :func:`peak_scores`.
+        threshold: the value above which a splat is densified.
         clone_below: largest scale (scene units) that is cloned; larger ones are split in two at random, as
             in 3DGS. None: all are split in two along their longest axis.
         max_splats: the largest gradients come first until this number is reached.

@@ -118,6 +118,7 @@ class Method(ABC, Generic[P, D]):
             "focal_width": data.train[0].width,
             "scene_extent": data.extent,
             "median_depth": data.median_depth,
+            **({"antialias": True} if self.parameters.antialias else {}),
         }
 
     # -- a step ----------------------------------------------------------------------------------------
@@ -270,6 +271,7 @@ class Method(ABC, Generic[P, D]):
             min_scale=min_scale,
             sh_degree=self.sh_degree(step),
             near=self.data.near,
+            antialias=self.parameters.antialias,
             background=self.background(step),
             backend=self.backend,
         )

@@ -17,6 +17,8 @@ from .parameters import Parameters
 
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
 """The tensors that every splat has; a model of splats may train further ones, (N,), under other names."""
+PEAKS = ("gradient_max", "radius_max")
+"""Stats that densification by maxima needs: as ``gradient_sum``, and in pixels, since the last reset."""
 
 
 class Model:
@@ -33,6 +35,7 @@ class Model:
         lr: the learning rate of each.
         columns: as the attribute.
         stats: further ones than ``gradient_sum`` and ``seen``, or these in another shape than (N,); zeros.
+        peaks: keep the stats ``gradient_max`` and ``radius_max`` as well.
     """
 
     def __init__(
@@ -41,11 +44,14 @@ class Model:
         lr: Mapping[str, LearningRate],
         columns: Mapping[str, torch.Tensor] | None = None,
         stats: Mapping[str, torch.Tensor] | None = None,
+        peaks: bool = False,
     ) -> None:
         self.adam = Adam({name: tensor.requires_grad_(True) for name, tensor in tensors.items()}, lr=lr)
         self.columns = dict(columns or {})
         blank = self["means"].detach().new_zeros(len(self))
         self.stats = {"gradient_sum": blank, "seen": blank.clone(), **(stats or {})}
+        if peaks:
+            self.stats |= {name: blank.clone() for name in PEAKS}
 
     def __len__(self) -> int:
         return len(self["means"])
@@ -98,12 +104,18 @@ class Model:
     def accumulate_stats(self, rendering: Rendering, shrink: float = 1) -> None:
         """After ``backward``: adds up image-plane gradients' norms, and how often each splat was drawn.
 
+        Where there are ``PEAKS``, these rise to the largest gradient and radius.
+
         Args:
             shrink: how many times smaller the photograph was, which made gradients as many times larger (see
                 ``TrainingData.threshold_scale``).
         """
-        self.stats["gradient_sum"] += rendering.grad2d.norm(dim=1) / shrink
+        gradient = rendering.grad2d.norm(dim=1) / shrink
+        self.stats["gradient_sum"] += gradient
         self.stats["seen"] += rendering.radii > 0
+        for name, now in zip(PEAKS, (gradient, rendering.radii), strict=True):
+            if name in self.stats:
+                self.stats[name] = torch.maximum(self.stats[name], now)
 
     def reset_stats(self) -> None:
         """Begins anew with what is added up."""

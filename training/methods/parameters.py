@@ -89,6 +89,11 @@ class Parameters:
         "anything: blurred colours at the depth of the edge instead of black. 0 leaves it empty.",
         high=2,
     )
+    antialias: bool = parameter(
+        False,
+        "Whether splats are drawn through Mip-Splatting's 2D filter, which keeps the light of those that are "
+        "smaller than a pixel, instead of 3DGS's dilation. Where a run begins with a base, the base decides.",
+    )
     lr_exposure: float = parameter(
         0.0,
         "Learning rate of each photograph's own gain and offset of colours, which pictures do not have; for "

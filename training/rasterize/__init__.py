@@ -47,7 +47,7 @@ def rasterize(
     sh_degree: int | None = None,
     min_scale: float = 0.0,
     near: float = 0.01,
-    antialias: bool = False,
+    antialias: bool | torch.Tensor = False,
     outputs: Collection[str] = (),
     features: torch.Tensor | None = None,
     limit: torch.Tensor | None = None,
@@ -71,7 +71,7 @@ def rasterize(
         near: a splat is drawn where its mean lies deeper than this, in world units.
         antialias: instead of 3DGS's dilation, filter with :data:`.rendering.MIP_VARIANCE` and give what a
             splat gains in area back in opacity, sqrt(det before / det after) (Mip-Splatting, Yu et al. 2024,
-            Eq. 10).
+            Eq. 10). Or (N,) bool, for each splat whether it is so.
         outputs: of :data:`OUTPUTS`, what :class:`Rendering` shall have besides; differentiable, too.
         features: (N, F) further values of each splat, blended as colours are over zero.
         limit: (H, W), for each pixel a depth along the camera's z axis, in world units: splats whose means
@@ -89,6 +89,7 @@ def rasterize(
     """
     count, means, view = len(gaussians), gaussians.means, View.of(camera, near, window)
     _check_weights(weights, count)
+    _check_antialias(antialias, count)
     gaussians = replace(gaussians, sh=_coefficients(gaussians.sh))
     if not set(outputs) <= set(OUTPUTS):
         raise ValueError(f"outputs can be {', '.join(OUTPUTS)}, not {', '.join(outputs)}")
@@ -107,7 +108,7 @@ def rasterize(
         blended.append(normals(gaussians, view))
     red, green, blue = (float(value) for value in background)
     settings = Settings(
-        view, float(min_scale), bool(antialias), (red, green, blue), _degree(gaussians.sh, sh_degree),
+        view, float(min_scale), antialias, (red, green, blue), _degree(gaussians.sh, sh_degree),
         median="median_depth" in outputs, absolute="absgrad2d" in outputs, limit=limit, rows=rows,
     )  # fmt: skip
     drawn = _backend(backend, means).rasterize(
@@ -203,7 +204,7 @@ def contributions(
     weights: torch.Tensor | None = None,
     min_scale: float = 0.0,
     near: float = 0.01,
-    antialias: bool = False,
+    antialias: bool | torch.Tensor = False,
     rows: torch.Tensor | None = None,
     backend: str = "auto",
 ) -> Contributions:
@@ -214,10 +215,11 @@ def contributions(
     """
     count, device = len(gaussians), gaussians.means.device
     _check_weights(weights, count)
+    _check_antialias(antialias, count)
     largest, total, radius = (torch.zeros(count, dtype=torch.float32, device=device) for _ in range(3))
     pixels, views = (torch.zeros(count, dtype=torch.int64, device=device) for _ in range(2))
     for camera in cameras:
-        settings = Settings(View.of(camera, near), float(min_scale), bool(antialias), rows=rows)
+        settings = Settings(View.of(camera, near), float(min_scale), antialias, rows=rows)
         found = _backend(backend, gaussians.means).contributions(gaussians, weights, settings)
         largest = torch.maximum(largest, found[0])
         total += found[1]
@@ -230,6 +232,11 @@ def contributions(
 def _check_weights(weights: torch.Tensor | None, count: int) -> None:
     if weights is not None and weights.shape != (count,):
         raise ValueError(f"weights must have shape ({count},), not {tuple(weights.shape)}")
+
+
+def _check_antialias(antialias: bool | torch.Tensor, count: int) -> None:
+    if isinstance(antialias, torch.Tensor) and (antialias.shape, antialias.dtype) != ((count,), torch.bool):
+        raise ValueError(f"antialias must be one bool or {count}, not {tuple(antialias.shape)}")
 
 
 def _coefficients(sh: torch.Tensor) -> torch.Tensor:

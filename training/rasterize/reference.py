@@ -121,11 +121,10 @@ def ellipses(gaussians: Gaussians, weights: torch.Tensor | None, settings: Setti
     opacity = opacity[drawn]
     scales = gaussians.log_scales[drawn].exp() + settings.min_scale
     half_covariance = rotation @ rotation_matrices(gaussians.quats[drawn]) * scales[:, None]
-    mean2d, covariance, determinant, area = project(
-        position, half_covariance, view, MIP_VARIANCE if settings.antialias else DILATION
-    )
-    if settings.antialias:
-        opacity = opacity * area
+    each = torch.as_tensor(settings.antialias, device=means.device).expand(len(means))[drawn]
+    dilation = torch.where(each, means.new_tensor(MIP_VARIANCE), means.new_tensor(DILATION))
+    mean2d, covariance, determinant, area = project(position, half_covariance, view, dilation)
+    opacity = torch.where(each, opacity * area, opacity)
     with torch.no_grad():
         xx, xy, yy = covariance
         # where alpha falls to its minimum: sigma² = 2 ln(opacity / minimum), along x and along y
@@ -145,13 +144,16 @@ def squared_reach(opacity: torch.Tensor) -> torch.Tensor:
     return 2 * torch.log((opacity / ALPHA_MIN).clamp_min(1))
 
 
-def project(position: torch.Tensor, half_covariance: torch.Tensor, view: View, dilation: float):
+def project(
+    position: torch.Tensor, half_covariance: torch.Tensor, view: View, dilation: float | torch.Tensor
+):
     """Means (N, 2) in pixels, dilated covariances' xx, xy, yy, their determinant, and sqrt(det before / det
     after), each (N,).
 
     Args:
         position: (N, 3) in camera coordinates.
         half_covariance: (N, 3, 3) M with covariance M Mᵀ, in camera coordinates.
+        dilation: in square pixels, of all or of each (N,).
     """
     x, y, z = position.unbind(1)
     clamped_x = (x / z).clamp(*view.x_limits) * z

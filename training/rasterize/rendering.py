@@ -84,7 +84,7 @@ class Settings:
 
     view: View
     min_scale: float
-    antialias: bool
+    antialias: bool | torch.Tensor
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     degree: int = 0
     median: bool = False

@@ -64,6 +64,7 @@ def write_scene(
     near: float,
     points: int = POINTS,
     backend: str = "auto",
+    antialias: bool = False,
 ) -> int:
     """Writes scene/images/*.jpg and scene/sparse/0/*.bin; nothing is left of it when something goes wrong.
 
@@ -74,6 +75,7 @@ def write_scene(
         cameras: the views, of one lens, in the splats' world.
         near: depth at which drawing begins, in world units.
         points: how many to look for.
+        antialias: how the splats are drawn, see ``Bundle.antialias``.
 
     Returns:
         How many points there are.
@@ -88,7 +90,7 @@ def write_scene(
     try:
         shutil.rmtree(beside, ignore_errors=True)
         (beside / "images").mkdir(parents=True)
-        count = _write(beside, splats, cameras, near, points, backend)
+        count = _write(beside, splats, cameras, near, points, backend, antialias)
         beside.rename(scene)
     except OSError as error:
         raise LodgsError(
@@ -101,12 +103,20 @@ def write_scene(
 
 
 def _write(
-    scene: Path, splats: Splats, cameras: Sequence[Camera], near: float, points: int, backend: str
+    scene: Path,
+    splats: Splats,
+    cameras: Sequence[Camera],
+    near: float,
+    points: int,
+    backend: str,
+    antialias: bool,
 ) -> int:
     gaussians, rng = Gaussians.of(splats), np.random.default_rng(0)
     views, pictures, depths, found = [], [], [], []
     for camera in cameras:
-        drawn = rasterize(gaussians, camera, near=near, outputs=("median_depth",), backend=backend)
+        drawn = rasterize(
+            gaussians, camera, near=near, antialias=antialias, outputs=("median_depth",), backend=backend
+        )
         assert drawn.median_depth is not None  # as asked for
         pictures.append((drawn.image.cpu().numpy().clip(0, 1) * 255).round().astype(np.uint8))
         depths.append(drawn.median_depth.cpu().numpy())

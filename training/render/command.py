@@ -120,7 +120,10 @@ def render(
         shown = select_levels(bundle, camera.center, camera.focal, settings(bundle, given or {}))
     else:
         shown = complete_levels(bundle, level or bundle.levels[-1].number)
-    instances = [Instance(SplatSet(x.splats, x.weights, backend), level=x.number) for x in shown]
+    instances = [
+        Instance(SplatSet(x.splats, x.weights, backend), level=x.number, antialias=bundle.antialias)
+        for x in shown
+    ]
     everything = out.suffix.lower() == ".exr"
     picture = draw(
         instances, camera, near=near, background=background, depth=everything, levels=everything, limit=limit,

@@ -42,6 +42,7 @@ class NamedSet:
     Attributes:
         file: a name in the folder of arrays.
         count: of its splats.
+        antialias: see ``scene.Instance``.
         columns: names of the further columns that the file has.
         choice: by what its splats are weighted, on top of the file's weights; None: by these alone.
     """
@@ -50,6 +51,7 @@ class NamedSet:
     count: int
     matrix: np.ndarray
     level: int
+    antialias: bool = False
     columns: tuple[str, ...] = ()
     choice: Choice | None = None
 
@@ -140,6 +142,7 @@ def _named_set(values: Any) -> NamedSet:
         count=_whole(values, "count", 0, MOST_SPLATS),
         matrix=matrix,
         level=_whole(values, "level", 0, LAST_LEVEL),
+        antialias=bool(values.get("antialias")),
         columns=_columns(values),
         choice=_choice(_of_kind(values, "choice", dict)) if values.get("choice") is not None else None,
     )

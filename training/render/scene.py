@@ -118,12 +118,14 @@ class Instance:
     Attributes:
         matrix: (4, 4) float64, from the set's coordinates to the world.
         level: number of the level of detail that it is; 0 where it is none.
+        antialias: how it is drawn, see ``Bundle.antialias``.
         weights: (N,) of its splats here; None: the set's own.
     """
 
     splats: SplatSet
     matrix: np.ndarray = field(default_factory=lambda: np.eye(4))
     level: int = 0
+    antialias: bool = False
     weights: np.ndarray | None = None
 
 
@@ -182,6 +184,7 @@ def draw(
         features = _membership(instances, weights, picture) if levels else None
         for top, drawn in strips(
             gaussians, camera, weights=torch.cat(weights), background=behind, near=near,
+            antialias=_filtered(instances, weights),
             outputs=("depth", "median_depth") if depth else (), features=features, window=window,
             limit=None if limit is None else torch.from_numpy(limit / unit).to(gaussians.means),
             strip=STRIP, backend=backend,
@@ -243,6 +246,15 @@ def _in_one_frame(
     ]
     left = [weight[some] for weight, some in zip(weights, drawn, strict=True)]
     return Gaussians.concatenated(there), left, camera, near, 1.0
+
+
+def _filtered(instances: list[Instance], weights: list[torch.Tensor]) -> bool | torch.Tensor:
+    """Whether splats are antialiased: all or none, or (N,) of each where sets differ."""
+    flags = {one.antialias for one in instances}
+    if len(flags) == 1:
+        return flags.pop()
+    each = zip(instances, weights, strict=True)
+    return torch.cat([torch.full_like(weight, one.antialias).bool() for one, weight in each])
 
 
 def _membership(instances: list[Instance], weights: list[torch.Tensor], picture: Picture) -> torch.Tensor:

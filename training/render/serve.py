@@ -163,9 +163,9 @@ class _Server:
         for one in sets:
             if one.file not in kept:
                 kept[one.file] = self._sets.get(one.file) or self._read_set(frame, one)
-            one_kept = kept[one.file]
-            weights = one_kept.weights(one.choice)
-            instances.append(Instance(one_kept.drawn, one.matrix, one.level, weights))
+            held = kept[one.file]
+            weights = held.weights(one.choice)
+            instances.append(Instance(held.drawn, one.matrix, one.level, one.antialias, weights))
         self._sets = kept
         return instances
 

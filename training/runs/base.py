@@ -17,12 +17,15 @@ from ..splats.gaussians import Splats
 from .folder import RunFolder
 
 
-def read_base(path: str | Path, warn: Warn = silent) -> Splats:
+def read_base(path: str | Path, warn: Warn = silent) -> tuple[Splats, bool]:
     """The finest complete level of a finished run, of a bundle or an exported folder, or of a plain PLY.
 
     Args:
         path: a run's folder, one of levels with its manifest, or a PLY.
         warn: as for ``read_bundle``.
+
+    Returns:
+        The splats, and whether they are antialiased (``Bundle.antialias``).
 
     Raises:
         LodgsError: there is no such file, the run is not finished, the file cannot be read, or it has no
@@ -45,7 +48,7 @@ def read_base(path: str | Path, warn: Warn = silent) -> Splats:
         splats = _as_seen(bundle, np.asarray(bundle.meta["camera_center"]))
     if not len(splats):
         raise LodgsError(f"{path} holds no splats to begin with.", "Choose another run or PLY.")
-    return splats
+    return splats, bundle.antialias
 
 
 def _as_seen(bundle: Bundle, eye: np.ndarray) -> Splats:

@@ -59,7 +59,8 @@ def evaluate_run(
         raise LodgsError(f"{run} holds no finished run (no bundle.ply).", "Train it to the end first.")
     job = Job.from_file(folder.job)
     data = training_data(job, folder)
-    evaluation, bundle = Evaluation(data, job.backend), read_bundle(folder.bundle)
+    bundle = read_bundle(folder.bundle)
+    evaluation = Evaluation(data, job.backend, bundle.antialias)
     rule = find_rule(bundle.rule)
     if rule is None and (given or bundle.rule):
         raise LodgsError(*unknown_rule(bundle.rule))

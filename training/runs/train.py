@@ -32,6 +32,7 @@ from ..methods.method import Method
 from ..rasterize import cuda, device_of, resolve, warm_up
 from ..scenes.orientation import up_rotation
 from ..splats.bundle import Bundle, Level, write_bundle
+from ..splats.dialects import comments_of
 from ..splats.ply import read_ply, write_ply
 from .base import read_base
 from .checkpoints import read_newest, remove_checkpoints, write_checkpoint
@@ -137,9 +138,9 @@ class _Run:
 
     def __init__(self, job: Job, backend: str, folder: RunFolder, events: Events, data: TrainingData) -> None:
         self.job, self.folder, self.events, self.data = job, folder, events, data
-        self.evaluation = Evaluation(data, backend)
         self._backend = backend
         self.method = self._fresh_method()
+        self.evaluation = Evaluation(data, backend, self.method.parameters.antialias)
         self._device = device_of(backend)
         self.step = 0
         self.levels: list[dict] = []
@@ -147,15 +148,18 @@ class _Run:
 
     def _fresh_method(self) -> Method:
         """The job's method before its first step."""
-        job, data, base = self.job, self.data, None
+        job, data, base, parameters = self.job, self.data, None, self.job.resolved_parameters()
         if job.base:
-            base = read_base(job.base, self._warn)
+            base, antialias = read_base(job.base, self._warn)
+            if antialias != parameters.antialias:
+                self._warn(f"The base is {'' if antialias else 'not '}antialiased, and so is this run.")
+                parameters = replace(parameters, antialias=antialias)
             if not any(camera.sees(base.means, near=data.near).any() for camera in data.train):
                 raise LodgsError(
                     f"No training view sees a splat of {job.base}.",
                     "Choose splats that were made from these photographs, in the same coordinates.",
                 )
-        return create(job.method, data, job.resolved_parameters(), job.seed, self._backend, base)
+        return create(job.method, data, parameters, job.seed, self._backend, base)
 
     def _warn(self, message: str) -> None:
         self.events("warning", message=message)
@@ -247,7 +251,7 @@ class _Run:
         bundle = replace(self._without_splats(), levels=levels)
         for place, level in enumerate(levels, 1):
             path = self.folder.levels_folder / f"level_{level.number}.ply"
-            write_ply(path, level.splats)
+            write_ply(path, level.splats, comments_of(bundle.meta))
             record = {
                 "level": level.number,
                 "path": f"levels/{path.name}",

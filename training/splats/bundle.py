@@ -102,6 +102,11 @@ class Bundle:
     meta: dict = field(default_factory=dict)
     tables: dict[str, Columns] = field(default_factory=dict)
 
+    @property
+    def antialias(self) -> bool:
+        """Whether the splats are drawn through Mip-Splatting's 2D filter, as they were trained."""
+        return bool(self.meta.get("antialias"))
+
     def upto(self, number: int) -> list[Level]:
         """The levels that are drawn at a level: it, and where levels add up the coarser ones before it."""
         return [
@@ -178,7 +183,7 @@ def read_bundle(path: str | Path, warn: Warn = silent) -> Bundle:
     bundle, lines = _parse(comments, path)
     if bundle is None:
         splats = as_3dgs(splats_from(elements["vertex"], path), path, warn)
-        return Bundle("", [Level(1, splats)], meta=meta_of(comments, path, warn))
+        return Bundle("", [Level(1, splats)], meta=meta_of(comments))
     try:
         begin = dict.fromkeys(elements, 0)
         of_levels = {line["element"] for line in lines if "level" in line}
@@ -220,7 +225,7 @@ def read_head(path: str | Path) -> Bundle:
         LodgsError: as `read_bundle`.
     """
     comments = read_comments(path)
-    return _parse(comments, path)[0] or Bundle("", [Level(1, NO_SPLATS)], meta=meta_of(comments, path))
+    return _parse(comments, path)[0] or Bundle("", [Level(1, NO_SPLATS)], meta=meta_of(comments))
 
 
 def write_folder(folder: str | Path, bundle: Bundle) -> str:
@@ -418,6 +423,7 @@ def _bundle(head: dict, lines: list[dict], meta: dict, path: str | Path) -> Bund
             values = np.asarray(meta[name])
             if values.shape != shape or values.dtype.kind not in "if" or (np.abs(values) > FARTHEST).any():
                 raise ValueError(f"{name} is not {shape} numbers")
+    _of_kind(meta.get("antialias", False), bool, "antialias")
     if not 1 <= len(_of_kind(lines, list, "levels")) <= MOST_LEVELS_READ:
         raise ValueError(f"{len(lines)} levels")
     for line in lines:

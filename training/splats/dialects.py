@@ -121,18 +121,12 @@ def _smoothed(
     return (log_scales + grown).astype(np.float32), np.minimum(logits, opacity_logits).astype(np.float32)
 
 
-def meta_of(comments: Iterable[str], path: str | Path, warn: Warn = silent) -> dict:
+def meta_of(comments: Iterable[str]) -> dict:
     """What the comments of a foreign PLY say of how it is drawn, as a bundle's meta has it.
 
     ``{"antialias": True}`` for splats that were trained with Mip-Splatting's 2D filter (Brush, Postshot).
     """
-    if _render_mode(comments) != "mip":
-        return {}
-    warn(
-        f"{path} was trained with Mip-Splatting's 2D filter, and is drawn with 3DGS's dilation: "
-        "small and distant splats look slightly thicker and denser."
-    )
-    return {"antialias": True}
+    return {"antialias": True} if _render_mode(comments) == "mip" else {}
 
 
 def comments_of(meta: dict) -> list[str]:

@@ -21,7 +21,7 @@ from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 from ..documents import open_file
 from ..errors import LodgsError
 from ..files import atomic_write
-from .dialects import Warn, as_3dgs, meta_of, refuse, silent
+from .dialects import Warn, as_3dgs, refuse, silent
 from .gaussians import Splats
 
 MOST_HEADER, MOST_COLUMNS = 1 << 20, 1000
@@ -81,8 +81,7 @@ def read_ply(path: str | Path, warn: Warn = silent) -> Splats:
     Raises:
         LodgsError: not a PLY, cut short, without the columns of splats, or of a dialect that cannot be read.
     """
-    elements, comments = read_elements(path)
-    meta_of(comments, path, warn)
+    elements, _ = read_elements(path)
     return as_3dgs(splats_from(elements["vertex"], path), path, warn)
 
 

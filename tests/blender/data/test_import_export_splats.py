@@ -107,12 +107,12 @@ def test_several_plain_files_at_once_as_dropped(bpy, lodgs, bundle, tmp_path):
     assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "plain2.ply").read_bytes()
 
 
-def test_a_foreign_dialect_is_warned_of_and_named_again_on_export(bpy, lodgs, bundle, tmp_path):
+def test_a_foreign_2d_filter_is_known_and_named_again_on_export(bpy, lodgs, bundle, tmp_path):
     splats = bundle.levels[0].splats
     lodgs("training.splats.ply").write_ply(tmp_path / "mip.ply", splats, ["SplatRenderMode: mip"])
     said = []
-    lodgs("data.scenes").import_splats(bpy.context, tmp_path / "mip.ply", warn=said.append)
-    assert len(said) == 1 and "trained with Mip-Splatting's 2D filter" in said[0]
+    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "mip.ply", warn=said.append)
+    assert said == [] and root.lodgs.antialias
     bpy.context.view_layer.objects.active = bpy.data.objects["mip"]
     for source in ("SHOWN", "LEVEL"):
         bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "out.ply"), source=source)

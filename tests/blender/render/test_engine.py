@@ -116,6 +116,24 @@ def test_f12_is_what_training_render_draws_to_the_bit(bpy, scene, bundle, tmp_pa
     np.testing.assert_array_equal(bytes_of(shown), bytes_of(expected))
 
 
+def test_f12_of_antialiased_splats_is_what_training_render_draws(bpy, lodgs, scene, bundle, tmp_path):
+    """By what the scene says, which its bundle then says as well."""
+    root = lodgs("data.scenes").roots(scene)[0]
+    for item in root.lodgs.levels:
+        for value in item.object.data.attributes["scale"].data:
+            value.vector = [x / 10 for x in value.vector]
+    before = f12(bpy, tmp_path)
+    root.lodgs.antialias = True
+    shown, camera = f12(bpy, tmp_path), tmp_path / "camera.json"
+    assert np.abs(bytes_of(before).astype(int) - bytes_of(shown)).max() > 20
+    bpy.ops.lodgs.export_camera(filepath=str(camera))
+    bpy.context.view_layer.objects.active = root
+    assert bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "small.ply")) == {"FINISHED"}
+    without_blender(tmp_path / "small.ply", camera, tmp_path / "trainer.png")
+    difference = np.abs(bytes_of(shown).astype(int) - bytes_of(pixels(bpy, tmp_path / "trainer.png")))
+    assert difference.max() <= 1 and (difference > 0).mean() < 0.01  # scales were float32's logarithms
+
+
 def test_levels_by_distance_are_what_training_render_chooses(bpy, lodgs, scene, bundle, tmp_path):
     root = lodgs("data.scenes").roots(scene)[0]
     root.lodgs.mode, root.lodgs.bands.gamma = "SELECTIVE", 10

@@ -100,12 +100,15 @@ def psnr(one, other):
 
 @pytest.fixture
 def truth(bpy, camera, tmp_path):
-    """``truth([(splats, matrix), ...])``: the trainer's picture of splats in the world, (SIZE, SIZE, 3)."""
+    """``truth([(splats, matrix), ...])``: the trainer's picture of splats in the world, (SIZE, SIZE, 3).
+
+    ``antialias`` says of each set whether it is.
+    """
     python = os.environ.get("LODGS_TRAINER_PYTHON")
     if not python:
         pytest.skip("LODGS_TRAINER_PYTHON names no Python that has the trainer")
 
-    def rendered(sets, keep=None):
+    def rendered(sets, keep=None, antialias=()):
         projection = camera.calc_matrix_camera(bpy.context.evaluated_depsgraph_get(), x=SIZE, y=SIZE)
         flip = np.diag([1.0, -1.0, -1.0, 1.0])
         world_to_camera = flip @ np.linalg.inv(np.array(camera.matrix_world, float))
@@ -113,6 +116,8 @@ def truth(bpy, camera, tmp_path):
         arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
         if keep is not None:
             arrays["weights"] = keep(arrays["means"]).astype(float)
+        if antialias:
+            arrays["antialias"] = np.repeat(antialias, [len(splats) for splats, _ in sets])
         intrinsics = (
             projection[0][0] * SIZE / 2, projection[1][1] * SIZE / 2,
             SIZE / 2 * (1 - projection[0][2]), SIZE / 2 * (1 + projection[1][2]),
@@ -196,6 +201,54 @@ def test_two_overlapping_sets_turned_scaled_and_stretched(bpy, lodgs, add, pictu
         sets.append((splats, matrix))
 
     assert psnr(displayed(picture()), truth(sets)) > 45
+
+
+def test_antialiased_splats_beside_others(bpy, lodgs, picture, truth):
+    """Each set through its own filter: splats of a pixel and less, two scenes that reach into each other."""
+    scenes, bundle = lodgs("data.scenes"), lodgs("training.splats.bundle")
+    sets = [(make_splats(lodgs, 6000, 1, seed, size=-5.5), np.eye(4)) for seed in range(2)]
+    for (splats, _), meta in zip(sets, ({"antialias": True}, {}), strict=True):
+        with scenes._new_scene(bpy.context, "scene") as root:
+            scenes.set_level(root, bundle.Level(1, splats))
+            scenes.set_bundle_facts(root, bundle.Bundle("", [], meta=meta))
+    bpy.context.view_layer.update()
+    expected = truth(sets, antialias=[True, False])
+    assert psnr(expected, truth(sets)) < 35
+    assert psnr(displayed(picture()), expected) > 45
+
+
+def test_a_copy_and_an_instance_are_antialiased_too(bpy, lodgs, picture):
+    """Whatever shows the splats of a scene draws them as the scene says, as soon as it says so."""
+    from mathutils import Matrix
+
+    scenes, bundle = lodgs("data.scenes"), lodgs("training.splats.bundle")
+    with scenes._new_scene(bpy.context, "scene") as root:
+        level = scenes.set_level(root, bundle.Level(1, make_splats(lodgs, 20)))
+        scenes.set_bundle_facts(root, bundle.Bundle("", []))
+    copy, instance = level.copy(), bpy.data.objects.new("instance", None)
+    root.users_collection[0].objects.link(copy)
+    instance.instance_type, instance.instance_collection = "COLLECTION", root.users_collection[0]
+    instance.matrix_world = Matrix.Translation((3, 0, 0))
+    bpy.context.scene.collection.objects.link(instance)
+    alone = bpy.data.objects.new("alone", level.data)
+    bpy.context.scene.collection.objects.link(alone)
+    shown = lodgs("data.shown")
+
+    def flags():
+        bpy.context.view_layer.update()
+        sets = shown.splat_instances(bpy.context.evaluated_depsgraph_get())
+        assert len(sets) == 5
+        return sorted((each.object.name, each.antialias) for each in sets)
+
+    assert not any(antialias for _, antialias in flags())
+    before = picture()
+    root.lodgs.antialias = True
+    assert scenes.read_levels(root).meta == {"antialias": True}
+    assert [name for name, antialias in flags() if not antialias] == ["alone"]
+    assert np.abs(picture() - before).max() > 0.01
+    root.lodgs.antialias = False
+    assert scenes.read_levels(root).meta == {}
+    assert not any(antialias for _, antialias in flags())
 
 
 def moved_by(bpy, offset):

@@ -120,7 +120,7 @@ def test_as_a_base_and_as_full_detail_splats_have_the_weights_that_a_camera_sees
     meta = {"camera_center": [2.0, 0.0, 0.0]}
     bundle = Bundle("clod", [Level(1, splats)], "decay", FACTS, meta=meta)
     write_bundle(tmp_path / "a.ply", bundle)
-    base = read_base(tmp_path / "a.ply")
+    base, _ = read_base(tmp_path / "a.ply")
     by_rule = weights(means, columns, eye=(2, 0, 0))
     expected = (by_rule * columns["opacity"])[by_rule > 0]
     assert 0 < len(expected) < 300 and len(base) == len(expected)

@@ -1,10 +1,12 @@
 """Splats that are cloned, split and pruned, whatever columns they have."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
-from training.methods.density import constrained_log, densify, prune, reset_opacities
+from training.methods.density import constrained_log, densify, peak_scores, prune, reset_opacities
 from training.methods.model import NAMES, Model
 
 ALL = (*NAMES, "decay")
@@ -97,6 +99,28 @@ def test_the_budget_goes_to_the_largest_gradients(model):
     )  # fmt: skip
     assert added == 3
     assert torch.equal(model["means"][50:], before[[47, 48, 49]])
+
+
+def test_maxima_decide_by_the_papers_equation_6():
+    """Two views by hand: the largest gradient and the largest radius count, be they of different views."""
+    tensors = {"means": torch.zeros(3, 3), "opacity_logits": torch.tensor([0.0, 0.0, -10.0])}
+    model = Model(tensors, dict.fromkeys(tensors, 0.0), peaks=True)
+    views = (
+        ([[3e-4, 4e-4], [0.0, 1e-3], [3e-4, 4e-4]], [8.0, 0.0, 40.0]),
+        ([[0.0, -1e-4], [0.0, 0.0], [0.0, 0.0]], [20.0, 15.0, 0.0]),
+    )
+    for gradients, radii in views:
+        seen = SimpleNamespace(grad2d=torch.tensor(gradients), radii=torch.tensor(radii))
+        model.accumulate_stats(seen)  # pyright: ignore[reportArgumentType]
+    faint = 1 / (1 + np.exp(10.0))
+    expected = [5e-4 * 20 * 0.5**0.2, 1e-3 * 15 * 0.5**0.2, 5e-4 * 40 * faint**0.2]
+    np.testing.assert_allclose(peak_scores(model), expected, rtol=1e-6)
+    # a photograph of half the side has gradients twice as large, which count as those of the whole one
+    shrunk = SimpleNamespace(grad2d=torch.tensor([[0.0, 2e-3]] * 3), radii=torch.tensor([1.0] * 3))
+    model.accumulate_stats(shrunk, shrink=2)  # pyright: ignore[reportArgumentType]
+    np.testing.assert_allclose(model.stats["gradient_max"], [1e-3] * 3, rtol=1e-6)
+    model.reset_stats()
+    assert not peak_scores(model).any()
 
 
 def test_constrained_log_undoes_the_constraint_and_stays_free_below_it():

@@ -2,6 +2,7 @@
 
 import inspect
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,17 @@ import torch
 
 from training import methods
 from training.errors import LodgsError
+from training.evaluate.metrics import psnr
 from training.methods.method import Method
+from training.rasterize import Gaussians, rasterize
 from training.runs import train as training_loop
 from training.runs.base import read_base
 from training.runs.failures import BAD_INPUT
 from training.runs.folder import RunFolder
 from training.runs.job import Job
+from training.runs.measure import evaluate_run
+from training.scenes.colmap import read_scene
+from training.scenes.images import load_image
 from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
 from training.splats.gaussians import Splats
 from training.splats.ply import write_ply
@@ -168,13 +174,35 @@ def test_a_run_begins_with_a_base_and_ends_with_its_column_in_the_bundle(tiny, t
     assert training_loop.train(made) == 0, "started again with the same job, it is resumed"
 
 
-def test_what_is_odd_about_a_base_is_a_warning_of_the_run(tiny, tiny_scene, tmp_path):
-    write_ply(tmp_path / "base.ply", base(), ["SplatRenderMode: mip"])
-    made = job(tiny_scene, tmp_path / "run", base=str(tmp_path / "base.ply"))
+@pytest.mark.parametrize("antialias", [False, True])
+def test_a_run_is_antialiased_where_its_base_is(tiny, tiny_scene, tmp_path, antialias):
+    """Whatever its job says, which it tells; its bundle, its levels and its measures are what it drew."""
+    small = replace(base(), log_scales=base().log_scales - np.float32(2))
+    write_ply(tmp_path / "base.ply", small, ["SplatRenderMode: mip"] * antialias)
+    made = job(
+        tiny_scene, tmp_path / "run", base=str(tmp_path / "base.ply"), parameters={"antialias": not antialias}
+    )
     assert training_loop.train(made) == 0
-    events, _ = RunFolder(made.out).events()
+    folder = RunFolder(made.out)
+    events, _ = folder.events()
     said = [event["message"] for event in events if event["event"] == "warning"]
-    assert len([text for text in said if "Mip-Splatting's 2D filter" in text]) == 1
+    assert said == [f"The base is {'' if antialias else 'not '}antialiased, and so is this run."]
+    bundle = read_bundle(folder.bundle)
+    assert bundle.antialias is antialias and bundle.meta.get("antialias", False) is antialias
+    level = next(event for event in events if event["event"] == "level")
+    assert read_bundle(folder.file(level["path"])).antialias is antialias
+    near, splats = read_scene(tiny_scene).near(), Gaussians.of(bundle.levels[0].splats)
+    rows = evaluate_run(folder.path)["levels"], [level]
+    for flag in (antialias, not antialias):
+        drawn = [
+            psnr(
+                rasterize(splats, camera, near=near, antialias=flag, backend="reference").image,
+                torch.from_numpy(load_image(camera.image, camera.width, camera.height)),
+            )
+            for camera in read_scene(tiny_scene).cameras[::4]
+        ]
+        for (row,) in rows:
+            assert (abs(row["psnr"] - np.mean(drawn)) < 5e-3) == (flag == antialias)
 
 
 def test_a_base_is_refused_where_a_method_cannot_begin_with_one_and_where_there_is_none(
@@ -207,11 +235,11 @@ def test_a_base_is_the_finest_complete_level_of_a_run_a_bundle_or_a_ply(tmp_path
     levels = [Level(1, coarse), Level(2, fine)]
     write_bundle(run.bundle, Bundle("flod", levels))
     for path in (run.path, run.bundle):
-        np.testing.assert_array_equal(read_base(path).means, fine.means)
+        np.testing.assert_array_equal(read_base(path)[0].means, fine.means)
     write_bundle(run.bundle, Bundle("octree", levels, cumulative=True))
-    np.testing.assert_array_equal(read_base(run.path).means, np.concatenate([coarse.means, fine.means]))
+    np.testing.assert_array_equal(read_base(run.path)[0].means, np.concatenate([coarse.means, fine.means]))
     write_ply(tmp_path / "plain.ply", coarse)
-    np.testing.assert_array_equal(read_base(tmp_path / "plain.ply").means, coarse.means)
+    np.testing.assert_array_equal(read_base(tmp_path / "plain.ply")[0].means, coarse.means)
     write_ply(tmp_path / "empty.ply", base(0))
     with pytest.raises(LodgsError, match="holds no splats"):
         read_base(tmp_path / "empty.ply")

@@ -1,6 +1,7 @@
 """Splats alone become a scene: its pictures are theirs, its points lie on them, and LODGE trains from it."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -53,6 +54,28 @@ def test_the_scene_has_the_splats_own_pictures_and_points_on_them(ball, tmp_path
         drawn = rasterize(Gaussians.of(ball), view, near=near, backend="reference").image.numpy().clip(0, 1)
         photograph = load_image(camera.image, 96, 64)
         assert np.abs(photograph - drawn).mean() < 0.02  # it is a JPEG
+
+
+def test_pictures_of_antialiased_splats_are_so(ball, tmp_path):
+    views, near = dome(ball, 6, 96, 64)
+    small = replace(ball, log_scales=ball.log_scales - np.float32(1))
+    for view in views:
+        write_camera(tmp_path / "cameras" / f"{view.name}.json", view, near)
+    write_ply(tmp_path / "small.ply", small, ["SplatRenderMode: mip"])
+    command = ["capture", str(tmp_path / "small.ply"), "--cameras", str(tmp_path / "cameras")]
+    assert main([*command, "--out", str(tmp_path / "scene")]) == 0
+    for view, camera in zip(views, read_scene(tmp_path / "scene").cameras, strict=True):
+        photograph = load_image(camera.image, 96, 64)
+        errors = [
+            np.abs(
+                rasterize(Gaussians.of(small), view, near=near, antialias=flag, backend="reference")
+                .image.numpy()
+                .clip(0, 1)
+                - photograph
+            ).mean()
+            for flag in (True, False)
+        ]
+        assert errors[0] < 0.02 and errors[0] < errors[1] / 2
 
 
 def test_nothing_is_overwritten_and_nothing_half_is_left(ball, tmp_path):

@@ -29,8 +29,8 @@ def pixels(path):
         return np.asarray(file)
 
 
-def expected(splats, camera, near=0.01):
-    return next(render(Gaussians.of(splats), [camera], near=near, dtype="uint8"))[..., :3]
+def expected(splats, camera, near=0.01, **options):
+    return next(render(Gaussians.of(splats), [camera], near=near, dtype="uint8", **options))[..., :3]
 
 
 def test_a_camera_survives_its_file(camera, tmp_path):
@@ -51,6 +51,21 @@ def test_levels_of_a_bundle(bundle, camera, tmp_path):
     np.testing.assert_array_equal(pixels(tmp_path / "fine.png"), fine)
     np.testing.assert_array_equal(pixels(tmp_path / "coarse.png"), coarse)
     np.testing.assert_array_equal(pixels(tmp_path / "far.png"), fine)  # finer details than any are wanted
+
+
+def test_antialiased_splats_are_drawn_so(make_splats, camera, tmp_path):
+    """A bundle's, by its meta, and those of a plain PLY, by its comment."""
+    splats = make_splats(60)
+    splats.log_scales -= 2
+    write_bundle(tmp_path / "b.ply", Bundle("3dgs", [Level(1, splats)], meta={"antialias": True}))
+    write_ply(tmp_path / "p.ply", splats, ["SplatRenderMode: mip"])
+    write_camera(tmp_path / "camera.json", camera, 0.01)
+    filtered = expected(splats, camera, antialias=True)
+    assert np.abs(filtered.astype(int) - expected(splats, camera)).max() > 20
+    for name in ("b.ply", "p.ply"):
+        command = ["render", str(tmp_path / name), "--camera", str(tmp_path / "camera.json")]
+        assert main([*command, "--out", str(tmp_path / "out.png")]) == 0
+        np.testing.assert_array_equal(pixels(tmp_path / "out.png"), filtered)
 
 
 def test_a_run_knows_its_views(make_splats, tmp_path):
@@ -182,7 +197,9 @@ def test_what_has_no_views_says_so(bundle, tmp_path, capsys):
 
 def test_what_is_drawn_otherwise_is_said(make_splats, camera, tmp_path, capsys):
     write_camera(tmp_path / "camera.json", camera, 0.01)
-    write_ply(tmp_path / "mip.ply", make_splats(5), ["SplatRenderMode: mip"])
+    odd = make_splats(5)
+    odd.means[0] = np.nan
+    write_ply(tmp_path / "odd.ply", odd)
     levels = [Level(1, make_splats(5)), Level(2, make_splats(9))]
     write_bundle(tmp_path / "foreign.ply", Bundle("sundial", levels, "shadow"))
 
@@ -194,7 +211,7 @@ def test_what_is_drawn_otherwise_is_said(make_splats, camera, tmp_path, capsys):
         )
         return capsys.readouterr().err
 
-    assert said(tmp_path / "mip.ply").startswith("warning: ")
+    assert said(tmp_path / "odd.ply").startswith("warning: ")
     text = said(tmp_path / "foreign.ply")
     assert text.count("\n") == 1 and "the rule 'shadow'" in text and "the finest level is shown" in text
     assert said(tmp_path / "foreign.ply", "--level", 1) == ""

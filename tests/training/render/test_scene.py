@@ -96,6 +96,27 @@ def test_two_sets_are_sorted_together(make_splats, camera):
     np.testing.assert_allclose(together.image, one.image, atol=1e-4)
 
 
+@pytest.mark.parametrize("in_world", [False, True])
+@pytest.mark.parametrize("first", [False, True])
+def test_sets_of_either_filter_in_one_picture(make_splats, camera, first, in_world):
+    """One behind the other, so that the picture is by hand what each is alone."""
+    front, back = make_splats(300), make_splats(300, seed=1)
+    for splats, ahead in ((front, 3.0), (back, 6.0)):
+        splats.means[:, 2] = ahead + splats.means[:, 2] / 10
+        splats.log_scales -= 2
+        splats.opacity_logits -= 1
+    camera = replace(camera, world_to_camera=np.eye(4))
+    before = rasterize(Gaussians.of(front), camera, antialias=first, backend="reference")
+    behind = rasterize(Gaussians.of(back), camera, antialias=not first, backend="reference")
+    expected = before.image + (1 - before.alpha[..., None]) * behind.image
+    elsewhere = [Instance(SplatSet(back), transform(translation=(0, 0, -1e4)))] * in_world
+    sets = [SplatSet(front), SplatSet(back)]
+    mixed = [Instance(one, antialias=flag) for one, flag in zip(sets, (first, not first), strict=True)]
+    alike = [Instance(one, antialias=first) for one in sets]
+    np.testing.assert_allclose(draw([*mixed, *elsewhere], camera).image, expected, atol=1e-4)
+    assert np.abs(draw([*alike, *elsewhere], camera).image - expected.numpy()).max() > 0.05
+
+
 @pytest.mark.parametrize("matrix", ["stretched", "sheared", "mirrored"])
 def test_a_set_that_is_no_longer_similar_has_the_covariances_of_its_transform(make_splats, matrix):
     linear = {

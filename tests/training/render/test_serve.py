@@ -66,14 +66,15 @@ def test_frames_are_what_draw_draws(client, make_splats, camera):
     wire.write_set(client.folder / "one", wire.packed(splats, weights))
     matrix = np.diag([2.0, 2, 2, 1])
     sets = [{"file": "one", "count": 80, "matrix": matrix.tolist(), "level": 4}]
-    for frame in (1, 2):
+    for frame in (1, 2, 3):
+        if frame == 3:
+            sets[0]["antialias"] = True
         client.say(**request(camera, sets, frame, depth=True, levels=True, background=None))
         answer = client.hear("frame", "error")
         assert answer["frame"] == frame
         planes = wire.read_planes(client.folder / "frame", len(answer["passes"]), 48, 64)
-        picture = draw(
-            [Instance(SplatSet(splats, weights), matrix, 4)], camera, background=None, depth=True, levels=True
-        )
+        placed = [Instance(SplatSet(splats, weights), matrix, 4, antialias=frame == 3)]
+        picture = draw(placed, camera, background=None, depth=True, levels=True)
         expected = picture.passes()
         assert answer["passes"] == list(expected)
         for plane, there in zip(expected.values(), planes, strict=True):

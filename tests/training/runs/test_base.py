@@ -6,7 +6,9 @@ import pytest
 from training.errors import LodgsError
 from training.runs.base import read_base
 from training.splats.bundle import Bundle, Level, write_bundle, write_folder
+from training.splats.dialects import comments_of
 from training.splats.gaussians import Splats
+from training.splats.ply import write_ply
 
 
 def splats(count: int) -> Splats:
@@ -23,10 +25,17 @@ def test_an_exported_folder_is_as_good_as_its_bundle(tmp_path, cumulative):
     bundle = Bundle("", [Level(1, splats(10)), Level(2, splats(30))], cumulative=cumulative)
     write_bundle(tmp_path / "b.ply", bundle)
     write_folder(tmp_path / "folder", bundle)
-    wanted, found = read_base(tmp_path / "b.ply"), read_base(tmp_path / "folder")
+    (wanted, _), (found, _) = read_base(tmp_path / "b.ply"), read_base(tmp_path / "folder")
     assert len(found) == (40 if cumulative else 30)
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
         np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
+
+
+def test_a_base_says_whether_it_is_antialiased(tmp_path):
+    for meta in ({}, {"antialias": True}):
+        write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, splats(3))], meta=meta))
+        write_ply(tmp_path / "p.ply", splats(3), comments_of(meta))
+        assert [read_base(tmp_path / name)[1] for name in ("b.ply", "p.ply")] == [bool(meta)] * 2
 
 
 def test_a_folder_of_something_else_is_no_base(tmp_path):

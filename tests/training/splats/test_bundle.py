@@ -183,6 +183,18 @@ def test_meta_that_no_header_can_hold_is_one_sentence(tmp_path, bundle):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_bundle_says_whether_it_is_antialiased_and_others_are_not(tmp_path, bundle):
+    for meta, flag in (
+        (META, False),
+        (META | {"antialias": False}, False),
+        (META | {"antialias": True}, True),
+    ):
+        bundle.meta = meta
+        write_bundle(tmp_path / "b.ply", bundle)
+        back = read_bundle(tmp_path / "b.ply")
+        assert back.antialias is read_head(tmp_path / "b.ply").antialias is flag and back.meta == meta
+
+
 def test_numpy_numbers_in_meta_read_back_as_plain_ones(tmp_path, bundle):
     bundle.meta = {"center": np.array([1.5, 2.5]), "focal_px": np.float32(0.1), "n": np.int64(3)}
     write_bundle(tmp_path / "b.ply", bundle)
@@ -239,6 +251,7 @@ def test_a_bundle_cut_short_says_what_is_missing(tmp_path, bundle, missing):
         (b'{"level":1', b'[{"level":1'),
         (b'{"level":1,', b'{"level":"one",'),
         (b'"meta":{', b'"meta":{"up_rotation":[0,0,1],'),
+        (b'"meta":{', b'"meta":{"antialias":"no",'),
         (b'"gamma":1.5', b'"gamma":"far"'),
         (b'"rule":"bands"', b'"rule":null'),
         (b'"cumulative":false', b'"cumulative":"false"'),

@@ -193,16 +193,12 @@ def test_the_coarsest_level_of_flod_is_known_by_its_folder(write):
         ([], False),
     ],
 )
-def test_a_2d_filter_is_known_and_warned_of(write, comments, mip):
+def test_a_2d_filter_is_known(write, comments, mip):
     path, warnings = write(PLAIN, comments=comments), []
-    meta = read_bundle(path, warnings.append).meta
-    assert meta == ({"antialias": True} if mip else {}) == read_head(path).meta
-    assert [("drawn with 3DGS's dilation" in text, str(path) in text) for text in warnings] == [
-        (True, True)
-    ] * mip
-    assert ("antialias: true" in describe(path)) is ("dilation" in describe(path)) is mip
-    read_ply(path, warnings.append)
-    assert len(warnings) == 2 * mip
+    bundle = read_bundle(path, warnings.append)
+    assert bundle.meta == ({"antialias": True} if mip else {}) == read_head(path).meta
+    assert bundle.antialias is mip and ("antialias: true" in describe(path)) is mip
+    assert warnings == []
 
 
 def test_flat_splats_by_a_comment_are_refused(write):
@@ -211,7 +207,7 @@ def test_flat_splats_by_a_comment_are_refused(write):
 
 
 def test_the_2d_filter_survives_every_way_of_writing(tmp_path, make_splats):
-    """Other programs know it by the comment, ours too; a bundle's is no second warning."""
+    """Other programs know it by the comment, ours too."""
     comment = "SplatRenderMode: mip"
     levels = [Level(1, make_splats(2, 0)), Level(2, make_splats(5, 0))]
     bundle = Bundle("lodge", levels, meta={"antialias": True})

@@ -76,7 +76,8 @@ class Method(threedgs_train.Method):
             self.begins = self._densify_until = 0
         sigma = torch.full((len(tensors["means"]),), p.sigma_init, device=self.device)
         rates = splat_rates(p, self.data.extent) | {SIGMA: p.lr_sigma}
-        self.model = Model(tensors | {SIGMA: self._stored(sigma)}, rates)
+        peaks = p.densify_by == "max"
+        self.model = Model(tensors | {SIGMA: self._stored(sigma)}, rates, peaks=peaks)
         self.reference = self._far_distance(p.reference_quantile) if p.reference_quantile else 0.0
 
     def levels_after(self, step: int) -> list[Level]:
@@ -198,7 +199,10 @@ class Method(threedgs_train.Method):
         What matters is how much a splat gives to the pixels of a training view that draws it, on average.
         """
         gaussians = self.model.gaussians.detach()
-        found = contributions(gaussians, self.data.train, near=self.data.near, backend=self.backend)
+        found = contributions(
+            gaussians, self.data.train, near=self.data.near, antialias=self.parameters.antialias,
+            backend=self.backend,
+        )  # fmt: skip
         importance = found.total / found.views.clamp_min(1)
         order = importance.argsort(descending=True, stable=True)
         drawn = found.views[order].cumsum(0)

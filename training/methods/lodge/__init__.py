@@ -82,7 +82,17 @@ class LodgeParameters(ThreedgsParameters):
 
 _DRAFT = LodgeParameters()
 _STANDARD = replace(_DRAFT, **STANDARD, steps=30_000, densify_interval=100, tune_steps=1000)
-_PAPER = replace(_STANDARD, **PAPER, tune_alone=0.0, prune_weight=0.02)
+_PAPER = replace(
+    _STANDARD,
+    **PAPER,
+    antialias=True,
+    densify_interval=300,
+    densify_from=600,
+    densify_by="max",
+    least_weight=0.02,
+    tune_alone=0.0,
+    prune_weight=0.02,
+)
 
 METHOD = MethodInfo(
     name="lodge",

@@ -89,13 +89,14 @@ def visible(
     least: float,
     near: float,
     backend: str,
+    antialias: bool = False,
 ) -> Rows:
     """Those rows of a chunk's set that have at least this share of some pixel of the cameras' images."""
     chosen = {
         number: IndexedLevel.of(together({number: level}, {number: rows[number]}))
         for number, level in levels.items()
     }
-    stack = Stack(chosen)
+    stack = Stack(chosen, antialias)
     pictures = (
         (camera, {number: level.in_view(camera, near) for number, level in chosen.items()})
         for camera in cameras

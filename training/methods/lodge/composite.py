@@ -102,12 +102,16 @@ def together(levels: Mapping[int, IndexedLevel], rows: Rows) -> Gaussians:
 class Stack:
     """All splats of some levels in one set, of which rows are drawn without copies.
 
+    Args:
+        antialias: how they are drawn, as of ``rasterize``.
+
     Attributes:
         gaussians: level after level.
         part: where each level's rows are, by number.
     """
 
-    def __init__(self, levels: Mapping[int, IndexedLevel]) -> None:
+    def __init__(self, levels: Mapping[int, IndexedLevel], antialias: bool = False) -> None:
+        self.antialias = antialias
         self.gaussians = Gaussians.concatenated([level.gaussians for level in levels.values()])
         ends = np.cumsum([len(level) for level in levels.values()])
         self.part = {
@@ -125,8 +129,10 @@ class Stack:
         largest = torch.zeros(len(self.gaussians))
         for camera, rows in pictures:
             some = self.rows(rows)
-            found = contributions(self.gaussians, [camera], near=near, rows=some, backend=backend).largest
-            largest = torch.maximum(largest, found.to(largest))
+            found = contributions(
+                self.gaussians, [camera], near=near, antialias=self.antialias, rows=some, backend=backend
+            )
+            largest = torch.maximum(largest, found.largest.to(largest))
         return largest
 
 

@@ -28,6 +28,7 @@ class Thresholds:
         backend: the rasterizer's.
         prune_weight: the least share of a pixel that keeps a splat of the coarser level.
         std: the smoothing filter's standard deviation for a distance, both in scene units.
+        antialias: as of ``rasterize``.
     """
 
     def __init__(
@@ -37,9 +38,11 @@ class Thresholds:
         backend: str,
         prune_weight: float,
         std: Callable[[float], float],
+        antialias: bool = False,
     ) -> None:
         self._cameras = evenly(cameras, VIEWS)
         self._near, self._backend, self._prune_weight, self._std = near, backend, prune_weight, std
+        self._antialias = antialias
 
     @torch.no_grad()
     def next(
@@ -66,14 +69,17 @@ class Thresholds:
         finest, number = next(iter(levels.values())), min(levels) - 1
         coarser = IndexedLevel.of(filtered(finest.gaussians, self._std(distance)))
         levels, d_l = {**levels, number: coarser}, {**d_l, number: distance}
-        stack = Stack(levels)
+        stack = Stack(levels, self._antialias)
         pictures = [(camera, rows_seen(levels, d_l, camera, self._near)) for camera in self._cameras]
         found = stack.importance(pictures, self._near, self._backend)[stack.part[number]].numpy()
         kept = found >= self._prune_weight
         tiles = []
         for camera, rows in pictures:
             some = stack.rows({**rows, number: rows[number][kept[rows[number]]]})
-            drawn = rasterize(stack.gaussians, camera, near=self._near, rows=some, backend=self._backend)
+            drawn = rasterize(
+                stack.gaussians, camera, near=self._near, antialias=self._antialias, rows=some,
+                backend=self._backend,
+            )  # fmt: skip
             tiles.append(drawn.tile_counts.double().mean())
         return float(torch.stack(tiles).mean())
 

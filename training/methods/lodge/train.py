@@ -22,7 +22,7 @@ from ...splats.ply import Columns
 from ..data import TrainingView
 from ..density import require_rows
 from ..method import Drawing
-from ..model import NAMES, Model, splat_rates
+from ..model import NAMES
 from ..start import from_splats
 from ..threedgs import train as threedgs_train
 from . import ROUNDS, LodgeParameters, chunks
@@ -75,7 +75,7 @@ class Method(threedgs_train.Method):
             super().setup(None)
         else:
             tensors = from_splats(base.select(spatial_order(base.means)), p.sh_degree, self.device)
-            self.model = Model(tensors, splat_rates(p, self.data.extent))
+            self.model = self.new_model(tensors)
             self._densify_until = 0
         self.d_l = {p.levels: 0.0}
         self.finished: dict[int, IndexedLevel] = {}
@@ -221,7 +221,9 @@ class Method(threedgs_train.Method):
         if given:
             self.d_l[number] = given
         else:
-            thresholds = Thresholds(data.train, data.near, self.backend, p.prune_weight, self._std)
+            thresholds = Thresholds(
+                data.train, data.near, self.backend, p.prune_weight, self._std, p.antialias
+            )
             self.d_l[number], costs = thresholds.next(self.finished, self.d_l)
             self.costs.append({"level": number, **costs})
         if number == self.levels - 1:
@@ -229,7 +231,7 @@ class Method(threedgs_train.Method):
         known = seen_from_afar(finest, data.train, data.near, self.d_l[number], FAR_VIEWS)
         self._alone_share = p.tune_alone * float((~known).mean())
         tensors = {name: getattr(finest.gaussians, name).clone() for name in NAMES}
-        self.model = Model(tensors, splat_rates(p, data.extent))
+        self.model = self.new_model(tensors)
 
     def _finish(self, number: int) -> None:
         """The level in training is what it is from now on."""
@@ -256,7 +258,7 @@ class Method(threedgs_train.Method):
         data, backend = self.data, self.backend
         level, farther, near = self._smoothed(number), self._farther(number), data.near
         levels = {**self.finished, number: level}
-        stack = Stack(levels)
+        stack = Stack(levels, self.parameters.antialias)
         beside = ((camera, rows_seen(levels, self.d_l, camera, near)) for camera in data.train)
         found = stack.importance(beside, near, backend)[stack.part[number]]
         if not self.parameters.tune_alone:
@@ -266,7 +268,7 @@ class Method(threedgs_train.Method):
             return found
         views = (camera.widened(self.parameters.margin).scaled(1 / farther) for camera in data.train)
         away = ((view, {number: level.in_view(view, near)}) for view in views)
-        alone = Stack({number: level}).importance(away, near, backend)
+        alone = Stack({number: level}, self.parameters.antialias).importance(away, near, backend)
         return torch.where(torch.from_numpy(known), found, torch.maximum(found, alone))
 
     # -- chunks ----------------------------------------------------------------------------------------
@@ -290,7 +292,7 @@ class Method(threedgs_train.Method):
         if p.visible_weight:
             rng = np.random.default_rng([self.seed, number, 11])
             views = [*near, *chunks.turned(near, rng)]
-            rows = chunks.visible(levels, rows, views, p.visible_weight, data.near, self.backend)
+            rows = chunks.visible(levels, rows, views, p.visible_weight, data.near, self.backend, p.antialias)
         for level, some in rows.items():
             members = np.zeros(len(levels[level]), bool)
             members[some] = True

@@ -153,8 +153,9 @@ class Method(method.Method[OctreeParameters, Drawing]):
 
     def _largest_weights(self, camera: Camera, view: int, weights: torch.Tensor) -> torch.Tensor:
         return contributions(
-            self.model.gaussians, [camera], weights=weights, near=self.data.near, backend=self.backend
-        ).largest
+            self.model.gaussians, [camera], weights=weights, near=self.data.near,
+            antialias=self.parameters.antialias, backend=self.backend,
+        ).largest  # fmt: skip
 
     def reassign_levels(self, step: int) -> None:
         """Splats that have become too wide or too narrow for their level move to one that they fit."""

@@ -17,7 +17,7 @@ from torch import nn
 from torch.nn.functional import normalize
 
 from ...lod.rules.octree import BIAS, faded
-from ...rasterize import Adam, Gaussians, Rendering, contributions, rasterize
+from ...rasterize import Adam, Contributions, Gaussians, Rendering, contributions, rasterize
 from ...rasterize import sh as harmonics
 from ...rasterize.adam import LearningRate
 from ...rasterize.rendering import ALPHA_MIN
@@ -311,7 +311,18 @@ class Method(method.Method[NeuralOctreeParameters, Drawing]):
             camera,
             weights=weights,
             near=self.data.near,
+            antialias=self.parameters.antialias,
             background=background,
+            backend=self.backend,
+        )
+
+    def contributions_of(self, decoded: NeuralGaussians, camera: Camera) -> Contributions:
+        """What Gaussians give to the pixels of a view."""
+        return contributions(
+            decoded.gaussians(),
+            [camera],
+            near=self.data.near,
+            antialias=self.parameters.antialias,
             backend=self.backend,
         )
 
@@ -384,7 +395,7 @@ class Method(method.Method[NeuralOctreeParameters, Drawing]):
 
     def _largest_weights(self, camera: Camera, view: int, weights: torch.Tensor) -> torch.Tensor:
         decoded = self.decode(camera, self.visible(camera, weights), view)
-        found = contributions(decoded.gaussians(), [camera], near=self.data.near, backend=self.backend)
+        found = self.contributions_of(decoded, camera)
         largest = torch.zeros(len(weights), self.parameters.offsets, device=self.device)
         largest[decoded.anchor, decoded.which] = found.largest
         return largest
@@ -423,7 +434,7 @@ class Method(method.Method[NeuralOctreeParameters, Drawing]):
             basis: list = [None] * terms
             harmonics.basis(x, y, z, p.sh_degree, basis)
             values = torch.stack(basis, 1)
-            seen = contributions(g.gaussians(), [camera], near=self.data.near, backend=self.backend)
+            seen = self.contributions_of(g, camera)
             # what is hidden in every view has a colour too
             weighted = values * (seen.largest + 1e-3 * g.opacities)[:, None]
             products[g.anchor, g.which] += weighted[:, :, None] * values[:, None]

@@ -14,6 +14,24 @@ class ThreedgsParameters(DensityParameters):
         0.5, "Share of the steps after which splats are no longer added or removed.", high=1
     )
     densify_interval: int = parameter(50, "Steps between two densifications.", above=0, unit="steps")
+    densify_from: int = parameter(0, "Step before which nothing is densified.", unit="steps")
+    densify_by: str = parameter(
+        "mean",
+        "What decides where splats are added: the mean image-plane gradient over the views since the last "
+        "densification, or the largest one times the largest radius times opacity^(1/5) (LODGE, Eq. 6).",
+        choices=("mean", "max"),
+    )
+    max_threshold: float = parameter(
+        0.015,
+        "With 'max', the product above which splats are added, at one megapixel: gradients in 3DGS units, "
+        "radii of three standard deviations in pixels (LODGE: 0.015 outdoors, 0.03 indoors).",
+    )
+    least_weight: float = parameter(
+        0.0,
+        "Splats whose largest blending weight in any training view is below this go at 8, 16 and 24 "
+        "thirtieths of the steps (LODGE, A.2: 0.02); 0 keeps all.",
+        high=1,
+    )
 
 
 _DRAFT = ThreedgsParameters()

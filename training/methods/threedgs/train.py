@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+import torch
 
+from ...rasterize import contributions
 from ...splats.bundle import Level
 from ...splats.gaussians import Splats
 from .. import method
 from ..data import TrainingView
-from ..density import densify, prune, require_rows, reset_opacities
+from ..density import densify, peak_scores, prune, require_rows, reset_opacities
 from ..method import Drawing
 from ..model import Model, splat_rates
 from ..schedules import due, log_linear, shrink_at
 from ..start import distinct, from_points, sampled
 from . import ThreedgsParameters
+
+WEIGHED_AT = (8 / 30, 16 / 30, 24 / 30)
+"""Shares of the steps after which splats that hardly show are removed, where that is wanted."""
 
 
 class Method(method.Method[ThreedgsParameters, Drawing]):
@@ -26,8 +31,13 @@ class Method(method.Method[ThreedgsParameters, Drawing]):
         points, colors = distinct(scene.points, scene.point_colors)
         points, colors = sampled(points, colors, self.growth_limit(0), self.seed)
         tensors = from_points(points, colors, p.sh_degree, self.device)
-        self.model = Model(tensors, splat_rates(p, self.data.extent))
+        self.model = self.new_model(tensors)
         self._densify_until = p.densify_until * p.steps
+
+    def new_model(self, tensors: Mapping[str, torch.Tensor]) -> Model:
+        """A model of splats with what densification by the job's rule has to know of them."""
+        p = self.parameters
+        return Model(tensors, splat_rates(p, self.data.extent), peaks=p.densify_by == "max")
 
     def levels_after(self, step: int) -> list[Level]:
         """The one level, at the end."""
@@ -51,13 +61,16 @@ class Method(method.Method[ThreedgsParameters, Drawing]):
 
     def control_density(self, step: int) -> None:
         p, model, done = self.parameters, self.model, step + 1
+        if p.least_weight and done in (round(share * p.steps) for share in WEIGHED_AT):
+            self.prune_unimportant(step)
         if done > self._densify_until:
             return
-        if due(p.densify_interval, done):
+        if due(p.densify_interval, done) and done >= p.densify_from:
+            peaks = p.densify_by == "max"
             densify(
                 model,
-                model.mean_gradient(),
-                threshold=p.grad_threshold * self.data.threshold_scale,
+                peak_scores(model) if peaks else model.mean_gradient(),
+                threshold=(p.max_threshold if peaks else p.grad_threshold) * self.data.threshold_scale,
                 clone_below=None if p.long_axis else p.clone_extent * self.data.extent,
                 max_splats=self.growth_limit(step),
                 rng=np.random.default_rng([self.seed, step, 1]),
@@ -68,6 +81,20 @@ class Method(method.Method[ThreedgsParameters, Drawing]):
             require_rows(model, step, "min_opacity")
         if due(p.opacity_reset_interval, done):
             reset_opacities(model)
+
+    @torch.no_grad()
+    def prune_unimportant(self, step: int) -> None:
+        """Splats go of which no training view, with what continues its photograph, shows much (RadSplat)."""
+        p, data = self.parameters, self.data
+        found = contributions(
+            self.model.gaussians,
+            (camera.widened(p.margin) for camera in data.train),
+            near=data.near,
+            antialias=p.antialias,
+            backend=self.backend,
+        )
+        self.model.keep(found.largest >= p.least_weight)
+        require_rows(self.model, step, "least_weight")
 
     def continues_margins(self, step: int) -> bool:
         return step < self._densify_until <= step + 1

@@ -81,7 +81,8 @@ def _of_kernels(settings: Settings) -> tuple:
     """The settings as ``project``'s kernels take them."""
     view = settings.view
     size = view.width, view.height
-    return *lens_of(view), *size, settings.degree, f32(settings.min_scale), settings.antialias
+    antialias = np.atleast_1d(np.asarray(settings.antialias))  # one for all, or one for each
+    return *lens_of(view), *size, settings.degree, f32(settings.min_scale), antialias
 
 
 @dataclass

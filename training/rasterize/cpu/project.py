@@ -127,9 +127,8 @@ def project_forward(
     """Project the splats ``some`` (M,): fill depths (M,), 0 for those not drawn, and of the others the rows
     of projected (M, COLUMNS) and radii (N,).
 
-    ``weights`` is empty where all are one.
+    ``weights`` is empty where all are one; ``antialias`` has one entry for all, or N.
     """
-    dilation = MIP_VARIANCE32 if antialias else DILATION32
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     scale = np.empty(3, np.float32)
     axes = np.empty((3, 3), np.float32)
@@ -171,10 +170,12 @@ def project_forward(
         vv = v0 * v0 + v1 * v1 + v2 * v2
         # |u × v|² = uu vv − uv², without the cancellation that needles suffer
         cross0, cross1, cross2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
+        filtered = antialias[min(i, antialias.shape[0] - 1)]
+        dilation = MIP_VARIANCE32 if filtered else DILATION32
         undilated = cross0 * cross0 + cross1 * cross1 + cross2 * cross2
         determinant = undilated + dilation * (uu + vv + dilation)
         xx, yy = uu + dilation, vv + dilation
-        if antialias:
+        if filtered:
             opacity *= math.sqrt(undilated / determinant)
             if opacity <= ALPHA_MIN32:
                 continue
@@ -304,8 +305,6 @@ def project_backward(
     by_axes = np.empty((3, 3), np.float32)
     by_rotation = np.empty((3, 3), np.float32)
     by_area = np.empty((2, 3), np.float32)
-    for k in range(3):
-        by_area[0, k], by_area[1, k] = ZERO, ZERO
     sums = np.empty(SUMS, np.float32)
     basis = np.empty(25, np.float32)
     basis_x = np.empty(25, np.float32)
@@ -348,13 +347,16 @@ def project_backward(
         ndc_x, ndc_y = by_mean_x * HALF * width, by_mean_y * HALF * height
         grad2d[i, 0], grad2d[i, 1] = ndc_x, ndc_y
 
-        if antialias:
+        if antialias[min(i, antialias.shape[0] - 1)]:
             # opacity has the factor |u × v| / sqrt(det cov): its logarithm's gradient by u, v and det cov
             by_log = -sums[G]
             area_gradient(axes, j0, j2, k1, k2, by_log, by_area)
             by_xx -= by_log * LN2 * row[CONIC_XX]
             by_xy -= by_log * LN2 * row[CONIC_XY]
             by_yy -= by_log * LN2 * row[CONIC_YY]
+        else:
+            for k in range(3):
+                by_area[0, k], by_area[1, k] = ZERO, ZERO
 
         # u = row 0 of J M, v = row 1: xx = u·u, xy = u·v, yy = v·v
         by_j0, by_j2, by_k1, by_k2 = ZERO, ZERO, ZERO, ZERO

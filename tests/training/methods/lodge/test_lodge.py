@@ -1,6 +1,7 @@
 """LODGE: levels are the rule's and no finer than their filter, the finest stays, runs go on to the bit."""
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,10 +11,12 @@ from training.errors import LodgsError
 from training.lod.blocks import spatial_order
 from training.lod.selection import select, settings
 from training.methods import create, method_info
+from training.methods.lodge import LodgeParameters
 from training.methods.lodge.composite import IndexedLevel, Stack, rows_seen, together
 from training.methods.lodge.thresholds import Thresholds
 from training.methods.parameters import override
-from training.rasterize import Gaussians, rasterize
+from training.methods.threedgs.train import WEIGHED_AT
+from training.rasterize import Gaussians, contributions, rasterize
 from training.scenes.cameras import Camera
 from training.splats.bundle import Bundle
 from training.splats.gaussians import Splats
@@ -152,6 +155,34 @@ def test_importance_is_the_largest_weight_of_the_reference(data, base):
         )
         picture = rasterize(only, camera, near=data.near, backend="reference").image
         assert found[row - 7] == pytest.approx(float(picture.max()), abs=2e-5)
+
+
+def test_the_papers_preset_trains_as_its_appendix_says():
+    p = method_info("lodge").preset("paper")
+    assert isinstance(p, LodgeParameters)
+    assert (p.antialias, p.densify_by, p.max_threshold, p.least_weight) == (True, "max", 0.015, 0.02)
+    assert (p.steps, p.densify_interval, p.densify_from, p.densify_until) == (30_000, 300, 600, 0.5)
+    assert p.opacity_reset_interval == 3000 and round(WEIGHED_AT[0] * p.steps) == 8000
+
+
+def test_levels_of_an_antialiased_base_are_found_and_drawn_so(data, base):
+    """Its importance and its pictures are of Mip-Splatting's filter, of splats smaller than a pixel."""
+    small = replace(base, log_scales=base.log_scales - np.float32(2))
+    given = {"distances": [1.2, 0.8, 0.0], "prune_weight": 0.0, "tune_alone": 0.0}
+    lodge = make(data, small, antialias=True, **given)
+    trained(lodge, until=1)
+    found, levels = lodge.importance(2), {**lodge.finished, 2: lodge._smoothed(2)}
+    for flag in (True, False):
+        largest = torch.zeros(len(found))
+        for camera in data.train:
+            rows = rows_seen(levels, lodge.d_l, camera, data.near)
+            of_picture = contributions(
+                together(levels, rows), [camera], near=data.near, antialias=flag, backend="reference"
+            ).largest
+            own = torch.from_numpy(rows[2]).long()
+            largest[own] = torch.maximum(largest[own], of_picture[len(of_picture) - len(own) :])
+        assert ((found - largest).abs().max() < 1e-4) == flag
+    assert lodge.meta()["antialias"] is True
 
 
 def test_what_hardly_shows_goes_and_what_shows_stays(data, base):

@@ -6,7 +6,9 @@ import torch
 
 from training.errors import LodgsError
 from training.methods import create, method_info
+from training.methods.density import peak_scores
 from training.methods.parameters import override
+from training.rasterize import contributions, rasterize
 
 
 def make(data, name="3dgs", **values):
@@ -47,6 +49,57 @@ def test_splats_are_only_added_before_densification_ends(data):
         method.train_step(step)
         counts.append(method.splats)
     assert counts[0] < counts[1] < counts[9] == counts[19]
+
+
+@pytest.mark.parametrize("threshold", [0.003, 0.01])
+def test_what_decides_by_maxima_is_added_from_the_step_on_that_is_given(data, threshold):
+    """As many as have a product above the threshold, which is of images of a megapixel."""
+    method = make(
+        data, steps=40, densify_interval=4, densify_from=7, densify_by="max", max_threshold=threshold,
+        margin=0.0, free_depth=0.0, largest=0.0, prune_interval=0, first_resolution=1.0,
+    )  # fmt: skip
+    counts, above = [method.splats], 0
+    for step in range(8):
+        if step == 7:  # what the 8th step's control of density sees, but for that step's own view
+            above = int((peak_scores(method.model) > threshold * np.sqrt(1e6 / (64 * 48))).sum())
+        method.train_step(step)
+        counts.append(method.splats)
+    assert counts[7] == counts[0] and counts[8] - counts[0] == pytest.approx(above, abs=3)
+    assert above > 3
+
+
+def test_what_hardly_shows_goes_at_three_steps(data):
+    method = make(
+        data, steps=30, least_weight=0.08, densify_until=0.0, prune_interval=0, free_depth=0.0, margin=0.0
+    )
+    counts = [method.splats]
+    for step in range(30):
+        if step + 1 in (8, 16, 24):  # the step before decides nearly alike
+            found = contributions(method.model.gaussians, data.train, near=data.near, backend="reference")
+            expected = int((found.largest >= 0.08).sum())
+        method.train_step(step)
+        counts.append(method.splats)
+        if step + 1 == 8:
+            assert 0 < counts[-1] == pytest.approx(expected, abs=3) and counts[-1] < counts[0]
+    gone = [step for step in range(1, 31) if counts[step] < counts[step - 1]]
+    assert 8 in gone and set(gone) <= {8, 16, 24}
+
+
+def test_the_light_of_small_splats_is_trained_as_it_is_drawn(data):
+    """A step's picture is the rasterizer's with that filter, and the bundle says which."""
+    for antialias in (False, True):
+        method = make(data, steps=10, antialias=antialias, random_background=False)
+        with torch.no_grad():
+            method.model["log_scales"].sub_(3)
+        gaussians, camera = method.model.gaussians.detach(), method.choose_view(0).camera
+        options = {"near": data.near, "sh_degree": 0, "backend": "reference"}
+        expected = [
+            rasterize(gaussians, camera, antialias=flag, **options).image
+            for flag in (antialias, not antialias)
+        ]
+        _, image, _ = method.train_step(0)
+        assert (image - expected[0]).abs().max() < 1e-4 < 0.01 < (image - expected[1]).abs().max()
+        assert method.meta().get("antialias", False) is antialias
 
 
 def test_positions_rates_fall_in_equal_factors(data):
