@@ -12,7 +12,7 @@ PYTEST := -m pytest -n auto
 quick test test-5.0 fuzz: export OMP_NUM_THREADS := 1  # torch's threads would come on top of the workers
 export LODGS_TRAINER_PYTHON := $(CURDIR)/$(VENV)
 
-.PHONY: help setup demo check quick test test-5.0 fuzz attacks lint docs tables bench bench-quality extension pins \
+.PHONY: help setup demo check quick test test-5.0 fuzz attacks lint docs tables bench bench-quality bench-lod extension pins \
 	window interop clean
 
 help:
@@ -26,6 +26,7 @@ help:
 	@echo "make tables     docs/parameters.md and controls.md, from what methods and rules declare"
 	@echo "make bench      how fast it is, as ratios from one run"
 	@echo "make bench-quality  PSNR and veil against seconds, all methods (SCENES=\"DIR ...\", BASE=another checkout)"
+	@echo "make bench-lod  levels and chunks on a town of 3 million splats (about an hour the first time)"
 	@echo "make extension  dist/lodgs-VERSION.zip, checked by Blender"
 	@echo "make pins       requirements/*.txt anew from requirements/*.in (UPGRADE=1 takes the newest of what these leave open)"
 	@echo "make window     a tour in a real Blender window, with pictures (METHOD=flod; needs Blender, Xvfb, ImageMagick)"
@@ -75,6 +76,9 @@ bench: setup
 
 bench-quality: setup
 	$(VENV) tools/bench_quality.py $(if $(BASE),--report --base $(BASE)) $(SCENES)
+
+bench-lod: setup
+	$(VENV) tools/bench_lod.py
 
 extension: setup
 	$(VENV) tools/extension.py

@@ -8,7 +8,7 @@ unregistered in reverse.
 import bpy
 
 from . import commands, operators, panels, viewport
-from .data import changes, older_files, properties, removal, scenes, updates
+from .data import changes, loaded, older_files, properties, removal, scenes, updates
 from .nodes import building
 from .render import compare, engine, renderer
 from .runs import jobs
@@ -23,6 +23,7 @@ MODULES = (
     *panels.MODULES,
     older_files,
     scenes,
+    loaded,
     removal,
     viewport,
     renderer,

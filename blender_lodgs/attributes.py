@@ -15,6 +15,8 @@ import numpy as np
 BASE, SH, SCALE, ROTATION = "radiance:base", "radiance:sh_{}", "scale", "rotation"
 LOG_SCALE, OPACITY_LOGIT, QUATERNION = "log_scale", "opacity_logit", "quaternion"
 COLOR, RADIUS, WEIGHT = "display_color", "radius", "lod_weight"
+COLUMN = "column:{}"
+"""A file's column whose own name may mean something else to Blender; every column of a table."""
 
 
 class Layout(NamedTuple):
@@ -36,19 +38,21 @@ LAYOUTS = {
 }
 
 
-def write_attribute(cloud: bpy.types.PointCloud, name: str, kind: str, values: np.ndarray) -> None:
+def write_attribute(
+    cloud: bpy.types.PointCloud | bpy.types.Mesh, name: str, kind: str, values: np.ndarray
+) -> None:
     """Sets a point attribute of type ``kind`` (a key of LAYOUTS) from (N,) or (N, width) values."""
     layout = LAYOUTS[kind]
     attribute = cloud.attributes.get(name) or cloud.attributes.new(name, kind, "POINT")
     attribute.data.foreach_set(layout.key, np.ascontiguousarray(values, layout.dtype).reshape(-1))
 
 
-def read_attribute(cloud: bpy.types.PointCloud, name: str) -> np.ndarray | None:
+def read_attribute(cloud: bpy.types.PointCloud | bpy.types.Mesh, name: str) -> np.ndarray | None:
     """A point attribute as (N,) or (N, width), or None if there is none of that name and a known type."""
     attribute = cloud.attributes.get(name)
     if attribute is None or attribute.data_type not in LAYOUTS or attribute.domain != "POINT":
         return None
     layout = LAYOUTS[attribute.data_type]
-    values = np.empty(len(cloud.points) * layout.width, layout.dtype)
+    values = np.empty(len(attribute.data) * layout.width, layout.dtype)
     attribute.data.foreach_get(layout.key, values)
     return values if layout.width == 1 else values.reshape(-1, layout.width)

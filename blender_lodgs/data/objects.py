@@ -21,6 +21,7 @@ from .. import compat
 from ..attributes import (
     BASE,
     COLOR,
+    COLUMN,
     LAYOUTS,
     LOG_SCALE,
     OPACITY_LOGIT,
@@ -37,7 +38,7 @@ from ..nodes import display
 
 _OWN = {"position", BASE, SCALE, ROTATION, LOG_SCALE, OPACITY_LOGIT, QUATERNION, COLOR, RADIUS, WEIGHT}
 _TYPE = "lodgs_type:"  # custom property that remembers a column's type
-_EXTRA = "column:"  # before a file's column whose name means something else to a point cloud
+_EXTRA = COLUMN.format("")
 _MADE = ("scenes", "objects", "collections", "pointclouds", "meshes", "cameras", "images")
 
 
@@ -86,7 +87,7 @@ def new_splats(name: str, splats: Splats) -> bpy.types.Object:
     write_attribute(cloud, QUATERNION, compat.WIDE_TYPE, splats.quats)
     for column, values in splats.extras.items():
         taken = column in _OWN or column.startswith((".", _EXTRA, "radiance:"))
-        _write_column(cloud, _EXTRA + column if taken else column, values)
+        write_column(cloud, _EXTRA + column if taken else column, values)
     # A sphere with the splat's mean size; a faint splat covers less, so that fog does not hide the scene.
     radius = np.exp(splats.log_scales @ np.full(3, 1 / 3, np.float32)) * np.sqrt(opacity)
     write_attribute(cloud, RADIUS, "FLOAT", radius)
@@ -117,7 +118,7 @@ def read_splats(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = N
         for a in cloud.attributes
         if a.name not in known
         and a.name[0] != "."
-        and (column := _read_column(cloud, a.name, types)) is not None
+        and (column := read_column(cloud, a.name, types)) is not None
     }
     return splats
 
@@ -166,6 +167,35 @@ def to_bytes(colors: np.ndarray) -> np.ndarray:
     return (np.clip(colors, 0, 1) * np.float32(255) + np.float32(0.5)).astype(np.uint8)
 
 
+def write_column(data: bpy.types.PointCloud | bpy.types.Mesh, name: str, values: np.ndarray) -> None:
+    """Sets an attribute to a file's own column, (N,) of any type that PLY has.
+
+    What Blender has no type for is remembered.
+    """
+    if values.dtype == np.float32:
+        write_attribute(data, name, "FLOAT", values)
+        return
+    if values.dtype == np.float64:
+        write_attribute(data, name, "INT32_2D", np.ascontiguousarray(values).view(np.int32))
+    else:
+        write_attribute(data, name, "INT", values.astype(np.int32))
+    data[_TYPE + name] = values.dtype.str
+
+
+def read_column(
+    data: bpy.types.PointCloud | bpy.types.Mesh, name: str, types: bpy.types.PointCloud | bpy.types.Mesh
+) -> np.ndarray | None:
+    """The column (N,) of an attribute that :func:`write_column` has set; None where it holds no such.
+
+    Args:
+        types: the original, where the data are evaluated: only that remembers types.
+    """
+    values, kind = read_attribute(data, name), types.get(_TYPE + name)
+    if values is not None and values.ndim == 2:
+        return values.reshape(-1).view(np.float64) if kind else None
+    return values if values is None or kind is None else values.astype(kind)
+
+
 def _in_colors(name: str, cloud: bpy.types.PointCloud, colors: np.ndarray) -> bpy.types.Object:
     """An object of the cloud in its (N, 3) uint8 sRGB colours; Blender shades in linear light."""
     linear = linear_from_srgb(np.arange(256, dtype=np.float32) / 255).astype(np.float32)
@@ -210,26 +240,6 @@ def _kept(cloud, name: str, activate, visible: np.ndarray, inverse: np.ndarray) 
     if same.ndim == 2:
         same = same.all(axis=1, keepdims=True)
     return stored if same.all() else np.where(same, stored, inverse)
-
-
-def _write_column(cloud, name: str, values: np.ndarray) -> None:
-    """A file's own column, (N,) of any type that PLY has. What Blender has no type for is remembered."""
-    if values.dtype == np.float32:
-        write_attribute(cloud, name, "FLOAT", values)
-        return
-    if values.dtype == np.float64:
-        write_attribute(cloud, name, "INT32_2D", np.ascontiguousarray(values).view(np.int32))
-    else:
-        write_attribute(cloud, name, "INT", values.astype(np.int32))
-    cloud[_TYPE + name] = values.dtype.str
-
-
-def _read_column(cloud, name: str, types) -> np.ndarray | None:
-    """The inverse; None for an attribute that is no column of numbers."""
-    values, kind = read_attribute(cloud, name), types.get(_TYPE + name)
-    if values is not None and values.ndim == 2:
-        return values.reshape(-1).view(np.float64) if kind else None
-    return values if values is None or kind is None else values.astype(kind)
 
 
 def _sigmoid(logits: np.ndarray) -> np.ndarray:

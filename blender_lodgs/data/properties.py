@@ -88,6 +88,23 @@ class SplatLevel(bpy.types.PropertyGroup):
         return obj is not None and obj.type == "POINTCLOUD" and bool(obj.users_collection)
 
 
+class SplatTable(bpy.types.PropertyGroup):
+    """A table that came with a splat scene, by its name; see ``tables``."""
+
+    object: bpy.props.PointerProperty(
+        name="Object", description="The mesh that holds the table's rows", type=bpy.types.Object
+    )
+    collection: bpy.props.PointerProperty(
+        name="Collection", description="What is to be seen of the table", type=bpy.types.Collection
+    )
+
+    @property
+    def exists(self) -> bool:
+        """False once an artist has deleted the table's object."""
+        obj = self.object
+        return obj is not None and obj.type == "MESH" and bool(obj.users_collection)
+
+
 def _level_set(rule: Rule, control: Control):
     """For a control that names a level: it stays among those that there are, and takes the other along."""
 
@@ -207,6 +224,9 @@ class SplatScene(bpy.types.PropertyGroup):
     active_level: bpy.props.IntProperty(
         name="Chosen Level", description="Line of the list of levels", options=set()
     )
+    tables: bpy.props.CollectionProperty(
+        type=SplatTable, name="Tables", description="What the rule knows besides the splats"
+    )
 
     mode: bpy.props.EnumProperty(
         name="Detail",
@@ -291,6 +311,7 @@ class SplatScene(bpy.types.PropertyGroup):
                 "Bands",
                 "Which level is wanted at which distance from the eye, in the same colours",
             ),
+            ("CHUNKS", "Chunks", "Which chunk is the nearest where, in colours that repeat"),
         ],
         options=set(),
     )
@@ -432,8 +453,8 @@ SplatScene.__annotations__ |= {
 }
 
 CLASSES = (
-    ViewSettings, ViewportSettings, *PARAMETERS.values(), TrainingSettings, SplatLevel, *CONTROLS.values(),
-    SplatScene, RenderSettings,
+    ViewSettings, ViewportSettings, *PARAMETERS.values(), TrainingSettings, SplatLevel, SplatTable,
+    *CONTROLS.values(), SplatScene, RenderSettings,
 )  # fmt: skip
 
 

@@ -17,13 +17,13 @@ import numpy as np
 from mathutils import Matrix
 
 from ...training.errors import LodgsError
-from ...training.lod.rule import Control, find_rule
+from ...training.lod.rule import Control, Tables, find_rule
 from ...training.lod.selection import complete, known_rule, unknown_rule
 from ...training.scenes.colmap import Scene, read_scene
 from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder
 from ...training.splats.gaussians import Splats
 from ..nodes import ellipsoids
-from . import objects, selection
+from . import objects, selection, tables
 from .photographs import match_render, new_camera, views
 
 LINKED = (
@@ -177,6 +177,7 @@ def import_splats(
         for level in bundle.levels:
             _put_level(root, level)
         set_bundle_facts(root, bundle)
+        set_tables(root, bundle.tables)
         root.lodgs.single_level = bundle.levels[-1].number
     if bundle.rule and not root.lodgs.by_distance:
         warn(" ".join(unknown_rule(bundle.rule)))
@@ -208,6 +209,15 @@ def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
     if "camera_center" in bundle.meta:
         settings.camera_center = bundle.meta["camera_center"]
     _levels_changed(root)
+
+
+def set_tables(root: bpy.types.Object, given: Tables) -> None:
+    """Gives a splat scene the tables of its bundle, in place of those that it has.
+
+    Apart from :func:`set_bundle_facts`: while levels are on their way, there are none yet.
+    """
+    tables.set_tables(root, given)
+    selection.update_inputs(root)
 
 
 def set_level(root: bpy.types.Object, level: Level) -> bpy.types.Object:
@@ -242,7 +252,8 @@ def contents(root: bpy.types.Object) -> str:
 
 
 def remove_finer_levels(root: bpy.types.Object) -> None:
-    """Removes all levels but the coarsest, whose object the coarsest of the next set takes over."""
+    """Removes tables and all levels but the coarsest, whose object the next set's coarsest takes over."""
+    tables.remove_tables(root)
     for item in root.lodgs.levels:
         if item.exists and item.number > 1:
             cloud = item.object.data
@@ -270,7 +281,8 @@ def read_levels(root: bpy.types.Object) -> Bundle:
     settings = root.lodgs
     facts, meta = selection.read_facts(settings.facts), selection.read_json(settings.meta)
     return Bundle(
-        settings.method, levels, settings.rule, facts, _set_controls(root), settings.cumulative, meta
+        settings.method, levels, settings.rule, facts, _set_controls(root), settings.cumulative, meta,
+        tables.read_tables(root),
     )  # fmt: skip
 
 

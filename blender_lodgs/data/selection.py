@@ -22,6 +22,7 @@ from .. import compat
 from ..nodes import rules as groups
 from ..nodes.building import edited
 from ..nodes.display import NAME as DISPLAY
+from .tables import read_table
 
 
 def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Choice | None:
@@ -55,7 +56,14 @@ def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Choic
         value(groups.HELD_FOCAL if held else groups.FOCAL),
         tuple((name, value(name)) for name in fact_names(rule)),
         tuple((control.name, value(control.name)) for control in rule.controls),
+        tuple((name, _frozen(value(groups.table_socket(name)))) for name in rule.tables),
     )
+
+
+def _frozen(obj: bpy.types.Object | None) -> tuple[tuple[str, str, bytes], ...]:
+    """A table's columns as :class:`Choice` keeps them."""
+    columns = read_table(obj.original) if obj is not None else {}
+    return tuple((name, values.dtype.str, values.tobytes()) for name, values in columns.items())
 
 
 def only_chosen(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
@@ -147,15 +155,17 @@ def outdated(root: bpy.types.Object) -> bool:
 
 
 def update_inputs(root: bpy.types.Object) -> None:
-    """Hands on to the modifiers what cannot be driven: the chosen or held eye, and each level's material."""
+    """Hands on to the modifiers what cannot be driven: the held or chosen eye, tables, a level's material."""
+    tables = {
+        groups.table_socket(item.name): item.object if item.exists else None for item in root.lodgs.tables
+    }
     for item in root.lodgs.levels:
         modifier = item.exists and _modifier(item.object)
         if modifier:
             slots = item.object.material_slots
-            for name, value in (
-                (groups.EYE_OBJECT, root.lodgs.eye_object),
-                (groups.MATERIAL, slots[0].material if slots else None),
-            ):
+            given = {groups.EYE_OBJECT: root.lodgs.eye_object} | tables
+            given[groups.MATERIAL] = slots[0].material if slots else None
+            for name, value in given.items():
                 _set(modifier, name, value, lambda there, value: there == value)
             held = root.lodgs.freeze or root.lodgs.eye == "VIEW"
             position = root.lodgs.held_eye if held else root.lodgs.camera_center

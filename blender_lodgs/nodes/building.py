@@ -47,6 +47,57 @@ class Nodes:
                 socket.default_value = value
         return node.outputs["Value"]
 
+    def vector(self, operation: str, *vectors: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        """The result of a Vector Math node, a vector or a number."""
+        node = self.add("ShaderNodeVectorMath", operation=operation)
+        for socket, value in zip(node.inputs, vectors, strict=False):
+            self.tree.links.new(value, socket)
+        return next(socket for socket in node.outputs if socket.enabled)
+
+    def named(self, name: str) -> bpy.types.NodeSocket:
+        """An attribute of numbers; 0 where there is none of that name."""
+        node = self.add("GeometryNodeInputNamedAttribute", data_type="FLOAT")
+        node.inputs["Name"].default_value = name
+        return next(s for s in node.outputs if s.name == "Attribute" and s.enabled)
+
+    def sorted(self, points: bpy.types.NodeSocket, by: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        """A geometry with its points in the order of a number, the smallest first."""
+        node = self.add("GeometryNodeSortElements", domain="POINT")
+        self.link(points, node, "Geometry")
+        self.link(by, node, "Sort Weight")
+        return node.outputs["Geometry"]
+
+    def sampled(
+        self,
+        points: bpy.types.NodeSocket,
+        values: bpy.types.NodeSocket,
+        index: bpy.types.NodeSocket | int,
+        *,
+        kind: str = "FLOAT",
+        clamp: bool = False,
+    ) -> bpy.types.NodeSocket:
+        """The value at one point of a geometry; 0, or with ``clamp`` the nearest, where there is none."""
+        node = self.add("GeometryNodeSampleIndex", data_type=kind, domain="POINT", clamp=clamp)
+        self.link(points, node, "Geometry")
+        self.link(values, node, "Value")
+        if isinstance(index, int):
+            node.inputs["Index"].default_value = index
+        else:
+            self.link(index, node, "Index")
+        return next(socket for socket in node.outputs if socket.enabled)
+
+    def which(
+        self, index: Field, *sources: bpy.types.NodeSocket, kind: str = "FLOAT"
+    ) -> bpy.types.NodeSocket:
+        """That one of several sources which a number names, counted from 0."""
+        node = self.add("GeometryNodeIndexSwitch", data_type=kind)
+        for _ in sources[2:]:
+            node.index_switch_items.new()
+        self.link(index.socket, node, "Index")
+        for number, source in enumerate(sources):
+            self.link(source, node, str(number))
+        return node.outputs["Output"]
+
     def field(self, socket: bpy.types.NodeSocket) -> Field:
         """A socket to calculate with."""
         return Field(self, socket)
@@ -118,6 +169,12 @@ class Field:
 
     def sqrt(self) -> Field:
         return self._math("SQRT", self)
+
+    def floor(self) -> Field:
+        return self._math("FLOOR", self)
+
+    def modulo(self, other: float) -> Field:
+        return self._math("FLOORED_MODULO", self, other)
 
     def where(self, yes: Field | float, no: Field | float) -> Field:
         """``yes`` where this is 1, ``no`` where it is 0; the other side may be anything, infinite too."""

@@ -6,7 +6,7 @@ import bpy
 
 from ...training.lod.rule import find_rule
 from ...training.lod.selection import unknown_rule
-from ..data import objects, scenes, selection
+from ..data import loaded, objects, scenes, selection
 from .parts import LevelsPanel, say
 
 
@@ -77,8 +77,14 @@ class LODGS_PT_detail(LevelsPanel):
         if settings.mode == "SINGLE":
             column.prop(settings, "single_level")
         else:
+            choice = loaded.chosen(context, root)
+            idle = choice.idle() if choice else {}
             for control in rule.controls if rule else ():
-                column.prop(settings.controls, control.name, slider=control.soft is not None)
+                row = column.row()
+                row.active = control.name not in idle
+                row.prop(settings.controls, control.name, slider=control.soft is not None)
+            for reason in dict.fromkeys(idle.values()):
+                say(column, reason, "INFO")
             row = column.row(align=True)
             row.prop(settings, "eye")
             row.prop(settings, "freeze", text="", icon="FREEZE")
@@ -88,8 +94,25 @@ class LODGS_PT_detail(LevelsPanel):
                 column.prop(settings, "camera_center", text="Position")
             if context.scene.camera is None and settings.eye != "VIEW":
                 layout.label(text="The scene has no camera", icon="ERROR")
-        shown, everything = scenes.count_shown(context, root)
-        layout.label(text=f"{shown:,} of {everything:,} splats shown")
+        for item in settings.tables:
+            if item.collection and len(item.collection.objects) > 1:  # the first holds its rows
+                text, spheres = f"Show {item.name.title()}", item.collection
+                layout.prop(spheres, "hide_viewport", text=text, toggle=True, invert_checkbox=True)
+        _counts(layout, context, root)
+
+
+def _counts(layout: bpy.types.UILayout, context: bpy.types.Context, root: bpy.types.Object) -> None:
+    """How much is drawn; and where the eye is, and what has to be at hand there."""
+    choice = loaded.chosen(context, root) if root.lodgs.mode == "SELECTIVE" else None
+    column = layout.column(align=True)
+    where = choice.where() if choice else ""
+    if where:
+        column.label(text=where)
+    shown, everything = scenes.count_shown(context, root)
+    column.label(text=f"{shown:,} of {everything:,} splats shown")
+    if choice and where:
+        splats, megabytes = loaded.count_loaded(root, choice)
+        column.label(text=f"{splats:,} loaded, {megabytes:.1f} MB")
 
 
 CLASSES = (LODGS_UL_levels, LODGS_PT_levels, LODGS_PT_detail)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ...training.lod.colors import level_color
+from ...training.lod.rule import find_rule
 from .. import compat, viewport
 from ..data import scenes
 from ..viewport import views
@@ -29,10 +30,14 @@ class LODGS_PT_viewport(Panel):
             column.prop(settings, "budget")
             column.prop(settings, "moving", slider=True)
         if root is not None:
-            row = column.row()
-            row.active = len(root.lodgs.levels) != 1  # one level has one colour
-            row.prop(root.lodgs, "tell", expand=True)
-            if root.lodgs.tell != "OWN" and row.active:
+            column = layout.column(align=True)
+            column.active = len(root.lodgs.levels) != 1  # one level has one colour
+            column.label(text="Colours")
+            row = column.row(align=True)
+            rule = find_rule(root.lodgs.rule)
+            for tell in ("OWN", "LEVELS", "BANDS", *(["CHUNKS"] if rule and rule.tables else [])):
+                row.prop_enum(root.lodgs, "tell", tell)
+            if root.lodgs.tell in ("LEVELS", "BANDS") and column.active:
                 _legend(layout, [item.number for item in root.lodgs.levels if item.exists])
         if viewport.problem:
             text = f"The viewport could not be drawn ({viewport.problem}). Untick Gaussian Splats for points."

@@ -16,7 +16,7 @@ import bpy
 from ...training.errors import LodgsError
 from ...training.runs.endings import ending
 from ...training.runs.folder import RunFolder
-from ...training.splats.bundle import Bundle, Level, read_head
+from ...training.splats.bundle import Bundle, Level, read_head, read_tables
 from ...training.splats.ply import read_ply
 from .. import extension
 from ..data import scenes
@@ -161,11 +161,13 @@ class Watch:
 
     def _finish(self, root: bpy.types.Object) -> None:
         head = read_head(self.folder.bundle)
+        head.tables = read_tables(self.folder.bundle)
         with extension.in_window():
             there = {item.number for item in root.lodgs.levels if item.exists}
             for number in {level.number for level in head.levels} & self.levels.keys() - there:
                 scenes.set_level(root, self._read_level(self.levels[number]))  # an undo took it away
             scenes.set_bundle_facts(root, head)
+            scenes.set_tables(root, head.tables)
             root.lodgs.training.read = self.offset
             extension.undo_step("Training finished")
 

@@ -74,7 +74,7 @@ def _points(
     yield settings.points, (0, 0, 0, 0)
     if levels and not compat.NATIVE_SPLATS:
         for item in settings.levels:
-            yield item.object, (*level_color(item.number), float(settings.tell != "OWN"))
+            yield item.object, (*level_color(item.number), float(settings.tell in ("LEVELS", "BANDS")))
 
 
 @bpy.app.handlers.persistent

@@ -250,8 +250,10 @@ def _thin(pool: Pool, placements, chosen, which: Sequence[int], keep: int) -> No
         start += len(part)
 
 
-def _color_levels(placement: Placement, means: np.ndarray) -> np.ndarray | float:
+def _color_levels(placement: Placement, means: np.ndarray) -> np.ndarray | int:
     """Which level's colour splats at means (M, 3) get."""
     if placement.tell == "BANDS" and placement.choice is not None:
         return placement.choice.wanted_level(means)
-    return placement.level if placement.tell != "OWN" else 0.0
+    if placement.tell == "CHUNKS" and placement.choice is not None:
+        return placement.choice.parts(means)
+    return placement.level if placement.tell in ("LEVELS", "BANDS") else 0

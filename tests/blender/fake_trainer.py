@@ -1,6 +1,7 @@
 """Stands in for the trainer's Python: speaks the protocol of a run, and goes wrong as $LODGS_FAKE says.
 
 - ``""``        two levels and done
+- ``chunks``    two levels of LODGE, which come again with what chunks have of them
 - ``two halves``  two levels, and done when the file ``go on`` is there
 - ``slow``      steps until it is asked to stop
 - ``killed``    one level, then SIGKILL to itself
@@ -86,7 +87,7 @@ def run(mode: str, job: Job, folder: RunFolder, say: Events) -> int:
             return 3
         if mode == "slow":
             time.sleep(0.02)
-    levels = []
+    levels, tables = [], {}
     for number, count in COUNTS.items():
         path = folder.levels_folder / f"level_{number}.ply"
         levels.append(Level(number, splats(count), {"s_min": 0.1 if number == 1 else 0.0}))
@@ -104,10 +105,23 @@ def run(mode: str, job: Job, folder: RunFolder, say: Events) -> int:
             print("garbage {on stdout")
             with folder.events_file.open("ab") as file:
                 file.write(b'not json\n{"no": "event"}\n[1, 2]\n\xff\xfe\n')
+    rule = "bands"
+    if mode == "chunks":
+        rule, tables = "chunks", {"chunks": {name: np.float32([1, 2]) for name in ("x", "y", "z", "radius")}}
+        for level in levels:
+            level.facts = {"d_l": 4.0 if level.number == 1 else 0.0}
+            level.splats.extras["chunks_0"] = np.arange(len(level.splats), dtype=np.float32)
+            path = folder.levels_folder / f"level_{level.number}.ply"
+            write_ply(path, level.splats)
+            say(
+                "level", level=level.number, path=f"levels/{path.name}", splats=len(level.splats), again=True,
+                facts=level.facts, rule=rule, scene_facts={}, controls={}, cumulative=False, meta={},
+            )  # fmt: skip
     while mode == "two halves" and not (folder.path / "go on").exists():
         time.sleep(0.02)
+    controls = {"gamma": 2.0} if rule == "bands" else {}
     meta = {"camera_center": [1.0, 2.0, 3.0], "focal_px": 100.0}
-    write_bundle(folder.bundle, Bundle(job.method, levels, "bands", {}, {"gamma": 2.0}, meta=meta))
+    write_bundle(folder.bundle, Bundle(job.method, levels, rule, {}, controls, meta=meta, tables=tables))
     say("done", bundle=folder.bundle.name, seconds=1.0, train_psnr=21.5, veil={"mean": 0.01, "max": 0.25},
         oversized=0)  # fmt: skip
     return 0

@@ -48,6 +48,18 @@ class Choice:
         assert region is not None
         return rules()[self.rule].loaded(columns, region)
 
+    def where(self) -> str:
+        """See ``Rule.where``."""
+        return rules()[self.rule].where(np.array(self.eye, np.float32), dict(self.values), self._tables())
+
+    def idle(self) -> Mapping[str, str]:
+        """See ``Rule.idle``."""
+        return rules()[self.rule].idle(np.array(self.eye, np.float32), dict(self.values), self._tables())
+
+    def parts(self, means: np.ndarray) -> np.ndarray:
+        """(N,) numbers of the parts of space where places are: see ``Rule.parts``."""
+        return rules()[self.rule].parts(means, self._tables())
+
     def wanted_level(self, means: np.ndarray) -> np.ndarray:
         """(N,) the level that is wanted at each place."""
         eye, facts, values = np.array(self.eye, np.float32), dict(self.facts), dict(self.values)

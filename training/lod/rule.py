@@ -147,6 +147,10 @@ class Rule(ABC):
         """
         return 0.0, inf
 
+    def check(self, tables: Tables) -> None:
+        """Raises ValueError, with half a sentence, where tables are there but not what the rule reads."""
+        return
+
     def region(self, eye: np.ndarray, values: Values, tables: Tables) -> Region | None:
         """Where an eye is, for rules whose splats can be told beforehand for a whole region; else None.
 
@@ -157,6 +161,19 @@ class Rule(ABC):
     def loaded(self, columns: Mapping[str, np.ndarray], region: Region) -> np.ndarray:
         """(N,) bool, which splats of a level an eye in a region may be shown."""
         raise NotImplementedError("this rule has no regions")
+
+    def where(self, eye: np.ndarray, values: Values, tables: Tables) -> str:
+        """Where an eye is, in a few words for people; empty where the rule tells no regions apart."""
+        return ""
+
+    def idle(self, eye: np.ndarray, values: Values, tables: Tables) -> Mapping[str, str]:
+        """The controls that change nothing for an eye, by name, each with the reason in a sentence."""
+        return {}
+
+    def parts(self, means: np.ndarray, tables: Tables) -> np.ndarray:
+        """The number (N,), from 1 on, of that part of space where each place is, for pictures that tell
+        them apart; 0 where the rule has no such parts."""
+        return np.zeros(len(means), np.float32)
 
     def wanted_level(
         self,

@@ -43,6 +43,14 @@ def known_rule(bundle: Bundle) -> Rule | None:
             f"The levels are said to {says}, but by their rule '{rule.name}' they {knows}.",
             "Another program may have changed the file; export it again.",
         )
+    if rule is not None:
+        try:
+            rule.check(bundle.tables)
+        except ValueError as error:
+            raise LodgsError(
+                f"The levels are to be chosen by the rule '{rule.name}', but {error}.",
+                "Export or train them again.",
+            ) from error
     return rule
 
 

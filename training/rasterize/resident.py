@@ -58,6 +58,7 @@ class Resident:
     def __init__(self, bundle: Bundle, backend: str = "auto") -> None:
         self._rule: Rule = rule_of(bundle)
         self._cumulative, self._tables = bundle.cumulative, bundle.tables
+        self._antialias = bundle.antialias
         numbered = [(level.number, level.facts) for level in bundle.levels]
         self._facts = {n: facts_of(self._rule, bundle.facts, numbered, n) for n, _ in numbered}
         self._splats = {
@@ -75,7 +76,8 @@ class Resident:
             near: depth at which drawing begins, in scene units.
             options: as for :func:`training.rasterize.rasterize`. Rows are those of the splats loaded.
         """
-        self._enter(self._rule.region(camera.center, values, self._tables))
+        eye = camera.center.astype(np.float32)  # as weights take it: on a border between regions it counts
+        self._enter(self._rule.region(eye, values, self._tables))
         rows, weights = [], []
         for level in self._levels:
             some, found = self._shown(level, camera, near, values)
@@ -126,7 +128,8 @@ class Resident:
         with torch.no_grad():
             return rasterize(
                 self._gaussians, camera, near=near, rows=index,
-                weights=None if weights is None else self._weights, backend=self._backend, **options,
+                weights=None if weights is None else self._weights,
+                antialias=self._antialias, backend=self._backend, **options,
             )  # fmt: skip
 
     def _enter(self, region: Region | None) -> None:

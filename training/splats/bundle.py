@@ -11,7 +11,7 @@ import hashlib
 import json
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -42,6 +42,8 @@ MOST_LEVELS = 12
 MOST_LEVELS_READ = 64
 """Levels that are read of a file of anybody's making."""
 ORDERS = ("finest_first", "stream")
+TABLES_FILE = "tables.ply"
+"""What holds the tables of a folder of levels."""
 _TAG = "lodsplat "
 # Some viewers search the whole header for these words, so no comment may hold one.
 _FORBIDDEN = ("packed_", "f_rest_", "end_header", "element chunk")
@@ -145,7 +147,6 @@ def write_bundle(path: str | Path, bundle: Bundle, order: str = "finest_first") 
         for lod, level in levels
         if (columns := columns_of_extras(level.splats))
     }
-    tables = {name: Element(f"lod_{name}", [columns]) for name, columns in bundle.tables.items()}
     comments = [_comment(_head(bundle, order=order))]
     offset = 0
     for i, (lod, level) in enumerate(levels):
@@ -155,18 +156,23 @@ def write_bundle(path: str | Path, bundle: Bundle, order: str = "finest_first") 
             line["extras"] = extras[lod].name
         comments.append(_comment(line))
         offset += len(level.splats) * element.dtype.itemsize
-    comments += [_comment({"table": name, "element": table.name}) for name, table in tables.items()]
+    comments += [_comment(line) for line in _table_lines(bundle)]
     comments.append(_comment({"meta": bundle.meta}))
     if sum(len(comment) + 9 for comment in comments) > _MAX_COMMENTS:
         raise LodgsError(
             f"What {path} would say beside its levels takes more than {_MAX_COMMENTS} bytes of header.",
             "Keep meta to a few numbers and names.",
         )
-    everything = [*elements, *extras.values(), *tables.values()]
+    everything = [*elements, *extras.values(), *_table_elements(bundle)]
     write_elements(path, everything, comments + comments_of(bundle.meta))
 
 
-def read_bundle(path: str | Path, warn: Warn = silent) -> Bundle:
+RowsOf = Callable[[Bundle], Mapping[int, np.ndarray]]
+"""Of a bundle with its tables, but without splats yet: which rows (M,) of each level to read, by number;
+those beyond its last one do not count."""
+
+
+def read_bundle(path: str | Path, warn: Warn = silent, rows_of: RowsOf | None = None) -> Bundle:
     """Read a bundle as it was written, bit for bit; any other 3DGS PLY reads as one level of unknown method.
 
     Splats that cannot be drawn are left out (`dialects.drawable`).
@@ -175,6 +181,7 @@ def read_bundle(path: str | Path, warn: Warn = silent) -> Bundle:
 
     Args:
         warn: as for `read_ply`.
+        rows_of: where not all splats are wanted: of a binary file no others are read then.
 
     Raises:
         LodgsError: not a PLY of splats, cut short, from a newer version, or a header that contradicts itself.
@@ -188,23 +195,22 @@ def read_bundle(path: str | Path, warn: Warn = silent) -> Bundle:
         begin = dict.fromkeys(elements, 0)
         of_levels = {line["element"] for line in lines if "level" in line}
         apart = {name: rows for name, rows in elements.items() if name not in of_levels}  # each is taken once
+        bundle.tables = _read_tables([line for line in lines if "table" in line], apart)
+        wanted = {} if rows_of is None else rows_of(bundle)
         for line in lines:
-            if "table" in line:
-                name = _of_kind(line["table"], str, "table")
-                if line["element"] != f"lod_{name}":
-                    raise ValueError(f"the table {shown(name)} is in another element")
-                rows = apart.pop(line["element"])
-                bundle.tables[name] = {column: np.array(rows[column]) for column in rows.dtype.names or ()}
             if "level" not in line:
                 continue
             name, count = line["element"], line["count"]
             rows = elements[name][begin[name] : begin[name] + count]
             begin[name] += count
-            splats = splats_from(rows, path)
             extras = apart.pop(line["extras"]) if "extras" in line else None
             if len(rows) != count or (extras is not None and len(extras) != count):
                 raise ValueError(f"level {line['level']} should have {count} splats")
+            some = wanted.get(line["level"], slice(None))
+            some = some if isinstance(some, slice) else some[some < count]
+            splats = splats_from(rows[some], path)
             if extras is not None:
+                extras = extras[some]
                 splats.extras |= {column: np.array(extras[column]) for column in extras.dtype.names or ()}
             level = next(level for level in bundle.levels if level.number == line["level"])
             level.splats = drawable(splats, path, warn)
@@ -228,25 +234,34 @@ def read_head(path: str | Path) -> Bundle:
     return _parse(comments, path)[0] or Bundle("", [Level(1, NO_SPLATS)], meta=meta_of(comments))
 
 
+def read_tables(path: str | Path) -> dict[str, Columns]:
+    """The tables of a bundle alone: its splats are not read. Any other 3DGS PLY has none.
+
+    Raises:
+        LodgsError: as `read_bundle`.
+    """
+    elements, comments = read_elements(path)
+    try:
+        return _read_tables([line for line in _parse(comments, path)[1] if "table" in line], elements)
+    except _CONTRADICTIONS as error:
+        raise _contradiction(path, error) from error
+
+
 def write_folder(folder: str | Path, bundle: Bundle) -> str:
     """Write every level as a complete plain PLY, ``lod0.ply`` the finest, and ``manifest.json``.
 
     All files have the same columns, as splat-transform wants it: extras that not every level has are left
-    out. Nothing is replaced before all is written; the manifest is moved into place last. Then the levels of
-    an earlier export that this one has no place for (``lodN.ply``) are removed, and nothing else.
+    out. Tables stand beside, in ``tables.ply``. Nothing is replaced before all is written; the manifest is
+    moved into place last. Then what an earlier export has left that this one has no place for (``lodN.ply``,
+    ``tables.ply``) is removed, and nothing else.
 
     Returns:
         The command line that makes streamed LOD for the web of the folder with splat-transform.
 
     Raises:
-        LodgsError: as `write_bundle`, or the bundle has tables, which have no place there.
+        LodgsError: as `write_bundle`.
     """
     _check(bundle)
-    if bundle.tables:
-        raise LodgsError(
-            f"Levels of the method '{bundle.method}' cannot be a folder: it has no place for their tables.",
-            "Export a bundle.",
-        )
     folder = Path(folder)
     first = columns_of_extras(bundle.levels[0].splats)
     shared = {
@@ -255,6 +270,8 @@ def write_folder(folder: str | Path, bundle: Bundle) -> str:
         if all(name in x.splats.extras and x.splats.extras[name].dtype == column.dtype for x in bundle.levels)
     }
     manifest = _head(bundle) | {"levels": [], "meta": bundle.meta}
+    if bundle.tables:
+        manifest["tables"] = _table_lines(bundle)
     command = ["splat-transform"]
     with ExitStack() as stack:
         manifest_file = stack.enter_context(atomic_write(folder / "manifest.json"))
@@ -280,13 +297,21 @@ def write_folder(folder: str | Path, bundle: Bundle) -> str:
                 | {"bounds": _bounds([x.splats for x in drawn])}
             )
             command += [str(path), "-l", str(lod)]
+        if bundle.tables:
+            temporary = stack.enter_context(atomic_write(folder / TABLES_FILE))
+            no_splats = Element("vertex", [columns_of(NO_SPLATS)])
+            write_elements(temporary, [no_splats, *_table_elements(bundle)])
         manifest_file.write_text(
             json.dumps(manifest, indent=1, default=_plain, allow_nan=False) + "\n", "ascii"
         )
-    for file in folder.glob("lod*.ply"):
-        if (found := re.fullmatch(r"lod(\d+)\.ply", file.name)) and int(found[1]) >= len(bundle.levels):
-            with suppress(OSError):  # the manifest does not name it
-                file.unlink()
+    unused = [
+        file
+        for file in folder.glob("lod*.ply")
+        if (found := re.fullmatch(r"lod(\d+)\.ply", file.name)) and int(found[1]) >= len(bundle.levels)
+    ]
+    for file in unused if bundle.tables else [*unused, folder / TABLES_FILE]:
+        with suppress(OSError):  # the manifest does not name it
+            file.unlink()
     return shlex.join([*command, str(folder / "web" / "lod-meta.json")])
 
 
@@ -318,6 +343,8 @@ def read_folder(folder: str | Path, warn: Warn = silent) -> Bundle:
                     splats = splats.select(slice(begin, None))
                     begin = line["count"]
                 level.splats = drawable(splats, file, warn)
+            if lines_of_tables := _of_kind(manifest.get("tables", []), list, "tables"):
+                bundle.tables = _read_tables(lines_of_tables, read_elements(folder / TABLES_FILE)[0])
             return bundle
         except _CONTRADICTIONS as error:
             raise _contradiction(manifest_file, error) from error
@@ -397,6 +424,27 @@ def _head(bundle: Bundle, **further) -> dict:
 def _level_line(lod: int, level: Level) -> dict:
     line = {"level": level.number, "lod": lod, "count": len(level.splats)}
     return line | {"facts": level.facts} if level.facts else line
+
+
+def _table_elements(bundle: Bundle) -> list[Element]:
+    return [Element(f"lod_{name}", [columns]) for name, columns in bundle.tables.items()]
+
+
+def _table_lines(bundle: Bundle) -> list[dict]:
+    return [{"table": name, "element": f"lod_{name}"} for name in bundle.tables]
+
+
+def _read_tables(lines: list[dict], elements: dict[str, np.ndarray]) -> dict[str, Columns]:
+    """The tables that a header or a manifest names, taken out of the elements; raises what a contradiction
+    raises."""
+    tables = {}
+    for line in lines:
+        name = _of_kind(line["table"], str, "table")
+        if line["element"] != f"lod_{name}":
+            raise ValueError(f"the table {shown(name)} is in another element")
+        rows = elements.pop(line["element"])
+        tables[name] = {column: np.array(rows[column]) for column in rows.dtype.names or ()}
+    return tables
 
 
 def _parse(comments: list[str], path: str | Path) -> tuple[Bundle | None, list[dict]]:

@@ -3,8 +3,9 @@
 A module has ``VERSION``, to be raised whenever its nodes change; ``FADES``, whether weights lie between 0
 and 1; and ``weight(inputs)``, the formula. What all groups have in common is here: their sockets bear the
 names of the rule's facts and controls, so that properties drive them by bare names and reading them gives the
-rule's arguments back; and distances are taken in the local space of the modifier's object, that is in the
-splats' own world, whatever the transforms of its parents.
+rule's arguments back, with an object for each of its tables (``data.tables``); and distances are taken in
+the local space of the modifier's object, that is in the splats' own world, whatever the transforms of its
+parents.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from types import ModuleType
 import bpy
 
 from ....training.lod.rule import Rule, fact_names, rules
-from ...attributes import OPACITY_LOGIT, WEIGHT
+from ...attributes import COLUMN, OPACITY_LOGIT, WEIGHT
 from ..building import VERSION, Field, Nodes, edited, group
 
 EYE, FREEZE, EYE_OBJECT, EYE_POSITION = "eye", "freeze", "eye_object", "eye_position"
@@ -40,6 +41,7 @@ class Inputs:
     """What a formula is made of.
 
     Attributes:
+        eye: its place.
         distance: of each point from the eye.
         focal_px: the eye's focal length in pixels.
         points: the geometry, for what needs all points at once.
@@ -52,7 +54,8 @@ class Inputs:
         self.points = self._sockets["Geometry"]
         held = self._held()
         self.focal_px = held.where(self[HELD_FOCAL], self[FOCAL])
-        self.distance = self._distance()
+        self.eye = self._eye()
+        self.distance = nodes.field(nodes.vector("DISTANCE", self.position(), self.eye))
 
     def __getitem__(self, name: str) -> Field:
         """A fact or a control."""
@@ -60,9 +63,28 @@ class Inputs:
 
     def column(self, name: str) -> Field:
         """A column of the splats; 0 where they have none of that name."""
-        node = self.nodes.add("GeometryNodeInputNamedAttribute", data_type="FLOAT")
-        node.inputs["Name"].default_value = name
-        return self.nodes.field(next(s for s in node.outputs if s.name == "Attribute" and s.enabled))
+        return self.nodes.field(self.nodes.named(name))
+
+    def position(self) -> bpy.types.NodeSocket:
+        """Where each point is."""
+        return self.nodes.add("GeometryNodeInputPosition").outputs["Position"]
+
+    def table(self, name: str) -> bpy.types.NodeSocket:
+        """A table, a point a row; none where the scene lacks it. Wherever its object is does not count."""
+        info = self.nodes.add("GeometryNodeObjectInfo", transform_space="ORIGINAL")
+        self.nodes.link(self._sockets[table_socket(name)], info, "Object")
+        return info.outputs["Geometry"]
+
+    def table_column(self, name: str) -> Field:
+        """A column of a table."""
+        return self.nodes.field(self.nodes.named(COLUMN.format(name)))
+
+    def table_place(self) -> bpy.types.NodeSocket:
+        """A table's columns ``x``, ``y``, ``z`` as places."""
+        node = self.nodes.add("ShaderNodeCombineXYZ")
+        for name in "xyz":
+            self.nodes.link(self.table_column(name).socket, node, name.upper())
+        return node.outputs["Vector"]
 
     def opacity(self) -> Field:
         """Each splat's own opacity."""
@@ -72,7 +94,7 @@ class Inputs:
         """Whether the eye stays where it is, or is the viewport's."""
         return self[FREEZE].maximum(self[EYE] > HELD - 0.5)
 
-    def _distance(self) -> Field:
+    def _eye(self) -> bpy.types.NodeSocket:
         nodes = self.nodes
         seen_from = []
         for obj in (
@@ -81,16 +103,8 @@ class Inputs:
             info = nodes.add("GeometryNodeObjectInfo", transform_space="RELATIVE")
             nodes.link(obj, info, "Object")
             seen_from.append(info.outputs["Location"])
-        eye = nodes.add("GeometryNodeIndexSwitch", data_type="VECTOR")
-        eye.index_switch_items.new()
-        nodes.link(self[FREEZE].where(2.0, self[EYE].minimum(2.0)).socket, eye, "Index")
-        for index, source in enumerate((*seen_from, self._sockets[EYE_POSITION])):
-            nodes.link(source, eye, str(index))
-        position = nodes.add("GeometryNodeInputPosition")
-        distance = nodes.add("ShaderNodeVectorMath", operation="DISTANCE")
-        nodes.tree.links.new(position.outputs["Position"], distance.inputs[0])
-        nodes.tree.links.new(eye.outputs["Output"], distance.inputs[1])
-        return nodes.field(distance.outputs["Value"])
+        which = self[FREEZE].where(2.0, self[EYE].minimum(2.0))
+        return nodes.which(which, *seen_from, self._sockets[EYE_POSITION], kind="VECTOR")
 
 
 @cache
@@ -140,6 +154,11 @@ def rule_of_group(tree: bpy.types.NodeTree | None) -> Rule | None:
     return None if tree is None or RULE not in tree or edited(tree) else rules().get(tree[RULE])
 
 
+def table_socket(name: str) -> str:
+    """The socket of a rule's table: facts and controls may have the table's name."""
+    return f"{name}_table"
+
+
 def _sockets(tree: bpy.types.GeometryNodeTree, rule: Rule) -> None:
     for name in fact_names(rule):
         tree.interface.new_socket(name, in_out="INPUT", socket_type="NodeSocketFloat")
@@ -150,6 +169,8 @@ def _sockets(tree: bpy.types.GeometryNodeTree, rule: Rule) -> None:
         number = int if control.whole else float
         socket.min_value, socket.max_value = number(control.low), number(control.high)
         socket.default_value = number(control.default)
+    for name in rule.tables:
+        tree.interface.new_socket(table_socket(name), in_out="INPUT", socket_type="NodeSocketObject")
     for name, kind in _SHARED.items():
         tree.interface.new_socket(name, in_out="INPUT", socket_type=kind)
 

@@ -39,11 +39,5 @@ def _for_budget(inputs: Inputs, opacity: Field, normalized: Field, variance: Fie
     for _ in range(NEWTON_STEPS):
         w = w / (w + 1.0) * ((product / w).log() + 1.0)
     limit = ratio * (w * -0.5).exp()
-    ordered = nodes.add("GeometryNodeSortElements", domain="POINT")
-    nodes.link(inputs.points, ordered, "Geometry")
-    nodes.link((limit * -1.0).socket, ordered, "Sort Weight")
-    sampled = nodes.add("GeometryNodeSampleIndex", data_type="FLOAT", domain="POINT", clamp=False)
-    nodes.link(ordered.outputs["Geometry"], sampled, "Geometry")
-    nodes.link(limit.socket, sampled, "Value")
-    nodes.link(inputs["at_most"].socket, sampled, "Index")
-    return nodes.field(next(s for s in sampled.outputs if s.enabled)) * (1 + CLEAR)
+    ordered = nodes.sorted(inputs.points, (limit * -1.0).socket)
+    return nodes.field(nodes.sampled(ordered, limit.socket, inputs["at_most"].socket)) * (1 + CLEAR)

@@ -25,6 +25,7 @@ def root(bpy, lodgs):
     scenes.set_bundle_facts(root, Bundle("flod", [], "bands"))
     for number, s_min in ((1, 0.1), (2, 0.0)):
         scenes.set_level(root, Level(number, splats(number), {"s_min": s_min}))
+    scenes.set_tables(root, {"any": {"x": np.float32([1, 2])}})
     root.location = (1, 2, 3)
     bpy.context.view_layer.update()
     return root

@@ -9,6 +9,7 @@ RULES = sorted(rules())
 RANGES = {
     "tau": (0.002, 0.02), "reference": (-3, 20), "sigma_d": (-0.5, 3), "s_v": (1, 4),
     "at_most": (-1500, 3000), "d_l": (1, 6), "coarser_d_l": (7, 14), "distance_scale": (0.7, 1.6),
+    "chunks_0": (0, 2**24), "chunks_1": (0, 2**24), "chunks_2": (0, 2**24), "chunks_3": (0, 2**24),
 }  # fmt: skip
 """Of facts, controls and columns for which the usual ones would show everything or nothing."""
 
@@ -29,16 +30,25 @@ def numbers(rule, rng):
     return facts, values
 
 
+def tables(rule, rng, count):
+    """Tables of a rule, of places with a radius; None: there are none."""
+    if count is None:
+        return {}
+    column = {name: rng.normal(0, 4, count).astype(np.float32) for name in "xyz"}
+    return {name: column | {"radius": rng.uniform(1, 6, count).astype(np.float32)} for name in rule.tables}
+
+
 @pytest.fixture
 def level(bpy, lodgs):
-    """``level(rule, count, facts, values, rng)``: an object with the rule's modifier, and its splats."""
+    """``level(rule, count, facts, values, rng, tables)``: an object with the modifier, and its splats."""
     from training.splats.gaussians import Splats
 
     objects, groups, compat = lodgs("data.objects"), lodgs("nodes.rules"), lodgs("compat")
 
-    def make(rule, count, facts, values, rng):
+    def make(rule, count, facts, values, rng, tables=None):
         names = [name for name in rule.columns if name != "opacity"]
         columns = {name: rng.uniform(*RANGES.get(name, (0.2, 2)), count).astype(np.float32) for name in names}
+        columns |= {name: np.floor(columns[name]) for name in names if name.startswith("chunks_")}  # bits
         splats = Splats(
             means=rng.normal(0, 4, (count, 3)).astype(np.float32),
             quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
@@ -54,19 +64,31 @@ def level(bpy, lodgs):
         for name, value in {**facts, **values}.items():
             kind = int if isinstance(compat.get_input(modifier, name), int) else float
             compat.set_input(modifier, name, kind(value))
+        root = bpy.data.objects.new("root", None)
+        bpy.context.scene.collection.objects.link(root)
+        lodgs("data.tables").set_tables(root, tables or {})
+        for item in root.lodgs.tables:
+            compat.set_input(modifier, groups.table_socket(item.name), item.object)
         return obj, modifier, splats
 
     return make
 
 
-@pytest.mark.parametrize("name", RULES)
-def test_the_node_group_weights_every_splat_as_the_rule_does(bpy, lodgs, level, name):
+WITH_TABLES = [
+    (name, count) for name in RULES for count in ((None, 0, 1, 2, 3, 96) if rules()[name].tables else (None,))
+]
+"""Each rule, and how many rows its tables have."""
+
+
+@pytest.mark.parametrize(("name", "count"), WITH_TABLES)
+def test_the_node_group_weights_every_splat_as_the_rule_does(bpy, lodgs, level, name, count):
     rule, weights = rules()[name], []
     compat, groups, selection = lodgs("compat"), lodgs("nodes.rules"), lodgs("data.selection")
     for seed in range(8):
         rng = np.random.default_rng(seed)
         facts, values = numbers(rule, rng)
-        obj, modifier, splats = level(rule, 4000, facts, values, rng)
+        known = tables(rule, rng, count)
+        obj, modifier, splats = level(rule, 4000, facts, values, rng, known)
         eye = rng.normal(0, 4, 3).astype(np.float32)
         obj.location = (3, -2, 1)  # the object's place must not count
         place = {groups.EYE: 2, groups.EYE_POSITION: tuple(map(float, eye)), groups.FOCAL: 2.5}
@@ -79,7 +101,8 @@ def test_the_node_group_weights_every_splat_as_the_rule_does(bpy, lodgs, level, 
         assert (asked.rule, asked.focal_px) == (name, 2.5)
         assert dict(asked.values) == pytest.approx(values) and dict(asked.facts) == pytest.approx(facts)
         columns = splats.extras | {"opacity": 1 / (1 + np.exp(-splats.opacity_logits))}
-        wanted = rule.weights(splats.means, eye, 2.5, columns, dict(asked.facts), dict(asked.values))
+        wanted = rule.weights(splats.means, eye, 2.5, columns, dict(asked.facts), dict(asked.values), known)
+        np.testing.assert_array_equal(asked.weights(splats.means, columns), wanted)
         found, cloud = np.zeros(len(splats), np.float32), evaluated.data
         if len(cloud.points):
             rows = np.empty(len(cloud.points), np.int32)

@@ -45,6 +45,10 @@ class Notes:
         if slider:
             self.sliders.append(name)
 
+    def prop_enum(self, owner, name, value):
+        assert value in owner.bl_rna.properties[name].enum_items
+        self.properties.append(f"{name} {value}")
+
 
 @pytest.fixture
 def draw_panel(bpy, lodgs, monkeypatch):

@@ -1,9 +1,12 @@
-"""What the Detail panel offers for every rule, and says where there is none."""
+"""What the Detail panel offers for every rule, and says where there is none; and what it says of chunks."""
 
 import numpy as np
 import pytest
 
 from training.lod.rule import rules
+from training.lod.rules.chunks import member_columns
+from training.splats.bundle import Bundle, Level
+from training.splats.gaussians import Splats
 
 
 @pytest.fixture
@@ -65,3 +68,77 @@ def test_what_has_no_known_rule_is_shown_level_by_level_and_says_so(root, draw):
     assert "These levels are not made for distances." in draw().texts
     root("weave")
     assert any("'weave', which this version does not know." in text for text in draw().texts)
+
+
+@pytest.fixture
+def town(bpy, lodgs):
+    """A level of 1000 splats for all distances below 20, one for the rest, and two chunks."""
+    scenes, sets = lodgs("data.scenes"), np.zeros((2, 1000), bool)
+    sets[0, :100] = sets[1, 50:300] = True
+    splats = Splats(
+        means=np.zeros((1000, 3), np.float32), quats=np.ones((1000, 4), np.float32),
+        log_scales=np.zeros((1000, 3), np.float32), opacity_logits=np.zeros(1000, np.float32),
+        sh=np.zeros((1000, 1, 3), np.float32), extras=member_columns(sets),
+    )  # fmt: skip
+    levels = [Level(1, splats.select(slice(0, 10)), {"d_l": 20.0}), Level(2, splats, {"d_l": 0.0})]
+    table = {"x": [0, 10], "y": [0, 0], "z": [0, 0], "radius": [10, 10]}
+    table = {name: np.float32(values) for name, values in table.items()}
+    with scenes._new_scene(bpy.context, "town") as root:
+        for one in levels:
+            scenes._put_level(root, one)
+        scenes.set_bundle_facts(root, Bundle("lodge", levels, "chunks"))
+        scenes.set_tables(root, {"chunks": table})
+    root.lodgs.mode, root.lodgs.eye = "SELECTIVE", "TRAINING"
+    return root
+
+
+def test_chunks_are_told_with_what_is_loaded_and_what_is_drawn(bpy, lodgs, town, draw):
+    def told(eye, **controls):
+        town.lodgs.camera_center = eye
+        for name, value in controls.items():
+            setattr(town.lodgs.controls, name, value)
+        bpy.context.view_layer.update()
+        return draw().texts
+
+    megabytes = lodgs("data.objects").megabytes
+    size = sum(megabytes(item.object.data) for item in town.lodgs.levels)
+    each = size / 1010
+    texts = told((2.5, 0, 0))
+    assert "Chunks 0 and 1, 25 %" in texts and "310 of 1,010 splats shown" in texts
+    assert f"310 loaded, {310 * each:.1f} MB" in texts
+    assert any("sets of chunks are fixed" in text for text in texts)
+    texts = told((0, -11.25, 0))
+    assert "Chunk 0, 50 % outside" in texts and f"1,010 loaded, {size:.1f} MB" in texts
+    assert not any("fixed" in text for text in texts)
+    texts = told((-1, 0, 0))
+    assert "Chunk 0" in texts and "110 of 1,010 splats shown" in texts
+    assert f"110 loaded, {110 * each:.1f} MB" in texts
+    texts = told((-1, 0, 0), chunks=False)
+    assert not any("Chunk" in text or "loaded" in text for text in texts)
+    assert "Only chunks fade into each other." in texts
+
+
+def test_what_is_loaded_is_counted_anew_when_the_splats_change(bpy, lodgs, town):
+    loaded, cloud = lodgs("data.loaded"), town.lodgs.levels[1].object.data
+    bpy.context.view_layer.update()
+    choice = loaded.chosen(bpy.context, town)
+    assert loaded.count_loaded(town, choice)[0] == 110
+    lodgs("attributes").write_attribute(cloud, "chunks_0", "FLOAT", np.ones(1000, np.float32))
+    cloud.update_tag()
+    bpy.context.view_layer.update()
+    assert loaded.count_loaded(town, choice)[0] == 1010
+
+
+def test_the_chunks_can_be_shown_and_told_by_colour(town, draw, draw_panel, root):
+    assert "hide_viewport" in draw().properties
+    assert "tell CHUNKS" in draw_panel("viewport", "LODGS_PT_viewport").properties
+    town.lodgs.tell = "CHUNKS"
+    assert not draw_panel("viewport", "LODGS_PT_viewport").colors
+
+
+def test_splats_without_chunks_say_so(bpy, root, draw):
+    made = root("chunks")
+    made.lodgs.mode = "SELECTIVE"
+    bpy.context.view_layer.update()
+    notes = draw()
+    assert "These splats have no chunks." in notes.texts and "hide_viewport" not in notes.properties

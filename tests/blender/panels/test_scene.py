@@ -43,7 +43,11 @@ def test_colours_have_a_legend(root, draw_panel):
     assert draw_panel("viewport", "LODGS_PT_viewport").colors == []
     root.lodgs.tell = "LEVELS"
     notes = draw_panel("viewport", "LODGS_PT_viewport")
-    assert notes.colors == [(*level_color(1), 1), (*level_color(2), 1)] and notes.texts[:2] == ["1", "2"]
+    assert notes.colors == [(*level_color(1), 1), (*level_color(2), 1)] and notes.texts[:3] == [
+        "Colours",
+        "1",
+        "2",
+    ]
 
 
 def test_without_a_trainer_only_what_works_is_offered(bpy, lodgs, root, draw_panel, fake, monkeypatch):

@@ -1,5 +1,7 @@
 """Which splats viewports draw, in which order and from which eye: against numpy and the modifiers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -299,6 +301,25 @@ def test_colours_tell_levels_and_distances(bpy, lodgs):
         assert result.count == (wanted > 1.25).sum()
         assert np.allclose(weight, np.clip(2 * wanted - 2.5, 0, 1)[index], atol=1e-4)
         assert np.array_equal(told, truth[index])
+
+
+def test_colours_tell_chunks(bpy, lodgs):
+    rng = np.random.default_rng(3)
+    arranging = lodgs("viewport.arranging")
+    part = random_set(rng, 400)
+    pool, _ = pool_of(lodgs, [part])
+    centres = rng.normal(size=(5, 3)).astype(np.float32)
+    columns = (*zip("xyz", centres.T, strict=True), ("radius", np.ones(5, np.float32)))
+    table = tuple((name, "<f4", values.tobytes()) for name, values in columns)
+    facts = {"level": 2, "finer": 1 << 30, "coarser": 0, "levels": 2, "d_l": 0, "coarser_d_l": 0}
+    values = {"distance_scale": 1.0, "chunks": 0, "fade": 1}
+    by = choice(lodgs, "chunks", 1.0, facts, values)
+    nearest = np.linalg.norm(part[0][:, None] - centres, axis=2).argmin(axis=1) + 1
+    for tables, truth in (((), 0 * nearest), ((("chunks", table),), nearest)):
+        placement = placed(lodgs, 0, 400, level=2, choice=replace(by, tables=tables), tell="CHUNKS")
+        result = arranging.arrange(pool, arranging.Request((placement,), (0, 0, 1), 10**6))
+        assert result.count == 400
+        assert np.array_equal(result.instances[:400, 3], truth[result.instances[:400, 0].astype(int)])
 
 
 def test_freeze_keeps_the_choice_while_the_eye_moves_on(bpy, lodgs, scene_of):

@@ -5,8 +5,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from training.errors import LodgsError
 from training.lod.rule import NO_TABLES, facts_of, rules
 from training.lod.rules.chunks import member_columns, members
+from training.lod.selection import known_rule
+from training.splats.bundle import NO_SPLATS, Bundle, Level
 
 CHUNKS = rules()["chunks"]
 LEVELS = [(1, {"d_l": 20.0}), (2, {"d_l": 5.0}), (3, {"d_l": 0.0})]
@@ -143,3 +146,59 @@ def test_the_bits_of_96_chunks_are_exact_in_single_precision():
         np.testing.assert_array_equal(members(columns, chunk), one)
     assert list(member_columns(sets[:24])) == ["chunks_0"]
     assert list(member_columns(sets[:25])) == ["chunks_0", "chunks_1"]
+
+
+def test_where_an_eye_is_in_words():
+    def said(eye, tables=TABLES, **values):
+        return CHUNKS.where(np.array(eye, float), CHUNKS.defaults([1]) | values, tables)
+
+    assert said([2.5, 0, 0]) == "Chunks 0 and 1, 25 %"
+    assert said([26.0, 0, 0]) == "Chunks 2 and 1, 15 %"  # the nearest first; t is 0.2, t' 2 / 15
+    assert said([-3.0, 0, 0]) == said([2.5, 0, 0], fade=0) == "Chunk 0"
+    assert said([0, -11.25, 0]) == "Chunk 0, 50 % outside"
+    assert said([0, -50.0, 0]) == "Outside the chunks"
+    assert said([2.5, 0, 0], NO_TABLES) == said([2.5, 0, 0], chunks=0) == ""
+
+
+def test_controls_that_change_nothing_say_why():
+    """And they do change nothing: weights stay whatever their values."""
+    for eye in ([2.5, 3, 0], [0, -11.25, 0], [0, 88, 0]):
+        for tables in (TABLES, NO_TABLES):
+            for chunks in (0, 1):
+                values = CHUNKS.defaults([1]) | {"chunks": chunks}
+                idle = CHUNKS.idle(np.array(eye, float), values, tables)
+                before = chunk_weights(eye, tables, **values)
+                for name in idle:
+                    for other in (0.02, 9.0) if name == "distance_scale" else (0, 1):
+                        assert chunk_weights(eye, tables, **values | {name: other}) == before
+                assert ("distance_scale" in idle) == (tables is TABLES and chunks == 1 and eye[1] == 3)
+                assert ("fade" in idle) == (tables is NO_TABLES or chunks == 0)
+                assert ("chunks" in idle) == (tables is NO_TABLES)
+
+
+def test_places_belong_to_the_nearest_chunk():
+    means = np.random.default_rng(0).normal(10, 15, (40_000, 3)).astype(np.float32)
+    centres = np.stack([TABLES["chunks"][axis] for axis in "xyz"], axis=1)
+    nearest = np.linalg.norm(means[:, None] - centres, axis=2).argmin(axis=1)
+    assert (CHUNKS.parts(means, TABLES) == nearest + 1).mean() > 0.9999  # halfway, a bit decides
+    assert not CHUNKS.parts(means, NO_TABLES).any()
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda table: table.pop("radius"), "its table 'chunks' has no radius"),
+        (lambda table: table.update(y=np.float32([0, np.nan, 0])), "a chunk is nowhere"),
+        (lambda table: table.update({name: np.zeros(97) for name in table}), "97 chunks, of at most 96"),
+    ],
+)
+def test_a_table_of_no_chunks_is_refused(change, says):
+    table = dict(TABLES["chunks"])
+    levels = [Level(number, NO_SPLATS, facts) for number, facts in LEVELS]
+    bundle = Bundle("lodge", levels, "chunks", tables={"chunks": table})
+    assert known_rule(bundle) is CHUNKS
+    change(table)
+    with pytest.raises(LodgsError, match=says):
+        known_rule(bundle)
+    bundle.tables = {"chunks": {}}
+    assert known_rule(bundle) is CHUNKS

@@ -422,7 +422,16 @@ def test_folder_of_a_cumulative_bundle_holds_complete_scenes_and_reads_back(tmp_
         read_folder(tmp_path)
 
 
-def test_tables_come_back_and_have_no_place_in_a_folder(tmp_path, bundle, same):
+def check_tables(expected, found):
+    assert list(found) == list(expected)
+    for name, table in expected.items():
+        assert list(found[name]) == list(table)
+        for column, values in table.items():
+            np.testing.assert_array_equal(found[name][column], values)
+            assert found[name][column].dtype == values.dtype
+
+
+def test_tables_come_back_from_a_bundle_and_from_a_folder(tmp_path, bundle, same):
     rng = np.random.default_rng(0)
     bundle.tables = {
         "chunks": {"x": rng.normal(size=7).astype("f4"), "splats": np.arange(7, dtype="u4")},
@@ -431,15 +440,33 @@ def test_tables_come_back_and_have_no_place_in_a_folder(tmp_path, bundle, same):
     write_bundle(tmp_path / "b.ply", bundle)
     again = read_bundle(tmp_path / "b.ply")
     check_same(bundle, again, same)
-    assert again.tables.keys() == bundle.tables.keys()
-    for name, table in bundle.tables.items():
-        for column, values in table.items():
-            np.testing.assert_array_equal(again.tables[name][column], values)
-            assert again.tables[name][column].dtype == values.dtype
+    check_tables(bundle.tables, again.tables)
     assert "table chunks: 7 rows of x, splats" in describe(tmp_path / "b.ply")
-    with pytest.raises(LodgsError, match="no place for their tables"):
-        write_folder(tmp_path / "f", bundle)
-    assert not (tmp_path / "f").exists()
+    for level in bundle.levels:
+        level.splats.extras.pop("only_here", None)
+    write_folder(tmp_path / "f", bundle)
+    again = read_folder(tmp_path / "f")
+    check_same(bundle, again, same)
+    check_tables(bundle.tables, again.tables)
+    assert "table chunks: 7 rows of x, splats" in describe(tmp_path / "f")
+    bundle.tables = {}
+    write_folder(tmp_path / "f", bundle)
+    assert not (tmp_path / "f" / "tables.ply").exists() and read_folder(tmp_path / "f").tables == {}
+
+
+def test_a_folder_that_contradicts_its_tables_is_refused(tmp_path, bundle):
+    bundle.tables = {"chunks": {"x": np.zeros(3, "f4")}}
+    write_folder(tmp_path, bundle)
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    for tables in (7, [{"table": "chunks"}], [{"table": "chunks", "element": "vertex"}],
+                   [{"table": "others", "element": "lod_others"}], ["chunks"]):  # fmt: skip
+        (tmp_path / "manifest.json").write_text(json.dumps(manifest | {"tables": tables}))
+        with pytest.raises(LodgsError, match="in a way that cannot be followed"):
+            read_folder(tmp_path)
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    (tmp_path / "tables.ply").unlink()
+    with pytest.raises(LodgsError, match=r"tables\.ply"):
+        read_folder(tmp_path)
 
 
 def test_folder_without_manifest(tmp_path, make_splats):

@@ -7,17 +7,22 @@ from math import inf
 
 import numpy as np
 
+from ...splats.dialects import FARTHEST
 from ..rule import NO_FINER, NO_TABLES, Control, Region, Rule, Tables, Values, distances
 
 STEP = 1.25
 """Factor by which a viewer's budget raises the distance scale at a time."""
 
+COLUMNS = ("x", "y", "z", "radius")
+"""Of the table of chunks."""
 BITS, MOST_CHUNKS = 24, 96
 """Chunks that one column tells of, as single precision holds so many bits; and chunks of a scene."""
 MEMBERS = tuple(f"chunks_{number}" for number in range(MOST_CHUNKS // BITS))
 """Columns of splats: bit c % BITS of column c // BITS is set where chunk c has the splat in its set."""
 TABLE = "chunks"
 """The table of chunks, one a row: centres x, y, z, and radius, in scene units."""
+_BLOCK = 1 << 14
+"""Places that are compared with all centres at a time."""
 LEAVING = 0.25
 """Beyond its radius a chunk's set counts less and less, until nothing after this share of the radius."""
 
@@ -72,6 +77,15 @@ class Chunks(Rule):
             weights += np.float32(1 - inside) * seen
         return np.minimum(weights, 1, out=weights)
 
+    def check(self, tables: Tables) -> None:
+        table = tables.get(TABLE, {})
+        if missing := [name for name in COLUMNS if table and name not in table]:
+            raise ValueError(f"its table '{TABLE}' has no {', '.join(missing)}")
+        if _rows(tables) > MOST_CHUNKS:
+            raise ValueError(f"there are {_rows(tables):,} chunks, of at most {MOST_CHUNKS}")
+        if not all((np.abs(table[name]) <= FARTHEST).all() for name in COLUMNS if table):
+            raise ValueError("a chunk is nowhere")
+
     def region(self, eye, values: Values, tables: Tables) -> Region | None:
         near_chunks = self.near_chunks(eye, values, tables)
         if sum(share for _, share in near_chunks) < 1:
@@ -84,6 +98,40 @@ class Chunks(Rule):
             found |= members(columns, chunk)
         return found
 
+    def where(self, eye, values: Values, tables: Tables) -> str:
+        if not values["chunks"] or not _rows(tables):
+            return ""
+        near_chunks = self.near_chunks(eye, values, tables)
+        inside = sum(share for _, share in near_chunks)
+        if not inside:
+            return "Outside the chunks"
+        said = " and ".join(str(number) for number, _ in near_chunks)
+        if len(near_chunks) > 1:
+            said += f", {100 * near_chunks[1][1] / inside:.0f} %"
+        if inside < 1:
+            said += f", {100 * (1 - inside):.0f} % outside"
+        return f"Chunk{'s'[: len(near_chunks) > 1]} {said}"
+
+    def idle(self, eye, values: Values, tables: Tables) -> Mapping[str, str]:
+        if not _rows(tables):
+            return dict.fromkeys(("chunks", "fade"), "These splats have no chunks.")
+        if not values["chunks"]:
+            return {"fade": "Only chunks fade into each other."}
+        if self.region(eye, values, tables) is None:
+            return {}
+        return {"distance_scale": "The sets of chunks are fixed: a distance scale counts outside of them."}
+
+    def parts(self, means, tables: Tables) -> np.ndarray:
+        if not _rows(tables):
+            return super().parts(means, tables)
+        centres = np.stack([tables[TABLE][axis] for axis in "xyz"]).astype(np.float32)
+        squares = (centres * centres).sum(axis=0)
+        found = np.empty(len(means), np.float32)
+        for start in range(0, len(means), _BLOCK):
+            block = means[start : start + _BLOCK]
+            found[start : start + _BLOCK] = (squares - 2 * block @ centres).argmin(axis=1) + 1
+        return found
+
     def near_chunks(self, eye, values: Values, tables: Tables) -> list[tuple[int, float]]:
         """The nearest chunk A and, where sets fade, the next one B, each as its number and its share.
 
@@ -94,9 +142,9 @@ class Chunks(Rule):
 
         Shares sum up to 1 within the radius of one of the two, to 0 far from both; none without chunks.
         """
-        table = tables.get(TABLE, {})
-        if not values["chunks"] or not len(table.get("x", ())):
+        if not values["chunks"] or not _rows(tables):
             return []
+        table = tables[TABLE]
         centres = np.stack([table[axis] for axis in "xyz"], axis=1).astype(np.float64)
         eye, radii = np.asarray(eye, np.float64), np.asarray(table["radius"], np.float64)
         away = np.linalg.norm(centres - eye, axis=1)
@@ -119,6 +167,11 @@ class Chunks(Rule):
             return {**values, "chunks": 0}
         scale = values["distance_scale"] * STEP
         return {**values, "distance_scale": scale} if scale <= self.controls[0].high else None
+
+
+def _rows(tables: Tables) -> int:
+    """How many chunks there are."""
+    return len(tables.get(TABLE, {}).get("x", ()))
 
 
 def _ends(facts: Mapping[str, float]) -> tuple[float, float]:

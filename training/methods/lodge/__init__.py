@@ -32,6 +32,14 @@ class LodgeParameters(ThreedgsParameters):
         "without a number).",
         high=1,
     )
+    keep: float = parameter(
+        0.3,
+        "Where more than about this share of the next finer level would stay, more is removed, so that "
+        "levels are worth drawing in scenes of many small splats, too. 1 goes by the share of a pixel alone. "
+        "Not in the paper.",
+        above=0,
+        high=1,
+    )
     tune_steps: int = parameter(
         120, "Steps after each of the three prunings of a level.", above=0, unit="steps"
     )
@@ -51,7 +59,7 @@ class LodgeParameters(ThreedgsParameters):
         high=96,
     )
     visible_weight: float = parameter(
-        0.005,
+        0.01,
         "Splats that no view in a chunk, turned anywhere, shows by so large a share of a pixel are not in "
         "its set (LODGE: a fixed threshold, without a number). 0 keeps all.",
         high=1,
@@ -92,6 +100,7 @@ _PAPER = replace(
     least_weight=0.02,
     tune_alone=0.0,
     prune_weight=0.02,
+    keep=1.0,
 )
 
 METHOD = MethodInfo(

@@ -13,9 +13,10 @@ from .composite import IndexedLevel, Stack, filtered, rows_seen
 
 VIEWS = 8
 """So many training views tell the cost."""
-TRIED, BETWEEN = 9, (0.01, 0.9)
-"""So many distances are tried, in equal ratios between these quantiles of the splats' distances in view."""
-STANDING_APART = 1.25
+TRIED, NEAREST, FARTHEST = 9, 0.05, 0.9
+"""So many distances are tried, in equal ratios: from that which this share of the splats of some view are
+nearer than, to that which this share of the splats of all views are nearer than."""
+STANDING_APART = 2.0
 """A level begins at least this many times farther away than the next finer one."""
 
 
@@ -89,5 +90,7 @@ class Thresholds:
         for camera in self._cameras:
             means = finest.means[finest.in_view(camera, self._near)]
             seen.append(np.linalg.norm(means[camera.sees(means, self._near)] - camera.center, axis=1))
-        near, far = np.quantile(np.concatenate([*seen, [least]]), BETWEEN)
-        return [float(d) for d in np.geomspace(max(near, least), max(far, least * 1.01), TRIED)]
+        seen = [distances for distances in seen if len(distances)] or [np.array([least])]
+        near = max(min(float(np.quantile(distances, NEAREST)) for distances in seen), least)
+        far = float(np.quantile(np.concatenate(seen), FARTHEST))
+        return [float(d) for d in np.geomspace(near, max(far, near), TRIED)]

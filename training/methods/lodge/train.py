@@ -14,7 +14,8 @@ import torch
 
 from ...errors import LodgsError
 from ...lod.blocks import Blocks, spatial_order
-from ...lod.rules.chunks import TABLE, member_columns
+from ...lod.rules.chunks import RULE, TABLE, member_columns
+from ...lod.streaming import BLOCKS, table_of_blocks
 from ...rasterize import Adam, Gaussians, Target, photometric_loss
 from ...splats.bundle import Level
 from ...splats.gaussians import Splats
@@ -46,9 +47,11 @@ class SeenRows:
         self._adam, self._rows, self._leaves = adam, rows, leaves
 
     def step(self) -> None:
+        """One step of these rows."""
         self._adam.step_rows(self._rows, {name: leaf.grad for name, leaf in self._leaves.items()})
 
     def zero_grad(self) -> None:
+        """The rows go with their gradients: the next picture has others."""
         self._leaves = {}
 
 
@@ -84,6 +87,7 @@ class Method(threedgs_train.Method):
         self.sets: dict[int, list[np.ndarray]] = {}
         self._blocks: Blocks | None = None  # of the level in training, as it was at its last pruning
         self._alone_share = p.tune_alone
+        self._threshold = p.prune_weight  # the least share of a pixel after the last pruning
         self._optimizer: SeenRows | None = None
 
     @property
@@ -123,17 +127,22 @@ class Method(threedgs_train.Method):
         if done > self.tuned_steps:
             return [self._level(number) for number in sorted(self.finished)] if done == self.steps else []
         if done == max(self.finest_steps, 1):
+            self._finish(self.levels)
             found.append(self._level(self.levels))
         if step >= self.finest_steps and self._local(done) == 0:
             found.insert(0, self._level(self.level_at(step)))
         return found
 
     def tables(self) -> dict[str, Columns]:
-        """The chunks, where there are any."""
+        """The chunks, where there are any, and which blocks of rows have splats of them."""
         if not len(self.centres):
             return {}
         x, y, z = self.centres.T
-        return {TABLE: {"x": x, "y": y, "z": z, "radius": self.radii}}
+        splats = {number: self._level(number).splats for number in sorted(self.sets)}
+        return {
+            TABLE: {"x": x, "y": y, "z": z, "radius": self.radii},
+            BLOCKS: table_of_blocks(RULE, splats),
+        }
 
     def meta(self) -> dict:
         return {**super().meta(), "filter_variance": self.parameters.filter_variance, "costs": self.costs}
@@ -205,11 +214,14 @@ class Method(threedgs_train.Method):
 
     def begin_round(self, step: int) -> None:
         """Before a step: what hardly shows leaves the level; a new level begins as a copy of the finest."""
-        number, local = self.level_at(step), self._local(step)
+        p, number, local = self.parameters, self.level_at(step), self._local(step)
         if local == 0:
             self._begin_level(number)
-        threshold = self.parameters.prune_weight * ROUNDS[local // self.parameters.tune_steps]
-        self.model.keep(self.importance(number) >= threshold)
+        found = self.importance(number)
+        if local == 0:
+            share = p.keep ** (self.levels - number)
+            self._threshold = max(p.prune_weight, float(np.quantile(found.numpy(), 1 - share)))
+        self.model.keep(found >= self._threshold * ROUNDS[local // p.tune_steps])
         require_rows(self.model, step, "prune_weight")
         self._blocks = self._smoothed(number).blocks
 
@@ -235,6 +247,8 @@ class Method(threedgs_train.Method):
 
     def _finish(self, number: int) -> None:
         """The level in training is what it is from now on."""
+        if number in self.finished:
+            return
         level = self._smoothed(number)
         if number == self.levels and self.finest_steps:
             order = torch.from_numpy(spatial_order(level.means))
@@ -336,6 +350,7 @@ class Method(threedgs_train.Method):
         return {
             **super().state_dict(),
             "d_l": self.d_l, "finished": finished, "costs": self.costs, "alone": self._alone_share,
+            "threshold": self._threshold,
             "blocks": {} if blocks is None else {
                 "count": blocks.count, "low": torch.from_numpy(blocks.low),
                 "high": torch.from_numpy(blocks.high), "reach": torch.from_numpy(blocks.reach),
@@ -350,6 +365,7 @@ class Method(threedgs_train.Method):
     def load_state_dict(self, state: dict) -> None:
         super().load_state_dict(state)
         self.d_l, self.costs, self._alone_share = state["d_l"], state["costs"], state["alone"]
+        self._threshold = state["threshold"]
         self.finished = {
             number: IndexedLevel.of(Gaussians(**tensors)) for number, tensors in state["finished"].items()
         }

@@ -1,0 +1,95 @@
+"""Tables of a bundle in Blender, such as LODGE's chunks: what rules know besides the splats themselves.
+
+A table is a mesh of a vertex a row and an attribute a column (``attributes.COLUMN``), where node groups read
+it. Nothing of it is ever drawn; rows that are places with a radius have spheres to look at, on request.
+"""
+
+from __future__ import annotations
+
+import json
+
+import bpy
+import numpy as np
+
+from ...training.lod.rule import Tables, find_rule
+from ...training.lod.rules.chunks import COLUMNS as SPHERE
+from ...training.lod.streaming import BLOCKS
+from ..attributes import COLUMN
+from .objects import read_column, write_column
+
+_COLUMNS = "lodgs_columns"
+"""Custom property of a table's mesh: its columns in their order, as JSON."""
+
+
+def set_tables(root: bpy.types.Object, tables: Tables) -> None:
+    """Gives a splat scene tables in place of those that it has. Its rule is to be known before."""
+    remove_tables(root)
+    rule = find_rule(root.lodgs.rule)
+    for name, columns in tables.items():
+        if name == BLOCKS:  # where rows are in a file: not true any more when somebody removes one
+            continue
+        collection = bpy.data.collections.new(f"{root.name} {name}")
+        collection.hide_viewport = collection.hide_render = True
+        root.users_collection[0].children.link(collection)
+        item = root.lodgs.tables.add()
+        item.name, item.collection = name, collection
+        item.object = _new_table(f"{root.name} {name}", columns)
+        objects = [item.object]
+        if rule is not None and name in rule.tables and all(column in columns for column in SPHERE):
+            objects += _new_spheres(f"{root.name} {name.removesuffix('s')}", columns)
+        for obj in objects:
+            obj.parent = root
+            collection.objects.link(obj)
+
+
+def remove_tables(root: bpy.types.Object) -> None:
+    """Takes all tables off a splat scene."""
+    objects = parts(root)
+    meshes = {obj.data for obj in objects} - {None}
+    collections = {item.collection for item in root.lodgs.tables} - {None}
+    bpy.data.batch_remove(objects)
+    bpy.data.batch_remove([mesh for mesh in meshes if not mesh.users])
+    root.lodgs.tables.clear()
+    bpy.data.batch_remove([part for part in collections if not part.objects and not part.children])
+
+
+def parts(root: bpy.types.Object) -> list[bpy.types.Object]:
+    """The objects of a splat scene's tables: their meshes, and the spheres. A copy of a root has none."""
+    collections = [item.collection for item in root.lodgs.tables if item.collection]
+    known = {item.object for item in root.lodgs.tables} | {obj for one in collections for obj in one.objects}
+    return [obj for obj in known if obj is not None and obj.parent == root]
+
+
+def read_tables(root: bpy.types.Object) -> dict[str, dict[str, np.ndarray]]:
+    """The tables of a splat scene, of columns (rows,) by name."""
+    return {item.name: read_table(item.object) for item in root.lodgs.tables if item.exists}
+
+
+def read_table(obj: bpy.types.Object) -> dict[str, np.ndarray]:
+    """The columns (rows,) of a table's object by name."""
+    mesh = obj.data
+    names = json.loads(mesh.get(_COLUMNS, "[]"))
+    columns = {name: read_column(mesh, COLUMN.format(name), mesh) for name in names}
+    return {name: values for name, values in columns.items() if values is not None}
+
+
+def _new_table(name: str, columns: dict[str, np.ndarray]) -> bpy.types.Object:
+    mesh = bpy.data.meshes.new(name)
+    mesh[_COLUMNS] = json.dumps(list(columns))
+    mesh.vertices.add(len(next(iter(columns.values()), ())))
+    for column, values in columns.items():
+        write_column(mesh, COLUMN.format(column), values)
+    obj = bpy.data.objects.new(name, mesh)
+    obj.hide_viewport = obj.hide_render = obj.hide_select = True
+    return obj
+
+
+def _new_spheres(name: str, columns: dict[str, np.ndarray]) -> list[bpy.types.Object]:
+    """An empty for each row, which shows where it is and how far it reaches, by its number."""
+    spheres = []
+    for number, (*place, radius) in enumerate(zip(*(columns[column] for column in SPHERE), strict=True)):
+        sphere = bpy.data.objects.new(f"{name} {number:02}", None)
+        sphere.location, sphere.empty_display_size = place, radius
+        sphere.empty_display_type, sphere.hide_select, sphere.show_name = "SPHERE", True, True
+        spheres.append(sphere)
+    return spheres

@@ -1,0 +1,205 @@
+"""Tables of bundles in Blender: they come in, are to be seen, go out again, and leave with their scene."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from tests.blender.fake_trainer import splats
+from training.lod.rules.chunks import member_columns
+from training.splats.bundle import Bundle, Level, read_bundle, read_folder, write_bundle, write_folder
+
+CHUNKS = {
+    "x": np.float32([0.1, 7, -3]), "y": np.float32([1, 2, 3]), "z": np.float32([0, 0, 1 / 3]),
+    "radius": np.float32([4, 5.5, 1e-3]),
+}  # fmt: skip
+OTHER = {"position": np.arange(4, dtype="u1"), ".hidden": np.float64([1 / 3, 2, -1, 0]),
+         "sharp_face": np.array([1, 2, 3, 2**32 - 1], "u4"), "n": np.arange(4, dtype="i2")}  # fmt: skip
+
+
+def level(number, count, d_l):
+    made = splats(count)
+    made.extras |= member_columns(np.random.default_rng(number).random((3, count)) < 0.5)
+    return Level(number, made, {"d_l": d_l})
+
+
+@pytest.fixture
+def bundle():
+    levels = [level(1, 30, 8.0), level(2, 90, 0.0)]
+    return Bundle("lodge", levels, "chunks", tables={"chunks": CHUNKS, "other": OTHER})
+
+
+@pytest.fixture
+def file(bundle, tmp_path):
+    write_bundle(tmp_path / "town.ply", bundle)
+    return tmp_path / "town.ply"
+
+
+@pytest.fixture
+def root(bpy, lodgs, file):
+    return lodgs("data.scenes").import_splats(bpy.context, file)
+
+
+def check_tables(found, expected):
+    assert found.keys() == expected.keys()
+    for name, table in expected.items():
+        assert found[name].keys() == table.keys()
+        for column, values in table.items():
+            np.testing.assert_array_equal(found[name][column], values)
+            assert found[name][column].dtype == values.dtype
+
+
+def exported(bpy, root, path):
+    bpy.context.view_layer.objects.active = root
+    assert bpy.ops.lodgs.export_bundle(filepath=str(path)) == {"FINISHED"}
+    return path.read_bytes()
+
+
+def everything(bpy):
+    kinds = ("objects", "collections", "meshes", "pointclouds")
+    return {kind: sorted(one.name for one in getattr(bpy.data, kind)) for kind in kinds}
+
+
+def test_a_bundle_comes_and_goes_to_the_bit_and_stays_so_in_a_file(bpy, root, file, tmp_path):
+    assert exported(bpy, root, tmp_path / "out.ply") == file.read_bytes()
+    name = root.name
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    assert exported(bpy, bpy.data.objects[name], tmp_path / "out.ply") == file.read_bytes()
+
+
+def test_a_folder_has_them_both_ways(bpy, bundle, root, tmp_path):
+    write_folder(tmp_path / "levels", bundle)
+    assert bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "levels")) == {"FINISHED"}
+    bpy.context.view_layer.objects.active = root
+    assert bpy.ops.lodgs.export_folder(directory=str(tmp_path / "again")) == {"FINISHED"}
+    again = read_folder(tmp_path / "again")
+    check_tables(again.tables, bundle.tables)
+    for one, other in zip(again.levels, bundle.levels, strict=True):
+        np.testing.assert_array_equal(one.splats.extras["chunks_0"], other.splats.extras["chunks_0"])
+
+
+def test_chunks_are_spheres_that_nobody_trips_over(bpy, root):
+    item = root.lodgs.tables["chunks"]
+    (levels,) = root.users_collection
+    assert item.collection in levels.children[:] and item.collection.hide_viewport
+    spheres = [obj for obj in item.collection.objects if obj.type == "EMPTY"]
+    assert [obj.name for obj in spheres] == [f"town chunk {number:02}" for number in range(3)]
+    for number, sphere in enumerate(spheres):
+        assert sphere.parent == root
+        assert sphere.location[:] == tuple(CHUNKS[axis][number] for axis in "xyz")
+        assert (sphere.empty_display_type, sphere.hide_select) == ("SPHERE", True)
+        assert sphere.empty_display_size == CHUNKS["radius"][number]
+    assert not any(obj.visible_get() for obj in item.collection.objects)
+    item.collection.hide_viewport = False
+    bpy.context.view_layer.update()
+    assert [obj.visible_get() for obj in item.collection.objects] == [False, True, True, True]
+    assert all(
+        (root.matrix_world @ obj.location - obj.matrix_world.translation).length < 1e-6 for obj in spheres
+    )
+    assert [obj.type for obj in root.lodgs.tables["other"].collection.objects] == ["MESH"]
+
+
+def test_two_scenes_of_one_file_have_their_own(bpy, lodgs, root, file, tmp_path):
+    scenes = lodgs("data.scenes")
+    other = scenes.import_splats(bpy.context, file)
+    scenes.set_tables(other, {"chunks": {name: values[::-1] for name, values in CHUNKS.items()}})
+    assert exported(bpy, root, tmp_path / "out.ply") == file.read_bytes()
+    for one in (root, other):
+        modifiers = [item.object.modifiers[-1] for item in one.lodgs.levels]
+        given = [lodgs("compat").get_input(modifier, "chunks_table") for modifier in modifiers]
+        assert given == [one.lodgs.tables["chunks"].object] * 2
+    assert other.lodgs.tables["chunks"].object != root.lodgs.tables["chunks"].object
+    assert bpy.ops.lodgs.remove_scene() == {"FINISHED"}  # the one imported last is active no more
+    assert len(scenes.roots(bpy.context.scene)) == 1
+
+
+def test_appended_they_come_along(bpy, root, file, tmp_path):
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    with bpy.data.libraries.load(str(tmp_path / "a.blend")) as (_, wanted):
+        wanted.collections = ["town"]
+    bpy.context.scene.collection.children.link(wanted.collections[0])
+    bpy.context.view_layer.update()
+    assert exported(bpy, bpy.data.objects["town"], tmp_path / "out.ply") == file.read_bytes()
+
+
+def test_undo_and_redo_take_and_bring_them(bpy, file, tmp_path):
+    bpy.ops.ed.undo_push(message="before")
+    assert bpy.ops.lodgs.import_splats("EXEC_DEFAULT", True, filepath=str(file)) == {"FINISHED"}
+    there = everything(bpy)
+    bpy.ops.ed.undo()
+    assert not any(everything(bpy).values())
+    bpy.ops.ed.redo()
+    assert everything(bpy) == there
+    assert exported(bpy, bpy.data.objects["town"], tmp_path / "out.ply") == file.read_bytes()
+
+
+def test_they_leave_with_their_scene(bpy, root):
+    assert bpy.ops.lodgs.remove_scene() == {"FINISHED"}
+    assert not any(everything(bpy).values())
+
+
+def test_a_copy_of_the_root_removed_takes_nothing_along(bpy, lodgs, root):
+    before = everything(bpy)
+    bpy.ops.object.select_all(action="DESELECT")
+    root.select_set(True)
+    bpy.context.view_layer.objects.active = root
+    bpy.ops.object.duplicate()
+    assert bpy.context.view_layer.objects.active != root
+    assert bpy.ops.lodgs.remove_scene() == {"FINISHED"}
+    assert everything(bpy) == before
+
+
+def test_a_deleted_table_is_no_table(bpy, lodgs, root):
+    bpy.data.objects.remove(root.lodgs.tables["other"].object)
+    root.lodgs.tables["chunks"].collection.objects.unlink(root.lodgs.tables["chunks"].object)
+    bpy.context.view_layer.update()
+    assert lodgs("data.scenes").read_levels(root).tables == {}
+    lodgs("data.scenes").set_tables(root, {})
+    assert not root.lodgs.tables
+    assert not any("chunk" in name for names in everything(bpy).values() for name in names)
+
+
+def test_another_training_begins_without_them(lodgs, root):
+    lodgs("data.scenes").remove_finer_levels(root)
+    assert not root.lodgs.tables and lodgs("data.scenes").read_levels(root).tables == {}
+
+
+def test_what_earlier_versions_saved_goes_on(bpy, lodgs, tmp_path):
+    """A scene of LODGE from before there were chunks: no tables, no columns, no controls but one."""
+    levels = [Level(1, splats(30), {"d_l": 1.5}), Level(2, splats(90), {"d_l": 0.0})]
+    bundle = Bundle("lodge", levels, "chunks", controls={"distance_scale": 2.0})
+    write_bundle(tmp_path / "old.ply", bundle)
+    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "old.ply")
+    root.lodgs.begun = json.dumps({"distance_scale": 2.0})
+    root.lodgs.mode, root.lodgs.eye, root.lodgs.camera_center = "SELECTIVE", "TRAINING", (0, 0, 0)
+    for item in root.lodgs.levels:
+        item.object.modifiers[-1].node_group["lodgs_version"] = 101
+    lodgs("data.older_files").bring_up_to_date(root)
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    for item, wanted in zip(root.lodgs.levels, (lambda d: d >= 0.75, lambda d: d < 0.75), strict=True):
+        shown = len(item.object.evaluated_get(depsgraph).data.points)
+        distances = np.linalg.norm(levels[item.number - 1].splats.means, axis=1)
+        assert shown == wanted(distances).sum()
+    assert lodgs("data.scenes").read_levels(root).controls == {"distance_scale": 2.0}
+
+
+def test_a_finished_run_brings_its_chunks_and_the_next_takes_them(bpy, lodgs, fake, tmp_path):
+    scenes, watch = lodgs("data.scenes"), lodgs("runs.watch")
+    with scenes._new_scene(bpy.context, "town") as root:
+        root.lodgs.scene_folder = str(tmp_path / "scene")
+    fake("chunks")
+    assert bpy.ops.lodgs.train(folder=str(tmp_path / "run")) == {"FINISHED"}
+    assert watch.watch_of(root).problem == ""
+    trained = read_bundle(tmp_path / "run" / "bundle.ply")
+    assert trained.tables and trained.levels[0].splats.extras
+    found = scenes.read_levels(root)
+    check_tables(found.tables, trained.tables)
+    for one, other in zip(found.levels, trained.levels, strict=True):
+        np.testing.assert_array_equal(one.splats.extras["chunks_0"], other.splats.extras["chunks_0"])
+    fake()
+    shutil.rmtree(tmp_path / "run")
+    assert bpy.ops.lodgs.train(folder=str(tmp_path / "run")) == {"FINISHED"}
+    assert not root.lodgs.tables and not bpy.data.meshes

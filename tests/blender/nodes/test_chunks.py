@@ -1,0 +1,181 @@
+"""LODGE's chunks in geometry nodes, worked by hand: two sets that fade into each other, distances beyond."""
+
+import numpy as np
+import pytest
+
+from training.lod.rules.chunks import member_columns
+
+NEITHER, FIRST, SECOND, BOTH = range(4)
+SETS = np.array([[0, 1, 0, 1], [0, 0, 1, 1]], bool)
+"""Of both chunks: which of four splats are in them."""
+CHUNKS = {"x": [0, 10], "y": [0, 0], "z": [0, 0], "radius": [10, 10]}
+
+
+@pytest.fixture
+def weights(bpy, lodgs):
+    """``weights(eye, **controls)``: those of four splats at the origin, of a level for distances below 20.
+
+    ``weights.root`` is their scene, which stands askew and has a level for the rest as well.
+    """
+    from training.splats.bundle import Bundle, Level
+
+    scenes = lodgs("data.scenes")
+    fine = splats(SETS)
+    levels = [Level(1, splats(~SETS), {"d_l": 20.0}), Level(2, fine, {"d_l": 0.0})]
+    table = {name: np.float32(values) for name, values in CHUNKS.items()}
+    bundle = Bundle("lodge", levels, "chunks", tables={"chunks": table})
+    with scenes._new_scene(bpy.context, "town") as root:
+        for one in levels:
+            scenes._put_level(root, one)
+        scenes.set_bundle_facts(root, bundle)
+        scenes.set_tables(root, bundle.tables)
+    root.location, root.rotation_euler, root.scale = (5, 6, 7), (1, 2, 3), (2, 3, 4)
+    root.lodgs.mode, root.lodgs.eye = "SELECTIVE", "TRAINING"
+
+    def asked(eye, **controls):
+        for name, value in {"chunks": True, "fade": True, "distance_scale": 1.0, **controls}.items():
+            setattr(root.lodgs.controls, name, value)
+        root.lodgs.camera_center = eye
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        evaluated = root.lodgs.levels[1].object.evaluated_get(depsgraph)
+        found = np.zeros(4, np.float32)
+        if len(evaluated.data.points):
+            read = lodgs("attributes").read_attribute
+            found[read(evaluated.data, "row")] = read(evaluated.data, "lod_weight")
+        choice = lodgs("data.selection").choice(evaluated, depsgraph)
+        np.testing.assert_allclose(choice.weights(fine.means, fine.extras), found, atol=1e-6)
+        again = lodgs("data.selection").choice(evaluated, depsgraph)
+        assert choice == again and hash(choice) == hash(again)
+        region = choice.region()
+        assert region is None or (choice.loaded(fine.extras) >= (found > 0)).all()
+        return found.tolist()
+
+    asked.root = root
+    return asked
+
+
+def splats(sets):
+    from training.splats.gaussians import Splats
+
+    count = sets.shape[1]
+    return Splats(
+        means=np.zeros((count, 3), np.float32), quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        log_scales=np.zeros((count, 3), np.float32), opacity_logits=np.zeros(count, np.float32),
+        sh=np.zeros((count, 1, 3), np.float32),
+        extras=member_columns(sets) | {"row": np.arange(count, dtype=np.int32)},
+    )  # fmt: skip
+
+
+def test_sets_fade_into_each_other_from_centre_to_centre(weights):
+    assert weights((0, 0, 0)) == [0, 1, 0, 1]
+    assert weights((2.5, 3, 0)) == [0, 0.75, 0.25, 1]
+    assert weights((10, 0, 0)) == [0, 0, 1, 1]
+    assert weights((-4, 0, 0)) == [0, 1, 0, 1]
+    assert weights((2.5, 3, 0), fade=False) == [0, 1, 0, 1]
+    assert weights((7.5, 3, 0), fade=False) == [0, 0, 1, 1]
+
+
+def test_away_from_chunks_distances_count(weights):
+    assert weights((-11.25, 0, 0)) == [0.5, 1, 0.5, 1]  # half of the quarter of a radius
+    assert weights((-11.25, 0, 0), fade=False) == [1, 1, 1, 1]
+    assert weights((-12.5, 0, 0)) == [1, 1, 1, 1]
+    assert weights((-12.5, 0, 0), distance_scale=2) == [0, 0, 0, 0]
+    assert weights((0, 9, 0), distance_scale=9) == [0, 1, 0, 1]
+    assert weights((0, 9, 0), distance_scale=9, chunks=False) == [0, 0, 0, 0]
+    assert weights((0, 9, 0), chunks=False) == [1, 1, 1, 1]
+
+
+def test_a_chunk_alone_has_its_radius(bpy, lodgs, weights):
+    one = {name: np.float32(values[1:]) for name, values in CHUNKS.items()}
+    lodgs("data.scenes").set_tables(weights.root, {"chunks": one})
+    assert weights((2.5, 0, 0)) == [0, 1, 0, 1]
+    assert weights((-1.25, 0, 0)) == [0.5, 1, 0.5, 1]
+
+
+def test_without_its_table_the_eye_counts(bpy, lodgs, weights):
+    (item,) = weights.root.lodgs.tables
+    bpy.data.objects.remove(item.object)
+    assert weights((2.5, 3, 0)) == [1, 1, 1, 1]
+    lodgs("data.scenes").set_tables(weights.root, {"chunks": {}})
+    assert weights((2.5, 3, 0)) == [1, 1, 1, 1]
+
+
+@pytest.mark.parametrize("eye", ["CAMERA", "OBJECT", "VIEW", "frozen"])
+def test_every_eye_chooses_its_chunks(bpy, weights, eye):
+    root, place = weights.root, (2.5, 3, 0)
+    obj = bpy.data.objects.new("eye", bpy.data.cameras.new("eye") if eye == "CAMERA" else None)
+    bpy.context.scene.collection.objects.link(obj)
+    bpy.context.view_layer.update()
+    obj.location = root.matrix_world @ obj.location.__class__(place)
+    if eye == "CAMERA":
+        bpy.context.scene.camera = obj
+    root.lodgs.eye_object, root.lodgs.held_eye = obj, place
+    if eye == "frozen":
+        root.lodgs.eye, root.lodgs.freeze = "OBJECT", True
+        root.lodgs.held_eye = place
+        obj.location = (100, 100, 100)
+    else:
+        root.lodgs.eye = eye
+        root.lodgs.held_eye = place
+    assert weights((100, 0, 0)) == pytest.approx([0, 0.75, 0.25, 1], abs=1e-5)
+
+
+def test_it_follows_an_animated_camera_and_files_without_handlers(bpy, lodgs, weights, tmp_path):
+    """As in background and for F12: nothing of this extension runs but what is saved in the file."""
+    root = weights.root
+    camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
+    bpy.context.scene.collection.objects.link(camera)
+    bpy.context.scene.camera = camera
+    bpy.context.view_layer.update()
+    for frame, x in ((1, 0.0), (11, 10.0)):
+        camera.location = root.matrix_world @ camera.location.__class__((x, 0, 0))
+        camera.keyframe_insert("location", frame=frame)
+    root.lodgs.eye = "CAMERA"
+    path, name = str(tmp_path / "a.blend"), root.lodgs.levels[1].object.name
+    bpy.ops.wm.save_as_mainfile(filepath=path)
+    handlers = [getattr(bpy.app.handlers, kind) for kind in ("depsgraph_update_post", "load_post")]
+    kept = [list(kind) for kind in handlers]
+    for kind in handlers:
+        kind.clear()
+    try:
+        bpy.ops.wm.open_mainfile(filepath=path)
+        shown = []
+        for frame in (1, 11):
+            bpy.context.scene.frame_set(frame)
+            cloud = bpy.data.objects[name].evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+            shown.append(lodgs("attributes").read_attribute(cloud, "row").tolist())
+    finally:
+        for kind, functions in zip(handlers, kept, strict=True):
+            kind.extend(functions)
+    assert shown == [[FIRST, BOTH], [SECOND, BOTH]]
+
+
+def test_a_render_evaluates_them_although_they_are_hidden(bpy, lodgs, weights):
+    seen = []
+
+    class Recorder(bpy.types.RenderEngine):
+        bl_idname, bl_label = "LODGS_TEST_RECORDER", "Recorder"
+
+        def render(self, depsgraph):
+            cloud = weights.root.lodgs.levels[1].object.evaluated_get(depsgraph).data
+            read = lodgs("attributes").read_attribute
+            seen.append((depsgraph.mode, read(cloud, "row").tolist(), read(cloud, "lod_weight").tolist()))
+
+    camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
+    bpy.context.scene.collection.objects.link(camera)
+    bpy.context.scene.camera = camera
+    camera.location = weights.root.matrix_world @ camera.location.__class__((2.5, 3, 0))
+    bpy.context.view_layer.update()
+    camera.location = weights.root.matrix_world @ camera.location.__class__((2.5, 3, 0))
+    weights.root.lodgs.eye = "CAMERA"
+    bpy.utils.register_class(Recorder)
+    try:
+        bpy.context.scene.render.engine = Recorder.bl_idname
+        bpy.context.scene.render.resolution_x = bpy.context.scene.render.resolution_y = 8
+        bpy.ops.render.render()
+    finally:
+        bpy.context.scene.render.engine = "LODGS"
+        bpy.utils.unregister_class(Recorder)
+    ((mode, rows, found),) = seen
+    assert (mode, rows) == ("RENDER", [FIRST, SECOND, BOTH])
+    assert found == pytest.approx([0.75, 0.25, 1], abs=1e-5)

@@ -1,0 +1,74 @@
+"""A chunk's splats by ranges of the file: the same as of the whole, with less read."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from training.errors import LodgsError
+from training.lod.blocks import SIZE, spatial_order
+from training.lod.rule import rules
+from training.lod.rules.chunks import member_columns, members
+from training.lod.streaming import BLOCKS, read_region, table_of_blocks
+from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
+from training.splats.gaussians import Splats
+
+COUNTS = {1: 300, 2: 5 * SIZE, 3: 20 * SIZE + 33}
+BYTES = 4 * (3 + 3 + 3 + 1 + 3 + 4 + 2)
+"""Of a splat of degree 0 with normals and two columns of bits."""
+
+
+@pytest.fixture
+def bundle():
+    """Thirty chunks along a line, each with the splats that are near it."""
+    rng, levels = np.random.default_rng(0), []
+    for number, count in COUNTS.items():
+        means = rng.uniform(0, 30, (count, 3)).astype(np.float32) * np.float32([1, 0.1, 0.1])
+        means = means[spatial_order(means)]
+        sets = np.abs(means[:, 0] - np.arange(30)[:, None] - 0.5) < 1
+        splats = Splats(
+            means, rng.normal(size=(count, 4)).astype(np.float32),
+            rng.normal(size=(count, 3)).astype(np.float32), rng.normal(size=count).astype(np.float32),
+            rng.normal(size=(count, 1, 3)).astype(np.float32),
+            member_columns(sets),
+        )  # fmt: skip
+        levels.append(Level(number, splats, {"d_l": 4.0 - number if number < 3 else 0.0}))
+    x = np.arange(30, dtype=np.float32) + 0.5
+    chunks = {"x": x, "y": 0 * x, "z": 0 * x, "radius": 0 * x + 1}
+    blocks = table_of_blocks(rules()["chunks"], {level.number: level.splats for level in levels})
+    return Bundle("lodge", levels, "chunks", tables={"chunks": chunks, BLOCKS: blocks})
+
+
+@pytest.mark.parametrize("order", ["finest_first", "stream"])
+@pytest.mark.parametrize("region", [(3,), (3, 4), (25, 26), (0, 29)])
+def test_a_region_is_what_the_whole_has_of_it(tmp_path, bundle, order, region):
+    write_bundle(tmp_path / "bundle.ply", bundle, order)
+    part, size = read_region(tmp_path / "bundle.ply", region)
+    for level, whole in zip(part.levels, read_bundle(tmp_path / "bundle.ply").levels, strict=True):
+        some = np.any([members(whole.splats.extras, chunk) for chunk in region], axis=0)
+        np.testing.assert_array_equal(level.splats.means, whole.splats.means[some])
+        np.testing.assert_array_equal(level.splats.sh, whole.splats.sh[some])
+        assert all(members(level.splats.extras, region[0]) == members(whole.splats.extras, region[0])[some])
+    loaded, everything = sum(len(level.splats) for level in part.levels), sum(COUNTS.values())
+    assert loaded * BYTES < size < 0.6 * everything * BYTES
+
+
+def test_a_file_without_blocks_is_read_whole(tmp_path, bundle):
+    without = replace(bundle, tables={"chunks": bundle.tables["chunks"]})
+    write_bundle(tmp_path / "a.ply", bundle)
+    write_bundle(tmp_path / "b.ply", without)
+    (part, some), (same, size) = (read_region(tmp_path / name, (7, 8)) for name in ("a.ply", "b.ply"))
+    assert some < size >= sum(COUNTS.values()) * BYTES
+    for one, other in zip(part.levels, same.levels, strict=True):
+        np.testing.assert_array_equal(one.splats.quats, other.splats.quats)
+
+
+def test_blocks_that_contradict_the_levels_lose_rows_at_most(tmp_path, bundle):
+    table = {name: np.tile(column, 3) for name, column in bundle.tables[BLOCKS].items()}
+    write_bundle(tmp_path / "odd.ply", replace(bundle, tables={**bundle.tables, BLOCKS: table}))
+    part, _ = read_region(tmp_path / "odd.ply", (3,))
+    assert all(len(level.splats) <= COUNTS[level.number] for level in part.levels)
+    del table["level"]
+    write_bundle(tmp_path / "none.ply", replace(bundle, tables={**bundle.tables, BLOCKS: table}))
+    with pytest.raises(LodgsError, match="cannot be followed"):
+        read_region(tmp_path / "none.ply", (3,))

@@ -1,0 +1,148 @@
+"""LODGE's chunks: Eq. 5 and the sets by hand, and a run that makes them."""
+
+import io
+
+import numpy as np
+import pytest
+import torch
+
+from training.lod.blocks import spatial_order
+from training.lod.rules.chunks import members as members_of
+from training.methods import create, method_info
+from training.methods.lodge import chunks
+from training.methods.lodge.composite import IndexedLevel
+from training.methods.parameters import override
+from training.rasterize import Gaussians
+from training.scenes.cameras import Camera, look_at
+from training.splats.gaussians import Splats
+
+NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
+
+
+def level_of(means, log_scale=-3.0) -> IndexedLevel:
+    count = len(means)
+    return IndexedLevel.of(
+        Gaussians.of(
+            Splats(
+                np.float32(means), np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+                np.full((count, 3), log_scale, np.float32), np.full(count, 5, np.float32),
+                np.zeros((count, 1, 3), np.float32),
+            )
+        )
+    )  # fmt: skip
+
+
+def test_how_many_chunks():
+    """The farthest camera is 6 from the mean, so 4 / d_1 * 6 (Eq. 5), but no more than there are."""
+    centers = np.array([[x, 0, 0] for x in np.linspace(-6, 6, 31)])
+    assert chunks.chunk_count(centers, 2.0) == 12
+    assert chunks.chunk_count(centers, 2.1) == 12  # 11.4
+    assert chunks.chunk_count(centers, 0.1) == 31
+    assert chunks.chunk_count(np.tile(centers, (20, 1)), 0.01) == 96
+
+
+def test_where_chunks_are_and_how_far_they_reach():
+    """Two clusters and one camera apart: centres are their means, radii as far as the next centre."""
+    places = np.array([[0, 0, 0], [2, 0, 0], [10, 0, 0], [12, 0, 0], [40, 0, 0]], float)
+    centres, radii = chunks.place_chunks(places, 3, 0)
+    order = np.argsort(centres[:, 0])
+    np.testing.assert_allclose(centres[order, 0], [1, 11, 40])
+    np.testing.assert_allclose(radii[order], [10, 10, 29])
+    one, reach = chunks.place_chunks(places, 1, 0)
+    np.testing.assert_allclose(one, [[12.8, 0, 0]])
+    np.testing.assert_allclose(reach, [27.2])  # to the farthest camera
+
+
+def test_a_set_is_chosen_from_farther_away_by_the_radius():
+    """Splats every unit along a line from the centre; d_l of 4 and 8, and a radius of 3."""
+    line = level_of([[x, 0, 0] for x in range(20)])
+    found = chunks.members({3: line, 2: line, 1: line}, {3: 0.0, 2: 4.0, 1: 8.0}, np.zeros(3), 3.0)
+    assert [found[n].tolist() for n in (3, 2, 1)] == [[*range(7)], [*range(7, 11)], [*range(11, 20)]]
+
+
+def test_what_no_view_shows_is_not_in_a_set():
+    """A wall of opaque splats before others; a camera turned anywhere sees no more of what is behind it."""
+    y, z = (each.reshape(-1) for each in np.meshgrid(np.linspace(-3, 3, 61), np.linspace(-3, 3, 61)))
+    wall = np.stack([0 * y + 2, y, z], axis=1)
+    hidden, seen = [[2.5, 0, 0], [2.4, 0.3, 0.1]], [[1.5, 0, 0], [-2, 0, 0]]
+    level = level_of(np.concatenate([wall, hidden, seen]), log_scale=np.log(0.12))
+    ahead = Camera("", 64, 64, 60.0, 60.0, 32.0, 32.0, look_at(np.zeros(3), np.array([1.0, 0, 0]), (0, 0, 1)))
+    rows = {1: np.arange(len(wall) + 4, dtype=np.int32)}
+    found = chunks.visible({1: level}, rows, [ahead], 0.005, 0.1, "cpu")[1]
+    count = len(wall)
+    assert not {count, count + 1} & set(found) and count + 2 in found
+    assert count + 3 not in found  # behind the eye
+    around = chunks.turned([ahead] * 8, np.random.default_rng(0))
+    assert len(around) == 32 and all(np.allclose(view.center, 0) for view in around)
+    found = chunks.visible({1: level}, rows, [ahead, *around], 0.005, 0.1, "cpu")[1]
+    assert not {count, count + 1} & set(found) and {count + 2, count + 3} <= set(found)
+
+
+def make(data, **values):
+    given = {
+        "steps": 8, "densify_until": 0.4, "prune_interval": 6, "tune_steps": 2, "margin": 0.0, "chunks": 3,
+        "distances": [1.6, 0.8, 0.0], **values,
+    }  # fmt: skip
+    return create("lodge", data, override(method_info("lodge").preset("draft"), given), 0, "cpu")
+
+
+def trained(lodge, begin=0, until=None):
+    step, levels = begin, []
+    while step < (until or lodge.steps):
+        lodge.train_step(step)
+        levels += lodge.levels_after(step)
+        step += 1
+    return levels
+
+
+def test_the_last_steps_make_chunks_and_all_levels_come_again(data):
+    lodge = make(data)
+    assert lodge.steps == 8 + 2 * 3 * 2  # until it is known where the chunks are
+    levels = trained(lodge)
+    assert lodge.steps == 20 + 3 and lodge.stage(21) == "chunk 2 of 3"
+    assert [level.number for level in levels] == [3, 2, 1, 1, 2, 3]
+    table = lodge.tables()["chunks"]
+    assert {len(column) for column in table.values()} == {3} and list(table) == ["x", "y", "z", "radius"]
+    for before, after in zip(levels[:3], levels[:2:-1], strict=True):
+        assert before.number == after.number and list(after.splats.extras) == ["chunks_0"]
+        assert all(np.array_equal(getattr(before.splats, n), getattr(after.splats, n)) for n in NAMES)
+    finest = levels[0].splats.means
+    np.testing.assert_array_equal(spatial_order(finest), np.arange(len(finest)))
+    shown = [members_of(level.splats.extras, 1) for level in levels[3:]]
+    assert 0 < sum(each.sum() for each in shown) < sum(map(len, shown))
+
+
+def test_sets_without_visibility_are_those_of_distances(data):
+    lodge = make(data, visible_weight=0.0)
+    levels = trained(lodge)[3:]
+    table = lodge.tables()["chunks"]
+    centre, radius = np.array([table[axis][2] for axis in "xyz"]), table["radius"][2]
+    ends = {1: (1.6, np.inf), 2: (0.8, 1.6), 3: (0.0, 0.8)}
+    for level in levels:
+        near, far = (end * data.median_depth + (radius if end else 0) for end in ends[level.number])
+        away = np.linalg.norm(level.splats.means - centre, axis=1)
+        np.testing.assert_array_equal(members_of(level.splats.extras, 2), (away >= near) & (away < far))
+
+
+def test_small_scenes_have_no_chunks_unless_they_are_asked_for(data):
+    lodge = make(data, chunks=0)
+    assert [level.number for level in trained(lodge)] == [3, 2, 1] and lodge.tables() == {}
+    assert trained(make(data, chunks=1))[-1].splats.extras == {}
+
+
+@pytest.mark.parametrize("stop", [19, 20, 21, 22])
+def test_a_run_goes_on_to_the_bit_within_its_chunks(data, stop):
+    whole, first = make(data), make(data)
+    levels = trained(whole)
+    before = trained(first, until=stop)
+    file = io.BytesIO()
+    torch.save(first.state_dict(), file)
+    file.seek(0)
+    second = make(data)
+    second.load_state_dict(torch.load(file, weights_only=True))
+    after = before + trained(second, stop)
+    for one, other in zip(levels, after, strict=True):
+        assert one.number == other.number
+        assert all(np.array_equal(getattr(one.splats, n), getattr(other.splats, n)) for n in NAMES)
+        for name, column in one.splats.extras.items():
+            np.testing.assert_array_equal(column, other.splats.extras[name])
