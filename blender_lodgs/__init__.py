@@ -8,7 +8,7 @@ unregistered in reverse.
 import bpy
 
 from . import commands, operators, panels, viewport
-from .data import loaded, older_files, properties, removal, scenes, updates
+from .data import changes, loaded, older_files, properties, removal, scenes, updates
 from .nodes import building
 from .render import compare, engine, renderer
 from .runs import jobs
@@ -18,6 +18,7 @@ MODULES = (
     properties,
     building,
     updates,
+    changes,
     *operators.MODULES,
     *panels.MODULES,
     older_files,

@@ -3,6 +3,8 @@
 Import: a plain PLY of SH degree 3 from file to a level's object, against plyfile reading the same rows.
 Selection: evaluating two levels after the eye moved, against numpy's masks and copies of the same splats.
 Every ratio is of two times from one run.
+F12: tiny frames of two levels by distance along a camera's way, where the renderer chooses by itself, against
+splats copied out of Blender's evaluation, as where artists have modifiers of their own.
 Viewport, where this Blender has graphics in background: what the main thread does after a camera move beside
 Blender's own evaluation (the rules, the list of splats onto the graphics card), what the thread beside it
 does (choosing and sorting), and how long all splats take onto the card, from their attributes.
@@ -17,6 +19,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import patch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
@@ -110,6 +113,26 @@ def two_levels(bpy, splats):
     return camera
 
 
+def f12_seconds(bpy, count: int) -> tuple[float, float]:
+    """Of a small frame after the camera moved, median of five: chosen by the renderer, and by Blender."""
+    camera, seconds = two_levels(bpy, random_splats(count)), []
+    engine = load("blender_lodgs.render.engine")
+
+    def frame() -> None:
+        engine.frame(bpy.context.evaluated_depsgraph_get(), 32, 18, (0, 0, 32, 18))
+
+    for chosen in (engine._chosen_by_rule, lambda *args: False):
+        frames = []
+        with patch.object(engine, "_chosen_by_rule", chosen):
+            for _ in range(6):
+                camera.location.x += 0.05
+                bpy.context.view_layer.update()
+                frames.append(least(frame, 1))
+        seconds.append(float(np.median(frames[1:])))
+    load("blender_lodgs.render.renderer").close()
+    return seconds[0], seconds[1]
+
+
 def viewport(bpy, count: int) -> None:
     """Prints what viewports cost with two levels of half as many splats each."""
     import gpu
@@ -131,7 +154,7 @@ def viewport(bpy, count: int) -> None:
 
     for _ in range(3):
         views.clear()
-        uploaded.append(least(lambda: views._upload(sets()), 1))
+        uploaded.append(least(lambda: views._upload(sets(), bpy.context.evaluated_depsgraph_get()), 1))
     uploads = views.uploads
     for _ in range(10):
         camera.location.x += 0.1
@@ -169,6 +192,14 @@ def main() -> None:
                 f" {select:8.4f} {mask:8.4f} {select / mask:6.2f}",
                 flush=True,
             )
+    if os.environ.get("LODGS_TRAINER_PYTHON"):
+        chosen, copied = f12_seconds(bpy, COUNTS[-1])
+        print(
+            f"F12, two levels of {COUNTS[-1]:,} splats, 32x18: {1e3 * chosen:.0f} ms a frame chosen by the"
+            f" renderer, {1e3 * copied:.0f} ms copied from Blender, ratio {chosen / copied:.2f}"
+        )
+    else:
+        print("F12: not measured, set LODGS_TRAINER_PYTHON")
     viewport(bpy, 500_000)
     sys.stdout.flush()
     os._exit(0)  # Blender 4.5 as a module can hang when Python ends

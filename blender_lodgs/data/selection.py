@@ -9,84 +9,20 @@ modifier gives the rule's arguments back: :func:`choice`.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import bpy
 import numpy as np
 
 from ...training.errors import LodgsError
-from ...training.lod.rule import Region, Rule, Tables, facts_of, find_rule, rules
+from ...training.lod.choice import Choice
+from ...training.lod.rule import Rule, fact_names, facts_of, find_rule
 from .. import compat
 from ..nodes import rules as groups
 from ..nodes.building import edited
 from ..nodes.display import NAME as DISPLAY
 from .tables import read_table
-
-
-@dataclass(frozen=True)
-class Choice:
-    """By what a level's splats are chosen: a rule with all its arguments but the splats. Choices compare.
-
-    Attributes:
-        rule: its name.
-        eye: in the splats' own space.
-        focal_px: the eye's focal length in pixels.
-        facts, values: see ``training.lod.rule``, as pairs.
-        tables: those that the rule reads: name, columns by name, each as its type and its bytes.
-    """
-
-    rule: str
-    eye: tuple[float, float, float]
-    focal_px: float
-    facts: tuple[tuple[str, float], ...]
-    values: tuple[tuple[str, float], ...]
-    tables: tuple[tuple[str, tuple[tuple[str, str, bytes], ...]], ...] = ()
-
-    def weights(self, means: np.ndarray, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-        """(N,) weights of splats at means (N, 3) with the rule's columns (N,) by name."""
-        rule = rules()[self.rule]
-        eye, facts, values = np.float32(self.eye), dict(self.facts), dict(self.values)
-        return rule.weights(means, eye, self.focal_px, columns, facts, values, self._tables())
-
-    def region(self) -> Region | None:
-        """See ``Rule.region``."""
-        return rules()[self.rule].region(np.float32(self.eye), dict(self.values), self._tables())
-
-    def loaded(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-        """(N,) bool: see ``Rule.loaded``, of the region that there must be."""
-        region = self.region()
-        assert region is not None
-        return rules()[self.rule].loaded(columns, region)
-
-    def where(self) -> str:
-        """See ``Rule.where``."""
-        return rules()[self.rule].where(np.float32(self.eye), dict(self.values), self._tables())
-
-    def idle(self) -> Mapping[str, str]:
-        """See ``Rule.idle``."""
-        return rules()[self.rule].idle(np.float32(self.eye), dict(self.values), self._tables())
-
-    def parts(self, means: np.ndarray) -> np.ndarray:
-        """(N,) numbers of the parts of space where places are: see ``Rule.parts``."""
-        return rules()[self.rule].parts(means, self._tables())
-
-    def wanted_level(self, means: np.ndarray) -> np.ndarray:
-        """(N,) the level that is wanted at each place."""
-        eye, facts, values = np.float32(self.eye), dict(self.facts), dict(self.values)
-        return rules()[self.rule].wanted_level(means, eye, self.focal_px, facts, values)
-
-    def coarser(self, levels: Sequence[int]) -> Choice | None:
-        """The next coarser choice, where there is one."""
-        values = rules()[self.rule].coarser(dict(self.values), levels)
-        return None if values is None else replace(self, values=tuple(values.items()))
-
-    def _tables(self) -> Tables:
-        return {
-            name: {column: np.frombuffer(rows, kind) for column, kind, rows in columns}
-            for name, columns in self.tables
-        }
 
 
 def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Choice | None:
@@ -118,7 +54,7 @@ def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Choic
         rule.name,
         eye,
         value(groups.HELD_FOCAL if held else groups.FOCAL),
-        tuple((name, value(name)) for name in groups.fact_names(rule)),
+        tuple((name, value(name)) for name in fact_names(rule)),
         tuple((control.name, value(control.name)) for control in rule.controls),
         tuple((name, _frozen(value(groups.table_socket(name)))) for name in rule.tables),
     )

@@ -7,16 +7,19 @@ which the compositor joins with this one by depth.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import bpy
 import numpy as np
 
 from ...training.errors import LodgsError
+from ...training.lod.rule import every_column
+from ...training.splats.gaussians import Splats
 from .. import attributes
-from ..data import objects, scenes, shown
+from ..data import changes, objects, scenes, selection, shown
 from ..data.cameras import scene_camera, view_of
 from . import renderer
 
@@ -148,18 +151,50 @@ def at_frame(pattern: str, scene: bpy.types.Scene, frame: int) -> Path:
 
 
 def placed_splats(depsgraph: bpy.types.Depsgraph) -> list[renderer.PlacedSplats]:
-    """What a depsgraph shows of splats, in the form that files have: so its pixels are those of the files."""
-    found, known = [], {}
+    """What a depsgraph shows of splats, in the form that files have: so its pixels are those of the files.
+
+    What only a rule chooses from is all of an object's splats, with the choice. Else it is what modifiers
+    leave.
+    """
+    found = []
     for instance in shown.splat_instances(depsgraph):
-        key = instance.object.session_uid
-        if key not in known:
-            cloud = instance.evaluated.data
-            known[key] = objects.splats_of(cloud), attributes.read_attribute(cloud, attributes.WEIGHT)
-        splats, weights = known[key]
-        if splats is not None and len(splats):
-            matrix, level, antialias = instance.matrix_world, instance.level, instance.antialias
-            found.append(renderer.PlacedSplats(key, splats, weights, matrix, level, antialias))
+        evaluated, matrix, level = instance.evaluated, instance.matrix_world, instance.level
+        place, empty = (matrix, level, instance.antialias), not len(evaluated.data.points)
+        if not _chosen_by_rule(instance, depsgraph):
+            if not empty:
+                read = partial(_splats_of, evaluated.data)
+                found.append(renderer.PlacedSplats(instance.object.session_uid, read, *place))
+            continue
+        own = instance.object.data
+        read = partial(_splats_of, own.evaluated_get(depsgraph), every_column())
+        version, choice = changes.version(own), selection.choice(evaluated, depsgraph)
+        found.append(renderer.PlacedSplats(own.session_uid, read, *place, version, choice, empty))
     return found
+
+
+def _chosen_by_rule(instance: shown.SplatInstance, depsgraph: bpy.types.Depsgraph) -> bool:
+    """Whether an instance shows its object's own splats, chosen by nothing but a rule.
+
+    Of objects that no viewport shows, Blender does not tell when they change.
+    """
+    return (
+        selection.only_chosen(instance.evaluated, depsgraph)
+        and attributes.WEIGHT not in instance.object.data.attributes
+        and instance.object.visible_get(view_layer=depsgraph.view_layer)
+    )
+
+
+def _splats_of(cloud: bpy.types.PointCloud, columns: Iterable[str] = ()) -> tuple[Splats, np.ndarray | None]:
+    """The splats of a point cloud with what it has of some columns, and their weights."""
+    splats = objects.splats_of(cloud)
+    if splats is None:  # modifiers have taken their attributes away
+        nothing = np.zeros((0, 4), np.float32)
+        return Splats(nothing[:, :3], nothing, nothing[:, :3], nothing[:, 0], np.zeros((0, 1, 3))), None
+    for name in columns:
+        values = attributes.read_attribute(cloud, name)
+        if values is not None and values.ndim == 1:
+            splats.extras[name] = values
+    return splats, attributes.read_attribute(cloud, attributes.WEIGHT)
 
 
 def size(render: bpy.types.RenderSettings) -> tuple[int, int]:

@@ -18,15 +18,18 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import bpy
 import numpy as np
 
 from ...training.errors import LodgsError
+from ...training.lod.choice import Choice
 from ...training.render import wire
 from ...training.scenes.cameras import Camera, camera_as_dict
 from ...training.splats.gaussians import Splats
 from .. import extension
+from ..data.changes import Version
 from ..runs import environment, processes
 
 IDLE = 300.0
@@ -59,19 +62,34 @@ class PlacedSplats:
 
     Attributes:
         key: says which splats are the same from frame to frame.
-        splats: in the files' form, in their own space.
-        weights: (N,), or None for ones.
+        read: the splats in the files' form, in their own space, and their weights (N,), or None for ones;
+            called where they are not known already.
         matrix: (4, 4) to the world.
         level: 0 where they are no level.
         antialias: see ``SplatScene.antialias``.
+        version: the splats with this key do not change as long as it stays; None: nobody knows.
+        choice: by what splats are weighted; None: all are drawn.
+        empty: whether nothing is seen of them. What has not been seen so far is not even read.
     """
 
     key: int
-    splats: Splats
-    weights: np.ndarray | None
+    read: Callable[[], tuple[Splats, np.ndarray | None]]
     matrix: np.ndarray
     level: int
     antialias: bool = False
+    version: Version | None = None
+    choice: Choice | None = None
+    empty: bool = False
+
+
+class _Known(NamedTuple):
+    """A set that the program has, or can read: its file, what is in it, and what it was made of."""
+
+    file: Path
+    digest: tuple
+    count: int
+    columns: list[str]
+    version: Version | None
 
 
 class Stopped(Exception):
@@ -92,7 +110,7 @@ class Renderer:
         wire.claim(self._folder)
         self._log = self._folder / "renderer.log"
         self._fresh = True  # the first frame on a computer compiles, for some seconds
-        self._known: dict[int, Path] = {}
+        self._known: dict[int, _Known] = {}
         self._numbers = itertools.count(1)
         self._answers: queue.SimpleQueue[dict | None] = queue.SimpleQueue()
         command = [str(python), "-m", "training", "serve", str(self._folder)]
@@ -142,7 +160,10 @@ class Renderer:
                 photograph=str(photograph) if photograph else None, holdout=str(holdout) if holdout else None,
             )  # fmt: skip
             answer = self._wait(frame, on_progress)
-            for path in set(old.values()) - set(self._known.values()):
+            done = {each.file for each in old.values()} - {each.file for each in self._known.values()}
+            if answer["event"] == "frame":  # all has been read
+                done |= {each.file for each in self._known.values()}
+            for path in done:
                 path.unlink(missing_ok=True)
             if answer["event"] == "error":
                 raise LodgsError(answer["what"], answer["remedy"])
@@ -188,24 +209,33 @@ class Renderer:
         """Writes the splats that are new or have changed, and names all."""
         known, named = {}, []
         for one in sets:
+            if one.empty and one.key not in self._known:
+                continue
             if one.key not in known:
-                columns = wire.packed(one.splats, one.weights)
-                path = self._known.get(one.key)
-                if path is None or not wire.holds(path, columns):
-                    path = self._folder / f"set-{next(self._numbers)}"
-                    wire.write_set(path, columns)
-                known[one.key] = path
+                known[one.key] = self._written(one)
+            file, _, count, columns, _ = known[one.key]
             named.append(
                 {
-                    "file": known[one.key].name,
-                    "count": len(one.splats),
-                    "matrix": one.matrix.tolist(),
-                    "level": one.level,
-                    "antialias": one.antialias,
+                    "file": file.name, "count": count, "columns": columns,
+                    "matrix": one.matrix.tolist(), "level": one.level, "antialias": one.antialias,
+                    "choice": None if one.choice is None else one.choice.as_dict(),
                 }
-            )
+            )  # fmt: skip
         self._known = known
         return named
+
+    def _written(self, one: PlacedSplats) -> _Known:
+        before = self._known.get(one.key)
+        if before is not None and one.version is not None and before.version == one.version:
+            return before
+        splats, weights = one.read()
+        columns = wire.packed(splats, weights)
+        digest, names = wire.digest(columns), list(splats.extras)
+        if before is not None and (before.digest, before.columns) == (digest, names):
+            return before._replace(version=one.version)
+        path = self._folder / f"set-{next(self._numbers)}"
+        wire.write_set(path, columns)
+        return _Known(path, digest, len(splats), names, one.version)
 
     def _wait(self, frame: int, on_progress: OnProgress) -> dict:
         """The answer to a frame; that of a cancelled one may come late, and is then passed over."""

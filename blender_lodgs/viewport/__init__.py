@@ -82,7 +82,6 @@ def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     if depsgraph.mode == "RENDER":  # a render's first evaluation: everything counts as new there
         return
     discs.on_update(depsgraph)
-    views.on_update(depsgraph)
 
 
 @bpy.app.handlers.persistent

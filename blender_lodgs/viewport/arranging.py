@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ...training.lod.choice import Choice, Chooser
 from ...training.lod.rule import OPACITY
-from ..data.selection import Choice
 
 WIDTH = 8192
 """Texels in a row of every texture that holds one texel for each of many splats."""
@@ -35,6 +35,41 @@ class Pool:
     scales: np.ndarray
     opacities: np.ndarray
     columns: dict[str, np.ndarray] = field(default_factory=dict)
+    _choosers: dict[tuple[int, int], Chooser] = field(default_factory=dict, compare=False)
+    _drawn: list[Drawn] = field(default_factory=list, compare=False)
+
+    def chooser(self, placement: Placement) -> Chooser:
+        """What chooses from a placement's splats."""
+        key = placement.first, placement.count
+        if key not in self._choosers:
+            part = slice(placement.first, placement.first + placement.count)
+            columns = {name: column[part] for name, column in self.columns.items()}
+            columns[OPACITY] = self.opacities[part]
+            self._choosers[key] = Chooser(self.means[part, :3], columns)
+        return self._choosers[key]
+
+    def drawn(self, request: Request) -> Drawn:
+        """What a request draws, in no order; the last one is kept."""
+        if not self._drawn or self._drawn[0].choices != request.choices:
+            self._drawn[:] = [_drawn(self, request)]
+        return self._drawn[0]
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """The M splats that are drawn.
+
+    Attributes:
+        choices: see there.
+        table: (M, 4) float32, the rows of :attr:`Arrangement.instances`.
+        means: of each placement's splats among them, in its own space.
+        left_out: how many were left out, to stay within the budget.
+    """
+
+    choices: tuple
+    table: np.ndarray
+    means: list[np.ndarray]
+    left_out: int
 
 
 @dataclass(frozen=True)
@@ -79,6 +114,11 @@ class Request:
     backward: tuple[float, float, float]
     budget: int
 
+    @property
+    def choices(self) -> tuple:
+        """All that says which splats are drawn, in whatever order."""
+        return self.budget, *(replace(placement, matrix=b"") for placement in self.placements)
+
 
 @dataclass(frozen=True)
 class Arrangement:
@@ -100,33 +140,46 @@ class Arrangement:
 
 
 def arrange(pool: Pool, request: Request) -> Arrangement:
-    """The splats to draw for a request, from back to front."""
-    chosen, left_out = within_budget(pool, request.placements, request.budget)
-    depths, color_levels = [], []
-    backward = np.append(request.backward, 0.0)
-    for placement, (index, _) in zip(request.placements, chosen, strict=True):
-        means = pool.means[placement.first : placement.first + placement.count]
-        depth = means @ (backward @ placement.world).astype(np.float32)  # grows towards the eye
-        depths.append(depth if len(index) == len(depth) else depth[index])
-        color_levels.append(_color_levels(placement, means, index))
-    depth = np.concatenate(depths) if depths else np.zeros(0, np.float32)
-    order = np.argsort(depth)
+    """The splats to draw for a request, from back to front.
 
-    count = len(order)
+    What is drawn is found anew where the choices or the budget have changed; while only the view turns, or
+    objects move, it is put in another order alone.
+    """
+    drawn, count = pool.drawn(request), 0
+    depths = np.empty(len(drawn.table), np.float32)
+    backward = np.append(request.backward, 0.0)
+    for placement, means in zip(request.placements, drawn.means, strict=True):
+        toward = (backward @ placement.world).astype(np.float32)  # grows towards the eye
+        np.add(means @ toward[:3], toward[3], out=depths[count : count + len(means)])
+        count += len(means)
     instances = np.zeros((max(1, -(-count // WIDTH)) * WIDTH, 4), np.float32)
-    if count:
-        columns = (
-            [
-                index + placement.first
-                for placement, (index, _) in zip(request.placements, chosen, strict=True)
-            ],
-            [weight for _, weight in chosen],
-            [np.full(len(index), number) for number, (index, _) in enumerate(chosen)],
-            color_levels,
-        )
-        for column, values in enumerate(columns):
-            instances[:count, column] = np.concatenate(values)[order]
-    return Arrangement(request, instances, count, left_out)
+    np.take(drawn.table, ascending(depths), axis=0, out=instances[:count])
+    return Arrangement(request, instances, count, drawn.left_out)
+
+
+def ascending(values: np.ndarray) -> np.ndarray:
+    """The order (N,) of float32 numbers (N,), equal ones as they come: ``argsort``, twice as fast.
+
+    Their bits in the order of whole numbers, sixteen at a time, which numpy counts instead of compares.
+    """
+    bits = (values + np.float32(0)).view(np.int32)  # no zero below zero
+    bits = np.where(bits < 0, ~bits, bits | np.int32(-(1 << 31))).view(np.uint32)
+    order = np.argsort(bits.astype(np.uint16), kind="stable")
+    return order[np.argsort((bits >> np.uint32(16)).astype(np.uint16)[order], kind="stable")]
+
+
+def _drawn(pool: Pool, request: Request) -> Drawn:
+    chosen, left_out = within_budget(pool, request.placements, request.budget)
+    table = np.empty((sum(len(index) for index, _ in chosen), 4), np.float32)
+    means, begin = [], 0
+    for number, (placement, (index, weight)) in enumerate(zip(request.placements, chosen, strict=True)):
+        own = pool.means[placement.first : placement.first + placement.count, :3][index]
+        rows = table[begin : begin + len(index)]
+        rows[:, 0], rows[:, 1], rows[:, 2] = index + placement.first, weight, number
+        rows[:, 3] = _color_levels(placement, own)
+        means.append(own)
+        begin += len(index)
+    return Drawn(request.choices, table, means, left_out)
 
 
 def within_budget(
@@ -172,14 +225,10 @@ def within_budget(
 
 
 def _choose(pool: Pool, placement: Placement) -> tuple[np.ndarray, np.ndarray]:
-    """The splats of a placement whose weight is not 0, and their weights."""
-    part = slice(placement.first, placement.first + placement.count)
+    """The splats of a placement that have a weight, and their weights."""
     if placement.choice is None:
         return np.arange(placement.count, dtype=np.int32), np.ones(placement.count, np.float32)
-    columns = {name: column[part] for name, column in pool.columns.items()} | {OPACITY: pool.opacities[part]}
-    weights = placement.choice.weights(pool.means[part, :3], columns)
-    index = np.flatnonzero(weights)
-    return index, weights[index].astype(np.float32)
+    return pool.chooser(placement).chosen(placement.choice)
 
 
 def _thin(pool: Pool, placements, chosen, which: Sequence[int], keep: int) -> None:
@@ -201,10 +250,10 @@ def _thin(pool: Pool, placements, chosen, which: Sequence[int], keep: int) -> No
         start += len(part)
 
 
-def _color_levels(placement: Placement, means: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Which level's colour each splat gets."""
+def _color_levels(placement: Placement, means: np.ndarray) -> np.ndarray | int:
+    """Which level's colour splats at means (M, 3) get."""
     if placement.tell == "BANDS" and placement.choice is not None:
-        return placement.choice.wanted_level(means[index, :3]).astype(np.float32)
+        return placement.choice.wanted_level(means)
     if placement.tell == "CHUNKS" and placement.choice is not None:
-        return placement.choice.parts(means[index, :3]).astype(np.float32)
-    return np.full(len(index), placement.level if placement.tell in ("LEVELS", "BANDS") else 0, np.float32)
+        return placement.choice.parts(means)
+    return placement.level if placement.tell in ("LEVELS", "BANDS") else 0

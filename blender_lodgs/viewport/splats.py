@@ -18,7 +18,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...training.lod.colors import LEVEL_COLORS
-from ...training.lod.rule import OPACITY, rules
+from ...training.lod.rule import every_column
 from .. import attributes
 from .arranging import WIDTH, Arrangement, Pool
 
@@ -258,8 +258,7 @@ def upload(clouds: Sequence[bpy.types.PointCloud]) -> Uploaded:
     buffers = {name: _Texels(total) for name in ("means", "quats", "scales", "bases")}
     stream = _Texels(3 * higher * total // 4 + 2)
     coefficients = stream.floats[: 3 * higher * total].reshape(higher, total, 3)
-    names = {name for rule in rules().values() for name in rule.columns} - {OPACITY}
-    columns = {name: np.zeros(total, np.float32) for name in names}
+    columns = {name: np.zeros(total, np.float32) for name in every_column()}
     for cloud, start, count in zip(clouds, starts, counts, strict=True):
         part = slice(start, start + count)
         if not count:

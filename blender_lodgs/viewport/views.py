@@ -2,8 +2,9 @@
 
 Splats are uploaded once, and anew only when the points of an object themselves have changed: distances and
 fading come from the modifiers' settings (``selection.choice``), so neither time nor view brings an upload. An
-object with other modifiers is uploaded as they leave it, whenever they do so anew. Which splats are drawn in
-which order is found in a thread when the view turns or the choice changes; until then the last order stays.
+object with other modifiers is uploaded as they leave it, whenever they do so anew. Which splats are drawn is
+found in a thread when the choice changes, in which order also when the view turns; until then the last
+arrangement stays, with the splats that it is of.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import bpy
 import gpu
 from mathutils import Matrix
 
-from ..data import scenes, selection, shown
+from ..data import changes, scenes, selection, shown
 from . import splats
 from .arranging import Arrangement, Placement, Request, arrange
 
@@ -52,10 +53,9 @@ _views: dict[int, ViewState] = {}
 _thread: ThreadPoolExecutor | None = None
 
 _uploaded: splats.Uploaded | None = None
-_keys: tuple[int, ...] = ()
-"""Whose splats are uploaded: point clouds, or objects whose modifiers change them, by ``session_uid``."""
-_stale: set[int] = set()
-"""Which of them have changed since."""
+_keys: dict[int, changes.Version | None] = {}
+"""Whose splats are uploaded: point clouds, or objects whose modifiers change them, by ``session_uid``; and in
+which version, None for one that only a render shows."""
 
 
 def draw(context: bpy.types.Context) -> None:
@@ -168,20 +168,20 @@ def _upload(instances: list[shown.SplatInstance], depsgraph: bpy.types.Depsgraph
     """The splats of all instances on the graphics card; they go there only where some have changed."""
     global _uploaded, _keys, uploads
     clouds: dict[int, bpy.types.PointCloud] = {}
-    changed: set[int] = set()
+    versions: dict[int, changes.Version | None] = {}
     for instance in instances:
         plain, key = _plain(instance, depsgraph), _key(instance, depsgraph)
         clouds.setdefault(key, instance.object.data if plain else instance.evaluated.data)
+        versions[key] = changes.version(instance.object.data if plain else instance.object)
         if not plain and depsgraph.mode == "RENDER":  # modifiers may do otherwise in viewports
-            changed.add(key)
-    missing = not clouds.keys() <= set(_keys)
-    if _uploaded is None or missing or (_stale | changed) & clouds.keys():
+            versions[key] = None
+    if _uploaded is None or any(_keys.get(key) != each or each is None for key, each in versions.items()):
         # A level that is hidden just now stays: artists step through levels.
         there = {cloud.session_uid: cloud for cloud in bpy.data.pointclouds if shown.is_splats(cloud)}
-        clouds |= {key: there[key] for key in _keys if key in there and key not in clouds}
-        _uploaded, _keys = splats.upload(list(clouds.values())), tuple(clouds)
-        _stale.clear()
-        _stale.update(changed)
+        stay = {key: there[key] for key in _keys if key in there and key not in clouds}
+        versions |= {key: changes.version(cloud) for key, cloud in stay.items()}
+        clouds |= stay
+        _uploaded, _keys = splats.upload(list(clouds.values())), {key: versions[key] for key in clouds}
         uploads += 1
     return _uploaded
 
@@ -192,9 +192,9 @@ def _placements(
     depsgraph: bpy.types.Depsgraph,
 ) -> tuple[Placement, ...]:
     roots = {item.object: root for root in scenes.roots(depsgraph.scene) for item in root.lodgs.levels}
-    found = []
+    numbers, found = {key: number for number, key in enumerate(_keys)}, []
     for instance in instances:
-        number = _keys.index(_key(instance, depsgraph))
+        number = numbers[_key(instance, depsgraph)]
         plain, root = _plain(instance, depsgraph), roots.get(instance.object)
         found.append(
             Placement(
@@ -261,19 +261,11 @@ def _wake() -> float | None:
     return 0.01 if waiting else None
 
 
-def on_update(depsgraph: bpy.types.Depsgraph) -> None:
-    """Notes whose points have changed since they were uploaded."""
-    for update in depsgraph.updates:
-        if update.is_updated_geometry:
-            _stale.add(update.id.original.session_uid)
-
-
 def clear() -> None:
     """Frees everything that is kept between drawings."""
     global _uploaded, _keys
     _views.clear()
-    _stale.clear()
-    _uploaded, _keys = None, ()
+    _uploaded, _keys = None, {}
 
 
 def stop() -> None:

@@ -238,6 +238,17 @@ def every_control() -> dict[str, Control]:
     return {control.name: control for rule in rules().values() for control in rule.controls}
 
 
+def every_column() -> set[str]:
+    """The columns of all rules, but the opacity."""
+    return {name for rule in rules().values() for name in rule.columns} - {OPACITY}
+
+
+def fact_names(rule: Rule) -> list[str]:
+    """The names of all that :func:`facts_of` says of a level."""
+    coarser = [f"coarser_{name}" for name in rule.level_facts]
+    return ["level", "finer", "coarser", "levels", *rule.scene_facts, *rule.level_facts, *coarser]
+
+
 def facts_of(
     rule: Rule,
     scene: Mapping[str, Any],

@@ -11,6 +11,8 @@ import numpy as np
 
 from ..documents import json_object
 from ..errors import LodgsError
+from ..lod.choice import Choice
+from ..lod.rule import Rule, fact_names, find_rule
 from ..scenes.cameras import FARTHEST, Camera, camera_from_dict, check_size
 
 BRIGHTEST = 1e6
@@ -18,6 +20,10 @@ BRIGHTEST = 1e6
 MOST_SPLATS = 1 << 30
 """Splats of one set."""
 LAST_LEVEL = 1 << 15
+LARGEST = 1e30
+"""Of numbers that a rule is told: single precision holds them."""
+MOST_COLUMNS, MOST_ROWS = 32, 4096
+"""Of a table, and columns of a set."""
 
 _NAME = re.compile(r"[\w-][\w.-]{0,99}", re.ASCII)
 
@@ -37,13 +43,17 @@ class NamedSet:
         file: a name in the folder of arrays.
         count: of its splats.
         antialias: see ``scene.Instance``.
+        columns: names of the further columns that the file has.
+        choice: by what its splats are weighted, on top of the file's weights; None: by these alone.
     """
 
     file: str
     count: int
     matrix: np.ndarray
     level: int
-    antialias: bool
+    antialias: bool = False
+    columns: tuple[str, ...] = ()
+    choice: Choice | None = None
 
 
 @dataclass(frozen=True)
@@ -133,7 +143,56 @@ def _named_set(values: Any) -> NamedSet:
         matrix=matrix,
         level=_whole(values, "level", 0, LAST_LEVEL),
         antialias=bool(values.get("antialias")),
+        columns=_columns(values),
+        choice=_choice(_of_kind(values, "choice", dict)) if values.get("choice") is not None else None,
     )
+
+
+def _columns(values: dict) -> tuple[str, ...]:
+    given = _of_kind({"columns": []} | values, "columns", list)
+    names = tuple(_name({"columns": name}, "columns") for name in given)
+    if len(names) > MOST_COLUMNS or len(set(names)) < len(names):
+        raise _refused("columns", given)
+    return names
+
+
+def _choice(values: dict) -> Choice:
+    rule = find_rule(_of_kind(values, "rule", str))
+    if rule is None:
+        raise _refused("rule", values["rule"])
+    x, y, z = _numbers(values, "eye", 3, FARTHEST)
+    (focal_px,) = _numbers({"focal_px": [values.get("focal_px")]}, "focal_px", 1, LARGEST)
+    controls = _by_name(values, "values", [control.name for control in rule.controls])
+    for control in rule.controls:  # the ends of a slider, as single precision has them, are possible
+        if not np.float32(control.low) <= np.float32(controls[control.name]) <= np.float32(control.high):
+            raise _refused(control.name, controls[control.name])
+    facts = _by_name(values, "facts", fact_names(rule))
+    return Choice(
+        rule.name, (x, y, z), focal_px, tuple(facts.items()), tuple(controls.items()), _tables(values, rule)
+    )
+
+
+def _tables(values: dict, rule: Rule) -> tuple:
+    """Tables as ``Choice`` has them; those that the rule knows, if any."""
+    found = []
+    for name, table in _of_kind({"tables": {}} | values, "tables", dict).items():
+        if name not in rule.tables or not isinstance(table, dict) or len(table) > MOST_COLUMNS:
+            raise _refused("tables", name)
+        lengths = {len(_of_kind(table, column, list)) for column in table}
+        if len(lengths) > 1 or max(lengths, default=0) > MOST_ROWS:
+            raise _refused(name, "of such columns")
+        rows = {column: _numbers(table, column, len(table[column]), LARGEST) for column in table}
+        found.append((name, tuple((column, "<f8", np.array(row).tobytes()) for column, row in rows.items())))
+    return tuple(found)
+
+
+def _by_name(values: dict, key: str, names: list[str]) -> dict[str, float]:
+    """An object of numbers with just these names, in their order."""
+    given = _of_kind(values, key, dict)
+    if given.keys() != set(names):
+        raise _refused(key, sorted(given))
+    numbers = _numbers({key: [given[name] for name in names]}, key, len(names), LARGEST)
+    return dict(zip(names, numbers, strict=True))
 
 
 def _window(values: dict, camera: Camera) -> tuple[int, int, int, int] | None:

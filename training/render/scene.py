@@ -43,6 +43,7 @@ class SplatSet:
         weights = np.ones(len(splats), np.float32) if weights is None else weights
         self.weights = torch.as_tensor(weights, dtype=torch.float32, device=device)
         self._in_world: tuple[bytes, Gaussians] | None = None
+        self._joined: tuple[list[SplatSet], Gaussians] | None = None
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -53,6 +54,29 @@ class SplatSet:
         if self._in_world is None or self._in_world[0] != key:
             self._in_world = key, self._transformed(torch.from_numpy(matrix))
         return self._in_world[1]
+
+    def joined(self, others: list[SplatSet]) -> Gaussians:
+        """These splats and those of other sets as one, kept as long as these are the others.
+
+        All of them are parts of it then, so that nothing is there twice.
+        """
+        if not others:
+            return self.gaussians
+        if self._joined is None or self._joined[0] != others:
+            sets = [self, *others]
+            most = max(one.gaussians.sh.shape[1] for one in sets)
+            whole = Gaussians.concatenated([
+                replace(one.gaussians, sh=pad(one.gaussians.sh, (0, 0, 0, most - one.gaussians.sh.shape[1])))
+                for one in sets
+            ])  # fmt: skip
+            if self in others:  # drawn twice at one place
+                return whole
+            begin = 0
+            for one in sets:
+                end = begin + len(one)
+                one.gaussians, begin = whole.select(slice(begin, end)), end
+            self._joined = others, whole
+        return self._joined[1]
 
     def _transformed(self, matrix: torch.Tensor) -> Gaussians:
         own = self.gaussians
@@ -75,10 +99,11 @@ class SplatSet:
             log_scales=lengths.clamp_min(1e-30).log().float(),
         )
 
-    def colours(self, matrix: np.ndarray, eye: np.ndarray) -> torch.Tensor:
-        """Colours (N, 3) that an eye in the world sees: harmonics turn, shrink and lean with the set."""
+    def colours(self, matrix: np.ndarray, eye: np.ndarray, some: torch.Tensor) -> torch.Tensor:
+        """Colours (M, 3) of ``some`` (M,) that an eye in the world sees: harmonics turn, shrink and lean with
+        the set."""
         own = np.linalg.solve(matrix, np.append(eye, 1.0))[:3]
-        means, sh = self.gaussians.means, self.gaussians.sh
+        means, sh = self.gaussians.means[some], self.gaussians.sh[some]
         directions = normalize(means - torch.as_tensor(own).to(means), dim=1)
         values: list = [None] * sh.shape[1]
         x, y, z = directions.unbind(1)
@@ -94,12 +119,14 @@ class Instance:
         matrix: (4, 4) float64, from the set's coordinates to the world.
         level: number of the level of detail that it is; 0 where it is none.
         antialias: how it is drawn, see ``Bundle.antialias``.
+        weights: (N,) of its splats here; None: the set's own.
     """
 
     splats: SplatSet
     matrix: np.ndarray = field(default_factory=lambda: np.eye(4))
     level: int = 0
     antialias: bool = False
+    weights: np.ndarray | None = None
 
 
 def draw(
@@ -154,9 +181,10 @@ def draw(
         if not instances:
             return picture
         gaussians, weights, camera, near, unit = _in_one_frame(instances, camera, near)
-        features = _membership(instances, picture) if levels else None
+        features = _membership(instances, weights, picture) if levels else None
         for top, drawn in strips(
-            gaussians, camera, weights=weights, background=behind, near=near, antialias=_filtered(instances),
+            gaussians, camera, weights=torch.cat(weights), background=behind, near=near,
+            antialias=_filtered(instances, weights),
             outputs=("depth", "median_depth") if depth else (), features=features, window=window,
             limit=None if limit is None else torch.from_numpy(limit / unit).to(gaussians.means),
             strip=STRIP, backend=backend,
@@ -195,39 +223,42 @@ def similarity(matrix: np.ndarray) -> bool:
 
 def _in_one_frame(
     instances: list[Instance], camera: Camera, near: float
-) -> tuple[Gaussians, torch.Tensor, Camera, float, float]:
-    """Splats and weights of all sets in one frame; the camera and its near depth in that frame, and how
-    many units of the world one of its units is."""
+) -> tuple[Gaussians, list[torch.Tensor], Camera, float, float]:
+    """Splats of all sets in one frame, and each set's weights; the camera and its near depth in that frame,
+    and how many units of the world one of its units is."""
     first = instances[0].matrix
     together = similarity(first) and all(np.array_equal(one.matrix, first) for one in instances)
     sets = [one.splats for one in instances]
-    weights = torch.cat([one.weights for one in sets])
-    if together:
-        camera, unit = camera.within(first)
-        most = max(one.gaussians.sh.shape[1] for one in sets)
-        padded = [
-            replace(one.gaussians, sh=pad(one.gaussians.sh, (0, 0, 0, most - one.gaussians.sh.shape[1])))
-            for one in sets
-        ]
-        return Gaussians.concatenated(padded), weights, camera, near / unit, unit
-    there = [
-        replace(one.splats.in_world(one.matrix), sh=one.splats.colours(one.matrix, camera.center))
+    weights = [
+        one.splats.weights if one.weights is None else torch.as_tensor(one.weights).to(one.splats.weights)
         for one in instances
     ]
-    return Gaussians.concatenated(there), weights, camera, near, 1.0
+    if together:
+        camera, unit = camera.within(first)
+        return sets[0].joined(sets[1:]), weights, camera, near / unit, unit
+    drawn = [(weight > 0).nonzero()[:, 0] for weight in weights]
+    there = [
+        replace(
+            one.splats.in_world(one.matrix).select(some),
+            sh=one.splats.colours(one.matrix, camera.center, some),
+        )
+        for one, some in zip(instances, drawn, strict=True)
+    ]
+    left = [weight[some] for weight, some in zip(weights, drawn, strict=True)]
+    return Gaussians.concatenated(there), left, camera, near, 1.0
 
 
-def _filtered(instances: list[Instance]) -> bool | torch.Tensor:
+def _filtered(instances: list[Instance], weights: list[torch.Tensor]) -> bool | torch.Tensor:
     """Whether splats are antialiased: all or none, or (N,) of each where sets differ."""
     flags = {one.antialias for one in instances}
     if len(flags) == 1:
         return flags.pop()
-    return torch.cat([torch.full_like(one.splats.weights, one.antialias).bool() for one in instances])
+    each = zip(instances, weights, strict=True)
+    return torch.cat([torch.full_like(weight, one.antialias).bool() for one, weight in each])
 
 
-def _membership(instances: list[Instance], picture: Picture) -> torch.Tensor:
+def _membership(instances: list[Instance], weights: list[torch.Tensor], picture: Picture) -> torch.Tensor:
     """(N, L) with 1 where a splat is of a level of the picture's."""
-    device = instances[0].splats.weights.device
-    levels = torch.tensor(picture.levels, device=device)
-    of = torch.cat([torch.full((len(one.splats),), one.level, device=device) for one in instances])
+    levels = torch.tensor(picture.levels, device=weights[0].device)
+    of = torch.cat([torch.full_like(each, one.level) for one, each in zip(instances, weights, strict=True)])
     return (of[:, None] == levels).float()

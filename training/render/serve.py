@@ -7,7 +7,8 @@ is removed when standard input ends, however the other program ended.
     {"frame": 7, "out": NAME, "camera": {...}, "near": 0.1, "background": [r, g, b] or null,
      "depth": true, "levels": true, "window": [left, top, width, height] or null,
      "photograph": PATH or null, "holdout": PATH or null,
-     "sets": [{"file": NAME, "count": N, "matrix": 4x4, "level": 3}, ...]}
+     "sets": [{"file": NAME, "count": N, "matrix": 4x4, "level": 3,
+               "columns": [NAME, ...], "choice": {...} or null}, ...]}
     {"cancel": 7}
 
 answer ``progress`` (frame, share) and ``warning`` (frame, message), then one of ``frame`` (frame, passes,
@@ -16,7 +17,10 @@ remedy). A photograph is read in the frame's size and its planes follow the othe
 then says how alike both are. A holdout is an EXR with the depth of what hides splats, of the camera's size or
 the window's.
 
-A set is read when its file is first named, and forgotten when a frame does not name it.
+A set is read when its file is first named, and forgotten when a frame does not name it; its file may go after
+an answer ``frame``. With a choice (``lod.choice``: ``rule``, ``eye`` in the set's coordinates, ``focal_px``,
+and by name ``facts``, ``values`` and ``tables``) its splats are weighted as the rule says, times the file's
+weights; what the rule knows of each splat are the file's columns of these names.
 """
 
 from __future__ import annotations
@@ -41,12 +45,15 @@ from ..runs.events import event_line
 from ..scenes.images import load_image
 from ..splats.dialects import drawable
 from . import wire
+from .kept import KeptSet
 from .picture import read_depth
 from .requests import Cancel, FrameRequest, NamedSet, frame_of, read_line, read_request
-from .scene import Instance, SplatSet, draw
+from .scene import Instance, draw
 
 LONGEST = 1 << 20
 """Bytes of a line that asks for something."""
+_WEIGHTS = ""
+"""Where weights stand among the columns of a set, which all have a name."""
 
 
 def serve(folder: Path, backend: str, requests: IO[bytes], answers: IO[str]) -> int:
@@ -68,7 +75,7 @@ def serve(folder: Path, backend: str, requests: IO[bytes], answers: IO[str]) -> 
 class _Server:
     def __init__(self, folder: Path, backend: str, answers: IO[str]) -> None:
         self._folder, self._backend, self._answers = folder, backend, answers
-        self._sets: dict[str, SplatSet] = {}
+        self._sets: dict[str, KeptSet] = {}
         self._requests: queue.SimpleQueue[FrameRequest] = queue.SimpleQueue()
         self._cancelled: set[int] = set()
 
@@ -156,16 +163,18 @@ class _Server:
         for one in sets:
             if one.file not in kept:
                 kept[one.file] = self._sets.get(one.file) or self._read_set(frame, one)
-            instances.append(Instance(kept[one.file], one.matrix, one.level, one.antialias))
+            held = kept[one.file]
+            weights = held.weights(one.choice)
+            instances.append(Instance(held.drawn, one.matrix, one.level, one.antialias, weights))
         self._sets = kept
         return instances
 
-    def _read_set(self, frame: int, one: NamedSet) -> SplatSet:
+    def _read_set(self, frame: int, one: NamedSet) -> KeptSet:
         """A set from its file, without what cannot be drawn."""
-        splats, weights = wire.read_set(self._folder / one.file, one.count)
-        splats.extras["weight"] = np.nan_to_num(weights)
+        splats, weights = wire.read_set(self._folder / one.file, one.count, one.columns)
+        splats.extras[_WEIGHTS] = np.nan_to_num(weights)
         splats = drawable(splats, "the scene", lambda text: self.say("warning", frame=frame, message=text))
-        return SplatSet(splats, splats.extras["weight"], self._backend)
+        return KeptSet(splats, splats.extras.pop(_WEIGHTS), self._backend)
 
     def _end(self) -> None:
         """Clean up and go, whatever the other threads are at."""

@@ -1,13 +1,15 @@
 """What Blender and the renderer hand each other beside lines of JSON: arrays in files. numpy only.
 
 A set of splats is one file of float32, column after column: means, quats, log-scales, opacity logits,
-weights, coefficients. A frame is one file of float32, plane after plane, rows from the top. Who writes a file
-finishes it before the line that names it is sent, and never changes it afterwards; both sides read by mapping
-it into memory. All lie in one folder, which bears a mark: without it the renderer removes nothing.
+weights, further columns by which a rule chooses, coefficients. A frame is one file of float32, plane after
+plane, rows from the top. Who writes a file finishes it before the line that names it is sent, and never
+changes it afterwards; both sides read by mapping it into memory. All lie in one folder, which bears a mark:
+without it the renderer removes nothing.
 """
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -17,7 +19,7 @@ import numpy as np
 from ..errors import LodgsError
 from ..splats.gaussians import Splats
 
-PROTOCOL = 1
+PROTOCOL = 2
 """Version of what is said; both sides come from one installation, so any other one is refused."""
 
 MARK = ".lodgs-renderer"
@@ -60,10 +62,18 @@ def release(folder: Path) -> None:
 
 
 def packed(splats: Splats, weights: np.ndarray | None) -> list[np.ndarray]:
-    """The columns of a set in the order of its file, float32; weights of None are ones."""
+    """The columns of a set in the order of its file, float32, extras included; weights of None are ones."""
     ones = np.ones(len(splats), np.float32) if weights is None else weights
-    columns = (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, ones, splats.sh)
+    columns = (
+        splats.means, splats.quats, splats.log_scales, splats.opacity_logits, ones,
+        *splats.extras.values(), splats.sh,
+    )  # fmt: skip
     return [np.ascontiguousarray(column, np.float32).reshape(-1) for column in columns]
+
+
+def digest(columns: list[np.ndarray]) -> tuple[tuple[int, int], ...]:
+    """What tells whether columns are those of before without keeping them: each one's length and CRC."""
+    return tuple((len(column), zlib.crc32(column.data)) for column in columns)
 
 
 def write_set(path: Path, columns: list[np.ndarray]) -> None:
@@ -73,21 +83,11 @@ def write_set(path: Path, columns: list[np.ndarray]) -> None:
             file.write(column.data)
 
 
-def holds(path: Path, columns: list[np.ndarray]) -> bool:
-    """Whether a file has just these columns in it."""
-    if sum(column.nbytes for column in columns) != path.stat().st_size:
-        return False
-    begin = 0
-    there = _mapped(path)
-    for column in columns:
-        if not np.array_equal(there[begin : begin + len(column)].view(np.int32), column.view(np.int32)):
-            return False
-        begin += len(column)
-    return True
-
-
-def read_set(path: Path, count: int) -> tuple[Splats, np.ndarray]:
+def read_set(path: Path, count: int, columns: Sequence[str] = ()) -> tuple[Splats, np.ndarray]:
     """A set's splats and weights.
+
+    Args:
+        columns: the names of its further columns, in their order; they become extras.
 
     Raises:
         LodgsError: the file is not there, or not one of ``count`` splats.
@@ -98,17 +98,19 @@ def read_set(path: Path, count: int) -> tuple[Splats, np.ndarray]:
         mapped = _mapped(path)
     except (OSError, ValueError) as error:
         raise LodgsError(f"The set of splats {path.name} cannot be read: {error}.") from error
-    rest, odd = divmod(mapped.size - count * sum(_WIDTHS), 3 * max(count, 1))
+    widths = (*_WIDTHS, *[1] * len(columns))
+    rest, odd = divmod(mapped.size - count * sum(widths), 3 * max(count, 1))
     if odd or (count and rest not in _TERMS) or (not count and mapped.size):
         raise LodgsError(f"The set of splats {path.name} does not hold {count} splats.")
     values = np.array(mapped)
     parts, begin = [], 0
-    for width in _WIDTHS:
+    for width in widths:
         parts.append(values[begin : begin + count * width].reshape(count, width))
         begin += count * width
-    means, quats, log_scales, logits, weights = parts
+    means, quats, log_scales, logits, weights, *further = parts
     sh = values[begin:].reshape(count, rest if count else 1, 3)
-    return Splats(means, quats, log_scales, logits[:, 0], sh), weights[:, 0]
+    extras = {name: column[:, 0] for name, column in zip(columns, further, strict=True)}
+    return Splats(means, quats, log_scales, logits[:, 0], sh, extras), weights[:, 0]
 
 
 def write_planes(path: Path, planes: Sequence[np.ndarray]) -> None:

@@ -17,7 +17,7 @@ from types import ModuleType
 
 import bpy
 
-from ....training.lod.rule import Rule, rules
+from ....training.lod.rule import Rule, fact_names, rules
 from ...attributes import COLUMN, OPACITY_LOGIT, WEIGHT
 from ..building import VERSION, Field, Nodes, edited, group
 
@@ -147,12 +147,6 @@ def serves(tree: bpy.types.NodeTree | None, rule: Rule) -> bool:
 
 def _version(rule: Rule) -> int:
     return 100 * _SHARED_VERSION + _modules()[rule.name].VERSION
-
-
-def fact_names(rule: Rule) -> list[str]:
-    """The sockets of a rule's facts, as ``training.lod.rule.facts_of`` names them."""
-    coarser = [f"coarser_{name}" for name in rule.level_facts]
-    return ["level", "finer", "coarser", "levels", *rule.scene_facts, *rule.level_facts, *coarser]
 
 
 def rule_of_group(tree: bpy.types.NodeTree | None) -> Rule | None:

@@ -212,7 +212,7 @@ def test_a_group_that_an_artist_has_changed_is_followed_by_all(bpy, lodgs, half,
             len(item.object.evaluated_get(depsgraph).data.points) for item in root.lodgs.levels
             if item.object.visible_get()
         )  # fmt: skip
-        rendered = sum(len(one.splats) for one in lodgs("render.engine").placed_splats(depsgraph))
+        rendered = sum(map(chosen, lodgs("render.engine").placed_splats(depsgraph)))
         view, camera = views.ViewState(), bpy.context.scene.camera
         instances = lodgs("data.shown").splat_instances(depsgraph)
         drawn = []
@@ -224,6 +224,13 @@ def test_a_group_that_an_artist_has_changed_is_followed_by_all(bpy, lodgs, half,
         frame(8, draw)
         assert drawn == [exported] == [rendered]
         return exported
+
+    def chosen(placed):
+        splats, _ = placed.read()
+        if placed.choice is None:
+            return len(splats)
+        columns = splats.extras | {"opacity": 1 / (1 + np.exp(-splats.opacity_logits))}
+        return len(lodgs("training.lod.choice").Chooser(splats.means, columns).chosen(placed.choice)[0])
 
     def everything():
         return sum(len(item.object.data.points) for item in root.lodgs.levels if item.object.visible_get())

@@ -258,6 +258,118 @@ def test_what_changes_is_handed_over(bpy, lodgs, scene, tmp_path):
     assert np.abs(before - after).mean() > 0.01
 
 
+@pytest.fixture
+def written(lodgs, monkeypatch):
+    """What the renderer has been handed so far, a list of calls."""
+    renderer, calls = lodgs("render.renderer"), []
+    write_set = renderer.wire.write_set
+    monkeypatch.setattr(renderer.wire, "write_set", lambda *a: calls.append(a) or write_set(*a))
+    return calls
+
+
+@pytest.fixture
+def by_distance(bpy, lodgs, scene, tmp_path):
+    """``by_distance(rule)``: levels that this rule chooses from the camera's place, about half of them."""
+
+    def made(name):
+        scene.render.resolution_percentage = 25
+        bpy.context.view_layer.update()
+        before = lodgs("data.scenes").roots(scene)[0]
+        middle = (before.matrix_world.inverted() @ scene.camera.matrix_world.translation).length
+        focal = before.lodgs.focal_px
+        of_scene, coarse, fine = {
+            "bands": ({}, {"s_min": middle / focal}, {"s_min": 0.0}),
+            "octree": ({"d_max": 2**-0.25 * middle, "d_max_focal": focal}, {}, {}),
+            "chunks": ({}, {"d_l": middle}, {"d_l": 0.0}),
+            "decay": ({"reference": 2 * middle, "tau": 0.01}, {}, {}),
+        }[name]
+        levels = [Level(1, random_splats(400, 1), coarse), Level(2, random_splats(1500, 1, 1), fine)]
+        for level in levels:
+            rng = np.random.default_rng(level.number)
+            for column, most in (("lod_bias", 1), ("sigma_d", 0.6)):
+                level.splats.extras[column] = rng.uniform(0, most, len(level.splats)).astype(np.float32)
+        bundle = Bundle("any", levels, name, facts=of_scene, cumulative=name == "octree")
+        write_bundle(tmp_path / "levels.ply", bundle)
+        bpy.data.batch_remove([obj for obj in bpy.data.objects if obj.type == "POINTCLOUD"])
+        root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "levels.ply")
+        root.matrix_world = before.matrix_world
+        root.lodgs.mode = "SELECTIVE"
+        bpy.context.view_layer.update()
+        return root
+
+    return made
+
+
+@pytest.mark.parametrize("rule", ["bands", "octree", "chunks", "decay"])
+def test_it_is_chosen_as_node_groups_choose(bpy, lodgs, scene, by_distance, written, monkeypatch, rule):
+    """The renderer is handed every level once, and then a choice with each frame; pictures are those of what
+    Blender's evaluation leaves, but for a splat on a border where float32 numbers are rounded otherwise."""
+    root, engine = by_distance(rule), lodgs("render.engine")
+    told, pictures = [], {}
+    for whole in (True, False):
+        written.clear()
+        if not whole:
+            monkeypatch.setattr(engine, "_chosen_by_rule", lambda *args: False)
+        for x in (1.3, 2.0, 0.4):
+            scene.camera.location.x = x
+            bpy.context.view_layer.update()
+            planes = passes(bpy, lodgs)
+            pictures.setdefault(x, []).append([planes[f"Combined.{channel}"] for channel in "RGBA"])
+        told.append(len(written))
+    assert told[0] <= 2 < told[1]
+    for new, old in pictures.values():
+        assert np.abs(np.float32(new) - np.float32(old)).max() <= 1 / 255
+        assert np.ptp(new[:3]) > 0.1
+    first, last = pictures[1.3][0], pictures[0.4][0]
+    assert np.abs(np.float32(first) - np.float32(last)).max() > 0.1
+    counts = [len(item.object.evaluated_get(bpy.context.evaluated_depsgraph_get()).data.points)
+              for item in root.lodgs.levels]  # fmt: skip
+    assert 0 < sum(counts) < 1900
+
+
+def test_what_modifiers_change_is_handed_over_as_they_leave_it(bpy, lodgs, scene, by_distance, written):
+    """An artist's own modifier on a level; taken away again, the level is chosen from again."""
+    root = by_distance("bands")
+    plain = passes(bpy, lodgs)["Combined.R"]
+    level = root.lodgs.levels[1].object
+    group = bpy.data.node_groups.new("shift", "GeometryNodeTree")
+    group.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
+    group.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    begin, move = group.nodes.new("NodeGroupInput"), group.nodes.new("GeometryNodeSetPosition")
+    move.inputs["Offset"].default_value = (0.3, 0, 0)
+    group.links.new(begin.outputs[0], move.inputs[0])
+    group.links.new(move.outputs[0], group.nodes.new("NodeGroupOutput").inputs[0])
+    modifier = level.modifiers.new("shift", "NODES")
+    modifier.node_group = group
+    bpy.context.view_layer.update()
+    assert np.abs(passes(bpy, lodgs)["Combined.R"] - plain).max() > 0.1
+    level.modifiers.remove(modifier)
+    bpy.context.view_layer.update()
+    np.testing.assert_array_equal(passes(bpy, lodgs)["Combined.R"], plain)
+
+
+def test_what_no_viewport_shows_is_read_at_every_frame(bpy, lodgs, scene, tmp_path, written):
+    """Blender does not tell when it changes."""
+    level = lodgs("data.scenes").roots(scene)[0].lodgs.levels[1].object
+    level.driver_remove("hide_viewport")
+    level.hide_viewport = True
+    before = f12(bpy, tmp_path)
+    cloud, attributes = level.data, lodgs("attributes")
+    base = attributes.read_attribute(cloud, "radiance:base")
+    base[:, :3] = 0
+    attributes.write_attribute(cloud, "radiance:base", cloud.attributes["radiance:base"].data_type, base)
+    cloud.update_tag()
+    assert np.abs(f12(bpy, tmp_path) - before).mean() > 0.01 and len(written) == 2
+
+
+def test_undo_has_all_be_compared_and_nothing_sent_again(bpy, lodgs, scene, written):
+    before = passes(bpy, lodgs)["Combined.R"]
+    count = len(written)
+    lodgs("data.changes")._on_load()
+    np.testing.assert_array_equal(passes(bpy, lodgs)["Combined.R"], before)
+    assert len(written) == count == 1
+
+
 def test_cancel(bpy, lodgs, scene, monkeypatch):
     """Asked to stop, it stops soon and without a picture; the renderer is the same and draws on."""
     passes(bpy, lodgs)

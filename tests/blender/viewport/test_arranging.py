@@ -148,6 +148,91 @@ def test_all_sets_are_sorted_together_from_back_to_front(bpy, lodgs):
     assert (np.diff(towards_eye) > -1e-5).all()
 
 
+def test_ascending_is_a_stable_argsort(bpy, lodgs):
+    rng = np.random.default_rng(5)
+    values = (rng.normal(size=20_000) * 10.0 ** rng.integers(-44, 38, 20_000)).astype(np.float32)
+    values[rng.integers(0, 20_000, 3000)] = rng.choice([0.0, -0.0, 1.0, -1.0, np.inf, -np.inf], 3000)
+    ascending = lodgs("viewport.arranging").ascending
+    for some in (values, values[:0], values[:1], np.repeat(np.float32(-2), 5)):
+        assert np.array_equal(ascending(some), np.argsort(some, kind="stable"))
+
+
+TABLE = (("chunks", tuple((axis, "<f4", np.float32(row).tobytes()) for axis, row in (
+    ("x", [0, 0.8, -0.8]), ("y", [0, 0, 0.4]), ("z", [0, 0, 0]), ("radius", [1, 1, 0.7]),
+))),)  # fmt: skip
+RULES = {
+    "bands": ({}, [0.9, 0.5, 0.0], "s_min"), "octree": ({"d_max": 1.5, "d_max_focal": 1.0}, [], ""),
+    "chunks": ({}, [0.9, 0.5, 0.0], "d_l"), "decay": ({"reference": 2.0, "tau": 0.01}, [], ""),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_what_is_kept_between_arrangements_is_what_is_found_anew(bpy, lodgs, monkeypatch, name):
+    """Whatever changes from one to the next: each splat's row as by the rule alone, from back to front. While
+    only the view turns or objects move, nothing is chosen anew."""
+    rng, arranging = np.random.default_rng(8), lodgs("viewport.arranging")
+    sets = [random_set(rng, n) for n in (300, 600, 1200)]
+    pool, starts = pool_of(lodgs, sets)
+    for column in ("chunks_0", "sigma_d", "lod_bias"):
+        most = {"chunks_0": 8, "sigma_d": 1, "lod_bias": 1}[column]
+        values = rng.uniform(0, most, 2100)
+        pool.columns[column] = np.float32(np.floor(values) if column == "chunks_0" else values)
+    scene, ends, fact = RULES[name]
+    rules = lodgs("training.lod.rule")
+    rule, looked_at = rules.rules()[name], []
+    levels = [(n, {fact: ends[n - 1]} if fact else {}) for n in (1, 2, 3)]
+    choose = arranging.within_budget
+    monkeypatch.setattr(arranging, "within_budget", lambda *a: looked_at.append(a) or choose(*a))
+
+    def request(eye, backward, matrix=None, tell="OWN", budget=10**6, **values):
+        placements = []
+        for level, (start, part) in enumerate(zip(starts, sets, strict=False), 1):
+            facts = rules.facts_of(rule, scene, levels, level)
+            values = rule.defaults([1, 2, 3]) | values
+            by = lodgs("data.selection").Choice(
+                name, eye, 1.0, tuple(facts.items()), tuple(values.items()), TABLE if name == "chunks" else ()
+            )
+            place = {"matrix": matrix, "level": level, "choice": by, "tell": tell}
+            placements.append(placed(lodgs, int(start), len(part[0]), **place))
+        return arranging.Request(tuple(placements), backward, budget)
+
+    here, moved = (0.1, 0.05, 0.0), np.eye(4)
+    moved[:3, 3] = 3, 1, 2
+    asked = [
+        (request(here, (1, 0, 0)), True), (request(here, (0, 1, 0)), False),
+        (request(here, (0, 1, 0), moved), False), (request((0.2, 0.1, 0), (0, 1, 0)), True),
+        (request((0.9, 0.1, 0), (0, 1, 0)), True), (request(here, (0, 1, 0), tell="BANDS"), True),
+        (request((-0.9, 0.4, 0), (0, 0, 1)), True), (request((5.0, 4.0, 0), (0, 0, 1)), True),
+        (request(here, (1, 0, 0), budget=200), True), (request(here, (1, 0, 0)), True),
+    ]  # fmt: skip
+    counts = []
+    for one, anew in asked:
+        before = len(looked_at)
+        result = arranging.arrange(pool, one)
+        assert len(looked_at) == before + anew
+        counts.append(result.count)
+        rows = result.instances[: result.count]
+        index, weight, number, _ = rows.T
+        depth = np.empty(len(rows))
+        for i, placement in enumerate(one.placements):
+            mine = number == i
+            world = pool.means[index[mine].astype(int)] @ placement.world.T
+            depth[mine] = world[:, :3] @ one.backward
+            if one.budget > 10**5:
+                part = slice(placement.first, placement.first + placement.count)
+                columns = {each: column[part] for each, column in pool.columns.items()}
+                zeros = dict.fromkeys(rule.columns, np.zeros(placement.count, np.float32))
+                own = placement.choice.weights(
+                    pool.means[part, :3], zeros | columns | {"opacity": pool.opacities[part]}
+                )
+                found = np.zeros(placement.count, np.float32)
+                found[index[mine].astype(int) - placement.first] = weight[mine]
+                np.testing.assert_array_equal(found, own)
+        assert (np.diff(depth) > -1e-5).all()
+        assert result.left_out == 0 if one.budget > 10**5 else result.count <= 200
+    assert len(set(counts)) > 3 and 0 < counts[0] < 2100
+
+
 def test_levels_that_add_up_lose_the_finest_first(bpy, lodgs):
     rng = np.random.default_rng(3)
     sets = [random_set(rng, n) for n in (100, 200, 400, 800)]

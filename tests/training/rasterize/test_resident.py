@@ -14,7 +14,7 @@ from training.splats.bundle import Bundle, Level
 from training.splats.gaussians import Splats
 
 NEAR = 0.1
-EYES = [(0, 0, 0), (1.0, 0.4, 0), (1.9, 0, 0.2), (4.2, 1, 0), (30, 0, 0)]
+EYES = [(0, 0, 0), (1.0, 0.4, 0), (1.9, 0, 0.2), (4.2, 1, 0), (0, 2.2, 0), (30, 0, 0)]
 CENTRES = np.float32([[0, 0, 0], [2, 0, 0], [4, 0, 0]])
 
 

@@ -10,6 +10,8 @@ import numpy as np
 import OpenEXR
 import pytest
 
+from training.lod.choice import Choice
+from training.lod.rule import rules
 from training.render import wire
 from training.render.scene import Instance, SplatSet, draw
 from training.scenes.cameras import camera_as_dict
@@ -61,10 +63,7 @@ def test_frames_are_what_draw_draws(client, make_splats, camera):
     hello = client.hear("hello")
     assert hello["protocol"] == wire.PROTOCOL and hello["backend"] == "cpu"
     splats, weights = make_splats(80), np.linspace(0, 1, 80, dtype=np.float32)
-    columns = wire.packed(splats, weights)
-    wire.write_set(client.folder / "one", columns)
-    assert wire.holds(client.folder / "one", columns)
-    assert not wire.holds(client.folder / "one", wire.packed(splats, None))
+    wire.write_set(client.folder / "one", wire.packed(splats, weights))
     matrix = np.diag([2.0, 2, 2, 1])
     sets = [{"file": "one", "count": 80, "matrix": matrix.tolist(), "level": 4}]
     for frame in (1, 2, 3):
@@ -81,6 +80,32 @@ def test_frames_are_what_draw_draws(client, make_splats, camera):
         for plane, there in zip(expected.values(), planes, strict=True):
             np.testing.assert_array_equal(plane, there)
         (client.folder / "one").unlink(missing_ok=True)  # what was read once is not read again
+
+
+def test_of_a_set_each_frame_draws_what_it_chooses(client, make_splats, camera):
+    """The file is read once, and may go; another eye makes another picture: that of the chosen alone."""
+    client.hear("hello")
+    splats = make_splats(200)
+    splats.extras["lod_bias"] = np.linspace(-1, 1, 200, dtype=np.float32)
+    wire.write_set(client.folder / "one", wire.packed(splats, None))
+    rule, pictures = rules()["octree"], []
+    facts = {"level": 2.0, "finer": 3.0, "coarser": 1.0, "levels": 3.0, "d_max": 1.2, "d_max_focal": 1.5}
+    values = {"offset": 0.25, "fade": 1}
+    for frame, eye in enumerate(((0.0, 0.0, 0.5), (0.5, 0.25, -1.0))):
+        choice = Choice("octree", eye, 1.5, tuple(facts.items()), tuple(values.items())).as_dict()
+        one = {"file": "one", "count": 200, "matrix": np.eye(4).tolist(), "level": 2}
+        client.say(**request(camera, [one | {"columns": ["lod_bias"], "choice": choice}], frame))
+        answer = client.hear("frame", "error")
+        planes = wire.read_planes(client.folder / "frame", len(answer["passes"]), 48, 64)
+        (client.folder / "one").unlink(missing_ok=True)
+        weights = rule.weights(splats.means, np.float32(eye), 1.5, splats.extras, facts, values)
+        some = weights > 0
+        assert 20 < some.sum() < 180
+        alone = draw([Instance(SplatSet(splats.select(some), weights[some]))], camera, background=None)
+        for plane, there in zip(alone.passes().values(), planes, strict=True):
+            np.testing.assert_array_equal(plane, there)
+        pictures.append(planes)
+    assert np.abs(pictures[0] - pictures[1]).max() > 0.1
 
 
 def test_a_holdout_is_read_and_told_where_it_cannot_be(client, make_splats, camera, tmp_path):

@@ -37,6 +37,24 @@ def test_only_what_was_claimed_is_removed(tmp_path):
         wire.claim(theirs / "a.jpg")
 
 
+def test_a_set_has_the_columns_that_it_is_said_to_have(make_splats, tmp_path):
+    splats = make_splats(5)
+    splats.extras |= {"lod_bias": np.arange(5, dtype=np.float32), "sigma_d": np.ones(5, np.float32)}
+    columns = wire.packed(splats, None)
+    wire.write_set(tmp_path / "set", columns)
+    again, weights = wire.read_set(tmp_path / "set", 5, list(splats.extras))
+    assert again.extras.keys() == splats.extras.keys() and (weights == 1).all()
+    for there, here in zip(wire.packed(again, weights), columns, strict=True):
+        np.testing.assert_array_equal(there, here)
+    with pytest.raises(LodgsError, match="does not hold"):
+        wire.read_set(tmp_path / "set", 5, ["lod_bias"])
+    for number in range(len(columns)):
+        changed = [column.copy() for column in columns]
+        changed[number][-1] += 1e-3
+        assert wire.digest(changed) != wire.digest(columns)
+    assert wire.digest([column.copy() for column in columns]) == wire.digest(columns)
+
+
 def test_a_set_is_of_its_size(make_splats, tmp_path):
     path = tmp_path / "set"
     for count, degree in ((5, 3), (1, 0), (0, 0)):
@@ -95,7 +113,8 @@ def test_impossible_requests_are_a_sentence(good, change):
         {"count": -1}, {"count": 1 << 40}, {"count": 1.5}, {"matrix": [[1, 0], [0, 1]]}, {"matrix": 1},
         {"matrix": np.full((4, 4), 1e300).tolist()}, {"matrix": np.ones((4, 4)).tolist()}, {"level": -1},
         {"level": None}, {"file": "/etc/passwd"}, {"file": "a\0"}, {"file": "C:x"},
-        {"matrix": [["a"] * 4] * 4},
+        {"matrix": [["a"] * 4] * 4}, {"columns": "a"}, {"columns": ["a", "a"]}, {"columns": ["../a"]},
+        {"columns": [1]}, {"columns": [f"a{i}" for i in range(40)]}, {"choice": 1}, {"choice": []},
         {"matrix": [[1, 0, 0, [0]], *np.eye(4)[1:].tolist()]},
     ],
 )  # fmt: skip

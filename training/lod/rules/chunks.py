@@ -60,7 +60,9 @@ class Chunks(Rule):
     )  # fmt: skip
 
     def band(self, focal_px: float, facts: Mapping[str, float], values: Values) -> tuple[float, float]:
-        """Near and far end of a level's distances from the eye, in scene units."""
+        """Near and far end of a level's distances from the eye, in scene units; any, where chunks count."""
+        if values["chunks"]:
+            return 0.0, inf
         near, far = _ends(facts)
         return near / values["distance_scale"], far / values["distance_scale"]
 

@@ -82,7 +82,7 @@ def rows_at_distances(
 ) -> Rows:
     """The rows of levels that the rule shows an eye (3,), of all blocks or of those that are True, (B,)."""
     facts = [(number, {"d_l": d_l[number]}) for number in sorted(levels)]
-    values = RULE.defaults(sorted(levels)) | {"distance_scale": distance_scale}
+    values = RULE.defaults(sorted(levels)) | {"distance_scale": distance_scale, "chunks": 0}
     eye, found = np.asarray(eye, np.float32), {}
     for number, level in levels.items():
         of_level = facts_of(RULE, {}, facts, number)

@@ -1,0 +1,54 @@
+"""Which datablocks' points have changed: for all who keep what they have made of them.
+
+Blender reports what has been tagged when it evaluates a view layer, and every operator has it do so first. It
+reports nothing of what no view layer of a window shows.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import bpy
+
+Version = tuple[int, int]
+
+_reported: Counter[int] = Counter()
+_files = 0
+
+
+def version(datablock: bpy.types.ID) -> Version:
+    """Another one after the points of a datablock, or of an object as modifiers leave it, have changed."""
+    return _files, _reported[datablock.session_uid]
+
+
+@bpy.app.handlers.persistent
+def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    if depsgraph.mode == "RENDER":  # a render's first evaluation: everything counts as new there
+        return
+    _reported.update(
+        update.id.original.session_uid for update in depsgraph.updates if update.is_updated_geometry
+    )
+
+
+@bpy.app.handlers.persistent
+def _on_load(*_) -> None:
+    """Another file, or another state of it: nothing is known of anything."""
+    global _files
+    _files += 1
+    _reported.clear()
+
+
+def register() -> None:
+    handlers = bpy.app.handlers
+    for changes in (handlers.depsgraph_update_post, handlers.frame_change_post):
+        changes.append(_on_update)
+    for changes in (handlers.load_post, handlers.undo_post, handlers.redo_post):
+        changes.append(_on_load)
+
+
+def unregister() -> None:
+    handlers = bpy.app.handlers
+    for changes in (handlers.depsgraph_update_post, handlers.frame_change_post):
+        changes.remove(_on_update)
+    for changes in (handlers.load_post, handlers.undo_post, handlers.redo_post):
+        changes.remove(_on_load)
