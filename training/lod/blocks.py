@@ -92,6 +92,18 @@ class Blocks:
         return rows[: len(rows) - max(int(begins[-1]) + SIZE - self.count, 0)] if len(begins) else rows
 
 
+def block_quantiles(values: np.ndarray, quantile: float) -> np.ndarray:
+    """(N,) for each row the lower quantile, in [0, 1), of the values (N,) in its block."""
+    blocks = -(-len(values) // SIZE)
+    ordered = np.full((blocks, SIZE), -np.inf, values.dtype)
+    ordered.reshape(-1)[: len(values)] = values
+    ordered.sort(axis=1)
+    counts = np.full(blocks, SIZE)
+    counts[-1:] = len(values) - SIZE * (blocks - 1)
+    found = ordered[np.arange(blocks), SIZE - counts + (quantile * counts).astype(int)]
+    return np.repeat(found, SIZE)[: len(values)]
+
+
 def spatial_order(means: np.ndarray) -> np.ndarray:
     """(N,) int64, an order of rows in which neighbours in space come near each other (a Z-order curve)."""
     if not len(means):

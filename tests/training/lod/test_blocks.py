@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from training.lod.blocks import SIZE, Blocks, spatial_order
+from training.lod.blocks import SIZE, Blocks, block_quantiles, spatial_order
 from training.rasterize import Gaussians, rasterize
 from training.scenes.cameras import Camera, look_at
 from training.splats.gaussians import Splats
@@ -91,3 +91,14 @@ def test_rows_of_blocks(splats):
     assert blocks.rows(np.zeros(41, bool)).size == 0
     nothing = Blocks.of(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
     assert nothing.rows(np.zeros(0, bool)).size == 0 and spatial_order(np.zeros((0, 3))).size == 0
+
+
+def test_quantiles_within_blocks():
+    values = np.random.default_rng(0).random(2 * SIZE + 100).astype(np.float32)
+    found = block_quantiles(values, 0.7)
+    for begin in (0, SIZE, 2 * SIZE):
+        block, kept = values[begin : begin + SIZE], (values >= found)[begin : begin + SIZE]
+        assert len(set(found[begin : begin + SIZE])) == 1
+        assert kept.mean() == pytest.approx(0.3, abs=1.1 / len(block))
+    assert (block_quantiles(values, 0.0) <= values).all()
+    assert block_quantiles(values[:0], 0.5).size == 0

@@ -34,9 +34,9 @@ class LodgeParameters(ThreedgsParameters):
     )
     keep: float = parameter(
         0.3,
-        "Where more than about this share of the next finer level would stay, more is removed, so that "
-        "levels are worth drawing in scenes of many small splats, too. 1 goes by the share of a pixel alone. "
-        "Not in the paper.",
+        "Where more than about this share of the next finer level would stay of splats that stand together, "
+        "more of them are removed, so that levels are worth drawing in scenes of many small splats, too. 1 "
+        "goes by the share of a pixel alone. Not in the paper.",
         above=0,
         high=1,
     )

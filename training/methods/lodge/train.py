@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from ...errors import LodgsError
-from ...lod.blocks import Blocks, spatial_order
+from ...lod.blocks import Blocks, block_quantiles, spatial_order
 from ...lod.rules.chunks import RULE, TABLE, member_columns
 from ...lod.streaming import BLOCKS, table_of_blocks
 from ...rasterize import Adam, Gaussians, Target, photometric_loss
@@ -31,6 +31,8 @@ from . import ROUNDS, LodgeParameters, chunks
 from .composite import IndexedLevel, Stack, filtered, rows_seen, seen_from_afar, together
 from .thresholds import MOST_CURVES, Thresholds
 
+THRESHOLD = "threshold"
+"""Column of the level in training: the least share of a pixel that keeps a splat at the last pruning."""
 FAR_VIEWS = 2
 """A place that so many training views have from a level's distance or farther is tuned and pruned by them."""
 
@@ -89,7 +91,6 @@ class Method(threedgs_train.Method):
         self.sets: dict[int, list[np.ndarray]] = {}
         self._blocks: Blocks | None = None  # of the level in training, as it was at its last pruning
         self._alone_share = p.tune_alone
-        self._threshold = p.prune_weight  # the least share of a pixel after the last pruning
         self._optimizer: SeenRows | None = None
 
     @property
@@ -223,8 +224,9 @@ class Method(threedgs_train.Method):
         found = self.importance(number)
         if local == 0:
             share = p.keep ** (self.levels - number)
-            self._threshold = max(p.prune_weight, float(np.quantile(found.numpy(), 1 - share)))
-        self.model.keep(found >= self._threshold * ROUNDS[local // p.tune_steps])
+            least = block_quantiles(found.numpy(), 1 - share)
+            self.model.columns[THRESHOLD] = torch.from_numpy(least.clip(min=p.prune_weight))
+        self.model.keep(found >= self.model.columns[THRESHOLD] * ROUNDS[local // p.tune_steps])
         require_rows(self.model, step, "prune_weight")
         self._blocks = self._smoothed(number).blocks
 
@@ -353,7 +355,6 @@ class Method(threedgs_train.Method):
         return {
             **super().state_dict(),
             "d_l": self.d_l, "finished": finished, "costs": self.costs, "alone": self._alone_share,
-            "threshold": self._threshold,
             "blocks": {} if blocks is None else {
                 "count": blocks.count, "low": torch.from_numpy(blocks.low),
                 "high": torch.from_numpy(blocks.high), "reach": torch.from_numpy(blocks.reach),
@@ -368,7 +369,6 @@ class Method(threedgs_train.Method):
     def load_state_dict(self, state: dict) -> None:
         super().load_state_dict(state)
         self.d_l, self.costs, self._alone_share = state["d_l"], state["costs"], state["alone"]
-        self._threshold = state["threshold"]
         self.finished = {
             number: IndexedLevel.of(Gaussians(**tensors)) for number, tensors in state["finished"].items()
         }
