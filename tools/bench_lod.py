@@ -35,12 +35,17 @@ from training.rasterize import Gaussians, Rendering
 from training.rasterize.resident import Resident
 from training.runs.capture import write_scene
 from training.scenes.cameras import Camera
+from training.scenes.colmap import read_scene
 from training.splats.bundle import Bundle, Level, read_bundle
 from training.splats.ply import columns_of, columns_of_extras, read_ply, write_ply
 
 REPEATS = 7
 DENSE = 40
 """Frames along the walk for each of its views, where jumps are looked for."""
+
+DISTANCES, CHUNKS = (20.0, 8.0), 64
+"""Of LODGE: from so many metres on its coarser levels are shown, and so many chunks. Left to itself it takes
+32 and 16 metres, and 16 chunks."""
 
 Draw = Callable[[Camera], Rendering]
 
@@ -210,8 +215,11 @@ def main() -> None:
     torch.set_num_threads(1)
     folder = options.out / f"town_{options.splats}"
     make_town(folder, options.splats, options.views)
-    full_size = "--image-scale", "1"
-    bundle = read_bundle(train(folder, "lodge", "--base", str(folder / "town.ply"), *full_size))
+    depth = read_scene(folder / "scene").median_depth()
+    distances = [round(metres / depth, 4) for metres in DISTANCES] + [0]
+    options_of_lodge = ["--base", str(folder / "town.ply"), "--image-scale", "1"]
+    options_of_lodge += ["--set", f"distances={distances}", "--set", f"chunks={CHUNKS}"]
+    bundle = read_bundle(train(folder, "lodge", *options_of_lodge))
     others = {name: read_bundle(train(folder, name)) for name in options.others}
     plan = town.plan_for(options.splats, 0)
     ways = {"walk": town.walk(plan, options.frames, 0.5), "flight": town.flight(plan, options.frames, 0.5)}

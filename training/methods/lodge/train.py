@@ -28,7 +28,15 @@ from ..model import NAMES
 from ..start import from_splats
 from ..threedgs import train as threedgs_train
 from . import ROUNDS, LodgeParameters, chunks
-from .composite import IndexedLevel, Stack, filtered, rows_seen, seen_from_afar, together
+from .composite import (
+    IndexedLevel,
+    Stack,
+    filtered,
+    room_taken_over,
+    rows_seen,
+    seen_from_afar,
+    together,
+)  # fmt: skip
 from .thresholds import MOST_CURVES, Thresholds
 
 THRESHOLD = "threshold"
@@ -226,7 +234,13 @@ class Method(threedgs_train.Method):
             share = p.keep ** (self.levels - number)
             least = block_quantiles(found.numpy(), 1 - share)
             self.model.columns[THRESHOLD] = torch.from_numpy(least.clip(min=p.prune_weight))
-        self.model.keep(found >= self.model.columns[THRESHOLD] * ROUNDS[local // p.tune_steps])
+        least = self.model.columns[THRESHOLD]
+        kept = found >= least * ROUNDS[local // p.tune_steps]
+        with torch.no_grad():
+            wider = room_taken_over(self.model["log_scales"].cpu().numpy(), found.numpy(), kept.numpy())
+            thinned = torch.from_numpy(wider).to(least) * (least > p.prune_weight)
+            self.model["log_scales"].add_(thinned[:, None])
+        self.model.keep(kept)
         require_rows(self.model, step, "prune_weight")
         self._blocks = self._smoothed(number).blocks
 
