@@ -39,8 +39,6 @@ from .composite import (
 )  # fmt: skip
 from .thresholds import MOST_CURVES, Thresholds
 
-THRESHOLD = "threshold"
-"""Column of the level in training: the least share of a pixel that keeps a splat at the last pruning."""
 FAR_VIEWS = 2
 """A place that so many training views have from a level's distance or farther is tuned and pruned by them."""
 
@@ -229,17 +227,16 @@ class Method(threedgs_train.Method):
         p, number, local = self.parameters, self.level_at(step), self._local(step)
         if local == 0:
             self._begin_level(number)
-        found = self.importance(number)
-        if local == 0:
-            share = p.keep ** (self.levels - number)
-            least = block_quantiles(found.numpy(), 1 - share)
-            self.model.columns[THRESHOLD] = torch.from_numpy(least.clip(min=p.prune_weight))
-        least = self.model.columns[THRESHOLD]
-        kept = found >= least * ROUNDS[local // p.tune_steps]
+        found, before = self.importance(number), (0.0, *ROUNDS)[local // p.tune_steps]
+        part = ROUNDS[local // p.tune_steps]
+        # of what stands together, so that the rounds come to the level's share of the finest one's splats
+        share = p.keep ** ((self.levels - number) * (part - before))
+        least = torch.from_numpy(block_quantiles(found.numpy(), 1 - share))
+        thinned = least > p.prune_weight * part
+        kept = found >= least.clamp_min(p.prune_weight * part)
         with torch.no_grad():
             wider = room_taken_over(self.model["log_scales"].cpu().numpy(), found.numpy(), kept.numpy())
-            thinned = torch.from_numpy(wider).to(least) * (least > p.prune_weight)
-            self.model["log_scales"].add_(thinned[:, None])
+            self.model["log_scales"].add_((torch.from_numpy(wider) * thinned).to(self.device)[:, None])
         self.model.keep(kept)
         require_rows(self.model, step, "prune_weight")
         self._blocks = self._smoothed(number).blocks

@@ -186,8 +186,8 @@ def test_levels_of_an_antialiased_base_are_found_and_drawn_so(data, base):
 
 
 def test_what_hardly_shows_goes_and_what_shows_stays(data, base):
-    all_of_it = make(data, base, prune_weight=0.0, distances=[1.2, 0.8, 0.0])
-    some = make(data, base, prune_weight=0.3, distances=[1.2, 0.8, 0.0])
+    all_of_it = make(data, base, prune_weight=0.0, keep=1.0, distances=[1.2, 0.8, 0.0])
+    some = make(data, base, prune_weight=0.3, keep=1.0, distances=[1.2, 0.8, 0.0])
     for lodge in (all_of_it, some):
         trained(lodge, until=1)
     assert len(all_of_it.model) == len(base)
@@ -195,6 +195,12 @@ def test_what_hardly_shows_goes_and_what_shows_stays(data, base):
     assert len(some.model) < len(base)
     # the first of three prunings takes a fifth of the threshold; the step in between changes little
     assert len(some.model) == pytest.approx(int((weights >= 0.06).sum()), abs=2)
+
+
+def test_levels_keep_their_share_at_most(data, base):
+    levels = trained(make(data, base, prune_weight=0.0, keep=0.4, distances=[1.2, 0.8, 0.0]))
+    shares = {level.number: len(level.splats) / len(base) for level in levels}
+    assert shares[2] == pytest.approx(0.4, abs=0.06) and shares[1] == pytest.approx(0.16, abs=0.06)
 
 
 def test_what_stays_takes_over_the_room_of_what_goes():
