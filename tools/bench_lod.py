@@ -43,9 +43,9 @@ REPEATS = 7
 DENSE = 40
 """Frames along the walk for each of its views, where jumps are looked for."""
 
-DISTANCES, CHUNKS = (20.0, 8.0), 64
-"""Of LODGE: from so many metres on its coarser levels are shown, and so many chunks. Left to itself it takes
-32 and 16 metres, and 16 chunks."""
+DISTANCES, CHUNKS, KEEP = (20.0, 8.0), 64, 0.35
+"""Of LODGE: from so many metres on its coarser levels are shown, so many chunks, and the share of splats
+that a coarser level keeps. Left to itself it takes 32 and 16 metres, and 16 chunks."""
 
 Draw = Callable[[Camera], Rendering]
 
@@ -218,7 +218,14 @@ def main() -> None:
     depth = read_scene(folder / "scene").median_depth()
     distances = [round(metres / depth, 4) for metres in DISTANCES] + [0]
     options_of_lodge = ["--base", str(folder / "town.ply"), "--image-scale", "1"]
-    options_of_lodge += ["--set", f"distances={distances}", "--set", f"chunks={CHUNKS}"]
+    options_of_lodge += [
+        "--set",
+        f"distances={distances}",
+        "--set",
+        f"chunks={CHUNKS}",
+        "--set",
+        f"keep={KEEP}",
+    ]
     bundle = read_bundle(train(folder, "lodge", *options_of_lodge))
     others = {name: read_bundle(train(folder, name)) for name in options.others}
     plan = town.plan_for(options.splats, 0)

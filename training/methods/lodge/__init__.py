@@ -33,10 +33,10 @@ class LodgeParameters(ThreedgsParameters):
         high=1,
     )
     keep: float = parameter(
-        0.3,
-        "Where more than about this share of the next finer level would stay of splats that stand together, "
-        "more of them are removed, so that levels are worth drawing in scenes of many small splats, too. 1 "
-        "goes by the share of a pixel alone. Not in the paper.",
+        1.0,
+        "At most about this share of the next finer level's splats stays, of those that stand together; "
+        "what stays takes over the room of what goes. For scenes of many small splats, of which each has a "
+        "fair share of some pixel: 0.3 to 0.4 there. Not in the paper.",
         above=0,
         high=1,
     )
@@ -104,7 +104,6 @@ _PAPER = replace(
     least_weight=0.02,
     tune_alone=0.0,
     prune_weight=0.02,
-    keep=1.0,
 )
 
 METHOD = MethodInfo(
@@ -115,6 +114,6 @@ METHOD = MethodInfo(
     parameters=LodgeParameters,
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     rule="chunks",
-    offered=("levels", "max_splats", "prune_weight", "chunks"),
+    offered=("levels", "max_splats", "prune_weight", "keep", "chunks"),
     from_base=True,
 )
