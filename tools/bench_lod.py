@@ -43,9 +43,10 @@ REPEATS = 7
 DENSE = 40
 """Frames along the walk for each of its views, where jumps are looked for."""
 
-DISTANCES, CHUNKS, KEEP = (20.0, 8.0), 64, 0.35
-"""Of LODGE: from so many metres on its coarser levels are shown, so many chunks, and the share of splats
-that a coarser level keeps. Left to itself it takes 32 and 16 metres, and 16 chunks."""
+DISTANCES = (24.0, 10.0)
+"""From so many metres on LODGE's coarser levels are shown. Left to itself it takes 32 and 16."""
+LODGE = {"chunks": 64, "keep": 0.35, "prune_weight": 0.03, "tune_steps": 240}
+"""Its other parameters: for 3 million splats 11 cm apart, of which each has a fair share of some pixel."""
 
 Draw = Callable[[Camera], Rendering]
 
@@ -218,14 +219,8 @@ def main() -> None:
     depth = read_scene(folder / "scene").median_depth()
     distances = [round(metres / depth, 4) for metres in DISTANCES] + [0]
     options_of_lodge = ["--base", str(folder / "town.ply"), "--image-scale", "1"]
-    options_of_lodge += [
-        "--set",
-        f"distances={distances}",
-        "--set",
-        f"chunks={CHUNKS}",
-        "--set",
-        f"keep={KEEP}",
-    ]
+    for name, value in {"distances": distances, **LODGE}.items():
+        options_of_lodge += ["--set", f"{name}={value}"]
     bundle = read_bundle(train(folder, "lodge", *options_of_lodge))
     others = {name: read_bundle(train(folder, name)) for name in options.others}
     plan = town.plan_for(options.splats, 0)
