@@ -19,6 +19,7 @@ from mathutils import Matrix
 from ...training.errors import LodgsError
 from ...training.lod.rule import Control, Tables, find_rule
 from ...training.lod.selection import complete, known_rule, unknown_rule
+from ...training.methods import METHODS
 from ...training.scenes.colmap import Scene, read_scene
 from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder
 from ...training.splats.gaussians import Splats
@@ -179,7 +180,7 @@ def import_splats(
         set_bundle_facts(root, bundle)
         set_tables(root, bundle.tables)
         root.lodgs.single_level = bundle.levels[-1].number
-        root.lodgs.training.method = "lodge"  # the one that gives levels to splats that are there
+        root.lodgs.training.method = next(info.name for info in METHODS.values() if info.for_splats)
     if bundle.rule and not root.lodgs.by_distance:
         warn(" ".join(unknown_rule(bundle.rule)))
     return root

@@ -31,6 +31,7 @@ class MethodInfo:
         rule: the name of the rule that chooses its detail (``training.lod``); "" for none.
         offered: the parameters that a panel shows, beside the presets.
         from_base: whether training can begin with splats (a job's ``base``) instead of the scene's points.
+        for_splats: whether it is what to offer first for splats that are there already.
         retired: names of parameters that earlier versions wrote into job files without any effect.
         package: the folder as a module, set where the method is found.
     """
@@ -44,6 +45,7 @@ class MethodInfo:
     rule: str = ""
     offered: tuple[str, ...] = ()
     from_base: bool = False
+    for_splats: bool = False
     retired: tuple[str, ...] = ()
     package: str = ""
 

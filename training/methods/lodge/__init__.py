@@ -116,4 +116,5 @@ METHOD = MethodInfo(
     rule="chunks",
     offered=("levels", "max_splats", "prune_weight", "keep", "chunks"),
     from_base=True,
+    for_splats=True,
 )
