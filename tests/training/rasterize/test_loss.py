@@ -6,6 +6,7 @@ import torch
 from scipy.ndimage import correlate1d
 
 from training.rasterize import Target, photometric_loss
+from training.rasterize.cpu.loss import loss_and_gradient, moments_of
 
 
 def scipy_loss(image, truth, ssim_weight):
@@ -46,6 +47,24 @@ def test_the_fused_gradient_is_autograds(size):
         (3 * photometric_loss(image, Target(truth.to(kind)), backend=backend)).backward()
         gradients.append(image.grad.double())
     assert (gradients[0] - gradients[1]).norm() <= 1e-4 * gradients[1].norm()
+
+
+@pytest.mark.parametrize("size", [(48, 64), (37, 53)])
+def test_the_same_bits_wherever_the_system_puts_arrays(size):
+    """A loop that adds up and writes may be compiled twice: for arrays that overlap, and for others."""
+    random = np.random.default_rng(0)
+    truth, image = random.random((2, 3, *size), dtype=np.float32)
+    found, taken = set(), []
+    for _ in range(400):
+        arrays = []
+        for array in (image, truth):
+            taken[:] = [
+                np.empty(length, np.uint8) for length in random.integers(100, 20_000, random.integers(30))
+            ]
+            arrays.append(array.copy())
+        loss, gradient = loss_and_gradient(*arrays, moments_of(arrays[1]), 0.2)
+        found.add((loss, gradient.tobytes()))
+    assert len(found) == 1
 
 
 def test_what_is_masked_out_costs_nothing(backend):

@@ -1,4 +1,8 @@
-"""L1 and structural similarity with their gradient, in two passes over blocks that fit the L1 cache."""
+"""L1 and structural similarity with their gradient, in two passes over blocks that fit the L1 cache.
+
+Loops that add up write nothing else: of one that does, the compiler makes two, and which of them runs, and
+so in which order it adds, hangs on where the system put the arrays.
+"""
 
 from __future__ import annotations
 
@@ -141,6 +145,7 @@ def similarity(begin, end, image, truth, moments_of_y, by_moments, sums):
                 of_y[0, j] = value
             for j in range(columns):
                 total += of_y[0, j]
+            for j in range(columns):
                 for k in range(3):
                     by_moments[k, channel, y0 + r, x0 + j] = moments[k, r, j]
         sums[block] = total
@@ -165,8 +170,9 @@ def loss_gradient(begin, end, image, truth, by_moments, l1_weight, ssim_weight, 
         total = ZERO
         for r in range(rows):
             for j in range(columns):
+                total += abs(image[channel, y0 + r, x0 + j] - truth[channel, y0 + r, x0 + j])
+            for j in range(columns):
                 x, y = image[channel, y0 + r, x0 + j], truth[channel, y0 + r, x0 + j]
-                total += abs(x - y)
                 sign = ONE if x > y else (-ONE if x < y else ZERO)
                 through_ssim = back[0, r, j] + TWO * x * back[1, r, j] + y * back[2, r, j]
                 gradient[channel, y0 + r, x0 + j] = l1_weight * sign - ssim_weight * through_ssim
