@@ -70,7 +70,7 @@ def controls_page() -> str:
         listed = [
             f"{what}: {', '.join(f'`{name}`' for name in names)}" for what, names in needs.items() if names
         ]
-        adds = "add up" if rule.cumulative else "replace one another"
+        adds = "add up" if rule.cumulative else "replace one another" if rule.complete else "belong together"
         always = " Its weights always count, for one level too." if rule.always else ""
         parts.append(f"Levels {adds}.{always} It needs {'; '.join(listed) or 'nothing else'}.")
     return "\n\n".join(parts) + "\n"

@@ -9,6 +9,7 @@ from plyfile import PlyData
 
 from training.lod.rule import rules
 from training.lod.rules.chunks import member_columns
+from training.lod.rules.cut import RULE
 from training.lod.selection import select_levels, settings
 from training.splats.bundle import Bundle, Level, read_bundle, read_folder, write_bundle, write_folder
 from training.splats.gaussians import Splats
@@ -20,6 +21,7 @@ FOCAL = (60.0, 500.0, 1333.3)
 CHOICES = {
     "bands": [{}, {"gamma": 0.3}, {"gamma": 4, "first": 1}, {"first": 2, "last": 4}, {"first": 1, "last": 1}],
     "chunks": [{}, {"distance_scale": 0.3}, {"distance_scale": 7.7, "chunks": 0}, {"fade": 0}],
+    "cut": [{}, {"pixels": 0.2}, {"pixels": 3.7}, {"pixels": 41.5}],
     "decay": [{}, {"s_v": 1.7}, {"s_v": 4}, {"at_most": 120}, {"at_most": 17, "s_v": 2}],
     "octree": [{}, {"offset": 1.7}, {"offset": -3.1}, {"fade": 0}, {"fade": 0, "offset": 0.6}],
 }
@@ -85,6 +87,7 @@ class Page:
             "octree": (self.octree, {"offset": 0, "fade": 1}),
             "decay": (self.decay, {"s_v": 1, "at_most": 0}),
             "chunks": (self.chunks, {"distance_scale": 1, "chunks": 1, "fade": 1}),
+            "cut": (self.cut, {"pixels": 1}),
         }[self.rule]
         self.eye = np.array(eye, float)
         values = defaults | self.controls | given
@@ -130,6 +133,13 @@ class Page:
             return (self.columns[n][f"chunks_{c // 24}"].astype(int) >> c % 24) % 2
 
         return u * ((1 - share) * inside(a) + share * inside(b)) + (1 - u) * w
+
+    def cut(self, n: int, d: np.ndarray, f: float, values: dict) -> np.ndarray:
+        k, columns = np.float32(max(f / values["pixels"], 32)), self.columns[n]
+        parent = np.stack([columns[f"parent_{axis}"] for axis in "xyz"], axis=1)
+        to_parent = np.sqrt(((parent - np.float32(self.eye)) ** 2).sum(axis=1))
+        with np.errstate(over="ignore"):
+            return (d >= k * columns["node_size"]) & ~(to_parent >= k * columns["parent_size"])
 
     def octree(self, n: int, d: np.ndarray, f: float, values: dict) -> np.ndarray:
         bias = self.columns[n].get("lod_bias", np.zeros(len(d), np.float32)) + np.float32(values["offset"])
@@ -200,7 +210,15 @@ def made(tmp_path):
     }
     table = {"chunks": centres | {"radius": np.full(30, 2, np.float32)}}
     chunks = Bundle("lodge", in_chunks, "chunks", tables=table)
+    of_tree = levels({1: {}, 2: {}}, RULE.columns)
+    for level, (own, its_parent) in zip(of_tree, ((0.03, 0.2), (0.0, 0.06)), strict=True):
+        columns = level.splats.extras
+        columns["node_size"] = np.float32(own) * abs(columns["node_size"])
+        columns["parent_size"] = columns["node_size"] + np.float32(its_parent) * abs(columns["parent_size"])
+        columns["parent_size"][:1] = 3e38
+    tree = Bundle("tree", of_tree, "cut", controls={"pixels": 2.5})
     bundles = {
+        "tree": tree,
         "distances": distances,
         "chunks": chunks,
         "bands": bands,
@@ -233,6 +251,8 @@ WRITTEN_NOW = (
     "decay",
     "decay folder",
     "farthest",
+    "tree",
+    "tree folder",
 )
 
 

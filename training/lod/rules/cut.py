@@ -1,0 +1,99 @@
+"""A LoD of Gaussians' rule (Anonymous 2025, Sec. 4.3): a cut through a tree of splats, node by node."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..rule import NO_TABLES, Control, Rule, Values, distances
+
+NODE_SIZE, PARENT_SIZE = "node_size", "parent_size"
+"""Columns of sizes, in scene units: a splat's own, 0 for leaves, and its parent's."""
+PARENT = ("parent_x", "parent_y", "parent_z")
+"""Columns of the parent's mean."""
+ABOVE_ROOT = 3.0e38
+"""The parent size of the root, which has none: larger than any distance, and finite, as files have it."""
+K_LEAST = 32.0
+"""The least detail of an eye: sizes are made so that cuts are proper from there on."""
+ROUNDING = 2.0**-20
+"""Share by which a parent's size is larger still: 16 units in float32's last place, of which comparing a
+distance with k size, for parent and child, can get 9 wrong."""
+STEP = 1.25
+"""Factor by which a viewer's budget raises the granularity at a time."""
+
+
+def detail_of(focal_px: float, pixels: float) -> float:
+    """k: the distance, over a node's size, from which on the node is fine enough for an eye."""
+    return max(focal_px / pixels, K_LEAST)
+
+
+def acceptable(means: np.ndarray, sizes: np.ndarray, eye: np.ndarray, k: float) -> np.ndarray:
+    """(N,) bool, which nodes are fine enough: ‖c - μ‖ >= k size.
+
+    The same bits wherever the same node is asked for, as itself or as a parent: all is float32, operation by
+    operation.
+
+    Args:
+        means: (N, 3) float32.
+        sizes: (N,) float32.
+        eye: (3,).
+        k: see :func:`detail_of`.
+    """
+    with np.errstate(over="ignore"):
+        return distances(means, eye) >= np.float32(k) * sizes
+
+
+def least_size(child_sizes: np.ndarray, away: np.ndarray) -> np.ndarray:
+    """The least sizes (N,) float64 of parents that keep cuts proper, rounding in float32 included.
+
+    size_child + away / K_LEAST: where a parent is fine enough, ‖c - μ_p‖ >= k size_p, its child is, because
+    ‖c - μ_c‖ >= ‖c - μ_p‖ - away >= k size_p - away >= k size_child for every k >= K_LEAST.
+
+    Args:
+        child_sizes: (N,).
+        away: (N,) distances of the children's means from their parents'.
+    """
+    return (child_sizes + np.asarray(away, np.float64) / K_LEAST) * (1 + ROUNDING)
+
+
+class Cut(Rule):
+    """1 where a node is fine enough and its parent is not, 0 elsewhere (Eq. 5).
+
+    A node is fine enough where its size, sqrt(s1 s2 + s1 s3 + s2 s3) of its scales (Eq. 6), covers no more
+    than ``pixels`` pixels. Two levels: the leaves, which are the full model and always fine enough, and the
+    nodes above them.
+
+    Sizes are saturated (:func:`least_size`), which is not in the paper. So from every eye whose k is at least
+    K_LEAST a node that is fine enough has no descendant that is not, and of every leaf and the nodes above it
+    exactly one is drawn. The paper's M_d has the same triangle inequality with the root of an SPT, and its
+    Eq. 5 is proper only as long as training leaves the heap condition whole.
+    """
+
+    name = "cut"
+    complete = False
+    columns = (NODE_SIZE, PARENT_SIZE, *PARENT)
+    controls = (
+        Control(
+            "pixels", 1.0, 0.1, 100.0, "Granularity",
+            "A splat stands for all that is below it in the tree where it covers no more than so many "
+            "pixels. Smaller is finer",
+            soft=(0.5, 16.0), unit="PIXEL",
+        ),
+    )  # fmt: skip
+    sweep = ("pixels", (0.5, 1.0, 2.0, 4.0, 8.0, 16.0))
+
+    def weights(self, means, eye, focal_px, columns, facts, values, tables=NO_TABLES) -> np.ndarray:
+        k = detail_of(focal_px, values["pixels"])
+        shown = acceptable(means, columns[NODE_SIZE], eye, k)
+        some = np.flatnonzero(shown)
+        parents = np.stack([columns[name][some] for name in PARENT], axis=1)
+        shown[some] = ~acceptable(parents, columns[PARENT_SIZE][some], eye, k)
+        return shown.astype(np.float32)
+
+    def coarser(self, values: Values, levels: Sequence[int]) -> Values | None:
+        pixels = values["pixels"] * STEP
+        return {**values, "pixels": pixels} if pixels <= self.controls[0].high else None
+
+
+RULE = Cut()
