@@ -18,7 +18,7 @@ from mathutils import Matrix
 
 from ...training.errors import LodgsError
 from ...training.lod.rule import Control, Tables, find_rule
-from ...training.lod.selection import complete, known_rule, unknown_rule
+from ...training.lod.selection import complete, known_rule, not_alone, unknown_rule
 from ...training.methods import METHODS
 from ...training.scenes.colmap import Scene, read_scene
 from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder
@@ -199,7 +199,7 @@ def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
     settings, rule = root.lodgs, known_rule(bundle)
     for control in rule.controls if rule else ():
         control.checked(bundle.controls.get(control.name, control.default))
-    if rule is not None and rule.always and settings.rule != bundle.rule:
+    if rule is not None and (rule.always or not rule.complete) and settings.rule != bundle.rule:
         settings.mode = "SELECTIVE"
     settings.method, settings.rule, settings.cumulative = bundle.method, bundle.rule, bundle.cumulative
     settings.facts, settings.meta = json.dumps(bundle.facts), json.dumps(bundle.meta)
@@ -302,11 +302,12 @@ def read_level(root: bpy.types.Object, number: int) -> Splats:
     """One level with all that artists have changed in it; where levels add up, with all coarser ones.
 
     Raises:
-        LodgsError: there is no such level.
+        LodgsError: there is no such level, or it is no scene by itself.
     """
     bundle = read_levels(root)
     for level in bundle.levels:
         if level.number == number:
+            _require_alone(root, number)
             return complete(bundle, level)
     raise LodgsError(f"{root.name} has no level {number}.", "Choose one from the list of levels.")
 
@@ -349,7 +350,12 @@ def count_shown(context: bpy.types.Context, root: bpy.types.Object) -> tuple[int
 
 
 def show_only(root: bpy.types.Object, number: int) -> None:
-    """Shows one level everywhere; where levels add up, with all coarser ones."""
+    """Shows one level everywhere; where levels add up, with all coarser ones.
+
+    Raises:
+        LodgsError: it is no scene by itself.
+    """
+    _require_alone(root, number)
     root.lodgs.mode, root.lodgs.single_level = "SINGLE", number
     for item in root.lodgs.levels:
         if item.number == number or (root.lodgs.cumulative and item.number < number):
@@ -383,6 +389,12 @@ def _new_scene(context: bpy.types.Context, name: str) -> Iterator[bpy.types.Obje
         obj.select_set(False)
     context.view_layer.objects.active = root
     root.select_set(True)
+
+
+def _require_alone(root: bpy.types.Object, number: int) -> None:
+    finest = max((item.number for item in root.lodgs.levels if item.exists), default=number)
+    if number < finest and not root.lodgs.complete:
+        raise LodgsError(*not_alone(number, finest))
 
 
 def _visible(context: bpy.types.Context, item) -> bool:

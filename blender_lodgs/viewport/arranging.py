@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ...training.lod.choice import Choice, Chooser
-from ...training.lod.rule import OPACITY
+from ...training.lod.rule import OPACITY, rules
 
 WIDTH = 8192
 """Texels in a row of every texture that holds one texel for each of many splats."""
@@ -176,7 +176,7 @@ def _drawn(pool: Pool, request: Request) -> Drawn:
         own = pool.means[placement.first : placement.first + placement.count, :3][index]
         rows = table[begin : begin + len(index)]
         rows[:, 0], rows[:, 1], rows[:, 2] = index + placement.first, weight, number
-        rows[:, 3] = _color_levels(placement, own)
+        rows[:, 3] = _color_levels(pool, placement, index, own)
         means.append(own)
         begin += len(index)
     return Drawn(request.choices, table, means, left_out)
@@ -250,8 +250,13 @@ def _thin(pool: Pool, placements, chosen, which: Sequence[int], keep: int) -> No
         start += len(part)
 
 
-def _color_levels(placement: Placement, means: np.ndarray) -> np.ndarray | int:
-    """Which level's colour splats at means (M, 3) get."""
+def _color_levels(
+    pool: Pool, placement: Placement, index: np.ndarray, means: np.ndarray
+) -> np.ndarray | float:
+    """Which level's colour a placement's splats (M,) at means (M, 3) get."""
+    if placement.tell == "LEVELS" and placement.choice is not None:
+        own, place = rules()[placement.choice.rule].columns, index + placement.first
+        return placement.choice.told_level({n: pool.columns[n][place] for n in own if n in pool.columns})
     if placement.tell == "BANDS" and placement.choice is not None:
         return placement.choice.wanted_level(means)
     if placement.tell == "CHUNKS" and placement.choice is not None:
