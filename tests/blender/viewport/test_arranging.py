@@ -285,6 +285,29 @@ def test_coarser_levels_stand_in_for_the_finest(bpy, lodgs):
     assert [len(index) for index, _ in chosen] == [300, 0, 0]
 
 
+def test_a_budget_finds_its_choice_by_asking_a_few(bpy, lodgs, monkeypatch):
+    """The same one as by asking all, of which it asks twice, whatever the number of steps to it."""
+    rng, arranging = np.random.default_rng(4), lodgs("viewport.arranging")
+    count, asked = 400_000, []
+    pool, _ = pool_of(lodgs, [random_set(rng, count)])
+    pool.columns.update(
+        node_size=np.zeros(count, np.float32), parent_x=np.ones(count, np.float32),
+        parent_size=np.float32(rng.uniform(0, 0.01, count)),
+    )  # fmt: skip
+    by = choice(lodgs, "cut", 1000.0, {"level": 2.0, "levels": 2.0}, {"pixels": 1.0})
+    truth, budget = by, 100_000
+    while len(pool.chooser(placed(lodgs, 0, count, level=2)).chosen(truth)[0]) > budget:
+        truth = truth.coarser([1, 2])
+    assert dict(truth.values)["pixels"] > 2
+    choose = arranging._choose
+    monkeypatch.setattr(arranging, "_choose", lambda *a: asked.append(a) or choose(*a))
+    ((index, _),), left_out = arranging.within_budget(
+        pool, [placed(lodgs, 0, count, level=2, choice=by)], budget
+    )
+    assert np.array_equal(index, pool.chooser(placed(lodgs, 0, count, level=2)).chosen(truth)[0])
+    assert len({placement.choice for _, placement in asked}) <= 3 and left_out > budget
+
+
 def test_colours_tell_levels_and_distances(bpy, lodgs):
     rng = np.random.default_rng(3)
     arranging = lodgs("viewport.arranging")
