@@ -17,11 +17,12 @@ import numpy as np
 from mathutils import Matrix
 
 from ...training.errors import LodgsError
+from ...training.lod.paging import read_within
 from ...training.lod.rule import Control, Tables, find_rule
 from ...training.lod.selection import complete, known_rule, not_alone, unknown_rule
 from ...training.methods import METHODS
 from ...training.scenes.colmap import Scene, read_scene
-from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder
+from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder, read_head
 from ...training.splats.gaussians import Splats
 from ..nodes import ellipsoids
 from . import objects, selection, tables
@@ -154,11 +155,13 @@ def import_splats(
     path: Path | str,
     *,
     upright: bool = True,
+    budget: int = 0,
     warn: Callable[[str], object] = print,
 ) -> bpy.types.Object:
     """A bundle, a folder of levels, or any 3DGS PLY as a single level, as a new splat scene.
 
     Args:
+        budget: most splats of a tree of splats, whose coarser ones stand for the others then; 0: all.
         upright: turn the root as the bundle says, or without that so that -y, which is up in most splat
             files, is up; otherwise leave the axes.
         warn: receives a sentence for each thing that is shown otherwise than the file's maker shows it.
@@ -170,7 +173,13 @@ def import_splats(
         LodgsError: the file cannot be read, or what it says is not possible. Nothing is left behind then.
     """
     path = Path(path)
-    bundle = (read_folder if path.is_dir() else read_bundle)(path, warn)
+    if budget and not path.is_dir() and read_head(path).rule == "cut":
+        bundle, total = read_within(path, budget)
+        here = sum(len(level.splats) for level in bundle.levels)
+        if here < total:
+            warn(f"{here:,} of {total:,} splats are here: coarser ones stand for the others.")
+    else:
+        bundle = (read_folder if path.is_dir() else read_bundle)(path, warn)
     with _new_scene(context, path.stem) as root:
         if upright:
             rows = bundle.meta.get("up_rotation", ((1, 0, 0), (0, 0, 1), (0, -1, 0)))

@@ -314,7 +314,7 @@ def distances(means: np.ndarray, eye: np.ndarray) -> np.ndarray:
 
     Axis by axis, which numpy does four times as fast as rows of three.
     """
-    return distances_by_axes(means.T, eye)
+    return distances_by_axes([*means.T], eye)
 
 
 def distances_by_axes(axes: Sequence[np.ndarray], eye: np.ndarray) -> np.ndarray:

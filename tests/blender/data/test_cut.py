@@ -103,6 +103,26 @@ def test_a_bundle_comes_back_as_the_same_tree(bpy, lodgs, tree, root, tmp_path):
         np.testing.assert_array_equal(other.splats.means, one.splats.means)
 
 
+def test_the_top_of_a_tree_can_be_imported(bpy, lodgs, tree, root, tmp_path):
+    """As a smaller tree: of each leaf and the nodes above it one is there, whatever the eye."""
+    said, budget = [], 2000
+    root = lodgs("data.scenes").import_splats(
+        bpy.context, tmp_path / "tree.ply", budget=budget, warn=said.append
+    )
+    counts = [len(item.object.data.points) for item in root.lodgs.levels]
+    assert 1900 < sum(counts) <= budget and counts[1] == counts[0] + 1  # a binary tree
+    assert said == [
+        f"{sum(counts):,} of {2 * LEAVES - 1:,} splats are here: coarser ones stand for the others."
+    ]
+    root.lodgs.mode = "SINGLE"
+    assert [len(rows) for rows in shown_rows(bpy, lodgs, root)] == [0, counts[1]]
+    bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "tree.ply"), budget=budget)
+    again = lodgs("data.scenes").active_root(bpy.context)
+    assert [len(item.object.data.points) for item in again.lodgs.levels] == counts
+    everything = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "tree.ply", budget=10**6)
+    assert [len(item.object.data.points) for item in everything.lodgs.levels] == [LEAVES - 1, LEAVES]
+
+
 def test_colours_tell_sizes(bpy, lodgs):
     """Each colour is an octave of what a splat stands for, leaves have the last."""
     rule = lodgs("training.lod.rule").rules()["cut"]

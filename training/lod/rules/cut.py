@@ -96,7 +96,7 @@ class Cut(Rule):
             parents, sizes = [columns[name][block] for name in PARENT], columns[NODE_SIZE][block]
             chosen = ~acceptable(parents, columns[PARENT_SIZE][block], eye, k)
             if sizes.any() and chosen.any():  # there are others than leaves, and some are not too fine
-                chosen &= acceptable(means[block].T, sizes, eye, k)
+                chosen &= acceptable([*means[block].T], sizes, eye, k)
             shown[block] = chosen
         return shown
 
