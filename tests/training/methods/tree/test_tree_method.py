@@ -91,7 +91,9 @@ def test_sizes_are_saturated_after_training(data, base):
 
 
 def test_a_step_moves_the_cut_of_its_view_alone(data, base):
-    tree = make(data, base, lod_noise=0.0, pixels=20.0)
+    middle = base.means.mean(axis=0)
+    far = replace(base, means=middle + (base.means - middle) / 30, log_scales=base.log_scales - np.float32(3))
+    tree = make(data, far, lod_noise=0.0)
     trained(tree, until=4)
     before = {name: tensor.detach().clone() for name, tensor in tree.model.adam.tensors.items()}
     tree.train_step(4)
