@@ -39,8 +39,9 @@ def _finest(self) -> int:
 
 
 def _single_changed(self, context) -> None:
-    if self.single_level > _finest(self):
-        self.single_level = _finest(self)
+    most = _finest(self)
+    if self.single_level > most or (self.levels and not self.complete and self.single_level < most):
+        self.single_level = most
     _changed(self, context)
 
 
@@ -304,7 +305,9 @@ class SplatScene(bpy.types.PropertyGroup):
             (
                 "LEVELS",
                 "Levels",
-                "Which level is where: violet (coarse), blue, teal, yellow, red and on",
+                "Which level is where: violet (coarse), blue, teal, yellow, red and on. In a tree of splats, "
+                "how large what a splat stands for is: each colour is half the size of the one before, white "
+                "the finest level",
             ),
             (
                 "BANDS",
@@ -322,6 +325,11 @@ class SplatScene(bpy.types.PropertyGroup):
     def by_distance(self) -> bool:
         """Whether the levels say at which distances they are to be shown, in a way that is known here."""
         return self.rule in rules()
+
+    @property
+    def complete(self) -> bool:
+        """Whether each level is a scene by itself, see ``Rule.complete``; else only the finest is."""
+        return not self.by_distance or rules()[self.rule].complete
 
     @property
     def controls(self) -> bpy.types.PropertyGroup | None:

@@ -17,11 +17,12 @@ import numpy as np
 from mathutils import Matrix
 
 from ...training.errors import LodgsError
+from ...training.lod.paging import read_within
 from ...training.lod.rule import Control, Tables, find_rule
-from ...training.lod.selection import complete, known_rule, unknown_rule
+from ...training.lod.selection import complete, known_rule, not_alone, unknown_rule
 from ...training.methods import METHODS
 from ...training.scenes.colmap import Scene, read_scene
-from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder
+from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder, read_head
 from ...training.splats.gaussians import Splats
 from ..nodes import ellipsoids
 from . import objects, selection, tables
@@ -154,11 +155,13 @@ def import_splats(
     path: Path | str,
     *,
     upright: bool = True,
+    budget: int = 0,
     warn: Callable[[str], object] = print,
 ) -> bpy.types.Object:
     """A bundle, a folder of levels, or any 3DGS PLY as a single level, as a new splat scene.
 
     Args:
+        budget: most splats of a tree of splats, whose coarser ones stand for the others then; 0: all.
         upright: turn the root as the bundle says, or without that so that -y, which is up in most splat
             files, is up; otherwise leave the axes.
         warn: receives a sentence for each thing that is shown otherwise than the file's maker shows it.
@@ -170,7 +173,13 @@ def import_splats(
         LodgsError: the file cannot be read, or what it says is not possible. Nothing is left behind then.
     """
     path = Path(path)
-    bundle = (read_folder if path.is_dir() else read_bundle)(path, warn)
+    if budget and not path.is_dir() and read_head(path).rule == "cut":
+        bundle, total = read_within(path, budget)
+        here = sum(len(level.splats) for level in bundle.levels)
+        if here < total:
+            warn(f"{here:,} of {total:,} splats are here: coarser ones stand for the others.")
+    else:
+        bundle = (read_folder if path.is_dir() else read_bundle)(path, warn)
     with _new_scene(context, path.stem) as root:
         if upright:
             rows = bundle.meta.get("up_rotation", ((1, 0, 0), (0, 0, 1), (0, -1, 0)))
@@ -199,7 +208,7 @@ def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
     settings, rule = root.lodgs, known_rule(bundle)
     for control in rule.controls if rule else ():
         control.checked(bundle.controls.get(control.name, control.default))
-    if rule is not None and rule.always and settings.rule != bundle.rule:
+    if rule is not None and (rule.always or not rule.complete) and settings.rule != bundle.rule:
         settings.mode = "SELECTIVE"
     settings.method, settings.rule, settings.cumulative = bundle.method, bundle.rule, bundle.cumulative
     settings.facts, settings.meta = json.dumps(bundle.facts), json.dumps(bundle.meta)
@@ -302,11 +311,12 @@ def read_level(root: bpy.types.Object, number: int) -> Splats:
     """One level with all that artists have changed in it; where levels add up, with all coarser ones.
 
     Raises:
-        LodgsError: there is no such level.
+        LodgsError: there is no such level, or it is no scene by itself.
     """
     bundle = read_levels(root)
     for level in bundle.levels:
         if level.number == number:
+            _require_alone(root, number)
             return complete(bundle, level)
     raise LodgsError(f"{root.name} has no level {number}.", "Choose one from the list of levels.")
 
@@ -349,7 +359,12 @@ def count_shown(context: bpy.types.Context, root: bpy.types.Object) -> tuple[int
 
 
 def show_only(root: bpy.types.Object, number: int) -> None:
-    """Shows one level everywhere; where levels add up, with all coarser ones."""
+    """Shows one level everywhere; where levels add up, with all coarser ones.
+
+    Raises:
+        LodgsError: it is no scene by itself.
+    """
+    _require_alone(root, number)
     root.lodgs.mode, root.lodgs.single_level = "SINGLE", number
     for item in root.lodgs.levels:
         if item.number == number or (root.lodgs.cumulative and item.number < number):
@@ -383,6 +398,12 @@ def _new_scene(context: bpy.types.Context, name: str) -> Iterator[bpy.types.Obje
         obj.select_set(False)
     context.view_layer.objects.active = root
     root.select_set(True)
+
+
+def _require_alone(root: bpy.types.Object, number: int) -> None:
+    finest = max((item.number for item in root.lodgs.levels if item.exists), default=number)
+    if number < finest and not root.lodgs.complete:
+        raise LodgsError(*not_alone(number, finest))
 
 
 def _visible(context: bpy.types.Context, item) -> bool:

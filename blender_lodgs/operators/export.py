@@ -53,7 +53,13 @@ class LODGS_OT_export_bundle(_Export, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        bundle = scenes.read_levels(scenes.active_root(context))
+        root = scenes.active_root(context)
+        if self.order == "stream" and not root.lodgs.complete:
+            raise LodgsError(
+                "The coarser level of these splats is no scene by itself, which other viewers would show.",
+                "Put the finest level first.",
+            )
+        bundle = scenes.read_levels(root)
         write_bundle(self._path(), bundle, self.order)
         self.report({"INFO"}, f"{len(bundle.levels)} levels written to {self._path()}")
         return {"FINISHED"}
@@ -126,7 +132,13 @@ class LODGS_OT_export_folder(OnLevels, bpy.types.Operator):
         folder = Path(bpy.path.abspath(self.directory))
         if not self.replace and any(folder.glob("lod*.ply")):
             raise LodgsError(f"{folder} already holds levels.", "Choose another folder, or tick Replace.")
-        bundle = scenes.read_levels(scenes.active_root(context))
+        root = scenes.active_root(context)
+        if not root.lodgs.complete:
+            raise LodgsError(
+                "The coarser level of these splats is no scene by itself, as a folder's levels are.",
+                "Export the bundle, or what is shown as a plain PLY.",
+            )
+        bundle = scenes.read_levels(root)
         command = write_folder(folder, bundle)
         self.report({"INFO"}, f"{len(bundle.levels)} levels written. For the web: {command}")
         return {"FINISHED"}

@@ -31,6 +31,15 @@ class LODGS_OT_import_splats(bpy.types.Operator):
         default=True,
     )
 
+    budget: bpy.props.IntProperty(
+        name="Splats at Most",
+        description="How many splats of a tree are imported at most: the coarse ones first, which stand for "
+        "those that are left out. 0 is no limit. Files without a tree are imported whole",
+        default=0,
+        min=0,
+        step=100_000,
+    )
+
     def invoke(self, context, event):
         if self.filepath or any(file.name for file in self.files):  # dropped
             return self.execute(context)
@@ -50,6 +59,7 @@ class LODGS_OT_import_splats(bpy.types.Operator):
                 context,
                 bpy.path.abspath(str(path)),
                 upright=self.upright,
+                budget=self.budget,
                 warn=warn,
             )
             if first:  # otherwise the artist is looking at something

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..data import scenes
-from .parts import OnScene
+from .parts import OnScene, report_errors
 
 
 class LODGS_OT_show_only_level(OnScene, bpy.types.Operator):
@@ -17,6 +17,7 @@ class LODGS_OT_show_only_level(OnScene, bpy.types.Operator):
 
     level: bpy.props.IntProperty(name="Level", description="1 is the coarsest", default=1, min=1)
 
+    @report_errors
     def execute(self, context):
         scenes.show_only(scenes.active_root(context), self.level)
         return {"FINISHED"}

@@ -27,6 +27,8 @@ class LODGS_UL_levels(bpy.types.UIList):
         detail = " ".join(f"{value:.2g}" if value else "all" for value in facts)  # 0: nothing is too small
         _columns(row, str(item.number), f"{len(cloud.points):,}", f"{objects.megabytes(cloud):.1f}", detail)
         alone = data.mode == "SINGLE" and data.single_level == item.number
+        row = row.row(align=True)
+        row.enabled = data.complete or item.number == data.levels[-1].number
         only = row.operator(
             "lodgs.show_only_level", text="", icon="SOLO_ON" if alone else "SOLO_OFF", emboss=False
         )
@@ -52,6 +54,10 @@ class LODGS_PT_levels(LevelsPanel):
         self.layout.template_list(
             "LODGS_UL_levels", "", settings, "levels", settings, "active_level", rows=rows
         )
+        if not settings.complete and len(settings.levels) > 1:
+            first, *_, finest = (item.number for item in settings.levels)
+            text = f"Splats of level {first} stand for groups of level {finest}'s: no scene by themselves."
+            say(self.layout, text, "INFO")
 
 
 class LODGS_PT_detail(LevelsPanel):
@@ -75,7 +81,9 @@ class LODGS_PT_detail(LevelsPanel):
         column = layout.column()
         column.use_property_split = True
         if settings.mode == "SINGLE":
-            column.prop(settings, "single_level")
+            row = column.row()
+            row.enabled = settings.complete
+            row.prop(settings, "single_level")
         else:
             choice = loaded.chosen(context, root)
             idle = choice.idle() if choice else {}

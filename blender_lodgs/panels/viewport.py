@@ -37,7 +37,13 @@ class LODGS_PT_viewport(Panel):
             rule = find_rule(root.lodgs.rule)
             for tell in ("OWN", "LEVELS", "BANDS", *(["CHUNKS"] if rule and rule.tables else [])):
                 row.prop_enum(root.lodgs, "tell", tell)
-            if root.lodgs.tell in ("LEVELS", "BANDS") and column.active:
+            if root.lodgs.tell in ("LEVELS", "BANDS") and column.active and not root.lodgs.complete:
+                say(
+                    layout,
+                    "Each colour is for sizes half as large as the one before; white: the finest level.",
+                    "COLOR",
+                )
+            elif root.lodgs.tell in ("LEVELS", "BANDS") and column.active:
                 _legend(layout, [item.number for item in root.lodgs.levels if item.exists])
         if viewport.problem:
             text = f"The viewport could not be drawn ({viewport.problem}). Untick Gaussian Splats for points."

@@ -8,13 +8,18 @@ list depends on where the eye is and in which direction the view looks.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ...training.lod.choice import Choice, Chooser
-from ...training.lod.rule import OPACITY
+from ...training.lod.rule import OPACITY, rules
+
+SAMPLE, LEAST_SAMPLE = 16, 10_000
+"""Of so many splats one is asked where a budget looks for a choice, and how many are asked at least."""
+ROUGHLY = 1.05
+"""Share of the budget at which asking a few ends, and all are asked: a sample may be wrong by that."""
 
 WIDTH = 8192
 """Texels in a row of every texture that holds one texel for each of many splats."""
@@ -47,6 +52,19 @@ class Pool:
             columns[OPACITY] = self.opacities[part]
             self._choosers[key] = Chooser(self.means[part, :3], columns)
         return self._choosers[key]
+
+    def about(self, placement: Placement) -> int:
+        """About how many splats of a placement have a weight: of many splats a few are asked."""
+        few = placement.count // SAMPLE
+        if placement.choice is None or not rules()[placement.choice.rule].apart or few < LEAST_SAMPLE:
+            return len(_choose(self, placement)[0])
+        key = placement.first, -few
+        if key not in self._choosers:
+            rows = placement.first + np.random.default_rng(0).integers(0, placement.count, few)
+            columns = {name: column[rows] for name, column in self.columns.items()}
+            columns[OPACITY] = self.opacities[rows]
+            self._choosers[key] = Chooser(self.means[rows, :3], columns)
+        return len(self._choosers[key].chosen(placement.choice)[0]) * SAMPLE
 
     def drawn(self, request: Request) -> Drawn:
         """What a request draws, in no order; the last one is kept."""
@@ -176,7 +194,7 @@ def _drawn(pool: Pool, request: Request) -> Drawn:
         own = pool.means[placement.first : placement.first + placement.count, :3][index]
         rows = table[begin : begin + len(index)]
         rows[:, 0], rows[:, 1], rows[:, 2] = index + placement.first, weight, number
-        rows[:, 3] = _color_levels(placement, own)
+        rows[:, 3] = _color_levels(pool, placement, index, own)
         means.append(own)
         begin += len(index)
     return Drawn(request.choices, table, means, left_out)
@@ -191,26 +209,17 @@ def within_budget(
     rule, again and again. Where no rule can give way any more, the least visible splats go: of levels that
     add up first those of the finest.
     """
+
+    def count(placement: Placement) -> int:
+        return len(_choose(pool, placement)[0])
+
     placements = list(placements)
+    wanted = sum(map(count, placements))
+    if wanted > budget:
+        _give_way(placements, pool.about, ROUGHLY * budget)
+        _give_way(placements, count, budget)
     chosen = [_choose(pool, placement) for placement in placements]
-    wanted = total = sum(len(index) for index, _ in chosen)
-    givers = {placement.scene for placement in placements if placement.choice is not None}
-    while total > budget and givers:
-        drawn = dict.fromkeys(givers, 0)
-        for placement, (index, _) in zip(placements, chosen, strict=True):
-            if placement.scene in drawn:
-                drawn[placement.scene] += len(index)
-        scene = max(drawn, key=lambda each: drawn[each])
-        levels = sorted({placement.level for placement in placements if placement.scene == scene})
-        for i, placement in enumerate(placements):
-            if placement.scene == scene and placement.choice is not None:
-                coarser = placement.choice.coarser(levels)
-                if coarser is None:
-                    givers.discard(scene)
-                    break
-                placements[i] = replace(placement, choice=coarser)
-                chosen[i] = _choose(pool, placements[i])
-        total = sum(len(index) for index, _ in chosen)
+    total = sum(len(index) for index, _ in chosen)
     while total > budget:
         of_scene = Counter(p.scene for p, (index, _) in zip(placements, chosen, strict=True) if len(index))
         adding = [
@@ -222,6 +231,27 @@ def within_budget(
         _thin(pool, placements, chosen, which, max(here - (total - budget), 0))
         total = sum(len(index) for index, _ in chosen)
     return chosen, wanted - sum(len(index) for index, _ in chosen)
+
+
+def _give_way(placements: list[Placement], count: Callable[[Placement], int], budget: float) -> None:
+    """Has scenes take coarser choices, in place, until no more than the budget are counted, if they can."""
+    counts = [count(placement) for placement in placements]
+    givers = {placement.scene for placement in placements if placement.choice is not None}
+    while sum(counts) > budget and givers:
+        drawn = dict.fromkeys(givers, 0)
+        for placement, here in zip(placements, counts, strict=True):
+            if placement.scene in drawn:
+                drawn[placement.scene] += here
+        scene = max(drawn, key=lambda each: drawn[each])
+        levels = sorted({placement.level for placement in placements if placement.scene == scene})
+        for i, placement in enumerate(placements):
+            if placement.scene == scene and placement.choice is not None:
+                coarser = placement.choice.coarser(levels)
+                if coarser is None:
+                    givers.discard(scene)
+                    break
+                placements[i] = replace(placement, choice=coarser)
+                counts[i] = count(placements[i])
 
 
 def _choose(pool: Pool, placement: Placement) -> tuple[np.ndarray, np.ndarray]:
@@ -250,8 +280,13 @@ def _thin(pool: Pool, placements, chosen, which: Sequence[int], keep: int) -> No
         start += len(part)
 
 
-def _color_levels(placement: Placement, means: np.ndarray) -> np.ndarray | int:
-    """Which level's colour splats at means (M, 3) get."""
+def _color_levels(
+    pool: Pool, placement: Placement, index: np.ndarray, means: np.ndarray
+) -> np.ndarray | float:
+    """Which level's colour a placement's splats (M,) at means (M, 3) get."""
+    if placement.tell == "LEVELS" and placement.choice is not None:
+        own, place = rules()[placement.choice.rule].columns, index + placement.first
+        return placement.choice.told_level({n: pool.columns[n][place] for n in own if n in pool.columns})
     if placement.tell == "BANDS" and placement.choice is not None:
         return placement.choice.wanted_level(means)
     if placement.tell == "CHUNKS" and placement.choice is not None:

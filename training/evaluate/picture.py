@@ -11,7 +11,7 @@ import torch
 from ..files import atomic_write
 from ..lod.colors import level_color
 from ..lod.rule import Values, find_rule
-from ..lod.selection import complete, select
+from ..lod.selection import complete, levels_alone, select
 from ..scenes.cameras import Camera
 from ..scenes.images import write_png
 from ..splats.bundle import Bundle
@@ -37,7 +37,7 @@ def level_picture(path: Path, bundle: Bundle, evaluation: Evaluation, camera: Ca
     rule = find_rule(bundle.rule)
     tiles = []
     if rule is None or not rule.always:
-        tiles = [tile(f"level {level.number}", complete(bundle, level)) for level in bundle.levels]
+        tiles = [tile(f"level {level.number}", complete(bundle, level)) for level in levels_alone(bundle)]
     if rule and rule.sweep:
         name, steps = rule.sweep
         for step in steps:

@@ -60,6 +60,10 @@ class Choice:
         """(N,) numbers of the parts of space where places are: see ``Rule.parts``."""
         return rules()[self.rule].parts(means, self._tables())
 
+    def told_level(self, columns: Mapping[str, np.ndarray]) -> np.ndarray | float:
+        """(N,) the level of splats with the rule's columns (N,): see ``Rule.told_level``."""
+        return rules()[self.rule].told_level(columns, dict(self.facts))
+
     def wanted_level(self, means: np.ndarray) -> np.ndarray:
         """(N,) the level that is wanted at each place."""
         eye, facts, values = np.array(self.eye, np.float32), dict(self.facts), dict(self.values)

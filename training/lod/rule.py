@@ -178,6 +178,19 @@ class Rule(ABC):
         them apart; 0 where the rule has no such parts."""
         return np.zeros(len(means), np.float32)
 
+    def alone(self, levels: Sequence[int]) -> Sequence[int]:
+        """The numbers of those levels that can be shown one at a time: all of them, or where levels are not
+        ``complete`` the finest.
+
+        Args:
+            levels: numbers of the levels that there are, ascending.
+        """
+        return levels if self.complete else levels[-1:]
+
+    def told_level(self, columns: Mapping[str, np.ndarray], facts: Mapping[str, float]) -> np.ndarray | float:
+        """The level (N,) of splats, or one for all, for pictures that tell which level is where."""
+        return facts["level"]
+
     def wanted_level(
         self,
         means: np.ndarray,
@@ -301,8 +314,13 @@ def distances(means: np.ndarray, eye: np.ndarray) -> np.ndarray:
 
     Axis by axis, which numpy does four times as fast as rows of three.
     """
-    squares = np.zeros(len(means), means.dtype)
-    for axis, place in zip(means.T, np.asarray(eye, means.dtype), strict=True):
+    return distances_by_axes([*means.T], eye)
+
+
+def distances_by_axes(axes: Sequence[np.ndarray], eye: np.ndarray) -> np.ndarray:
+    """The same of means whose x, y and z are (N,) each."""
+    squares = np.zeros(len(axes[0]), axes[0].dtype)
+    for axis, place in zip(axes, np.asarray(eye, squares.dtype), strict=True):
         away = axis - place
         away *= away
         squares += away

@@ -167,17 +167,35 @@ def columns_of(rule: Rule, splats: Splats) -> dict[str, np.ndarray]:
     return columns
 
 
+def levels_alone(bundle: Bundle) -> list[Level]:
+    """The levels that can be shown one at a time, coarse to fine: see ``Rule.alone``."""
+    rule, numbers = find_rule(bundle.rule), [level.number for level in bundle.levels]
+    alone = numbers if rule is None else rule.alone(numbers)
+    return [level for level in bundle.levels if level.number in alone]
+
+
+def not_alone(number: int, finest: int) -> tuple[str, str]:
+    """What to say, and what to do about it, where a level is wanted that is no scene by itself."""
+    return (
+        f"Level {number} is no scene by itself: its splats stand for groups of finer ones, where those are "
+        "not needed.",
+        f"Take level {finest}, or choose by distance.",
+    )
+
+
 def complete_levels(bundle: Bundle, number: int) -> list[Shown]:
     """All that is drawn at a level: the level, and where levels add up the coarser ones before it.
 
     Raises:
-        LodgsError: there is no such level.
+        LodgsError: there is no such level, or it is no scene by itself.
     """
     numbers = [level.number for level in bundle.levels]
     if number not in numbers:
         raise LodgsError(
             f"There is no level {number}.", f"Choose from {numbers[0]} (coarsest) to {numbers[-1]}."
         )
+    if number not in [level.number for level in levels_alone(bundle)]:
+        raise LodgsError(*not_alone(number, numbers[-1]))
     return [Shown(level.number, level.splats) for level in bundle.upto(number)]
 
 

@@ -15,7 +15,7 @@ from ..evaluate.views import Evaluation, shown_at
 from ..evaluate.words import summary_lines
 from ..files import atomic_write
 from ..lod.rule import Values, find_rule
-from ..lod.selection import select, settings, unknown_rule
+from ..lod.selection import levels_alone, select, settings, unknown_rule
 from ..methods import create
 from ..scenes.aside import read_aside
 from ..splats.bundle import read_bundle
@@ -37,8 +37,9 @@ def evaluate_run(
         far: measure also how levels do from farther away (``evaluate.distance``).
 
     Returns:
-        Of all levels, ``levels``: coarse to fine, ``level``, its facts, ``splats``, ``drawn``, ``psnr``,
-        ``ssim``, ``frame_s``, ``veil``; where levels add up, of each with all coarser ones. Of the finest,
+        Of all levels, but those that are no scene by themselves, ``levels``: coarse to fine, ``level``, its
+        facts, ``splats``, ``drawn``, ``psnr``, ``ssim``, ``frame_s``, ``veil``; where levels add up, of each
+        with all coarser ones. Of the finest,
         ``train_psnr``, ``veil``, ``oversized``, ``worst`` (``evaluate.summary``), and ``aside`` where the
         scene has views off its path (``scenes.aside``): their mean ``psnr`` and the names of the ``views``.
         By the rule, ``selective``: per view and predetermined (chosen from the mean training camera), with
@@ -65,12 +66,13 @@ def evaluate_run(
     if rule is None and (given or bundle.rule):
         raise LodgsError(*unknown_rule(bundle.rule))
     aside = [camera.scaled(job.image_scale) for camera in read_aside(Path(job.scene))]
-    *coarser, finest = bundle.levels
+    alone = levels_alone(bundle)
+    *coarser, finest = alone
     measured = summary(evaluation, bundle)
     veils = [veil(evaluation, shown_at(bundle, level)) for level in coarser] + [measured["veil"]]
     levels = [
         {"level": level.number, **level.facts, **evaluation.measure_level(bundle, level), "veil": veiled}
-        for level, veiled in zip(bundle.levels, veils, strict=True)
+        for level, veiled in zip(alone, veils, strict=True)
     ]
     report = {
         "scene": job.scene,

@@ -26,7 +26,7 @@ from ..evaluate.summary import summary
 from ..evaluate.views import Evaluation
 from ..files import atomic_write
 from ..lod.rule import find_rule
-from ..lod.selection import settings
+from ..lod.selection import levels_alone, settings
 from ..methods import METHODS, create
 from ..methods.data import TrainingData
 from ..methods.method import Method
@@ -250,6 +250,7 @@ class _Run:
         """Hands levels over: a file and an event each. A level that came before is replaced."""
         known = {record["level"]: record for record in self.levels}
         bundle = replace(self._without_splats(), levels=levels)
+        alone = [level.number for level in levels_alone(bundle)]
         for place, level in enumerate(levels, 1):
             path = self.folder.levels_folder / f"level_{level.number}.ply"
             write_ply(path, level.splats, comments_of(bundle.meta))
@@ -259,7 +260,7 @@ class _Run:
                 "splats": len(level.splats),
                 "facts": level.facts,
             }
-            quality = self.evaluation.measure_level(bundle, level)
+            quality = self.evaluation.measure_level(bundle, level) if level.number in alone else {}
             self.events(
                 "level", **(quality | record), rule=bundle.rule, scene_facts=bundle.facts,
                 controls=bundle.controls, cumulative=bundle.cumulative, meta=bundle.meta,

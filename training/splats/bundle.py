@@ -191,12 +191,83 @@ def read_bundle(path: str | Path, warn: Warn = silent, rows_of: RowsOf | None = 
     if bundle is None:
         splats = as_3dgs(splats_from(elements["vertex"], path), path, warn)
         return Bundle("", [Level(1, splats)], meta=meta_of(comments))
+    rows = _rows_of_levels(bundle, lines, elements, path)
     try:
-        begin = dict.fromkeys(elements, 0)
+        wanted = {} if rows_of is None else rows_of(bundle)
+        for level in bundle.levels:
+            found, some = rows[level.number], wanted.get(level.number, slice(None))
+            some = some if isinstance(some, slice) else some[some < len(found)]
+            level.splats = drawable(found.read(some), path, warn)
+        return bundle
+    except _CONTRADICTIONS as error:
+        raise _contradiction(path, error) from error
+
+
+@dataclass(frozen=True)
+class Rows:
+    """A level's splats in a file.
+
+    Attributes:
+        vertices: the 3DGS columns of each splat, structured.
+        extras: the further columns, or None.
+        path: of the file.
+    """
+
+    vertices: np.ndarray
+    extras: np.ndarray | None
+    path: str | Path
+
+    def __len__(self) -> int:
+        return len(self.vertices)
+
+    def columns(self, some: slice, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """Columns (M,) of a range of rows, of those of these names that there are; nothing else is read."""
+        found = {}
+        for rows in (self.vertices, self.extras):
+            there = () if rows is None else rows.dtype.names or ()
+            found |= {name: np.array(rows[name][some]) for name in names if name in there}  # type: ignore[index]
+        return found
+
+    def read(self, some: slice | np.ndarray) -> Splats:
+        """The splats of some rows, drawable or not.
+
+        Raises:
+            LodgsError: as ``splats_from``.
+        """
+        splats = splats_from(self.vertices[some], self.path)
+        if self.extras is not None:
+            extras = self.extras[some]
+            splats.extras |= {column: np.array(extras[column]) for column in extras.dtype.names or ()}
+        return splats
+
+
+def open_bundle(path: str | Path) -> tuple[Bundle, dict[int, Rows]]:
+    """A bundle with its tables, but without splats, and each level's by number to read of: of a binary file
+    nothing else is read.
+
+    Raises:
+        LodgsError: as `read_bundle`, or it is a PLY without levels.
+    """
+    elements, comments = read_elements(path)
+    bundle, lines = _parse(comments, path)
+    if bundle is None:
+        raise LodgsError(f"{path} is a PLY without levels.", "Choose a bundle.")
+    return bundle, _rows_of_levels(bundle, lines, elements, path)
+
+
+def _rows_of_levels(
+    bundle: Bundle, lines: list[dict], elements: dict[str, np.ndarray], path: str | Path
+) -> dict[int, Rows]:
+    """Where each level's splats are; the bundle gets its tables.
+
+    Raises:
+        LodgsError: the lines contradict the elements.
+    """
+    try:
+        found, begin = {}, dict.fromkeys(elements, 0)
         of_levels = {line["element"] for line in lines if "level" in line}
         apart = {name: rows for name, rows in elements.items() if name not in of_levels}  # each is taken once
         bundle.tables = _read_tables([line for line in lines if "table" in line], apart)
-        wanted = {} if rows_of is None else rows_of(bundle)
         for line in lines:
             if "level" not in line:
                 continue
@@ -206,18 +277,11 @@ def read_bundle(path: str | Path, warn: Warn = silent, rows_of: RowsOf | None = 
             extras = apart.pop(line["extras"]) if "extras" in line else None
             if len(rows) != count or (extras is not None and len(extras) != count):
                 raise ValueError(f"level {line['level']} should have {count} splats")
-            some = wanted.get(line["level"], slice(None))
-            some = some if isinstance(some, slice) else some[some < count]
-            splats = splats_from(rows[some], path)
-            if extras is not None:
-                extras = extras[some]
-                splats.extras |= {column: np.array(extras[column]) for column in extras.dtype.names or ()}
-            level = next(level for level in bundle.levels if level.number == line["level"])
-            level.splats = drawable(splats, path, warn)
+            found[line["level"]] = Rows(rows, extras, path)
         for name in of_levels:
             if begin[name] != len(elements[name]):
                 raise ValueError(f"{name} has more splats than its levels")
-        return bundle
+        return found
     except _CONTRADICTIONS as error:
         raise _contradiction(path, error) from error
 

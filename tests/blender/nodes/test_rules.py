@@ -10,8 +10,12 @@ RANGES = {
     "tau": (0.002, 0.02), "reference": (-3, 20), "sigma_d": (-0.5, 3), "s_v": (1, 4),
     "at_most": (-1500, 3000), "d_l": (1, 6), "coarser_d_l": (7, 14), "distance_scale": (0.7, 1.6),
     "chunks_0": (0, 2**24), "chunks_1": (0, 2**24), "chunks_2": (0, 2**24), "chunks_3": (0, 2**24),
+    "node_size": (-0.05, 0.1), "parent_size": (0, 0.4), "parent_x": (-8, 8), "parent_y": (-8, 8),
+    "parent_z": (-8, 8),
 }  # fmt: skip
 """Of facts, controls and columns for which the usual ones would show everything or nothing."""
+FOCALS = {"cut": 300.0}
+"""Focal lengths in pixels of rules for which 2.5 would not count."""
 
 
 def numbers(rule, rng):
@@ -84,6 +88,7 @@ WITH_TABLES = [
 def test_the_node_group_weights_every_splat_as_the_rule_does(bpy, lodgs, level, name, count):
     rule, weights = rules()[name], []
     compat, groups, selection = lodgs("compat"), lodgs("nodes.rules"), lodgs("data.selection")
+    focal = FOCALS.get(name, 2.5)
     for seed in range(8):
         rng = np.random.default_rng(seed)
         facts, values = numbers(rule, rng)
@@ -91,17 +96,17 @@ def test_the_node_group_weights_every_splat_as_the_rule_does(bpy, lodgs, level, 
         obj, modifier, splats = level(rule, 4000, facts, values, rng, known)
         eye = rng.normal(0, 4, 3).astype(np.float32)
         obj.location = (3, -2, 1)  # the object's place must not count
-        place = {groups.EYE: 2, groups.EYE_POSITION: tuple(map(float, eye)), groups.FOCAL: 2.5}
+        place = {groups.EYE: 2, groups.EYE_POSITION: tuple(map(float, eye)), groups.FOCAL: focal}
         for socket, value in place.items():
             compat.set_input(modifier, socket, value)
         depsgraph = bpy.context.evaluated_depsgraph_get()
         evaluated = obj.evaluated_get(depsgraph)
 
         asked = selection.choice(evaluated, depsgraph)
-        assert (asked.rule, asked.focal_px) == (name, 2.5)
+        assert (asked.rule, asked.focal_px) == (name, focal)
         assert dict(asked.values) == pytest.approx(values) and dict(asked.facts) == pytest.approx(facts)
         columns = splats.extras | {"opacity": 1 / (1 + np.exp(-splats.opacity_logits))}
-        wanted = rule.weights(splats.means, eye, 2.5, columns, dict(asked.facts), dict(asked.values), known)
+        wanted = rule.weights(splats.means, eye, focal, columns, dict(asked.facts), dict(asked.values), known)
         np.testing.assert_array_equal(asked.weights(splats.means, columns), wanted)
         found, cloud = np.zeros(len(splats), np.float32), evaluated.data
         if len(cloud.points):

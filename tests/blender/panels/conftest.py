@@ -19,7 +19,7 @@ class Notes:
     def row(self, **_):
         return self
 
-    column = box = grid_flow = row
+    column = box = grid_flow = split = row
 
     def label(self, text="", **_):
         self.texts.append(text)

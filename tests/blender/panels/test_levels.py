@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from tests.training.lod.trees import random_leaves, tree_of
 from training.lod.rule import rules
 from training.lod.rules.chunks import member_columns
 from training.splats.bundle import Bundle, Level
@@ -171,3 +172,19 @@ def test_distances_and_what_they_cost_are_told_in_blenders_units(bpy, lodgs, dra
     assert draw_panel("levels_costs", "LODGS_PT_costs").operators == ["lodgs.show_costs"]
     assert bpy.ops.lodgs.show_costs() == {"FINISHED"}
     assert tuple(bpy.data.images["costs.png"].size) == (960, 540)
+
+
+@pytest.fixture
+def tree(bpy, lodgs, tmp_path):
+    """A scene of a small tree of splats."""
+    bundle = tree_of(random_leaves(50, np.random.default_rng(1)))
+    lodgs("training.splats.bundle").write_bundle(tmp_path / "tree.ply", bundle)
+    return lodgs("data.scenes").import_splats(bpy.context, tmp_path / "tree.ply")
+
+
+def test_panels_say_what_a_trees_coarser_level_is(tree, draw_panel):
+    texts = draw_panel("levels", "LODGS_PT_levels").texts
+    assert any("Splats of level 1 stand for groups of level 2's" in text for text in texts)
+    tree.lodgs.tell = "LEVELS"
+    notes = draw_panel("viewport", "LODGS_PT_viewport")
+    assert not notes.colors and any("half as large" in text for text in notes.texts)

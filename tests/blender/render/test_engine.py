@@ -282,11 +282,18 @@ def by_distance(bpy, lodgs, scene, tmp_path):
             "octree": ({"d_max": 2**-0.25 * middle, "d_max_focal": focal}, {}, {}),
             "chunks": ({}, {"d_l": middle}, {"d_l": 0.0}),
             "decay": ({"reference": 2 * middle, "tau": 0.01}, {}, {}),
+            "cut": ({}, {}, {}),
         }[name]
         levels = [Level(1, random_splats(400, 1), coarse), Level(2, random_splats(1500, 1, 1), fine)]
         for level in levels:
             rng = np.random.default_rng(level.number)
-            for column, most in (("lod_bias", 1), ("sigma_d", 0.6)):
+            size = 2 * middle / max(focal, 32)
+            for column, most in (
+                ("lod_bias", 1),
+                ("sigma_d", 0.6),
+                ("node_size", size),
+                ("parent_size", size),
+            ):
                 level.splats.extras[column] = rng.uniform(0, most, len(level.splats)).astype(np.float32)
         bundle = Bundle("any", levels, name, facts=of_scene, cumulative=name == "octree")
         write_bundle(tmp_path / "levels.ply", bundle)
@@ -300,7 +307,7 @@ def by_distance(bpy, lodgs, scene, tmp_path):
     return made
 
 
-@pytest.mark.parametrize("rule", ["bands", "octree", "chunks", "decay"])
+@pytest.mark.parametrize("rule", ["bands", "octree", "chunks", "decay", "cut"])
 def test_it_is_chosen_as_node_groups_choose(bpy, lodgs, scene, by_distance, written, monkeypatch, rule):
     """The renderer is handed every level once, and then a choice with each frame; pictures are those of what
     Blender's evaluation leaves, but for a splat on a border where float32 numbers are rounded otherwise."""

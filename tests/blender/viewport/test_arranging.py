@@ -163,6 +163,7 @@ TABLE = (("chunks", tuple((axis, "<f4", np.float32(row).tobytes()) for axis, row
 RULES = {
     "bands": ({}, [0.9, 0.5, 0.0], "s_min"), "octree": ({"d_max": 1.5, "d_max_focal": 1.0}, [], ""),
     "chunks": ({}, [0.9, 0.5, 0.0], "d_l"), "decay": ({"reference": 2.0, "tau": 0.01}, [], ""),
+    "cut": ({}, [], ""),
 }  # fmt: skip
 
 
@@ -173,8 +174,8 @@ def test_what_is_kept_between_arrangements_is_what_is_found_anew(bpy, lodgs, mon
     rng, arranging = np.random.default_rng(8), lodgs("viewport.arranging")
     sets = [random_set(rng, n) for n in (300, 600, 1200)]
     pool, starts = pool_of(lodgs, sets)
-    for column in ("chunks_0", "sigma_d", "lod_bias"):
-        most = {"chunks_0": 8, "sigma_d": 1, "lod_bias": 1}[column]
+    most_of = {"chunks_0": 8, "sigma_d": 1, "lod_bias": 1, "node_size": 0.04, "parent_size": 0.06}
+    for column, most in most_of.items():
         values = rng.uniform(0, most, 2100)
         pool.columns[column] = np.float32(np.floor(values) if column == "chunks_0" else values)
     scene, ends, fact = RULES[name]
@@ -284,6 +285,29 @@ def test_coarser_levels_stand_in_for_the_finest(bpy, lodgs):
     assert [len(index) for index, _ in chosen] == [300, 0, 0]
 
 
+def test_a_budget_finds_its_choice_by_asking_a_few(bpy, lodgs, monkeypatch):
+    """The same one as by asking all, of which it asks twice, whatever the number of steps to it."""
+    rng, arranging = np.random.default_rng(4), lodgs("viewport.arranging")
+    count, asked = 400_000, []
+    pool, _ = pool_of(lodgs, [random_set(rng, count)])
+    pool.columns.update(
+        node_size=np.zeros(count, np.float32), parent_x=np.ones(count, np.float32),
+        parent_size=np.float32(rng.uniform(0, 0.01, count)),
+    )  # fmt: skip
+    by = choice(lodgs, "cut", 1000.0, {"level": 2.0, "levels": 2.0}, {"pixels": 1.0})
+    truth, budget = by, 100_000
+    while len(pool.chooser(placed(lodgs, 0, count, level=2)).chosen(truth)[0]) > budget:
+        truth = truth.coarser([1, 2])
+    assert dict(truth.values)["pixels"] > 2
+    choose = arranging._choose
+    monkeypatch.setattr(arranging, "_choose", lambda *a: asked.append(a) or choose(*a))
+    ((index, _),), left_out = arranging.within_budget(
+        pool, [placed(lodgs, 0, count, level=2, choice=by)], budget
+    )
+    assert np.array_equal(index, pool.chooser(placed(lodgs, 0, count, level=2)).chosen(truth)[0])
+    assert len({placement.choice for _, placement in asked}) <= 3 and left_out > budget
+
+
 def test_colours_tell_levels_and_distances(bpy, lodgs):
     rng = np.random.default_rng(3)
     arranging = lodgs("viewport.arranging")
@@ -301,6 +325,21 @@ def test_colours_tell_levels_and_distances(bpy, lodgs):
         assert result.count == (wanted > 1.25).sum()
         assert np.allclose(weight, np.clip(2 * wanted - 2.5, 0, 1)[index], atol=1e-4)
         assert np.array_equal(told, truth[index])
+
+
+def test_colours_tell_how_large_nodes_are(bpy, lodgs):
+    """Of a tree each octave has its colour, and the leaves have one."""
+    rng, arranging = np.random.default_rng(3), lodgs("viewport.arranging")
+    sizes = np.float32(rng.uniform(0.0001, 0.02, 300) ** 1.5 * rng.integers(0, 4, 300).clip(0, 1))
+    pool, _ = pool_of(lodgs, [random_set(rng, 300)])
+    pool.columns.update(node_size=sizes, parent_size=np.full(300, 3e38, np.float32))
+    by = choice(lodgs, "cut", 1.0, {"level": 1.0, "levels": 2.0}, {"pixels": 1.0})
+    placement = placed(lodgs, 0, 300, level=1, choice=by, tell="LEVELS")
+    result = arranging.arrange(pool, arranging.Request((placement,), (0, 0, 1), 10**6))
+    index, _, _, told = result.instances[: result.count].T
+    sizes = sizes[index.astype(int)]
+    assert result.count > 250 and 0 < (sizes == 0).sum() < 100
+    assert np.array_equal(told, np.where(sizes > 0, (1 - np.frexp(sizes)[1]) % 11 + 1, 12))
 
 
 def test_colours_tell_chunks(bpy, lodgs):

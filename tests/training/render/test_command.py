@@ -8,7 +8,9 @@ import pytest
 from PIL import Image
 
 from tests.training.conftest import write_tiny_scene
+from tests.training.lod.trees import tree_of
 from training.__main__ import main
+from training.lod.selection import select
 from training.rasterize import Gaussians, render
 from training.runs.job import Job
 from training.scenes.cameras import camera_as_dict, read_camera, write_camera
@@ -51,6 +53,28 @@ def test_levels_of_a_bundle(bundle, camera, tmp_path):
     np.testing.assert_array_equal(pixels(tmp_path / "fine.png"), fine)
     np.testing.assert_array_equal(pixels(tmp_path / "coarse.png"), coarse)
     np.testing.assert_array_equal(pixels(tmp_path / "far.png"), fine)  # finer details than any are wanted
+
+
+def test_a_trees_coarser_level_is_not_drawn_alone(camera, make_splats, tmp_path, capsys):
+    splats = make_splats(60)
+    splats.means, splats.log_scales = splats.means * np.float32(0.05), splats.log_scales - 3
+    tree = tree_of(splats)
+    write_bundle(tmp_path / "tree.ply", tree)
+    write_camera(tmp_path / "camera.json", camera, 0.01)
+    command = ["render", str(tmp_path / "tree.ply"), "--camera", str(tmp_path / "camera.json"), "--out"]
+    assert main([*command, str(tmp_path / "full.png")]) == 0
+    np.testing.assert_array_equal(
+        pixels(tmp_path / "full.png"), expected(tree.levels[1].splats, camera)
+    )  # fmt: skip
+    assert main([*command, str(tmp_path / "cut.png"), "--pixels", "4"]) == 0
+    splats, _ = select(tree, camera.center, camera.focal, {"pixels": 4.0})
+    assert 0 < len(splats) < 60
+    np.testing.assert_array_equal(pixels(tmp_path / "cut.png"), expected(splats, camera))
+    capsys.readouterr()
+    assert main([*command, str(tmp_path / "none.png"), "--level", "1"]) == 2
+    said = capsys.readouterr().err
+    assert "Level 1 is no scene by itself" in said and "Take level 2, or choose by distance" in said
+    assert not (tmp_path / "none.png").exists()
 
 
 def test_antialiased_splats_are_drawn_so(make_splats, camera, tmp_path):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.training.lod.trees import tree_of
 from training.__main__ import main
 from training.errors import LodgsError
 from training.rasterize import Gaussians, rasterize
@@ -54,6 +55,16 @@ def finished(scene, splats, tmp_path):
         return run.path
 
     return make
+
+
+def test_of_a_tree_the_finest_level_alone_is_measured(finished, splats, tmp_path):
+    run = finished(test_every=4)
+    write_bundle(RunFolder(run).bundle, tree_of(splats))
+    report = evaluate_run(run, {"pixels": 2.0}, picture=tmp_path / "levels.png")
+    (row,) = report["levels"]
+    assert (row["level"], row["splats"]) == (2, len(splats)) and row["veil"] == report["veil"]
+    assert [row["pixels"] for row in report["curve"]] == [0.5, 1, 2, 4, 8, 16]
+    assert "level 1" not in table(report)
 
 
 def quality(splats: Splats, camera) -> float:

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..rule import NO_TABLES, Control, Rule, Values, distances
+from ..colors import LEVEL_COLORS
+from ..rule import NO_TABLES, Control, Rule, Values, distances, distances_by_axes
 
 NODE_SIZE, PARENT_SIZE = "node_size", "parent_size"
 """Columns of sizes, in scene units: a splat's own, 0 for leaves, and its parent's."""
@@ -21,6 +22,10 @@ ROUNDING = 2.0**-20
 distance with k size, for parent and child, can get 9 wrong."""
 STEP = 1.25
 """Factor by which a viewer's budget raises the granularity at a time."""
+_BLOCK = 1 << 14
+"""Splats that are looked at together, which stay in the processor's cache."""
+OCTAVES = len(LEVEL_COLORS) - 1
+"""Colours for sizes, each for twice the size of the next, over and over; the one after is the leaves'."""
 
 
 def detail_of(focal_px: float, pixels: float) -> float:
@@ -28,20 +33,20 @@ def detail_of(focal_px: float, pixels: float) -> float:
     return max(focal_px / pixels, K_LEAST)
 
 
-def acceptable(means: np.ndarray, sizes: np.ndarray, eye: np.ndarray, k: float) -> np.ndarray:
+def acceptable(axes: Sequence[np.ndarray], sizes: np.ndarray, eye: np.ndarray, k: float) -> np.ndarray:
     """(N,) bool, which nodes are fine enough: ‖c - μ‖ >= k size.
 
     The same bits wherever the same node is asked for, as itself or as a parent: all is float32, operation by
     operation.
 
     Args:
-        means: (N, 3) float32.
+        axes: x, y and z of means, (N,) float32 each.
         sizes: (N,) float32.
         eye: (3,).
         k: see :func:`detail_of`.
     """
     with np.errstate(over="ignore"):
-        return distances(means, eye) >= np.float32(k) * sizes
+        return distances_by_axes(axes, eye) >= np.float32(k) * sizes
 
 
 def least_size(child_sizes: np.ndarray, away: np.ndarray) -> np.ndarray:
@@ -85,15 +90,34 @@ class Cut(Rule):
 
     def weights(self, means, eye, focal_px, columns, facts, values, tables=NO_TABLES) -> np.ndarray:
         k = detail_of(focal_px, values["pixels"])
-        shown = acceptable(means, columns[NODE_SIZE], eye, k)
-        some = np.flatnonzero(shown)
-        parents = np.stack([columns[name][some] for name in PARENT], axis=1)
-        shown[some] = ~acceptable(parents, columns[PARENT_SIZE][some], eye, k)
-        return shown.astype(np.float32)
+        shown = np.zeros(len(means), np.float32)
+        for begin in range(0, len(means), _BLOCK):
+            block = slice(begin, begin + _BLOCK)
+            parents, sizes = [columns[name][block] for name in PARENT], columns[NODE_SIZE][block]
+            chosen = ~acceptable(parents, columns[PARENT_SIZE][block], eye, k)
+            if sizes.any() and chosen.any():  # there are others than leaves, and some are not too fine
+                chosen &= acceptable([*means[block].T], sizes, eye, k)
+            shown[block] = chosen
+        return shown
+
+    def told_level(self, columns, facts) -> np.ndarray:
+        """The number of a colour: the octave of a node's size, OCTAVES + 1 for leaves."""
+        return _octave(columns[NODE_SIZE])
+
+    def wanted_level(self, means, eye, focal_px, facts, values) -> np.ndarray:
+        """The same of the largest size that is fine enough where splats are."""
+        return _octave(distances(means, eye) / np.float32(detail_of(focal_px, values["pixels"])))
 
     def coarser(self, values: Values, levels: Sequence[int]) -> Values | None:
         pixels = values["pixels"] * STEP
         return {**values, "pixels": pixels} if pixels <= self.controls[0].high else None
+
+
+def _octave(sizes: np.ndarray) -> np.ndarray:
+    """(N,) float32, from 1 on: one more for half the size."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        octaves = -np.floor(np.log2(sizes)) % np.float32(OCTAVES)
+    return np.where(sizes > 0, octaves, np.float32(OCTAVES)) + np.float32(1)
 
 
 RULE = Cut()

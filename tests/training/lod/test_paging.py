@@ -1,0 +1,258 @@
+"""Of a tree in a file what fits into a budget: complete cuts at any time, and the whole's where it fits."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.training.lod.trees import random_leaves, tree_of
+from training.errors import LodgsError
+from training.lod.blocks import SIZE
+from training.lod.paging import Pager, TreeFile, read_within, standing, streaming_order, table_of_pages
+from training.lod.rule import rules
+from training.lod.rules.cut import ABOVE_ROOT
+from training.lod.selection import Choice, select
+from training.lod.streaming import BLOCKS
+from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
+
+CUT = rules()["cut"]
+FOCAL = 1000.0
+LEAVES = 30_000
+
+
+class Truth:
+    """A whole tree: its nodes by their places, which none shares, and which is above which."""
+
+    def __init__(self, bundle):
+        self.bundle, self.choice = bundle, Choice(bundle)
+        splats = self.choice.splats
+        self.node_at = {mean.tobytes(): node for node, mean in enumerate(splats.means)}
+        assert len(self.node_at) == len(splats)
+        parents = np.stack([splats.extras[f"parent_{axis}"] for axis in "xyz"], 1)
+        root = splats.extras["parent_size"] == np.float32(ABOVE_ROOT)
+        self.parents = np.array(
+            [-1 if r else self.node_at[p.tobytes()] for p, r in zip(parents, root, strict=True)]
+        )
+        self.leaves = np.arange(len(bundle.levels[0].splats), len(splats))
+
+    def cut(self, eye, pixels):
+        return np.flatnonzero(self.choice.weights(np.float32(eye), FOCAL, {"pixels": pixels}))
+
+    def nodes(self, means):
+        return np.array([self.node_at[mean.tobytes()] for mean in means], int)
+
+    def require_complete(self, drawn):
+        """Of every leaf and the nodes above it exactly one is drawn."""
+        assert len(set(drawn.tolist())) == len(drawn)
+        there = np.zeros(len(self.parents) + 1, int)
+        there[drawn] = 1
+        above, found = self.leaves.copy(), np.zeros(len(self.leaves), int)
+        while (above >= 0).any():
+            found += there[above]
+            above = np.where(above >= 0, self.parents[above], -1)
+        assert (found == 1).all()
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return Truth(tree_of(random_leaves(LEAVES, np.random.default_rng(1), degree=1)))
+
+
+@pytest.fixture(params=["by octaves", "by size", "with a table"])
+def path(request, truth, tmp_path):
+    bundle, tables = truth.bundle, {}
+    if request.param != "by size":
+        ordered = [level.splats.select(streaming_order(level.splats.extras)) for level in bundle.levels]
+        bundle = replace(bundle, levels=[Level(1, ordered[0]), Level(2, ordered[1])])
+    if request.param == "with a table":
+        tables = {BLOCKS: table_of_pages({level.number: level.splats.extras for level in bundle.levels})}
+    file = tmp_path / f"{request.param}.ply"
+    write_bundle(file, replace(bundle, tables=tables))
+    return file
+
+
+def shown(resident, eye, pixels):
+    """The means of what an eye is shown of what is in memory."""
+    splats = resident.splats
+    weights = CUT.weights(splats.means, np.float32(eye), FOCAL, splats.extras, {}, {"pixels": pixels})
+    return splats.means[weights > 0]
+
+
+def come_in(pager, eye, pixels):
+    """All that an eye needs comes in, page by page."""
+    while (update := pager.step(np.array(eye), max(FOCAL / pixels, 32))) is not None:
+        for _ in pager.resident.pieces(update):
+            yield
+
+
+EYES = [(0, 0, 3), (0.5, 0.2, 2), (-8, 8, 1), (7, -7, 0.5), (7, -6, 0.2), (60, 0, 20), (0, 0, 3)]
+
+
+def test_with_room_for_all_it_is_the_whole_files_cut(truth, path):
+    pager = Pager(path, 10**6)
+    for eye in EYES:
+        for pixels in (1.0, 4.0, 30.0):
+            list(come_in(pager, eye, pixels))
+            drawn = truth.nodes(shown(pager.resident, eye, pixels))
+            np.testing.assert_array_equal(np.sort(drawn), truth.cut(eye, pixels))
+
+
+@pytest.mark.parametrize("budget", [SIZE, 5000, 20_000])
+def test_within_a_budget_cuts_are_complete_whatever_is_there(truth, path, budget):
+    """Also while pages come in, and from an eye that they are not for."""
+    pager, equal = Pager(path, budget), 0
+    assert len(pager.resident.splats) <= budget
+    list(pager.resident.pieces(pager.step(None, 0.0)))  # nothing is there before
+    for eye in EYES:
+        for pixels in (30.0, 3.0):
+            for number, _ in enumerate(come_in(pager, eye, pixels)):
+                if number % 37 == 0:
+                    for other in (eye, (3, 3, 1)):
+                        truth.require_complete(truth.nodes(shown(pager.resident, other, pixels)))
+            drawn = truth.nodes(shown(pager.resident, eye, pixels))
+            truth.require_complete(drawn)
+            needed = np.flatnonzero(pager._index.detail(np.array(eye)) < FOCAL / pixels * 1.001)
+            if len(needed) <= budget // SIZE:
+                equal += 1
+                np.testing.assert_array_equal(np.sort(drawn), truth.cut(eye, pixels))
+    assert equal or budget < 20_000 or path.stem == "by size"  # where pages are wide
+
+
+def test_coarse_pages_come_first_and_those_of_no_use_for_longest_go_first(path):
+    file = TreeFile(path)
+    order = file.index().order(np.array([7, -7, 0.5]), 1000.0)
+    sizes, place = file.index().parent_size[order], np.arange(len(order))
+    assert np.corrcoef(np.log(np.minimum(sizes, 100)), place)[0, 1] < -0.5
+    pager = Pager(path, 12 * SIZE)
+    a, b, c = ((0, 0, 40), 300.0), ((9, 9, 1), 60.0), ((-9, -9, 1), 60.0)
+    there = []
+    for eye, pixels in (a, b, c, a, b):
+        list(come_in(pager, eye, pixels))
+        there.append(set(np.flatnonzero(pager._slot_of >= 0)))
+        assert pager.pages == len(there[-1]) <= 12
+    assert there[0] <= there[1]  # there was room
+
+
+def test_a_thread_brings_in_what_is_asked_for(truth, path):
+    pager = Pager(path, 10**6)
+    pager.start()
+    try:
+        for eye in EYES[:4]:
+            pager.ask(np.array(eye), FOCAL)
+            wanted, until = truth.cut(eye, 1.0), time.monotonic() + 60
+            while True:
+                pager.take(0.001)
+                drawn = np.sort(truth.nodes(shown(pager.resident, eye, 1.0)))
+                if np.array_equal(drawn, wanted) or time.monotonic() > until:
+                    break
+                if len(drawn):  # nothing before the first page
+                    truth.require_complete(drawn)
+                time.sleep(0.01)
+            np.testing.assert_array_equal(drawn, wanted)
+    finally:
+        pager.stop()
+    assert not pager.problem
+
+
+def test_a_thread_that_fails_says_why(path, monkeypatch):
+    pager = Pager(path, 5000)
+    monkeypatch.setattr(pager.file, "read", lambda pages: (_ for _ in ()).throw(OSError("the disk is gone")))
+    pager.start()
+    pager._thread.join(10)
+    assert pager.problem == "the disk is gone"
+    pager.stop()
+
+
+@pytest.mark.parametrize("budget", [SIZE, 5000, 10**6])
+def test_the_top_of_a_tree_is_a_smaller_tree(truth, path, budget, tmp_path):
+    bundle, total = read_within(path, budget)
+    assert total == 2 * LEAVES - 1
+    assert 0 < sum(len(level.splats) for level in bundle.levels) <= budget
+    write_bundle(tmp_path / "small.ply", bundle)
+    choice = Choice(read_bundle(tmp_path / "small.ply"))
+    for eye in EYES:
+        for pixels in (1.0, 30.0):
+            some = choice.weights(np.float32(eye), FOCAL, {"pixels": pixels}) > 0
+            drawn = truth.nodes(choice.splats.means[some])
+            truth.require_complete(drawn)
+            if budget == 10**6:
+                np.testing.assert_array_equal(np.sort(drawn), truth.cut(eye, pixels))
+    finest = bundle.levels[-1].splats
+    truth.require_complete(truth.nodes(finest.means))
+    assert not finest.extras["node_size"].any() and set(finest.extras) == set(CUT.columns)
+
+
+def test_what_one_eye_needs_is_read_for_it(truth, path):
+    for eye in EYES[-2:]:
+        k = FOCAL / 20
+        part, _ = read_within(path, 10**6, np.array(eye), k)
+        assert sum(len(level.splats) for level in part.levels) < 1.8 * LEAVES
+        splats, _ = select(part, np.array(eye), FOCAL, {"pixels": 20.0})
+        np.testing.assert_array_equal(np.sort(truth.nodes(splats.means)), truth.cut(eye, 20.0))
+
+
+def test_nodes_stand_for_what_is_missing():
+    """Worked by hand: 0 above 1 and 2, 1 above 3 and 4, 3 above 5 and 6; and one that nothing leads to."""
+    x = np.arange(8, dtype=np.float32)
+    sizes = np.float32([8, 4, 0, 2, 0, 0, 0, 0])
+    parents = np.array([-1, 0, 0, 1, 1, 3, 3, 3])
+    columns = {
+        "x": x, "y": 0 * x, "z": 0 * x, "node_size": sizes, "parent_x": x[parents],
+        "parent_y": 0 * x, "parent_z": -0.0 * x, "parent_size": sizes[parents],
+    }  # fmt: skip
+    columns["parent_size"][0] = ABOVE_ROOT
+
+    def found(*rows):
+        return [
+            np.array(rows)[each].tolist() for each in standing({n: c[list(rows)] for n, c in columns.items()})
+        ]
+
+    assert found(0, 1, 2, 3, 4, 5, 6) == [[0, 1, 3], [0, 1, 2, 3, 4, 5, 6]]
+    assert found(6, 5, 4, 3, 2, 1, 0) == [[3, 1, 0], [6, 5, 4, 3, 2, 1, 0]]
+    assert found(0, 1, 2, 3, 4, 5) == [[0, 1], [0, 1, 2, 3, 4]]
+    assert found(0, 1, 3, 4, 5, 6) == [[1, 3], [0]]
+    assert found(0, 1, 2, 3, 5, 6) == [[0, 3], [0, 1, 2]]
+    assert found(1, 2, 3, 4, 5, 6) == [[1, 3], []]
+    assert found(5, 6) == [[], []]
+    assert found(0) == [[], [0]]
+    assert found(0, 1, 2, 3, 4, 5, 6, 7) == [[0, 1], [0, 1, 2, 3, 4]]  # three children are none
+
+
+def test_a_table_of_pages_is_what_reading_finds(truth, tmp_path):
+    bundle = truth.bundle
+    table = table_of_pages({level.number: level.splats.extras for level in bundle.levels})
+    write_bundle(tmp_path / "a.ply", bundle)
+    write_bundle(tmp_path / "b.ply", replace(bundle, tables={BLOCKS: table}))
+    one, other = (TreeFile(tmp_path / name).index() for name in ("a.ply", "b.ply"))
+    for name in ("low", "high", "parent_size"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    means = truth.choice.splats.means[truth.parents]
+    first = means[:SIZE][truth.parents[:SIZE] >= 0]
+    assert (one.low[0] <= first.min(axis=0)).all() and (one.high[0] >= first.max(axis=0)).all()
+
+
+def test_splats_that_cannot_be_drawn_leave_no_holes(truth, tmp_path):
+    """Their parents stand for them and for their siblings."""
+    above, leaves = (level.splats.select(slice(None)) for level in truth.bundle.levels)
+    means = leaves.means.copy()
+    means[5], means[7000] = np.nan, np.inf
+    leaves = replace(leaves, means=means)
+    write_bundle(tmp_path / "tree.ply", replace(truth.bundle, levels=[Level(1, above), Level(2, leaves)]))
+    pager = Pager(tmp_path / "tree.ply", 10**6)
+    list(come_in(pager, (0, 0, 3), 1.0))
+    truth.require_complete(truth.nodes(shown(pager.resident, (0, 0, 3), 1.0)))
+
+
+def test_what_is_no_tree_or_has_no_room_is_a_sentence(truth, tmp_path):
+    leaves = truth.bundle.levels[1].splats
+    write_bundle(tmp_path / "a.ply", Bundle("flod", [Level(1, leaves, {"s_min": 0.0})], "bands"))
+    write_bundle(tmp_path / "b.ply", truth.bundle)
+    for read in (TreeFile, lambda path: read_within(path, 10**5), lambda path: Pager(path, 10**5)):
+        with pytest.raises(LodgsError, match="is no tree of splats"):
+            read(tmp_path / "a.ply")
+    for read, budget in ((read_within, 0), (Pager, 300)):
+        with pytest.raises(LodgsError, match=f"{budget} splats are too few"):
+            read(tmp_path / "b.ply", budget)
+    bundle, _ = read_within(tmp_path / "b.ply", 1)
+    assert [len(level.splats) for level in bundle.levels] == [0, 1]

@@ -1,0 +1,68 @@
+"""Trees of splats to choose from, of any size: merged crudely, neighbour by neighbour, with proper sizes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from training.lod.blocks import spatial_order
+from training.lod.rules.cut import ABOVE_ROOT, least_size
+from training.splats.bundle import Bundle, Level
+from training.splats.gaussians import Splats
+
+
+def random_leaves(count: int, rng: np.random.Generator, degree: int = 0, extent: float = 10.0) -> Splats:
+    """Splats on a rolling ground, small beside the distances of their neighbours."""
+    means = rng.uniform(-extent, extent, (count, 3))
+    means[:, 2] = np.sin(means[:, 0]) * np.cos(means[:, 1]) + rng.normal(0, 0.05, count)
+    return Splats(
+        means=means.astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        log_scales=np.log(extent / count**0.5 * rng.uniform(0.3, 1, (count, 3))).astype(np.float32),
+        opacity_logits=rng.normal(1, 1, count).astype(np.float32),
+        sh=rng.normal(0, 0.5, (count, (degree + 1) ** 2, 3)).astype(np.float32),
+    )
+
+
+def tree_of(leaves: Splats) -> Bundle:
+    """The tree over at least two splats; further columns of theirs are dropped."""
+    leaves = leaves.select(spatial_order(leaves.means))
+    count = len(leaves)
+    total = 2 * count - 1
+    means, squares = np.empty((total, 3)), np.empty(total)
+    sh = np.empty((total, *leaves.sh.shape[1:]), np.float32)
+    means[:count], sh[:count] = leaves.means, leaves.sh
+    squares[:count] = np.exp(2 * leaves.log_scales.astype(np.float64)).mean(axis=1)
+    sizes, parents, opacity = np.zeros(total), np.full(total, -1), np.empty(total)
+    opacity[:count] = 1 / (1 + np.exp(-leaves.opacity_logits.astype(np.float64)))
+    row, first = np.arange(count), count
+    while len(row) > 1:
+        pairs = len(row) // 2
+        two, new = row[: 2 * pairs].reshape(-1, 2), np.arange(first, first + pairs)
+        weight = (opacity * squares)[two]
+        weight /= weight.sum(axis=1, keepdims=True)
+        means[new] = np.float32(np.einsum("nt,ntc->nc", weight, means[two]))  # as files have it
+        away = np.linalg.norm(means[two] - means[new][:, None], axis=2)
+        squares[new] = np.einsum("nt,nt->n", weight, squares[two] + away**2 / 3)
+        sh[new] = np.einsum("nt,ntkc->nkc", weight, sh[two])
+        opacity[new] = np.einsum("nt,nt->n", weight, opacity[two])
+        least = np.maximum(least_size(sizes[two], away).max(axis=1), np.sqrt(3 * squares[new]))
+        sizes[new] = np.nextafter(np.float32(least), np.float32(np.inf))
+        parents[two] = new[:, None]
+        row, first = np.append(new, row[2 * pairs :]), first + pairs
+    above = sizes[parents]
+    above[-1] = ABOVE_ROOT
+    columns = {"node_size": sizes, "parent_size": above}
+    columns |= {f"parent_{axis}": means[parents, i] for i, axis in enumerate("xyz")}
+    extras = {name: column.astype(np.float32) for name, column in columns.items()}
+    clipped = opacity.clip(1e-4, 1 - 1e-4)
+    nodes = Splats(
+        means=means.astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (total, 1)),
+        log_scales=np.tile(np.log(squares)[:, None] / 2, 3).astype(np.float32),
+        opacity_logits=np.log(clipped / (1 - clipped)).astype(np.float32),
+        sh=sh,
+        extras=extras,
+    )
+    leaves.extras = {name: column[:count] for name, column in extras.items()}
+    above = nodes.select(np.argsort(-sizes[count:], kind="stable") + count)
+    return Bundle("tree", [Level(1, above), Level(2, leaves)], "cut")

@@ -1,0 +1,500 @@
+"""A tree of splats larger than the memory that it may take: of its bundle the part that an eye needs.
+
+The file is read in pages, ranges of SIZE rows of a level. What is in memory is a tree of its own at any time:
+a node of which not both children are there stands for all that is below it, as if it were a leaf, so every
+cut is complete. Pages come in coarse to fine, as the eye comes near; at most so many splats as the budget
+says are there, and the pages that were of no use for longest go first.
+
+numpy only. Files are read in a thread (:class:`Pager`); what it has found, the thread that draws takes over
+in pieces, for as long as it has time (:meth:`Pager.take`).
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields
+from itertools import pairwise
+from math import inf
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import LodgsError
+from ..splats.bundle import Bundle, Level, Rows, open_bundle
+from ..splats.dialects import drawable
+from ..splats.gaussians import Splats
+from .blocks import SIZE, spatial_order
+from .rule import distances_by_axes
+from .rules.cut import ABOVE_ROOT, K_LEAST, NODE_SIZE, PARENT, PARENT_SIZE
+from .selection import rule_of
+from .streaming import BLOCKS
+
+BOUNDS = tuple(f"{end}_{axis}" for end in ("low", "high") for axis in "xyz")
+"""Columns of the table of blocks beside ``level`` and ``parent_size``: bounds of the parents' places."""
+COLUMNS = (NODE_SIZE, PARENT_SIZE, *PARENT)
+AT_ONCE = 256
+"""Pages that come in between two looks at where the eye is."""
+ROUNDING = 1e-4
+"""Share of a distance that single precision may get wrong."""
+_PAGE = "page"
+"""Column that tells of rows in which page they are, while they are read."""
+_INDEXED = 1 << 11
+"""Pages that are looked at together when there is no table of blocks."""
+
+Columns = Mapping[str, np.ndarray]
+
+
+def streaming_order(columns: Columns) -> np.ndarray:
+    """(N,) int64, the order of a level's splats in a file: by octaves of their parents' sizes, the largest
+    first, and within one as neighbours in space.
+
+    Their parents tell from where splats are needed, so that pages are of one size and one place, and both
+    children of a node come together.
+
+    Args:
+        columns: of the rule, (N,) each.
+    """
+    place = np.empty(len(columns[PARENT_SIZE]), np.int64)
+    place[spatial_order(np.stack([columns[name] for name in PARENT], axis=1))] = np.arange(len(place))
+    return np.lexsort((place, -np.floor(np.log2(np.maximum(columns[PARENT_SIZE], 1e-30)))))
+
+
+def table_of_pages(columns: Mapping[int, Columns]) -> dict[str, np.ndarray]:
+    """The table ``blocks`` of a tree: of every SIZE rows of a level, in the order of rows, the ``level``, the
+    greatest ``parent_size``, and the BOUNDS of the parents' places.
+
+    Args:
+        columns: of the rule, (N,) each, by the level's number.
+    """
+    parts = [_bounds(number, own) for number, own in columns.items()]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _bounds(number: int, columns: Columns) -> dict[str, np.ndarray]:
+    begins = np.arange(0, len(columns[PARENT_SIZE]), SIZE)
+    found = {"level": np.full(len(begins), number, np.int32)}
+    found[PARENT_SIZE] = np.maximum.reduceat(columns[PARENT_SIZE], begins)
+    named = [(f"{end}_{name[-1]}", name) for end in ("low", "high") for name in PARENT]
+    extremes = [np.minimum] * 3 + [np.maximum] * 3
+    for (bound, name), extreme in zip(named, extremes, strict=True):
+        found[bound] = extreme.reduceat(columns[name], begins)
+    return found
+
+
+class TreeFile:
+    """A bundle of the rule ``cut``, read page by page.
+
+    Attributes:
+        bundle: what it says of itself, without splats.
+        levels: (P,) of each page, the level's number.
+        begins, counts: (P,) its first row in the level, and its rows.
+        total: splats of the whole file.
+
+    Raises:
+        LodgsError: as ``open_bundle``, or it has another rule.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.bundle, self._rows = open_bundle(path)
+        if rule_of(self.bundle).name != "cut":
+            raise LodgsError(
+                f"{path} is no tree of splats: its levels are chosen by the rule '{self.bundle.rule}'.",
+                "Open it as a whole.",
+            )
+        numbers = [level.number for level in self.bundle.levels]
+        lengths = [len(self._rows[number]) for number in numbers]
+        pages = [-(-length // SIZE) for length in lengths]
+        self.total = sum(lengths)
+        self.levels = np.repeat(numbers, pages)
+        self.begins = np.concatenate([np.arange(0, length, SIZE) for length in lengths])
+        self.counts = np.minimum(SIZE, np.repeat(lengths, pages) - self.begins)
+        self._finest = numbers[-1]
+
+    def __len__(self) -> int:
+        return len(self.levels)
+
+    def read(self, pages: np.ndarray) -> list[Splats]:
+        """The splats of each of some pages (M,); those that cannot be drawn are missing."""
+        found: dict[int, Splats] = {}
+        for number in self._rows:
+            mine = pages[self.levels[pages] == number]
+            each = self.begins[mine, None] + np.arange(SIZE)
+            there = np.arange(SIZE) < self.counts[mine, None]
+            splats = self.read_rows(number, each[there], {_PAGE: np.nonzero(there)[0]})
+            begins = np.searchsorted(splats.extras.pop(_PAGE), np.arange(len(mine) + 1))
+            parts = [splats.select(slice(*ends)) for ends in pairwise(begins)]
+            found |= dict(zip(mine.tolist(), parts, strict=True))
+        return [found[page] for page in pages.tolist()]
+
+    def read_rows(self, number: int, rows: np.ndarray, beside: Columns | None = None) -> Splats:
+        """The splats of some rows (M,) of a level, with further columns (M,); those that cannot be drawn are
+        missing."""
+        splats = self._rows[number].read(rows)
+        nothing = np.zeros(len(splats), np.float32)
+        splats.extras = dict.fromkeys(COLUMNS, nothing) | splats.extras | dict(beside or {})
+        return drawable(splats, self.path)
+
+    def details(self, eye: np.ndarray | None) -> dict[int, np.ndarray]:
+        """By the level's number, (N,) float32: the least detail k at which an eye needs each splat, which is
+        where its parent is not fine enough; for no eye in particular 1 / size_p."""
+        found = {}
+        for number, rows in self._rows.items():
+            found[number] = np.empty(len(rows), np.float32)
+            for begin in range(0, len(rows), _INDEXED * SIZE):
+                block = slice(begin, begin + _INDEXED * SIZE)
+                columns = _columns_of(rows, block)
+                away = 1.0 if eye is None else distances_by_axes([columns[name] for name in PARENT], eye)
+                found[number][block] = away / np.maximum(columns[PARENT_SIZE], np.float32(1e-30))
+        return found
+
+    def index(self, on_progress: Callable[[float], bool] = lambda share: True) -> PageIndex:
+        """Where pages are needed: of the file's table of blocks, or found by reading the rule's columns once.
+
+        Args:
+            on_progress: called with the share that is done; where it returns False, an InterruptedError is
+                raised.
+        """
+        table = self.bundle.tables.get(BLOCKS, {})
+        wanted = {"level", PARENT_SIZE, *BOUNDS}
+        if wanted <= table.keys() and np.array_equal(table["level"], self.levels):
+            return PageIndex.of(table)
+        parts = []
+        for number, rows in ((level.number, self._rows[level.number]) for level in self.bundle.levels):
+            for begin in range(0, len(rows), _INDEXED * SIZE):
+                if not on_progress(sum(len(part["level"]) for part in parts) / max(len(self), 1)):
+                    raise InterruptedError
+                parts.append(_bounds(number, _columns_of(rows, slice(begin, begin + _INDEXED * SIZE))))
+        return PageIndex.of({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+
+
+def _columns_of(rows: Rows, some: slice) -> dict[str, np.ndarray]:
+    found = rows.columns(some, (PARENT_SIZE, *PARENT))
+    nothing = np.zeros(len(rows.vertices[some]), np.float32)
+    return {name: np.nan_to_num(found.get(name, nothing)) for name in (PARENT_SIZE, *PARENT)}
+
+
+@dataclass(frozen=True)
+class PageIndex:
+    """From where on each of P pages is needed.
+
+    Attributes:
+        low, high: (P, 3) float64, bounds of the parents' places.
+        parent_size: (P,) float64, the greatest.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+    parent_size: np.ndarray
+
+    @classmethod
+    def of(cls, table: Columns) -> PageIndex:
+        """By a table of blocks."""
+        low, high = (np.stack([table[name] for name in part], 1) for part in (BOUNDS[:3], BOUNDS[3:]))
+        return cls(low.astype(np.float64), high.astype(np.float64), table[PARENT_SIZE].astype(np.float64))
+
+    def detail(self, eye: np.ndarray) -> np.ndarray:
+        """(P,) the least detail k (``cut.detail_of``) at which an eye needs a splat of each page, or less.
+
+        A splat is needed where its parent is not fine enough, ‖c - μ_p‖ < k size_p.
+        """
+        eye = np.asarray(eye, np.float64)
+        beside = np.maximum(np.maximum(self.low - eye, eye - self.high), 0)
+        away = np.sqrt(np.square(beside).sum(axis=1)) * (1 - ROUNDING)
+        return away / np.maximum(self.parent_size, 1e-30)
+
+    def order(self, eye: np.ndarray, k: float) -> np.ndarray:
+        """The pages (M,) that an eye needs at a detail, those first without which others are of no use.
+
+        Balls of k size around nodes lie within their parents' for every k of at least K_LEAST, so parents
+        are needed from a lower k on; what is needed from K_LEAST on goes by size.
+        """
+        detail = self.detail(eye)
+        some = np.flatnonzero(detail < k * (1 + ROUNDING))
+        keys = (-self.parent_size[some], np.maximum(detail[some], K_LEAST))
+        return some[np.lexsort(keys)]
+
+
+def standing(columns: Columns) -> tuple[np.ndarray, np.ndarray]:
+    """Which of N splats of a tree can be told apart by a cut where others may be missing.
+
+    Children know their parent by its size and place, bit for bit. (Of several nodes of one size at one place
+    none is told apart.)
+
+    Args:
+        columns: of the rule, and x, y, z, (N,) float32 each.
+
+    Returns:
+        inner: (N,) bool, both children are there. Others stand for all below them.
+        reached: (N,) bool, all nodes above are there and inner. Others are never drawn.
+    """
+    size, above = columns[NODE_SIZE], columns[PARENT_SIZE]
+    count = len(size)
+    own = np.stack([size, *(columns[axis] for axis in "xyz")], 1) + np.float32(0)  # no zero below zero
+    sought = np.stack([above, *(columns[name] for name in PARENT)], 1) + np.float32(0)
+    nodes = np.flatnonzero(size > 0)
+    keys, wanted = _hashed(own[nodes]), _hashed(sought)
+    order = np.argsort(keys, kind="stable")
+    place = np.searchsorted(keys[order], wanted).clip(max=max(len(nodes) - 1, 0))
+    parent = nodes[order[place]] if len(nodes) else np.zeros(count, np.int64)
+    root = above >= np.float32(ABOVE_ROOT)
+    known = (own[parent] == sought).all(axis=1) & (above > size) & ~root
+    inner = np.bincount(parent[known], minlength=count)[:count] == 2
+    # whether all nodes above are inner: twice as far up at every step
+    reached, up = root | (known & inner[parent]), np.where(known, parent, np.arange(count))
+    for _ in range(count.bit_length()):
+        further = reached & reached[up]
+        if np.array_equal(further, reached) and np.array_equal(up, up[up]):
+            break
+        reached, up = further, up[up]
+    return inner, reached
+
+
+def _hashed(rows: np.ndarray) -> np.ndarray:
+    """(N,) uint64 of rows (N, 4) float32: equal ones have equal numbers, and hardly any others."""
+    words = np.ascontiguousarray(rows).view(np.uint32).astype(np.uint64)
+    found = np.zeros(len(rows), np.uint64)
+    for word in words.T:
+        found = (found ^ word) * np.uint64(0x9E3779B97F4A7C15)
+        found ^= found >> np.uint64(29)
+    return found
+
+
+def read_within(
+    path: str | Path, budget: int, eye: np.ndarray | None = None, k: float = inf
+) -> tuple[Bundle, int]:
+    """The top of a tree as a smaller one, complete by itself; and how many splats the whole has.
+
+    Args:
+        budget: most splats of it.
+        eye: (3,) for whom; None: for any.
+        k: the eye's detail (``cut.detail_of``): where the budget has room for all that it needs, its cut is
+            the whole tree's.
+
+    Raises:
+        LodgsError: as :class:`TreeFile`, or the budget leaves nothing.
+    """
+    file = TreeFile(path)
+    details, bundle = file.details(eye), file.bundle
+    everything = np.concatenate([*details.values()])
+    most = np.float32(k)
+    if np.count_nonzero(everything < most) > budget:
+        most = np.partition(everything, budget)[budget]  # siblings have the same, and come together
+    splats = Splats.concatenated(
+        [file.read_rows(n, np.flatnonzero(each < most)) for n, each in details.items()]
+    )
+    if not len(splats):
+        raise LodgsError(*_too_few(budget, path))
+    inner, reached = standing(splats.extras | dict(zip("xyz", splats.means.T, strict=True)))
+    coarse, fine = splats.select(inner & reached), splats.select(~inner & reached)
+    fine.extras[NODE_SIZE] = np.zeros(len(fine), np.float32)
+    parts = zip((bundle.levels[0], bundle.levels[-1]), (coarse, fine), strict=True)
+    bundle.levels = [Level(level.number, part, level.facts) for level, part in parts]
+    bundle.tables.pop(BLOCKS, None)
+    return bundle, file.total
+
+
+def _too_few(budget: int, path: str | Path) -> tuple[str, str]:
+    return f"{budget:,} splats are too few to show {Path(path).name}.", f"Take {SIZE} or more of them."
+
+
+@dataclass(frozen=True)
+class Update:
+    """What comes in at once.
+
+    Attributes:
+        before: the sizes of all rows, their own and their parents', without those that are replaced.
+        pages: where in memory each begins, and its splats.
+        after: the sizes with them.
+    """
+
+    before: tuple[np.ndarray, np.ndarray]
+    pages: list[tuple[int, Splats]]
+    after: tuple[np.ndarray, np.ndarray]
+
+
+class Resident:
+    """Splats of a tree in memory, N rows: those that are there, and room. Its thread is the one that draws.
+
+    Attributes:
+        splats: all rows; those without a splat have a parent size of 0, so that no eye is shown them. The
+            extras are the columns of the rule ``cut``, whose weights make a complete cut of what is there.
+    """
+
+    def __init__(self, rows: int, degree: int) -> None:
+        shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": ()}
+        arrays = {name: np.zeros((rows, *shape), np.float32) for name, shape in shapes.items()}
+        sh = np.zeros((rows, (degree + 1) ** 2, 3), np.float32)
+        extras = {name: np.zeros(rows, np.float32) for name in COLUMNS}
+        self.splats = Splats(**arrays, sh=sh, extras=extras)
+
+    def pieces(self, update: Update) -> Iterator[None]:
+        """Takes an update over, a little at each step; after every one, what is there is complete."""
+        self._set(update.before)
+        yield
+        for begin, page in update.pages:
+            rows = slice(begin, begin + len(page))
+            for each in fields(Splats):
+                if each.name != "extras":
+                    getattr(self.splats, each.name)[rows] = getattr(page, each.name)
+            for name in PARENT:
+                self.splats.extras[name][rows] = page.extras[name]
+            yield
+        self._set(update.after)
+        yield
+
+    def _set(self, sizes: tuple[np.ndarray, np.ndarray]) -> None:
+        self.splats.extras[NODE_SIZE], self.splats.extras[PARENT_SIZE] = sizes
+
+
+class Pager:
+    """Keeps of a tree in a file what an eye needs in memory, in a thread.
+
+    Args:
+        path: a bundle of the rule ``cut``.
+        budget: most splats in memory.
+
+    Attributes:
+        file: what is read.
+        resident: what is in memory.
+        problem: why the thread has ended by itself; empty as long as it has not.
+
+    Raises:
+        LodgsError: as :class:`TreeFile`, or the budget is less than a page.
+    """
+
+    def __init__(self, path: str | Path, budget: int) -> None:
+        self.file = TreeFile(path)
+        slots = min(budget // SIZE, len(self.file))
+        if not slots:
+            raise LodgsError(*_too_few(budget, path))
+        (first,) = self.file.read(np.array([0]))
+        self.resident, self.problem = Resident(slots * SIZE, first.sh_degree), ""
+        self._columns = {name: np.zeros(slots * SIZE, np.float32) for name in (*COLUMNS, *"xyz")}
+        self._slot_of, self._page_in = np.full(len(self.file), -1), np.full(slots, -1)
+        self._used, self._tick = np.zeros(len(self.file), np.int64), 0
+        self._last = self._sizes()
+        self._index: PageIndex | None = None
+        self._asked: tuple[np.ndarray, float] | None = None
+        self._done = self._asked
+        self._changed, self._stopping = threading.Condition(), False
+        self._ready: Update | None = None
+        self._taking: Iterator[None] | None = None
+        self._thread: threading.Thread | None = None
+
+    @property
+    def pages(self) -> int:
+        """How many pages are in memory, or on their way."""
+        return int((self._page_in >= 0).sum())
+
+    def step(self, eye: np.ndarray | None, k: float) -> Update | None:
+        """The next pages for an eye: what the thread does again and again; None where there are no more.
+
+        Args:
+            eye: (3,) in the splats' space; None: nowhere yet, the first pages of the file.
+            k: its detail, see ``cut.detail_of``.
+        """
+        slots = len(self._page_in)
+        if eye is None:
+            order = np.arange(slots)
+        else:
+            if self._index is None:
+                self._index = self.file.index(lambda share: not self._stopping)
+            order = self._index.order(eye, k)[:slots]
+        self._tick += 1
+        self._used[order] = self._tick
+        missing = order[self._slot_of[order] < 0][:AT_ONCE]
+        if not len(missing):
+            return None
+        free = np.flatnonzero(self._page_in < 0)
+        if len(free) < len(missing):
+            there = np.flatnonzero(self._page_in >= 0)
+            oldest = np.argsort(self._used[self._page_in[there]], kind="stable")
+            gone = there[oldest[: len(missing) - len(free)]]
+            for name in COLUMNS:
+                self._columns[name].reshape(-1, SIZE)[gone] = 0
+            self._last = self._sizes()
+            self._slot_of[self._page_in[gone]] = self._page_in[gone] = -1
+            free = np.concatenate([free, gone])
+        before, pages = self._last, []
+        for page, slot, splats in zip(missing, free, self.file.read(missing), strict=False):
+            begin = int(slot) * SIZE
+            rows = slice(begin, begin + len(splats))
+            for name in COLUMNS:
+                self._columns[name][rows] = splats.extras[name]
+            for name, column in zip("xyz", splats.means.T, strict=True):
+                self._columns[name][rows] = column
+            self._slot_of[page], self._page_in[slot] = slot, page
+            pages.append((begin, splats))
+        self._last = self._sizes()
+        return Update(before, pages, self._last)
+
+    def _sizes(self) -> tuple[np.ndarray, np.ndarray]:
+        """The sizes of all rows as the rule is to have them: of nodes that stand for all below them 0, their
+        parents' 0 where they are not drawn."""
+        some = np.flatnonzero(self._columns[PARENT_SIZE] > 0)
+        columns = {name: column[some] for name, column in self._columns.items()}
+        inner, reached = standing(columns)
+        sizes, parents = np.zeros((2, len(self._columns[NODE_SIZE])), np.float32)
+        sizes[some[inner]], parents[some[reached]] = columns[NODE_SIZE][inner], columns[PARENT_SIZE][reached]
+        return sizes, parents
+
+    def start(self) -> None:
+        """Begins to read in a thread: the first pages of the file, and then what is asked for."""
+        self._thread = threading.Thread(target=self._run, name="lodgs-paging", daemon=True)
+        self._thread.start()
+
+    def ask(self, eye: np.ndarray, k: float) -> None:
+        """Says where the eye is, and its detail. Returns at once."""
+        with self._changed:
+            self._asked = np.array(eye, np.float64), float(k)
+            self._changed.notify_all()
+
+    def take(self, seconds: float = 0.01) -> bool:
+        """Takes over what has come in, for about so long at most; whether anything has changed.
+
+        For the thread that draws. Between two calls, what is in memory makes complete cuts.
+        """
+        until, changed = time.perf_counter() + seconds, False
+        while True:
+            if self._taking is None:
+                with self._changed:
+                    update, self._ready = self._ready, None
+                    self._changed.notify_all()
+                if update is None:
+                    return changed
+                self._taking = self.resident.pieces(update)
+            for _ in self._taking:
+                changed = True
+                if time.perf_counter() >= until:
+                    return True
+            self._taking = None
+
+    def stop(self) -> None:
+        """Ends the thread."""
+        with self._changed:
+            self._stopping = True
+            self._changed.notify_all()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            while not self._stopping:
+                self._done = self._asked
+                # first the file's first pages: where they are needed is not known yet
+                update = self.step(None, 0.0) if self._index is None else None
+                if update is None and self._done is not None:
+                    update = self.step(*self._done)
+                with self._changed:
+                    if update is None:
+                        self._changed.wait_for(lambda: self._stopping or self._asked is not self._done)
+                    else:
+                        self._changed.wait_for(lambda: self._stopping or self._ready is None)
+                        self._ready = update
+        except InterruptedError:
+            return
+        except Exception as error:  # a disk that is gone, a file that is not what it says
+            self.problem = str(error) or type(error).__name__
