@@ -7,9 +7,6 @@ the sets of chunks, one a step.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-
 import numpy as np
 import torch
 
@@ -17,7 +14,7 @@ from ...errors import LodgsError
 from ...lod.blocks import Blocks, block_quantiles, spatial_order
 from ...lod.rules.chunks import RULE, TABLE, member_columns
 from ...lod.streaming import BLOCKS, table_of_blocks
-from ...rasterize import Adam, Gaussians, Target, photometric_loss
+from ...rasterize import Gaussians, Target, photometric_loss
 from ...scenes.cameras import evenly
 from ...splats.bundle import Level
 from ...splats.gaussians import Splats
@@ -26,8 +23,7 @@ from ..data import TrainingView
 from ..density import require_rows
 from ..method import Drawing
 from ..model import NAMES
-from ..start import from_splats
-from ..threedgs import train as threedgs_train
+from ..refining import Refining
 from . import ROUNDS, LodgeParameters, chunks
 from .composite import (
     IndexedLevel,
@@ -46,32 +42,10 @@ FAR_VIEWS = 2
 """A place that so many training views have from a level's distance or farther is tuned and pruned by them."""
 
 
-class SeenRows:
-    """Adam's step for the rows alone that a picture was made of.
-
-    Args:
-        adam: of all rows.
-        rows: (M,) int64 of them.
-        leaves: these rows of each tensor, from which the picture was made.
-    """
-
-    def __init__(self, adam: Adam, rows: torch.Tensor, leaves: dict[str, torch.Tensor]) -> None:
-        self._adam, self._rows, self._leaves = adam, rows, leaves
-
-    def step(self) -> None:
-        """One step of these rows."""
-        self._adam.step_rows(self._rows, {name: leaf.grad for name, leaf in self._leaves.items()})
-
-    def zero_grad(self) -> None:
-        """The rows go with their gradients: the next picture has others."""
-        self._leaves = {}
-
-
-class Method(threedgs_train.Method):
+class Method(Refining):
     """One run of LODGE.
 
     Attributes:
-        finest_steps: so many steps come before the coarser levels; none with a base.
         d_l: the distance from which on each level is shown, in scene units, by number; those known so far.
         finished: the levels that no step changes any more, as they are drawn, by number, finest first.
         costs: what finding the distances has told, see ``Thresholds``.
@@ -85,14 +59,7 @@ class Method(threedgs_train.Method):
         p = self.parameters
         if base is not None and p.levels == 1:
             raise LodgsError("A base is the one level itself: there is nothing to train.", "Give levels = 2.")
-        self.finest_steps = 0 if base is not None else p.steps
-        if base is None:
-            super().setup(None)
-        else:
-            p = self.parameters = replace(p, sh_degree=min(p.sh_degree, base.sh_degree))  # as they come
-            tensors = from_splats(base.select(spatial_order(base.means)), p.sh_degree, self.device)
-            self.model = self.new_model(tensors)
-            self._densify_until = 0
+        super().setup(base)
         self.d_l = {p.levels: 0.0}
         self.finished: dict[int, IndexedLevel] = {}
         self.costs: list[dict] = []
@@ -100,7 +67,6 @@ class Method(threedgs_train.Method):
         self.sets: dict[int, list[np.ndarray]] = {}
         self._blocks: Blocks | None = None  # of the level in training, as it was at its last pruning
         self._alone_share = p.tune_alone
-        self._optimizer: SeenRows | None = None
 
     @property
     def steps(self) -> int:
@@ -163,9 +129,8 @@ class Method(threedgs_train.Method):
     # -- a step ----------------------------------------------------------------------------------------
 
     def shrink(self, step: int) -> float:
-        if step < self.finest_steps:
-            return super().shrink(step)
-        return self._farther(self.level_at(step)) if self._alone(step) else 1
+        alone = self.refines(step) and self._alone(step)
+        return self._farther(self.level_at(step)) if alone else super().shrink(step)
 
     def choose_view(self, step: int) -> TrainingView:
         if step >= self.finest_steps and self._local(step) % self.parameters.tune_steps == 0:
@@ -187,41 +152,15 @@ class Method(threedgs_train.Method):
             scale = 1 / rng.uniform(1 - spread, 1 + spread)
             rows = rows_seen({**self.finished, number: level}, self.d_l, view.camera, near, scale)
         own = torch.from_numpy(rows[number]).long().to(self.device)
-        leaves = {name: tensor.requires_grad_() for name, tensor in self.model.rows(own).items()}
-        self._optimizer = SeenRows(self.model.adam, own, leaves)
-        shown = [filtered(Gaussians(**leaves), self._std(self.d_l[number]))]
+        shown = [filtered(self.take_rows(own), self._std(self.d_l[number]))]
         if len(rows) > 1:
             shown.insert(0, together(self.finished, {n: some for n, some in rows.items() if n != number}))
         drawn = self.rasterize_model(view.camera, step, gaussians=Gaussians.concatenated(shown))
         return [Drawing(drawn)]
 
-    def optimizers(self) -> Sequence[Adam | SeenRows]:
-        return super().optimizers() if self._optimizer is None else (self._optimizer,)
-
     def background(self, step: int) -> tuple[float, float, float]:
         """Black for the coarser levels, which the finest covers for: what is nothing may be black."""
         return super().background(step) if step < self.finest_steps else (0.0, 0.0, 0.0)
-
-    def sh_degree(self, step: int) -> int:
-        return super().sh_degree(step) if step < self.finest_steps else self.parameters.sh_degree
-
-    def accumulate_stats(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> None:
-        if step < self.finest_steps:
-            super().accumulate_stats(drawings, view, step)
-
-    def set_learning_rates(self, step: int) -> None:
-        if step < self.finest_steps:
-            super().set_learning_rates(step)
-        else:  # a finished model's (the paper says nothing)
-            self.model.adam.lr["means"] = self.parameters.lr_means_final * self.data.extent
-
-    def keep_supported(self, step: int) -> None:
-        if step < self.finest_steps:
-            super().keep_supported(step)
-
-    def control_density(self, step: int) -> None:
-        if step < self.finest_steps:
-            super().control_density(step)
 
     # -- levels ----------------------------------------------------------------------------------------
 

@@ -1,0 +1,112 @@
+"""A tree's sizes and columns against a walk node by node."""
+
+import numpy as np
+import pytest
+
+from training.lod.rule import rules
+from training.lod.rules.cut import ABOVE_ROOT, K_LEAST
+from training.lod.selection import select_levels, settings
+from training.lod.tree import Tree, area_of, size_of, treeless_columns
+from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
+from training.splats.gaussians import Splats
+
+
+def random_tree(rng, leaves):
+    """Pairs merged at random: deep and shallow ones."""
+    free, children = list(range(leaves)), []
+    while len(free) > 1:
+        pair = [free.pop(rng.integers(len(free))) for _ in range(2)]
+        free.append(leaves + len(children))
+        children.append(pair)
+    return Tree(np.array(children, np.int32).reshape(-1, 2))
+
+
+def nodes(rng, count):
+    return Splats(
+        rng.normal(0, 3, (count, 3)).astype(np.float32),
+        rng.normal(size=(count, 4)).astype(np.float32),
+        rng.normal(-3, 1.5, (count, 3)).astype(np.float32),
+        rng.normal(0, 2, count).astype(np.float32),
+        rng.normal(size=(count, 4, 3)).astype(np.float32),
+    )
+
+
+def test_the_size_of_a_disc_is_its_radius():
+    assert size_of(np.log([[2.0, 2.0, 1e-9]])) == pytest.approx(2)
+    assert area_of(np.log([[1.0, 2.0, 3.0]])) == pytest.approx(2 + 3 + 6)
+
+
+@pytest.mark.parametrize("leaves", [2, 3, 50, 400])
+def test_sizes_are_the_least_that_keep_cuts_proper(leaves):
+    rng = np.random.default_rng(leaves)
+    tree = random_tree(rng, leaves)
+    splats = nodes(rng, len(tree))
+    sizes = tree.sizes(splats.means, splats.log_scales)
+    assert tree.leaves == leaves and len(tree) == 2 * leaves - 1 and sizes.dtype == np.float32
+    assert not sizes[:leaves].any()
+    expected, means = np.zeros(len(tree)), splats.means.astype(float)
+    for node in range(leaves, len(tree)):
+        a, b, c = np.exp(splats.log_scales[node].astype(float))
+        least = (a * b + a * c + b * c) ** 0.5
+        for child in tree.children[node - leaves]:
+            away = float(np.sqrt(((means[child] - means[node]) ** 2).sum()))
+            assert float(sizes[node]) >= (float(sizes[child]) + away / K_LEAST) * (1 + 2**-20)
+            least = max(least, (expected[child] + away / K_LEAST) * (1 + 2**-20))
+            assert tree.parents[child] == node
+        expected[node] = least
+    np.testing.assert_allclose(sizes, expected, rtol=1e-5)
+    assert tree.parents[-1] == -1
+    assert sorted(np.concatenate(tree.layers)) == list(range(leaves, len(tree)))
+
+
+def test_columns_are_the_parents_own_numbers():
+    rng = np.random.default_rng(0)
+    tree = random_tree(rng, 60)
+    splats = nodes(rng, len(tree))
+    sizes = tree.sizes(splats.means, splats.log_scales)
+    columns = tree.columns(splats.means, sizes)
+    for node in range(len(tree) - 1):
+        above = tree.parents[node]
+        assert columns["node_size"][node] == sizes[node] and columns["parent_size"][node] == sizes[above]
+        assert [columns[f"parent_{axis}"][node] for axis in "xyz"] == splats.means[above].tolist()
+    assert columns["parent_size"][-1] == np.float32(ABOVE_ROOT)
+
+
+def test_levels_in_a_file_are_a_proper_cut_from_everywhere(tmp_path):
+    """Splats of both levels that the rule shows, traced back by their colours: one above each leaf."""
+    rng = np.random.default_rng(1)
+    tree = random_tree(rng, 300)
+    splats = nodes(rng, len(tree))
+    splats.sh[:, 0, 0] = np.arange(len(tree))
+    above, leaves = tree.levels(splats)
+    assert (above.number, leaves.number) == (1, 2) and len(above.splats) == 299 and len(leaves.splats) == 300
+    np.testing.assert_array_equal(leaves.splats.sh[:, 0, 0], np.arange(300))
+    assert (np.diff(above.splats.extras["node_size"]) <= 0).all()
+    write_bundle(tmp_path / "a.ply", Bundle("tree", [above, leaves], "cut"))
+    bundle = read_bundle(tmp_path / "a.ply")
+    drawn = []
+    for eye in (np.zeros(3), np.array([40.0, 3, 1]), np.array([3e3, 0, 0]), splats.means[7]):
+        for pixels in (0.5, 8, 60):
+            shown = select_levels(bundle, eye, 500.0, settings(bundle, {"pixels": pixels}))
+            found = np.concatenate([one.splats.sh[:, 0, 0] for one in shown]).astype(int)
+            assert all(one.weights is None for one in shown)
+            seen = np.zeros(len(tree), bool)
+            seen[found] = True
+            for leaf in range(300):
+                path, node = [], leaf
+                while node >= 0:
+                    path.append(node)
+                    node = tree.parents[node]
+                assert seen[path].sum() == 1
+            drawn.append(len(found))
+    assert min(drawn) == 1 and max(drawn) == 300
+
+
+def test_leaves_without_a_tree_are_all_shown():
+    means, columns = np.zeros((5, 3), np.float32), treeless_columns(5)
+    assert rules()["cut"].weights(means, np.ones(3), 100.0, columns, {}, {"pixels": 16.0}).all()
+    rng = np.random.default_rng(0)
+    splats = nodes(rng, 5)
+    splats.extras |= columns
+    bundle = Bundle("tree", [Level(2, splats)], "cut")
+    assert len(select_levels(bundle, np.zeros(3), 10.0, settings(bundle, {}))[0].splats) == 5

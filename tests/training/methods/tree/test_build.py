@@ -1,0 +1,161 @@
+"""The tree as it is built: moments of the leaves, nothing that is fog or a hole, no order that breaks it."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import quad
+from scipy.spatial.transform import Rotation
+from scipy.special import expit, logit
+
+from training.errors import LodgsError
+from training.lod.tree import area_of
+from training.methods.tree.build import OPAQUE, SPREAD, build, optical_depth
+from training.rasterize import Gaussians, rasterize
+from training.scenes.cameras import Camera
+from training.splats.gaussians import Splats
+
+
+def scene(count, seed=0, opacity=0.6):
+    rng = np.random.default_rng(seed)
+    return Splats(
+        rng.normal(0, 3, (count, 3)).astype(np.float32),
+        rng.normal(size=(count, 4)).astype(np.float32),
+        rng.normal(-3, 0.6, (count, 3)).astype(np.float32),
+        np.full(count, logit(opacity), np.float32),
+        rng.normal(0, 0.3, (count, 4, 3)).astype(np.float32),
+        {"other": np.zeros(count, np.float32)},
+    )
+
+
+def covariances(splats):
+    turns = Rotation.from_quat(splats.quats[:, [1, 2, 3, 0]].astype(float)).as_matrix()
+    scales = np.exp(splats.log_scales.astype(float))
+    return np.einsum("nij,nj,nkj->nik", turns, scales**2, turns)
+
+
+def below(tree, node):
+    """The leaves below a node, one by one."""
+    if node < tree.leaves:
+        return [node]
+    return [leaf for child in tree.children[node - tree.leaves] for leaf in below(tree, child)]
+
+
+@pytest.mark.parametrize("count", [2, 3, 17, 600])
+def test_every_node_has_the_moments_of_its_leaves(count):
+    nodes, tree = build(scene(count))
+    assert len(nodes) == len(tree) == 2 * count - 1 and tree.leaves == count
+    assert sorted(below(tree, len(tree) - 1)) == list(range(count))
+    means, spreads = nodes.means.astype(float), covariances(nodes)
+    weights = optical_depth(expit(nodes.opacity_logits.astype(float))) * area_of(nodes.log_scales)
+    for node in range(count, len(tree), 1 + count // 40):
+        leaves = below(tree, node)
+        shares = weights[leaves] / weights[leaves].sum()
+        mean = shares @ means[leaves]
+        np.testing.assert_allclose(means[node], mean, atol=1e-4)
+        apart = means[leaves] - mean
+        expected = np.einsum("n,nij->ij", shares, spreads[leaves] + apart[:, :, None] * apart[:, None])
+        ratio = np.trace(spreads[node]) / np.trace(expected)
+        assert 0.999 < ratio < SPREAD * 1.001
+        np.testing.assert_allclose(spreads[node] / ratio, expected, atol=1e-3 * np.trace(expected))
+        color = np.einsum("n,nkc->kc", shares, nodes.sh[leaves])
+        np.testing.assert_allclose(nodes.sh[node], color, atol=1e-4)
+        if expit(nodes.opacity_logits[node]) < OPAQUE * 0.999:  # what is hidden stays as much
+            assert weights[node] == pytest.approx(weights[leaves].sum(), rel=1e-3) and ratio < 1.001
+
+
+def test_opacities_stay_below_one():
+    stacked = scene(500, opacity=0.98)
+    stacked.means[:] *= np.float32(0.01)
+    nodes, tree = build(stacked)
+    opacities = expit(nodes.opacity_logits.astype(float))
+    assert opacities.max() <= OPAQUE * 1.00001 and opacities[tree.leaves :].min() > 0.9
+
+
+@pytest.mark.parametrize("opacity", [0.02, 0.5, 0.9, 0.99])
+def test_optical_depth_is_what_a_splat_hides(opacity):
+    hidden, _ = quad(lambda r: -np.log(1 - opacity * np.exp(-r * r / 2)) * r, 0, 12)
+    assert optical_depth(np.array([opacity]))[0] == pytest.approx(hidden, rel=1e-5)
+
+
+def test_two_splats_in_one_place_hide_what_they_hid():
+    two = scene(2, opacity=0.3)
+    for column in (two.means, two.quats, two.log_scales):
+        column[1] = column[0]
+    nodes, _ = build(two)
+    # 1 - 0.7² in the middle, and more outside: of the same shape, 0.55 hides as much in all
+    assert expit(nodes.opacity_logits[2]) == pytest.approx(0.55, abs=0.01)
+    np.testing.assert_allclose(covariances(nodes)[2], covariances(nodes)[0], rtol=1e-4)
+
+
+def test_a_wall_is_a_wall_at_every_size_without_holes():
+    """Discs on a grid, seen from before: whatever the cut, the picture is as opaque, and has its colour."""
+    side = 64
+    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, side)] * 2), axis=-1).reshape(-1, 2)
+    step = 2 / (side - 1)
+    wall = Splats(
+        np.concatenate([grid, np.zeros((side**2, 1))], axis=1).astype(np.float32),
+        np.tile(np.float32([1, 0, 0, 0]), (side**2, 1)),
+        np.tile(np.log([step, step, step / 10]), (side**2, 1)).astype(np.float32),
+        np.full(side**2, logit(0.9), np.float32),
+        np.full((side**2, 1, 3), 0.8, np.float32),
+    )
+    nodes, tree = build(wall)
+    pose = np.eye(4)
+    pose[2, 3] = 3
+    camera = Camera("a", 48, 48, 100.0, 100.0, 24.0, 24.0, pose)  # well within the wall
+    sizes = tree.sizes(nodes.means, nodes.log_scales)
+    parents = np.append(sizes, np.inf)[tree.parents]
+    for size in (2 * step, 4 * step, 8 * step):
+        rows = np.flatnonzero((sizes <= size) & (parents > size))
+        assert len(rows) < 2 * (2 / size) ** 2
+        gaussians = Gaussians.of(nodes.select(rows))
+        drawn = rasterize(gaussians, camera, backend="cpu")
+        assert float(drawn.alpha.min()) > 0.8 and float(drawn.alpha.mean()) > 0.9
+        torch.testing.assert_close(
+            drawn.image, drawn.alpha[..., None] * (0.5 + 0.28209 * 0.8) * torch.ones(3)
+        )
+
+
+def test_repetitions_and_chains_end_soon():
+    """Equal splats, and a row in which each is nearer to the next one than to the one before."""
+    equal = scene(1000)
+    for column in (equal.means, equal.quats, equal.log_scales, equal.sh):
+        column[:] = column[0]
+    chain = scene(300)
+    chain.means[:] = 0
+    chain.means[:, 0] = np.float32(1.2) ** -np.arange(300)
+    chain.quats[:], chain.log_scales[:] = chain.quats[0], -20
+    for splats in (equal, chain):
+        nodes, tree = build(splats)
+        assert len(tree.layers) <= 60
+        assert all(np.isfinite(getattr(nodes, name)).all() for name in ("means", "quats", "log_scales", "sh"))
+
+
+def test_odd_splats_make_a_tree():
+    odd = scene(40)
+    odd.log_scales[0], odd.log_scales[1], odd.log_scales[2, 0] = -80, 25, -80
+    odd.opacity_logits[3], odd.opacity_logits[4] = -100, 100
+    odd.means[5] = 1e9
+    nodes, _ = build(odd)
+    for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
+        assert np.isfinite(getattr(nodes, name)[40:]).all()
+
+
+def test_one_splat_is_a_sentence():
+    with pytest.raises(LodgsError, match="One splat makes no tree"):
+        build(scene(1))
+
+
+def test_a_tree_is_the_same_on_any_number_of_threads():
+    from training.rasterize.cpu import compile
+
+    before, found = compile.threads(), []
+    try:
+        for count in (1, 3):
+            compile.set_threads(count)
+            found.append(build(scene(20_000)))
+    finally:
+        compile.set_threads(before)
+    (one, tree), (other, same) = found
+    np.testing.assert_array_equal(tree.children, same.children)
+    np.testing.assert_array_equal(one.sh, other.sh)

@@ -1,0 +1,166 @@
+"""A LoD of Gaussians as a method: leaves, tree, cuts that train what they show, runs that go on."""
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from training.lod.blocks import spatial_order
+from training.lod.rules.cut import least_size
+from training.lod.selection import Choice, settings
+from training.lod.tree import size_of
+from training.methods import create, method_info
+from training.methods.parameters import override
+from training.rasterize import rasterize
+from training.splats.bundle import Bundle
+from training.splats.gaussians import Splats
+
+
+def make(data, base=None, preset="draft", **values):
+    short = {"steps": 12, "densify_until": 0.4, "prune_interval": 6, "tune_steps": 8, "margin": 0.0}
+    return create("tree", data, override(method_info("tree").preset(preset), short | values), 0, "cpu", base)
+
+
+def trained(tree, begin=0, until=None):
+    levels = []
+    for step in range(begin, until or tree.steps):
+        tree.train_step(step)
+        levels += tree.levels_after(step)
+    return levels
+
+
+def same(one: Splats, other: Splats) -> bool:
+    names = ("means", "quats", "log_scales", "opacity_logits", "sh")
+    columns = one.extras.keys() == other.extras.keys() and all(
+        np.array_equal(one.extras[name], other.extras[name]) for name in one.extras
+    )
+    return columns and all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names)
+
+
+@pytest.fixture(scope="module")
+def base(data) -> Splats:
+    parameters = override(method_info("3dgs").preset("draft"), {"steps": 12, "margin": 0.0})
+    plain = create("3dgs", data, parameters, 0, "cpu")
+    return trained(plain)[-1].splats
+
+
+def test_leaves_come_first_and_all_nodes_last(data):
+    tree = make(data)
+    assert tree.steps == tree.parameters.total_steps == 12 + 1 + 8 and tree.levels == 2
+    first, above, leaves = trained(tree)
+    assert [level.number for level in (first, above, leaves)] == [2, 1, 2]
+    assert len(first.splats) == len(leaves.splats) == len(above.splats) + 1 == tree.tree.leaves
+    camera = data.train[0]  # until there is a tree everything is shown
+    shown = Choice(Bundle("tree", [first], "cut")).weights(camera.center, camera.focal, {"pixels": 16.0})
+    assert shown.all()
+
+
+def test_until_the_tree_is_built_it_is_3dgs(data):
+    values = {"steps": 12, "densify_until": 0.4, "prune_interval": 6, "margin": 0.0}
+    plain = create("3dgs", data, override(method_info("3dgs").preset("draft"), values), 0, "cpu")
+    tree = make(data)
+    assert [step for step in range(12) if tree.ends_level(step)] == [11]
+    for step in range(12):
+        assert tree.train_step(step)[0] == pytest.approx(plain.train_step(step)[0], rel=1e-5)
+    torch.testing.assert_close(tree.model["means"], plain.model["means"])
+
+
+def test_without_tuning_the_leaves_are_the_base_to_the_bit(data, base):
+    tree = make(data, base, tune_steps=0)
+    assert tree.steps == tree.parameters.base_steps == 1
+    above, leaves = trained(tree)
+    ordered = base.select(spatial_order(base.means))
+    ordered = ordered.select(spatial_order(ordered.means))
+    leaves.splats.extras = {}
+    assert same(leaves.splats, ordered) and above.number == 1
+
+
+def test_sizes_are_saturated_after_training(data, base):
+    tree = make(data, base, lr_scales=0.5, lr_means_final=0.05)  # which moves nodes far
+    levels = trained(tree)
+    nodes, splats = tree.tree, tree.model.splats()
+    sizes = nodes.sizes(splats.means, splats.log_scales)
+    for node in range(nodes.leaves, len(nodes)):
+        assert sizes[node] >= size_of(splats.log_scales[node : node + 1])[0]
+        for child in nodes.children[node - nodes.leaves]:
+            away = np.linalg.norm(splats.means[child].astype(float) - splats.means[node].astype(float))
+            assert float(sizes[node]) >= least_size(np.array(float(sizes[child])), np.array(away))
+    np.testing.assert_array_equal(levels[0].splats.extras["node_size"], np.sort(sizes[nodes.leaves :])[::-1])
+
+
+def test_a_step_moves_the_cut_of_its_view_alone(data, base):
+    middle = base.means.mean(axis=0)
+    far = replace(base, means=middle + (base.means - middle) / 30, log_scales=base.log_scales - np.float32(3))
+    tree = make(data, far, lod_noise=0.0)
+    trained(tree, until=4)
+    before = {name: tensor.detach().clone() for name, tensor in tree.model.adam.tensors.items()}
+    tree.train_step(4)
+    moved = torch.zeros(len(tree.model), dtype=torch.bool)
+    for name, tensor in tree.model.adam.tensors.items():
+        moved |= (tensor.detach() != before[name]).reshape(len(moved), -1).any(dim=1)
+    rows = tree.cut(tree.choose_view(4), tree.parameters.pixels)
+    cut = torch.zeros_like(moved)
+    cut[rows] = True
+    assert moved.sum() > 0 and not (moved & ~cut).any()
+    assert moved[tree.tree.leaves :].any()  # nodes above leaves are trained, too
+
+
+def test_training_draws_what_the_bundle_shows(data, base):
+    tree = make(data, base, tune_steps=0)
+    bundle = Bundle("tree", trained(tree), "cut")
+    choice = Choice(bundle)
+    for pixels in (0.5, 3.0, 11.0):
+        for camera in data.train[:3]:
+            view = replace(tree.choose_view(0), camera=camera)
+            rows = tree.cut(view, pixels)
+            one = tree.rasterize_model(camera, 0, gaussians=tree.model.gaussians.select(rows)).image
+            weights = choice.weights(camera.center, camera.focal, settings(bundle, {"pixels": pixels}))
+            gaussians = type(tree.model.gaussians).of(choice.splats)
+            other = rasterize(
+                gaussians, camera, weights=torch.from_numpy(weights), near=data.near,
+                background=tree.background(0), sh_degree=tree.sh_degree(0), backend="reference",
+            ).image  # fmt: skip
+            assert len(rows) <= (weights > 0).sum()
+            torch.testing.assert_close(one.detach(), other, atol=2e-5, rtol=1e-4)
+
+
+def test_noise_is_coarser_most_at_its_end(data, base):
+    tree = make(data, base, pixels=2.0)
+    found = np.array([tree._pixels(step) for step in range(4000)])
+    assert found.min() >= 2 and found.max() <= 12
+    # A.6: 1 + 5 r⁴ is below 2 for r < (1/5)^(1/4) = 0.669
+    assert (found < 4).mean() == pytest.approx(0.669, abs=0.02)
+
+
+def test_a_view_of_nothing_makes_its_step(data, base):
+    """All splats behind one camera, which every step may meet."""
+    camera = data.train[0]
+    behind = replace(base, means=(base.means - camera.center + 0).astype(np.float32))
+    behind.means = (camera.center - 50 * camera.world_to_camera[2, :3] + 0.01 * behind.means).astype(
+        np.float32
+    )
+    tree = make(data, behind)
+    trained(tree, until=1)
+    view = replace(tree.choose_view(1), camera=camera)
+    assert len(tree.cut(view, 1.0)) == 0
+    tree.choose_view = lambda step: view
+    assert np.isfinite(tree.train_step(1)[0])
+
+
+@pytest.mark.parametrize("stop", [11, 12, 13, 16])
+def test_a_run_goes_on_to_the_bit(data, stop):
+    """Stopped among the leaves' steps, at their end, before the tree's first step, between two resizings."""
+    values = {"resize_interval": 3, "lr_scales": 0.1}
+    whole, first = make(data, **values), make(data, **values)
+    levels = trained(whole)
+    before = trained(first, until=stop)
+    file = io.BytesIO()
+    torch.save(first.state_dict(), file)
+    file.seek(0)
+    second = make(data, **values)
+    second.load_state_dict(torch.load(file, weights_only=True))
+    after = before + trained(second, stop)
+    assert [level.number for level in after] == [level.number for level in levels]
+    assert all(same(one.splats, other.splats) for one, other in zip(levels, after, strict=True))

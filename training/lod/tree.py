@@ -1,0 +1,106 @@
+"""A binary tree of splats: its shape, the sizes that make cuts of it proper, and its levels. numpy only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ..splats.bundle import Level
+from ..splats.gaussians import Splats
+from .rules.cut import ABOVE_ROOT, NODE_SIZE, PARENT, PARENT_SIZE, least_size
+
+NODES, LEAVES = 1, 2
+"""Numbers of the levels: the nodes above, and the leaves, which are the full scene."""
+
+
+@dataclass(frozen=True)
+class Tree:
+    """Which node is above which: nodes 0 to N - 1 are leaves, N - 1 further ones stand above two each.
+
+    Attributes:
+        children: (N - 1, 2) int32, of the nodes N, N + 1, ...; the last of these is the root.
+    """
+
+    children: np.ndarray
+
+    @property
+    def leaves(self) -> int:
+        """N."""
+        return len(self.children) + 1
+
+    def __len__(self) -> int:
+        return 2 * self.leaves - 1
+
+    @cached_property
+    def parents(self) -> np.ndarray:
+        """(2N - 1,) int32; -1 for the root."""
+        parents = np.full(len(self), -1, np.int32)
+        parents[self.children] = np.arange(self.leaves, len(self), dtype=np.int32)[:, None]
+        return parents
+
+    @cached_property
+    def layers(self) -> list[np.ndarray]:
+        """The nodes above leaves, (M,) int32 each, by their number of nodes above them: the root first."""
+        layers, layer = [], np.array([len(self) - 1], np.int32)
+        while len(layer := layer[layer >= self.leaves]):
+            layers.append(layer)
+            layer = self.children[layer - self.leaves].reshape(-1)
+        return layers
+
+    def sizes(self, means: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
+        """(2N - 1,) float32, saturated: of leaves 0, of others at least :func:`size_of` and ``least_size``.
+
+        Args:
+            means, log_scales: (2N - 1, 3) float32 of all nodes.
+        """
+        sizes = np.zeros(len(self), np.float32)
+        for layer in reversed(self.layers):
+            below = self.children[layer - self.leaves]
+            apart = means[below].astype(np.float64) - means[layer, None].astype(np.float64)
+            least = least_size(sizes[below], np.sqrt(np.square(apart).sum(axis=2))).max(axis=1)
+            sizes[layer] = _rounded_up(np.maximum(least, size_of(log_scales[layer])))
+        return sizes
+
+    def columns(self, means: np.ndarray, sizes: np.ndarray) -> dict[str, np.ndarray]:
+        """The rule's columns of all nodes, (2N - 1,) float32 each."""
+        above = np.append(sizes, np.float32(ABOVE_ROOT))[self.parents]  # -1 is the last one
+        places = means[self.parents].T  # of the root anything
+        named = zip(PARENT, places.astype(np.float32), strict=True)
+        return {NODE_SIZE: sizes, PARENT_SIZE: above, **dict(named)}
+
+    def levels(self, splats: Splats) -> list[Level]:
+        """All nodes, (2N - 1), as a bundle has them: the ones above from the largest down, and the leaves."""
+        sizes = self.sizes(splats.means, splats.log_scales)
+        splats.extras |= self.columns(splats.means, sizes)
+        above = np.argsort(-sizes[self.leaves :], kind="stable") + self.leaves
+        return [
+            Level(NODES, splats.select(above)),
+            Level(LEAVES, splats.select(slice(0, self.leaves))),
+        ]
+
+
+def size_of(log_scales: np.ndarray) -> np.ndarray:
+    """sqrt(s1 s2 + s1 s3 + s2 s3), (N,) float64, of log-scales (N, 3) (A LoD of Gaussians, Eq. 6)."""
+    return np.sqrt(area_of(log_scales))
+
+
+def area_of(log_scales: np.ndarray) -> np.ndarray:
+    """s1 s2 + s1 s3 + s2 s3, (N,) float64: 1 / 2π of a Gaussian ellipsoid's mean shadow, times 3 if round."""
+    a, b, c = np.exp(np.minimum(log_scales, 60).T.astype(np.float64))
+    return a * b + a * c + b * c
+
+
+def treeless_columns(count: int) -> Mapping[str, np.ndarray]:
+    """Columns (N,) of leaves with nothing above them: every eye is shown all of them."""
+    nothing = np.zeros(count, np.float32)
+    above = np.full(count, ABOVE_ROOT, np.float32)
+    return {NODE_SIZE: nothing, PARENT_SIZE: above} | dict.fromkeys(PARENT, nothing)
+
+
+def _rounded_up(values: np.ndarray) -> np.ndarray:
+    """The next float32 (N,) that are not below float64 values."""
+    rounded = values.astype(np.float32)
+    return np.where(rounded < values, np.nextafter(rounded, np.float32(np.inf)), rounded)

@@ -1,0 +1,58 @@
+"""A LoD of Gaussians (Anonymous 2025): a tree over splats, whose cuts are trained and drawn."""
+
+from dataclasses import dataclass, replace
+
+from ..info import MethodInfo
+from ..parameters import PAPER, STANDARD, parameter
+from ..threedgs import ThreedgsParameters
+
+
+@dataclass(frozen=True)
+class TreeParameters(ThreedgsParameters):
+    """Those of A LoD of Gaussians; ``steps`` are those of 3DGS, which makes the leaves where there is no
+    base."""
+
+    tune_steps: int = parameter(
+        600, "Steps that train the cut which each view sees of the tree; 0 leaves it as built.", unit="steps"
+    )
+    pixels: float = parameter(
+        1.0, "Granularity of these cuts, in pixels of the training images.", low=0.1, high=100, unit="px"
+    )
+    lod_noise: float = parameter(
+        5.0,
+        "Each step's granularity is larger by this times r⁴, r random from 0 to 1: most cuts are fine, some "
+        "are coarse.",
+        high=100,
+    )
+    resize_interval: int = parameter(
+        1000,
+        "Steps after which cuts follow the sizes that nodes have by then; 0: those that the tree was built "
+        "with.",
+        unit="steps",
+    )
+
+    @property
+    def total_steps(self) -> int:
+        return self.steps + self.base_steps
+
+    @property
+    def base_steps(self) -> int:
+        return 1 + self.tune_steps
+
+
+_DRAFT = TreeParameters()
+_STANDARD = replace(_DRAFT, **STANDARD, steps=30_000, densify_interval=100, tune_steps=10_000)
+_PAPER = replace(_STANDARD, **PAPER, pixels=3.0, sh_degree=1, tune_steps=150_000)
+
+METHOD = MethodInfo(
+    name="tree",
+    number=6,
+    label="A LoD of Gaussians",
+    about="a tree over a finished model, drawn at the detail that each place needs",
+    parameters=TreeParameters,
+    presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
+    rule="cut",
+    offered=("max_splats", "tune_steps", "pixels"),
+    from_base=True,
+    for_splats=True,
+)
