@@ -37,14 +37,19 @@ from training.rasterize.resident import Resident
 from training.runs.capture import write_scene
 from training.runs.folder import RunFolder
 from training.runs.job import Job
-from training.scenes.cameras import Camera
+from training.scenes.cameras import Camera, evenly
 from training.scenes.colmap import read_scene
+from training.scenes.images import write_png
 from training.splats.bundle import Bundle, read_bundle, write_bundle
 from training.splats.ply import columns_of, columns_of_extras, read_ply, write_ply
 
 REPEATS = 7
-DENSE = 40
-"""Frames along the walk for each of its views, where jumps are looked for."""
+PACE = 1.5 / 24
+"""Metres from frame to frame of somebody who walks, where jumps are looked for."""
+PLACES = 12
+"""So many of the chunks' borders along the walk, and as many places between them, are looked at."""
+FRAMES = 6
+"""Frames at each of these places."""
 
 DISTANCES = (24.0, 10.0)
 """From so many metres on LODGE's coarser levels are shown. Left to itself it takes 32 and 16."""
@@ -209,28 +214,47 @@ def measure(rows: Sequence[Row], ways: dict[str, list[Camera]]) -> list[dict]:
     return table
 
 
-def jumps(rows: Sequence[Row], bundle: Bundle, views: list[Camera]) -> dict[str, dict[str, float]]:
-    """How much frames along a way change where the nearest chunk does, and elsewhere, over the full model's.
+def jumps(rows: Sequence[Row], bundle: Bundle, plan: town.Plan, picture: Path) -> dict[str, dict[str, float]]:
+    """How much frames at walking pace change where the nearest chunk does and elsewhere, over the full one's.
+
+    At a quicker pace all that moves hides the border.
+
+    Args:
+        picture: PNG to write of the border that shows most: the frame before it, and ten times the difference
+            to the next frame of the full model, without blending, and with it.
 
     Returns:
         By the row's name the largest ``border`` and ``elsewhere``.
     """
+    eyes = np.stack([camera.center for camera in town.walk(plan, 1000)])
+    views = town.walk(plan, round(np.linalg.norm(np.diff(eyes, axis=0), axis=1).sum() / PACE), 0.5)
     values = settings(bundle, {"fade": 0})
     nearest = [RULE.near_chunks(view.center, values, bundle.tables)[:1] for view in views]
-    crossed = np.array([a != b for a, b in pairwise(nearest)])
+    borders = [number for number, (a, b) in enumerate(pairwise(nearest)) if a != b]
+    places = {"border": borders, "elsewhere": [(a + b) // 2 for a, b in pairwise(borders)]}
+    places = {name: [max(place - 2, 0) for place in evenly(some, PLACES)] for name, some in places.items()}
+    shown = [rows[0], *rows[3:5]]
 
-    def changes(draw: Draw) -> np.ndarray:
-        pictures = (draw(view).image.numpy() for view in views)
-        return np.array([np.abs(b - a).mean() for a, b in pairwise(pictures)])
+    def drawn(row: Row, place: int) -> list[np.ndarray]:
+        return [row.draw(view).image.numpy() for view in views[place : place + FRAMES]]
 
-    full, found = changes(rows[0].draw), {}
-    for row in rows[3:5]:
-        over = changes(row.draw) / full
-        found[row.name] = {
-            "border": round(float(over[crossed].max()), 3),
-            "elsewhere": round(float(over[~crossed].max()), 3),
+    def changes(row: Row, name: str) -> np.ndarray:
+        found = [[np.abs(b - a).mean() for a, b in pairwise(drawn(row, place))] for place in places[name]]
+        return np.array(found)
+
+    found = {name: [changes(row, name) for row in shown] for name in places}
+    worst = np.argmax((found["border"][1] / found["border"][0]).max(axis=1))
+    at = np.argmax(found["border"][1][worst] / found["border"][0][worst])
+    frames = [drawn(row, places["border"][worst])[at : at + 2] for row in shown]
+    tiles = [frames[0][0], *(10 * np.abs(b - a) for a, b in frames)]
+    sheet = np.concatenate([np.concatenate(tiles[:2], axis=1), np.concatenate(tiles[2:], axis=1)])
+    write_png(picture, np.round(255 * sheet.clip(0, 1)).astype(np.uint8))
+    return {
+        row.name: {
+            name: round(float((of_rows[number] / of_rows[0]).max()), 3) for name, of_rows in found.items()
         }
-    return found
+        for number, row in enumerate(shown[1:], 1)
+    }
 
 
 def about(run: Path) -> dict:
@@ -275,8 +299,7 @@ def write_table(folder: Path, out: Path, frames: int, splats: int) -> None:
     said["chunks"] = len(bundle.tables[TABLE]["x"]) if TABLE in bundle.tables else 0
     said["d_l"] = {level.number: level.facts["d_l"] for level in bundle.levels}
     if said["chunks"]:
-        along = town.walk(plan, frames * DENSE, 0.5)[: 6 * DENSE]
-        said["jumps"] = jumps(rows, bundle, along)
+        said["jumps"] = jumps(rows, bundle, plan, out / "lod-border.png")
         for name, change in said["jumps"].items():
             print(f"{name}: at chunks' borders {change['border']:.2f}, elsewhere {change['elsewhere']:.2f}")
     (out / "lod.json").write_text(json.dumps(said, indent=1) + "\n", encoding="utf-8")
