@@ -32,6 +32,9 @@ from .gaussians import Gaussians
 from .placing import transformed
 from .rendering import Rendering
 
+MANY = 16 * SIZE
+"""Fewer splats are not worth being put in order; of equally deep ones the first in order is in front."""
+
 
 class SplatSet:
     """Splats where a backend draws them.
@@ -43,7 +46,7 @@ class SplatSet:
         ordered: their rows are in spatial order already; then nothing is copied.
 
     Attributes:
-        gaussians: the same in spatial order, on the backend's device.
+        gaussians: the same, where there are MANY in spatial order, on the backend's device.
     """
 
     def __init__(
@@ -54,7 +57,7 @@ class SplatSet:
         ordered: bool = False,
     ) -> None:
         device = device_of(backend)
-        if not ordered and len(splats) > SIZE:
+        if not ordered and len(splats) >= MANY:
             order = spatial_order(splats.means)
             splats, weights = splats.select(order), None if weights is None else weights[order]
         self.gaussians = Gaussians.of(splats, device)
