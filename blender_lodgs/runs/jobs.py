@@ -21,7 +21,7 @@ from ...training.lod.selection import complete
 from ...training.methods import method_info, parameters_of
 from ...training.methods.parameters import Parameters
 from ...training.runs.folder import RunFolder
-from ...training.runs.job import DOME, Job
+from ...training.runs.job import CHANGEABLE, DOME, Job
 from ...training.scenes.cameras import write_camera
 from ...training.splats.bundle import write_bundle
 from .. import extension
@@ -106,7 +106,7 @@ def start_or_resume(root: bpy.types.Object, job: Job) -> Watch:
     if state in {"empty", "running"}:
         return _begin(root, run, job)
     before, now = Job.from_file(run.job).resolved(), job.resolved()
-    names = [f.name for f in fields(Job) if f.name not in ("backend", "out")]
+    names = [f.name for f in fields(Job) if f.name not in CHANGEABLE]
     changed = [name for name in names if getattr(before, name) != getattr(now, name)]
     if changed:
         raise LodgsError(
@@ -116,7 +116,8 @@ def start_or_resume(root: bpy.types.Object, job: Job) -> Watch:
     if state == "done":
         return attach(root, job.out)
     root.lodgs.training.read = 0
-    return _launch(root, run, None if before.backend == job.backend else job)
+    same = all(getattr(before, name) == getattr(job, name) for name in CHANGEABLE if name != "out")
+    return _launch(root, run, None if same else job)
 
 
 def cancel(root: bpy.types.Object) -> None:
