@@ -168,8 +168,8 @@ def scene(tiny_scene):
     return read_scene(tiny_scene)
 
 
-def trained(scene, name: str, steps: range, memory: int, state: dict | None = None, **about) -> dict:
-    parameters = override(METHODS[name].presets["draft"], about)
+def trained(scene, name: str, steps: range, memory: int, state: dict | None = None, about=()) -> dict:
+    parameters = override(METHODS[name].presets["draft"], dict(about))
     method = create(name, TrainingData(scene, 1.0, 4, photo_memory=memory), parameters, 0, "cpu")
     if state is not None:
         method.load_state_dict(state)
@@ -193,7 +193,7 @@ def test_the_same_bits_whatever_the_budget_and_whenever_photographs_arrive(scene
     """Also where a run goes on with another budget; some steps see smaller photographs."""
     photograph = TARGET_BYTES * 64 * 48
     about = {} if name == "octree" else {"first_resolution": 0.5, "full_resolution": 0.01}
-    truth = trained(scene, name, range(16), 1 << 30, **about)
+    truth = trained(scene, name, range(16), 1 << 30, about=about)
     read = TrainingData._read
 
     def slowly(self, camera):
@@ -202,9 +202,9 @@ def test_the_same_bits_whatever_the_budget_and_whenever_photographs_arrive(scene
 
     monkeypatch.setattr(TrainingData, "_read", slowly)
     for memory in (0, photograph, 3 * photograph, 1 << 30):
-        assert same(trained(scene, name, range(16), memory, **about), truth)
-    half = trained(scene, name, range(7), 2 * photograph, **about)
-    assert same(trained(scene, name, range(7, 16), photograph, half, **about), truth)
+        assert same(trained(scene, name, range(16), memory, about=about), truth)
+    half = trained(scene, name, range(7), 2 * photograph, about=about)
+    assert same(trained(scene, name, range(7, 16), photograph, half, about=about), truth)
 
 
 @pytest.mark.parametrize("name", sorted(METHODS))
