@@ -51,8 +51,8 @@ def _draw() -> None:
 
 def _draw_view(context: bpy.types.Context) -> None:
     space, region, view = context.space_data, context.region, context.region_data
-    eye.on_draw(region, context.scene, view)
     with_splats = draws_splats(context.scene) and space.shading.type != "WIREFRAME"
+    eye.on_draw(region, context.scene, view, splats=with_splats)
     if space.shading.type == "SOLID" and space.shading.color_type not in {"OBJECT", "RANDOM", "SINGLE"}:
         points = [
             (obj, tint)

@@ -1,8 +1,8 @@
 """Splats on the graphics card: those that viewports draw, brought there when they are first needed.
 
 Of all splats memory holds what choosing needs (the pool). The rest is read from Blender's attributes a piece
-at a time, for splats that are drawn and not there yet. On the card they lie in a store that is a little larger
-than what is drawn: who comes takes the place of whoever has not been drawn for the longest time.
+at a time, for splats that are drawn and not there yet. On the card they lie in a store somewhat larger than
+what is drawn: who comes takes the place of whoever has not been drawn for the longest time.
 """
 
 from __future__ import annotations

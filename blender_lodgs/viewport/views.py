@@ -14,7 +14,7 @@ import time
 import weakref
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import bpy
 import gpu
@@ -22,7 +22,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ..data import changes, scenes, selection, shown
-from . import resident, splats
+from . import eye, resident, splats
 from .arranging import Arrangement, Placement, Request, arrange
 from .resident import Resident, Store
 
@@ -98,7 +98,7 @@ def draw(context: bpy.types.Context) -> None:
     view.resolution = settings.moving / 100 if now - view.moved < STILL else 1.0
     draw_splats(
         view, instances, context.evaluated_depsgraph_get(),
-        region_data.view_matrix, region_data.window_matrix, settings.budget,
+        region_data.view_matrix, region_data.window_matrix, settings.budget, moving=True,
         under_overlays=space.overlay.show_overlays and not _shows_photograph(context),
     )  # fmt: skip
     if view.pending is not None or view.loading is not None or view.resolution < 1:
@@ -139,16 +139,17 @@ def draw_splats(
     *,
     under_overlays: bool = True,
     wait: bool = False,
+    moving: bool = False,
 ) -> None:
     """Draws splat instances into the active framebuffer.
 
     Args:
         view: what was drawn there last; changed.
         view_matrix, projection: from the world to the camera's space, and on to clip space.
-        budget, wait: see :func:`prepare`.
+        budget, wait, moving: see :func:`prepare`.
         under_overlays: see ``splats.draw``.
     """
-    request = prepare(view, instances, depsgraph, view_matrix, budget, wait)
+    request = prepare(view, instances, depsgraph, view_matrix, budget, wait, moving)
     if view.arrangement is None or view.store is None or view.instances is None or not view.count:
         return
     placements = view.arrangement.request.placements
@@ -169,12 +170,14 @@ def prepare(
     view_matrix: Matrix,
     budget: int,
     wait: bool = False,
+    moving: bool = False,
 ) -> Request:
     """All that comes before drawing: what has changed is read, and what has been found taken over.
 
     Args:
         budget: most splats to draw.
         wait: for the splats and their order, rather than going on with the last ones that there are.
+        moving: choose for the eye that is the viewport's own from where it is now, see ``eye.moved``.
 
     Returns:
         What is to be drawn, which ``view.arrangement`` may not answer yet.
@@ -184,7 +187,7 @@ def prepare(
         return Request((), (0.0, 0.0, 1.0), budget)
     _all.add(view)
     of, clouds = _read(instances, depsgraph)
-    request = Request(_placements(instances, of, depsgraph), tuple(view_matrix[2][:3]), budget)
+    request = Request(_placements(instances, of, depsgraph, moving), tuple(view_matrix[2][:3]), budget)
     _arrange(view, of, request, wait)
     _load(view, of, clouds, wait)
     return request
@@ -207,7 +210,7 @@ def _key(instance: shown.SplatInstance, depsgraph: bpy.types.Depsgraph) -> int:
 def _read(
     instances: list[shown.SplatInstance], depsgraph: bpy.types.Depsgraph
 ) -> tuple[Resident, list[bpy.types.PointCloud | None]]:
-    """The splats of all instances, read anew only where some have changed; and the clouds that they are of."""
+    """The splats of all instances, read anew only where some have changed; and their clouds."""
     global _resident, _keys, reads
     clouds: dict[int, bpy.types.PointCloud] = {}
     versions: dict[int, changes.Version | None] = {}
@@ -232,19 +235,23 @@ def _placements(
     instances: list[shown.SplatInstance],
     of: Resident,
     depsgraph: bpy.types.Depsgraph,
+    moving: bool,
 ) -> tuple[Placement, ...]:
     roots = {item.object: root for root in scenes.roots(depsgraph.scene) for item in root.lodgs.levels}
     numbers, found = {key: number for number, key in enumerate(_keys)}, []
     for instance in instances:
         number = numbers[_key(instance, depsgraph)]
         plain, root = _plain(instance, depsgraph), roots.get(instance.object)
+        choice = selection.choice(instance.evaluated, depsgraph) if plain else None
+        if moving and choice is not None and root and (seen := eye.moved(depsgraph.scene, root)):
+            choice = replace(choice, eye=seen[0], focal_px=seen[1])
         found.append(
             Placement(
                 first=of.starts[number],
                 count=of.counts[number],
                 matrix=instance.matrix_world.tobytes(),
                 level=instance.level,
-                choice=selection.choice(instance.evaluated, depsgraph) if plain else None,
+                choice=choice,
                 scene=(root or instance.object).session_uid,
                 tell=root.lodgs.tell if root else "OWN",
                 antialias=instance.antialias,
@@ -273,9 +280,7 @@ def _arrange(view: ViewState, of: Resident, request: Request, wait: bool) -> Non
         view.loading, view.pending = view.pending[2].result(), None
 
 
-def _load(
-    view: ViewState, of: Resident, clouds: Sequence[bpy.types.PointCloud | None], wait: bool
-) -> None:
+def _load(view: ViewState, of: Resident, clouds: Sequence[bpy.types.PointCloud | None], wait: bool) -> None:
     """Brings splats of an arrangement to the graphics card, and takes it over when they all are there."""
     if view.loading is None and view.resident is of and view.store is not of.store:
         view.loading = view.arrangement  # into the store that another viewport has made
