@@ -50,11 +50,19 @@ class Resident:
     def total(self) -> int:
         return len(self.pool.means)
 
-    def make_room(self, wanted: int) -> Store:
-        """The store, anew and empty where it has no room for so many splats, or far too much."""
+    def hold(self, lists: Sequence[np.ndarray]) -> Store:
+        """The store, in which from now on lists of splats (M,) keep their places, and others may lose theirs.
+
+        It is anew and empty where it has no room for all of them, or far too much.
+        """
+        held = np.zeros(self.total, bool)
+        for each in lists:
+            held[each] = True
+        wanted = int(np.count_nonzero(held))
         room = min(max(round(SPARE * wanted), LEAST), self.total)
-        if self.store is None or not min(wanted, self.total) <= len(self.store.owners) <= WASTE * room:
+        if self.store is None or not wanted <= len(self.store.owners) <= WASTE * room:
             self.store = Store(self.total, room, self.higher)
+        self.store.hold(held)
         return self.store
 
     def of_one_cloud(self, wanted: np.ndarray) -> int:
@@ -99,16 +107,19 @@ class Store:
         self.texture = gpu.types.GPUTexture((WIDTH, height), format="RGBA32F")
         self._frame = gpu.types.GPUFrameBuffer(color_slots=self.texture)
 
-    def hold(self, lists: Sequence[np.ndarray]) -> None:
-        """From now on lists of splats (M,) keep their places, and others may lose theirs."""
+    def hold(self, held: np.ndarray) -> None:
+        """From now on these splats, (N,) bool, keep their places, and others may lose theirs."""
         self._now += 1
-        for each in lists:
-            places = self.places[each]
-            self._drawn[places[places >= 0]] = self._now
+        there = self.owners >= 0
+        there[there] = held[self.owners[there]]
+        self._drawn[there] = self._now
 
     def missing(self, wanted: np.ndarray) -> np.ndarray:
         """Those of the wanted splats (M,) that are not there, ascending; copies want the same ones."""
-        return np.unique(wanted[self.places[wanted] < 0])
+        absent = np.zeros(len(self.places), bool)
+        absent[wanted] = True
+        absent &= self.places < 0
+        return np.flatnonzero(absent).astype(np.int32)
 
     def put(self, splats_: np.ndarray, records: np.ndarray) -> None:
         """Gives splats (M,) places, which stay theirs as of those that are held.

@@ -47,6 +47,7 @@ class ViewState:
         instances, count: the list of those that are drawn.
         pending: the arrangement that is being computed, and of which splats.
         loading: the arrangement whose splats are on their way to the store.
+        missing: those of them (M,) that are not there yet, and in which store.
         loaded: when some of them were brought there last.
         matrix: from the world to clip space when it was last drawn.
         moved: when it last moved.
@@ -60,6 +61,7 @@ class ViewState:
     count: int = 0
     pending: tuple[Resident, Request, Future[Arrangement]] | None = None
     loading: Arrangement | None = None
+    missing: tuple[Store, np.ndarray] | None = None
     loaded: float = 0.0
     matrix: Matrix | None = None
     moved: float = 0.0
@@ -183,7 +185,8 @@ def prepare(
         What is to be drawn, which ``view.arrangement`` may not answer yet.
     """
     if not instances:
-        view.resident = view.arrangement = view.store = view.instances = view.pending = view.loading = None
+        view.resident = view.arrangement = view.store = view.instances = None
+        view.pending = view.loading = view.missing = None
         return Request((), (0.0, 0.0, 1.0), budget)
     _all.add(view)
     of, clouds = _read(instances, depsgraph)
@@ -267,7 +270,7 @@ def _arrange(view: ViewState, of: Resident, request: Request, wait: bool) -> Non
         found_of, _, found = view.pending
         view.pending = None
         if found_of is of:
-            view.loading = found.result()
+            view.loading, view.missing = found.result(), None
     current = view.loading or (view.arrangement if view.resident is of else None)
     if (current is not None and current.request == request) or view.pending is not None:
         return
@@ -277,38 +280,42 @@ def _arrange(view: ViewState, of: Resident, request: Request, wait: bool) -> Non
         _thread = ThreadPoolExecutor(1, "lodgs-order")
     view.pending = (of, request, _thread.submit(arrange, of.pool, request))
     if wait:
-        view.loading, view.pending = view.pending[2].result(), None
+        view.loading, view.missing, view.pending = view.pending[2].result(), None, None
 
 
 def _load(view: ViewState, of: Resident, clouds: Sequence[bpy.types.PointCloud | None], wait: bool) -> None:
     """Brings splats of an arrangement to the graphics card, and takes it over when they all are there."""
+    now = time.monotonic()
     if view.loading is None and view.resident is of and view.store is not of.store:
         view.loading = view.arrangement  # into the store that another viewport has made
-    loading, now = view.loading, time.monotonic()
+    loading = view.loading
     if loading is None:
-        view.loaded = 0.0
         return
+    begun = view.missing is not None and view.missing[0] is of.store
+    if not begun:
+        store = of.hold([each for other in _all for each in other.lists(of)])
+        view.missing = store, store.missing(loading.splats)
+    store, missing = view.missing
     # where redraws take long, as much is loaded in each
-    end, view.loaded = now + min(max(now - (view.loaded or now), LOADING[0]), LOADING[1]), now
-    lists = [each for other in _all for each in other.lists(of)]
-    store = of.make_room(sum(map(len, lists)))
-    store.hold(lists)
-    missing, begin = store.missing(loading.splats), 0
+    end = now + min(max(now - view.loaded if begun else 0, LOADING[0]), LOADING[1])
+    view.loaded, begin = now, 0
     while begin < len(missing) and (wait or not begin or time.monotonic() < end):
         piece = missing[begin : begin + resident.PIECE]
         piece = piece[: of.of_one_cloud(piece)]
         records = of.read(clouds, piece)
         if records is None:  # what there is now is asked for
-            view.loading = view.arrangement = None
+            view.loading = view.arrangement = view.missing = None
             return
         store.put(piece, records)
         begin += len(piece)
-    complete, there = begin == len(missing), len(loading.splats) - len(missing) + begin
-    part = view.arrangement is loading and view.store is store and there > GROWTH * view.count
-    if complete or part or view.arrangement is None:
+    missing = missing[begin:]
+    part = view.arrangement is loading and view.store is store
+    part = part and len(loading.splats) - len(missing) > GROWTH * view.count
+    if not len(missing) or part or view.arrangement is None:
         view.resident, view.arrangement, view.store = of, loading, store
         view.instances, view.count = splats.instances_texture(loading, store.places)
-    if complete:
+    view.missing = (store, missing) if len(missing) else None
+    if not len(missing):
         view.loading = None
 
 

@@ -90,7 +90,9 @@ def test_places_change_hands(lodgs, frame):
         store, last = resident.Store(5000, 2500, 8), np.zeros(0, np.int32)
         for count in (900, 1200, 10, 1200, 1300, 1100):
             wanted = rng.choice(5000, count, replace=False).astype(np.int32)
-            store.hold([wanted, last])
+            held = np.zeros(5000, bool)
+            held[wanted] = held[last] = True
+            store.hold(held)
             stay = last[store.places[last] >= 0]
             missing = store.missing(np.concatenate([wanted, wanted[:5]]))
             assert set(missing.tolist()).isdisjoint(np.flatnonzero(store.places >= 0).tolist())
@@ -123,7 +125,7 @@ def test_viewports_share_the_store(lodgs, seen, monkeypatch):
         stores.add(one.resident.store)
         np.testing.assert_array_equal(seen(other, 0.0), alone[2])
     assert len(stores) > 1, "no store was too small"
-    assert len(one.resident.make_room(10).owners) < 100
+    assert len(one.resident.hold([np.arange(10)]).owners) < 100
 
 
 def test_a_few_come_at_each_redraw(bpy, lodgs, seen, monkeypatch):
