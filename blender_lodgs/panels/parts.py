@@ -44,6 +44,14 @@ def say(layout: bpy.types.UILayout, text: str, icon: str) -> None:
         column.label(text=line, icon="BLANK1" if number else icon)  # type: ignore[arg-type]
 
 
+def scene_length(context: bpy.types.Context, root: bpy.types.Object, value: float) -> str:
+    """A length of a splat scene, in its own units, as Blender says it in the scene's."""
+    units, scale = context.scene.unit_settings, max(root.matrix_world.to_scale())
+    return bpy.utils.units.to_string(
+        units.system, "LENGTH", value * scale * units.scale_length, precision=3
+    ).strip()
+
+
 def draw_environment(layout: bpy.types.UILayout, missing: str = "") -> None:
     """The trainer's environment: a button that makes one and what is wrong, or how far the making is.
 

@@ -8,11 +8,11 @@ from ...training.errors import LodgsError
 from ...training.evaluate.words import summary_lines
 from ...training.methods import method_info
 from ..data import scenes, viewpoints
-from ..data.training import hold_out, offered
+from ..data.training import chooses_distances, hold_out, level_distances, offered
 from ..runs import environment, jobs
 from ..runs.watch import Watch, watch_of
 from ..runs.words import measured_on, progress_facts, short_level_line
-from .parts import Panel, draw_environment, say, split_column
+from .parts import Panel, draw_environment, say, scene_length, split_column
 
 
 class LODGS_PT_training(Panel):
@@ -61,6 +61,8 @@ class LODGS_PT_training_advanced(Panel):
         _draw_parameter(layout, settings, "test_every")
         for f in offered(settings.method):
             _draw_parameter(layout, settings.parameters, f.name)
+        if chooses_distances(settings.method):
+            _draw_distances(layout, context, root)
         if root.lodgs.scene_folder:
             layout.prop(settings, "model")
             layout.prop(settings, "images")
@@ -133,6 +135,21 @@ def _draw_parameter(layout: bpy.types.UILayout, group: bpy.types.PropertyGroup, 
     value = row.row(align=True)
     value.enabled = group.is_property_set(name)
     value.prop(group, name if value.enabled else f"preset_{name}", text="")
+
+
+def _draw_distances(layout: bpy.types.UILayout, context: bpy.types.Context, root: bpy.types.Object) -> None:
+    """From where on each coarser level is shown, where training is not to find it; and how far that is."""
+    settings = root.lodgs.training
+    layout.prop(settings, "find_distances")
+    if settings.find_distances:
+        return
+    column = layout.column(align=True)
+    for number, place in level_distances(settings):
+        text = f"Level {number} From"
+        if settings.median_depth:
+            text += f" ({scene_length(context, root, settings.distances[place] * settings.median_depth)})"
+        column.prop(settings, "distances", index=place, text=text)
+    say(layout, "In median depths: half of what photographs show is nearer than 1.", "INFO")
 
 
 def _draw_running(layout: bpy.types.UILayout, watch: Watch) -> None:

@@ -85,6 +85,35 @@ def test_a_parameter_shows_the_presets_number_until_it_is_set(root, draw):
     assert shown() == ["use_max_splats", "preset_max_splats"]
 
 
+def test_distances_can_be_given_by_hand(lodgs, root, draw, fake):
+    """For as many levels as there will be, as the job has them; and in the scene's own lengths, if known."""
+    settings, panel = root.lodgs.training, "LODGS_PT_training_advanced"
+    assert not any("distances" in name for name in draw(panel).properties)
+    settings.method = "lodge"
+    changes = lodgs("runs.jobs").changes
+    assert "find_distances" in draw(panel).properties and "distances" not in changes(settings)
+    settings.find_distances = False
+    assert [name for name in draw(panel).properties if name.startswith("distances")] == [
+        "distances[1] Level 1 From", "distances[0] Level 2 From",
+    ]  # fmt: skip
+    assert changes(settings)["distances"] == (6.0, 3.0, 0.0)
+    settings.median_depth, settings.parameters.levels, settings.distances[0] = 2.0, 4, 2.6
+    root.scale = (0.5, 0.5, 0.5)
+    root.id_data.update_tag()
+    import bpy
+
+    bpy.context.view_layer.update()
+    assert [name for name in draw(panel).properties if name.startswith("distances")] == [
+        "distances[2] Level 1 From (12 m)", "distances[1] Level 2 From (6 m)",
+        "distances[0] Level 3 From (2.6 m)",
+    ]  # fmt: skip
+    assert lodgs("runs.jobs").parameters(settings).distances == (12.0, 6.0, 2.6, 0.0)
+    settings.distances[1] = 30.0
+    assert any("Give falling numbers" in text for text in draw().texts)
+    settings.distances[1] = 0.0  # which training finds
+    assert not any("Give falling numbers" in text for text in draw().texts)
+
+
 def test_what_training_starts_from_is_asked_where_a_method_can_choose(lodgs, root, draw, fake, monkeypatch):
     assert "start_from" not in draw().properties
     methods = lodgs("training.methods").METHODS
