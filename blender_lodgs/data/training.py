@@ -169,6 +169,12 @@ class TrainingSettings(bpy.types.PropertyGroup):
     views: bpy.props.IntProperty(
         name="Views", description="How many views there are", default=Job.views, min=VIEWS[0], max=VIEWS[1]
     )
+    show_views: bpy.props.BoolProperty(
+        name="Show Views",
+        description="Show in the viewport from where the splats will be looked at",
+        default=False,
+        options=set(),
+    )
     view_width: bpy.props.IntProperty(
         name="View Width",
         description="How wide their pictures are; training makes them smaller by Image Scale",

@@ -36,7 +36,7 @@ class LODGS_PT_training(Panel):
             row = self.layout.row()
             row.label(text="There was a run", icon="FILE_FOLDER")
             row.operator("lodgs.open_run").directory = root.lodgs.training.run
-        _draw_choices(self.layout, root, resumable=watch is not None and watch.state != "done")
+        _draw_choices(self.layout, context, root, resumable=watch is not None and watch.state != "done")
 
 
 class LODGS_PT_training_advanced(Panel):
@@ -70,7 +70,9 @@ class LODGS_PT_training_advanced(Panel):
         layout.operator("lodgs.open_run", icon="FILE_FOLDER", text="Open Run…")
 
 
-def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object, resumable: bool) -> None:
+def _draw_choices(
+    layout: bpy.types.UILayout, context: bpy.types.Context, root: bpy.types.Object, resumable: bool
+) -> None:
     settings = root.lodgs.training
     alone, info = viewpoints.alone(root), method_info(settings.method)
     if not root.lodgs.scene_folder and not alone:
@@ -84,7 +86,7 @@ def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object, resumable:
     column.prop(settings, "preset")
     column.prop(settings, "image_scale")
     if alone:
-        _draw_views(column, settings)
+        _draw_views(column, context, root)
     elif info.from_base:
         column.prop(settings, "start_from")
         if settings.start_from == "FILE":
@@ -115,8 +117,9 @@ def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object, resumable:
         layout.operator("lodgs.train", icon="PLAY")
 
 
-def _draw_views(column: bpy.types.UILayout, settings: bpy.types.PropertyGroup) -> None:
+def _draw_views(column: bpy.types.UILayout, context: bpy.types.Context, root: bpy.types.Object) -> None:
     """From where splats without photographs are looked at."""
+    settings = root.lodgs.training
     column.separator()
     column.prop(settings, "views_from")
     if settings.views_from == "CURVE":
@@ -126,6 +129,15 @@ def _draw_views(column: bpy.types.UILayout, settings: bpy.types.PropertyGroup) -
     else:
         column.prop(settings, "views")
     column.prop(settings, "view_width")
+    if settings.views_from == "DOME":
+        column.prop(settings, "show_views")
+        try:
+            _, shells = viewpoints.dome_of(root)
+        except LodgsError as error:
+            say(column, str(error), "ERROR")
+            return
+        near, far = (scene_length(context, root, away) for away in shells)
+        say(column, f"Half of them {near} from the middle of the splats, half {far}.", "INFO")
 
 
 def _draw_parameter(layout: bpy.types.UILayout, group: bpy.types.PropertyGroup, name: str) -> None:

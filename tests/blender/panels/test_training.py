@@ -49,13 +49,15 @@ def test_before_training(root, draw, fake):
 def test_splats_alone_ask_for_views_of_them(bpy, lodgs, root, draw, fake):
     root.lodgs.scene_folder = ""
     assert draw().operators == [] and "Not imported from photographs: nothing to train on." in draw().texts
-    splats = lodgs("training.splats.bundle").NO_SPLATS
-    lodgs("data.scenes").set_level(root, lodgs("training.splats.bundle").Level(1, splats))
+    level = lodgs("training.splats.bundle").Level
+    lodgs("data.scenes").set_level(root, level(1, lodgs("training.splats.bundle").NO_SPLATS))
     assert "FLoD needs photographs, and these splats have none." in draw().texts and not draw().operators
     settings = root.lodgs.training
     settings.method = "lodge"
     begin = ["method", "preset", "image_scale", "views_from"]
-    assert draw().properties == [*begin, "views", "view_width"] and draw().operators == ["lodgs.train"]
+    assert draw().properties == [*begin, "views", "view_width", "show_views"]
+    assert draw().operators == ["lodgs.train"]
+    assert any("There is no opaque splat to look at" in text for text in draw().texts)
     assert "720 steps in 3 levels" in draw().texts  # none of them are the finest level's
     settings.views_from = "CURVE"
     assert draw().properties == [*begin, "curve", "views", "view_width"]
