@@ -40,7 +40,7 @@ def say(layout: bpy.types.UILayout, text: str, icon: str) -> None:
     column.scale_y = 0.8
     width = bpy.context.region.width / bpy.context.preferences.system.ui_scale
     letters = max(int((width - 85) / 5.6), 24)  # of the default font, beside the icon and the tabs
-    for number, line in enumerate(textwrap.wrap(text, letters)):
+    for number, line in enumerate(textwrap.wrap(text, letters, break_on_hyphens=False)):
         column.label(text=line, icon="BLANK1" if number else icon)  # type: ignore[arg-type]
 
 

@@ -26,7 +26,7 @@ def draw(scene: bpy.types.Scene) -> None:
                 continue
             shader = gpu.shader.from_builtin("UNIFORM_COLOR")
             batch = batch_for_shader(shader, "LINES", {"pos": lines(views, LENGTH * shells[0])})
-            with gpu.matrix.push_pop():
+            with gpu.matrix.push_pop():  # type: ignore[attr-defined]
                 gpu.matrix.multiply_matrix(root.matrix_world)
                 shader.bind()
                 shader.uniform_float("color", COLOR)

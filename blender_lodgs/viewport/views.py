@@ -291,11 +291,11 @@ def _load(view: ViewState, of: Resident, clouds: Sequence[bpy.types.PointCloud |
     loading = view.loading
     if loading is None:
         return
-    begun = view.missing is not None and view.missing[0] is of.store
-    if not begun:
+    if begun := view.missing is not None and view.missing[0] is of.store:
+        store, missing = view.missing
+    else:
         store = of.hold([each for other in _all for each in other.lists(of)])
-        view.missing = store, store.missing(loading.splats)
-    store, missing = view.missing
+        missing = store.missing(loading.splats)
     # where redraws take long, as much is loaded in each
     end = now + min(max(now - view.loaded if begun else 0, LOADING[0]), LOADING[1])
     view.loaded, begin = now, 0
