@@ -172,6 +172,7 @@ def read_pool(clouds: Sequence[bpy.types.PointCloud]) -> Resident:
             continue
         cloud.attributes["position"].data.foreach_get("vector", means[part].reshape(-1))
         scales = attributes.view_attribute(cloud, attributes.SCALE)
+        assert scales is not None
         areas[part] = np.einsum("ij,ij->i", scales, scales)
         opacities[part] = attributes.view_attribute(cloud, attributes.BASE)[:, 3]
         if (weights := attributes.read_attribute(cloud, attributes.WEIGHT)) is not None:

@@ -291,9 +291,8 @@ def _load(view: ViewState, of: Resident, clouds: Sequence[bpy.types.PointCloud |
     loading = view.loading
     if loading is None:
         return
-    if begun := view.missing is not None and view.missing[0] is of.store:
-        store, missing = view.missing
-    else:
+    store, missing = view.missing or (None, None)
+    if not (begun := store is not None and store is of.store):
         store = of.hold([each for other in _all for each in other.lists(of)])
         missing = store.missing(loading.splats)
     # where redraws take long, as much is loaded in each
