@@ -157,11 +157,11 @@ def _draw_distances(layout: bpy.types.UILayout, context: bpy.types.Context, root
         return
     column = layout.column(align=True)
     for number, place in level_distances(settings):
-        text = f"Level {number} From"
-        if settings.median_depth:
-            text += f" ({scene_length(context, root, settings.distances[place] * settings.median_depth)})"
-        column.prop(settings, "distances", index=place, text=text)
-    say(layout, "In median depths: half of what photographs show is nearer than 1.", "INFO")
+        column.prop(settings, "distances", index=place, text=f"Level {number} From")
+    text = "In median depths: half of what photographs show is nearer than 1"
+    if settings.median_depth:
+        text += f", which is {scene_length(context, root, settings.median_depth)}"
+    say(layout, f"{text}.", "INFO")
 
 
 def _draw_running(layout: bpy.types.UILayout, watch: Watch) -> None:

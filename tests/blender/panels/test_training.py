@@ -87,7 +87,7 @@ def test_a_parameter_shows_the_presets_number_until_it_is_set(root, draw):
     assert shown() == ["use_max_splats", "preset_max_splats"]
 
 
-def test_distances_can_be_given_by_hand(lodgs, root, draw, fake):
+def test_distances_can_be_given_by_hand(bpy, lodgs, root, draw, fake):
     """For as many levels as there will be, as the job has them; and in the scene's own lengths, if known."""
     settings, panel = root.lodgs.training, "LODGS_PT_training_advanced"
     assert not any("distances" in name for name in draw(panel).properties)
@@ -99,16 +99,14 @@ def test_distances_can_be_given_by_hand(lodgs, root, draw, fake):
         "distances[1] Level 1 From", "distances[0] Level 2 From",
     ]  # fmt: skip
     assert changes(settings)["distances"] == (6.0, 3.0, 0.0)
+    assert "In median depths: half of what photographs show is nearer than 1." in draw(panel).texts
     settings.median_depth, settings.parameters.levels, settings.distances[0] = 2.0, 4, 2.6
-    root.scale = (0.5, 0.5, 0.5)
-    root.id_data.update_tag()
-    import bpy
-
+    root.scale = (0.75, 0.75, 0.75)
     bpy.context.view_layer.update()
     assert [name for name in draw(panel).properties if name.startswith("distances")] == [
-        "distances[2] Level 1 From (12 m)", "distances[1] Level 2 From (6 m)",
-        "distances[0] Level 3 From (2.6 m)",
+        "distances[2] Level 1 From", "distances[1] Level 2 From", "distances[0] Level 3 From",
     ]  # fmt: skip
+    assert draw(panel).texts[-1].endswith("is nearer than 1, which is 1.5 m.")
     assert lodgs("runs.jobs").parameters(settings).distances == (12.0, 6.0, 2.6, 0.0)
     settings.distances[1] = 30.0
     assert any("Give falling numbers" in text for text in draw().texts)
