@@ -27,9 +27,17 @@ class LodgeParameters(ThreedgsParameters):
         "finest (LODGE: d_l). 0 finds the one that leaves least to draw.",
     )
     prune_weight: float = parameter(
-        0.12,
+        0.1,
         "Splats of a coarser level that are nowhere more than this share of a pixel are removed (LODGE: γ, "
         "without a number).",
+        high=1,
+    )
+    drawn: float = parameter(
+        0.59,
+        "By distance the training views draw at most this share of the splats that they draw of the finest "
+        "level alone; where it is more, prune_weight is raised for a level. 1 does not raise it. Not in the "
+        "paper.",
+        above=0,
         high=1,
     )
     keep: float = parameter(
@@ -41,7 +49,7 @@ class LodgeParameters(ThreedgsParameters):
         high=1,
     )
     tune_steps: int = parameter(
-        120, "Steps after each of the three prunings of a level.", above=0, unit="steps"
+        400, "Steps after each of the three prunings of a level.", above=0, unit="steps"
     )
     tune_range: float = parameter(
         0.3, "While a level is tuned, distances are random by this share of them, up or down.", high=0.9
@@ -104,6 +112,7 @@ _PAPER = replace(
     least_weight=0.02,
     tune_alone=0.0,
     prune_weight=0.02,
+    drawn=1.0,
 )
 
 METHOD = MethodInfo(
@@ -114,7 +123,7 @@ METHOD = MethodInfo(
     parameters=LodgeParameters,
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     rule="chunks",
-    offered=("levels", "max_splats", "prune_weight", "keep", "chunks"),
+    offered=("levels", "max_splats", "drawn", "keep", "chunks"),
     from_base=True,
     for_splats=True,
 )

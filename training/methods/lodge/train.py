@@ -18,6 +18,7 @@ from ...lod.blocks import Blocks, block_quantiles, spatial_order
 from ...lod.rules.chunks import RULE, TABLE, member_columns
 from ...lod.streaming import BLOCKS, table_of_blocks
 from ...rasterize import Adam, Gaussians, Target, photometric_loss
+from ...scenes.cameras import evenly
 from ...splats.bundle import Level
 from ...splats.gaussians import Splats
 from ...splats.ply import Columns
@@ -39,6 +40,8 @@ from .composite import (
 )  # fmt: skip
 from .thresholds import MOST_CURVES, Thresholds
 
+VIEWS_COUNTED = 24
+"""In so many training views it is counted what they draw."""
 FAR_VIEWS = 2
 """A place that so many training views have from a level's distance or farther is tuned and pruned by them."""
 
@@ -232,14 +235,41 @@ class Method(threedgs_train.Method):
         # of what stands together, so that the rounds come to the level's share of the finest one's splats
         share = p.keep ** ((self.levels - number) * (part - before))
         least = torch.from_numpy(block_quantiles(found.numpy(), 1 - share))
-        thinned = least > p.prune_weight * part
-        kept = found >= least.clamp_min(p.prune_weight * part)
+        weight = max(p.prune_weight * part, self._affordable(number, found, part))
+        thinned = least > weight
+        kept = found >= least.clamp_min(weight)
         with torch.no_grad():
             wider = room_taken_over(self.model["log_scales"].cpu().numpy(), found.numpy(), kept.numpy())
             self.model["log_scales"].add_((torch.from_numpy(wider) * thinned).to(self.device)[:, None])
         self.model.keep(kept)
         require_rows(self.model, step, "prune_weight")
         self._blocks = self._smoothed(number).blocks
+
+    def _affordable(self, number: int, importance: torch.Tensor, part: float) -> float:
+        """The least importance of those splats of a level that come to what the views may draw (``drawn``).
+
+        A share ``part`` of the way from all of them; at least a quarter of those that the views would draw.
+        """
+        share = 1 - (1 - self.parameters.drawn) * part
+        if share == 1:
+            return 0.0
+        level, near = self._smoothed(number), self.data.near
+        levels = {**self.finished, number: level}
+        views, finest, others = np.zeros(len(level), np.int64), 0, 0
+        for camera in evenly(self.data.train, VIEWS_COUNTED):
+            alone = self.finished[self.levels]
+            finest += camera.sees(alone.means[alone.in_view(camera, near)], near).sum()
+            for each, rows in rows_seen(levels, self.d_l, camera, near).items():
+                seen = camera.sees(levels[each].means[rows], near)
+                if each == number:
+                    views[rows[seen]] += 1
+                else:
+                    others += seen.sum()
+        most = max(share * finest - others, views.sum() / 4)
+        values = importance.numpy()
+        descending = np.argsort(-values, kind="stable")
+        within = int(np.searchsorted(views[descending].cumsum(), most, side="right"))
+        return float(values[descending[within - 1]]) if 0 < within < len(values) else 0.0
 
     def _begin_level(self, number: int) -> None:
         p, data = self.parameters, self.data

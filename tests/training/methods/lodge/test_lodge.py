@@ -1,6 +1,5 @@
 """LODGE: levels are the rule's and no finer than their filter, the finest stays, runs go on to the bit."""
 
-import io
 from dataclasses import replace
 
 import numpy as np
@@ -186,8 +185,8 @@ def test_levels_of_an_antialiased_base_are_found_and_drawn_so(data, base):
 
 
 def test_what_hardly_shows_goes_and_what_shows_stays(data, base):
-    all_of_it = make(data, base, prune_weight=0.0, keep=1.0, distances=[1.2, 0.8, 0.0])
-    some = make(data, base, prune_weight=0.3, keep=1.0, distances=[1.2, 0.8, 0.0])
+    all_of_it = make(data, base, prune_weight=0.0, drawn=1.0, distances=[1.2, 0.8, 0.0])
+    some = make(data, base, prune_weight=0.3, drawn=1.0, distances=[1.2, 0.8, 0.0])
     for lodge in (all_of_it, some):
         trained(lodge, until=1)
     assert len(all_of_it.model) == len(base)
@@ -197,8 +196,20 @@ def test_what_hardly_shows_goes_and_what_shows_stays(data, base):
     assert len(some.model) == pytest.approx(int((weights >= 0.06).sum()), abs=2)
 
 
+@pytest.mark.parametrize("drawn", [0.5, 0.8])
+def test_views_by_distance_draw_at_most_a_share_of_the_finest_level(data, base, drawn):
+    lodge = make(data, base, prune_weight=0.0, drawn=drawn, distances=[1.2, 0.6, 0.0])
+    bundle = Bundle("lodge", sorted(trained(lodge), key=lambda level: level.number), "chunks")
+    by_distance = finest = 0
+    for camera in data.train:
+        shown, _ = select(bundle, camera.center, camera.focal, settings(bundle, {}))
+        by_distance += camera.sees(shown.means, data.near).sum()
+        finest += camera.sees(base.means, data.near).sum()
+    assert 0.8 * drawn < by_distance / finest <= drawn * 1.001
+
+
 def test_levels_keep_their_share_at_most(data, base):
-    levels = trained(make(data, base, prune_weight=0.0, keep=0.4, distances=[1.2, 0.8, 0.0]))
+    levels = trained(make(data, base, prune_weight=0.0, drawn=1.0, keep=0.4, distances=[1.2, 0.8, 0.0]))
     shares = {level.number: len(level.splats) / len(base) for level in levels}
     assert shares[2] == pytest.approx(0.4, abs=0.06) and shares[1] == pytest.approx(0.16, abs=0.06)
 
@@ -264,17 +275,6 @@ def test_the_head_of_a_bundle_has_room_for_what_was_tried(data, base, tmp_path, 
 
 
 @pytest.mark.parametrize("stop", [11, 12, 14, 15, 21])
-def test_a_run_goes_on_to_the_bit(data, stop):
+def test_a_run_goes_on_to_the_bit(data, stop, check_resumed):
     """Stopped in the finest level, at its end, within a round, at a round's and at a level's end."""
-    whole, first = make(data), make(data)
-    levels = trained(whole)
-    before = trained(first, until=stop)
-    file = io.BytesIO()
-    torch.save(first.state_dict(), file)
-    file.seek(0)
-    second = make(data)
-    second.load_state_dict(torch.load(file, weights_only=True))
-    after = before + trained(second, stop)
-    assert [level.number for level in after] == [level.number for level in levels]
-    assert all(same(one.splats, other.splats) for one, other in zip(levels, after, strict=True))
-    assert second.meta() == whole.meta()
+    check_resumed(lambda: make(data), stop)
