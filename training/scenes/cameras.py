@@ -157,7 +157,7 @@ T = TypeVar("T")
 
 
 def evenly(cameras: Sequence[T], most: int) -> list[T]:
-    """At most so many of the cameras, or of what else stands in a row, evenly chosen, both ends among them."""
+    """At most so many of the cameras (or of anything), evenly chosen, the first and the last among them."""
     chosen = np.linspace(0, len(cameras) - 1, min(most, len(cameras)))
     return [cameras[place] for place in chosen.round().astype(int)]
 
