@@ -366,6 +366,7 @@ class FileRows:
             for run in _runs(places // self._block, places // (self._blocks_at_once * self._block)):
                 first, last = int(places[run.start]), int(places[run.stop - 1])
                 part = np.empty((last - first + 1, width), np.float32)
+                assert self._file is not None, "where a block has a slot there is a file"
                 self._file.seek(first * 4 * width)
                 _read(self._file, part)
                 found[to[run]] = part[places[run] - first]
