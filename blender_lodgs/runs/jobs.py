@@ -26,7 +26,7 @@ from ...training.scenes.cameras import write_camera
 from ...training.splats.bundle import write_bundle
 from .. import extension
 from ..data import scenes, viewpoints
-from ..data.training import hold_out, offered
+from ..data.training import chooses_distances, hold_out, level_distances, offered
 from . import environment, processes
 from .watch import Watch, begin, root_by_uid, watch_of, watches
 
@@ -280,11 +280,15 @@ def _hand_over(root: bpy.types.Object, run: RunFolder, job: Job) -> None:
 def changes(settings: TrainingSettings) -> dict:
     """The method's parameters that are set in the panel, by name; all others are the preset's."""
     group = settings.parameters
-    return {
+    found = {
         f.name: _as_typed(getattr(group, f.name))
         for f in offered(settings.method)
         if group.is_property_set(f.name)
     }
+    if chooses_distances(settings.method) and not settings.find_distances:
+        places = [place for _, place in level_distances(settings)]
+        found["distances"] = (*(_as_typed(settings.distances[place]) for place in places), 0.0)
+    return found
 
 
 def parameters(settings: TrainingSettings) -> Parameters:
@@ -316,6 +320,11 @@ def show(settings: TrainingSettings, job: Job) -> None:
         settings.parameters.property_unset(f.name)
         if getattr(own, f.name) != getattr(preset, f.name):
             setattr(settings.parameters, f.name, getattr(own, f.name))
+    settings.property_unset("distances")
+    settings.find_distances = not any(getattr(own, "distances", ()))
+    if chooses_distances(job.method) and not settings.find_distances:
+        for number, place in level_distances(settings):
+            settings.distances[place] = own.distances[number - 1]
 
 
 def base_of(root: bpy.types.Object, out: Path) -> str:
