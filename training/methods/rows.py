@@ -69,12 +69,26 @@ class Rows(Protocol):
     layout: Layout
 
     def __len__(self) -> int: ...
-    def read(self, rows: np.ndarray) -> torch.Tensor: ...
-    def write(self, rows: np.ndarray, records: torch.Tensor) -> None: ...
-    def append(self, records: torch.Tensor) -> None: ...
-    def remove(self, rows: np.ndarray) -> None: ...
-    def state_dict(self) -> dict[str, Any]: ...
-    def load_state_dict(self, state: Mapping[str, Any]) -> None: ...
+
+    def read(self, rows: np.ndarray) -> torch.Tensor:
+        """Records (M, width) at rows (M,) int64, in any order, on the CPU."""
+        ...
+
+    def write(self, rows: np.ndarray, records: torch.Tensor) -> None:
+        """Puts records (M, width) at rows (M,) int64, each named once, in any order."""
+
+    def append(self, records: torch.Tensor) -> None:
+        """Adds rows (M, width) at the end."""
+
+    def remove(self, rows: np.ndarray) -> None:
+        """Removes rows (M,), each named once; those behind close up in their order."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """A checkpoint, as ``torch.load(weights_only=True)`` reads it."""
+        ...
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Becomes what ``state_dict`` gave."""
 
 
 class MemoryRows:
@@ -366,6 +380,7 @@ class FileRows:
             for run in _runs(places // self._block, places // (self._blocks_at_once * self._block)):
                 first, last = int(places[run.start]), int(places[run.stop - 1])
                 part = np.empty((last - first + 1, width), np.float32)
+                assert self._file is not None, "where a block has a slot there is a file"
                 self._file.seek(first * 4 * width)
                 _read(self._file, part)
                 found[to[run]] = part[places[run] - first]
