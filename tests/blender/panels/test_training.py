@@ -58,7 +58,7 @@ def test_splats_alone_ask_for_views_of_them(bpy, lodgs, root, draw, fake):
     assert draw().properties == [*begin, "views", "view_width", "show_views"]
     assert draw().operators == ["lodgs.train"]
     assert any("There is no opaque splat to look at" in text for text in draw().texts)
-    assert "720 steps in 3 levels" in draw().texts  # none of them are the finest level's
+    assert "2,400 steps in 3 levels" in draw().texts  # none of them are the finest level's
     settings.views_from = "CURVE"
     assert draw().properties == [*begin, "curve", "views", "view_width"]
     settings.views_from = "CAMERAS"
