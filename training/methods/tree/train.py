@@ -1,4 +1,4 @@
-"""A LoD of Gaussians (2025): a tree over a finished model, whose cuts are then trained.
+"""A LoD of Gaussians (Windisch et al. 2026): a tree over a finished model, whose cuts are then trained.
 
 The leaves are a base, or 3DGS in the first steps. One step builds the tree; in those after it every view
 draws its cut, a little coarser at random (A.6, "Varying level of detail"), and moves the nodes of this cut
