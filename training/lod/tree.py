@@ -10,7 +10,8 @@ import numpy as np
 
 from ..splats.bundle import Level
 from ..splats.gaussians import Splats
-from .rules.cut import ABOVE_ROOT, NODE_SIZE, PARENT, PARENT_SIZE, least_size
+from .paging import streaming_order
+from .rules.cut import ABOVE_ROOT, NODE_SIZE, PARENT, PARENT_SIZE, RULE, least_size
 
 NODES, LEAVES = 1, 2
 """Numbers of the levels: the nodes above, and the leaves, which are the full scene."""
@@ -72,14 +73,15 @@ class Tree:
         return {NODE_SIZE: sizes, PARENT_SIZE: above, **dict(named)}
 
     def levels(self, splats: Splats) -> list[Level]:
-        """All nodes, (2N - 1), as a bundle has them: the ones above from the largest down, and the leaves."""
+        """All nodes, (2N - 1), as a bundle has them: those above, and the leaves, both from coarse to fine in
+        the order in which ranges are of one place (``paging.streaming_order``)."""
         sizes = self.sizes(splats.means, splats.log_scales)
         splats.extras |= self.columns(splats.means, sizes)
-        above = np.argsort(-sizes[self.leaves :], kind="stable") + self.leaves
-        return [
-            Level(NODES, splats.select(above)),
-            Level(LEAVES, splats.select(slice(0, self.leaves))),
-        ]
+        levels = []
+        for number, begin, end in ((NODES, self.leaves, len(self)), (LEAVES, 0, self.leaves)):
+            columns = {name: splats.extras[name][begin:end] for name in RULE.columns}
+            levels.append(Level(number, splats.select(streaming_order(columns) + begin)))
+        return levels
 
 
 def size_of(log_scales: np.ndarray) -> np.ndarray:
