@@ -51,7 +51,7 @@ class Hspt:
             below[layer] = below[one] + below[other]
             for bound, extreme in ((low, np.minimum), (high, np.maximum), (reach, np.maximum)):
                 bound[layer] = extreme(bound[layer], extreme(bound[one], bound[other]))
-        in_lists = below <= (longest or math.isqrt(count) // 2)
+        in_lists = below <= (longest or max(math.isqrt(count) // 2, 1))
         # what is walked: the upper tree, and the roots of lists, whose children are in the lists
         root = tree.parents < 0
         walked = np.flatnonzero(~in_lists | root | ~in_lists[tree.parents]).astype(np.int32)[::-1]
