@@ -26,7 +26,7 @@ help:
 	@echo "make tables     docs/parameters.md and controls.md, from what methods and rules declare"
 	@echo "make bench      how fast it is, as ratios from one run"
 	@echo "make bench-quality  PSNR and veil against seconds, all methods (SCENES=\"DIR ...\", BASE=another checkout)"
-	@echo "make bench-lod  levels and chunks on a town of 3 million splats (about an hour the first time)"
+	@echo "make bench-lod  levels and chunks on a town of 3 million splats (over an hour the first time; STAGES=\"town lodge others table\")"
 	@echo "make bench-tree cuts of trees of up to 10 million nodes (some minutes)"
 	@echo "make extension  dist/lodgs-VERSION.zip, checked by Blender"
 	@echo "make pins       requirements/*.txt anew from requirements/*.in (UPGRADE=1 takes the newest of what these leave open)"
@@ -79,7 +79,7 @@ bench-quality: setup
 	$(VENV) tools/bench_quality.py $(if $(BASE),--report --base $(BASE)) $(SCENES)
 
 bench-lod: setup
-	$(VENV) tools/bench_lod.py
+	$(VENV) tools/bench_lod.py $(STAGES)
 
 bench-tree: setup
 	$(VENV) tools/bench_tree.py

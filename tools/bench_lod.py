@@ -3,8 +3,8 @@
 A town of known truth (``examples.town``) is photographed, given levels and chunks, and drawn from places that
 no training saw: the whole model, levels alone, with chunks, what is visible of them, and blending; and FLoD's
 and Octree-GS's own levels, trained on the same photographs. Frames are timed in turn. Prints the table, and
-saves build/bench/lod.json. What was trained is kept beside it, and taken up again; the first time takes
-about an hour on two cores.
+saves build/bench/lod.json. What was made is kept beside it, and taken up again where it was left; the first
+time takes about an hour on two cores. Stages can be asked for one by one: the table has what is there.
 """
 
 from __future__ import annotations
@@ -29,15 +29,18 @@ from examples import town
 from training.evaluate.metrics import psnr
 from training.lod.rules.chunks import RULE, TABLE, member_columns
 from training.lod.selection import settings
+from training.lod.streaming import BLOCKS, read_part, table_of_blocks
 from training.methods.lodge.chunks import members
 from training.methods.lodge.composite import IndexedLevel
 from training.rasterize import Gaussians, Rendering
 from training.rasterize.resident import Resident
 from training.runs.capture import write_scene
+from training.runs.folder import RunFolder
+from training.runs.job import Job
 from training.scenes.cameras import Camera, evenly
 from training.scenes.colmap import read_scene
 from training.scenes.images import write_png
-from training.splats.bundle import Bundle, Level, read_bundle
+from training.splats.bundle import Bundle, read_bundle, write_bundle
 from training.splats.ply import columns_of, columns_of_extras, read_ply, write_ply
 
 REPEATS = 7
@@ -52,6 +55,13 @@ DISTANCES = (24.0, 10.0)
 """From so many metres on LODGE's coarser levels are shown. Left to itself it takes 32 and 16."""
 LODGE = {"chunks": 64, "keep": 0.35, "prune_weight": 0.03, "tune_steps": 240}
 """Its other parameters: for 3 million splats 11 cm apart, of which each has a fair share of some pixel."""
+OTHERS = {
+    "flod": {"steps": [400, 600, 800, 1200, 2000], "max_splats": 300_000},
+    "octree": {"steps": 5000, "max_splats": 300_000},
+}
+"""The other methods, which begin with points and are trained on the photographs at half size, and their
+budget: draft presets with more steps and splats, for at most some 20 minutes each."""
+STAGES = ("town", "lodge", "others", "table")
 
 Draw = Callable[[Camera], Rendering]
 
@@ -82,21 +92,43 @@ def make_town(folder: Path, splats: int, views: int) -> None:
         write_scene(folder / "scene", read_ply(folder / "town.ply"), cameras, town.NEAR, town.POINTS)
 
 
-def train(folder: Path, method: str, *options: str) -> Path:
-    """A run of a method on the photographs, its bundle; taken up where it was left."""
+def train(folder: Path, method: str, parameters: dict, *options: str) -> None:
+    """A run of a method on the photographs; taken up where it was left."""
     run = folder / method
-    if not (run / "bundle.ply").exists():
-        started = time.monotonic()
-        print(f"training {method} ...", flush=True)
-        command = [sys.executable, "-m", "training", "train", "--scene", folder / "scene", "--out", run]
-        command += ["--method", method, "--test-every", "0", *options]
-        subprocess.run([str(part) for part in command], check=True, stdout=subprocess.DEVNULL)
-        print(f"{method}: {time.monotonic() - started:.0f} s")
-    return run / "bundle.ply"
+    if (run / "bundle.ply").exists():
+        return
+    started = time.monotonic()
+    print(f"training {method} ...", flush=True)
+    command = [sys.executable, "-m", "training", "train", "--scene", folder / "scene", "--out", run]
+    command += ["--method", method, "--test-every", "0", *options]
+    for name, value in parameters.items():
+        command += ["--set", f"{name}={value}"]
+    subprocess.run([str(part) for part in command], check=True, stdout=subprocess.DEVNULL)
+    print(f"{method}: {time.monotonic() - started:.0f} s", flush=True)
 
 
-def without_visibility(bundle: Bundle) -> Bundle:
-    """The same chunks with all that Eq. 2 gives them at their centres."""
+def train_lodge(folder: Path, views: int, effort: float) -> None:
+    """LODGE's levels and chunks of the town itself."""
+    depth = read_scene(folder / "scene").median_depth()
+    distances = [round(metres / depth, 4) for metres in DISTANCES] + [0]
+    parameters = {"distances": distances, **LODGE, "tune_steps": scaled(LODGE["tune_steps"], effort)}
+    parameters["chunks"] = min(LODGE["chunks"], 4 * views // 3)
+    train(folder, "lodge", parameters, "--base", str(folder / "town.ply"), "--image-scale", "1")
+
+
+def scaled(steps, effort: float):
+    """Numbers of steps, or a share of them."""
+    if isinstance(steps, list):
+        return [scaled(each, effort) for each in steps]
+    return max(round(effort * steps), 10)
+
+
+def without_visibility(file: Path) -> Path:
+    """The same chunks with all that Eq. 2 gives them at their centres, in a file beside."""
+    path = file.with_name("without_visibility.ply")
+    if path.exists() and path.stat().st_mtime > file.stat().st_mtime:
+        return path
+    bundle = read_bundle(file)
     levels = {level.number: IndexedLevel.of(Gaussians.of(level.splats)) for level in reversed(bundle.levels)}
     d_l = {level.number: level.facts["d_l"] for level in bundle.levels}
     table, sets = bundle.tables[TABLE], {number: [] for number in levels}
@@ -106,47 +138,45 @@ def without_visibility(bundle: Bundle) -> Bundle:
             inside = np.zeros(len(levels[number]), bool)
             inside[rows] = True
             sets[number].append(inside)
-    return replace(
-        bundle,
-        levels=[
-            Level(
-                x.number,
-                replace(x.splats, extras=member_columns(np.stack(sets[x.number]))),
-                x.facts,
-            )
-            for x in bundle.levels
-        ],
-    )
+    splats = {
+        level.number: replace(level.splats, extras=member_columns(np.stack(sets[level.number])))
+        for level in bundle.levels
+    }
+    tables = {**bundle.tables, BLOCKS: table_of_blocks(RULE, splats)}
+    found = [replace(level, splats=splats[level.number]) for level in bundle.levels]
+    write_bundle(path, replace(bundle, levels=found, tables=tables))
+    return path
 
 
-def rows_of(bundle: Bundle, others: dict[str, Bundle]) -> list[Row]:
-    """All ways to draw, the whole model first."""
+def rows_of(file: Path, others: dict[str, Path]) -> list[Row]:
+    """All ways to draw, the whole model first. Of each what it needs is read of its file."""
 
-    def row(name: str, shown: Bundle, **values: float) -> Row:
-        resident, size = Resident(shown), bytes_of(shown)
-        given = settings(shown, values)
-        return Row(name, resident, lambda camera: resident.draw(camera, given, near=town.NEAR), size)
+    def row(name: str, shown: Path, **values: float) -> Row:
+        resident = Resident(shown)
+        given = settings(resident.bundle, values)
+        return Row(
+            name, resident, lambda camera: resident.draw(camera, given, near=town.NEAR), bytes_of(shown)
+        )
 
-    finest = bundle.levels[-1].number
-    alone = Resident(replace(bundle, levels=bundle.levels[-1:], tables={}))
-    plain = bytes_of(replace(bundle, levels=[Level(1, replace(bundle.levels[-1].splats, extras={}))]))
+    alone, plain = Resident(file), bytes_of(file, extras=False)
+    finest = alone.bundle.levels[-1].number
     found = [
         Row("full", alone, lambda camera: alone.draw_level(finest, camera, near=town.NEAR), plain),
-        row("levels", bundle, chunks=0),
+        row("levels", file, chunks=0),
     ]
-    if TABLE in bundle.tables:
+    if TABLE in alone.bundle.tables:
         found += [
-            row("levels + chunks", without_visibility(bundle), chunks=1, fade=0),
-            row("levels + chunks + visibility", bundle, chunks=1, fade=0),
-            row("levels + chunks + visibility + blending", bundle, chunks=1, fade=1),
+            row("levels + chunks", without_visibility(file), chunks=1, fade=0),
+            row("levels + chunks + visibility", file, chunks=1, fade=0),
+            row("levels + chunks + visibility + blending", file, chunks=1, fade=1),
         ]
     return found + [row(name, other) for name, other in others.items()]
 
 
-def bytes_of(bundle: Bundle) -> int:
+def bytes_of(file: Path, extras: bool = True) -> int:
     """Of a splat in a file."""
-    splats = bundle.levels[-1].splats
-    columns = columns_of(splats) | columns_of_extras(splats)
+    splats = read_part(file, [])[0].levels[-1].splats
+    columns = columns_of(splats) | (columns_of_extras(splats) if extras else {})
     return sum(column.dtype.itemsize for column in columns.values())
 
 
@@ -227,29 +257,33 @@ def jumps(rows: Sequence[Row], bundle: Bundle, plan: town.Plan, picture: Path) -
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+def about(run: Path) -> dict:
+    """What another method was given and what it made of it, by its run's own files."""
+    folder = RunFolder(run)
+    job, ended = Job.from_file(folder.job), folder.end_event() or {}
+    steps = int(np.sum(job.resolved_parameters().steps))  # type: ignore[attr-defined]
+    splats = [level["splats"] for level in folder.levels()]
+    found = {
+        "steps": steps,
+        "image_scale": job.image_scale,
+        "splats": splats,
+        "seconds": ended.get("seconds"),
+    }
+    found["what"] = (
+        f"{steps:,} steps on photographs at {job.image_scale:g} of their size, from points; "
+        f"{sum(splats):,} splats on {len(splats)} levels, {found['seconds']:.0f} s"
     )
-    parser.add_argument("--splats", type=int, default=3_000_000)
-    parser.add_argument("--views", type=int, default=48, help="photographs of each way")
-    parser.add_argument("--frames", type=int, default=12, help="held-out views of each way")
-    parser.add_argument("--others", nargs="*", default=["flod", "octree"], help="other methods to train")
-    parser.add_argument("--out", type=Path, default=Path("build/bench"))
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    folder = options.out / f"town_{options.splats}"
-    make_town(folder, options.splats, options.views)
-    depth = read_scene(folder / "scene").median_depth()
-    distances = [round(metres / depth, 4) for metres in DISTANCES] + [0]
-    options_of_lodge = ["--base", str(folder / "town.ply"), "--image-scale", "1"]
-    for name, value in {"distances": distances, **LODGE}.items():
-        options_of_lodge += ["--set", f"{name}={value}"]
-    bundle = read_bundle(train(folder, "lodge", *options_of_lodge))
-    others = {name: read_bundle(train(folder, name)) for name in options.others}
-    plan = town.plan_for(options.splats, 0)
-    ways = {"walk": town.walk(plan, options.frames, 0.5), "flight": town.flight(plan, options.frames, 0.5)}
-    rows = rows_of(bundle, others)
+    return found
+
+
+def write_table(folder: Path, out: Path, frames: int, splats: int) -> None:
+    """Draws, measures and prints all that is there."""
+    file = folder / "lodge" / "bundle.ply"
+    others = {name: folder / name / "bundle.ply" for name in OTHERS}
+    others = {name: path for name, path in others.items() if path.exists()}
+    plan = town.plan_for(splats, 0)
+    ways = {"walk": town.walk(plan, frames, 0.5), "flight": town.flight(plan, frames, 0.5)}
+    rows = rows_of(file, others)
     table = measure(rows, ways)
     print(f"{'':<42}{'PSNR':>7}{'ms':>8}{'x':>6}{'drawn':>11}{'loaded':>11}{'MB':>8}")
     for line in table:
@@ -258,14 +292,45 @@ def main() -> None:
             f"{line['name']:<42}{line['psnr_full']:>7.2f}{line['ms']:>8.1f}{times:>6.1f}"
             f"{line['drawn']:>11,.0f}{line['loaded']:>11,.0f}{line['mb']:>8.1f}"
         )
-    chunks = len(bundle.tables[TABLE]["x"]) if TABLE in bundle.tables else 0
-    said = {"splats": options.splats, "chunks": chunks, "rows": table}
-    said |= {"d_l": {level.number: level.facts["d_l"] for level in bundle.levels}}
-    if chunks:
-        said["jumps"] = jumps(rows, bundle, plan, options.out / "lod-border.png")
+    said = {"splats": splats, "rows": table, "others": {name: about(folder / name) for name in others}}
+    for name, given in said["others"].items():
+        print(f"{name}: {given['what']}")
+    bundle = rows[0].resident.bundle
+    said["chunks"] = len(bundle.tables[TABLE]["x"]) if TABLE in bundle.tables else 0
+    said["d_l"] = {level.number: level.facts["d_l"] for level in bundle.levels}
+    if said["chunks"]:
+        said["jumps"] = jumps(rows, bundle, plan, out / "lod-border.png")
         for name, change in said["jumps"].items():
             print(f"{name}: at chunks' borders {change['border']:.2f}, elsewhere {change['elsewhere']:.2f}")
-    (options.out / "lod.json").write_text(json.dumps(said, indent=1) + "\n", encoding="utf-8")
+    (out / "lod.json").write_text(json.dumps(said, indent=1) + "\n", encoding="utf-8")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("stages", nargs="*", metavar="STAGE", help=f"of {', '.join(STAGES)}; otherwise all")
+    parser.add_argument("--splats", type=int, default=3_000_000)
+    parser.add_argument("--views", type=int, default=48, help="photographs of each way")
+    parser.add_argument("--frames", type=int, default=12, help="held-out views of each way")
+    parser.add_argument("--others", nargs="*", default=list(OTHERS), help="other methods to train")
+    parser.add_argument("--effort", type=float, default=1.0, help="share of all steps, to try it out")
+    parser.add_argument("--out", type=Path, default=Path("build/bench"))
+    options = parser.parse_args()
+    stages = options.stages or STAGES
+    if unknown := set(stages) - set(STAGES):
+        parser.error(f"there is no stage {', '.join(unknown)}")
+    torch.set_num_threads(1)
+    folder = options.out / f"town_{options.splats}"
+    if "town" in stages:
+        make_town(folder, options.splats, options.views)
+    if "lodge" in stages:
+        train_lodge(folder, options.views, options.effort)
+    for name in options.others if "others" in stages else ():
+        parameters = OTHERS[name] | {"steps": scaled(OTHERS[name]["steps"], options.effort)}
+        train(folder, name, parameters)
+    if "table" in stages:
+        write_table(folder, options.out, options.frames, options.splats)
 
 
 if __name__ == "__main__":

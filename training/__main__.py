@@ -238,13 +238,14 @@ def _render(chosen: argparse.Namespace) -> int:
     if chosen.size:
         camera = camera.resized(*chosen.size)
     by_distance = given if given or chosen.by_distance else None
-    rule = source.bundle.rule
-    if rule and find_rule(rule) is None and by_distance is None and not chosen.level:
-        _warn(" ".join(unknown_rule(rule)))
-    render(
+    if source.rule and find_rule(source.rule) is None and by_distance is None and not chosen.level:
+        _warn(" ".join(unknown_rule(source.rule)))
+    drawn = render(
         source, camera, near, chosen.out, level=chosen.level, given=by_distance,
-        background=chosen.background, holdout=chosen.holdout, backend=chosen.backend,
+        background=chosen.background, holdout=chosen.holdout, backend=chosen.backend, warn=_warn,
     )  # fmt: skip
+    read = f" of {drawn.bytes_read / 1e6:.1f} MB" if drawn.bytes_read else ""
+    print(f"{chosen.out}: {drawn.loaded:,} splats loaded{read}")
     return 0
 
 

@@ -120,6 +120,7 @@ def test_the_table_of_evaluate(file_regression):
         "aside": {"psnr": 21.25, "views": ["a.jpg", "b.jpg"]},
         "levels": rows,
         "selective": [{"set": "per view", **detail}, {"set": "predetermined", **detail}],
+        "frame_s": {"by_distance": 0.04, "full": 0.08},
         "farther": [{"factor": 2, "drawn": 9_000, "drawn_full": 120_000, "psnr": 31.5}],
         "jumps": {"faded": 1.25, "hard": 3.5},
     }

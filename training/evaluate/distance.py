@@ -9,7 +9,8 @@ from itertools import pairwise
 import numpy as np
 
 from ..lod.rule import Values
-from ..lod.selection import Choice, rule_of
+from ..lod.selection import rule_of
+from ..rasterize.resident import Resident
 from ..scenes.cameras import Camera
 from ..splats.bundle import Bundle
 from .metrics import psnr
@@ -35,15 +36,15 @@ def farther(evaluation: Evaluation, bundle: Bundle, values: Values) -> list[dict
         For each of FACTORS ``factor``, ``drawn`` and ``drawn_full`` (splats in the image), and ``psnr`` of
         the picture by distance against that of full detail, means over views.
     """
-    rows, full_detail, choice = [], shown_at(bundle, bundle.levels[-1]), Choice(bundle)
-    splats = evaluation.load(choice.splats)
+    rows, full_detail = [], shown_at(bundle, bundle.levels[-1])
+    resident = Resident(bundle, evaluation.backend)
     for factor in FACTORS:
         found = []
         for camera in evaluation.cameras:
             view = pulled_back(camera, factor, evaluation.data.median_depth)
             everything, fixed = full_detail(camera)
             full = evaluation.render(everything, view, fixed)
-            some = evaluation.render(splats, view, choice.weights(view.center, view.focal, values))
+            some = resident.draw(view, values, near=evaluation.data.near)
             counts = [int((rendering.radii > 0).sum()) for rendering in (some, full)]
             found.append((*counts, psnr(some.image.cpu(), full.image.cpu())))
         drawn, drawn_full, alike = np.mean(found, axis=0)
@@ -69,8 +70,7 @@ def jumps(evaluation: Evaluation, bundle: Bundle, values: Values, camera: Camera
         ``hard``, with levels switched on and off.
     """
     everything, fixed = shown_at(bundle, bundle.levels[-1])(camera)
-    everything, choice = evaluation.load(everything), Choice(bundle)
-    splats = evaluation.load(choice.splats)
+    everything, resident = evaluation.load(everything), Resident(bundle, evaluation.backend)
     views = [
         pulled_back(camera, factor, evaluation.data.median_depth)
         for factor in np.geomspace(FACTORS[0], FACTORS[-1], FRAMES)
@@ -80,8 +80,8 @@ def jumps(evaluation: Evaluation, bundle: Bundle, values: Values, camera: Camera
         return np.array([np.abs(b - a).mean() for a, b in pairwise(pictures)])
 
     def largest(values: Values) -> float:
-        chosen = ((view, choice.weights(view.center, view.focal, values)) for view in views)
-        pictures = (evaluation.draw(splats, view, weights).numpy() for view, weights in chosen)
+        drawn = (resident.draw(view, values, near=evaluation.data.near) for view in views)
+        pictures = (rendering.image.cpu().numpy() for rendering in drawn)
         return round(float((differences(pictures) / still).max()), 3)
 
     still = differences(evaluation.draw(everything, view, fixed).numpy() for view in views)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from ..lod.rule import Values, find_rule
 from ..lod.selection import Choice, complete, settings
 from ..methods.data import TrainingData
 from ..rasterize import Gaussians, Rendering, device_of, rasterize
+from ..rasterize.resident import Chosen, Resident, SplatSet, draw
 from ..scenes.cameras import Camera, evenly
 from ..splats.bundle import Bundle, Level
 from ..splats.gaussians import Splats
@@ -21,6 +22,8 @@ from .metrics import psnr, ssim
 
 MOST_TRAINING_VIEWS = 24
 """How many training views tell the quality of all."""
+REPEATS = 3
+"""How often a view is drawn to time it."""
 
 ShownTo = Callable[[Camera], tuple[Splats, np.ndarray | None]]
 """What a camera is shown: splats, the same for all, and weights (N,) in [0, 1] on opacities; None: all 1."""
@@ -94,6 +97,10 @@ class Evaluation:
                 backend=self.backend,
             )
 
+    @property
+    def _options(self) -> dict:
+        return {"near": self.data.near, "antialias": self.antialias}
+
     def psnrs(self, cameras: Sequence[Camera], shown_to: ShownTo) -> np.ndarray:
         """The PSNR of each of some views with a photograph, in dB, (V,)."""
         found = []
@@ -102,28 +109,28 @@ class Evaluation:
             found.append(psnr(self.draw(splats, camera, weights), self.target(camera)))
         return np.array(found)
 
-    def measure(self, shown_to: Callable[[Camera], tuple[Gaussians, np.ndarray | None]]) -> dict:
+    def measure(self, render: Callable[[Camera], Rendering], count: Callable[[Camera], int]) -> dict:
         """Mean quality, splats that have a weight and seconds a frame over ``cameras``.
 
         Args:
-            shown_to: the splats that a camera is shown, with their weights (None: all 1).
+            render: what a camera sees, choosing included.
+            count: how many splats have a weight for it, in sight or not.
 
         Returns:
             ``splats`` (mean count), ``drawn`` (of these in the image), ``psnr`` (dB), ``ssim``, ``frame_s``
             (median, selection included); on training views ``train_psnr`` and ``train_ssim``.
         """
-        found = []
+        drawn = []
 
         def picture(camera: Camera) -> torch.Tensor:
-            splats, weights = shown_to(camera)
-            rendering = self.render(splats, camera, weights)
-            found.append((len(splats) if weights is None else weights, rendering.radii))
+            rendering = render(camera)
+            drawn.append(rendering.radii)
             return rendering.image.cpu()
 
         quality = self.measure_pictures(picture)
-        drawn = [int((radii > 0).sum()) for _, radii in found]
-        splats = [given if isinstance(given, int) else np.count_nonzero(given > 0) for given, _ in found]
-        return {"splats": round(float(np.mean(splats))), "drawn": round(float(np.mean(drawn))), **quality}
+        counts = [int((radii > 0).sum()) for radii in drawn]
+        splats = np.mean([count(camera) for camera in self.cameras])
+        return {"splats": round(float(splats)), "drawn": round(float(np.mean(counts))), **quality}
 
     def measure_pictures(self, picture: Callable[[Camera], torch.Tensor]) -> dict:
         """Quality and ``frame_s`` as :meth:`measure`, of pictures however they are made."""
@@ -141,19 +148,41 @@ class Evaluation:
             "frame_s": round(float(np.median(table[:, 2])), 4),
         }
 
-    def measure_by_distance(self, bundle: Bundle, values: Values) -> dict:
+    def measure_by_distance(self, resident: Resident, values: Values) -> dict:
         """The same of what each view is shown of a bundle by its rule, with these values of the controls."""
-        choice = Choice(bundle)
-        splats = self.load(choice.splats)
-        return self.measure(lambda camera: (splats, choice.weights(camera.center, camera.focal, values)))
+
+        def count(camera: Camera) -> int:
+            shown = resident.by_distance(camera, values).values()
+            return sum(len(one.splats.chosen(one.choice)[0]) for one in shown)
+
+        return self.measure(lambda camera: resident.draw(camera, values, **self._options), count)
 
     def measure_level(self, bundle: Bundle, level: Level) -> dict:
         """The same of all that is drawn at a level; by the bundle's rule where its weights always count."""
-        shown = shown_at(bundle, level)
-        loaded = self.load(shown(self.cameras[0])[0])  # of all cameras the same, but for their weights
-        return self.measure(lambda camera: (loaded, shown(camera)[1]))
+        rule, alone = find_rule(bundle.rule), replace(bundle, levels=bundle.upto(level.number))
+        resident = Resident(alone, self.backend)
+        if rule is not None and rule.always:
+            return self.measure_by_distance(resident, settings(alone, {}))
+        total = sum(len(each.splats) for each in alone.levels)
+        return self.measure(
+            lambda camera: resident.draw_level(level.number, camera, **self._options), lambda camera: total
+        )
 
     def measure_set(self, splats: Splats, weights: np.ndarray | None = None) -> dict:
         """The same for one set of splats that every view is shown."""
-        loaded = self.load(splats)
-        return self.measure(lambda camera: (loaded, weights))
+        shown = [Chosen(SplatSet(splats, weights, self.backend), None)]
+        return self.measure(
+            lambda camera: draw(shown, camera, backend=self.backend, **self._options),
+            lambda camera: len(splats),
+        )
+
+    def frame_times(self, draws: Mapping[str, Callable[[Camera], object]]) -> dict[str, float]:
+        """Seconds a frame of several ways to draw, by name: the median over views, drawn in turn."""
+        found: dict[str, list[float]] = {name: [] for name in draws}
+        for camera in evenly(self.cameras, MOST_TRAINING_VIEWS):
+            for _ in range(REPEATS):
+                for name, one in draws.items():
+                    started = time.perf_counter()
+                    one(camera)
+                    found[name].append(time.perf_counter() - started)
+        return {name: round(float(np.median(seconds)), 5) for name, seconds in found.items()}

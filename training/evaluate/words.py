@@ -20,6 +20,12 @@ def summary_lines(measures: dict) -> list[str]:
     match measures.get("veil"):
         case {"mean": int() | float() as mean, "max": int() | float() as most}:
             lines.append(f"Between views: {mean:.1%} veiled, {most:.1%} at worst")
+    match measures.get("frame_s"):
+        case {"by_distance": int() | float() as chosen, "full": int() | float() as full} if full:
+            lines.append(
+                f"A frame by distance: {1e3 * chosen:.1f} ms, {chosen / full:.0%} of full detail's "
+                f"{1e3 * full:.1f} ms"
+            )
     match measures.get("oversized"):
         case int() as count if count:
             lines.append(f"Oversized opaque splats: {count:,}")

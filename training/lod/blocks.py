@@ -80,8 +80,14 @@ class Blocks:
         farthest = np.maximum(np.abs(below), np.abs(above))
         return np.linalg.norm(nearest, axis=1), np.linalg.norm(farthest, axis=1)
 
-    def between(self, eye: np.ndarray, near: float, far: float) -> np.ndarray:
-        """(B,) bool, False where no mean of a block is at a distance near <= d < far from an eye (3,)."""
+    def between(self, eye: np.ndarray, near: float | np.ndarray, far: float | np.ndarray) -> np.ndarray:
+        """(B,) bool, False where no mean of a block is at a distance near <= d < far from an eye (3,).
+
+        Args:
+            near, far: for all blocks, or (B,) of each.
+        """
+        if isinstance(far, float) and (near, far) in ((0.0, np.inf), (np.inf, np.inf)):
+            return np.full(len(self.low), near == 0)
         least, most = self.distances(eye)
         return (most * (1 + ROUNDING) >= near) & (least * (1 - ROUNDING) < far)
 
@@ -90,6 +96,19 @@ class Blocks:
         begins = np.flatnonzero(which).astype(np.int32) * SIZE
         rows = (begins[:, None] + np.arange(SIZE, dtype=np.int32)).reshape(-1)
         return rows[: len(rows) - max(int(begins[-1]) + SIZE - self.count, 0)] if len(begins) else rows
+
+    def of_rows(self, which: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """``values[self.rows(which)]`` of values (N, ...): copied block by block, which is much faster."""
+        if which.all():
+            return values
+        whole = self.count // SIZE
+        found = values[: whole * SIZE].reshape(whole, SIZE, *values.shape[1:])[which[:whole]]
+        found = found.reshape(-1, *values.shape[1:])
+        return np.concatenate([found, values[whole * SIZE :]]) if which[whole:].any() else found
+
+    def highest(self, values: np.ndarray) -> np.ndarray:
+        """(B,) the greatest of the values (N,) in each block that are numbers."""
+        return np.fmax.reduceat(values, np.arange(0, self.count, SIZE)) if self.count else values
 
 
 def block_quantiles(values: np.ndarray, quantile: float) -> np.ndarray:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from .rule import OPACITY, Region, Tables, every_column, rules
+from ..scenes.cameras import Camera
+from .blocks import Blocks
+from .rule import OPACITY, Region, Rule, Tables, every_column, rules
 
 Column = tuple[str, str, bytes]
 """A column of a table: its name, its type, its rows."""
@@ -37,6 +39,10 @@ class Choice:
         rule = rules()[self.rule]
         eye, facts, values = np.array(self.eye, np.float32), dict(self.facts), dict(self.values)
         return rule.weights(means, eye, self.focal_px, columns, facts, values, self._tables())
+
+    def band(self, highest: Mapping[str, np.ndarray]) -> tuple[float, float | np.ndarray]:
+        """See ``Rule.band``."""
+        return rules()[self.rule].band(self.focal_px, dict(self.facts), dict(self.values), highest)
 
     def region(self) -> Region | None:
         """See ``Rule.region``."""
@@ -95,39 +101,106 @@ class Choice:
 class Chooser:
     """The splats of one set, from which one choice after the other is made.
 
-    While the eye stays in a region (``Rule.region``), only what may be shown there is looked at.
+    While the eye stays in a region (``Rule.region``), only what may be shown there is looked at. Of splats
+    that stand together in rows (``blocks.spatial_order``) those blocks are passed over that are out of the
+    rule's reach (``Rule.band``), or out of sight.
 
     Args:
         means: (N, 3).
         columns: (N,) by name, OPACITY among them; those that are missing are zeros.
+        log_scales: (N, 3), where blocks are to be passed over.
     """
 
-    def __init__(self, means: np.ndarray, columns: Mapping[str, np.ndarray]) -> None:
+    def __init__(
+        self, means: np.ndarray, columns: Mapping[str, np.ndarray], log_scales: np.ndarray | None = None
+    ) -> None:
         nothing = np.broadcast_to(np.float32(0), len(means))
-        self._means, self._columns = means, dict.fromkeys([*every_column(), OPACITY], nothing) | dict(columns)
-        self._near: tuple[str, Region, np.ndarray, np.ndarray, dict[str, np.ndarray]] | None = None
-        self._last: tuple[Choice, tuple[np.ndarray, np.ndarray]] | None = None
+        known = dict.fromkeys([*every_column(), OPACITY], nothing) | dict(columns)
+        self._all, self._log_scales = _Part.of(None, means, known, log_scales), log_scales
+        self._near: tuple[str, Region, _Part] | None = None
+        self._last: tuple[Choice | None, tuple[np.ndarray, np.ndarray]] | None = None
 
-    def chosen(self, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
-        """The splats that have a weight, (M,) ascending, and their weights (M,) float32.
+    def chosen(
+        self, choice: Choice | None, camera: Camera | None = None, near: float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The splats that have a weight, (M,) int32 ascending, and their weights (M,) float32.
 
-        Those of one choice are found once.
+        Those of one choice are found once, but for a camera: then blocks that are not in its image are left
+        out.
+
+        Args:
+            choice: None: all have the weight 1.
+            near: depth at which the camera's drawing begins.
         """
+        if camera is not None:
+            return self._choose(choice, camera, near)
         if self._last is None or self._last[0] != choice:
-            self._last = choice, self._choose(choice)
+            self._last = choice, self._choose(choice, None, 0.0)
         return self._last[1]
 
-    def _choose(self, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
-        region = choice.region()
+    def _part(self, choice: Choice) -> tuple[_Part, bool]:
+        """What is to be looked at, and whether that is of a region."""
+        region, every = choice.region(), self._all
         if region is None:
-            weights = choice.weights(self._means, self._columns)
-            some = np.flatnonzero(weights > 0)
-            return some, weights[some].astype(np.float32)
+            return every, False
         if self._near is None or self._near[:2] != (choice.rule, region):
-            rows = np.flatnonzero(choice.loaded(self._columns))
-            columns = {name: self._columns[name][rows] for name in rules()[choice.rule].columns}
-            self._near = choice.rule, region, rows, self._means[rows], columns
-        _, _, rows, means, columns = self._near
-        weights = choice.weights(means, columns)
+            rows = np.flatnonzero(choice.loaded(every.columns)).astype(np.int32)
+            if len(rows) < len(every.means):
+                columns = {name: every.columns[name][rows] for name in rules()[choice.rule].columns}
+                log_scales = None if self._log_scales is None else self._log_scales[rows]
+                every = _Part.of(rows, every.means[rows], columns, log_scales)
+            self._near = choice.rule, region, every
+        return self._near[2], True
+
+    def _choose(
+        self, choice: Choice | None, camera: Camera | None, near: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        part, in_region = (self._all, False) if choice is None else self._part(choice)
+        blocks, means, rows = part.blocks, part.means, part.rows
+        rule = None if choice is None else rules()[choice.rule]
+        columns = {} if rule is None else {name: part.columns[name] for name in rule.columns}
+
+        def weigh(means: np.ndarray, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+            return np.ones(len(means), np.float32) if choice is None else choice.weights(means, columns)
+
+        if blocks is None:
+            weights = weigh(means, columns)
+        else:
+            seen = np.ones(len(blocks.low), bool)
+            if choice is not None and rule is not None and rule.apart and not in_region:
+                eye = np.array(choice.eye, np.float32)  # as weights take it
+                seen &= blocks.between(eye, *choice.band(part.highest(rule)))
+            if camera is not None and seen.any():
+                seen &= blocks.in_view(camera, near)
+            if rule is None or rule.apart:
+                columns = {name: blocks.of_rows(seen, column) for name, column in columns.items()}
+                weights = weigh(blocks.of_rows(seen, means), columns)
+            else:
+                weights = blocks.of_rows(seen, weigh(means, columns))
+            rows = blocks.rows(seen) if rows is None else blocks.of_rows(seen, rows)
         some = np.flatnonzero(weights > 0)
-        return rows[some], weights[some].astype(np.float32)
+        found = some.astype(np.int32) if rows is None else rows[some]
+        return found, weights[some].astype(np.float32)
+
+
+@dataclass
+class _Part:
+    """Splats to choose from: which they are (None: all), and what is known of them."""
+
+    rows: np.ndarray | None
+    means: np.ndarray
+    columns: Mapping[str, np.ndarray]
+    blocks: Blocks | None
+    _highest: dict[str, np.ndarray] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, rows, means: np.ndarray, columns: Mapping[str, np.ndarray], log_scales) -> _Part:
+        return cls(rows, means, columns, None if log_scales is None else Blocks.of(means, log_scales))
+
+    def highest(self, rule: Rule) -> Mapping[str, np.ndarray]:
+        """(B,) the greatest value in each block of each of a rule's columns."""
+        assert self.blocks is not None
+        for name in rule.columns:
+            if name not in self._highest:
+                self._highest[name] = self.blocks.highest(self.columns[name])
+        return self._highest

@@ -315,7 +315,7 @@ class Update:
     after: tuple[np.ndarray, np.ndarray]
 
 
-class Resident:
+class Memory:
     """Splats of a tree in memory, N rows: those that are there, and room. Its thread is the one that draws.
 
     Attributes:
@@ -358,7 +358,7 @@ class Pager:
 
     Attributes:
         file: what is read.
-        resident: what is in memory.
+        memory: what is in memory.
         problem: why the thread has ended by itself; empty as long as it has not.
 
     Raises:
@@ -371,7 +371,7 @@ class Pager:
         if not slots:
             raise LodgsError(*_too_few(budget, path))
         (first,) = self.file.read(np.array([0]))
-        self.resident, self.problem = Resident(slots * SIZE, first.sh_degree), ""
+        self.memory, self.problem = Memory(slots * SIZE, first.sh_degree), ""
         self._columns = {name: np.zeros(slots * SIZE, np.float32) for name in (*COLUMNS, *"xyz")}
         self._slot_of, self._page_in = np.full(len(self.file), -1), np.full(slots, -1)
         self._used, self._tick = np.zeros(len(self.file), np.int64), 0
@@ -465,7 +465,7 @@ class Pager:
                     self._changed.notify_all()
                 if update is None:
                     return changed
-                self._taking = self.resident.pieces(update)
+                self._taking = self.memory.pieces(update)
             for _ in self._taking:
                 changed = True
                 if time.perf_counter() >= until:

@@ -32,6 +32,7 @@ Values = Mapping[str, float]
 Tables = Mapping[str, Mapping[str, np.ndarray]]
 """Tables of a bundle, of columns (rows,) by name."""
 NO_TABLES: Tables = {}
+NO_COLUMNS: Mapping[str, np.ndarray] = {}
 
 Region = tuple[int, ...]
 """Names a part of space; what it is made of is the rule's."""
@@ -142,11 +143,21 @@ class Rule(ABC):
             tables: of the bundle, those of the rule at least; coordinates are in the same space.
         """
 
-    def band(self, focal_px: float, facts: Mapping[str, float], values: Values) -> tuple[float, float]:
+    def band(
+        self,
+        focal_px: float,
+        facts: Mapping[str, float],
+        values: Values,
+        highest: Mapping[str, np.ndarray] = NO_COLUMNS,
+    ) -> tuple[float, float | np.ndarray]:
         """The distances near <= d < far from the eye outside which no splat of a level has a weight.
 
         For whoever can leave out many splats at once. Where a region counts (:meth:`region`), that does
         instead.
+
+        Args:
+            highest: the greatest value of each column among splats of the level, (B,) of B sets of them;
+                ``far`` may then be (B,), too. Without it what depends on columns is taken for possible.
         """
         return 0.0, inf
 

@@ -183,22 +183,6 @@ def not_alone(number: int, finest: int) -> tuple[str, str]:
     )
 
 
-def complete_levels(bundle: Bundle, number: int) -> list[Shown]:
-    """All that is drawn at a level: the level, and where levels add up the coarser ones before it.
-
-    Raises:
-        LodgsError: there is no such level, or it is no scene by itself.
-    """
-    numbers = [level.number for level in bundle.levels]
-    if number not in numbers:
-        raise LodgsError(
-            f"There is no level {number}.", f"Choose from {numbers[0]} (coarsest) to {numbers[-1]}."
-        )
-    if number not in [level.number for level in levels_alone(bundle)]:
-        raise LodgsError(*not_alone(number, numbers[-1]))
-    return [Shown(level.number, level.splats) for level in bundle.upto(number)]
-
-
 def complete(bundle: Bundle, level: Level) -> Splats:
     """All that is drawn at a level, as one set of splats."""
     return Splats.concatenated([each.splats for each in bundle.upto(level.number)])

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from ..splats.bundle import Bundle, read_bundle
+from ..splats.bundle import Bundle, read_bundle, read_head, read_tables
+from ..splats.dialects import Warn, silent
 from ..splats.gaussians import Splats
 from ..splats.ply import columns_of as columns_in_file
 from ..splats.ply import columns_of_extras
@@ -31,34 +34,54 @@ def table_of_blocks(rule: Rule, levels: dict[int, Splats]) -> dict[str, np.ndarr
     return {name: np.concatenate(parts) for name, parts in table.items()}
 
 
-def read_region(path: str | Path, region: Region) -> tuple[Bundle, int]:
-    """The splats of a bundle that eyes in a region may be shown, in its order, and how many bytes were read.
-
-    Blocks that have none of these are not read; of a file without a table of blocks everything is.
+def read_head_and_tables(path: str | Path) -> Bundle:
+    """What a bundle says of its levels, which are without splats, with its tables.
 
     Raises:
-        LodgsError: as ``read_bundle``, its levels are not made for distances, or its rule is not known here.
+        LodgsError: as ``read_bundle``.
+    """
+    return replace(read_head(path), tables=read_tables(path))
+
+
+def read_part(
+    path: str | Path, numbers: Collection[int], region: Region | None = None, warn: Warn = silent
+) -> tuple[Bundle, int]:
+    """Some levels of a bundle, or what eyes in a region may be shown of them; and how many bytes were read.
+
+    Blocks that have none of these are not read. Splats are in the file's order; the other levels have none.
+
+    Args:
+        numbers: of the levels.
+        region: None, or where the file has no table of blocks: everywhere.
+        warn: as for ``read_bundle``.
+
+    Raises:
+        LodgsError: as ``read_bundle``; or, for a region, the rule of its levels is not known here.
     """
     size = 0
 
     def rows_of(bundle: Bundle) -> dict[int, np.ndarray]:
         nonlocal size
         size = sum(column.nbytes for table in bundle.tables.values() for column in table.values())
+        found = {
+            level.number: np.zeros(0, np.int64) for level in bundle.levels if level.number not in numbers
+        }
         table = bundle.tables.get(BLOCKS)
-        if table is None:
-            return {}
-        rule, found = rule_of(bundle), {}
+        if table is None or region is None:
+            return found
+        rule = rule_of(bundle)
         nothing = np.zeros(len(table["level"]), np.float32)
         needed = rule.loaded({name: table.get(name, nothing) for name in rule.columns}, region)
-        for level in bundle.levels:
-            blocks = np.flatnonzero(needed[table["level"] == level.number])
-            found[level.number] = (blocks[:, None] * SIZE + np.arange(SIZE)).reshape(-1)
+        for number in numbers:
+            blocks = np.flatnonzero(needed[table["level"] == number])
+            found[number] = (blocks[:, None] * SIZE + np.arange(SIZE)).reshape(-1)
         return found
 
-    bundle = read_bundle(path, rows_of=rows_of)
-    rule = rule_of(bundle)
+    bundle = read_bundle(path, warn, rows_of)
+    rule = None if region is None or BLOCKS not in bundle.tables else rule_of(bundle)
     for level in bundle.levels:
         columns = columns_in_file(level.splats) | columns_of_extras(level.splats)
         size += sum(column.dtype.itemsize for column in columns.values()) * len(level.splats)
-        level.splats = level.splats.select(rule.loaded(columns_of(rule, level.splats), region))
+        if rule is not None and region is not None:
+            level.splats = level.splats.select(rule.loaded(columns_of(rule, level.splats), region))
     return bundle, size

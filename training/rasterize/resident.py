@@ -1,159 +1,290 @@
-"""A bundle's levels where they are drawn: what a camera is shown of them, and no more work than that."""
+"""Splats where they are drawn, kept from picture to picture: whatever draws levels by distance draws with it.
+
+A set of splats (``SplatSet``) is put in spatial order once, and looked at in blocks of rows: what is out of
+sight, or out of its level's reach, is left out before its splats are looked at one by one, and nothing that
+is left out is copied. ``Resident`` is a bundle's levels as such sets; of a file that has an index of its
+blocks it reads what the eye's region needs.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from torch.nn.functional import pad
 
-from ..lod.blocks import Blocks, spatial_order
-from ..lod.rule import Region, Rule, Values, facts_of
-from ..lod.selection import columns_of, rule_of
+from ..errors import LodgsError
+from ..lod.blocks import SIZE, spatial_order
+from ..lod.choice import Choice, Chooser
+from ..lod.rule import OPACITY, Region, Values, every_column, facts_of
+from ..lod.selection import known_rule, levels_alone, not_alone, rule_of
+from ..lod.streaming import BLOCKS, read_head_and_tables, read_part
 from ..scenes.cameras import Camera
 from ..splats.bundle import Bundle
+from ..splats.dialects import Warn, silent
 from ..splats.gaussians import Splats
 from . import device_of, rasterize
 from .gaussians import Gaussians
+from .placing import transformed
 from .rendering import Rendering
 
+MANY = 16 * SIZE
+"""Fewer splats are not worth being put in order; of equally deep ones the first in order is in front."""
 
-@dataclass(frozen=True)
-class _Level:
-    """A level's place among all splats that are loaded.
+
+class SplatSet:
+    """Splats where a backend draws them.
+
+    Args:
+        splats: in the set's own coordinates; of their extras those are kept that rules ask for.
+        weights: (N,) on the opacities; None: ones.
+        backend: rasterizer.
+        ordered: their rows are in spatial order already; then nothing is copied.
 
     Attributes:
-        number: of the level.
-        begin: its first row.
-        means: (N, 3); columns: what its rule needs, (N,) by name; blocks: of its rows.
+        gaussians: the same, where there are MANY in spatial order, on the backend's device.
     """
 
-    number: int
-    begin: int
-    means: np.ndarray
-    columns: Mapping[str, np.ndarray]
-    blocks: Blocks
+    def __init__(
+        self,
+        splats: Splats,
+        weights: np.ndarray | None = None,
+        backend: str = "auto",
+        ordered: bool = False,
+    ) -> None:
+        device = device_of(backend)
+        if not ordered and len(splats) >= MANY:
+            order = spatial_order(splats.means)
+            splats, weights = splats.select(order), None if weights is None else weights[order]
+        self.gaussians = Gaussians.of(splats, device)
+        self._weights = None if weights is None else np.asarray(weights, np.float32)
+        self._columns = {name: splats.extras[name] for name in every_column() if name in splats.extras}
+        self._chooser: Chooser | None = None
+        self._in_world: tuple[bytes, Gaussians] | None = None
+        self._joined: tuple[list[SplatSet], Gaussians] | None = None
+
+    def __len__(self) -> int:
+        return len(self.gaussians)
+
+    def chosen(
+        self, choice: Choice | None, camera: Camera | None = None, near: float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The splats that have a weight, (M,) int32 ascending, and their weights (M,) float32.
+
+        Args:
+            choice: by what they are weighted, on top of their own weights; None: by these alone.
+            camera: in the set's own coordinates; splats that are out of its sight may be left out.
+            near: depth at which its drawing begins, in the set's units.
+        """
+        if self._chooser is None:
+            self._chooser = self._make_chooser()
+        rows, weights = self._chooser.chosen(choice, camera, near)
+        if self._weights is None:
+            return rows, weights
+        weights = weights * self._weights[rows]
+        some = weights > 0
+        return (rows, weights) if some.all() else (rows[some], weights[some])
+
+    def in_world(self, matrix: np.ndarray) -> Gaussians:
+        """The splats where a transform (4, 4) puts them, any affine one; kept while it is the same.
+
+        Their harmonics stay the set's.
+        """
+        key = matrix.tobytes()
+        if self._in_world is None or self._in_world[0] != key:
+            self._in_world = key, transformed(self.gaussians, matrix)
+        return self._in_world[1]
+
+    def joined(self, others: Sequence[SplatSet]) -> Gaussians:
+        """These splats and those of other sets as one, kept as long as these are the others.
+
+        All of them are parts of it then, so that nothing is there twice.
+        """
+        others = list(others)
+        if not others:
+            return self.gaussians
+        if self._joined is None or self._joined[0] != others:
+            sets = [self, *others]
+            most = max(one.gaussians.sh.shape[1] for one in sets)
+            whole = Gaussians.concatenated([
+                replace(one.gaussians, sh=pad(one.gaussians.sh, (0, 0, 0, most - one.gaussians.sh.shape[1])))
+                for one in sets
+            ])  # fmt: skip
+            if self in others:  # drawn twice at one place
+                return whole
+            begin = 0
+            for one in sets:
+                end = begin + len(one)
+                one.gaussians, begin = whole.select(slice(begin, end)), end
+                one._chooser = one._in_world = None  # which hold what these tensors took the place of
+            self._joined = others, whole
+        return self._joined[1]
+
+    def _make_chooser(self) -> Chooser:
+        own = self.gaussians
+        means, log_scales, logits = (x.cpu().numpy() for x in (own.means, own.log_scales, own.opacity_logits))
+        with np.errstate(over="ignore"):
+            opacities = 1 / (1 + np.exp(-logits))
+        return Chooser(means, self._columns | {OPACITY: opacities}, log_scales)
+
+
+class Chosen(NamedTuple):
+    """A set of splats, and by what they are weighted; None: by nothing but their own weights."""
+
+    splats: SplatSet
+    choice: Choice | None
+
+
+def looked_at(
+    sets: Sequence[Chosen], camera: Camera, near: float
+) -> tuple[Gaussians, torch.Tensor, torch.Tensor]:
+    """Of sets that stand together all splats, N, which of them to look at, and weights: for ``rasterize``.
+
+    Args:
+        camera, near: in the sets' coordinates.
+
+    Returns:
+        The splats; rows (M,) int32; weights (N,), which count in these rows only.
+    """
+    gaussians, begin = sets[0].splats.joined([one.splats for one in sets[1:]]), 0
+    rows, weights = [], np.zeros(len(gaussians), np.float32)
+    for splats, choice in sets:
+        some, found = splats.chosen(choice, camera, near)
+        rows.append(some + np.int32(begin))
+        weights[begin : begin + len(splats)][some] = found
+        begin += len(splats)
+    device = gaussians.means.device
+    return gaussians, torch.from_numpy(np.concatenate(rows)).to(device), torch.from_numpy(weights).to(device)
+
+
+def draw(
+    sets: Sequence[Chosen], camera: Camera, *, near: float = 0.01, backend: str = "auto", **options: Any
+) -> Rendering:
+    """What a camera sees of sets that stand together. Nothing is kept for gradients.
+
+    Args:
+        options: as for :func:`training.rasterize.rasterize`.
+    """
+    with torch.no_grad():
+        gaussians, rows, weights = looked_at(sets, camera, near)
+        return rasterize(gaussians, camera, near=near, rows=rows, weights=weights, backend=backend, **options)
 
 
 class Resident:
-    """Levels that are drawn again and again.
-
-    Splats are put in spatial order once, and then looked at in blocks: what is out of sight, or at another
-    level's distance, is left out before its splats are looked at one by one. Where the rule tells for a
-    region which splats may be shown in it, only these are loaded, and they stay while the eye is there.
+    """A bundle's levels, for one picture after another.
 
     Args:
-        bundle: its levels are not copied beyond being put in order.
+        source: a bundle, all of whose splats are kept ready; or the file of one. Of that is read what is
+            asked for: where it has a table of blocks (``lod.streaming``), and the rule tells for a region
+            which splats may be shown in it, these alone, which stay while the eye is there.
         backend: rasterizer.
+        warn: as for ``read_bundle``.
 
     Attributes:
-        loaded: how many splats are held ready for drawing.
+        bundle: what is known of it; without splats where it is a file.
+        loaded: how many splats are held ready.
+        bytes_read: of the file, so far.
 
     Raises:
-        LodgsError: its levels are not made for distances, the rule is not known here, or facts are missing.
+        LodgsError: as ``read_bundle``, or the bundle contradicts its rule.
     """
 
-    def __init__(self, bundle: Bundle, backend: str = "auto") -> None:
-        self._rule: Rule = rule_of(bundle)
-        self._cumulative, self._tables = bundle.cumulative, bundle.tables
-        self._antialias = bundle.antialias
-        numbered = [(level.number, level.facts) for level in bundle.levels]
-        self._facts = {n: facts_of(self._rule, bundle.facts, numbered, n) for n, _ in numbered}
-        self._splats = {
-            level.number: level.splats.select(spatial_order(level.splats.means)) for level in bundle.levels
-        }
-        self._backend, self._device = backend, device_of(backend)
-        self._region: Region | None = None
-        self._load(self._splats)
+    def __init__(self, source: Bundle | str | Path, backend: str = "auto", warn: Warn = silent) -> None:
+        self._path = None if isinstance(source, Bundle) else Path(source)
+        self.bundle = source if isinstance(source, Bundle) else read_head_and_tables(source)
+        self._backend, self._warn = backend, warn
+        self.loaded, self.bytes_read = 0, 0
+        self._sets: dict[int, SplatSet] = {}
+        self._holds: tuple[Region | None, frozenset[int]] | None = None
+        self._rule = known_rule(self.bundle)
+        self._facts: dict[int, tuple[tuple[str, float], ...]] = {}
+        self._tables = tuple(
+            (name, tuple((column, rows.dtype.str, rows.tobytes()) for column, rows in table.items()))
+            for name, table in self.bundle.tables.items()
+            if self._rule is not None and name in self._rule.tables
+        )
 
-    def draw(self, camera: Camera, values: Values, *, near: float = 0.01, **options: Any) -> Rendering:
-        """What a camera is shown by the rule.
+    def by_distance(self, camera: Camera, values: Values) -> dict[int, Chosen]:
+        """The levels by number, weighted as the rule says for a camera's eye.
 
         Args:
             values: of the rule's controls, see ``lod.selection.settings``.
-            near: depth at which drawing begins, in scene units.
-            options: as for :func:`training.rasterize.rasterize`. Rows are those of the splats loaded.
+
+        Raises:
+            LodgsError: the levels are not made for distances, the rule is not known here, or facts are
+                missing; or as ``read_bundle``.
         """
-        eye = camera.center.astype(np.float32)  # as weights take it: on a border between regions it counts
-        self._enter(self._rule.region(eye, values, self._tables))
-        rows, weights = [], []
-        for level in self._levels:
-            some, found = self._shown(level, camera, near, values)
-            rows.append(some + level.begin)
-            weights.append(found)
-        return self._rasterize(camera, near, rows, weights, options)
+        rule = rule_of(self.bundle)
+        x, y, z = camera.center.tolist()
+        choices = {
+            number: Choice(rule.name, (x, y, z), camera.focal, facts, tuple(values.items()), self._tables)
+            for number, facts in self._all_facts().items()
+        }
+        self._hold(next(iter(choices.values())).region(), frozenset(choices))
+        return {number: Chosen(self._sets[number], choice) for number, choice in choices.items()}
+
+    def complete(self, number: int) -> dict[int, Chosen]:
+        """All that is drawn at a level: the level, and where levels add up the coarser ones before it.
+
+        Raises:
+            LodgsError: there is no such level, or it is no scene by itself; or as ``read_bundle``.
+        """
+        known = [level.number for level in self.bundle.levels]
+        if number not in known:
+            raise LodgsError(
+                f"There is no level {number}.", f"Choose from {known[0]} (coarsest) to {known[-1]}."
+            )
+        if number not in [level.number for level in levels_alone(self.bundle)]:
+            raise LodgsError(*not_alone(number, known[-1]))
+        numbers = [level.number for level in self.bundle.upto(number)]
+        self._hold(None, frozenset(numbers))
+        return {number: Chosen(self._sets[number], None) for number in numbers}
+
+    def draw(self, camera: Camera, values: Values, *, near: float = 0.01, **options: Any) -> Rendering:
+        """What a camera is shown by the rule; arguments as of :meth:`by_distance` and :func:`draw`."""
+        return self._draw(self.by_distance(camera, values), camera, near, options)
 
     def draw_level(self, number: int, camera: Camera, *, near: float = 0.01, **options: Any) -> Rendering:
-        """What a camera sees at a level alone; where levels add up, with all coarser ones."""
-        self._enter(None)
-        rows = [
-            level.blocks.rows(level.blocks.in_view(camera, near)) + level.begin
-            for level in self._levels
-            if level.number == number or (self._cumulative and level.number < number)
-        ]
-        return self._rasterize(camera, near, rows, None, options)
+        """What a camera sees at a level; arguments as of :meth:`complete` and :func:`draw`."""
+        return self._draw(self.complete(number), camera, near, options)
 
-    def _shown(
-        self, level: _Level, camera: Camera, near: float, values: Values
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """The rows (M,) of a level that may be in view and have a weight, and their weights."""
-        facts, rule, blocks = self._facts[level.number], self._rule, level.blocks
-        what = camera.center.astype(np.float32), camera.focal
-        seen = blocks.in_view(camera, near)
-        if not rule.apart:
-            rows = blocks.rows(seen)
-            weights = rule.weights(level.means, *what, level.columns, facts, values, self._tables)[rows]
+    def _draw(self, shown: dict[int, Chosen], camera: Camera, near: float, options: dict) -> Rendering:
+        options = {"antialias": self.bundle.antialias, "backend": self._backend} | options
+        return draw(list(shown.values()), camera, near=near, **options)
+
+    def _all_facts(self) -> dict[int, tuple[tuple[str, float], ...]]:
+        """What the rule knows of each level, by number."""
+        if not self._facts:
+            rule, numbered = (
+                rule_of(self.bundle),
+                [(level.number, level.facts) for level in self.bundle.levels],
+            )
+            for number, _ in numbered:
+                found = facts_of(rule, self.bundle.facts, numbered, number)
+                self._facts[number] = tuple(found.items())
+        return self._facts
+
+    def _hold(self, region: Region | None, numbers: frozenset[int]) -> None:
+        """Has these levels ready, or at least what a region shows of them."""
+        if self._path is None or BLOCKS not in self.bundle.tables:
+            region = None
+        if self._holds is not None and self._holds[0] == region and numbers <= self._holds[1]:
+            return
+        if self._path is None:
+            bundle, numbers = self.bundle, frozenset(level.number for level in self.bundle.levels)
         else:
-            if self._region is None:
-                seen &= blocks.between(camera.center, *rule.band(camera.focal, facts, values))
-            rows = blocks.rows(seen)
-            columns = {name: column[rows] for name, column in level.columns.items()}
-            weights = rule.weights(level.means[rows], *what, columns, facts, values, self._tables)
-        some = np.flatnonzero(weights)
-        return rows[some], weights[some]
-
-    def _rasterize(
-        self,
-        camera: Camera,
-        near: float,
-        rows: Sequence[np.ndarray],
-        weights: Sequence[np.ndarray] | None,
-        options: Mapping[str, Any],
-    ) -> Rendering:
-        index = torch.from_numpy(np.concatenate(rows)).to(self._device)
-        if weights is not None:
-            self._weights[index.long()] = torch.from_numpy(np.concatenate(weights)).to(self._weights)
-        with torch.no_grad():
-            return rasterize(
-                self._gaussians, camera, near=near, rows=index,
-                weights=None if weights is None else self._weights,
-                antialias=self._antialias, backend=self._backend, **options,
-            )  # fmt: skip
-
-    def _enter(self, region: Region | None) -> None:
-        """Loads what a region needs, unless it is there already."""
-        if region == self._region:
-            return
-        self._region = region
-        if region is None:
-            self._load(self._splats)
-            return
-        columns = {number: columns_of(self._rule, splats) for number, splats in self._splats.items()}
-        self._load(
-            {
-                number: splats.select(np.flatnonzero(self._rule.loaded(columns[number], region)))
-                for number, splats in self._splats.items()
-            }
-        )
-
-    def _load(self, splats: Mapping[int, Splats]) -> None:
-        self._levels, begin = [], 0
-        for number, one in splats.items():
-            blocks = Blocks.of(one.means, one.log_scales)
-            self._levels.append(_Level(number, begin, one.means, columns_of(self._rule, one), blocks))
-            begin += len(one)
-        self.loaded = begin
-        self._gaussians = Gaussians.of(Splats.concatenated(list(splats.values())), self._device)
-        self._weights = torch.ones(begin, device=self._device)
+            self._holds, self._sets = None, {}  # so that both are never in memory
+            bundle, size = read_part(self._path, numbers, region, self._warn)
+            self.bytes_read += size
+        ordered = BLOCKS in bundle.tables
+        self._sets = {
+            level.number: SplatSet(level.splats, None, self._backend, ordered)
+            for level in bundle.levels
+            if level.number in numbers
+        }
+        self.loaded = sum(map(len, self._sets.values()))
+        self._holds = region, numbers

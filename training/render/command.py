@@ -6,17 +6,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import LodgsError
-from ..lod.rule import Values
-from ..lod.selection import complete_levels, known_rule, select_levels, settings
+from ..lod.rule import Values, find_rule
+from ..lod.selection import settings
+from ..rasterize.resident import Resident
 from ..runs.data import training_data
 from ..runs.folder import RunFolder
 from ..runs.job import Job
 from ..scenes.cameras import Camera
 from ..scenes.colmap import read_scene
-from ..splats.bundle import Bundle, read_bundle, read_folder
+from ..splats.bundle import Bundle, read_folder, read_head
 from ..splats.dialects import Warn, silent
-from .picture import Picture, read_depth, write_picture
-from .scene import Instance, SplatSet, draw
+from .picture import read_depth, write_picture
+from .scene import Instance, draw
 
 
 @dataclass(frozen=True)
@@ -24,10 +25,13 @@ class Source:
     """What is rendered: levels, and where they were trained, the views that they were trained from.
 
     Attributes:
-        run: the run that the bundle was found in, or None.
+        levels: a file, of which nothing but the header is read yet; or what was read of a folder of levels.
+        rule: by which they are chosen, see ``Bundle``.
+        run: the run that the file was found in, or None.
     """
 
-    bundle: Bundle
+    levels: Path | Bundle
+    rule: str
     run: RunFolder | None
 
     @classmethod
@@ -49,9 +53,10 @@ class Source:
                 raise LodgsError(
                     f"{path} holds no finished run (no bundle.ply).", "Train it to the end first."
                 )
-            return cls(read_bundle(run.bundle, warn), run)
-        bundle = (read_folder if path.is_dir() else read_bundle)(path, warn)
-        return cls(bundle, run if run.job.exists() else None)
+            path = run.bundle
+        levels = read_folder(path, warn) if path.is_dir() else path
+        rule = (levels if isinstance(levels, Bundle) else read_head(levels)).rule
+        return cls(levels, rule, run if run.job.exists() else None)
 
     def view(self, name: str, scene: Path | None = None) -> tuple[Camera, float]:
         """A photograph's view in the photograph's own size, and the depth at which drawing begins.
@@ -97,7 +102,8 @@ def render(
     background: tuple[float, float, float] | None = (0.0, 0.0, 0.0),
     holdout: Path | None = None,
     backend: str = "auto",
-) -> Picture:
+    warn: Warn = silent,
+) -> Resident:
     """Draws one view into a file: a PNG, or an EXR with depth and levels besides.
 
     Args:
@@ -106,23 +112,27 @@ def render(
         given: controls of the bundle's rule by name: draw levels by their distance instead.
         background: display-coded; None leaves it transparent.
         holdout: an EXR with the depth of what hides splats, as :func:`.picture.read_depth` reads it.
+        warn: as for :meth:`Source.read`.
+
+    Returns:
+        What was drawn: it tells how much was read for it.
 
     Raises:
         LodgsError: there is no such level or control, the bundle contradicts its rule, the holdout is not
-            one, or the file cannot be written.
+            one, or a file cannot be read or written.
     """
-    bundle = source.bundle
     if out.suffix.lower() not in (".png", ".exr"):
         raise LodgsError(f"{out.name} is neither .png nor .exr.", "Choose one of these endings.")
     limit = None if holdout is None else read_depth(holdout, camera.width, camera.height, None)
-    rule = known_rule(bundle)
+    resident = Resident(source.levels, backend, warn)
+    bundle, rule = resident.bundle, find_rule(source.rule)
     if given is not None or (rule is not None and rule.always and not level):
-        shown = select_levels(bundle, camera.center, camera.focal, settings(bundle, given or {}))
+        shown = resident.by_distance(camera, settings(bundle, given or {}))
     else:
-        shown = complete_levels(bundle, level or bundle.levels[-1].number)
+        shown = resident.complete(level or bundle.levels[-1].number)
     instances = [
-        Instance(SplatSet(x.splats, x.weights, backend), level=x.number, antialias=bundle.antialias)
-        for x in shown
+        Instance(one.splats, level=number, antialias=bundle.antialias, choice=one.choice)
+        for number, one in shown.items()
     ]
     everything = out.suffix.lower() == ".exr"
     picture = draw(
@@ -131,4 +141,4 @@ def render(
     )  # fmt: skip
     assert picture is not None
     write_picture(out, picture)
-    return picture
+    return resident

@@ -45,10 +45,9 @@ from ..runs.events import event_line
 from ..scenes.images import load_image
 from ..splats.dialects import drawable
 from . import wire
-from .kept import KeptSet
 from .picture import read_depth
 from .requests import Cancel, FrameRequest, NamedSet, frame_of, read_line, read_request
-from .scene import Instance, draw
+from .scene import Instance, SplatSet, draw
 
 LONGEST = 1 << 20
 """Bytes of a line that asks for something."""
@@ -75,7 +74,7 @@ def serve(folder: Path, backend: str, requests: IO[bytes], answers: IO[str]) -> 
 class _Server:
     def __init__(self, folder: Path, backend: str, answers: IO[str]) -> None:
         self._folder, self._backend, self._answers = folder, backend, answers
-        self._sets: dict[str, KeptSet] = {}
+        self._sets: dict[str, SplatSet] = {}
         self._requests: queue.SimpleQueue[FrameRequest] = queue.SimpleQueue()
         self._cancelled: set[int] = set()
 
@@ -163,18 +162,16 @@ class _Server:
         for one in sets:
             if one.file not in kept:
                 kept[one.file] = self._sets.get(one.file) or self._read_set(frame, one)
-            held = kept[one.file]
-            weights = held.weights(one.choice)
-            instances.append(Instance(held.drawn, one.matrix, one.level, one.antialias, weights))
+            instances.append(Instance(kept[one.file], one.matrix, one.level, one.antialias, one.choice))
         self._sets = kept
         return instances
 
-    def _read_set(self, frame: int, one: NamedSet) -> KeptSet:
+    def _read_set(self, frame: int, one: NamedSet) -> SplatSet:
         """A set from its file, without what cannot be drawn."""
         splats, weights = wire.read_set(self._folder / one.file, one.count, one.columns)
         splats.extras[_WEIGHTS] = np.nan_to_num(weights)
         splats = drawable(splats, "the scene", lambda text: self.say("warning", frame=frame, message=text))
-        return KeptSet(splats, splats.extras.pop(_WEIGHTS), self._backend)
+        return SplatSet(splats, splats.extras.pop(_WEIGHTS), self._backend)
 
     def _end(self) -> None:
         """Clean up and go, whatever the other threads are at."""

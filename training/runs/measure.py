@@ -17,6 +17,7 @@ from ..files import atomic_write
 from ..lod.rule import Values, find_rule
 from ..lod.selection import levels_alone, select, settings, unknown_rule
 from ..methods import create
+from ..rasterize.resident import Resident
 from ..scenes.aside import read_aside
 from ..splats.bundle import read_bundle
 from .arrays import damaged, read_arrays
@@ -43,8 +44,10 @@ def evaluate_run(
         ``train_psnr``, ``veil``, ``oversized``, ``worst`` (``evaluate.summary``), and ``aside`` where the
         scene has views off its path (``scenes.aside``): their mean ``psnr`` and the names of the ``views``.
         By the rule, ``selective``: per view and predetermined (chosen from the mean training camera), with
-        the values of the rule's controls; none where the levels have no rule. ``curve``: the same for each
-        value of the rule's ``sweep``, where it has one. ``networks``: of a model that was baked, before that.
+        the values of the rule's controls; none where the levels have no rule. ``frame_s``: seconds a frame
+        ``by_distance``, choosing included, and in ``full`` detail, drawn in turn; not for rules whose weights
+        always count. ``curve``: as ``selective`` for each value of the rule's ``sweep``, where it has one.
+        ``networks``: of a model that was baked, before that.
         ``farther`` and ``jumps`` (of the middle view), where asked for.
 
         Where no views are held out, ``test_views`` is empty, there is no ``worst``, and quality is of
@@ -89,15 +92,22 @@ def evaluate_run(
     values = settings(bundle, given or {}) if rule else {}
     if rule:
         predetermined = select(bundle, data.mean_camera, data.focal, values)
+        resident = Resident(bundle, job.backend)
         report["selective"] = [
-            {"set": "per view", **values, **evaluation.measure_by_distance(bundle, values)},
+            {"set": "per view", **values, **evaluation.measure_by_distance(resident, values)},
             {"set": "predetermined", **values, **evaluation.measure_set(*predetermined)},
         ]
-    if rule and rule.sweep:
-        name, steps = rule.sweep
-        report["curve"] = [
-            {name: step, **evaluation.measure_by_distance(bundle, {**values, name: step})} for step in steps
-        ]
+        if rule.sweep:
+            name, steps = rule.sweep
+            report["curve"] = [
+                {name: step, **evaluation.measure_by_distance(resident, {**values, name: step})}
+                for step in steps
+            ]
+        if not rule.always:
+            report["frame_s"] = evaluation.frame_times({
+                "by_distance": lambda camera: resident.draw(camera, values, near=data.near),
+                "full": lambda camera: resident.draw_level(finest.number, camera, near=data.near),
+            })  # fmt: skip
     if folder.model.exists():
         method = create(job.method, data, job.resolved_parameters(), job.seed, job.backend)
         arrays = read_arrays(folder.model)
@@ -134,7 +144,7 @@ def table(report: dict) -> str:
     """``evaluate_run``'s report as text."""
     quality = [f"{'' if report['test_views'] else 'train_'}{name}" for name in ("psnr", "ssim")]
     measured = ("splats", "drawn", *quality, "frame_s", "veil")
-    lines = [f"{'':>28} {'splats':>9} {'PSNR':>7} {'SSIM':>7} {'s/frame':>8} {'veiled':>7}"]
+    lines = [f"{'':>28} {'splats':>9} {'PSNR':>7} {'SSIM':>7} {'ms/frame':>8} {'veiled':>7}"]
     rows = []
     for row in report["levels"]:
         facts = "".join(f", {k} {v:.5g}" for k, v in row.items() if k not in ("level", *measured))
@@ -156,7 +166,7 @@ def table(report: dict) -> str:
         psnr, ssim = (row[each] for each in quality)
         veiled = f" {row['veil']['mean']:>7.1%}" if "veil" in row else ""
         lines.append(
-            f"{name:<28} {row['splats']:>9,} {psnr:>7.2f} {ssim:>7.4f} {row['frame_s']:>8.3f}{veiled}"
+            f"{name:<28} {row['splats']:>9,} {psnr:>7.2f} {ssim:>7.4f} {1e3 * row['frame_s']:>8.1f}{veiled}"
         )
     lines += summary_lines(report)
     for row in report.get("farther", []):

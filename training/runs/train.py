@@ -31,6 +31,7 @@ from ..methods import METHODS, create
 from ..methods.data import TrainingData
 from ..methods.method import Method
 from ..rasterize import cuda, device_of, resolve, warm_up
+from ..rasterize.resident import Resident
 from ..scenes.orientation import up_rotation
 from ..splats.bundle import Bundle, Level, write_bundle
 from ..splats.dialects import comments_of
@@ -214,7 +215,8 @@ class _Run:
                 np.savez(file, **arrays)
             if self.data.test:
                 before = self.evaluation.measure_pictures(self.method.picture)["psnr"]
-                after = self.evaluation.measure_by_distance(bundle, settings(bundle, {}))["psnr"]
+                resident = Resident(bundle, self.evaluation.backend)
+                after = self.evaluation.measure_by_distance(resident, settings(bundle, {}))["psnr"]
                 meta |= {"neural_psnr": before, "baked_psnr": after}
                 message = f"Held-out views: {before:.2f} dB with networks, {after:.2f} dB baked for Blender."
                 self._warn(message)

@@ -72,9 +72,9 @@ def path(request, truth, tmp_path):
     return file
 
 
-def shown(resident, eye, pixels):
+def shown(memory, eye, pixels):
     """The means of what an eye is shown of what is in memory."""
-    splats = resident.splats
+    splats = memory.splats
     weights = CUT.weights(splats.means, np.float32(eye), FOCAL, splats.extras, {}, {"pixels": pixels})
     return splats.means[weights > 0]
 
@@ -82,7 +82,7 @@ def shown(resident, eye, pixels):
 def come_in(pager, eye, pixels):
     """All that an eye needs comes in, page by page."""
     while (update := pager.step(np.array(eye), max(FOCAL / pixels, 32))) is not None:
-        for _ in pager.resident.pieces(update):
+        for _ in pager.memory.pieces(update):
             yield
 
 
@@ -94,7 +94,7 @@ def test_with_room_for_all_it_is_the_whole_files_cut(truth, path):
     for eye in EYES:
         for pixels in (1.0, 4.0, 30.0):
             list(come_in(pager, eye, pixels))
-            drawn = truth.nodes(shown(pager.resident, eye, pixels))
+            drawn = truth.nodes(shown(pager.memory, eye, pixels))
             np.testing.assert_array_equal(np.sort(drawn), truth.cut(eye, pixels))
 
 
@@ -102,15 +102,15 @@ def test_with_room_for_all_it_is_the_whole_files_cut(truth, path):
 def test_within_a_budget_cuts_are_complete_whatever_is_there(truth, path, budget):
     """Also while pages come in, and from an eye that they are not for."""
     pager, equal = Pager(path, budget), 0
-    assert len(pager.resident.splats) <= budget
-    list(pager.resident.pieces(pager.step(None, 0.0)))  # nothing is there before
+    assert len(pager.memory.splats) <= budget
+    list(pager.memory.pieces(pager.step(None, 0.0)))  # nothing is there before
     for eye in EYES:
         for pixels in (30.0, 3.0):
             for number, _ in enumerate(come_in(pager, eye, pixels)):
                 if number % 37 == 0:
                     for other in (eye, (3, 3, 1)):
-                        truth.require_complete(truth.nodes(shown(pager.resident, other, pixels)))
-            drawn = truth.nodes(shown(pager.resident, eye, pixels))
+                        truth.require_complete(truth.nodes(shown(pager.memory, other, pixels)))
+            drawn = truth.nodes(shown(pager.memory, eye, pixels))
             truth.require_complete(drawn)
             needed = np.flatnonzero(pager._index.detail(np.array(eye)) < FOCAL / pixels * 1.001)
             if len(needed) <= budget // SIZE:
@@ -143,7 +143,7 @@ def test_a_thread_brings_in_what_is_asked_for(truth, path):
             wanted, until = truth.cut(eye, 1.0), time.monotonic() + 60
             while True:
                 pager.take(0.001)
-                drawn = np.sort(truth.nodes(shown(pager.resident, eye, 1.0)))
+                drawn = np.sort(truth.nodes(shown(pager.memory, eye, 1.0)))
                 if np.array_equal(drawn, wanted) or time.monotonic() > until:
                     break
                 if len(drawn):  # nothing before the first page
@@ -241,7 +241,7 @@ def test_splats_that_cannot_be_drawn_leave_no_holes(truth, tmp_path):
     write_bundle(tmp_path / "tree.ply", replace(truth.bundle, levels=[Level(1, above), Level(2, leaves)]))
     pager = Pager(tmp_path / "tree.ply", 10**6)
     list(come_in(pager, (0, 0, 3), 1.0))
-    truth.require_complete(truth.nodes(shown(pager.resident, (0, 0, 3), 1.0)))
+    truth.require_complete(truth.nodes(shown(pager.memory, (0, 0, 3), 1.0)))
 
 
 def test_what_is_no_tree_or_has_no_room_is_a_sentence(truth, tmp_path):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from training.errors import LodgsError
-from training.lod.rule import Control, distances, every_control, facts_of, find_rule, rules
+from training.lod.rule import Control, Rule, distances, every_control, facts_of, find_rule, rules
 from training.lod.selection import Choice, select, select_levels, settings
 from training.splats.bundle import Bundle, Level, read_bundle, read_folder, write_bundle, write_folder
 from training.splats.gaussians import Splats
@@ -70,6 +70,17 @@ def test_files_give_back_the_rule_its_facts_and_the_same_choice(name, tmp_path):
                 np.testing.assert_array_equal(a.weights, b.weights)
 
 
+def any_values(rule: Rule, rng: np.random.Generator) -> dict[str, float]:
+    given = {}
+    for control in rule.controls:
+        low, high = (control.low, min(control.high, 4)) if control.whole else control.soft or (1, 4)
+        value = rng.uniform(low, high)
+        given[control.name] = round(value) if control.whole else value
+    if "first" in given:
+        given["first"], given["last"] = sorted((given["first"], given["last"]))
+    return given
+
+
 @pytest.mark.parametrize("name", RULES)
 @pytest.mark.parametrize("seed", range(5))
 def test_an_eye_is_shown_what_the_rule_gives_weight_bit_for_bit(name, seed):
@@ -78,14 +89,7 @@ def test_an_eye_is_shown_what_the_rule_gives_weight_bit_for_bit(name, seed):
     choice, levels = Choice(bundle), [(level.number, level.facts) for level in bundle.levels]
     for _ in range(10):
         eye, focal = rng.normal(0, 6, 3), rng.uniform(0.5, 9)
-        given = {}
-        for control in rule.controls:
-            low, high = (control.low, min(control.high, 4)) if control.whole else control.soft or (1, 4)
-            value = rng.uniform(low, high)
-            given[control.name] = round(value) if control.whole else value
-        if "first" in given:
-            given["first"], given["last"] = sorted((given["first"], given["last"]))
-        values = settings(bundle, given)
+        values = settings(bundle, any_values(rule, rng))
         expected = []
         for level in bundle.levels:
             columns = {n: level.splats.extras[n] for n in rule.columns if n != "opacity"}
@@ -101,6 +105,27 @@ def test_an_eye_is_shown_what_the_rule_gives_weight_bit_for_bit(name, seed):
         np.testing.assert_array_equal(
             np.ones(len(copied)) if its_weights is None else its_weights, weights[shown]
         )
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_nothing_outside_the_band_has_a_weight(name):
+    """By the columns of each splat, by the highest of all, and where nobody knows them."""
+    bundle, rule, rng = bundle_of(name), rules()[name], np.random.default_rng(8)
+    levels = [(level.number, level.facts) for level in bundle.levels]
+    for _ in range(60):
+        eye, focal = rng.normal(0, 6, 3).astype(np.float32), rng.uniform(0.5, 9)
+        values = settings(bundle, any_values(rule, rng))
+        for level in bundle.levels:
+            columns = {n: level.splats.extras[n] for n in rule.columns if n != "opacity"}
+            columns["opacity"] = 1 / (1 + np.exp(-level.splats.opacity_logits))
+            facts = facts_of(rule, bundle.facts, levels, level.number)
+            weighted = rule.weights(level.splats.means, eye, focal, columns, facts, values) > 0
+            away = distances(level.splats.means, eye)
+            of_all = {n: column.max(keepdims=True) for n, column in columns.items()}
+            for highest in (columns, of_all, {}):
+                near, far = rule.band(focal, facts, values, highest)
+                assert (near <= away[weighted] * 1.00001).all()
+                assert (away * 0.99999 < far)[weighted].all()
 
 
 def test_distances_are_those_of_float64():

@@ -1,16 +1,21 @@
 """What a resident bundle draws is what selection and rasterizer give, whatever was left out on the way."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from training.lod.blocks import SIZE
+from training.errors import LodgsError
+from training.lod.blocks import SIZE, spatial_order
+from training.lod.rule import rules
 from training.lod.rules.chunks import member_columns
 from training.lod.selection import complete, select, settings
+from training.lod.streaming import BLOCKS, table_of_blocks
 from training.rasterize import Gaussians, rasterize
-from training.rasterize.resident import Resident
+from training.rasterize.resident import MANY, Resident
 from training.scenes.cameras import Camera, look_at
-from training.splats.bundle import Bundle, Level
+from training.splats.bundle import Bundle, Level, write_bundle
 from training.splats.gaussians import Splats
 
 NEAR = 0.1
@@ -33,7 +38,7 @@ def level(number: int, count: int, facts: dict, **columns) -> Level:
 
 
 def bundle(rule: str) -> Bundle:
-    rng, counts = np.random.default_rng(9), {1: 2 * SIZE, 2: 4 * SIZE + 100, 3: 9 * SIZE + 1}
+    rng, counts = np.random.default_rng(9), {1: 2 * SIZE, 2: 17 * SIZE + 100, 3: 29 * SIZE + 1}
     match rule:
         case "bands":
             facts = {1: {"s_min": 0.05}, 2: {"s_min": 0.02}, 3: {"s_min": 0.0}}
@@ -68,7 +73,7 @@ def views():
     ("rule", "given"),
     [
         ("bands", {}), ("bands", {"gamma": 2.0, "last": 2}), ("octree", {}), ("octree", {"fade": 0}),
-        ("decay", {}), ("decay", {"at_most": 900}), ("chunks", {}), ("chunks", {"fade": 0}),
+        ("decay", {}), ("decay", {"at_most": 2900}), ("chunks", {}), ("chunks", {"fade": 0}),
         ("chunks", {"chunks": 0, "distance_scale": 0.6}),
     ],
 )  # fmt: skip
@@ -97,24 +102,85 @@ def test_a_level_is_drawn_with_all_that_belongs_to_it(rule):
         torch.testing.assert_close(resident.draw_level(number, camera, near=NEAR).image, whole)
 
 
-def test_only_what_a_region_can_show_is_loaded():
-    shown = bundle("chunks")
-    resident, values = Resident(shown, "cpu"), settings(shown, {})
-    total = sum(len(level.splats) for level in shown.levels)
-    assert resident.loaded == total
-    loaded = {}
-    for eye in ((0.0, 0, 0), (0.6, 0, 0), (30.0, 0, 0), (0.0, 0, 0)):
-        camera = Camera(
-            "", 64, 48, 60.0, 60.0, 32.0, 24.0, look_at(np.array(eye), np.array([9.0, 0, 0]), (0, 0, 1))
-        )
-        resident.draw(camera, values, near=NEAR)
-        loaded[eye] = resident.loaded
-    in_first, in_second = (
-        np.concatenate([x.splats.extras["chunks_0"].astype(int) >> bit & 1 for x in shown.levels]) > 0
-        for bit in (0, 1)
-    )
-    assert loaded == {
-        (0.0, 0, 0): in_first.sum(),
-        (0.6, 0, 0): (in_first | in_second).sum(),
-        (30.0, 0, 0): total,
-    }
+def indexed(path) -> Bundle:
+    """A bundle of chunks, each with what is near it, in a file with a table of its blocks."""
+    shown, levels = bundle("chunks"), []
+    for each in shown.levels:
+        splats = each.splats.select(spatial_order(each.splats.means))
+        near = np.linalg.norm(splats.means - CENTRES[:, None], axis=2) < 7
+        levels.append(replace(each, splats=replace(splats, extras=member_columns(near))))
+    table = table_of_blocks(rules()["chunks"], {x.number: x.splats for x in levels})
+    shown = replace(shown, levels=levels, tables={**shown.tables, BLOCKS: table})
+    write_bundle(path, shown)
+    return shown
+
+
+def members(shown: Bundle, *chunks: int) -> int:
+    bits = sum(1 << chunk for chunk in chunks)
+    return sum(int((x.splats.extras["chunks_0"].astype(int) & bits > 0).sum()) for x in shown.levels)
+
+
+def test_of_a_file_only_what_a_region_can_show_is_loaded_and_pictures_are_the_same_bits(tmp_path):
+    shown = indexed(tmp_path / "bundle.ply")
+    whole, part = Resident(shown, "cpu"), Resident(tmp_path / "bundle.ply", "cpu")
+    values, total = settings(shown, {}), sum(len(level.splats) for level in shown.levels)
+    assert part.loaded == part.bytes_read == 0
+    loaded, read = [], []
+    for eye in ((0.0, 0, 0), (0.1, 0, 0), (0.6, 0, 0), (30.0, 0, 0), (0.0, 0, 0)):
+        for target in ((9.0, 0, 0), (-9.0, 3, 1)):
+            pose = look_at(np.array(eye), np.array(target), (0, 0, 1))
+            camera = Camera("", 64, 48, 60.0, 60.0, 32.0, 24.0, pose)
+            ours, theirs = (each.draw(camera, values, near=NEAR) for each in (part, whole))
+            assert torch.equal(ours.image, theirs.image) and torch.equal(ours.alpha, theirs.alpha)
+            assert int((ours.radii > 0).sum()) == int((theirs.radii > 0).sum()) > 0
+        loaded.append(part.loaded)
+        read.append(part.bytes_read)
+    assert loaded == [members(shown, 0), *[members(shown, 0, 1)] * 2, total, members(shown, 0)]
+    assert whole.loaded == total and whole.bytes_read == 0
+    steps = np.diff([0, *read])
+    assert steps[0] == steps[4] < steps[1] < steps[3] and steps[2] == 0  # of (0, 1) nothing again
+
+
+def test_of_a_file_a_level_is_read_alone(tmp_path):
+    shown, camera = indexed(tmp_path / "bundle.ply"), next(views())
+    part = Resident(tmp_path / "bundle.ply", "cpu")
+    for level in shown.levels:
+        picture = part.draw_level(level.number, camera, near=NEAR).image
+        assert torch.equal(picture, Resident(shown, "cpu").draw_level(level.number, camera, near=NEAR).image)
+        assert part.loaded == len(level.splats)
+    with pytest.raises(LodgsError, match="There is no level 7"):
+        part.draw_level(7, camera)
+
+
+def test_what_is_drawn_now_and_then_at_a_level_is_what_was(tmp_path):
+    """Sets are joined anew where others are drawn together."""
+    shown = bundle("octree")
+    resident, values, camera = Resident(shown, "cpu"), settings(shown, {}), next(views())
+    first = resident.draw(camera, values, near=NEAR).image
+    resident.draw_level(2, camera, near=NEAR)
+    assert torch.equal(resident.draw(camera, values, near=NEAR).image, first)
+
+
+@pytest.mark.parametrize("rule", ["bands", "octree", "decay", "chunks"])
+def test_nothing_with_a_weight_is_passed_over(rule):
+    """Whatever is chosen for a camera, is all that has a weight among what it sees."""
+    shown = bundle(rule)
+    resident, values, passed = Resident(shown, "cpu"), settings(shown, {}), 0
+    for camera in views():
+        for level in shown.levels:
+            splats, choice = resident.by_distance(camera, values)[level.number]
+            ordered = level.splats
+            if len(ordered) >= MANY:
+                ordered = ordered.select(spatial_order(ordered.means))
+            opacity, own = 1 / (1 + np.exp(-ordered.opacity_logits)), splats.gaussians
+            weights = choice.weights(ordered.means, ordered.extras | {"opacity": opacity})
+            everywhere, found = splats.chosen(choice)
+            np.testing.assert_array_equal(everywhere, np.flatnonzero(weights > 0))
+            np.testing.assert_array_equal(found, weights[everywhere])
+            some, found = splats.chosen(choice, camera, NEAR)
+            np.testing.assert_array_equal(found, weights[some])
+            left_out = torch.from_numpy(np.setdiff1d(everywhere, some)).long()
+            alone = rasterize(own.select(left_out), camera, near=NEAR, backend="cpu")
+            assert not (alone.radii > 0).any()
+            passed += len(left_out)
+    assert passed

@@ -1,6 +1,7 @@
 """The command line: a view of a bundle as a picture, and a sentence for what cannot be."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import OpenEXR
@@ -10,7 +11,11 @@ from PIL import Image
 from tests.training.conftest import write_tiny_scene
 from tests.training.lod.trees import tree_of
 from training.__main__ import main
+from training.lod.blocks import spatial_order
+from training.lod.rule import rules
+from training.lod.rules.chunks import member_columns
 from training.lod.selection import select
+from training.lod.streaming import BLOCKS, table_of_blocks
 from training.rasterize import Gaussians, render
 from training.runs.job import Job
 from training.scenes.cameras import camera_as_dict, read_camera, write_camera
@@ -75,6 +80,40 @@ def test_a_trees_coarser_level_is_not_drawn_alone(camera, make_splats, tmp_path,
     said = capsys.readouterr().err
     assert "Level 1 is no scene by itself" in said and "Take level 2, or choose by distance" in said
     assert not (tmp_path / "none.png").exists()
+
+
+def test_only_what_the_view_needs_is_read(make_splats, camera, tmp_path, capsys):
+    """Of a level its own splats; by distance, where the file tells chunks and blocks, those of its chunk."""
+    rule, levels = rules()["chunks"], []
+    for number, count in ((1, 600), (2, 9000)):
+        splats = make_splats(count, 1, number)
+        splats = splats.select(spatial_order(splats.means))
+        sides = np.stack([splats.means[:, 0] < -0.3, splats.means[:, 0] > 2])
+        extras = member_columns(sides)
+        levels.append(Level(number, replace(splats, extras=extras), {"d_l": 2.0 * (number < 2)}))
+    apart = np.float32([-1, 3])
+    chunks = {"x": apart, "y": 0 * apart, "z": 0 * apart, "radius": np.float32([9, 9])}
+    blocks = table_of_blocks(rule, {level.number: level.splats for level in levels})
+    bundle = Bundle("lodge", levels, "chunks", tables={"chunks": chunks, BLOCKS: blocks})
+    write_bundle(tmp_path / "blocks.ply", bundle)
+    write_bundle(tmp_path / "plain.ply", replace(bundle, tables={"chunks": chunks}))
+    write_camera(tmp_path / "camera.json", camera, 0.01)
+    said, pictures = {}, {}
+    for name in ("blocks", "plain"):
+        for level in ("--level=1", "--fade=0"):
+            out = tmp_path / f"{name}{level}.png"
+            command = ["render", str(tmp_path / f"{name}.ply"), "--camera", str(tmp_path / "camera.json")]
+            assert main([*command, "--out", str(out), level]) == 0
+            said[name, level] = capsys.readouterr().out.splitlines()[-1].removeprefix(f"{out}: ")
+            pictures[name, level] = pixels(out)
+    inside = sum(int((level.splats.means[:, 0] < -0.3).sum()) for level in levels)
+    assert said["blocks", "--level=1"] == said["plain", "--level=1"] == "600 splats loaded of 0.1 MB"
+    assert said["plain", "--fade=0"] == "9,600 splats loaded of 1.0 MB"
+    loaded, _, size = said["blocks", "--fade=0"].partition(" splats loaded of ")
+    assert loaded == f"{inside:,}" and float(size.removesuffix(" MB")) < 0.8
+    for level in ("--level=1", "--fade=0"):
+        np.testing.assert_array_equal(pictures["blocks", level], pictures["plain", level])
+    assert np.ptp(pictures["plain", "--fade=0"]) > 100
 
 
 def test_antialiased_splats_are_drawn_so(make_splats, camera, tmp_path):
@@ -195,7 +234,7 @@ def test_little_memory_is_a_sentence(bundle, camera, tmp_path, capsys, monkeypat
         str(tmp_path / "a.png"),
     ]
     torchs = RuntimeError("[enforce fail at alloc_cpu.cpp:117] DefaultCPUAllocator: can't allocate memory: 9")
-    for place in ("picture.Picture.empty", "picture.Picture.eight_bit", "scene.strips", "command.SplatSet"):
+    for place in ("picture.Picture.empty", "picture.Picture.eight_bit", "scene.strips", "command.Resident"):
         for error in (MemoryError(), torchs):
 
             def fail(*_, error=error, **__):

@@ -90,6 +90,7 @@ def test_training_views_and_the_worst_held_out_one(finished, scene, splats):
     assert report["worst"]["psnr"] == pytest.approx(held_out[worst], abs=0.02)
     assert report["oversized"] == 0 and report["veil"] == report["levels"][1]["veil"]
     assert "aside" not in report
+    assert set(report["frame_s"]) == {"by_distance", "full"} and min(report["frame_s"].values()) > 0
     assert f"Training views: {report['train_psnr']:.1f} dB" in table(report).splitlines()
 
 

@@ -8,7 +8,7 @@ from math import inf
 import numpy as np
 
 from ...errors import LodgsError
-from ..rule import NO_TABLES, Control, Rule, Values, distances
+from ..rule import NO_COLUMNS, NO_TABLES, Control, Rule, Values, distances
 
 MOST = 64
 """The largest number of a level that can be asked for: more than any scene has."""
@@ -51,7 +51,9 @@ class Bands(Rule):
         ),
     )  # fmt: skip
 
-    def band(self, focal_px: float, facts: Mapping[str, float], values: Values) -> tuple[float, float]:
+    def band(
+        self, focal_px: float, facts: Mapping[str, float], values: Values, highest=NO_COLUMNS
+    ) -> tuple[float, float]:
         """Near and far end of a level's band, in scene units; (inf, inf) for a level that is not in use."""
         first = min(values["first"], values["last"], facts["levels"])  # sliders that cross leave some level
         last = max(values["first"], values["last"])

@@ -8,7 +8,7 @@ from math import inf
 import numpy as np
 
 from ...splats.dialects import FARTHEST
-from ..rule import NO_FINER, NO_TABLES, Control, Region, Rule, Tables, Values, distances
+from ..rule import NO_COLUMNS, NO_FINER, NO_TABLES, Control, Region, Rule, Tables, Values, distances
 
 STEP = 1.25
 """Factor by which a viewer's budget raises the distance scale at a time."""
@@ -59,7 +59,9 @@ class Chunks(Rule):
         ),
     )  # fmt: skip
 
-    def band(self, focal_px: float, facts: Mapping[str, float], values: Values) -> tuple[float, float]:
+    def band(
+        self, focal_px: float, facts: Mapping[str, float], values: Values, highest=NO_COLUMNS
+    ) -> tuple[float, float]:
         """Near and far end of a level's distances from the eye, in scene units; any, where chunks count."""
         if values["chunks"]:
             return 0.0, inf

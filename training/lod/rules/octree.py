@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import inf
 
 import numpy as np
 
-from ..rule import NO_TABLES, Control, Rule, Values, distances
+from ..rule import NO_COLUMNS, NO_TABLES, Control, Rule, Values, distances
 
 BIAS = "lod_bias"
 """Column of each splat's bias, in levels."""
@@ -14,6 +15,8 @@ FADE = 0.5
 """Over how many levels of what is wanted a level fades in."""
 STEP = 0.25
 """Levels that a budget goes without at a time."""
+CLEAR = 1e-4
+"""Levels by which a band is taken too far, against rounding."""
 
 
 def wanted_at(distances, bias, d_max: float, levels: float):
@@ -62,6 +65,18 @@ class Octree(Rule):
         ),
     )  # fmt: skip
 
+    def band(
+        self, focal_px: float, facts: Mapping[str, float], values: Values, highest=NO_COLUMNS
+    ) -> tuple[float, float | np.ndarray]:
+        """0, and where the splat with the highest bias is no longer wanted; level 1 is wanted everywhere."""
+        if facts["level"] <= 1 or BIAS not in highest:
+            return 0.0, inf
+        # faded(wanted, level) > 0, or >= 0.5 without fading, of wanted = log2(d_max / d) + bias + offset + 1
+        short = facts["level"] - 1.5 - (FADE / 2 if values["fade"] else 0) - CLEAR
+        levels = highest[BIAS].astype(np.float64) + (values["offset"] - short)
+        with np.errstate(over="ignore", invalid="ignore"):  # of a bias that is no number
+            return 0.0, _own_d_max(focal_px, facts) * np.exp2(levels)
+
     def weights(self, means, eye, focal_px, columns, facts, values, tables=NO_TABLES) -> np.ndarray:
         found = self._wanted(means, eye, focal_px, columns[BIAS], facts, values)
         weight = faded(found, np.float32(facts["level"])).astype(np.float32)
@@ -78,8 +93,13 @@ class Octree(Rule):
         self, means, eye, focal_px: float, bias, facts: Mapping[str, float], values: Values
     ) -> np.ndarray:
         """The level wanted where each splat is; the focal length counts as in Sec. 5.2."""
-        d_max = float(np.float32(facts["d_max"] * (focal_px / max(facts["d_max_focal"], 1e-20))))
+        d_max = _own_d_max(focal_px, facts)
         return wanted_at(distances(means, eye), bias + np.float32(values["offset"]), d_max, facts["levels"])
+
+
+def _own_d_max(focal_px: float, facts: Mapping[str, float]) -> float:
+    """``d_max`` for an eye of another focal length than it was found for."""
+    return float(np.float32(facts["d_max"] * (focal_px / max(facts["d_max_focal"], 1e-20))))
 
 
 RULE = Octree()

@@ -33,7 +33,7 @@ class LodgeParameters(ThreedgsParameters):
         high=1,
     )
     drawn: float = parameter(
-        0.58,
+        0.59,
         "By distance the training views draw at most this share of the splats that they draw of the finest "
         "level alone; where it is more, prune_weight is raised for a level. 1 does not raise it. Not in the "
         "paper.",
@@ -49,7 +49,7 @@ class LodgeParameters(ThreedgsParameters):
         high=1,
     )
     tune_steps: int = parameter(
-        300, "Steps after each of the three prunings of a level.", above=0, unit="steps"
+        400, "Steps after each of the three prunings of a level.", above=0, unit="steps"
     )
     tune_range: float = parameter(
         0.3, "While a level is tuned, distances are random by this share of them, up or down.", high=0.9

@@ -1,7 +1,5 @@
 """FLoD as published: constraint, level rise, overlap pruning, schedule."""
 
-import copy
-
 import numpy as np
 import pytest
 import torch
@@ -264,19 +262,6 @@ def test_one_level_has_nothing_to_meet(data):
 
 
 @pytest.mark.parametrize("stop", [8, 18, 21])
-def test_what_is_resumed_ends_where_an_unbroken_run_ends(data, stop):
+def test_what_is_resumed_ends_where_an_unbroken_run_ends(data, stop, check_resumed):
     """Before the last level, when it is finished, and amid the finishing steps."""
-    ends, state = [], None
-    for broken in (False, True):
-        flod, handed = make(data, finish_share=0.5), {}
-        for step in range(flod.steps):
-            if broken and step == stop:
-                state = copy.deepcopy(flod.state_dict())
-                flod = make(data, finish_share=0.5)
-                flod.load_state_dict(state)
-            flod.train_step(step)
-            handed |= {level.number: level for level in flod.levels_after(step)}
-        ends.append(handed)
-    for one, other in zip(ends[0].values(), ends[1].values(), strict=True):
-        for name in NAMES:
-            np.testing.assert_array_equal(getattr(one.splats, name), getattr(other.splats, name))
+    check_resumed(lambda: make(data, finish_share=0.5), stop)

@@ -1,10 +1,7 @@
 """LODGE's chunks: Eq. 5 and the sets by hand, and a run that makes them."""
 
-import io
-
 import numpy as np
 import pytest
-import torch
 
 from training.lod.blocks import spatial_order
 from training.lod.rules.chunks import members as members_of
@@ -131,18 +128,5 @@ def test_small_scenes_have_no_chunks_unless_they_are_asked_for(data):
 
 
 @pytest.mark.parametrize("stop", [19, 20, 21, 22])
-def test_a_run_goes_on_to_the_bit_within_its_chunks(data, stop):
-    whole, first = make(data), make(data)
-    levels = trained(whole)
-    before = trained(first, until=stop)
-    file = io.BytesIO()
-    torch.save(first.state_dict(), file)
-    file.seek(0)
-    second = make(data)
-    second.load_state_dict(torch.load(file, weights_only=True))
-    after = before + trained(second, stop)
-    for one, other in zip(levels, after, strict=True):
-        assert one.number == other.number
-        assert all(np.array_equal(getattr(one.splats, n), getattr(other.splats, n)) for n in NAMES)
-        for name, column in one.splats.extras.items():
-            np.testing.assert_array_equal(column, other.splats.extras[name])
+def test_a_run_goes_on_to_the_bit_within_its_chunks(data, stop, check_resumed):
+    check_resumed(lambda: make(data), stop)

@@ -1,6 +1,5 @@
 """LODGE: levels are the rule's and no finer than their filter, the finest stays, runs go on to the bit."""
 
-import io
 from dataclasses import replace
 
 import numpy as np
@@ -276,17 +275,6 @@ def test_the_head_of_a_bundle_has_room_for_what_was_tried(data, base, tmp_path, 
 
 
 @pytest.mark.parametrize("stop", [11, 12, 14, 15, 21])
-def test_a_run_goes_on_to_the_bit(data, stop):
+def test_a_run_goes_on_to_the_bit(data, stop, check_resumed):
     """Stopped in the finest level, at its end, within a round, at a round's and at a level's end."""
-    whole, first = make(data), make(data)
-    levels = trained(whole)
-    before = trained(first, until=stop)
-    file = io.BytesIO()
-    torch.save(first.state_dict(), file)
-    file.seek(0)
-    second = make(data)
-    second.load_state_dict(torch.load(file, weights_only=True))
-    after = before + trained(second, stop)
-    assert [level.number for level in after] == [level.number for level in levels]
-    assert all(same(one.splats, other.splats) for one, other in zip(levels, after, strict=True))
-    assert second.meta() == whole.meta()
+    check_resumed(lambda: make(data), stop)

@@ -9,7 +9,6 @@ import torch
 from training.lod.choice import Choice
 from training.lod.rule import NO_FINER, fact_names, rules
 from training.lod.rules.chunks import TABLE, member_columns
-from training.render.kept import KeptSet
 from training.render.requests import read_request
 from training.render.scene import Instance, SplatSet, draw
 from training.scenes.cameras import camera_as_dict
@@ -44,6 +43,7 @@ def splats(make_splats) -> Splats:
     """Splats with the columns of all rules."""
     rng = np.random.default_rng(7)
     columns = {"lod_bias": rng.uniform(-1, 1, COUNT), "sigma_d": rng.uniform(0, 1.5, COUNT)}
+    columns |= {"node_size": rng.uniform(0, 0.08, COUNT), "parent_size": rng.uniform(0, 0.3, COUNT)}
     extras = {name: column.astype(np.float32) for name, column in columns.items()}
     return replace(make_splats(COUNT), extras=extras | member_columns(rng.random((3, COUNT)) < 0.4))
 
@@ -57,18 +57,26 @@ def by_rule(choice: Choice, splats: Splats) -> np.ndarray:
     return choice.weights(splats.means, columns)
 
 
+def weights_of(held: SplatSet, choice: Choice) -> np.ndarray:
+    """The weights (N,) of all."""
+    weights = np.zeros(COUNT, np.float32)
+    some, found = held.chosen(choice)
+    weights[some] = found
+    return weights
+
+
 @pytest.mark.parametrize("name", sorted(rules()))
 def test_weights_are_the_rules(splats, name):
-    kept_set = KeptSet(splats, np.full(COUNT, 0.5, np.float32), "cpu")
+    held = SplatSet(splats, np.full(COUNT, 0.5, np.float32), "cpu")
     for eye in np.random.default_rng(3).uniform(-1, 4, (20, 3)):
         choice = choice_of(name, eye)
         wanted = by_rule(choice, splats)
-        np.testing.assert_array_equal(kept_set.weights(choice), wanted * np.float32(0.5))
+        np.testing.assert_array_equal(weights_of(held, choice), wanted * np.float32(0.5))
     assert 0.1 < (by_rule(choice_of(name, (0.5, 0, 0)), splats) > 0).mean() < 0.9
 
 
 def test_while_the_eye_stays_in_a_region_only_what_is_loaded_there_is_looked_at(splats, monkeypatch):
-    kept_set = KeptSet(splats, np.ones(COUNT, np.float32), "cpu")
+    held = SplatSet(splats, backend="cpu")
     looked_at, found = [], []
     rule = rules()["chunks"]
     weights, loaded = type(rule).weights, type(rule).loaded
@@ -86,8 +94,8 @@ def test_while_the_eye_stays_in_a_region_only_what_is_loaded_there_is_looked_at(
     monkeypatch.setattr(type(rule), "weights", counted)
     monkeypatch.setattr(type(rule), "loaded", once)
     for eye, weight in zip(eyes, wanted, strict=True):
-        np.testing.assert_array_equal(kept_set.weights(choice_of("chunks", eye)), weight)
-        kept_set.weights(choice_of("chunks", eye))  # the same frame again
+        np.testing.assert_array_equal(weights_of(held, choice_of("chunks", eye)), weight)
+        held.chosen(choice_of("chunks", eye))  # the same frame again
     assert found == [(0, 1)] and len(looked_at) == len(eyes)
     either = (splats.extras["chunks_0"].astype(int) & 3) > 0
     assert set(looked_at) == {either.sum()} and either.sum() < COUNT
@@ -100,11 +108,12 @@ def test_the_picture_is_that_of_the_chosen_alone(splats, make_splats, camera, ap
     matrix = np.eye(4)
     matrix[:3, 3] = 0.2, 0.1, 0.3
     here = [np.diag([1.5, 1.5, 1.5, 1])] * 2 if not apart else [np.eye(4), matrix]
-    sets = [KeptSet(each, np.ones(COUNT, np.float32), "cpu") for each in (splats, further)]
+    sets = [SplatSet(each, backend="cpu") for each in (splats, further)]
     for eye in ((9, 9, 9), (0, 0.7, 0), (0.5, 0, 0)):
-        weights = [each.weights(choice_of("octree", eye)) for each in sets]
+        choice = choice_of("octree", eye)
+        weights = [weights_of(each, choice) for each in sets]
         for kept in ([0, 1], [1], [1, 0]):
-            shown = [Instance(sets[i].drawn, here[i], i + 1, weights=weights[i]) for i in kept]
+            shown = [Instance(sets[i], here[i], i + 1, choice=choice) for i in kept]
             alone = []
             for i in kept:
                 some = weights[i] > 0
