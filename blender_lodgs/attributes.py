@@ -7,6 +7,7 @@ opacity), ``radiance:sh_1``.. (one vector a coefficient), ``scale`` (standard de
 
 from __future__ import annotations
 
+import ctypes
 from typing import NamedTuple
 
 import bpy
@@ -55,4 +56,24 @@ def read_attribute(cloud: bpy.types.PointCloud | bpy.types.Mesh, name: str) -> n
     layout = LAYOUTS[attribute.data_type]
     values = np.empty(len(attribute.data) * layout.width, layout.dtype)
     attribute.data.foreach_get(layout.key, values)
+    return values if layout.width == 1 else values.reshape(-1, layout.width)
+
+
+def view_attribute(cloud: bpy.types.PointCloud | bpy.types.Mesh, name: str) -> np.ndarray | None:
+    """As :func:`read_attribute`, without copying: to read some rows of many, at once.
+
+    It is Blender's own memory, which is another as soon as Blender goes on: never keep it, nor hand it to
+    another thread.
+    """
+    attribute = cloud.attributes.get(name)
+    if attribute is None or attribute.data_type not in LAYOUTS or attribute.domain != "POINT":
+        return None
+    layout, data = LAYOUTS[attribute.data_type], attribute.data
+    size, last = np.dtype(layout.dtype).itemsize * layout.width, len(data) - 1
+    start = data[0].as_pointer() if len(data) else 0
+    if not len(data) or data[last].as_pointer() - start != size * last:  # no such array
+        return read_attribute(cloud, name)
+    memory = (ctypes.c_byte * (size * len(data))).from_address(start)
+    values = np.frombuffer(memory, layout.dtype)
+    values.flags.writeable = False
     return values if layout.width == 1 else values.reshape(-1, layout.width)

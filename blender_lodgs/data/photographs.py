@@ -114,7 +114,7 @@ def look_through(context: bpy.types.Context, root: bpy.types.Object, step: int =
 
 def look_at_scene(context: bpy.types.Context, root: bpy.types.Object, warn: Warn = silent) -> None:
     """Turns the window's viewports to a splat scene, to orbit there: as it was photographed, where that is
-    known, else from where they look already, with most of it in sight.
+    known, else from where they look already, with most of it in sight. They see as far as its sky.
 
     Args:
         warn: told of meshes that stand between where it was photographed from and what was seen there, such
@@ -126,8 +126,10 @@ def look_at_scene(context: bpy.types.Context, root: bpy.types.Object, warn: Warn
         warn(f"'{obj.name}' stands before the cameras and is hidden; Alt+H shows it.")
     if context.screen is None:
         return
+    reach = _reach(root)
     for area in context.screen.areas:
         if area.type == "VIEW_3D":
+            area.spaces.active.clip_end = max(area.spaces.active.clip_end, reach)
             looks = area.spaces.active.region_3d
             looks.view_perspective = "PERSP"
             if photographed is not None:
@@ -182,6 +184,17 @@ def bounds_of_most(root: bpy.types.Object) -> tuple[Vector, float] | None:
     low, high = np.percentile(places, (5, 95), axis=0)
     size = float(np.linalg.norm(high - low)) * max(root.matrix_basis.to_scale())
     return root.matrix_basis @ Vector((low + high) / 2), size
+
+
+def _reach(root: bpy.types.Object) -> float:
+    """How far a viewport has to see: across all splats of the finest level, or a hundred times most of them
+    where some are lost in space; 0 without splats."""
+    bounds = bounds_of_most(root)
+    if bounds is None:
+        return 0.0
+    places = _positions([item.object for item in root.lodgs.levels if item.exists][-1])
+    across = float(np.linalg.norm(np.ptp(places, axis=0))) * max(root.matrix_basis.to_scale())
+    return min(across, 100 * bounds[1])
 
 
 def _positions(obj: bpy.types.Object | None) -> np.ndarray:

@@ -127,6 +127,7 @@ def import_colmap(
         root.empty_display_size = extent / 4
         root.lodgs.scene_folder = str(scene.folder)
         root.lodgs.camera_center = scene.center
+        root.lodgs.training.median_depth = _median_depth(scene)
         root.lodgs.training.model = str(scene.model) if model else ""
         root.lodgs.training.images = str(scene.images_folder) if images else ""
 
@@ -420,6 +421,14 @@ def _extent(scene: Scene) -> float:
         return scene.extent()
     except LodgsError:  # one place to stand, and no points: nothing tells the size
         return 1.0
+
+
+def _median_depth(scene: Scene) -> float:
+    """0 where no camera sees a point."""
+    try:
+        return scene.median_depth()
+    except LodgsError:
+        return 0.0
 
 
 def _near(scene: Scene) -> float:

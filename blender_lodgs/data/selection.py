@@ -155,7 +155,7 @@ def outdated(root: bpy.types.Object) -> bool:
 
 
 def update_inputs(root: bpy.types.Object) -> None:
-    """Hands on to the modifiers what cannot be driven: the held or chosen eye, tables, a level's material."""
+    """Hands on to the modifiers what cannot be driven: the chosen eye, tables, a level's material."""
     tables = {
         groups.table_socket(item.name): item.object if item.exists else None for item in root.lodgs.tables
     }
@@ -167,9 +167,6 @@ def update_inputs(root: bpy.types.Object) -> None:
             given[groups.MATERIAL] = slots[0].material if slots else None
             for name, value in given.items():
                 _set(modifier, name, value, lambda there, value: there == value)
-            held = root.lodgs.freeze or root.lodgs.eye == "VIEW"
-            position = root.lodgs.held_eye if held else root.lodgs.camera_center
-            _set(modifier, groups.EYE_POSITION, position, lambda there, value: tuple(there) == tuple(value))
 
 
 def _set(modifier: bpy.types.NodesModifier, name: str, value, same: Callable[[Any, Any], bool]) -> None:
@@ -218,14 +215,16 @@ def _drive(
     root: bpy.types.Object,
     expression: str,
     without: Mapping[str, float] | None = None,
+    index: int = -1,
     **sources: str,
 ) -> None:
     """Drives a property by an expression of the root's properties: names, and their paths in ``lodgs``.
 
     Args:
+        index: of a vector's component.
         without: values of names where this extension, and with it the properties, are missing; others are 0.
     """
-    driver = _driver(obj, path, expression)
+    driver = _driver(obj, path, expression, index)
     for name, source in sources.items():
         variable = driver.variables.new()
         variable.name, variable.type = name, "SINGLE_PROP"
@@ -266,6 +265,12 @@ def _drive_level(root: bpy.types.Object, obj: bpy.types.Object, rule: Rule, fact
     for name, source in driven.items():
         if compat.has_input(modifier, name):
             _drive(obj, compat.input_path(modifier, name), root, name, **{name: source})
+    # Setting it would tell Blender that the points have changed, at every step of the viewport's eye.
+    for axis in range(3) if compat.has_input(modifier, groups.EYE_POSITION) else ():
+        sources = {"held": f"held_eye[{axis}]", "center": f"camera_center[{axis}]"}
+        sources |= {name: name for name in (groups.EYE, groups.FREEZE)}
+        expression = f"held if {groups.FREEZE} or {groups.EYE} == {groups.HELD} else center"
+        _drive(obj, compat.input_path(modifier, groups.EYE_POSITION), root, expression, index=axis, **sources)
 
 
 def _modifier_of(obj: bpy.types.Object, rule: Rule) -> bpy.types.NodesModifier:
@@ -318,10 +323,10 @@ def _modifier(obj: bpy.types.Object) -> bpy.types.NodesModifier | None:
     return None
 
 
-def _driver(obj: bpy.types.Object, path: str, expression: str) -> bpy.types.Driver:
-    """A fresh driver of the property at ``path``, without variables."""
-    obj.driver_remove(path)
-    driver = obj.driver_add(path).driver
+def _driver(obj: bpy.types.Object, path: str, expression: str, index: int = -1) -> bpy.types.Driver:
+    """A fresh driver of the property at ``path``, or of a vector's component, without variables."""
+    obj.driver_remove(path, index)
+    driver = obj.driver_add(path, index).driver
     assert driver is not None
     driver.type, driver.expression = "SCRIPTED", expression
     return driver

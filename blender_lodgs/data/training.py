@@ -9,6 +9,7 @@ import bpy
 
 from ...training.methods import METHODS, PRESETS, MethodInfo, method_info
 from ...training.runs.job import VIEW_WIDTHS, VIEWS, Job
+from ...training.splats.bundle import MOST_LEVELS
 from . import photographs, viewpoints
 
 _WHOLE_MOST, _MOST = 2**31 - 1, 3.4e38
@@ -36,6 +37,19 @@ def offered(method: str) -> list[Field]:
     info = method_info(method)
     known = {f.name: f for f in fields(info.parameters)}
     return [known[name] for name in info.offered if not isinstance(known[name].default, tuple)]
+
+
+def chooses_distances(method: str) -> bool:
+    """Whether a method can be told from where on each level is shown."""
+    return "distances" in {f.name for f in fields(method_info(method).parameters)}
+
+
+def level_distances(settings: bpy.types.PropertyGroup) -> list[tuple[int, int]]:
+    """The coarser levels whose distances can be set: their numbers, coarse to fine, and their places in
+    ``settings.distances``, where the one next to the finest comes first, however many there are."""
+    group = settings.parameters
+    levels = group.levels if group.is_property_set("levels") else group.preset_levels
+    return [(number, levels - 1 - number) for number in range(1, levels)]
 
 
 def _is_curve(settings: bpy.types.PropertyGroup, obj: bpy.types.Object) -> bool:
@@ -155,6 +169,12 @@ class TrainingSettings(bpy.types.PropertyGroup):
     views: bpy.props.IntProperty(
         name="Views", description="How many views there are", default=Job.views, min=VIEWS[0], max=VIEWS[1]
     )
+    show_views: bpy.props.BoolProperty(
+        name="Show Views",
+        description="Show in the viewport from where the splats will be looked at",
+        default=False,
+        options=set(),
+    )
     view_width: bpy.props.IntProperty(
         name="View Width",
         description="How wide their pictures are; training makes them smaller by Image Scale",
@@ -168,6 +188,28 @@ class TrainingSettings(bpy.types.PropertyGroup):
         description="What to walk along, at the height of the eyes",
         type=bpy.types.Object,
         poll=_is_curve,
+    )
+    find_distances: bpy.props.BoolProperty(
+        name="Find Distances",
+        description="Training finds from where on each level is shown: where the least is left to draw. "
+        "Without it these distances are yours",
+        default=True,
+    )
+    distances: bpy.props.FloatVectorProperty(
+        name="Level Distances",
+        description="From how far away a level is shown, in median depths: half of all that photographs show "
+        "is nearer than 1. The coarser a level, the farther away; 0 has training find it",
+        size=MOST_LEVELS - 1,
+        default=[3.0 * 2.0**place for place in range(MOST_LEVELS - 1)],
+        min=0.0,
+        soft_max=100.0,
+        step=50,
+        precision=2,
+    )
+    median_depth: bpy.props.FloatProperty(
+        name="Median Depth",
+        description="How far away what photographs show is, in the scene's own units; 0 where nobody knows",
+        options={"HIDDEN"},
     )
     base: bpy.props.StringProperty(
         name="Splats",

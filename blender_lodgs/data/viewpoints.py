@@ -8,9 +8,17 @@ import numpy as np
 from ...training.errors import LodgsError
 from ...training.runs.job import VIEWS
 from ...training.scenes.cameras import Camera
-from ...training.scenes.viewpoints import walk
+from ...training.scenes.viewpoints import DOMES, NEAR, OPAQUE, dome_around, walk
 from ...training.splats.gaussians import Splats
+from .. import attributes
+from . import changes
 from .cameras import matrix_of, scene_camera, view_from
+
+SAMPLE = 100_000
+"""About so many splats say where a dome will be, before there is one."""
+
+_domes: dict[tuple, tuple[list[Camera], tuple[float, float]]] = {}
+"""The last one, by what it depends on."""
 
 
 def alone(root: bpy.types.Object) -> bool:
@@ -56,6 +64,26 @@ def placed(context: bpy.types.Context, root: bpy.types.Object, splats: Splats) -
             views, near = walk(splats, way, into[:3, 2], settings.views, width, height)
             return [(view, near) for view in views]
     return []
+
+
+def dome_of(root: bpy.types.Object) -> tuple[list[Camera], tuple[float, float]]:
+    """The dome that training will place around a root's splats, up to the few that it looks at more closely,
+    and how far its two shells are away from their middle; kept until something changes.
+
+    Raises:
+        LodgsError: there is no opaque splat to look at.
+    """
+    cloud = [item for item in root.lodgs.levels if item.exists][-1].object.data
+    key = cloud.session_uid, changes.version(cloud), root.lodgs.training.views
+    if key not in _domes:
+        step = max(len(cloud.points) // SAMPLE, 1)
+        means, base = (attributes.view_attribute(cloud, name) for name in ("position", attributes.BASE))
+        if means is None or base is None:  # as Blender has no points
+            means, base = np.zeros((0, 3)), np.zeros((0, 4))
+        views, near = dome_around(means[base[:, 3] > OPAQUE][::step].astype(np.float64), key[-1])
+        _domes.clear()
+        _domes[key] = views, (DOMES[0] * near / NEAR, DOMES[1] * near / NEAR)
+    return _domes[key]
 
 
 def size(scene: bpy.types.Scene, settings: bpy.types.PropertyGroup) -> tuple[int, int]:

@@ -11,11 +11,18 @@ from .parts import LevelsPanel, say
 
 
 def _columns(row: bpy.types.UILayout, *texts: str) -> None:
-    """Four texts in columns with room for millions of splats."""
+    """Four texts in columns."""
     for text, share in zip(texts, (0.18, 0.4, 0.4), strict=False):
         row = row.split(factor=share)
         row.label(text=text)
     row.label(text=texts[-1])
+
+
+def _short(value: float, digits: int = 0) -> str:
+    """A number that fits its column: 682,973; 3.97 M; 79.2; 344."""
+    if value >= 1e6:
+        return f"{value / 1e6:.3g} M" if value < 1e9 else f"{value / 1e9:.3g} G"
+    return f"{value:,.{digits if value < 100 else 0}f}"
 
 
 class LODGS_UL_levels(bpy.types.UIList):
@@ -25,7 +32,9 @@ class LODGS_UL_levels(bpy.types.UIList):
         cloud = item.object.data
         facts = selection.read_facts(item.facts).values()
         detail = " ".join(f"{value:.2g}" if value else "all" for value in facts)  # 0: nothing is too small
-        _columns(row, str(item.number), f"{len(cloud.points):,}", f"{objects.megabytes(cloud):.1f}", detail)
+        _columns(
+            row, str(item.number), _short(len(cloud.points)), _short(objects.megabytes(cloud), 1), detail
+        )
         alone = data.mode == "SINGLE" and data.single_level == item.number
         row = row.row(align=True)
         row.enabled = data.complete or item.number == data.levels[-1].number

@@ -7,7 +7,7 @@ import bpy
 from ...training.evaluate.costs import cost_lines
 from ..data import scenes, selection
 from ..runs import jobs
-from .parts import LevelsPanel
+from .parts import LevelsPanel, scene_length
 
 
 class LODGS_PT_costs(LevelsPanel):
@@ -32,14 +32,8 @@ class LODGS_PT_costs(LevelsPanel):
 
 def _lines(context: bpy.types.Context, root: bpy.types.Object) -> list[str]:
     """What the distances are and cost, in Blender's units."""
-    units, scale = context.scene.unit_settings, max(root.matrix_world.to_scale())
-
-    def length(value: float) -> str:
-        return bpy.utils.units.to_string(
-            units.system, "LENGTH", value * scale * units.scale_length, precision=3
-        )
-
-    return cost_lines(selection.read_json(root.lodgs.meta), length)
+    meta = selection.read_json(root.lodgs.meta)
+    return cost_lines(meta, lambda value: scene_length(context, root, value))
 
 
 CLASSES = (LODGS_PT_costs,)

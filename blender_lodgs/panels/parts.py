@@ -40,8 +40,16 @@ def say(layout: bpy.types.UILayout, text: str, icon: str) -> None:
     column.scale_y = 0.8
     width = bpy.context.region.width / bpy.context.preferences.system.ui_scale
     letters = max(int((width - 85) / 5.6), 24)  # of the default font, beside the icon and the tabs
-    for number, line in enumerate(textwrap.wrap(text, letters)):
+    for number, line in enumerate(textwrap.wrap(text, letters, break_on_hyphens=False)):
         column.label(text=line, icon="BLANK1" if number else icon)  # type: ignore[arg-type]
+
+
+def scene_length(context: bpy.types.Context, root: bpy.types.Object, value: float) -> str:
+    """A length of a splat scene, in its own units, as Blender says it in the scene's."""
+    units, scale = context.scene.unit_settings, max(root.matrix_world.to_scale())
+    return bpy.utils.units.to_string(
+        units.system, "LENGTH", value * scale * units.scale_length, precision=3
+    ).strip()
 
 
 def draw_environment(layout: bpy.types.UILayout, missing: str = "") -> None:

@@ -8,11 +8,11 @@ from ...training.errors import LodgsError
 from ...training.evaluate.words import summary_lines
 from ...training.methods import method_info
 from ..data import scenes, viewpoints
-from ..data.training import hold_out, offered
+from ..data.training import chooses_distances, hold_out, level_distances, offered
 from ..runs import environment, jobs
 from ..runs.watch import Watch, watch_of
 from ..runs.words import measured_on, progress_facts, short_level_line
-from .parts import Panel, draw_environment, say, split_column
+from .parts import Panel, draw_environment, say, scene_length, split_column
 
 
 class LODGS_PT_training(Panel):
@@ -36,7 +36,7 @@ class LODGS_PT_training(Panel):
             row = self.layout.row()
             row.label(text="There was a run", icon="FILE_FOLDER")
             row.operator("lodgs.open_run").directory = root.lodgs.training.run
-        _draw_choices(self.layout, root, resumable=watch is not None and watch.state != "done")
+        _draw_choices(self.layout, context, root, resumable=watch is not None and watch.state != "done")
 
 
 class LODGS_PT_training_advanced(Panel):
@@ -61,6 +61,8 @@ class LODGS_PT_training_advanced(Panel):
         _draw_parameter(layout, settings, "test_every")
         for f in offered(settings.method):
             _draw_parameter(layout, settings.parameters, f.name)
+        if chooses_distances(settings.method):
+            _draw_distances(layout, context, root)
         if root.lodgs.scene_folder:
             layout.prop(settings, "model")
             layout.prop(settings, "images")
@@ -68,7 +70,9 @@ class LODGS_PT_training_advanced(Panel):
         layout.operator("lodgs.open_run", icon="FILE_FOLDER", text="Open Run…")
 
 
-def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object, resumable: bool) -> None:
+def _draw_choices(
+    layout: bpy.types.UILayout, context: bpy.types.Context, root: bpy.types.Object, resumable: bool
+) -> None:
     settings = root.lodgs.training
     alone, info = viewpoints.alone(root), method_info(settings.method)
     if not root.lodgs.scene_folder and not alone:
@@ -82,7 +86,7 @@ def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object, resumable:
     column.prop(settings, "preset")
     column.prop(settings, "image_scale")
     if alone:
-        _draw_views(column, settings)
+        _draw_views(column, context, root)
     elif info.from_base:
         column.prop(settings, "start_from")
         if settings.start_from == "FILE":
@@ -113,8 +117,9 @@ def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object, resumable:
         layout.operator("lodgs.train", icon="PLAY")
 
 
-def _draw_views(column: bpy.types.UILayout, settings: bpy.types.PropertyGroup) -> None:
+def _draw_views(column: bpy.types.UILayout, context: bpy.types.Context, root: bpy.types.Object) -> None:
     """From where splats without photographs are looked at."""
+    settings = root.lodgs.training
     column.separator()
     column.prop(settings, "views_from")
     if settings.views_from == "CURVE":
@@ -124,6 +129,15 @@ def _draw_views(column: bpy.types.UILayout, settings: bpy.types.PropertyGroup) -
     else:
         column.prop(settings, "views")
     column.prop(settings, "view_width")
+    if settings.views_from == "DOME":
+        column.prop(settings, "show_views")
+        try:
+            _, shells = viewpoints.dome_of(root)
+        except LodgsError as error:
+            say(column, str(error), "ERROR")
+            return
+        near, far = (scene_length(context, root, away) for away in shells)
+        say(column, f"Half of them {near} from the middle of the splats, half {far}.", "INFO")
 
 
 def _draw_parameter(layout: bpy.types.UILayout, group: bpy.types.PropertyGroup, name: str) -> None:
@@ -133,6 +147,21 @@ def _draw_parameter(layout: bpy.types.UILayout, group: bpy.types.PropertyGroup, 
     value = row.row(align=True)
     value.enabled = group.is_property_set(name)
     value.prop(group, name if value.enabled else f"preset_{name}", text="")
+
+
+def _draw_distances(layout: bpy.types.UILayout, context: bpy.types.Context, root: bpy.types.Object) -> None:
+    """From where on each coarser level is shown, where training is not to find it; and how far that is."""
+    settings = root.lodgs.training
+    layout.prop(settings, "find_distances")
+    if settings.find_distances:
+        return
+    column = layout.column(align=True)
+    for number, place in level_distances(settings):
+        column.prop(settings, "distances", index=place, text=f"Level {number} From")
+    text = "In median depths: half of what photographs show is nearer than 1"
+    if settings.median_depth:
+        text += f", which is {scene_length(context, root, settings.median_depth)}"
+    say(layout, f"{text}.", "INFO")
 
 
 def _draw_running(layout: bpy.types.UILayout, watch: Watch) -> None:

@@ -21,12 +21,12 @@ from ...training.lod.selection import complete
 from ...training.methods import method_info, parameters_of
 from ...training.methods.parameters import Parameters
 from ...training.runs.folder import RunFolder
-from ...training.runs.job import DOME, Job
+from ...training.runs.job import CHANGEABLE, DOME, Job
 from ...training.scenes.cameras import write_camera
 from ...training.splats.bundle import write_bundle
 from .. import extension
 from ..data import scenes, viewpoints
-from ..data.training import hold_out, offered
+from ..data.training import chooses_distances, hold_out, level_distances, offered
 from . import environment, processes
 from .watch import Watch, begin, root_by_uid, watch_of, watches
 
@@ -106,7 +106,7 @@ def start_or_resume(root: bpy.types.Object, job: Job) -> Watch:
     if state in {"empty", "running"}:
         return _begin(root, run, job)
     before, now = Job.from_file(run.job).resolved(), job.resolved()
-    names = [f.name for f in fields(Job) if f.name not in ("backend", "out")]
+    names = [f.name for f in fields(Job) if f.name not in CHANGEABLE]
     changed = [name for name in names if getattr(before, name) != getattr(now, name)]
     if changed:
         raise LodgsError(
@@ -116,7 +116,8 @@ def start_or_resume(root: bpy.types.Object, job: Job) -> Watch:
     if state == "done":
         return attach(root, job.out)
     root.lodgs.training.read = 0
-    return _launch(root, run, None if before.backend == job.backend else job)
+    same = all(getattr(before, name) == getattr(job, name) for name in CHANGEABLE if name != "out")
+    return _launch(root, run, None if same else job)
 
 
 def cancel(root: bpy.types.Object) -> None:
@@ -279,11 +280,15 @@ def _hand_over(root: bpy.types.Object, run: RunFolder, job: Job) -> None:
 def changes(settings: TrainingSettings) -> dict:
     """The method's parameters that are set in the panel, by name; all others are the preset's."""
     group = settings.parameters
-    return {
+    found = {
         f.name: _as_typed(getattr(group, f.name))
         for f in offered(settings.method)
         if group.is_property_set(f.name)
     }
+    if chooses_distances(settings.method) and not settings.find_distances:
+        places = [place for _, place in level_distances(settings)]
+        found["distances"] = (*(_as_typed(settings.distances[place]) for place in places), 0.0)
+    return found
 
 
 def parameters(settings: TrainingSettings) -> Parameters:
@@ -315,6 +320,11 @@ def show(settings: TrainingSettings, job: Job) -> None:
         settings.parameters.property_unset(f.name)
         if getattr(own, f.name) != getattr(preset, f.name):
             setattr(settings.parameters, f.name, getattr(own, f.name))
+    settings.property_unset("distances")
+    settings.find_distances = not any(getattr(own, "distances", ()))
+    if chooses_distances(job.method) and not settings.find_distances:
+        for number, place in level_distances(settings):
+            settings.distances[place] = own.distances[number - 1]
 
 
 def base_of(root: bpy.types.Object, out: Path) -> str:

@@ -3,7 +3,8 @@
 Splats are drawn in all shadings but Wireframe where ``Scene.lodgs_viewport.splats`` is on; otherwise they are
 points like those of COLMAP: discs in Solid shading, Blender's own points elsewhere. Where Blender draws
 splats by itself, it is left to it. ``arranging`` decides which are drawn in which order, ``views`` keeps what
-each viewport shows, and ``eye`` follows a viewport's view.
+each viewport shows, ``eye`` follows a viewport's view, and ``frusta`` shows where
+training will look from.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import bpy
 from ...training.lod.colors import level_color
 from .. import compat, extension
 from ..data import scenes
-from . import discs, eye, splats, views
+from . import discs, eye, frusta, splats, views
 
 if TYPE_CHECKING:
     from ..data.properties import SplatScene
@@ -51,8 +52,8 @@ def _draw() -> None:
 
 def _draw_view(context: bpy.types.Context) -> None:
     space, region, view = context.space_data, context.region, context.region_data
-    eye.on_draw(region, context.scene, view)
     with_splats = draws_splats(context.scene) and space.shading.type != "WIREFRAME"
+    eye.on_draw(region, context.scene, view, splats=with_splats)
     if space.shading.type == "SOLID" and space.shading.color_type not in {"OBJECT", "RANDOM", "SINGLE"}:
         points = [
             (obj, tint)
@@ -65,6 +66,8 @@ def _draw_view(context: bpy.types.Context) -> None:
             discs.draw(points, depsgraph, view.view_matrix, view.window_matrix, region.height)
     if with_splats:
         views.draw(context)
+    if space.overlay.show_overlays:
+        frusta.draw(context.scene)
 
 
 def _points(

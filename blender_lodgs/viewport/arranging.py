@@ -1,8 +1,8 @@
 """Which splats a viewport draws, and in which order: numpy only, for a thread beside Blender's own.
 
-Drawing needs two things: the splats themselves, which stay on the graphics card until they change (the pool),
-and a list of which of them are drawn, from back to front, each with its weight (the arrangement). Only the
-list depends on where the eye is and in which direction the view looks.
+Drawing needs two things: the splats themselves, which stay on the graphics card as long as they are drawn
+(``resident``), and a list of which are drawn, from back to front, each with its weight (the arrangement). It
+is made from what the pool says of all splats.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ class Pool:
     """N splats of any number of objects, one after the other.
 
     Attributes:
-        means: (N, 4) float32 in their objects' space, the fourth number is 1.
-        scales: (N, 4) float32 standard deviations; the fourth number is unused.
+        means: (N, 3) float32 in their objects' space.
+        areas: (N,) float32, the sum of their squared standard deviations.
         opacities: (N,) float32 in [0, 1].
         columns: (N,) float32 by name: what rules need to know of splats; zeros where an object lacks one.
     """
 
     means: np.ndarray
-    scales: np.ndarray
+    areas: np.ndarray
     opacities: np.ndarray
     columns: dict[str, np.ndarray] = field(default_factory=dict)
     _choosers: dict[tuple[int, int], Chooser] = field(default_factory=dict, compare=False)
@@ -50,7 +50,7 @@ class Pool:
             part = slice(placement.first, placement.first + placement.count)
             columns = {name: column[part] for name, column in self.columns.items()}
             columns[OPACITY] = self.opacities[part]
-            self._choosers[key] = Chooser(self.means[part, :3], columns)
+            self._choosers[key] = Chooser(self.means[part], columns)
         return self._choosers[key]
 
     def about(self, placement: Placement) -> int:
@@ -144,17 +144,21 @@ class Arrangement:
 
     Attributes:
         request: what it answers.
-        instances: (rows * WIDTH, 4) float32; the first ``count`` are, from back to front: a splat's place in
-            the pool, its weight, its placement's number, and the level or band whose colour it gets (0: its
-            own).
-        count: how many are drawn.
+        instances: (M, 4) float32, from back to front: a splat's place in the pool, its weight, its
+            placement's number, and the level or band whose colour it gets (0: its own).
+        splats: (M,) int32, the same places in the pool.
         left_out: how many were left out, to stay within the budget.
     """
 
     request: Request
     instances: np.ndarray
-    count: int
+    splats: np.ndarray
     left_out: int
+
+    @property
+    def count(self) -> int:
+        """How many are drawn."""
+        return len(self.splats)
 
 
 def arrange(pool: Pool, request: Request) -> Arrangement:
@@ -170,9 +174,8 @@ def arrange(pool: Pool, request: Request) -> Arrangement:
         toward = (backward @ placement.world).astype(np.float32)  # grows towards the eye
         np.add(means @ toward[:3], toward[3], out=depths[count : count + len(means)])
         count += len(means)
-    instances = np.zeros((max(1, -(-count // WIDTH)) * WIDTH, 4), np.float32)
-    np.take(drawn.table, ascending(depths), axis=0, out=instances[:count])
-    return Arrangement(request, instances, count, drawn.left_out)
+    instances = drawn.table[ascending(depths)]
+    return Arrangement(request, instances, instances[:, 0].astype(np.int32), drawn.left_out)
 
 
 def ascending(values: np.ndarray) -> np.ndarray:
@@ -191,7 +194,7 @@ def _drawn(pool: Pool, request: Request) -> Drawn:
     table = np.empty((sum(len(index) for index, _ in chosen), 4), np.float32)
     means, begin = [], 0
     for number, (placement, (index, weight)) in enumerate(zip(request.placements, chosen, strict=True)):
-        own = pool.means[placement.first : placement.first + placement.count, :3][index]
+        own = pool.means[placement.first : placement.first + placement.count][index]
         rows = table[begin : begin + len(index)]
         rows[:, 0], rows[:, 1], rows[:, 2] = index + placement.first, weight, number
         rows[:, 3] = _color_levels(pool, placement, index, own)
@@ -267,8 +270,7 @@ def _thin(pool: Pool, placements, chosen, which: Sequence[int], keep: int) -> No
     for i in which:
         index, weight = chosen[i]
         place = index + placements[i].first
-        scales = pool.scales[place, :3]
-        visible.append(pool.opacities[place] * weight * np.einsum("ij,ij->i", scales, scales))
+        visible.append(pool.opacities[place] * weight * pool.areas[place])
     everything = np.concatenate(visible)
     stays = np.zeros(len(everything), bool)
     if keep:

@@ -1,13 +1,17 @@
 """The eye that is the viewport's own view: distances follow whoever orbits.
 
 No driver sees a viewport's view. Drawing reports here where it looks from, and a timer hands the view that
-moved last to the splat scenes whose eye is the viewport, some times a second: what draws may not change what
-it draws.
+moved last to the splat scenes whose eye is the viewport: what draws may not change what it draws. Splats that
+are drawn as such are chosen from there at once (:func:`moved`), and the modifiers, which take long for
+millions, follow when the view rests; where modifiers are what is seen, they do some times a second.
 """
 
 from __future__ import annotations
 
+import time
+
 import bpy
+import numpy as np
 from mathutils import Matrix, Vector
 
 from ..data import scenes, selection
@@ -15,12 +19,16 @@ from ..data import scenes, selection
 Place = tuple[float, float, float]
 
 PAUSE = 0.08
-"""Seconds between two changes of the eye while the view moves: each chooses the detail anew."""
+"""Seconds between two changes of the eye while the view moves, where modifiers are what is seen."""
+REST = 0.25
+"""Seconds after which a view rests that has not moved."""
 
 _last: dict[int, Matrix] = {}
 """What each viewport's region looked through when it was last drawn."""
 _newest: tuple[str, Place, float] | None = None
 """Of the view that moved last, until it is handed on: Blender scene, eye in the world, focal length."""
+_due = 0.0
+"""When that is to be handed on."""
 
 
 def place(view: Matrix, projection: Matrix, width: int, distance: float) -> tuple[Place, float]:
@@ -41,9 +49,15 @@ def place(view: Matrix, projection: Matrix, width: int, distance: float) -> tupl
     return eye, focal
 
 
-def on_draw(region: bpy.types.Region, scene: bpy.types.Scene, view: bpy.types.RegionView3D) -> None:
-    """A viewport is being drawn; where its view has moved it is the eye from now on."""
-    global _newest
+def on_draw(
+    region: bpy.types.Region, scene: bpy.types.Scene, view: bpy.types.RegionView3D, *, splats: bool = False
+) -> None:
+    """A viewport is being drawn; where its view has moved it is the eye from now on.
+
+    Args:
+        splats: whether it draws splats as such.
+    """
+    global _newest, _due
     if not any(_follows(root) for root in scenes.roots(scene)):
         _last.clear()
         return
@@ -58,8 +72,20 @@ def on_draw(region: bpy.types.Region, scene: bpy.types.Scene, view: bpy.types.Re
     _newest = (
         scene.name, *place(view.view_matrix, view.window_matrix, region.width, view.view_distance)
     )  # fmt: skip
-    if not bpy.app.timers.is_registered(_hand_on):
+    waiting = bpy.app.timers.is_registered(_hand_on)
+    if splats or not waiting:
+        _due = time.monotonic() + (REST if splats else PAUSE)
+    if not waiting:
         bpy.app.timers.register(_hand_on, first_interval=PAUSE)
+
+
+def moved(scene: bpy.types.Scene, root: bpy.types.Object) -> tuple[Place, float] | None:
+    """The eye of a splat scene, in its own space, and its focal length; None where the modifiers know it."""
+    if _newest is None or _newest[0] != scene.name or not _follows(root):
+        return None
+    _, eye, focal_px = _newest
+    local = root.matrix_world.inverted_safe() @ Vector(eye)
+    return tuple(np.float32(local).tolist()), float(np.float32(focal_px))  # as properties will have them
 
 
 def follow(scene: bpy.types.Scene, eye: Place, focal_px: float) -> None:
@@ -73,11 +99,14 @@ def _follows(root: bpy.types.Object) -> bool:
     return root.lodgs.eye == "VIEW" and not root.lodgs.freeze
 
 
-def _hand_on() -> None:
+def _hand_on() -> float | None:
     global _newest
+    if (wait := _due - time.monotonic()) > 0:
+        return wait
     newest, _newest = _newest, None
     if newest is not None and (scene := bpy.data.scenes.get(newest[0])) is not None:
         follow(scene, *newest[1:])
+    return None
 
 
 def clear() -> None:

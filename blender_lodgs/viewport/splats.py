@@ -1,4 +1,4 @@
-"""True Gaussians in a framebuffer: the splats on the graphics card, and the shaders that draw them.
+"""True Gaussians in a framebuffer: the shaders that draw splats which are on the graphics card.
 
 What a pixel shows is that of ``docs/rasterizer.md``; splats are blended back to front in half floats, in
 display space as the photographs are, in an offscreen buffer of their own. A splat is hidden where what is
@@ -9,18 +9,14 @@ linear, beneath overlays that are there already.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
-import bpy
 import gpu
 import numpy as np
 from mathutils import Matrix
 
 from ...training.lod.colors import LEVEL_COLORS
-from ...training.lod.rule import every_column
-from .. import attributes
-from .arranging import WIDTH, Arrangement, Pool
+from .arranging import WIDTH, Arrangement
 
 MOST_COEFFICIENTS = 24
 """Coefficients beyond the first: degree 4."""
@@ -35,50 +31,51 @@ vec4 texel(sampler2D data, int i) { return texelFetch(data, ivec2(i % WIDTH, i /
 _VERTEX = (
     _FETCH
     + """
-// Three floats of the stream that coefficient k of all splats lies in, each after the other.
-vec3 coefficient(int k, int splat)
+// Three floats of a splat's record, as ``resident.read_records`` makes them.
+vec3 coefficient(int k, int record)
 {
-  int start = ((k - 1) * total + splat) * 3;
-  vec4 a = texel(higher, start / 4);
+  int start = 11 + 3 * k;
+  vec4 a = texel(records, record + start / 4);
   int part = start % 4;
   if (part == 0) { return a.xyz; }
-  vec4 b = texel(higher, start / 4 + 1);
-  return part == 1 ? a.yzw : part == 2 ? vec3(a.zw, b.x) : vec3(a.w, b.xy);
+  if (part == 1) { return a.yzw; }
+  vec4 b = texel(records, record + start / 4 + 1);
+  return part == 2 ? vec3(a.zw, b.x) : vec3(a.w, b.xy);
 }
 
-vec3 seen_color(int splat, vec3 base, vec3 d)
+vec3 seen_color(int record, vec3 base, vec3 d)
 {
   vec3 c = 0.5 + 0.28209479177387814 * base;
   if (degree >= 1) {
-    c += 0.4886025119029199 * (d.z * coefficient(2, splat) - d.y * coefficient(1, splat)
-                               - d.x * coefficient(3, splat));
+    c += 0.4886025119029199 * (d.z * coefficient(2, record) - d.y * coefficient(1, record)
+                               - d.x * coefficient(3, record));
   }
   if (degree >= 2) {
     vec3 q = d * d;
-    c += 1.0925484305920792 * (d.x * d.y * coefficient(4, splat) - d.y * d.z * coefficient(5, splat)
-                               - d.x * d.z * coefficient(7, splat));
-    c += 0.31539156525252005 * (2.0 * q.z - q.x - q.y) * coefficient(6, splat);
-    c += 0.5462742152960396 * (q.x - q.y) * coefficient(8, splat);
+    c += 1.0925484305920792 * (d.x * d.y * coefficient(4, record) - d.y * d.z * coefficient(5, record)
+                               - d.x * d.z * coefficient(7, record));
+    c += 0.31539156525252005 * (2.0 * q.z - q.x - q.y) * coefficient(6, record);
+    c += 0.5462742152960396 * (q.x - q.y) * coefficient(8, record);
     if (degree >= 3) {
-      c -= 0.5900435899266435 * (d.y * (3.0 * q.x - q.y) * coefficient(9, splat)
-                                 + d.x * (q.x - 3.0 * q.y) * coefficient(15, splat));
-      c += 2.890611442640554 * d.x * d.y * d.z * coefficient(10, splat);
+      c -= 0.5900435899266435 * (d.y * (3.0 * q.x - q.y) * coefficient(9, record)
+                                 + d.x * (q.x - 3.0 * q.y) * coefficient(15, record));
+      c += 2.890611442640554 * d.x * d.y * d.z * coefficient(10, record);
       c -= 0.4570457994644658 * (4.0 * q.z - q.x - q.y)
-           * (d.y * coefficient(11, splat) + d.x * coefficient(13, splat));
-      c += 0.3731763325901154 * d.z * (2.0 * q.z - 3.0 * q.x - 3.0 * q.y) * coefficient(12, splat);
-      c += 1.445305721320277 * d.z * (q.x - q.y) * coefficient(14, splat);
+           * (d.y * coefficient(11, record) + d.x * coefficient(13, record));
+      c += 0.3731763325901154 * d.z * (2.0 * q.z - 3.0 * q.x - 3.0 * q.y) * coefficient(12, record);
+      c += 1.445305721320277 * d.z * (q.x - q.y) * coefficient(14, record);
     }
     if (degree >= 4) {
-      c += 2.5033429417967046 * d.x * d.y * (q.x - q.y) * coefficient(16, splat);
-      c -= 1.7701307697799304 * d.z * (d.y * (3.0 * q.x - q.y) * coefficient(17, splat)
-                                       + d.x * (q.x - 3.0 * q.y) * coefficient(23, splat));
-      c += 0.9461746957575601 * d.x * d.y * (7.0 * q.z - 1.0) * coefficient(18, splat);
+      c += 2.5033429417967046 * d.x * d.y * (q.x - q.y) * coefficient(16, record);
+      c -= 1.7701307697799304 * d.z * (d.y * (3.0 * q.x - q.y) * coefficient(17, record)
+                                       + d.x * (q.x - 3.0 * q.y) * coefficient(23, record));
+      c += 0.9461746957575601 * d.x * d.y * (7.0 * q.z - 1.0) * coefficient(18, record);
       c -= 0.6690465435572892 * d.z * (7.0 * q.z - 3.0)
-           * (d.y * coefficient(19, splat) + d.x * coefficient(21, splat));
-      c += 0.10578554691520431 * (q.z * (35.0 * q.z - 30.0) + 3.0) * coefficient(20, splat);
-      c += 0.47308734787878004 * (q.x - q.y) * (7.0 * q.z - 1.0) * coefficient(22, splat);
+           * (d.y * coefficient(19, record) + d.x * coefficient(21, record));
+      c += 0.10578554691520431 * (q.z * (35.0 * q.z - 30.0) + 3.0) * coefficient(20, record);
+      c += 0.47308734787878004 * (q.x - q.y) * (7.0 * q.z - 1.0) * coefficient(22, record);
       c += 0.6258357354491761 * (q.x * (q.x - 3.0 * q.y) - q.y * (3.0 * q.x - q.y))
-           * coefficient(24, splat);
+           * coefficient(24, record);
     }
   }
   return max(c, 0.0);
@@ -91,13 +88,13 @@ void main()
   color_opacity = vec4(0.0);
 
   vec4 instance = texel(instances, gl_InstanceID);  // splat, weight, placement, level whose colour it gets
-  int splat = int(instance.x), row = int(instance.z) * 5;
-  vec4 base = texel(bases, splat);
-  float opacity = base.w * instance.y;
+  int record = int(instance.x) * texels, row = int(instance.z) * 5;
+  vec4 mean = texel(records, record);
+  float opacity = mean.w * instance.y;
   if (opacity <= 1.0 / 255.0) {
     return;
   }
-  vec4 mean = vec4(texel(means, splat).xyz, 1.0);
+  mean.w = 1.0;
   vec4 to_view_x = texel(placements, row), to_view_y = texel(placements, row + 1);
   vec4 to_view_z = texel(placements, row + 2), eye = texel(placements, row + 3);
   vec3 position = vec3(dot(to_view_x, mean), dot(to_view_y, mean), dot(to_view_z, mean));
@@ -112,8 +109,8 @@ void main()
   mat4 rows = transpose(projection);
   vec3 by_x = (rows[0].xyz - held.x * rows[3].xyz) * (0.5 * size.x / clip.w);
   vec3 by_y = (rows[1].xyz - held.y * rows[3].xyz) * (0.5 * size.y / clip.w);
-  vec4 q = texel(quats, splat);  // w, x, y, z
-  vec3 s = texel(scales, splat).xyz;
+  vec4 q = texel(records, record + 1);  // w, x, y, z
+  vec4 s = texel(records, record + 2);  // and of the colour the first number
   mat3 turn = mat3(
     1.0 - 2.0 * (q.z * q.z + q.w * q.w), 2.0 * (q.y * q.z + q.x * q.w), 2.0 * (q.y * q.w - q.x * q.z),
     2.0 * (q.y * q.z - q.x * q.w), 1.0 - 2.0 * (q.y * q.y + q.w * q.w), 2.0 * (q.z * q.w + q.x * q.y),
@@ -143,7 +140,8 @@ void main()
   place = corner * reach;
   gl_Position = vec4(ndc.xy + offset * 2.0 / size, ndc.z, 1.0);
 
-  vec3 color = seen_color(splat, base.xyz, normalize(mean.xyz * eye.w - eye.xyz));
+  vec3 base = vec3(s.w, texel(records, record + 3).xy);
+  vec3 color = seen_color(record, base, normalize(mean.xyz * eye.w - eye.xyz));
   if (instance.w > 0.0) {  // in the lightness of its own colour, so that the scene stays readable
     float lightness = min(dot(color, vec3(1.0 / 3.0)), 1.0);
     color = (0.35 + 0.65 * lightness) * texelFetch(palette, ivec2(int(instance.w - 1.0) % PALETTE, 0), 0).rgb;
@@ -162,6 +160,19 @@ void main()
   drawn = vec4(color_opacity.rgb * alpha, alpha);
 }
 """
+_COPY_VERTEX = """
+void main()
+{
+  shift = corner.z;
+  gl_Position = vec4(corner.xy, 0.0, 1.0);
+}
+"""
+_COPY_FRAGMENT = (
+    _FETCH
+    + """
+void main() { copied = texel(source, int(gl_FragCoord.x) + int(shift)); }
+"""
+)
 _SCREEN_VERTEX = """
 void main()
 {
@@ -222,106 +233,63 @@ void main()
 """
 
 
-@dataclass
-class Uploaded:
-    """Splats on the graphics card, and of them in memory what arranging needs.
+def instances_texture(arrangement: Arrangement, places: np.ndarray) -> tuple[gpu.types.GPUTexture, int]:
+    """An arrangement's list on the graphics card, and how many splats it has: those that have a place there.
 
-    Attributes:
-        pool: see there.
-        starts, counts: where each point cloud's splats begin, and how many they are, in the order given.
-        textures: by the shader's names.
-        degree: of the harmonics, up to 4.
-        total: how many splats.
+    Args:
+        places: see ``resident.Store``.
     """
+    there = places[arrangement.splats]
+    some = there >= 0
+    rows = arrangement.instances if some.all() else arrangement.instances[some]
+    height = max(-(-len(rows) // WIDTH), 1)
+    data = gpu.types.Buffer("FLOAT", height * WIDTH * 4)
+    listed = np.frombuffer(data, np.float32).reshape(-1, 4)[: len(rows)]  # type: ignore[arg-type]
+    listed[:], listed[:, 0] = rows, there[some]
+    return gpu.types.GPUTexture((WIDTH, height), format="RGBA32F", data=data), len(rows)
 
-    pool: Pool
-    starts: list[int]
-    counts: list[int]
-    textures: dict[str, gpu.types.GPUTexture]
-    degree: int
-    total: int
 
+def copy_records(
+    frame: gpu.types.GPUFrameBuffer, store: gpu.types.GPUTexture, places: np.ndarray, records: np.ndarray
+) -> None:
+    """Brings records to their places in a texture, which Blender has no other way to change a part of.
 
-def upload(clouds: Sequence[bpy.types.PointCloud]) -> Uploaded:
-    """Brings the splats of point clouds to the graphics card, as they are, one cloud after the other.
-
-    Weights that modifiers have given them are factors on their opacities.
+    Args:
+        frame: with the texture as its colours.
+        places: (M,) ascending; records of neighbours go on from one row of the texture to the next.
+        records: (M, 4 * texels) float32.
     """
-    counts = [len(cloud.points) for cloud in clouds]
-    starts = [sum(counts[:i]) for i in range(len(counts))]
-    total = max(sum(counts), 1)
-    most = gpu.capabilities.max_texture_size_get() * WIDTH
-    higher = max((_higher(cloud) for cloud in clouds), default=0)
-    while 3 * higher * total > 4 * most:  # rather fewer harmonics than no splats
-        higher = {24: 15, 15: 8, 8: 3}.get(higher, 0)
-
-    buffers = {name: _Texels(total) for name in ("means", "quats", "scales", "bases")}
-    stream = _Texels(3 * higher * total // 4 + 2)
-    coefficients = stream.floats[: 3 * higher * total].reshape(higher, total, 3)
-    columns = {name: np.zeros(total, np.float32) for name in every_column()}
-    for cloud, start, count in zip(clouds, starts, counts, strict=True):
-        part = slice(start, start + count)
-        if not count:
-            continue
-        for name, attribute in (("quats", attributes.ROTATION), ("bases", attributes.BASE)):
-            _read(cloud, attribute, buffers[name].rows[part])
-        for name, attribute in (("means", "position"), ("scales", attributes.SCALE)):
-            buffers[name].rows[part, :3] = attributes.read_attribute(cloud, attribute)
-        if (weights := attributes.read_attribute(cloud, attributes.WEIGHT)) is not None:
-            buffers["bases"].rows[part, 3] *= weights
-        for k in range(min(higher, _higher(cloud))):
-            _read(cloud, attributes.SH.format(k + 1), coefficients[k, part])
-        for name, values in columns.items():
-            if (column := attributes.read_attribute(cloud, name)) is not None:
-                values[part] = column
-    buffers["means"].rows[:total, 3] = 1
-    pool = Pool(
-        buffers["means"].rows[:total],
-        buffers["scales"].rows[:total],
-        buffers["bases"].rows[:total, 3],
-        columns,
-    )
-    textures = {name: texels.texture() for name, texels in (buffers | {"higher": stream}).items()}
-    return Uploaded(pool, starts, counts, textures, round((higher + 1) ** 0.5) - 1, total)
-
-
-def _higher(cloud: bpy.types.PointCloud) -> int:
-    """How many coefficients beyond the first a cloud has, of whole degrees up to 4."""
-    count = 0
-    while count < MOST_COEFFICIENTS and attributes.SH.format(count + 1) in cloud.attributes:
-        count += 1
-    return int((count + 1) ** 0.5) ** 2 - 1
-
-
-def _read(cloud: bpy.types.PointCloud, name: str, into: np.ndarray) -> None:
-    """An attribute, straight into contiguous memory."""
-    attribute = cloud.attributes[name]
-    attribute.data.foreach_get(attributes.LAYOUTS[attribute.data_type].key, into.reshape(-1))
-
-
-class _Texels:
-    """Memory that numpy fills and a texture is made of, four floats a texel, of at least ``count`` texels.
-
-    Attributes:
-        floats: (rows * WIDTH * 4,) float32.
-        rows: the same as (rows * WIDTH, 4).
-    """
-
-    def __init__(self, count: int) -> None:
-        self.height = -(-count // WIDTH)
-        self.buffer = gpu.types.Buffer("FLOAT", self.height * WIDTH * 4)
-        self.floats = np.frombuffer(self.buffer, np.float32)  # type: ignore[arg-type]
-        self.rows = self.floats.reshape(-1, 4)
-
-    def texture(self) -> gpu.types.GPUTexture:
-        return gpu.types.GPUTexture((WIDTH, self.height), format="RGBA32F", data=self.buffer)
-
-
-def instances_texture(arrangement: Arrangement) -> gpu.types.GPUTexture:
-    """An arrangement's list on the graphics card."""
-    height = len(arrangement.instances) // WIDTH
-    data = gpu.types.Buffer("FLOAT", arrangement.instances.size, arrangement.instances.reshape(-1))
-    return gpu.types.GPUTexture((WIDTH, height), format="RGBA32F", data=data)
+    texels = records.shape[1] // 4
+    height = -(-records.size // (4 * WIDTH))
+    data = gpu.types.Buffer("FLOAT", height * WIDTH * 4)
+    np.frombuffer(data, np.float32)[: records.size] = records.reshape(-1)  # type: ignore[arg-type]
+    source = gpu.types.GPUTexture((WIDTH, height), format="RGBA32F", data=data)
+    begins = np.flatnonzero(np.diff(places, prepend=-2) != 1)
+    ends = np.append(begins[1:], len(places))
+    start, stop = places[begins].astype(np.int64) * texels, (places[ends - 1].astype(np.int64) + 1) * texels
+    # each run of neighbours as its parts in rows of the texture
+    first, last = start // WIDTH, (stop - 1) // WIDTH
+    parts = last - first + 1
+    run = np.repeat(np.arange(len(begins)), parts)
+    row = first[run] + np.arange(len(run)) - (np.cumsum(parts) - parts)[run]
+    left = np.where(row == first[run], start[run] % WIDTH, 0)
+    right = np.where(row == last[run], (stop[run] - 1) % WIDTH + 1, WIDTH)
+    shift = begins[run] * texels + row * WIDTH - start[run]  # from a column to its texel in the source
+    corners = np.empty((len(run), 6, 3), np.float32)
+    x, y = 2.0 * np.stack([left, right]) / WIDTH - 1, 2.0 * np.stack([row, row + 1]) / store.height - 1
+    for corner, (across, up) in enumerate(((0, 0), (1, 0), (0, 1), (0, 1), (1, 0), (1, 1))):
+        corners[:, corner] = np.stack([x[across], y[up], shift], axis=1)
+    layout = gpu.types.GPUVertFormat()
+    layout.attr_add(id="corner", comp_type="F32", len=3, fetch_mode="FLOAT")
+    vertices = gpu.types.GPUVertBuf(layout, 6 * len(run))
+    vertices.attr_fill("corner", corners.reshape(-1, 3))
+    shader = _once("copy", _copy_shader)
+    with frame.bind():  # type: ignore[union-attr]
+        gpu.state.depth_test_set("NONE")
+        gpu.state.blend_set("NONE")
+        shader.bind()
+        shader.uniform_sampler("source", source)
+        gpu.types.GPUBatch(type="TRIS", buf=vertices).draw(shader)
 
 
 class Canvas:
@@ -344,7 +312,8 @@ class Canvas:
 
 
 def draw(
-    uploaded: Uploaded,
+    records: gpu.types.GPUTexture,
+    higher: int,
     instances: gpu.types.GPUTexture,
     count: int,
     worlds: Sequence[np.ndarray],
@@ -359,7 +328,8 @@ def draw(
     """Draws splats into the active framebuffer, tested against its depth.
 
     Args:
-        instances, count: the arrangement's.
+        records, higher: the texture of a ``resident.Store``, and how many coefficients it has.
+        instances, count: an arrangement's list.
         worlds: each placement's ``matrix_world``, (4, 4) float64.
         view, projection: from the world to the camera's space, and on to clip space.
         antialias: of each placement, see ``SplatScene.antialias``; none: no one is.
@@ -394,15 +364,14 @@ def draw(
         gpu.state.blend_set("ALPHA_PREMULT")
         shader, quad = _program("splats")
         shader.bind()
-        for name, texture in uploaded.textures.items():
-            shader.uniform_sampler(name, texture)
+        shader.uniform_sampler("records", records)
         shader.uniform_sampler("instances", instances)
         shader.uniform_sampler("placements", placements)
         shader.uniform_sampler("palette", _palette())
         shader.uniform_float("projection", projection)
         shader.uniform_float("size", size)
-        shader.uniform_int("degree", uploaded.degree)
-        shader.uniform_int("total", uploaded.total)
+        shader.uniform_int("degree", round((higher + 1) ** 0.5) - 1)
+        shader.uniform_int("texels", -(-(14 + 3 * higher) // 4))
         quad.draw_instanced(shader, instance_count=count)
 
     gpu.state.depth_test_set("NONE")
@@ -492,7 +461,7 @@ def _splat_shader() -> gpu.types.GPUShader:
     info, between = _shader("splats")
     between.smooth("VEC2", "place")
     between.flat("VEC4", "color_opacity")
-    names = ("instances", "placements", "means", "quats", "scales", "bases", "higher", "palette")
+    names = ("instances", "placements", "records", "palette")
     for slot, name in enumerate(names):
         info.sampler(slot, "FLOAT_2D", name)
     info.define("WIDTH", str(WIDTH))
@@ -500,8 +469,19 @@ def _splat_shader() -> gpu.types.GPUShader:
     info.push_constant("MAT4", "projection")
     info.push_constant("VEC2", "size")
     info.push_constant("INT", "degree")
-    info.push_constant("INT", "total")
+    info.push_constant("INT", "texels")
     return _made(info, between, _VERTEX, _FRAGMENT)
+
+
+def _copy_shader() -> gpu.types.GPUShader:
+    between = gpu.types.GPUStageInterfaceInfo("lodgs_copy")
+    between.flat("FLOAT", "shift")
+    info = gpu.types.GPUShaderCreateInfo()
+    info.vertex_in(0, "VEC3", "corner")
+    info.fragment_out(0, "VEC4", "copied")
+    info.sampler(0, "FLOAT_2D", "source")
+    info.define("WIDTH", str(WIDTH))
+    return _made(info, between, _COPY_VERTEX, _COPY_FRAGMENT)
 
 
 def _depth_shader() -> gpu.types.GPUShader:

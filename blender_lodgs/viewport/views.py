@@ -1,66 +1,95 @@
 """What each viewport shows of the splats, kept between drawings.
 
-Splats are uploaded once, and anew only when the points of an object themselves have changed: distances and
-fading come from the modifiers' settings (``selection.choice``), so neither time nor view brings an upload. An
-object with other modifiers is uploaded as they leave it, whenever they do so anew. Which splats are drawn is
-found in a thread when the choice changes, in which order also when the view turns; until then the last
-arrangement stays, with the splats that it is of.
+Splats are brought to the graphics card when they are first drawn, some at each redraw so that no window waits
+for them, and anew only when the points of an object themselves have changed: distances and fading come from
+the modifiers' settings (``selection.choice``), so neither time nor view changes a splat. An object with other
+modifiers is read as they leave it, whenever they do so anew. Which splats are drawn is found in a thread when
+the choice changes, in which order also when the view turns; until all that is drawn is there, the last
+arrangement stays. Only where there is none to stay is the new one drawn as far as it has come.
 """
 
 from __future__ import annotations
 
 import time
+import weakref
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import bpy
 import gpu
+import numpy as np
 from mathutils import Matrix
 
 from ..data import changes, scenes, selection, shown
-from . import splats
+from . import eye, resident, splats
 from .arranging import Arrangement, Placement, Request, arrange
+from .resident import Resident, Store
 
 STILL = 0.2
 """Seconds after which a view that no longer moves is drawn in full resolution."""
+LOADING = 0.02, 0.1
+"""Seconds after which a redraw leaves further splats to the next one: at least, and at most."""
+GROWTH = 1.5
+"""By how much more splats a picture that is not complete is drawn again."""
 
-uploads = 0
-"""How often splats were uploaded since Blender started."""
+reads = 0
+"""How often all splats were read since Blender started."""
 
 
-@dataclass
+@dataclass(eq=False)
 class ViewState:
     """What one viewport shows.
 
     Attributes:
-        uploaded, arrangement, instances: what is drawn, which belong together.
+        resident, arrangement: what is drawn, or what the drawn part is of.
+        store: where its splats are.
+        instances, count: the list of those that are drawn.
         pending: the arrangement that is being computed, and of which splats.
+        loading: the arrangement whose splats are on their way to the store.
+        missing: those of them (M,) that are not there yet, and in which store.
+        loaded: when some of them were brought there last.
         matrix: from the world to clip space when it was last drawn.
         moved: when it last moved.
     """
 
     canvas: splats.Canvas = field(default_factory=splats.Canvas)
-    uploaded: splats.Uploaded | None = None
+    resident: Resident | None = None
     arrangement: Arrangement | None = None
+    store: Store | None = None
     instances: gpu.types.GPUTexture | None = None
-    pending: tuple[splats.Uploaded, Request, Future[Arrangement]] | None = None
+    count: int = 0
+    pending: tuple[Resident, Request, Future[Arrangement]] | None = None
+    loading: Arrangement | None = None
+    missing: tuple[Store, np.ndarray] | None = None
+    loaded: float = 0.0
     matrix: Matrix | None = None
     moved: float = 0.0
     resolution: float = 1.0
 
+    def lists(self, of: Resident) -> list[np.ndarray]:
+        """The splats (M,) that it draws, and those that are on their way."""
+        drawn = self.arrangement if self.resident is of else None
+        both = drawn, self.loading if self.loading is not drawn else None
+        return [each.splats for each in both if each is not None]
+
 
 _views: dict[int, ViewState] = {}
+_all: weakref.WeakSet[ViewState] = weakref.WeakSet()
+"""Those for which there are splats in the store: of viewports, and of renders while they last."""
 _thread: ThreadPoolExecutor | None = None
 
-_uploaded: splats.Uploaded | None = None
+_resident: Resident | None = None
 _keys: dict[int, changes.Version | None] = {}
-"""Whose splats are uploaded: point clouds, or objects whose modifiers change them, by ``session_uid``; and in
+"""Whose splats were read: point clouds, or objects whose modifiers change them, by ``session_uid``; and in
 which version, None for one that only a render shows."""
 
 
 def draw(context: bpy.types.Context) -> None:
     """Draws all visible splats into the viewport that is being drawn."""
     space, region, region_data = context.space_data, context.region, context.region_data
+    if region.as_pointer() not in _views:
+        _forget_closed()
     view = _views.setdefault(region.as_pointer(), ViewState())
     instances = shown.splat_instances(context.evaluated_depsgraph_get(), space)
     now, matrix = time.monotonic(), region_data.window_matrix @ region_data.view_matrix
@@ -71,11 +100,23 @@ def draw(context: bpy.types.Context) -> None:
     view.resolution = settings.moving / 100 if now - view.moved < STILL else 1.0
     draw_splats(
         view, instances, context.evaluated_depsgraph_get(),
-        region_data.view_matrix, region_data.window_matrix, settings.budget,
+        region_data.view_matrix, region_data.window_matrix, settings.budget, moving=True,
         under_overlays=space.overlay.show_overlays and not _shows_photograph(context),
     )  # fmt: skip
-    if view.pending is not None or view.resolution < 1:
+    if view.pending is not None or view.loading is not None or view.resolution < 1:
         _wake_later()
+
+
+def _forget_closed() -> None:
+    """Frees what viewports keep that no window shows any more."""
+    there = {
+        region.as_pointer()
+        for window in bpy.context.window_manager.windows
+        for area in window.screen.areas
+        for region in area.regions
+    }
+    for key in _views.keys() - there:
+        _all.discard(_views.pop(key))
 
 
 def _shows_photograph(context: bpy.types.Context) -> bool:
@@ -100,27 +141,27 @@ def draw_splats(
     *,
     under_overlays: bool = True,
     wait: bool = False,
+    moving: bool = False,
 ) -> None:
     """Draws splat instances into the active framebuffer.
 
     Args:
         view: what was drawn there last; changed.
         view_matrix, projection: from the world to the camera's space, and on to clip space.
-        budget, wait: see :func:`prepare`.
+        budget, wait, moving: see :func:`prepare`.
         under_overlays: see ``splats.draw``.
     """
-    request = prepare(view, instances, depsgraph, view_matrix, budget, wait)
-    if view.uploaded is None or view.arrangement is None or view.instances is None:
-        return
-    if not view.arrangement.count:
+    request = prepare(view, instances, depsgraph, view_matrix, budget, wait, moving)
+    if view.arrangement is None or view.store is None or view.instances is None or not view.count:
         return
     placements = view.arrangement.request.placements
     if _alike(placements, request.placements):  # what moves, moves at once; its order follows
         placements = request.placements
     splats.draw(
-        view.uploaded, view.instances, view.arrangement.count, [placement.world for placement in placements],
-        view_matrix, projection, view.canvas, antialias=[placement.antialias for placement in placements],
-        resolution=view.resolution, under_overlays=under_overlays,
+        view.store.texture, view.store.higher, view.instances, view.count,
+        [placement.world for placement in placements], view_matrix, projection, view.canvas,
+        antialias=[placement.antialias for placement in placements], resolution=view.resolution,
+        under_overlays=under_overlays,
     )  # fmt: skip
 
 
@@ -131,22 +172,27 @@ def prepare(
     view_matrix: Matrix,
     budget: int,
     wait: bool = False,
+    moving: bool = False,
 ) -> Request:
-    """All that comes before drawing: what has changed is uploaded, and what has been found taken over.
+    """All that comes before drawing: what has changed is read, and what has been found taken over.
 
     Args:
         budget: most splats to draw.
-        wait: for the splats' order, rather than going on with the last one that there is.
+        wait: for the splats and their order, rather than going on with the last ones that there are.
+        moving: choose for the eye that is the viewport's own from where it is now, see ``eye.moved``.
 
     Returns:
         What is to be drawn, which ``view.arrangement`` may not answer yet.
     """
     if not instances:
-        view.uploaded = view.arrangement = view.instances = view.pending = None
+        view.resident = view.arrangement = view.store = view.instances = None
+        view.pending = view.loading = view.missing = None
         return Request((), (0.0, 0.0, 1.0), budget)
-    uploaded = _upload(instances, depsgraph)
-    request = Request(_placements(instances, uploaded, depsgraph), tuple(view_matrix[2][:3]), budget)
-    _arrange(view, uploaded, request, wait)
+    _all.add(view)
+    of, clouds = _read(instances, depsgraph)
+    request = Request(_placements(instances, of, depsgraph, moving), tuple(view_matrix[2][:3]), budget)
+    _arrange(view, of, request, wait)
+    _load(view, of, clouds, wait)
     return request
 
 
@@ -164,9 +210,11 @@ def _key(instance: shown.SplatInstance, depsgraph: bpy.types.Depsgraph) -> int:
     return (instance.object.data if _plain(instance, depsgraph) else instance.object).session_uid
 
 
-def _upload(instances: list[shown.SplatInstance], depsgraph: bpy.types.Depsgraph) -> splats.Uploaded:
-    """The splats of all instances on the graphics card; they go there only where some have changed."""
-    global _uploaded, _keys, uploads
+def _read(
+    instances: list[shown.SplatInstance], depsgraph: bpy.types.Depsgraph
+) -> tuple[Resident, list[bpy.types.PointCloud | None]]:
+    """The splats of all instances, read anew only where some have changed; and their clouds."""
+    global _resident, _keys, reads
     clouds: dict[int, bpy.types.PointCloud] = {}
     versions: dict[int, changes.Version | None] = {}
     for instance in instances:
@@ -175,34 +223,38 @@ def _upload(instances: list[shown.SplatInstance], depsgraph: bpy.types.Depsgraph
         versions[key] = changes.version(instance.object.data if plain else instance.object)
         if not plain and depsgraph.mode == "RENDER":  # modifiers may do otherwise in viewports
             versions[key] = None
-    if _uploaded is None or any(_keys.get(key) != each or each is None for key, each in versions.items()):
+    if _resident is None or any(_keys.get(key) != each or each is None for key, each in versions.items()):
         # A level that is hidden just now stays: artists step through levels.
         there = {cloud.session_uid: cloud for cloud in bpy.data.pointclouds if shown.is_splats(cloud)}
         stay = {key: there[key] for key in _keys if key in there and key not in clouds}
         versions |= {key: changes.version(cloud) for key, cloud in stay.items()}
         clouds |= stay
-        _uploaded, _keys = splats.upload(list(clouds.values())), {key: versions[key] for key in clouds}
-        uploads += 1
-    return _uploaded
+        _resident, _keys = resident.read_pool(list(clouds.values())), {key: versions[key] for key in clouds}
+        reads += 1
+    return _resident, [clouds.get(key) for key in _keys]
 
 
 def _placements(
     instances: list[shown.SplatInstance],
-    uploaded: splats.Uploaded,
+    of: Resident,
     depsgraph: bpy.types.Depsgraph,
+    moving: bool,
 ) -> tuple[Placement, ...]:
     roots = {item.object: root for root in scenes.roots(depsgraph.scene) for item in root.lodgs.levels}
     numbers, found = {key: number for number, key in enumerate(_keys)}, []
     for instance in instances:
         number = numbers[_key(instance, depsgraph)]
         plain, root = _plain(instance, depsgraph), roots.get(instance.object)
+        choice = selection.choice(instance.evaluated, depsgraph) if plain else None
+        if moving and choice is not None and root and (seen := eye.moved(depsgraph.scene, root)):
+            choice = replace(choice, eye=seen[0], focal_px=seen[1])
         found.append(
             Placement(
-                first=uploaded.starts[number],
-                count=uploaded.counts[number],
+                first=of.starts[number],
+                count=of.counts[number],
                 matrix=instance.matrix_world.tobytes(),
                 level=instance.level,
-                choice=selection.choice(instance.evaluated, depsgraph) if plain else None,
+                choice=choice,
                 scene=(root or instance.object).session_uid,
                 tell=root.lodgs.tell if root else "OWN",
                 antialias=instance.antialias,
@@ -211,28 +263,59 @@ def _placements(
     return tuple(found)
 
 
-def _arrange(view: ViewState, uploaded: splats.Uploaded, request: Request, wait: bool) -> None:
+def _arrange(view: ViewState, of: Resident, request: Request, wait: bool) -> None:
     """Takes over an arrangement that has been found, and asks for another where one is wanted."""
     global _thread
     if view.pending is not None and (wait or view.pending[2].done()):
-        of, _, found = view.pending
+        found_of, _, found = view.pending
         view.pending = None
-        _take(view, of, found.result())
-    current = view.arrangement is not None and view.uploaded is uploaded
-    if (current and view.arrangement.request == request) or view.pending is not None:
+        if found_of is of:
+            view.loading, view.missing = found.result(), None
+    current = view.loading or (view.arrangement if view.resident is of else None)
+    if (current is not None and current.request == request) or view.pending is not None:
+        return
+    if view.loading is not None and not wait:  # what comes now, comes whole
         return
     if _thread is None:
         _thread = ThreadPoolExecutor(1, "lodgs-order")
-    view.pending = (uploaded, request, _thread.submit(arrange, uploaded.pool, request))
+    view.pending = (of, request, _thread.submit(arrange, of.pool, request))
     if wait:
-        _, _, found = view.pending
-        view.pending = None
-        _take(view, uploaded, found.result())
+        view.loading, view.missing, view.pending = view.pending[2].result(), None, None
 
 
-def _take(view: ViewState, uploaded: splats.Uploaded, arrangement: Arrangement) -> None:
-    view.uploaded, view.arrangement = uploaded, arrangement
-    view.instances = splats.instances_texture(arrangement)
+def _load(view: ViewState, of: Resident, clouds: Sequence[bpy.types.PointCloud | None], wait: bool) -> None:
+    """Brings splats of an arrangement to the graphics card, and takes it over when they all are there."""
+    now = time.monotonic()
+    if view.loading is None and view.resident is of and view.store is not of.store:
+        view.loading = view.arrangement  # into the store that another viewport has made
+    loading = view.loading
+    if loading is None:
+        return
+    store, missing = view.missing or (None, None)
+    if not (begun := store is not None and store is of.store):
+        store = of.hold([each for other in _all for each in other.lists(of)])
+        missing = store.missing(loading.splats)
+    # where redraws take long, as much is loaded in each
+    end = now + min(max(now - view.loaded if begun else 0, LOADING[0]), LOADING[1])
+    view.loaded, begin = now, 0
+    while begin < len(missing) and (wait or not begin or time.monotonic() < end):
+        piece = missing[begin : begin + resident.PIECE]
+        piece = piece[: of.of_one_cloud(piece)]
+        records = of.read(clouds, piece)
+        if records is None:  # what there is now is asked for
+            view.loading = view.arrangement = view.missing = None
+            return
+        store.put(piece, records)
+        begin += len(piece)
+    missing = missing[begin:]
+    part = view.arrangement is loading and view.store is store
+    part = part and len(loading.splats) - len(missing) > GROWTH * view.count
+    if not len(missing) or part or view.arrangement is None:
+        view.resident, view.arrangement, view.store = of, loading, store
+        view.instances, view.count = splats.instances_texture(loading, store.places)
+    view.missing = (store, missing) if len(missing) else None
+    if not len(missing):
+        view.loading = None
 
 
 def _alike(one: tuple[Placement, ...], other: tuple[Placement, ...]) -> bool:
@@ -255,17 +338,18 @@ def _wake() -> float | None:
                 if view is None:
                     continue
                 still = view.resolution < 1 and now - view.moved >= STILL
-                if still or (view.pending is not None and view.pending[2].done()):
+                if still or view.loading is not None or (view.pending and view.pending[2].done()):
                     region.tag_redraw()
-                waiting |= view.pending is not None or view.resolution < 1
+                waiting |= bool(view.loading or view.pending) or view.resolution < 1
     return 0.01 if waiting else None
 
 
 def clear() -> None:
     """Frees everything that is kept between drawings."""
-    global _uploaded, _keys
+    global _resident, _keys
     _views.clear()
-    _uploaded, _keys = None, {}
+    _all.clear()
+    _resident, _keys = None, {}
 
 
 def stop() -> None:

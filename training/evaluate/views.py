@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -62,16 +61,10 @@ class Evaluation:
         self.antialias = antialias
         self.cameras = data.test or evenly(data.train, MOST_TRAINING_VIEWS)
         self.prefix = "" if data.test else "train_"
-        self._training = {camera.image: index for index, camera in enumerate(data.train)}
-        self._targets: dict[Path | None, torch.Tensor] = {}
 
     def target(self, camera: Camera) -> torch.Tensor:
         """The photograph of a view, (H, W, 3)."""
-        if camera.image in self._training:  # which a run at its end has read long ago
-            return self.data.target(self._training[camera.image]).image
-        if camera.image not in self._targets:
-            self._targets[camera.image] = torch.from_numpy(self.data.image(camera))
-        return self._targets[camera.image]
+        return self.data.photographs.target(camera).image
 
     def load(self, splats: Splats | Gaussians) -> Gaussians:
         """Splats where they are drawn, for those that are drawn again and again."""

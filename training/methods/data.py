@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
+import torch
 
 from ..errors import LodgsError
 from ..rasterize import Target
@@ -13,12 +15,10 @@ from ..scenes.cameras import Camera
 from ..scenes.colmap import Scene
 from ..scenes.images import load_image
 from .support import Support
+from .targets import Targets, default_budget
 
-IMAGE_MEMORY = 2 << 30
-"""Bytes of ground truth, with its cached moments, that are kept; further views are read when needed."""
-
-TARGET_BYTES = 36
-"""Bytes a pixel of ground truth: the photograph and its two local moments, float32."""
+Planned = Callable[[int], tuple[int, float] | None]
+"""Of a step: the index of its training view, and how many times smaller that is; None: it needs none."""
 
 
 @dataclass(frozen=True)
@@ -39,10 +39,15 @@ class TrainingView:
 
 
 class TrainingData:
-    """A scene's views, resized, with images read when first needed.
+    """A scene's views, resized, and their photographs, never more than fit.
+
+    Args:
+        photo_memory: bytes of photographs that are kept; None: ``targets.default_budget``. What is trained
+            does not depend on it.
 
     Attributes:
         train, test: cameras at training size; test views are every n-th by name (see ``Scene.split``).
+        photographs: of any of these views.
     """
 
     def __init__(
@@ -52,6 +57,7 @@ class TrainingData:
         test_every: int = 8,
         exposure: float = 0.0,
         validation: bool = False,
+        photo_memory: int | None = None,
     ) -> None:
         if len(scene.points) == 0:
             raise LodgsError(
@@ -67,8 +73,8 @@ class TrainingData:
         self.scene, self.exposure = scene, exposure
         self.train = [camera.scaled(image_scale) for camera in train]
         self.test = [camera.scaled(image_scale) for camera in test]
-        self._targets: dict[tuple[int, float], Target] = {}
-        self._room = IMAGE_MEMORY
+        self.photographs = Targets(self._read, default_budget() if photo_memory is None else photo_memory)
+        self._planned: Planned | None = None
 
     @cached_property
     def extent(self) -> float:
@@ -113,12 +119,21 @@ class TrainingData:
     def training_view(self, step: int, seed: int) -> int:
         """The index of the view to train at a step: every epoch is a new shuffle, from (seed, epoch)."""
         epoch, place = divmod(step, len(self.train))
-        return int(np.random.default_rng([seed, epoch]).permutation(len(self.train))[place])
+        return int(_shuffled(len(self.train), seed, epoch)[place])
 
-    def image(self, camera: Camera) -> np.ndarray:
-        """The photograph at the camera's size, (H, W, 3) float32, display-coded, 0 to 1."""
-        assert camera.image is not None
-        return load_image(camera.image, camera.width, camera.height, exposure=self.exposure)
+    def view_at(self, step: int, planned: Planned) -> TrainingView:
+        """The view of a step; those that the next steps need are read meanwhile.
+
+        Args:
+            planned: what steps need, as far as is known now.
+        """
+        if planned != self._planned:
+            self._planned = planned
+            self._plan = lambda step: None if (view := planned(step)) is None else self.camera(*view)
+        self.photographs.follow(step, self._plan)
+        view = planned(step)
+        assert view is not None
+        return self.view(*view)
 
     def view(self, index: int, shrink: float = 1) -> TrainingView:
         """A training view by index, its image ``shrink`` times smaller."""
@@ -130,12 +145,15 @@ class TrainingData:
 
     def target(self, view: int, shrink: float = 1) -> Target:
         """The ground truth of a training view, ``shrink`` times smaller, ready for the loss."""
-        target = self._targets.get((view, shrink))
-        if target is None:
-            camera = self.camera(view, shrink)
-            target = Target(self.image(camera))
-            size = TARGET_BYTES * camera.width * camera.height
-            if size <= self._room:
-                self._room -= size
-                self._targets[view, shrink] = target
-        return target
+        return self.photographs.target(self.camera(view, shrink))
+
+    def _read(self, camera: Camera) -> Target:
+        """The photograph at the camera's size, its planes one after the other as losses take them."""
+        assert camera.image is not None
+        image = load_image(camera.image, camera.width, camera.height, exposure=self.exposure)
+        return Target(torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))).permute(1, 2, 0))
+
+
+@lru_cache(8)
+def _shuffled(count: int, seed: int, epoch: int) -> np.ndarray:
+    return np.random.default_rng([seed, epoch]).permutation(count)

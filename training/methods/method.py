@@ -147,8 +147,20 @@ class Method(ABC, Generic[P, D]):
         return float(loss.detach()), self.over_black(drawings[0].rendering, step), view.target
 
     def choose_view(self, step: int) -> TrainingView:
-        """The photograph of a step: every epoch shows each once."""
-        return self.data.view(self.data.training_view(step, self.seed), self.shrink(step))
+        """The photograph of a step."""
+        return self.data.view_at(step, self.planned)
+
+    def planned(self, step: int) -> tuple[int, float] | None:
+        """Which view :meth:`choose_view` takes at a step, and its ``shrink``; None: it is not asked.
+
+        It is asked ahead, so that photographs are read before they are needed, and may say something else
+        later.
+        """
+        return (self.view_index(step), self.shrink(step)) if step < self.steps else None
+
+    def view_index(self, step: int) -> int:
+        """The training view of a step, from (seed, step): every epoch shows each once."""
+        return self.data.training_view(step, self.seed)
 
     def shrink(self, step: int) -> float:
         """How many times smaller the photograph of a step is."""

@@ -1,7 +1,8 @@
 """Checkpoints of a run: written whole, verified, and read whole or not at all.
 
 A checkpoint is what ``torch.save`` writes: a ZIP archive. It holds a CRC-32 of each of its parts, which
-``torch.load`` does not look at and :func:`read_checkpoint` does.
+``torch.load`` does not look at and :func:`read_checkpoint` does. What is too much to be written every time
+lies beside them, in files of ``methods.rows``, of which a checkpoint holds a table.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ def write_checkpoint(folder: RunFolder, step: int, levels: list[dict], method: d
 
 def remove_checkpoints(folder: RunFolder) -> None:
     """Removes all checkpoints: a finished run has no more use for them."""
-    for path in _newest_first(folder):
+    for path in [*_newest_first(folder), *folder.checkpoints.glob("rows_*.bin")]:
         path.unlink(missing_ok=True)
 
 

@@ -45,7 +45,10 @@ def training_data(
     for warning in warnings:
         if tell:
             tell("warning", message=warning)
-    return TrainingData(scene, job.image_scale, job.test_every, job.exposure, job.validation)
+    return TrainingData(
+        scene, job.image_scale, job.test_every, job.exposure, job.validation,
+        photo_memory=job.photo_memory * 10**6 or None,
+    )  # fmt: skip
 
 
 def _scene_folder(job: Job, folder: RunFolder, tell: Callable[..., None] | None) -> Path:

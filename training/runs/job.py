@@ -15,6 +15,8 @@ from ..methods.parameters import Parameters
 from .folder import RunFolder
 
 BACKENDS = ("auto", "cpu", "cuda", "reference")
+CHANGEABLE = ("backend", "out", "photo_memory")
+"""The keys that a run may go on with other values of: they say where it is trained, not what."""
 MOST_STOPS = 32
 """Most stops that a job lightens or darkens linear images by."""
 DOME = "dome"
@@ -54,6 +56,8 @@ class Job:
         validation: hold out other views instead and leave those out altogether: who tries settings measures
             them so, and the views that report quality have had no part in it.
         exposure: stops added to linear (EXR) images before they are trained on.
+        photo_memory: megabytes of photographs that are kept; others are read ahead while steps go on. 0: a
+            quarter of the memory that is free, 2 GB at most. What is trained does not depend on it.
         model, images: the COLMAP model's and the photographs' folder where they are not found by themselves.
         parameters: changes to the preset's parameters by name.
     """
@@ -72,6 +76,7 @@ class Job:
     test_every: int = 8
     validation: bool = False
     exposure: float = 0.0
+    photo_memory: int = 0
     model: str = ""
     images: str = ""
     parameters: dict = field(default_factory=dict)
@@ -139,6 +144,10 @@ class Job:
             raise LodgsError(
                 f"exposure = {self.exposure!r} is not possible.",
                 f"Give stops from {-MOST_STOPS} to {MOST_STOPS}.",
+            )
+        if not 0 <= self.photo_memory < 2**31:
+            raise LodgsError(
+                f"photo_memory = {self.photo_memory!r} is not possible.", "Give megabytes, or 0 to let it be."
             )
         if self.backend not in BACKENDS:
             raise LodgsError(

@@ -39,6 +39,11 @@ _OPTIONS: dict[str, dict] = {
     "seed": {"metavar": "N", "type": _whole, "help": "of every random choice"},
     "backend": {"choices": list(BACKENDS), "help": "what draws; auto is cuda where that works, else cpu"},
     "exposure": {"metavar": "STOPS", "type": float, "help": "stops added to linear (EXR) images"},
+    "photo_memory": {
+        "metavar": "MB",
+        "type": _whole,
+        "help": "photographs that are kept; 0 is a quarter of the free memory, 2048 at most",
+    },
     "model": {"metavar": "DIR", "help": "folder of the COLMAP model, where it is not found by itself"},
     "images": {"metavar": "DIR", "help": "folder of the photographs, where it is not found by itself"},
 }

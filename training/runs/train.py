@@ -42,7 +42,7 @@ from .data import training_data
 from .events import PROTOCOL, Events, event_line
 from .failures import CANCELLED, CRASHED, DONE, in_words
 from .folder import RunFolder
-from .job import Job
+from .job import CHANGEABLE, Job
 
 CHECKPOINT_SECONDS = float(os.environ.get("LODGS_CHECKPOINT_SECONDS", "60"))
 PROGRESS_SECONDS = 0.25, 10.0
@@ -192,6 +192,7 @@ class _Run:
             if now - last_progress >= pause or self.step == method.steps:
                 self._tell_progress(level, loss, psnr(image.cpu(), target.image.cpu()))
                 last_progress = now
+            del image, target  # which the next step's photograph may need the room of
             self._write_levels(levels)
             if levels or time.monotonic() - last_checkpoint >= CHECKPOINT_SECONDS:
                 self._save()
@@ -297,14 +298,14 @@ def _keep_job(job: Job, folder: RunFolder) -> None:
     """Writes the job into the run; a run folder keeps to the job that it began with, but for the backend."""
     if folder.job.exists():
         before = asdict(Job.from_file(folder.job).resolved())
-        same = {**asdict(job), "backend": before["backend"], "out": before["out"]}
-        changed = [key for key, value in same.items() if before[key] != value]
+        other = [key for key, value in asdict(job).items() if before[key] != value]
+        changed = [key for key in other if key not in CHANGEABLE]
         if changed:
             raise LodgsError(
                 f"The run folder {folder.path} belongs to another job (different: {', '.join(changed)}).",
                 "Choose another run folder, or start the run's own job.toml to resume it.",
             )
-        if before["backend"] == job.backend:
+        if not set(other) - {"out"}:
             return
     job.write(folder.job)
 

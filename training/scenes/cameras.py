@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -152,8 +153,11 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray | tuple[float, f
     return pose
 
 
-def evenly(cameras: Sequence[Camera], most: int) -> list[Camera]:
-    """At most so many of the cameras, evenly chosen, the first and the last among them."""
+T = TypeVar("T")
+
+
+def evenly(cameras: Sequence[T], most: int) -> list[T]:
+    """At most so many of the cameras (or of anything), evenly chosen, the first and the last among them."""
     chosen = np.linspace(0, len(cameras) - 1, min(most, len(cameras)))
     return [cameras[place] for place in chosen.round().astype(int)]
 

@@ -32,7 +32,19 @@ def dome(splats: Splats, count: int, width: int = 960, height: int = 640) -> tup
     Raises:
         LodgsError: there is no opaque splat to look at.
     """
-    opaque = _opaque(splats)
+    return dome_around(_opaque(splats), count, width, height)
+
+
+def dome_around(
+    opaque: np.ndarray, count: int, width: int = 960, height: int = 640
+) -> tuple[list[Camera], float]:
+    """As :func:`dome`, of the places (N, 3) float64 of opaque splats, or some of them.
+
+    Raises:
+        LodgsError: there are none.
+    """
+    if not len(opaque):
+        raise _nothing()
     middle = np.median(opaque, axis=0)
     radius = max(float(np.quantile(np.linalg.norm(opaque - middle, axis=1), INSIDE)), 1e-6)
     fills = radius * np.hypot(1, 2 * FOCAL)  # a ball of that radius meets the upper and lower edge
@@ -90,8 +102,12 @@ def _opaque(splats: Splats) -> np.ndarray:
     """Where opaque splats are, (N, 3) float64."""
     means = splats.means[splats.opacity_logits > np.log(OPAQUE / (1 - OPAQUE))].astype(np.float64)
     if not len(means):
-        raise LodgsError("There is no opaque splat to look at.", "Give cameras of your own.")
+        raise _nothing()
     return means
+
+
+def _nothing() -> LodgsError:
+    return LodgsError("There is no opaque splat to look at.", "Give cameras of your own.")
 
 
 def _lens(width: int, height: int) -> tuple[int, int, float, float, float, float]:

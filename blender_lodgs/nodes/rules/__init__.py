@@ -34,7 +34,7 @@ _SHARED = {
     EYE_POSITION: "NodeSocketVector", FOCAL: "NodeSocketFloat", HELD_FOCAL: "NodeSocketFloat",
     MATERIAL: "NodeSocketMaterial",
 }  # fmt: skip
-_SHARED_VERSION = 1
+_SHARED_VERSION = 2
 
 
 class Inputs:

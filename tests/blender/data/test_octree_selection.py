@@ -129,8 +129,9 @@ def test_another_method_leaves_no_driver_of_the_first(bpy, lodgs, root):
         for item in root.lodgs.levels:
             names = [modifier.name for modifier in item.object.modifiers if modifier.name != "mine"]
             assert names == ["LODGS Display", name]
-            paths = [driver.data_path for driver in item.object.animation_data.drivers]
-            assert len(paths) == len(set(paths))
+            drivers = item.object.animation_data.drivers
+            paths = [driver.data_path for driver in drivers]
+            assert len(paths) == len({(driver.data_path, driver.array_index) for driver in drivers})
             assert all(name in path or "Display" in path for path in paths if path.startswith("modifiers"))
             assert all(driver.driver.is_valid for driver in item.object.animation_data.drivers)
         assert [modifier.name for modifier in obj.modifiers][1:] == [name, "mine"], "in its old place"

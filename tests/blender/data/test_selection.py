@@ -243,7 +243,7 @@ def test_unused_levels_are_not_evaluated(bpy, root):
 def test_drivers_need_no_scripts(bpy, root):
     """Simple expressions are what Blender evaluates with Auto Run Python Scripts off."""
     drivers = [c.driver for t in [root, *root.children] if t.animation_data for c in t.animation_data.drivers]
-    assert len(drivers) == 1 + 12 * len(S_MIN)
+    assert len(drivers) == 1 + 15 * len(S_MIN)
     assert all(driver.is_simple_expression and driver.is_valid for driver in drivers)
 
 

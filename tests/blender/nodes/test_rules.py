@@ -297,10 +297,12 @@ def test_an_emptied_group_stops_nothing(bpy, lodgs, half, name, capfd):
 def test_sockets_are_driven_by_bare_names(splat_scene, name):
     obj = splat_scene(name).lodgs.levels[0].object
     title = f'modifiers["LODGS {name.title()}"]'
-    paths = {d.data_path: d.driver for d in obj.animation_data.drivers if d.data_path.startswith(title)}
-    assert len(paths) == 2 + 4 + len(rules()[name].controls)
-    for driver in paths.values():
-        assert driver.expression.isidentifier()
+    drivers = [d for d in obj.animation_data.drivers if d.data_path.startswith(title)]
+    eyes = [d for d in drivers if not d.driver.expression.isidentifier()]
+    assert [(d.data_path, d.array_index) for d in eyes] == [(eyes[0].data_path, axis) for axis in range(3)]
+    bare = {d.data_path: d.driver for d in drivers if d not in eyes}
+    assert len(bare) == 2 + 4 + len(rules()[name].controls)
+    for driver in bare.values():
         assert [variable.name for variable in driver.variables] == [driver.expression]
 
 

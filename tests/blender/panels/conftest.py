@@ -42,9 +42,9 @@ class Notes:
     def template_node_socket(self, color):
         self.colors.append(tuple(color))
 
-    def prop(self, owner, name, slider=False, **_):
+    def prop(self, owner, name, slider=False, index=-1, text="", **_):
         assert hasattr(owner, name)
-        self.properties.append(name)
+        self.properties.append(name if index < 0 else f"{name}[{index}] {text}")
         if slider:
             self.sliders.append(name)
 

@@ -49,14 +49,16 @@ def test_before_training(root, draw, fake):
 def test_splats_alone_ask_for_views_of_them(bpy, lodgs, root, draw, fake):
     root.lodgs.scene_folder = ""
     assert draw().operators == [] and "Not imported from photographs: nothing to train on." in draw().texts
-    splats = lodgs("training.splats.bundle").NO_SPLATS
-    lodgs("data.scenes").set_level(root, lodgs("training.splats.bundle").Level(1, splats))
+    level = lodgs("training.splats.bundle").Level
+    lodgs("data.scenes").set_level(root, level(1, lodgs("training.splats.bundle").NO_SPLATS))
     assert "FLoD needs photographs, and these splats have none." in draw().texts and not draw().operators
     settings = root.lodgs.training
     settings.method = "lodge"
     begin = ["method", "preset", "image_scale", "views_from"]
-    assert draw().properties == [*begin, "views", "view_width"] and draw().operators == ["lodgs.train"]
-    assert "720 steps in 3 levels" in draw().texts  # none of them are the finest level's
+    assert draw().properties == [*begin, "views", "view_width", "show_views"]
+    assert draw().operators == ["lodgs.train"]
+    assert any("There is no opaque splat to look at" in text for text in draw().texts)
+    assert "2,400 steps in 3 levels" in draw().texts  # none of them are the finest level's
     settings.views_from = "CURVE"
     assert draw().properties == [*begin, "curve", "views", "view_width"]
     settings.views_from = "CAMERAS"
@@ -83,6 +85,33 @@ def test_a_parameter_shows_the_presets_number_until_it_is_set(root, draw):
     assert settings.parameters.max_splats == settings.parameters.preset_max_splats == 1_000_000
     settings.method = "3dgs"
     assert shown() == ["use_max_splats", "preset_max_splats"]
+
+
+def test_distances_can_be_given_by_hand(bpy, lodgs, root, draw, fake):
+    """For as many levels as there will be, as the job has them; and in the scene's own lengths, if known."""
+    settings, panel = root.lodgs.training, "LODGS_PT_training_advanced"
+    assert not any("distances" in name for name in draw(panel).properties)
+    settings.method = "lodge"
+    changes = lodgs("runs.jobs").changes
+    assert "find_distances" in draw(panel).properties and "distances" not in changes(settings)
+    settings.find_distances = False
+    assert [name for name in draw(panel).properties if name.startswith("distances")] == [
+        "distances[1] Level 1 From", "distances[0] Level 2 From",
+    ]  # fmt: skip
+    assert changes(settings)["distances"] == (6.0, 3.0, 0.0)
+    assert "In median depths: half of what photographs show is nearer than 1." in draw(panel).texts
+    settings.median_depth, settings.parameters.levels, settings.distances[0] = 2.0, 4, 2.6
+    root.scale = (0.75, 0.75, 0.75)
+    bpy.context.view_layer.update()
+    assert [name for name in draw(panel).properties if name.startswith("distances")] == [
+        "distances[2] Level 1 From", "distances[1] Level 2 From", "distances[0] Level 3 From",
+    ]  # fmt: skip
+    assert draw(panel).texts[-1].endswith("is nearer than 1, which is 1.5 m.")
+    assert lodgs("runs.jobs").parameters(settings).distances == (12.0, 6.0, 2.6, 0.0)
+    settings.distances[1] = 30.0
+    assert any("Give falling numbers" in text for text in draw().texts)
+    settings.distances[1] = 0.0  # which training finds
+    assert not any("Give falling numbers" in text for text in draw().texts)
 
 
 def test_what_training_starts_from_is_asked_where_a_method_can_choose(lodgs, root, draw, fake, monkeypatch):

@@ -168,6 +168,18 @@ def test_the_panel_shows_a_job(lodgs, jobs, root, from_base):
     assert jobs.changes(settings) == {"levels": 2, "footprint": 9.5}
 
 
+def test_the_panel_shows_a_jobs_distances(lodgs, jobs, root):
+    settings, job = root.lodgs.training, lodgs("training.runs.job").Job
+    given = {"levels": 4, "distances": [9.0, 0.0, 2.5, 0.0]}
+    jobs.show(settings, job("/scene", "/run", "lodge", "draft", parameters=given))
+    assert not settings.find_distances
+    assert jobs.changes(settings) == {"levels": 4, "distances": (9.0, 0.0, 2.5, 0.0)}
+    jobs.show(settings, job("/scene", "/run", "lodge", "draft"))
+    assert settings.find_distances and jobs.changes(settings) == {}
+    jobs.show(settings, job("/scene", "/run", "flod", "draft"))
+    assert jobs.changes(settings) == {}
+
+
 @pytest.mark.parametrize("backend", ["auto", "cpu", "cuda"])
 def test_what_trains_is_a_preference(bpy, lodgs, jobs, fake, root, tmp_path, backend):
     preferences = lodgs("extension").preferences()

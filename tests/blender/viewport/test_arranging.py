@@ -104,10 +104,8 @@ def pool_of(lodgs, sets):
     """The pool of (means, scales, opacities), and where each set starts."""
     arranging = lodgs("viewport.arranging")
     means, scales, opacities = (np.concatenate(parts).astype(np.float32) for parts in zip(*sets, strict=True))
-    four = np.ones((len(means), 4), np.float32), np.zeros((len(means), 4), np.float32)
-    four[0][:, :3], four[1][:, :3] = means, scales
-    starts = np.cumsum([0, *(len(part[0]) for part in sets)])
-    return arranging.Pool(*four, opacities, {"lod_bias": np.zeros(len(means), np.float32)}), starts
+    starts, areas = np.cumsum([0, *(len(part[0]) for part in sets)]), (scales**2).sum(axis=1)
+    return arranging.Pool(means, areas, opacities, {"lod_bias": np.zeros(len(means), np.float32)}), starts
 
 
 def placed(lodgs, first, count, *, matrix=None, level=1, choice=None, scene=0, tell="OWN"):
@@ -217,14 +215,14 @@ def test_what_is_kept_between_arrangements_is_what_is_found_anew(bpy, lodgs, mon
         depth = np.empty(len(rows))
         for i, placement in enumerate(one.placements):
             mine = number == i
-            world = pool.means[index[mine].astype(int)] @ placement.world.T
-            depth[mine] = world[:, :3] @ one.backward
+            world = pool.means[index[mine].astype(int)] @ placement.world[:3, :3].T + placement.world[:3, 3]
+            depth[mine] = world @ one.backward
             if one.budget > 10**5:
                 part = slice(placement.first, placement.first + placement.count)
                 columns = {each: column[part] for each, column in pool.columns.items()}
                 zeros = dict.fromkeys(rule.columns, np.zeros(placement.count, np.float32))
                 own = placement.choice.weights(
-                    pool.means[part, :3], zeros | columns | {"opacity": pool.opacities[part]}
+                    pool.means[part], zeros | columns | {"opacity": pool.opacities[part]}
                 )
                 found = np.zeros(placement.count, np.float32)
                 found[index[mine].astype(int) - placement.first] = weight[mine]

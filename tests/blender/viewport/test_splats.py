@@ -429,7 +429,7 @@ def test_only_changed_splats_are_uploaded_again(bpy, lodgs, camera, picture, fra
         return seen
 
     first = drawn()
-    uploads = views.uploads
+    reads = views.reads
     pictures = [first]
     for number in (5, 10, 20):
         scene.frame_set(number)
@@ -444,13 +444,13 @@ def test_only_changed_splats_are_uploaded_again(bpy, lodgs, camera, picture, fra
         root.lodgs.single_level = number
         bpy.context.view_layer.update()
         drawn()
-    assert views.uploads == uploads
+    assert views.reads == reads
     cloud = root.lodgs.levels[1].object.data
     cloud.attributes["position"].data.foreach_set("vector", np.zeros(1500, np.float32))
     cloud.update_tag()
     bpy.context.view_layer.update()
     last = pictures[-1]
-    assert not np.array_equal(drawn(), last) and views.uploads == uploads + 1
+    assert not np.array_equal(drawn(), last) and views.reads == reads + 1
 
 
 def test_artists_own_modifiers_are_drawn(bpy, lodgs, add, picture):
@@ -460,9 +460,9 @@ def test_artists_own_modifiers_are_drawn(bpy, lodgs, add, picture):
     before = picture(view=view)
     obj.modifiers.new("move", "NODES").node_group = moved_by(bpy, (0, 0, 0.5))
     bpy.context.view_layer.update()
-    uploads = views.uploads
+    reads = views.reads
     after = picture(view=view)
-    assert views.uploads == uploads + 1
+    assert views.reads == reads + 1
     obj.modifiers.remove(obj.modifiers["move"])
     obj.location.z = 0.5
     bpy.context.view_layer.update()

@@ -90,6 +90,7 @@ def test_what_lies_in_the_run_is_found_where_the_run_lies(tmp_path):
         ("scene = \n", "is not valid"),
         ('scene = "a"\nout = "b"\nexposure = nan\n', "exposure = nan is not a finite number"),
         ('scene = "a"\nout = "b"\nexposure = 33\n', "exposure = 33 is not possible"),
+        ('scene = "a"\nout = "b"\nphoto_memory = -1\n', "photo_memory = -1 is not possible"),
         ('scene = "a"\nout = "b"\nexposure = true\n', "exposure = True is not a number"),
         ('scene = "a"\nout = "b"\nseed = true\n', "seed = True is not a whole number"),
         ('scene = "a"\nout = "b"\nseed = 2147483648\n', "seed = 2147483648"),

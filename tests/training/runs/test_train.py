@@ -187,7 +187,9 @@ def test_cancel_by_file_saves_and_resume_gives_the_same_bits(unbroken, tmp_path,
     assert code == training_loop.CANCELLED and folder.state() == "cancelled"
     assert events[-1]["event"] == "cancelled" and events[-1]["step"] == at + 1
     monkeypatch.undo()
+    keys["photo_memory"] = 1  # megabyte, of which nothing that is trained depends
     assert run_in_process(keys)[0] == 0
+    assert Job.from_file(folder.job).photo_memory == 1
     assert folder.bundle.read_bytes() == unbroken["bundle"]
 
 

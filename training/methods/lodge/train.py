@@ -137,6 +137,9 @@ class Method(Refining):
             self.begin_round(step)
         return super().choose_view(step)
 
+    def planned(self, step: int) -> tuple[int, float] | None:
+        return super().planned(step) if step < self.tuned_steps else None
+
     def train_step(self, step: int) -> tuple[float, torch.Tensor, Target]:
         return super().train_step(step) if step < self.tuned_steps else self._chunk_step(step)
 

@@ -53,10 +53,6 @@ class Schedule:
 
     # -- what a step sees ------------------------------------------------------------------------------
 
-    def view(self, step: int) -> TrainingView:
-        """The photograph of a step, sometimes made smaller."""
-        return self.data.view(self.data.training_view(step, self.seed), self.shrink(step))
-
     def shrinks(self) -> list[int]:
         """How many times smaller photographs are made at most, in powers of two from 1."""
         far = self.parameters.far_share

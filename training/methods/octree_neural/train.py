@@ -204,8 +204,8 @@ class Method(method.Method[NeuralOctreeParameters, Drawing]):
 
     # -- a step ----------------------------------------------------------------------------------------
 
-    def choose_view(self, step: int) -> TrainingView:
-        return self.schedule.view(step)
+    def shrink(self, step: int) -> float:
+        return self.schedule.shrink(step)
 
     def draw(self, view: TrainingView, step: int) -> list[Drawing]:
         weights = self.schedule.weights(view.camera, self.model, step, full=view.shrink == 1)

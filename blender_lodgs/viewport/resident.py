@@ -1,0 +1,207 @@
+"""Splats on the graphics card: those that viewports draw, brought there when they are first needed.
+
+Of all splats memory holds what choosing needs (the pool). The rest is read from Blender's attributes a piece
+at a time, for splats that are drawn and not there yet. On the card they lie in a store somewhat larger than
+what is drawn: who comes takes the place of whoever has not been drawn for the longest time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import bpy
+import gpu
+import numpy as np
+
+from ...training.lod.rule import every_column
+from .. import attributes
+from . import splats
+from .arranging import WIDTH, Pool
+
+PIECE = 1 << 16
+"""Splats that are brought to the graphics card at a time."""
+LEAST, SPARE, WASTE = 1 << 16, 1.25, 2.0
+"""The smallest store, in splats; how much more than is drawn a new one holds; and from how much more on it
+gives way to a smaller one."""
+
+bytes_uploaded = 0
+"""What was brought to the graphics card since Blender started, in bytes."""
+
+
+@dataclass
+class Resident:
+    """The splats of some point clouds, one cloud after the other.
+
+    Attributes:
+        pool: see there.
+        starts, counts: where each cloud's splats begin, and how many they are.
+        higher: how many coefficients beyond the first they have at most, of whole degrees up to 4.
+        store: those on the graphics card; none as long as nothing was drawn.
+    """
+
+    pool: Pool
+    starts: list[int]
+    counts: list[int]
+    higher: int
+    store: Store | None = None
+
+    @property
+    def total(self) -> int:
+        return len(self.pool.means)
+
+    def hold(self, lists: Sequence[np.ndarray]) -> Store:
+        """The store, in which from now on lists of splats (M,) keep their places, and others may lose theirs.
+
+        It is anew and empty where it has no room for all of them, or far too much.
+        """
+        held = np.zeros(self.total, bool)
+        for each in lists:
+            held[each] = True
+        wanted = int(np.count_nonzero(held))
+        room = min(max(round(SPARE * wanted), LEAST), self.total)
+        if self.store is None or not wanted <= len(self.store.owners) <= WASTE * room:
+            self.store = Store(self.total, room, self.higher)
+        self.store.hold(held)
+        return self.store
+
+    def of_one_cloud(self, wanted: np.ndarray) -> int:
+        """How many of some splats (M,), ascending, are of the first one's cloud."""
+        number = self._cloud(wanted)
+        return int(np.searchsorted(wanted, self.starts[number] + self.counts[number]))
+
+    def read(self, clouds: Sequence[bpy.types.PointCloud | None], wanted: np.ndarray) -> np.ndarray | None:
+        """The records of splats (M,), ascending, of one cloud: see :func:`read_records`.
+
+        Returns:
+            None where the cloud is not what it was.
+        """
+        number = self._cloud(wanted)
+        cloud = clouds[number]
+        if cloud is None or len(cloud.points) != self.counts[number] or self.store is None:
+            return None
+        return read_records(cloud, wanted - self.starts[number], self.store.higher)
+
+    def _cloud(self, wanted: np.ndarray) -> int:
+        return int(np.searchsorted(self.starts, wanted[0], side="right")) - 1
+
+
+class Store:
+    """A texture with room for some of N splats, each a record of texels in a row.
+
+    Attributes:
+        places: (N,) int32 where each splat is; -1 where it is not there.
+        owners: (room,) int32 which splat is at each place; -1 where none is.
+        higher: how many coefficients beyond the first it has of each splat.
+        texture: WIDTH texels wide.
+    """
+
+    def __init__(self, total: int, room: int, higher: int) -> None:
+        most = gpu.capabilities.max_texture_size_get() * WIDTH
+        while higher and record_texels(higher) * room > most:  # rather fewer harmonics than no splats
+            higher = {24: 15, 15: 8, 8: 3}.get(higher, 0)
+        self.places, self.owners = np.full(total, -1, np.int32), np.full(room, -1, np.int32)
+        self.higher = higher
+        self._drawn, self._now, self._filled = np.zeros(room, np.int32), 0, 0
+        height = max(-(-record_texels(higher) * room // WIDTH), 1)
+        self.texture = gpu.types.GPUTexture((WIDTH, height), format="RGBA32F")
+        self._frame = gpu.types.GPUFrameBuffer(color_slots=self.texture)
+
+    def hold(self, held: np.ndarray) -> None:
+        """From now on these splats, (N,) bool, keep their places, and others may lose theirs."""
+        self._now += 1
+        there = self.owners >= 0
+        there[there] = held[self.owners[there]]
+        self._drawn[there] = self._now
+
+    def missing(self, wanted: np.ndarray) -> np.ndarray:
+        """Those of the wanted splats (M,) that are not there, ascending; copies want the same ones."""
+        absent = np.zeros(len(self.places), bool)
+        absent[wanted] = True
+        absent &= self.places < 0
+        return np.flatnonzero(absent).astype(np.int32)
+
+    def put(self, splats_: np.ndarray, records: np.ndarray) -> None:
+        """Gives splats (M,) places, which stay theirs as of those that are held.
+
+        Args:
+            records: (M, 4 * texels) float32.
+        """
+        global bytes_uploaded
+        places = self._free(len(splats_))
+        gone = self.owners[places]
+        gone = gone[gone >= 0]
+        self.places[gone] = -1
+        self.owners[places], self.places[splats_], self._drawn[places] = splats_, places, self._now
+        splats.copy_records(self._frame, self.texture, places, records)
+        bytes_uploaded += records.nbytes
+
+    def _free(self, count: int) -> np.ndarray:
+        """Places (M,), ascending: what was never used, then what was drawn longest ago."""
+        if self._filled + count <= len(self.owners):
+            self._filled += count
+            return np.arange(self._filled - count, self._filled, dtype=np.int32)
+        self._filled = len(self.owners)
+        return np.sort(np.argpartition(self._drawn, count - 1)[:count]).astype(np.int32)
+
+
+def record_texels(higher: int) -> int:
+    """How many texels of four floats a splat's record has: see :func:`read_records`."""
+    return -(-(14 + 3 * higher) // 4)
+
+
+def higher_of(cloud: bpy.types.PointCloud) -> int:
+    """How many coefficients beyond the first a cloud has, of whole degrees up to 4."""
+    count = 0
+    while count < splats.MOST_COEFFICIENTS and attributes.SH.format(count + 1) in cloud.attributes:
+        count += 1
+    return int((count + 1) ** 0.5) ** 2 - 1
+
+
+def read_pool(clouds: Sequence[bpy.types.PointCloud]) -> Resident:
+    """What choosing needs of the splats of point clouds, one cloud after the other."""
+    counts = [len(cloud.points) for cloud in clouds]
+    starts = [sum(counts[:i]) for i in range(len(counts))]
+    total = sum(counts)
+    means, areas = np.zeros((total, 3), np.float32), np.zeros(total, np.float32)
+    opacities = np.zeros(total, np.float32)
+    columns = {name: np.zeros(total, np.float32) for name in every_column()}
+    for cloud, start, count in zip(clouds, starts, counts, strict=True):
+        part = slice(start, start + count)
+        if not count:
+            continue
+        cloud.attributes["position"].data.foreach_get("vector", means[part].reshape(-1))
+        scales = attributes.view_attribute(cloud, attributes.SCALE)
+        assert scales is not None
+        areas[part] = np.einsum("ij,ij->i", scales, scales)
+        opacities[part] = attributes.view_attribute(cloud, attributes.BASE)[:, 3]
+        if (weights := attributes.read_attribute(cloud, attributes.WEIGHT)) is not None:
+            opacities[part] *= weights
+        for name, values in columns.items():
+            if (column := attributes.read_attribute(cloud, name)) is not None:
+                values[part] = column
+    pool = Pool(means, areas, opacities, columns)
+    return Resident(pool, starts, counts, max(map(higher_of, clouds), default=0))
+
+
+def read_records(cloud: bpy.types.PointCloud, rows: np.ndarray, higher: int) -> np.ndarray:
+    """What the shader needs of splats (M,) of a cloud, (M, 4 * texels) float32.
+
+    Mean, opacity, quaternion wxyz, standard deviations, and coefficients of the harmonics, three floats each.
+    Weights that modifiers have given splats are factors on their opacities.
+    """
+    if len(rows) and rows[-1] - rows[0] == len(rows) - 1:
+        rows = slice(rows[0], rows[-1] + 1)  # type: ignore[assignment]  # a view, not a copy
+    base = attributes.view_attribute(cloud, attributes.BASE)[rows]
+    records = np.zeros((len(base), 4 * record_texels(higher)), np.float32)
+    records[:, 0:3] = attributes.view_attribute(cloud, "position")[rows]
+    records[:, 3] = base[:, 3]
+    records[:, 4:8] = attributes.view_attribute(cloud, attributes.ROTATION)[rows]
+    records[:, 8:11] = attributes.view_attribute(cloud, attributes.SCALE)[rows]
+    records[:, 11:14] = base[:, :3]
+    for k in range(min(higher, higher_of(cloud))):
+        place = 14 + 3 * k
+        records[:, place : place + 3] = attributes.view_attribute(cloud, attributes.SH.format(k + 1))[rows]
+    if (weights := attributes.view_attribute(cloud, attributes.WEIGHT)) is not None:
+        records[:, 3] *= weights[rows]
+    return records

@@ -1,0 +1,78 @@
+"""Where training will look from, as the viewport shows it."""
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture
+def root(bpy, lodgs):
+    rng, bundle = np.random.default_rng(1), lodgs("training.splats.bundle")
+    count = 4000
+    splats = lodgs("training.splats.gaussians").Splats(
+        means=rng.normal((3, -2, 1), 0.7, (count, 3)).astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        log_scales=np.full((count, 3), -3, np.float32),
+        opacity_logits=np.float32(rng.choice([-3.0, 3.0], count)),
+        sh=np.zeros((count, 1, 3), np.float32),
+    )
+    with lodgs("data.scenes")._new_scene(bpy.context, "scene") as root:
+        lodgs("data.scenes").set_level(root, bundle.Level(1, splats))
+    bpy.context.view_layer.update()
+    return root, splats
+
+
+def test_it_is_the_dome_that_training_places(lodgs, root):
+    root, splats = root
+    viewpoints, settings = lodgs("data.viewpoints"), root.lodgs.training
+    settings.views = 10
+    views, shells = viewpoints.dome_of(root)
+    placed, _ = lodgs("training.scenes.viewpoints").dome(splats, 10)
+    assert len(views) == 10
+    middle = np.median(splats.means[splats.opacity_logits > 0], axis=0)
+    for view, truth in zip(views, placed, strict=True):
+        np.testing.assert_allclose(view.world_to_camera, truth.world_to_camera, atol=1e-6)
+        assert np.isclose(np.linalg.norm(view.center - middle), shells, rtol=1e-5).any()
+    settings.views = 12
+    assert len(viewpoints.dome_of(root)[0]) == 12
+
+
+def test_a_sample_of_many_splats_is_enough(lodgs, root, monkeypatch):
+    root, _ = root
+    viewpoints = lodgs("data.viewpoints")
+    _, shells = viewpoints.dome_of(root)
+    monkeypatch.setattr(viewpoints, "SAMPLE", 1000)
+    viewpoints._domes.clear()
+    assert np.allclose(viewpoints.dome_of(root)[1], shells, rtol=0.1)
+
+
+def test_pyramids_point_where_the_views_look(lodgs, root):
+    root, _ = root
+    views, _ = lodgs("data.viewpoints").dome_of(root)
+    ends = lodgs("viewport.frusta").lines(views, 0.5).reshape(len(views), 8, 2, 3)
+    for view, edges in zip(views, ends, strict=True):
+        np.testing.assert_allclose(edges[:4, 0], np.tile(view.center, (4, 1)), rtol=1e-6)
+        seen = edges[:4, 1] @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
+        pixels = seen[:, :2] / seen[:, 2:] * (view.fx, view.fy) + (view.cx, view.cy)
+        corners = [(0, 0), (view.width, 0), (view.width, view.height), (0, view.height)]
+        np.testing.assert_allclose(pixels, corners, atol=0.01)
+        np.testing.assert_allclose(seen[:, 2], 0.5, rtol=1e-4)
+        np.testing.assert_allclose(edges[4:, 0], edges[:4, 1])
+        np.testing.assert_allclose(edges[4:, 1], np.roll(edges[:4, 1], -1, axis=0))
+
+
+def test_they_are_drawn(bpy, lodgs, root, frame):
+    import gpu
+    from mathutils import Matrix
+
+    root, _ = root
+    root.lodgs.training.show_views = True
+
+    def draw():
+        with gpu.matrix.push_pop(), gpu.matrix.push_pop_projection():
+            gpu.matrix.load_identity()
+            gpu.matrix.load_projection_matrix(Matrix.Diagonal((0.1, 0.1, 0.01, 1)))
+            lodgs("viewport.frusta").draw(bpy.context.scene)
+
+    assert (frame(64, draw)[..., 0] > 0).sum() > 50
+    root.lodgs.training.show_views = False
+    assert not frame(64, draw).any()

@@ -1,0 +1,87 @@
+"""Views that stay near: chances by the formula, every view seen, the same from any step on."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from training.methods.walk import BLOCK, Walk
+
+CENTERS = np.random.default_rng(0).random((30, 3)) * (4, 1, 2)
+
+
+def by_the_formula(centers: np.ndarray, k: int, spread: float) -> np.ndarray:
+    """P(j | i) as a dense matrix, by sorting all distances."""
+    count = len(centers)
+    w = np.linalg.norm(centers[:, None] - centers, axis=2)
+    np.fill_diagonal(w, np.inf)
+    near = np.argsort(w, axis=1)[:, :k]
+    typical = np.median(np.take_along_axis(w, near, 1))
+    chances = np.zeros((count, count))
+    np.put_along_axis(chances, near, 1 / (np.take_along_axis(w, near, 1) + spread * typical), 1)
+    return chances / chances.sum(1, keepdims=True)
+
+
+@pytest.mark.parametrize(("k", "spread"), [(5, 1.0), (100, 0.2), (29, 5.0)])
+def test_what_follows_is_drawn_by_the_formula(k, spread):
+    """The chances themselves, and the walk's own counts by a chi-squared test at one in a thousand."""
+    walk = Walk(CENTERS, 3, neighbours=k, spread=spread)
+    truth = by_the_formula(CENTERS, min(k, 29), spread)
+    dense = np.zeros_like(truth)
+    np.put_along_axis(dense, walk.neighbours, walk.chances, 1)
+    np.testing.assert_allclose(dense, truth, atol=1e-12)
+    views = np.array([walk(step) for step in range(200 * BLOCK)]).reshape(-1, BLOCK)
+    counts = np.zeros_like(truth)
+    np.add.at(counts, (views[:, :-1].ravel(), views[:, 1:].ravel()), 1)
+    assert not counts[truth == 0].any()
+    expected = counts.sum(1, keepdims=True) * truth
+    possible = expected > 0
+    statistic = ((counts - expected)[possible] ** 2 / expected[possible]).sum()
+    assert statistic < chi2.ppf(0.999, possible.sum() - len(CENTERS))
+
+
+def test_it_stays_nearer_than_a_shuffle():
+    rng = np.random.default_rng(1)
+    centers = np.stack([np.linspace(0, 100, 400), rng.random(400), rng.random(400)], 1)
+    walk = Walk(centers, 0, neighbours=20)
+    views = np.array([walk(step) for step in range(20 * BLOCK)])
+    away = np.linalg.norm(np.diff(centers[views], axis=0), axis=1)
+    within = np.arange(1, len(views)) % BLOCK != 0
+    assert away[within].max() < 7 < np.mean(away[~within])
+
+
+def test_every_view_is_seen_and_begins_a_block_as_often_as_any_other():
+    walk = Walk(CENTERS, 1, neighbours=3)
+    first = [walk(block * BLOCK) for block in range(3 * len(CENTERS))]
+    for epoch in range(3):
+        assert sorted(first[30 * epoch : 30 * epoch + 30]) == list(range(30))
+    assert first[:30] != first[30:60]
+
+
+def test_a_step_depends_on_its_number_and_the_seed_alone():
+    steps = np.random.default_rng(2).permutation(5 * BLOCK)
+    walk, again = Walk(CENTERS, 7), Walk(CENTERS, 7)
+    views = [walk(step) for step in range(5 * BLOCK)]
+    assert [again(step) for step in steps] == [views[step] for step in steps]
+    other = Walk(CENTERS, 8)
+    assert [other(step) for step in range(5 * BLOCK)] != views
+
+
+def test_lengths_do_not_matter():
+    small, large = Walk(CENTERS, 7), Walk(1000 * CENTERS + 5, 7)
+    np.testing.assert_allclose(small.chances, large.chances, rtol=1e-9)
+    assert [small(step) for step in range(500)] == [large(step) for step in range(500)]
+
+
+@pytest.mark.parametrize("spread", [0.0, 1.0])
+def test_odd_places_of_cameras(spread):
+    """One camera; two; all in one place; rigs of six in each of many places."""
+    assert {Walk(np.zeros((1, 3)), 0, spread=spread)(step) for step in range(300)} == {0}
+    two = Walk(np.eye(3)[:2], 0, spread=spread)
+    assert [two(step) for step in range(4)] in ([0, 1, 0, 1], [1, 0, 1, 0])
+    together = Walk(np.zeros((40, 3)), 0, neighbours=8, spread=spread)
+    np.testing.assert_allclose(together.chances, 1 / 8)
+    rigs = Walk(np.repeat(CENTERS, 6, axis=0), 0, neighbours=10, spread=spread)
+    for walk in (together, rigs):
+        assert not (walk.neighbours == np.arange(len(walk.neighbours))[:, None]).any()
+        assert all(len(set(row)) == len(row) for row in walk.neighbours.tolist())
+        assert np.isfinite(walk.chances).all() and len({walk(step) for step in range(2000)}) > 20

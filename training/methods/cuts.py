@@ -1,0 +1,264 @@
+"""Cuts of point trees in fast memory: what a view needs of rows that lie elsewhere, kept while it is near."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..errors import LodgsError
+from .rows import STAGING, Rows
+from .schedules import due
+
+REUSE = 0.77, 2.0
+"""A cut is used again where the distance over that of its making is in here ("A LoD of Gaussians", Eq. 7)."""
+FLUSH_INTERVAL = 1000
+"""Steps after which everything goes back, so that no cut stays for good."""
+REDUCED = 0.8
+"""Share of the room that is taken after the least recently used has gone."""
+BESIDE = 25
+"""Bytes that are kept of each row beside its numbers."""
+
+Cut = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Told which (K,) of the groups asked for have to be cut, says the rows of each, one group's after the
+other's, (M,) int64, and how many each has, (K,)."""
+
+
+class CutCache:
+    """Rows in fast memory, in groups that come and go together: a group's is a cut of one point tree.
+
+    Changes stay here until a group goes, least recently used first, or everything is written back. Memory is
+    the budget and, of every row there is, 4 bytes. A group's rows are no other group's.
+
+    What a step sees depends on which cuts are here, so ``state_dict`` tells that, too.
+
+    Args:
+        rows: where rows are otherwise; only this object may change them.
+        groups: how many groups there are.
+        budget: bytes.
+        device: where records live; with a GPU ``rows`` are best pinned, in ordinary memory.
+        reuse: smallest and largest distance, over that of its making, for which a cut is used again.
+        flush_interval: steps, see :meth:`after`.
+        reduced: see REDUCED.
+
+    Attributes:
+        loaded: rows that have been brought in so far.
+        reused: rows that were there when they were asked for.
+    """
+
+    def __init__(
+        self,
+        rows: Rows,
+        groups: int,
+        budget: int,
+        device: torch.device | str = "cpu",
+        reuse: tuple[float, float] = REUSE,
+        flush_interval: int = FLUSH_INTERVAL,
+        reduced: float = REDUCED,
+    ) -> None:
+        self.rows, self.layout, self._device = rows, rows.layout, torch.device(device)
+        self._least, self._most = reuse
+        self._flush_interval, self._reduced = flush_interval, reduced
+        record = 4 * self.layout.width
+        self.capacity = budget // (record + BESIDE)
+        self._at_once = max(STAGING // record, 1)
+        self._records = torch.zeros(self.capacity, self.layout.width, device=self._device)
+        self.loaded = self.reused = 0
+        self._forget(groups)
+
+    def _forget(self, groups: int) -> None:
+        self._place = np.full(len(self.rows), -1, np.int32)  # of each row, where its record is; -1: not here
+        self._row = np.zeros(self.capacity, np.int64)  # of each record, which row it is
+        self._group = np.full(self.capacity, -1, np.int64)
+        self._dirty = np.zeros(self.capacity, bool)
+        self._free, self._room = np.arange(self.capacity)[::-1].copy(), self.capacity  # a stack of places
+        self._places: dict[int, np.ndarray] = {}  # of each group that is here
+        self._distance = np.full(groups, np.nan)
+        self._used = np.full(groups, -1)
+        self._clock = 0
+
+    def __len__(self) -> int:
+        """Rows that are here."""
+        return self.capacity - self._room
+
+    # -- a step ----------------------------------------------------------------------------------------
+
+    def reusable(self, groups: np.ndarray, distances: np.ndarray) -> np.ndarray:
+        """Which of some groups (G,) have a cut here that serves for these distances (G,)."""
+        made = self._distance[groups]
+        with np.errstate(invalid="ignore"):
+            return (distances >= self._least * made) & (distances <= self._most * made)
+
+    def take(self, groups: np.ndarray, distances: np.ndarray, cut: Cut) -> np.ndarray:
+        """Where the records of groups are, brought in where no cut of theirs serves.
+
+        Args:
+            groups: (G,) int64, each once.
+            distances: (G,) from the eye to the root of each.
+            cut: asked for the rows of those that are not here, or for another distance.
+
+        Returns:
+            (M,) int64 places, for :meth:`get` and :meth:`put`: group after group, each in its cut's order.
+
+        Raises:
+            LodgsError: there is no room for them all.
+            ValueError: a row is in two groups, or in one twice.
+        """
+        groups, distances = np.asarray(groups, np.int64), np.asarray(distances, np.float64)
+        known = self.reusable(groups, distances)
+        anew = np.flatnonzero(~known)
+        rows, counts = cut(anew) if len(anew) else (np.zeros(0, np.int64), np.zeros(0, np.int64))
+        there = sum(len(self._places[group]) for group in groups[known].tolist())
+        if there + len(rows) > self.capacity:
+            raise LodgsError(
+                f"A view needs {there + len(rows):,} splats at once; the memory budget has room for "
+                f"{self.capacity:,}.",
+                "Give more memory, or ask for coarser detail.",
+            )
+        self._clock += 1
+        self._used[groups] = self._clock
+        self.reused += there
+        if len(anew):
+            self._bring(groups[anew], np.asarray(rows, np.int64), np.asarray(counts, np.int64))
+        self._distance[groups[anew]] = distances[anew]
+        places = [self._places[group] for group in groups.tolist()]
+        return np.concatenate(places) if places else np.zeros(0, np.int64)
+
+    def rows_at(self, places: np.ndarray) -> np.ndarray:
+        """Which rows (M,) are at places (M,)."""
+        return self._row[places]
+
+    def get(self, places: np.ndarray) -> torch.Tensor:
+        """A copy of the records (M, width) at places (M,), on the device."""
+        return self._records.index_select(0, torch.from_numpy(places).to(self._device))
+
+    def put(self, places: np.ndarray, records: torch.Tensor) -> None:
+        """Puts records (M, width) at places (M,), each named once."""
+        self._records.index_copy_(0, torch.from_numpy(places).to(self._device), records)
+        self._dirty[places] = True
+
+    def after(self, step: int) -> None:
+        """To be called after every step: everything goes back where that is due."""
+        if due(self._flush_interval, step + 1):
+            self.clear()
+
+    # -- coming and going ------------------------------------------------------------------------------
+
+    def write_back(self) -> None:
+        """What has changed is written; all stays here."""
+        self._write(np.flatnonzero(self._dirty))
+
+    def clear(self, groups: int | None = None) -> None:
+        """Writes back, and keeps nothing.
+
+        Args:
+            groups: how many there are from now on.
+        """
+        self.write_back()
+        self._forget(len(self._used) if groups is None else groups)
+
+    def append(self, records: torch.Tensor, groups: int | None = None) -> None:
+        """Adds rows (M, width) at the end; nothing stays here."""
+        self.clear()
+        self.rows.append(records)
+        self._forget(len(self._used) if groups is None else groups)
+
+    def remove(self, rows: np.ndarray, groups: int | None = None) -> None:
+        """Removes rows; those behind close up in their order. Nothing stays here."""
+        self.clear()
+        self.rows.remove(rows)
+        self._forget(len(self._used) if groups is None else groups)
+
+    def _bring(self, groups: np.ndarray, rows: np.ndarray, counts: np.ndarray) -> None:
+        """Makes some groups consist of these rows; what they have in common with before stays."""
+        owners, places = np.repeat(groups, counts), self._place[rows]
+        here = places >= 0
+        coming, stays = rows[~here], places[here]
+        self._place[coming] = np.arange(len(coming), dtype=np.int32)
+        twice = not np.array_equal(self._place[coming], np.arange(len(coming)))
+        self._place[coming] = -1
+        if twice or (self._group[stays] != owners[here]).any() or len(np.unique(stays)) < len(stays):
+            raise ValueError("a row is in two groups, or in one twice")
+        self._group[stays] = -1
+        before = [self._places.pop(group) for group in groups.tolist() if group in self._places]
+        leaving = np.concatenate(before) if before else np.zeros(0, np.int64)
+        leaving = leaving[self._group[leaving] >= 0]
+        self._group[stays] = owners[here]
+        short = len(coming) - len(leaving) - self._room
+        if short > 0:
+            leaving = np.concatenate([leaving, *self._least_used(short)])
+        self._drop(leaving)
+        self._room -= len(coming)
+        room = self._free[self._room : self._room + len(coming)].copy()
+        for first in range(0, len(coming), self._at_once):
+            some = slice(first, first + self._at_once)
+            records = self.rows.read(coming[some]).to(self._device, non_blocking=True)
+            self._records.index_copy_(0, torch.from_numpy(room[some]).to(self._device), records)
+        self._place[coming], self._row[room] = room, coming
+        places[~here] = room
+        self._group[places] = owners
+        ends = np.cumsum(counts)
+        self._places |= zip(groups.tolist(), np.split(places.astype(np.int64), ends[:-1]), strict=True)
+        self.loaded += len(coming)
+        self.reused += len(stays)
+
+    def _least_used(self, short: int) -> list[np.ndarray]:
+        """The places of groups that go, so that so many are free, and some more; none that are in use now."""
+        others = np.array([g for g in self._places if self._used[g] < self._clock], np.int64)
+        others = others[np.lexsort((others, self._used[others]))]
+        sizes = np.cumsum([len(self._places[group]) for group in others.tolist()])
+        enough = short + int((1 - self._reduced) * self.capacity)
+        many = min(int(np.searchsorted(sizes, enough)) + 1, len(others))
+        self._distance[others[:many]] = np.nan
+        return [self._places.pop(group) for group in others[:many].tolist()]
+
+    def _drop(self, places: np.ndarray) -> None:
+        self._write(places[self._dirty[places]])
+        self._place[self._row[places]] = -1
+        self._group[places] = -1
+        self._free[self._room : self._room + len(places)] = places
+        self._room += len(places)
+
+    def _write(self, places: np.ndarray) -> None:
+        """Writes back the records at places, in the order of their rows."""
+        places = places[np.argsort(self._row[places])]
+        for first in range(0, len(places), self._at_once):
+            some = places[first : first + self._at_once]
+            self.rows.write(self._row[some], self.get(some).cpu())
+            self._dirty[some] = False
+
+    # -- what lasts ------------------------------------------------------------------------------------
+
+    def state_dict(self) -> dict[str, Any]:
+        """A checkpoint of the rows, see ``FileRows.state_dict``, and which of them are here."""
+        self.write_back()
+        groups = sorted(self._places)
+        places = [self._places[group] for group in groups]
+        return {
+            "rows": self.rows.state_dict(),
+            "groups": torch.tensor(groups, dtype=torch.int64),
+            "counts": torch.tensor([len(each) for each in places], dtype=torch.int64),
+            "here": torch.from_numpy(self._row[np.concatenate(places)] if places else np.zeros(0, np.int64)),
+            "distance": torch.from_numpy(self._distance.copy()),
+            "used": torch.from_numpy(self._used.copy()),
+            "clock": self._clock,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Goes on from what ``state_dict`` gave.
+
+        Raises:
+            ValueError: the rows cannot be read, or there are more groups' here than there is room for.
+        """
+        self.rows.load_state_dict(state["rows"])
+        groups, counts, here, distance, used = (
+            state[name].cpu().numpy().copy() for name in ("groups", "counts", "here", "distance", "used")
+        )
+        if len(here) > self.capacity:
+            raise ValueError("its cache has no room in the memory budget")
+        self._forget(len(used))
+        if len(groups):
+            self._bring(groups, here, counts)
+        self._distance, self._used, self._clock = distance, used, state["clock"]

@@ -1,0 +1,456 @@
+"""Rows of numbers outside memory: splats with their moments in one file of a run, read and written in parts.
+
+The file consists of slots that hold a block of rows each, and a table says which slot each block is in. What
+a checkpoint has is never overwritten: the first time that a block is written after one, it goes to another
+slot, and a checkpoint is the table alone, with a checksum of each block, kept in what ``checkpoints`` writes
+by rename. So it costs what has changed since the last one, and whatever ends a trainer, a full disk too,
+leaves every checkpoint as it was.
+
+The file is read and written by explicit calls, not mapped: a mapped page counts as the process's own memory
+for as long as the system leaves it there, and a failing disk would end the process by a signal.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import zlib
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from io import FileIO
+from itertools import pairwise
+from math import prod
+from pathlib import Path
+from typing import Any, Protocol
+from uuid import uuid4
+
+import numpy as np
+import torch
+
+from ..errors import LodgsError
+
+BLOCK = 64
+"""Rows of a block."""
+STAGING = 4 << 20
+"""Bytes of blocks that are between file and tensors at a time; in up to six copies, all told."""
+KEPT = 2
+"""Checkpoints before the newest one whose blocks stay: a run has as many, the newest may not be whole yet."""
+
+_NAME = re.compile(r"rows_[0-9a-f]{8}\.bin")
+
+
+class Layout:
+    """What a row holds: arrays by name, one after the other, float32.
+
+    Attributes:
+        shapes: of each array of a row; () for a number.
+        width: numbers of a row.
+    """
+
+    def __init__(self, shapes: Mapping[str, tuple[int, ...]]) -> None:
+        self.shapes = {name: tuple(shape) for name, shape in shapes.items()}
+        self.width = sum(map(prod, self.shapes.values()))
+
+    def split(self, records: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Views of records (M, width), by name: (M, ...)."""
+        parts = records.split([prod(shape) for shape in self.shapes.values()], dim=1)
+        shapes = zip(self.shapes.items(), parts, strict=True)
+        return {name: part.unflatten(1, shape) if shape else part[:, 0] for (name, shape), part in shapes}
+
+    def join(self, tensors: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """Records (M, width) of tensors (M, ...) by name."""
+        return torch.cat([tensors[name].reshape(len(tensors[name]), -1) for name in self.shapes], 1)
+
+
+class Rows(Protocol):
+    """Rows that are read and written by their numbers, wherever they are."""
+
+    layout: Layout
+
+    def __len__(self) -> int: ...
+
+    def read(self, rows: np.ndarray) -> torch.Tensor:
+        """Records (M, width) at rows (M,) int64, in any order, on the CPU."""
+        ...
+
+    def write(self, rows: np.ndarray, records: torch.Tensor) -> None:
+        """Puts records (M, width) at rows (M,) int64, each named once, in any order."""
+
+    def append(self, records: torch.Tensor) -> None:
+        """Adds rows (M, width) at the end."""
+
+    def remove(self, rows: np.ndarray) -> None:
+        """Removes rows (M,), each named once; those behind close up in their order."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """A checkpoint, as ``torch.load(weights_only=True)`` reads it."""
+        ...
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Becomes what ``state_dict`` gave."""
+
+
+class MemoryRows:
+    """Rows in ordinary memory, pinned where a GPU takes them from there."""
+
+    def __init__(self, layout: Layout, pinned: bool = False) -> None:
+        self.layout, self._pinned = layout, pinned
+        self._records = torch.zeros(0, layout.width)
+
+    def __len__(self) -> int:
+        return len(self._records)
+
+    def read(self, rows: np.ndarray) -> torch.Tensor:
+        """Records (M, width) at rows (M,)."""
+        found = torch.empty(len(rows), self.layout.width, pin_memory=self._pinned)
+        return torch.index_select(self._records, 0, torch.from_numpy(_checked(rows, len(self))), out=found)
+
+    def write(self, rows: np.ndarray, records: torch.Tensor) -> None:
+        """Puts records (M, width) at rows (M,), each named once."""
+        self._records[torch.from_numpy(_checked(rows, len(self)))] = records
+
+    def append(self, records: torch.Tensor) -> None:
+        """Adds rows at the end."""
+        self._keep(torch.cat([self._records, records]))
+
+    def remove(self, rows: np.ndarray) -> None:
+        """Removes rows; those behind close up in their order."""
+        mask = torch.ones(len(self), dtype=torch.bool)
+        mask[torch.from_numpy(_checked(rows, len(self)))] = False
+        self._keep(self._records[mask])
+
+    def state_dict(self) -> dict[str, Any]:
+        """All rows."""
+        return {"records": self._records}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Becomes what ``state_dict`` gave."""
+        self._keep(state["records"].clone())
+
+    def _keep(self, records: torch.Tensor) -> None:
+        self._records = records.pin_memory() if self._pinned else records
+
+
+class FileRows:
+    """Rows in a file of a folder; in memory are 17 bytes for each block of them.
+
+    For one thread. Where a write fails, what it was to replace may be lost: nothing more is read or written
+    then, and a run goes on from its last checkpoint.
+
+    Args:
+        folder: where the file is made, when first written to, under a name of its own.
+        block: rows that are read and written together at least.
+        staging: bytes, see STAGING.
+    """
+
+    def __init__(self, folder: Path, layout: Layout, block: int = BLOCK, staging: int = STAGING) -> None:
+        self.layout, self._folder, self._block = layout, folder, block
+        self._blocks_at_once = max(staging // (4 * layout.width * block), 1)
+        self._file: FileIO | None = None
+        self._broken: LodgsError | None = None
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        self._count, self._size = 0, 0  # rows, and slots that the file has
+        self._slots = np.zeros(0, np.int64)  # of each block; -1: all zeros, in none
+        self._checks = np.zeros(0, np.int64)  # CRC-32 of each block
+        self._fresh = np.zeros(0, bool)  # whether it has been written since the last checkpoint
+        self._free = np.zeros(0, np.int64)  # slots that nobody needs
+        self._retiring: list[np.ndarray] = []  # slots of the last checkpoint that have been replaced since
+        self._retired: deque[np.ndarray] = deque()  # the same of the checkpoints before it, oldest first
+
+    def __len__(self) -> int:
+        return self._count
+
+    # -- rows ------------------------------------------------------------------------------------------
+
+    def read(self, rows: np.ndarray) -> torch.Tensor:
+        """Records (M, width) at rows (M,) int64, in any order, on the CPU.
+
+        Raises:
+            LodgsError: the file cannot be read.
+        """
+        self._require_whole()
+        rows = _checked(rows, self._count)
+        found = np.zeros((len(rows), self.layout.width), np.float32)
+        slots = self._slots[rows // self._block]
+        there = np.flatnonzero(slots >= 0)
+        self._read_places(slots[there] * self._block + rows[there] % self._block, there, found)
+        return torch.from_numpy(found)
+
+    def write(self, rows: np.ndarray, records: torch.Tensor) -> None:
+        """Puts records (M, width) at rows (M,) int64, each named once, in any order.
+
+        Raises:
+            LodgsError: the disk is full, or the file cannot be written.
+            ValueError: a row is named twice.
+        """
+        self._require_whole()
+        rows = _checked(rows, self._count)
+        order = np.argsort(rows)
+        rows = rows[order]
+        if (np.diff(rows) == 0).any():
+            raise ValueError("a row is written twice")
+        values = records.detach().numpy()
+        blocks, begins = np.unique(rows // self._block, return_index=True)
+        ends = np.append(begins[1:], len(rows))
+        for first in range(0, len(blocks), self._blocks_at_once):
+            some = slice(first, first + self._blocks_at_once)
+            part = slice(begins[some][0], ends[some][-1])
+            self._write_blocks(blocks[some], (ends - begins)[some], rows[part], values[order[part]])
+
+    def append(self, records: torch.Tensor) -> None:
+        """Adds rows (M, width) at the end.
+
+        Raises:
+            LodgsError: as :meth:`write`.
+        """
+        begin, self._count = self._count, self._count + len(records)
+        more = -(-self._count // self._block) - len(self._slots)
+        self._slots = np.append(self._slots, np.full(more, -1))
+        self._checks = np.append(self._checks, np.zeros(more, np.int64))
+        self._fresh = np.append(self._fresh, np.zeros(more, bool))
+        self.write(np.arange(begin, self._count), records)
+
+    def remove(self, rows: np.ndarray) -> None:
+        """Removes rows (M,), each named once; those behind close up in their order.
+
+        Raises:
+            LodgsError: as :meth:`write`.
+        """
+        gone = np.sort(_checked(rows, self._count))
+        if not len(gone):
+            return
+        if (np.diff(gone) == 0).any():
+            raise ValueError("a row is removed twice")
+        to, at_once = int(gone[0]), self._blocks_at_once * self._block
+        for begin in range(to, self._count, at_once):
+            some = np.arange(begin, min(begin + at_once, self._count))
+            left = some[gone[np.searchsorted(gone, some).clip(max=len(gone) - 1)] != some]
+            self.write(np.arange(to, to + len(left)), self.read(left))
+            to += len(left)
+        self._count = to
+        blocks = -(-to // self._block)
+        self._release(self._slots[blocks:], self._fresh[blocks:])
+        self._slots, self._checks, self._fresh = (
+            column[:blocks].copy() for column in (self._slots, self._checks, self._fresh)
+        )
+
+    # -- checkpoints -----------------------------------------------------------------------------------
+
+    def state_dict(self) -> dict[str, Any]:
+        """A checkpoint, for the file that is then written; what it tells of is on the disk.
+
+        Call it for nothing else: after three further calls slots of this one are used again.
+
+        Raises:
+            LodgsError: the disk does not take it.
+        """
+        self._require_whole()
+        with self._telling():
+            if self._file is not None:
+                os.fsync(self._file.fileno())
+        self._retired.append(_joined(self._retiring))
+        self._retiring = []
+        while len(self._retired) > KEPT:
+            self._free = np.sort(np.append(self._free, self._retired.popleft()))
+            self._remove_others()
+        self._fresh[:] = False
+        return {
+            "file": "" if self._file is None else Path(str(self._file.name)).name,
+            "count": self._count,
+            "block": self._block,
+            "shapes": {name: list(shape) for name, shape in self.layout.shapes.items()},
+            "slots": torch.from_numpy(self._slots.copy()),
+            "checks": torch.from_numpy(self._checks.copy()),
+            "retired": [torch.from_numpy(slots) for slots in self._retired],
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Goes on from a checkpoint, all of which is read once to be sure of it.
+
+        Raises:
+            ValueError: the file is not there, is damaged, or is not of such rows.
+        """
+        self.discard()
+        shapes = {name: tuple(shape) for name, shape in state["shapes"].items()}
+        if shapes != self.layout.shapes or state["block"] != self._block:
+            raise ValueError("its rows are of another kind")
+        self._count = state["count"]
+        self._slots, self._checks = (state[name].cpu().numpy().copy() for name in ("slots", "checks"))
+        self._retired = deque(slots.cpu().numpy().copy() for slots in state["retired"])
+        self._fresh = np.zeros(len(self._slots), bool)
+        if not (0 <= self._count <= len(self._slots) * self._block and len(self._slots) == len(self._checks)):
+            raise ValueError("its table of rows is damaged")
+        if state["file"]:
+            if not _NAME.fullmatch(state["file"]):
+                raise ValueError("its file of rows has an impossible name")
+            path = self._folder / state["file"]
+            if path.is_symlink() or not path.is_file():
+                raise ValueError(f"{path.name} is missing")
+            self._open(path)
+        self._verify()
+        taken = np.concatenate([self._slots[self._slots >= 0], *self._retired])
+        self._free = np.setdiff1d(np.arange(self._size), taken)
+
+    def close(self) -> None:
+        """Closes the file."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def discard(self) -> None:
+        """Forgets all rows; a file that no checkpoint tells of is removed."""
+        if self._file is not None:
+            path, unknown = Path(str(self._file.name)), not self._retired
+            self.close()
+            if unknown:
+                path.unlink(missing_ok=True)
+        self._broken = None
+        self._begin_anew()
+
+    def _verify(self) -> None:
+        if (self._slots >= self._size).any() or (self._slots < -1).any():
+            raise ValueError("its file of rows is cut short")
+        there = np.flatnonzero(self._slots >= 0)
+        there = there[np.argsort(self._slots[there])]
+        for first in range(0, len(there), self._blocks_at_once):
+            some = there[first : first + self._blocks_at_once]
+            found = np.empty((len(some), self._block, self.layout.width), np.float32)
+            self._read_slots(self._slots[some], np.arange(len(some)), found)
+            if (_checksums(found) != self._checks[some]).any():
+                raise ValueError("its file of rows is damaged")
+
+    def _remove_others(self) -> None:
+        """Removes files that earlier lives of the run have left."""
+        for path in self._folder.glob("rows_*.bin"):
+            if _NAME.fullmatch(path.name) and (
+                self._file is None or path.name != Path(str(self._file.name)).name
+            ):
+                with suppress(OSError):
+                    path.unlink()
+
+    # -- blocks ----------------------------------------------------------------------------------------
+
+    def _write_blocks(self, blocks: np.ndarray, given: np.ndarray, rows: np.ndarray, values: np.ndarray):
+        """Writes blocks (B,), of which ``given`` (B,) rows each are new: ``rows`` (M,), ascending."""
+        buffer = np.zeros((len(blocks), self._block, self.layout.width), np.float32)
+        held = np.minimum(self._count - blocks * self._block, self._block)
+        before, fresh = self._slots[blocks], self._fresh[blocks]
+        old = np.flatnonzero((given < held) & (before >= 0))
+        self._read_slots(before[old], old, buffer)
+        buffer[np.searchsorted(blocks, rows // self._block), rows % self._block] = values
+        slots = before.copy()
+        slots[~fresh] = self._new_slots(int((~fresh).sum()))
+        order = np.argsort(slots)
+        with self._telling():
+            file = self._file or self._open(self._folder / f"rows_{uuid4().hex[:8]}.bin", new=True)
+            for run in _runs(slots[order]):
+                some = order[run]
+                file.seek(int(slots[some[0]]) * buffer[0].nbytes)
+                _write(file, buffer[some])
+        self._slots[blocks], self._checks[blocks], self._fresh[blocks] = slots, _checksums(buffer), True
+        self._release(before[~fresh], np.zeros(int((~fresh).sum()), bool))
+
+    def _new_slots(self, count: int) -> np.ndarray:
+        """Slots that nobody needs, ascending; at the end of the file where there are no others."""
+        found, self._free = self._free[:count], self._free[count:]
+        end = np.arange(self._size, self._size + count - len(found))
+        self._size += len(end)
+        return np.append(found, end)
+
+    def _release(self, slots: np.ndarray, fresh: np.ndarray) -> None:
+        """Gives slots up: those that no checkpoint has at once, others when their checkpoints are gone."""
+        if fresh.any():
+            self._free = np.sort(np.append(self._free, slots[fresh]))
+        self._retiring.append(slots[~fresh & (slots >= 0)])
+
+    def _read_slots(self, slots: np.ndarray, to: np.ndarray, found: np.ndarray) -> None:
+        """Reads the blocks in slots (B,) to places ``to`` (B,) among blocks ``found`` (., block, width)."""
+        inside = np.arange(self._block)
+        places, to = ((each[:, None] * self._block + inside).ravel() for each in (slots, to))
+        self._read_places(places, to, found.reshape(-1, self.layout.width))
+
+    def _read_places(self, places: np.ndarray, to: np.ndarray, found: np.ndarray) -> None:
+        """Reads the rows at places (M,), counted through all slots, to rows ``to`` (M,) of ``found``."""
+        order = np.argsort(places)
+        places, to, width = places[order], to[order], self.layout.width
+        with self._telling():
+            for run in _runs(places // self._block, places // (self._blocks_at_once * self._block)):
+                first, last = int(places[run.start]), int(places[run.stop - 1])
+                part = np.empty((last - first + 1, width), np.float32)
+                assert self._file is not None, "where a block has a slot there is a file"
+                self._file.seek(first * 4 * width)
+                _read(self._file, part)
+                found[to[run]] = part[places[run] - first]
+
+    # -- the file --------------------------------------------------------------------------------------
+
+    def _open(self, path: Path, new: bool = False) -> FileIO:
+        self._file = file = open(path, "x+b" if new else "r+b", buffering=0)  # noqa: SIM115
+        self._size = max(self._size, os.fstat(file.fileno()).st_size // self._block_bytes)
+        return file
+
+    @property
+    def _block_bytes(self) -> int:
+        return 4 * self.layout.width * self._block
+
+    def _require_whole(self) -> None:
+        if self._broken is not None:
+            raise self._broken
+
+    @contextmanager
+    def _telling(self) -> Iterator[None]:
+        """What goes wrong with the file is a LodgsError, then and later."""
+        try:
+            yield
+        except OSError as error:
+            place = self._folder if self._file is None else self._file.name
+            self._broken = LodgsError(
+                f"{place} could not be read or written: {error.strerror or error}.",
+                "Free some space there or choose another folder, then resume the run.",
+            )
+            raise self._broken from error
+
+
+def _checked(rows: np.ndarray, count: int) -> np.ndarray:
+    rows = np.asarray(rows, np.int64)
+    if len(rows) and (rows.min() < 0 or rows.max() >= count):
+        raise IndexError(f"rows from {rows.min()} to {rows.max()}, there are {count}")
+    return rows
+
+
+def _joined(arrays: list[np.ndarray]) -> np.ndarray:
+    return np.concatenate(arrays) if arrays else np.zeros(0, np.int64)
+
+
+def _runs(numbers: np.ndarray, cells: np.ndarray | None = None) -> list[slice]:
+    """Where ascending numbers (M,) follow each other without a gap, and without leaving a cell."""
+    if not len(numbers):
+        return []
+    breaks = np.diff(numbers) > 1
+    if cells is not None:
+        breaks |= np.diff(cells) > 0
+    borders = [0, *(np.flatnonzero(breaks) + 1).tolist(), len(numbers)]
+    return [slice(*ends) for ends in pairwise(borders)]
+
+
+def _checksums(blocks: np.ndarray) -> np.ndarray:
+    """CRC-32 of each block."""
+    return np.array([zlib.crc32(block) for block in blocks], np.int64).reshape(len(blocks))
+
+
+def _read(file: FileIO, array: np.ndarray) -> None:
+    left = array.data.cast("B")
+    while left:
+        got = file.readinto(left)
+        if not got:
+            raise OSError("it is cut short")
+        left = left[got:]
+
+
+def _write(file: FileIO, array: np.ndarray) -> None:
+    left = np.ascontiguousarray(array).data.cast("B")
+    while left:
+        left = left[file.write(left) :]
