@@ -12,7 +12,7 @@ PYTEST := -m pytest -n auto
 quick test test-5.0 fuzz: export OMP_NUM_THREADS := 1  # torch's threads would come on top of the workers
 export LODGS_TRAINER_PYTHON := $(CURDIR)/$(VENV)
 
-.PHONY: help setup demo check quick test test-5.0 fuzz attacks lint docs tables bench bench-quality bench-lod extension pins \
+.PHONY: help setup demo check quick test test-5.0 fuzz attacks lint docs tables bench bench-quality bench-lod bench-tree extension pins \
 	window interop clean
 
 help:
@@ -27,6 +27,7 @@ help:
 	@echo "make bench      how fast it is, as ratios from one run"
 	@echo "make bench-quality  PSNR and veil against seconds, all methods (SCENES=\"DIR ...\", BASE=another checkout)"
 	@echo "make bench-lod  levels and chunks on a town of 3 million splats (over an hour the first time; STAGES=\"town lodge others table\")"
+	@echo "make bench-tree cuts of trees of up to 10 million nodes (some minutes)"
 	@echo "make extension  dist/lodgs-VERSION.zip, checked by Blender"
 	@echo "make pins       requirements/*.txt anew from requirements/*.in (UPGRADE=1 takes the newest of what these leave open)"
 	@echo "make window     a tour in a real Blender window, with pictures (METHOD=flod; needs Blender, Xvfb, ImageMagick)"
@@ -79,6 +80,9 @@ bench-quality: setup
 
 bench-lod: setup
 	$(VENV) tools/bench_lod.py $(STAGES)
+
+bench-tree: setup
+	$(VENV) tools/bench_tree.py
 
 extension: setup
 	$(VENV) tools/extension.py

@@ -32,8 +32,8 @@ class Hspt:
         means: (2N - 1, 3) float32 of all nodes.
         sizes: (2N - 1,) float32, saturated (``Tree.sizes``).
         log_scales: (2N - 1, 3) float32.
-        longest: most leaves below the root of a list; 0: the square root of the number of nodes, so that
-            the upper tree and the lists are about as long.
+        longest: most leaves below the root of a list; 0: half the square root of the number of nodes, so
+            that the upper tree and a list are about as long.
 
     Attributes:
         lists: how many there are.
@@ -51,7 +51,7 @@ class Hspt:
             below[layer] = below[one] + below[other]
             for bound, extreme in ((low, np.minimum), (high, np.maximum), (reach, np.maximum)):
                 bound[layer] = extreme(bound[layer], extreme(bound[one], bound[other]))
-        in_lists = below <= (longest or math.isqrt(count))
+        in_lists = below <= (longest or max(math.isqrt(count) // 2, 1))
         # what is walked: the upper tree, and the roots of lists, whose children are in the lists
         root = tree.parents < 0
         walked = np.flatnonzero(~in_lists | root | ~in_lists[tree.parents]).astype(np.int32)[::-1]
@@ -74,10 +74,9 @@ class Hspt:
         ends[roots] = np.cumsum(counts)
         begins[roots] = ends[roots] - counts
         self.lists = len(roots)
-        middles = (low[walked].astype(np.float64) + high[walked]) / 2
-        radii = np.linalg.norm(high[walked].astype(np.float64) - low[walked], axis=1) / 2
-        spheres = np.concatenate([middles, radii[:, None], reach[walked, None]], axis=1)
-        self._walked = walked, children, balls[walked], spheres, begins, ends
+        least, most = low[walked].astype(np.float64), high[walked].astype(np.float64)
+        boxes = np.concatenate([(least + most) / 2, (most - least) / 2, reach[walked, None]], axis=1)
+        self._walked = walked, children, balls[walked], boxes, begins, ends
         pairs = tree.children[entries - leaves]
         families = np.concatenate([balls[entries], balls[pairs].reshape(-1, 8)], axis=1)
         self._lists = pairs, families
@@ -98,7 +97,7 @@ class Hspt:
             image: as of :func:`image_of`; None: nothing is left out.
         """
         eye, detail = np.asarray(eye, np.float32), f32(k)
-        image = np.zeros((0, 7)) if image is None else image
+        image = np.zeros((0, 6)) if image is None else image
         nodes = np.empty(len(self._walked[0]), np.int32)
         parts = np.empty((self.lists, 4), np.int64)
         counts = np.zeros(2, np.int64)
@@ -115,21 +114,20 @@ class Hspt:
 
 
 def image_of(camera: Camera, near: float) -> np.ndarray:
-    """(5, 7) float64: what ``lod.blocks.Blocks.in_view`` asks of a sphere, one border of the image a row.
+    """(5, 6) float64: what ``lod.blocks.Blocks.in_view`` asks, here of a box, one border of the image a row.
 
-    (n, c, r, s, p): out of the image is where n · middle + c > r radius + s reach + p depth, depth that of
-    the sphere's far end. The first row is the near plane, and has the near depth as p.
+    (n, c, s, p): out of the image is where n · middle + c > |n| · half + s reach + p depth, depth that of the
+    box's far end. The first row is the near plane, and has the near depth as p.
     """
     turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
-    rows = [(*-turn[2], near - shift[2], 1.0, 0.0, near)]
+    rows = [(*-turn[2], near - shift[2], 0.0, near)]
     for axis, focal, least, most in (
         (0, camera.fx, -camera.cx, camera.width - camera.cx),
         (1, camera.fy, -camera.cy, camera.height - camera.cy),
     ):
         for sign, border in ((1, most / focal), (-1, -least / focal)):
             normal, offset = (sign * part[axis] - border * part[2] for part in (turn, shift))
-            spread = math.hypot(1, border), math.hypot(1, SLANT * border), PIXELS / focal
-            rows.append((*normal, offset, *spread))
+            rows.append((*normal, offset, math.hypot(1, SLANT * border), PIXELS / focal))
     return np.array(rows)
 
 
@@ -141,26 +139,35 @@ def _fine(balls, i, first, eye, k):
 
 
 @inlined(STRICT)
-def _in_image(sphere, image):
-    if not len(image):
-        return True
-    x, y, z, radius, reach = sphere[0], sphere[1], sphere[2], sphere[3], sphere[4]
+def _in_image(box, image):
     depth = 0.0
     for i in range(len(image)):
         row = image[i]
-        away = row[0] * x + row[1] * y + row[2] * z + row[3]
+        away, room = row[3], 0.0
+        for axis in range(3):
+            away += row[axis] * box[axis]
+            room += abs(row[axis]) * box[3 + axis]
         if i == 0:
-            depth = max(radius - away + row[6], 0.0)
-            room = radius
+            depth = max(room - away + row[5], 0.0)
         else:
-            room = row[4] * radius + row[5] * reach + row[6] * depth
+            room += row[4] * box[6] + row[5] * depth
         if away > room:
             return False
     return True
 
 
+@inlined(STRICT)
+def _distance(box, eye):
+    """From an eye to a box, 0 within."""
+    squares = 0.0
+    for axis in range(3):
+        away = max(abs(np.float64(eye[axis]) - box[axis]) - box[3 + axis], 0.0)
+        squares += away * away
+    return np.sqrt(squares)
+
+
 @kernel(STRICT)
-def _walk(walked, children, balls, spheres, begins, ends, families, eye, k, image, nodes, parts, counts):
+def _walk(walked, children, balls, boxes, begins, ends, families, eye, k, image, nodes, parts, counts):
     """From the root, which is the first, down the upper tree: nodes to draw, and parts of lists to search."""
     count, used, top = 0, 0, 1
     stack = np.empty(len(walked) + 1, np.int32)
@@ -168,7 +175,7 @@ def _walk(walked, children, balls, spheres, begins, ends, families, eye, k, imag
     while top:
         top -= 1
         i = stack[top]
-        if not _in_image(spheres[i], image):
+        if not _in_image(boxes[i], image):
             continue
         if _fine(balls, i, 0, eye, k):
             nodes[count] = walked[i]
@@ -177,9 +184,7 @@ def _walk(walked, children, balls, spheres, begins, ends, families, eye, k, imag
             stack[top], stack[top + 1] = children[i, 1], children[i, 0]
             top += 2
         else:
-            x, y, z = spheres[i, 0] - eye[0], spheres[i, 1] - eye[1], spheres[i, 2] - eye[2]
-            nearest = np.sqrt(x * x + y * y + z * z) - spheres[i, 3]
-            least = nearest * (1 - SLACK) / k
+            least = _distance(boxes[i], eye) * (1 - SLACK) / k
             low, high = begins[i], ends[i]
             while low < high:  # sizes fall
                 middle = (low + high) // 2

@@ -1,4 +1,4 @@
-"""A LoD of Gaussians' rule (Anonymous 2025, Sec. 4.3): a cut through a tree of splats, node by node."""
+"""A LoD of Gaussians' rule (Windisch et al. 2026, Sec. 4.3): a cut through a tree of splats, node by node."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A LoD of Gaussians (Anonymous 2025): a tree over splats, whose cuts are trained and drawn."""
+"""A LoD of Gaussians (Windisch et al. 2026): a tree over splats, whose cuts are trained and drawn."""
 
 from dataclasses import dataclass, replace
 

@@ -1,4 +1,4 @@
-"""A LoD of Gaussians (2025): a tree over a finished model, whose cuts are then trained.
+"""A LoD of Gaussians (Windisch et al. 2026): a tree over a finished model, whose cuts are then trained.
 
 The leaves are a base, or 3DGS in the first steps. One step builds the tree; in those after it every view
 draws its cut, a little coarser at random (A.6, "Varying level of detail"), and moves the nodes of this cut
@@ -13,11 +13,14 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from ...lod.paging import table_of_pages
+from ...lod.streaming import BLOCKS
 from ...lod.tree import LEAVES, Tree, treeless_columns
 from ...rasterize import Target
 from ...rasterize.hspt import Hspt
 from ...splats.bundle import Level
 from ...splats.gaussians import Splats
+from ...splats.ply import Columns
 from ..data import TrainingView
 from ..method import Drawing
 from ..refining import Refining
@@ -72,6 +75,13 @@ class Method(Refining):
             splats.extras |= treeless_columns(len(splats))
             return [Level(LEAVES, splats)]
         return []
+
+    def tables(self) -> dict[str, Columns]:
+        """Which blocks of rows an eye needs, by which a part of the file can be read."""
+        if self.tree is None:
+            return {}
+        levels = self.tree.levels(self.model.splats())
+        return {BLOCKS: table_of_pages({level.number: level.splats.extras for level in levels})}
 
     # -- a step ----------------------------------------------------------------------------------------
 

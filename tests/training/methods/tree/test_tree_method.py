@@ -126,6 +126,16 @@ def test_training_draws_what_the_bundle_shows(data, base):
             torch.testing.assert_close(one.detach(), other, atol=2e-5, rtol=1e-4)
 
 
+def test_a_bundle_tells_which_blocks_an_eye_needs(data, base):
+    tree = make(data, base, tune_steps=0)
+    assert tree.tables() == {}
+    levels = trained(tree)
+    table = tree.tables()["blocks"]
+    assert table["level"].tolist() == [1, 2]  # of fewer than 512 rows each
+    for row, level in enumerate(levels):
+        assert table["parent_size"][row] == level.splats.extras["parent_size"].max()
+
+
 def test_noise_is_coarser_most_at_its_end(data, base):
     tree = make(data, base, pixels=2.0)
     found = np.array([tree._pixels(step) for step in range(4000)])
