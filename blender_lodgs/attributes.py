@@ -74,6 +74,6 @@ def view_attribute(cloud: bpy.types.PointCloud | bpy.types.Mesh, name: str) -> n
     if not len(data) or data[last].as_pointer() - start != size * last:  # no such array
         return read_attribute(cloud, name)
     memory = (ctypes.c_byte * (size * len(data))).from_address(start)
-    values = np.frombuffer(memory, layout.dtype)
+    values = np.frombuffer(memory, np.dtype(layout.dtype))
     values.flags.writeable = False
     return values if layout.width == 1 else values.reshape(-1, layout.width)
