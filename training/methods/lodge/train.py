@@ -23,7 +23,7 @@ from ..data import TrainingView
 from ..density import require_rows
 from ..method import Drawing
 from ..model import NAMES
-from ..refining import Refining
+from ..threedgs.refining import Refining
 from . import ROUNDS, LodgeParameters, chunks
 from .composite import (
     IndexedLevel,

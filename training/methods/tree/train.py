@@ -23,9 +23,9 @@ from ...splats.gaussians import Splats
 from ...splats.ply import Columns
 from ..data import TrainingView
 from ..method import Drawing
-from ..refining import Refining
 from ..schedules import due
 from ..start import from_splats
+from ..threedgs.refining import Refining
 from . import TreeParameters
 from .build import build
 

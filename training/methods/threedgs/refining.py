@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import torch
 
-from ..lod.blocks import spatial_order
-from ..rasterize import Adam, Gaussians
-from ..splats.gaussians import Splats
-from .data import TrainingView
-from .method import Drawing
-from .start import from_splats
-from .threedgs import train as threedgs_train
+from ...lod.blocks import spatial_order
+from ...rasterize import Adam, Gaussians
+from ...splats.gaussians import Splats
+from ..data import TrainingView
+from ..method import Drawing
+from ..start import from_splats
+from . import train as threedgs_train
 
 
 class SeenRows:
