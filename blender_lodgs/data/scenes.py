@@ -17,7 +17,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...training.errors import LodgsError
-from ...training.lod.paging import read_within
+from ...training.lod.paging import is_tree, read_within
 from ...training.lod.rule import Control, Tables, find_rule
 from ...training.lod.selection import complete, known_rule, not_alone, unknown_rule
 from ...training.methods import METHODS
@@ -174,7 +174,7 @@ def import_splats(
         LodgsError: the file cannot be read, or what it says is not possible. Nothing is left behind then.
     """
     path = Path(path)
-    if budget and not path.is_dir() and read_head(path).rule == "cut":
+    if budget and not path.is_dir() and is_tree(read_head(path)):
         bundle, total = read_within(path, budget)
         here = sum(len(level.splats) for level in bundle.levels)
         if here < total:

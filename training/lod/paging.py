@@ -27,8 +27,7 @@ from ..splats.dialects import drawable
 from ..splats.gaussians import Splats
 from .blocks import SIZE, spatial_order
 from .rule import distances_by_axes
-from .rules.cut import ABOVE_ROOT, K_LEAST, NODE_SIZE, PARENT, PARENT_SIZE
-from .selection import rule_of
+from .rules.cut import ABOVE_ROOT, K_LEAST, NODE_SIZE, PARENT, PARENT_SIZE, RULE
 from .streaming import BLOCKS
 
 BOUNDS = tuple(f"{end}_{axis}" for end in ("low", "high") for axis in "xyz")
@@ -83,6 +82,11 @@ def _bounds(number: int, columns: Columns) -> dict[str, np.ndarray]:
     return found
 
 
+def is_tree(bundle: Bundle) -> bool:
+    """Whether the levels of a bundle are a tree of splats."""
+    return bundle.rule == RULE.name
+
+
 class TreeFile:
     """A bundle of the rule ``cut``, read page by page.
 
@@ -99,7 +103,7 @@ class TreeFile:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.bundle, self._rows = open_bundle(path)
-        if rule_of(self.bundle).name != "cut":
+        if not is_tree(self.bundle):
             raise LodgsError(
                 f"{path} is no tree of splats: its levels are chosen by the rule '{self.bundle.rule}'.",
                 "Open it as a whole.",
