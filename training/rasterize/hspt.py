@@ -13,6 +13,7 @@ import math
 import numpy as np
 
 from ..lod.blocks import PIXELS, REACH, SLANT
+from ..lod.forest import split
 from ..lod.rules.cut import detail_of
 from ..lod.tree import Tree
 from ..scenes.cameras import Camera
@@ -22,6 +23,72 @@ SLACK = 1e-5
 """Share by which single precision may get distances and sizes wrong, and more."""
 _GRAIN = 8
 """Lists that a thread takes at a time."""
+
+
+class Upper:
+    """The upper tree with the roots of the lists, which is walked.
+
+    Args:
+        tree: of G leaves, each the root of a list.
+        balls: (2G - 1, 4) float32, means and sizes.
+        low, high: (2G - 1, 3) float32, bounds of the means of all that is at or below each.
+        reach: (2G - 1,) float32, how far the largest of these splats reaches from its mean.
+    """
+
+    def __init__(
+        self, tree: Tree, balls: np.ndarray, low: np.ndarray, high: np.ndarray, reach: np.ndarray
+    ) -> None:
+        least, most = low.astype(np.float64), high.astype(np.float64)
+        boxes = np.concatenate([(least + most) / 2, (most - least) / 2, reach[:, None]], axis=1)
+        children = np.concatenate([np.full((tree.leaves, 2), -1, np.int32), tree.children])
+        self.lists = tree.leaves
+        self._walked = children, balls, boxes
+
+    @classmethod
+    def over(
+        cls, tree: Tree, means: np.ndarray, log_scales: np.ndarray, sizes: np.ndarray, bounds: Bounds
+    ) -> Upper:
+        """That of a tree, (2G - 1, ...) of each node, whose leaves have bounds, (G, ...)."""
+        parts = zip(bounds, bounds_of(means, log_scales), strict=True)
+        low, high, reach = bounds = tuple(np.append(a, b[tree.leaves :], axis=0) for a, b in parts)
+        for layer in reversed(tree.layers):
+            one, other = tree.children[layer - tree.leaves].T
+            for bound, extreme in zip(bounds, (np.minimum, np.maximum, np.maximum), strict=True):
+                bound[layer] = extreme(bound[layer], extreme(bound[one], bound[other]))
+        return cls(tree, np.concatenate([means, sizes[:, None]], axis=1), low, high, reach)
+
+    def walk(self, eye: np.ndarray, k: float, image: np.ndarray | None) -> tuple[np.ndarray, ...]:
+        """What is fine enough, and where a list has to be looked at.
+
+        Args:
+            eye: (3,).
+            k: the detail.
+            image: as of :func:`image_of`; None: nothing is left out.
+
+        Returns:
+            Nodes to draw, (M,) int32, those below G roots of lists; lists, (L,) int32, and of each the least
+            size, (L,) float64, that a node in it has which is not fine enough.
+        """
+        count = len(self._walked[0])
+        image = np.zeros((0, 6)) if image is None else image
+        nodes, lists, least = np.empty(count, np.int32), np.empty(self.lists, np.int32), np.empty(self.lists)
+        counts = np.zeros(2, np.int64)
+        eye = np.asarray(eye, np.float32)
+        at_once(_walk, *self._walked, eye, f32(k), image, nodes, lists, least, counts)
+        return nodes[: counts[0]], lists[: counts[1]], least[: counts[1]]
+
+
+Bounds = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Of each of some nodes: the least and the greatest mean, (., 3) float32, and the reach, (.,) float32."""
+
+
+def bounds_of(means: np.ndarray, log_scales: np.ndarray, begins: np.ndarray | None = None) -> Bounds:
+    """Of nodes (N, 3) themselves, or of all from each of ``begins`` (G,) to the next."""
+    reach = (REACH * np.exp(np.minimum(log_scales.max(axis=1), 60))).astype(np.float32)
+    if begins is None:
+        return means, means, reach
+    least, most = np.minimum.reduceat(means, begins, axis=0), np.maximum.reduceat(means, begins, axis=0)
+    return least, most, np.maximum.reduceat(reach, begins)
 
 
 class Hspt:
@@ -42,42 +109,18 @@ class Hspt:
     def __init__(
         self, tree: Tree, means: np.ndarray, sizes: np.ndarray, log_scales: np.ndarray, longest: int = 0
     ) -> None:
-        leaves, count = tree.leaves, len(tree)
+        order, forest = split(tree, longest)
+        names = self._names = order[forest.walked]
+        inside = order[: forest.ends[-1]]
+        bounds = bounds_of(means[inside], log_scales[inside], forest.begins)
+        self._upper = Upper.over(forest.upper, means[names], log_scales[names], sizes[names], bounds)
+        self.lists = len(forest.counts)
+        of_list = np.repeat(np.arange(self.lists, dtype=np.int32), 2 * forest.counts - 1)
+        above = inside >= tree.leaves
+        entries = inside[above][np.lexsort((-sizes[inside[above]], of_list[above]))]
+        self._ends = np.cumsum(forest.counts - 1)
         balls = np.concatenate([means, sizes[:, None]], axis=1)
-        below, low, high = np.ones(count, np.int32), means.copy(), means.copy()
-        reach = (REACH * np.exp(np.minimum(log_scales.max(axis=1), 60))).astype(np.float32)
-        for layer in reversed(tree.layers):
-            one, other = tree.children[layer - leaves].T
-            below[layer] = below[one] + below[other]
-            for bound, extreme in ((low, np.minimum), (high, np.maximum), (reach, np.maximum)):
-                bound[layer] = extreme(bound[layer], extreme(bound[one], bound[other]))
-        in_lists = below <= (longest or max(math.isqrt(count) // 2, 1))
-        # what is walked: the upper tree, and the roots of lists, whose children are in the lists
-        root = tree.parents < 0
-        walked = np.flatnonzero(~in_lists | root | ~in_lists[tree.parents]).astype(np.int32)[::-1]
-        place = np.full(count, -1, np.int32)
-        place[walked] = np.arange(len(walked), dtype=np.int32)
-        children = np.full((len(walked), 2), -1, np.int32)
-        upper = ~in_lists[walked]
-        children[upper] = place[tree.children[walked[upper] - leaves]]
-        roots = np.flatnonzero(~upper & (walked >= leaves)).astype(np.int32)
-        of_list = np.full(count, -1, np.int32)
-        of_list[walked[roots]] = np.arange(len(roots), dtype=np.int32)
-        for layer in tree.layers:
-            inside = layer[of_list[layer] >= 0]
-            of_list[tree.children[inside - leaves]] = of_list[inside][:, None]
-        entries = leaves + np.flatnonzero(of_list[leaves:] >= 0)
-        entries = entries[np.lexsort((-sizes[entries], of_list[entries]))].astype(np.int32)
-        counts = np.bincount(of_list[entries], minlength=len(roots))
-        begins = np.full(len(walked), -1, np.int64)
-        ends = begins.copy()
-        ends[roots] = np.cumsum(counts)
-        begins[roots] = ends[roots] - counts
-        self.lists = len(roots)
-        least, most = low[walked].astype(np.float64), high[walked].astype(np.float64)
-        boxes = np.concatenate([(least + most) / 2, (most - least) / 2, reach[walked, None]], axis=1)
-        self._walked = walked, children, balls[walked], boxes, begins, ends
-        pairs = tree.children[entries - leaves]
+        pairs = tree.children[entries - tree.leaves]
         families = np.concatenate([balls[entries], balls[pairs].reshape(-1, 8)], axis=1)
         self._lists = pairs, families
 
@@ -96,21 +139,37 @@ class Hspt:
         Args:
             image: as of :func:`image_of`; None: nothing is left out.
         """
-        eye, detail = np.asarray(eye, np.float32), f32(k)
-        image = np.zeros((0, 6)) if image is None else image
-        nodes = np.empty(len(self._walked[0]), np.int32)
-        parts = np.empty((self.lists, 4), np.int64)
-        counts = np.zeros(2, np.int64)
-        at_once(_walk, *self._walked, self._lists[1], eye, detail, image, nodes, parts, counts)
-        parts = parts[: counts[1]]
-        lengths = parts[:, 1] - parts[:, 0]
-        parts[:, 2] = 2 * (np.cumsum(lengths) - lengths)
-        buffer = np.empty(2 * int(lengths.sum()), np.int32)
-        in_parallel(_search, len(parts), _GRAIN, *self._lists, eye, detail, parts, buffer)
-        found = np.empty(int(counts[0] + parts[:, 3].sum()), np.int32)
-        found[: counts[0]] = nodes[: counts[0]]
-        at_once(_gather, parts, buffer, found[counts[0] :])
-        return found
+        nodes, lists, least = self._upper.walk(eye, k, image)
+        begins = np.append(0, self._ends)[lists]
+        ends = np.empty_like(begins)
+        at_once(_cut_off, self._lists[1], begins, self._ends[lists], least, ends)
+        found, _ = search(*self._lists, begins, ends, eye, k)
+        return np.append(self._names[nodes], found)
+
+
+def search(
+    pairs: np.ndarray, families: np.ndarray, begins: np.ndarray, ends: np.ndarray, eye: np.ndarray, k: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of parts of lists, the children that are fine enough of nodes that are not (Eq. 5).
+
+    Args:
+        pairs: (E, 2) int32, the children of each node of the lists.
+        families: (E, 12) float32, mean and size of each node and of its children.
+        begins, ends: (L,) int64 of the parts, among the E.
+        eye: (3,).
+        k: the detail.
+
+    Returns:
+        Nodes (M,) int32, one part's after the other's; and how many are of each, (L,) int64.
+    """
+    lengths = ends - begins
+    parts = np.stack([begins, ends, 2 * (np.cumsum(lengths) - lengths), np.zeros_like(begins)], axis=1)
+    buffer = np.empty(2 * int(lengths.sum()), np.int32)
+    eye = np.asarray(eye, np.float32)
+    in_parallel(_search, len(parts), _GRAIN, pairs, families, eye, f32(k), parts, buffer)
+    found = np.empty(int(parts[:, 3].sum()), np.int32)
+    at_once(_gather, parts, buffer, found)
+    return found, parts[:, 3]
 
 
 def image_of(camera: Camera, near: float) -> np.ndarray:
@@ -167,34 +226,40 @@ def _distance(box, eye):
 
 
 @kernel(STRICT)
-def _walk(walked, children, balls, boxes, begins, ends, families, eye, k, image, nodes, parts, counts):
-    """From the root, which is the first, down the upper tree: nodes to draw, and parts of lists to search."""
+def _walk(children, balls, boxes, eye, k, image, nodes, lists, least, counts):
+    """From the root, which is the last, down the upper tree: nodes to draw, and lists to look at."""
     count, used, top = 0, 0, 1
-    stack = np.empty(len(walked) + 1, np.int32)
-    stack[0] = 0
+    stack = np.empty(len(children) + 1, np.int32)
+    stack[0] = len(children) - 1
     while top:
         top -= 1
         i = stack[top]
         if not _in_image(boxes[i], image):
             continue
         if _fine(balls, i, 0, eye, k):
-            nodes[count] = walked[i]
+            nodes[count] = i
             count += 1
         elif children[i, 0] >= 0:
             stack[top], stack[top + 1] = children[i, 1], children[i, 0]
             top += 2
         else:
-            least = _distance(boxes[i], eye) * (1 - SLACK) / k
-            low, high = begins[i], ends[i]
-            while low < high:  # sizes fall
-                middle = (low + high) // 2
-                if families[middle, 3] >= least:
-                    low = middle + 1
-                else:
-                    high = middle
-            parts[used, 0], parts[used, 1] = begins[i], low
+            lists[used], least[used] = i, _distance(boxes[i], eye) * (1 - SLACK) / k
             used += 1
     counts[0], counts[1] = count, used
+
+
+@kernel(STRICT)
+def _cut_off(families, begins, ends, least, cut):
+    """Where each list, in which sizes fall, comes to sizes below the least."""
+    for i in range(len(begins)):
+        low, high = begins[i], ends[i]
+        while low < high:
+            middle = (low + high) // 2
+            if families[middle, 3] >= least[i]:
+                low = middle + 1
+            else:
+                high = middle
+        cut[i] = low
 
 
 @kernel(STRICT)
