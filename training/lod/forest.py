@@ -46,6 +46,16 @@ class Forest:
         return np.cumsum(2 * self.counts - 1)
 
     @cached_property
+    def list_begins(self) -> np.ndarray:
+        """(G,) int64, the first of the nodes above leaves of each subtree, counted through all subtrees."""
+        return self.list_ends - (self.counts - 1)
+
+    @cached_property
+    def list_ends(self) -> np.ndarray:
+        """(G,) int64, one after the last of them."""
+        return np.cumsum(self.counts - 1)
+
+    @cached_property
     def walked(self) -> np.ndarray:
         """(2G - 1,) int64: the nodes of the upper tree, its leaves too, in its own numbering."""
         return np.append(self.ends - 1, np.arange(self.ends[-1], len(self)))

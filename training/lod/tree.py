@@ -53,9 +53,7 @@ class Tree:
             layer = self.children[layer - self.leaves].reshape(-1)
         return layers
 
-    def sizes(
-        self, means: np.ndarray, log_scales: np.ndarray, below: np.ndarray | float = 0.0
-    ) -> np.ndarray:
+    def sizes(self, means: np.ndarray, log_scales: np.ndarray, below: np.ndarray | float = 0.0) -> np.ndarray:
         """(2N - 1,) float32, saturated: of leaves 0, of others at least :func:`size_of` and ``least_size``.
 
         Args:
