@@ -1,4 +1,4 @@
-"""A tree in pieces: subtrees, which are handled a few at a time, and an upper tree whose leaves are their roots.
+"""A tree in pieces: subtrees, handled a few at a time, and an upper tree whose leaves are their roots.
 
 numpy only. The nodes of a forest are numbered subtree after subtree, each as its own ``Tree`` numbers them
 (leaves first, root last), and those of the upper tree come after all of them.
@@ -44,6 +44,16 @@ class Forest:
     def ends(self) -> np.ndarray:
         """(G,) int64, one after the last node of each subtree, which is its root."""
         return np.cumsum(2 * self.counts - 1)
+
+    @cached_property
+    def list_begins(self) -> np.ndarray:
+        """(G,) int64, the first of the nodes above leaves of each subtree, counted through all subtrees."""
+        return self.list_ends - (self.counts - 1)
+
+    @cached_property
+    def list_ends(self) -> np.ndarray:
+        """(G,) int64, one after the last of them."""
+        return np.cumsum(self.counts - 1)
 
     @cached_property
     def walked(self) -> np.ndarray:
@@ -107,7 +117,7 @@ def pieces(splats: Splats, tree: Tree, longest: int = 0) -> tuple[Iterator[Piece
 
 
 def side_by_side(trees: Sequence[Tree]) -> tuple[np.ndarray, Tree]:
-    """Several trees as one: which node of them, one tree after the other, each is, (.,) int64; and the tree."""
+    """Several trees as one: which node of them, one tree after the other, each is, (.,); and that tree."""
     ends = np.cumsum([len(tree) for tree in trees])
     begins = ends - [len(tree) for tree in trees]
     leaves = np.array([tree.leaves for tree in trees])

@@ -54,16 +54,16 @@ class Tree:
         return layers
 
     def sizes(
-        self, means: np.ndarray, log_scales: np.ndarray, below: np.ndarray | float = 0.0
+        self, means: np.ndarray, log_scales: np.ndarray, leaf_sizes: np.ndarray | float = 0.0
     ) -> np.ndarray:
         """(2N - 1,) float32, saturated: of leaves 0, of others at least :func:`size_of` and ``least_size``.
 
         Args:
             means, log_scales: (2N - 1, 3) float32 of all nodes; of leaves log-scales are not looked at.
-            below: (N,) sizes of leaves that are themselves the roots of trees.
+            leaf_sizes: (N,) of leaves that are themselves the roots of trees.
         """
         sizes = np.zeros(len(self), np.float32)
-        sizes[: self.leaves] = below
+        sizes[: self.leaves] = leaf_sizes
         for layer in reversed(self.layers):
             below = self.children[layer - self.leaves]
             apart = means[below].astype(np.float64) - means[layer, None].astype(np.float64)

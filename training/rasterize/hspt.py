@@ -31,31 +31,28 @@ class Upper:
     Args:
         tree: of G leaves, each the root of a list.
         balls: (2G - 1, 4) float32, means and sizes.
-        low, high: (2G - 1, 3) float32, bounds of the means of all that is at or below each.
-        reach: (2G - 1,) float32, how far the largest of these splats reaches from its mean.
+        boxes: (2G - 1, 7) float64 of all that is at or below each: the middle and half the extent of the
+            means, and how far the largest splat reaches from its mean.
     """
 
-    def __init__(
-        self, tree: Tree, balls: np.ndarray, low: np.ndarray, high: np.ndarray, reach: np.ndarray
-    ) -> None:
-        least, most = low.astype(np.float64), high.astype(np.float64)
-        boxes = np.concatenate([(least + most) / 2, (most - least) / 2, reach[:, None]], axis=1)
-        children = np.concatenate([np.full((tree.leaves, 2), -1, np.int32), tree.children])
-        self.lists = tree.leaves
-        self._walked = children, balls, boxes
+    def __init__(self, tree: Tree, balls: np.ndarray, boxes: np.ndarray) -> None:
+        self.balls, self.boxes = balls, boxes
+        self._children = np.concatenate([np.full((tree.leaves, 2), -1, np.int32), tree.children])
 
     @classmethod
     def over(
         cls, tree: Tree, means: np.ndarray, log_scales: np.ndarray, sizes: np.ndarray, bounds: Bounds
     ) -> Upper:
         """That of a tree, (2G - 1, ...) of each node, whose leaves have bounds, (G, ...)."""
-        parts = zip(bounds, bounds_of(means, log_scales), strict=True)
-        low, high, reach = bounds = tuple(np.append(a, b[tree.leaves :], axis=0) for a, b in parts)
+        own = zip(bounds, bounds_of(means, log_scales), strict=True)
+        low, high, reach = (np.append(below, each[tree.leaves :], axis=0) for below, each in own)
         for layer in reversed(tree.layers):
             one, other = tree.children[layer - tree.leaves].T
-            for bound, extreme in zip(bounds, (np.minimum, np.maximum, np.maximum), strict=True):
+            for bound, extreme in ((low, np.minimum), (high, np.maximum), (reach, np.maximum)):
                 bound[layer] = extreme(bound[layer], extreme(bound[one], bound[other]))
-        return cls(tree, np.concatenate([means, sizes[:, None]], axis=1), low, high, reach)
+        least, most = low.astype(np.float64), high.astype(np.float64)
+        boxes = np.concatenate([(least + most) / 2, (most - least) / 2, reach[:, None]], axis=1)
+        return cls(tree, np.concatenate([means, sizes[:, None]], axis=1), boxes)
 
     def walk(self, eye: np.ndarray, k: float, image: np.ndarray | None) -> tuple[np.ndarray, ...]:
         """What is fine enough, and where a list has to be looked at.
@@ -69,12 +66,11 @@ class Upper:
             Nodes to draw, (M,) int32, those below G roots of lists; lists, (L,) int32, and of each the least
             size, (L,) float64, that a node in it has which is not fine enough.
         """
-        count = len(self._walked[0])
         image = np.zeros((0, 6)) if image is None else image
-        nodes, lists, least = np.empty(count, np.int32), np.empty(self.lists, np.int32), np.empty(self.lists)
-        counts = np.zeros(2, np.int64)
-        eye = np.asarray(eye, np.float32)
-        at_once(_walk, *self._walked, eye, f32(k), image, nodes, lists, least, counts)
+        nodes, lists = np.empty((2, len(self.balls)), np.int32)
+        least, counts = np.empty(len(self.balls)), np.zeros(2, np.int64)
+        arrays = self._children, self.balls, self.boxes, np.asarray(eye, np.float32), f32(k), image
+        at_once(_walk, *arrays, nodes, lists, least, counts)
         return nodes[: counts[0]], lists[: counts[1]], least[: counts[1]]
 
 
@@ -114,11 +110,10 @@ class Hspt:
         inside = order[: forest.ends[-1]]
         bounds = bounds_of(means[inside], log_scales[inside], forest.begins)
         self._upper = Upper.over(forest.upper, means[names], log_scales[names], sizes[names], bounds)
-        self.lists = len(forest.counts)
+        self.lists, self._forest = len(forest.counts), forest
         of_list = np.repeat(np.arange(self.lists, dtype=np.int32), 2 * forest.counts - 1)
         above = inside >= tree.leaves
         entries = inside[above][np.lexsort((-sizes[inside[above]], of_list[above]))]
-        self._ends = np.cumsum(forest.counts - 1)
         balls = np.concatenate([means, sizes[:, None]], axis=1)
         pairs = tree.children[entries - tree.leaves]
         families = np.concatenate([balls[entries], balls[pairs].reshape(-1, 8)], axis=1)
@@ -140,11 +135,22 @@ class Hspt:
             image: as of :func:`image_of`; None: nothing is left out.
         """
         nodes, lists, least = self._upper.walk(eye, k, image)
-        begins = np.append(0, self._ends)[lists]
-        ends = np.empty_like(begins)
-        at_once(_cut_off, self._lists[1], begins, self._ends[lists], least, ends)
+        begins, ends = self._forest.list_begins[lists], self._forest.list_ends[lists]
+        ends = cut_off(self._lists[1][:, 3], begins, ends, least)
         found, _ = search(*self._lists, begins, ends, eye, k)
         return np.append(self._names[nodes], found)
+
+
+def cut_off(sizes: np.ndarray, begins: np.ndarray, ends: np.ndarray, least: np.ndarray) -> np.ndarray:
+    """Where lists come to sizes below their least, (L,) int64.
+
+    Args:
+        sizes: (E,) float32, falling from each list's begin, (L,) int64, to its end, (L,).
+        least: (L,) float64.
+    """
+    found = np.empty_like(begins)
+    at_once(_cut_off, sizes, begins, ends, least, found)
+    return found
 
 
 def search(
@@ -249,17 +255,16 @@ def _walk(children, balls, boxes, eye, k, image, nodes, lists, least, counts):
 
 
 @kernel(STRICT)
-def _cut_off(families, begins, ends, least, cut):
-    """Where each list, in which sizes fall, comes to sizes below the least."""
+def _cut_off(sizes, begins, ends, least, found):
     for i in range(len(begins)):
         low, high = begins[i], ends[i]
         while low < high:
             middle = (low + high) // 2
-            if families[middle, 3] >= least[i]:
+            if sizes[middle] >= least[i]:
                 low = middle + 1
             else:
                 high = middle
-        cut[i] = low
+        found[i] = low
 
 
 @kernel(STRICT)
