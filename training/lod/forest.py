@@ -1,0 +1,201 @@
+"""A tree of splats in pieces, which together may be larger than memory. numpy only."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from ..splats.bundle import NO_SPLATS, Level
+from ..splats.gaussians import Splats
+from ..splats.ply import Columns
+from ..splats.scratch import Scratch
+from .paging import streaming_order, table_of_pages
+from .rules.cut import NODE_SIZE, PARENT, PARENT_SIZE
+from .tree import LEAVES, NODES, Tree
+
+Piece = tuple[Splats, Tree]
+"""Splats, and the tree that they are the nodes of."""
+_KEYS = (PARENT_SIZE, *PARENT)
+
+
+class Forest(Protocol):
+    """A tree of splats: subtrees, and the upper tree, whose leaves are the subtrees' roots in their order."""
+
+    def __iter__(self) -> Iterator[Piece]:
+        """The subtrees one after the other, as neighbours in space: the 2N - 1 nodes, and the tree, of each.
+
+        A subtree of one leaf is a leaf that stands alone under the upper tree.
+        """
+        ...
+
+    @property
+    def upper(self) -> Piece:
+        """The G - 1 nodes above G subtrees, without the roots of these, and the tree, which has these as its
+        leaves. It may be known only when all subtrees have been asked for."""
+        ...
+
+
+@dataclass(frozen=True)
+class Grove:
+    """A forest in memory; see :class:`Forest`."""
+
+    subtrees: Sequence[Piece]
+    upper: Piece
+
+    def __iter__(self) -> Iterator[Piece]:
+        return iter(self.subtrees)
+
+
+def longest_of(leaves: int) -> int:
+    """Most leaves of a subtree of a tree of N leaves: half the square root of the number of nodes, so that
+    the upper tree and a subtree have about as many."""
+    return max(math.isqrt(2 * leaves - 1) // 2, 1)
+
+
+def divided(splats: Splats, tree: Tree, longest: int) -> Grove:
+    """A tree as a forest: the largest subtrees of at most ``longest`` leaves, by their first leaves.
+
+    Args:
+        splats: its 2N - 1 nodes.
+    """
+    leaves, count = tree.leaves, len(tree)
+    below = tree.leaves_below
+    within = below <= longest
+    parents = tree.parents
+    roots = np.flatnonzero(within & ((parents < 0) | ~within[parents]))
+    piece = np.full(count, len(roots))  # the number of a node's subtree; of those above, one more
+    piece[roots] = np.arange(len(roots))
+    for layer in tree.layers:
+        inside = layer[within[layer]]
+        piece[tree.children[inside - leaves]] = piece[inside][:, None]
+    _, first = np.unique(piece[:leaves], return_index=True)
+    rank = np.empty(len(roots) + 1, np.int64)
+    rank[np.argsort(first)] = np.arange(len(roots))
+    rank[-1] = len(roots)
+    piece = rank[piece]
+    above = np.arange(count) >= leaves
+    last = parents < 0
+    last[roots] = True
+    order = np.lexsort((above & last, above, piece))
+    begins = np.searchsorted(piece[order], np.arange(len(roots) + 2))
+    number = np.empty(count, np.int64)  # of a node in its own tree
+    number[order] = np.arange(count) - begins[piece[order]]
+    number[piece == len(roots)] += len(roots)
+    child = tree.children
+    in_upper = np.where(piece[child] == len(roots), number[child], piece[child])
+    numbers = np.where((piece[leaves:] == len(roots))[:, None], in_upper, number[child]).astype(np.int32)
+    splats = splats.select(order)
+    of_piece = np.bincount(piece[:leaves], minlength=len(roots) + 1)
+    subtrees = []
+    for begin, end, own in zip(begins[:-2].tolist(), begins[1:-1].tolist(), of_piece.tolist(), strict=False):
+        children = numbers[order[begin + own : end] - leaves]
+        subtrees.append((splats.select(slice(begin, end)), Tree(children)))
+    rest = slice(int(begins[-2]), count)
+    return Grove(subtrees, (splats.select(rest), Tree(numbers[order[rest] - leaves])))
+
+
+def joined(forest: Forest) -> Piece:
+    """A forest as one tree in memory: all leaves in the order of subtrees, the nodes above them, the upper
+    tree's."""
+    subtrees = list(forest)
+    above, upper = forest.upper
+    leaves = [splats.select(slice(0, tree.leaves)) for splats, tree in subtrees]
+    inner = [splats.select(slice(tree.leaves, None)) for splats, tree in subtrees]
+    return Splats.concatenated([*leaves, *inner, above]), joined_trees([tree for _, tree in subtrees], upper)
+
+
+def joined_trees(trees: Sequence[Tree], upper: Tree) -> Tree:
+    """One tree of others: of the trees whose roots are the leaves of an upper one, in their order."""
+    counts = np.array([tree.leaves for tree in trees])
+    first_leaf, first_inner = np.cumsum(counts) - counts, np.cumsum(counts - 1) - (counts - 1)
+    leaves = int(counts.sum())
+    children = []
+    for tree, own, leaf, inner in zip(trees, counts, first_leaf, first_inner, strict=True):
+        shift = np.where(tree.children < own, leaf, leaves + inner - own)
+        children.append(tree.children + shift)
+    roots = np.where(counts == 1, first_leaf, leaves + first_inner + counts - 2)
+    beyond = leaves + int((counts - 1).sum()) - len(trees)
+    in_upper = upper.children
+    known = np.append(roots, 0)[np.minimum(in_upper, len(trees))]
+    children.append(np.where(in_upper < len(trees), known, in_upper + beyond))
+    return Tree(np.concatenate(children).astype(np.int32).reshape(-1, 2))
+
+
+def levels_of(forest: Forest, folder: Path) -> tuple[list[Level], Columns]:
+    """The levels of a bundle, in the order of their rows, and its table of blocks; the splats stay in files.
+
+    What they are is what ``Tree.levels`` makes of the same tree. In memory are 16 bytes of each node, and up
+    to 45 of those of one level.
+
+    Args:
+        folder: where the files are, which have no names and go with the levels.
+
+    Raises:
+        LodgsError: the folder takes no files.
+    """
+    files = {number: _LevelFile(folder) for number in (NODES, LEAVES)}
+    roots, places = [], []
+    for splats, tree in forest:
+        columns = tree.columns(splats.means, tree.sizes(splats.means, splats.log_scales))
+        splats = replace(splats, extras=columns)
+        roots.append(splats.select(slice(-1, None)))
+        files[LEAVES].append(splats.select(slice(0, tree.leaves)))
+        files[NODES].append(splats.select(slice(tree.leaves, None)))
+        file = files[LEAVES if tree.leaves == 1 else NODES]
+        places.append((file, len(file.keys) - 1, len(file.splats) - 1))
+    above, upper = forest.upper
+    ends = Splats.concatenated(roots)
+    means, log_scales = np.concatenate([ends.means, above.means]), [ends.log_scales, above.log_scales]
+    sizes = upper.sizes(means, np.concatenate(log_scales), ends.extras[NODE_SIZE])
+    columns = upper.columns(means, sizes)
+    for i, (root, (file, part, row)) in enumerate(zip(roots, places, strict=True)):  # parents are known now
+        root.extras = {name: column[i : i + 1] for name, column in columns.items()}
+        file.splats.write(row, root)
+        file.keys[part][-1] = _keys(root)
+    above = replace(above, extras={name: column[upper.leaves :] for name, column in columns.items()})
+    files[NODES].append(above)
+    levels, tables = zip(*(files.pop(number).finished(number) for number in (NODES, LEAVES)), strict=True)
+    return list(levels), {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
+
+
+class _LevelFile:
+    """A level's splats in a file, and in memory by what they are put in order, (N, 4) float32 in parts."""
+
+    def __init__(self, folder: Path) -> None:
+        self.splats, self.keys = Scratch(folder), []
+
+    def append(self, splats: Splats) -> None:
+        if len(splats):
+            self.splats.append(splats)
+            self.keys.append(_keys(splats))
+
+    def finished(self, number: int) -> tuple[Level, Columns]:
+        """The level, and what the table of blocks says of it."""
+        keys, self.keys = np.concatenate(self.keys), []
+        columns: Columns = dict(zip(_KEYS, keys.T, strict=True))
+        order = streaming_order(columns).astype(np.int32)
+        table = table_of_pages({number: {name: column[order] for name, column in columns.items()}})
+        return Level(number, NO_SPLATS, elsewhere=_Ordered(self.splats, order)), table
+
+
+@dataclass(frozen=True)
+class _Ordered:
+    """The splats of a file at rows (N,)."""
+
+    file: Scratch
+    rows: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def select(self, some: slice, /) -> Splats:
+        return self.file.select(self.rows[some])
+
+
+def _keys(splats: Splats) -> np.ndarray:
+    return np.stack([splats.extras[name] for name in _KEYS], axis=1)
