@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from ..lod.blocks import PIXELS, REACH, SLANT
-from ..lod.forest import split
+from ..lod.forest import longest_of, shape_of
 from ..lod.rules.cut import detail_of
 from ..lod.tree import Tree
 from ..scenes.cameras import Camera
@@ -105,8 +105,8 @@ class Hspt:
     def __init__(
         self, tree: Tree, means: np.ndarray, sizes: np.ndarray, log_scales: np.ndarray, longest: int = 0
     ) -> None:
-        order, forest = split(tree, longest)
-        names = self._names = order[forest.walked]
+        order, forest = shape_of(tree, longest or longest_of(tree.leaves))
+        names = self._names = order[forest.in_upper]
         inside = order[: forest.ends[-1]]
         bounds = bounds_of(means[inside], log_scales[inside], forest.begins)
         self._upper = Upper.over(forest.upper, means[names], log_scales[names], sizes[names], bounds)

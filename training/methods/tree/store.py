@@ -8,7 +8,7 @@ looks at: sorted by size, with means and sizes as they were when sizes were last
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from math import prod
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ...lod.forest import Forest, Piece, leaves_first
+from ...lod.forest import Forest, ForestShape, Piece, side_by_side
 from ...lod.rules.cut import detail_of
 from ...lod.tree import Tree
 from ...rasterize.hspt import Upper, bounds_of, cut_off, image_of, search
@@ -48,13 +48,13 @@ def layout_of(sh_degree: int) -> Layout:
 
     steps: how many steps of Adam have moved it;
     grad: the largest norm of its gradient in the image plane since density control last asked;
-    unseen: for density control, which sets it.
+    seen: the last step, from 1, that had it in its image; 0: none.
     """
     shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": ()}
     values: dict[str, tuple[int, ...]] = shapes | {"sh": ((sh_degree + 1) ** 2, 3)}
     count = sum(map(prod, values.values()))
     moments: dict[str, tuple[int, ...]] = {"first": (count,), "second": (count,)}
-    return Layout({**values, **moments, "steps": (), "grad": (), "unseen": ()})
+    return Layout({**values, **moments, "steps": (), "grad": (), "seen": ()})
 
 
 class Store:
@@ -66,12 +66,12 @@ class Store:
         device: where what is drawn lives.
 
     Attributes:
-        forest: where the pieces of the tree are among the rows, when all have been added.
+        shape: where the pieces of the tree are among the rows.
         cache: of G + 1 groups: the subtrees, and the upper nodes, which are always all there.
         columns: where each array of a record begins.
     """
 
-    forest: Forest
+    shape: ForestShape
     cache: CutCache
 
     def __init__(self, folder: Path, sh_degree: int, budget: int, device: torch.device | str = "cpu") -> None:
@@ -89,10 +89,10 @@ class Store:
 
     # -- a tree comes in -------------------------------------------------------------------------------
 
-    def fill(self, subtrees: Iterable[Piece]) -> None:
-        """Takes a forest's subtrees, in their order; after them comes :meth:`crown`."""
+    def fill(self, forest: Forest) -> None:
+        """Takes a tree's pieces, one after the other; with it, it can be cut."""
         counts, waiting, nodes = [], [], 0
-        for piece in subtrees:
+        for piece in forest:
             counts.append(piece[1].leaves)
             waiting.append(piece)
             nodes += len(piece[0])
@@ -100,17 +100,14 @@ class Store:
                 self._append(waiting)
                 waiting, nodes = [], 0
         self._append(waiting)
-        self._counts = np.array(counts, np.int64)
-
-    def crown(self, upper: Piece) -> None:
-        """Takes the upper tree; with it the tree is whole, and can be cut."""
-        self.rows.append(self._records(upper[0]))
-        self._take_shape(Forest(self._counts, upper[1]))
+        splats, upper = forest.upper
+        self.rows.append(self._records(splats))
+        self._take_shape(ForestShape(np.array(counts, np.int64), upper))
         self.resize()
 
     def _append(self, subtrees: list[Piece]) -> None:
-        for splats, tree in subtrees:
-            assert len(splats) == len(tree)
+        if not subtrees:
+            return
         self.rows.append(torch.cat([self._records(splats) for splats, _ in subtrees]))
         entries = []
         for _, tree in subtrees:
@@ -126,10 +123,10 @@ class Store:
         np.concatenate(arrays, axis=1, out=records[:, : self.values])
         return torch.from_numpy(records)
 
-    def _take_shape(self, forest: Forest) -> None:
-        self.forest = forest
-        self._mark_ends = np.cumsum(-(-(forest.counts - 1) // MARK))
-        self.cache = CutCache(self.rows, len(self.forest.counts) + 1, self._budget, self._device)
+    def _take_shape(self, shape: ForestShape) -> None:
+        self.shape = shape
+        self._mark_ends = np.cumsum(-(-(shape.counts - 1) // MARK))
+        self.cache = CutCache(self.rows, len(self.shape.counts) + 1, self._budget, self._device)
 
     # -- cuts ------------------------------------------------------------------------------------------
 
@@ -143,20 +140,20 @@ class Store:
             LodgsError: there is no room for it.
         """
         k, eye = detail_of(camera.focal, pixels), camera.center
-        nodes, lists, least = self.upper.walk(eye, k, image_of(camera, near))
-        subtrees = len(self.forest.counts)
+        nodes, lists, least = self._top.walk(eye, k, image_of(camera, near))
+        subtrees = len(self.shape.counts)
         alone, above = nodes[nodes < subtrees], nodes[nodes >= subtrees] - subtrees
         groups = np.append(alone, lists)
         least = np.append(np.full(len(alone), np.inf), least)
         order = np.argsort(groups)
         groups, least = groups[order], least[order]
-        distances = np.linalg.norm(self.upper.balls[groups, :3] - eye, axis=1) / k
+        distances = np.linalg.norm(self._top.balls[groups, :3] - eye, axis=1) / k
 
         def cut(anew: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             own = anew[anew < len(groups)]
             rows, counts = self.cut(groups[own], least[own], eye, k)
             if len(own) < len(anew):
-                rows = np.append(rows, np.arange(self.forest.ends[-1], len(self)))
+                rows = np.append(rows, np.arange(self.shape.ends[-1], len(self)))
                 counts = np.append(counts, subtrees - 1)
             return rows, counts
 
@@ -174,15 +171,15 @@ class Store:
             least: (G,) as ``Upper.walk`` says it; infinite where the root is fine enough.
         """
         counts = np.ones(len(groups), np.int64)
-        rows = [self.forest.ends[groups[np.isinf(least)]] - 1]
+        rows = [self.shape.ends[groups[np.isinf(least)]] - 1]
         searched = np.flatnonzero(np.isfinite(least))
         lists, least = groups[searched], least[searched]
-        begins, marks = self.forest.list_begins[lists], self._mark_ends[lists - 1] * (lists > 0)
+        begins, marks = self.shape.list_begins[lists], self._mark_ends[lists - 1] * (lists > 0)
         lengths = MARK * (cut_off(self._marks, marks, self._mark_ends[lists], least) - marks)
-        lengths = np.minimum(lengths, self.forest.list_ends[lists] - begins)
+        lengths = np.minimum(lengths, self.shape.list_ends[lists] - begins)
         for some in _batches(lengths):
             entries = self._lists.read(_ranges(begins[some], lengths[some])).numpy()
-            first = np.repeat(self.forest.begins[lists[some]], lengths[some])
+            first = np.repeat(self.shape.begins[lists[some]], lengths[some])
             pairs = (entries[:, 1:3] + first[:, None]).astype(np.int32)
             stops = np.cumsum(lengths[some])
             families = np.ascontiguousarray(entries[:, 3:])
@@ -206,15 +203,15 @@ class Store:
         """Cuts are made by the nodes as they are now."""
         self.cache.clear()
         shapes, bounds, roots, marks = [], [], [], []
-        for some in _batches(2 * self.forest.counts - 1):
+        for some in _batches(2 * self.shape.counts - 1):
             records, entries = self._read(some)
-            counts = self.forest.counts[some]
+            counts = self.shape.counts[some]
             ends = np.cumsum(2 * counts - 1)
             begins = ends - (2 * counts - 1)
             of_list = np.repeat(np.arange(len(counts)), counts - 1)
             family = entries[:, :3].astype(np.int32) + begins[of_list, None].astype(np.int32)
             in_order = np.argsort(family[:, 0])
-            order, tree = leaves_first(counts, ends, family[in_order, 1:])
+            order, tree = side_by_side(counts, family[in_order, 1:])
             means, log_scales = (records[name].numpy() for name in ("means", "log_scales"))
             sizes = np.empty(len(order), np.float32)
             sizes[order] = tree.sizes(means[order], log_scales[order])
@@ -229,43 +226,44 @@ class Store:
             shapes.append(log_scales[ends - 1])
             roots.append(balls[ends - 1])
         self._marks = np.concatenate(marks)
-        upper = self.layout.split(self.rows.read(np.arange(self.forest.ends[-1], len(self))))
+        upper = self.layout.split(self.rows.read(np.arange(self.shape.ends[-1], len(self))))
         below = np.concatenate(roots)
         means = np.append(below[:, :3], upper["means"].numpy(), axis=0)
         log_scales = np.append(np.concatenate(shapes), upper["log_scales"].numpy(), axis=0)
-        sizes = self.forest.upper.sizes(means, log_scales, below[:, 3])
+        sizes = self.shape.upper.sizes(means, log_scales, below[:, 3])
         low, high, reach = (np.concatenate(each) for each in zip(*bounds, strict=True))
-        self.upper = Upper.over(self.forest.upper, means, log_scales, sizes, (low, high, reach))
+        self._top = Upper.over(self.shape.upper, means, log_scales, sizes, (low, high, reach))
 
     def _read(self, some: slice) -> tuple[dict[str, torch.Tensor], np.ndarray]:
         """The records and the lists' entries (., 15) of some subtrees."""
-        begin, end = int(self.forest.begins[some.start]), int(self.forest.ends[some.stop - 1])
+        begin, end = int(self.shape.begins[some.start]), int(self.shape.ends[some.stop - 1])
         entries = self._lists.read(self._of_lists(some)).numpy()
         return self.layout.split(self.rows.read(np.arange(begin, end))), entries
 
     def _of_lists(self, some: slice) -> np.ndarray:
         """Where the lists of some subtrees are."""
-        return np.arange(self.forest.list_begins[some.start], self.forest.list_ends[some.stop - 1])
+        return np.arange(self.shape.list_begins[some.start], self.shape.list_ends[some.stop - 1])
 
     # -- the tree goes out -----------------------------------------------------------------------------
 
-    def subtrees(self) -> Iterator[Piece]:
-        """The forest's subtrees as they are now, in their order."""
+    def __iter__(self) -> Iterator[Piece]:
+        """The subtrees as they are now: a store is a ``Forest``."""
         self.cache.write_back()
-        for some in _batches(2 * self.forest.counts - 1):
+        for some in _batches(2 * self.shape.counts - 1):
             records, entries = self._read(some)
             row = entry = 0
-            for leaves in self.forest.counts[some].tolist():
+            for leaves in self.shape.counts[some].tolist():
                 children = entries[entry : entry + leaves - 1, :3].astype(np.int32)
                 children = children[np.argsort(children[:, 0]), 1:]
                 yield _splats(records, slice(row, row + 2 * leaves - 1)), Tree(children)
                 row, entry = row + 2 * leaves - 1, entry + leaves - 1
 
-    def above(self) -> Piece:
+    @property
+    def upper(self) -> Piece:
         """The upper tree as it is now."""
         self.cache.write_back()
-        records = self.layout.split(self.rows.read(np.arange(self.forest.ends[-1], len(self))))
-        return _splats(records, slice(None)), self.forest.upper
+        records = self.layout.split(self.rows.read(np.arange(self.shape.ends[-1], len(self))))
+        return _splats(records, slice(None)), self.shape.upper
 
     # -- what lasts ------------------------------------------------------------------------------------
 
@@ -277,8 +275,8 @@ class Store:
     def state_dict(self) -> dict[str, Any]:
         """A checkpoint, for the file that is then written, see ``FileRows.state_dict``."""
         arrays = {
-            "counts": self.forest.counts, "upper": self.forest.upper.children, "marks": self._marks,
-            "balls": self.upper.balls, "boxes": self.upper.boxes,
+            "counts": self.shape.counts, "upper": self.shape.upper.children, "marks": self._marks,
+            "balls": self._top.balls, "boxes": self._top.boxes,
         }  # fmt: skip
         return {
             "cache": self.cache.state_dict(),
@@ -295,9 +293,9 @@ class Store:
         arrays = {
             name: state[name].cpu().numpy().copy() for name in ("counts", "upper", "marks", "balls", "boxes")
         }
-        self._take_shape(Forest(arrays["counts"], Tree(arrays["upper"])))
+        self._take_shape(ForestShape(arrays["counts"], Tree(arrays["upper"])))
         self._marks = arrays["marks"]
-        self.upper = Upper(self.forest.upper, arrays["balls"], arrays["boxes"])
+        self._top = Upper(self.shape.upper, arrays["balls"], arrays["boxes"])
         self._lists.load_state_dict(state["lists"])
         self.cache.load_state_dict(state["cache"])
 

@@ -16,11 +16,11 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from ...lod.forest import Piece, pieces, whole
+from ...lod.forest import joined
 from ...lod.paging import table_of_pages
 from ...lod.streaming import BLOCKS
 from ...lod.tree import LEAVES, treeless_columns
-from ...rasterize import Gaussians, Target
+from ...rasterize import Gaussians, Rendering, Target
 from ...rasterize.adam import LearningRate, step_records
 from ...splats.bundle import Level
 from ...splats.gaussians import Splats
@@ -33,7 +33,7 @@ from ..start import from_splats
 from ..threedgs.refining import Refining
 from ..walk import Walk
 from . import TreeParameters
-from .build import build
+from .build import GrowingForest
 from .store import Store, default_budget
 
 
@@ -54,11 +54,13 @@ class SeenRecords:
         self._store, self._places, self._lr, self._most = store, places, lr, most
         self.leaves = {name: values.requires_grad_() for name, values in store.values_at(places).items()}
 
-    def note_gradients(self, norms: torch.Tensor) -> None:
-        """Tells the norms (M,) of gradients in the image plane, of which the largest are kept."""
-        column = self._store.cache.records[:, self._store.columns["grad"]]
-        at = torch.from_numpy(self._places).to(column.device)
-        column[at] = torch.maximum(column[at], norms)
+    def accumulate_stats(self, rendering: Rendering) -> None:
+        """After ``backward``: what density control asks for."""
+        records, columns = self._store.cache.records, self._store.columns
+        at = torch.from_numpy(self._places).to(records.device)
+        grad = records[:, columns["grad"]]
+        grad[at] = torch.maximum(grad[at], rendering.grad2d.norm(dim=1))
+        records[at[rendering.radii > 0], columns["seen"]] = float(self._most + 1)
         self._store.cache.changed(self._places)
 
     def step(self) -> None:
@@ -131,13 +133,9 @@ class Method(Refining):
             return {}
         return {BLOCKS: table_of_pages({level.number: level.splats.extras for level in self._levels()})}
 
-    def nodes(self) -> Piece:
-        """All nodes (2N - 1) as they are now, and the tree of them."""
-        assert self.store is not None
-        return whole(self.store.subtrees(), self.store.above())
-
     def _levels(self) -> list[Level]:
-        splats, tree = self.nodes()
+        assert self.store is not None
+        splats, tree = joined(self.store)
         return tree.levels(splats)
 
     # -- a step ----------------------------------------------------------------------------------------
@@ -181,19 +179,16 @@ class Method(Refining):
     def accumulate_stats(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> None:
         super().accumulate_stats(drawings, view, step)
         if isinstance(self._optimizer, SeenRecords):
-            self._optimizer.note_gradients(drawings[0].rendering.grad2d.norm(dim=1))
+            self._optimizer.accumulate_stats(drawings[0].rendering)
 
     @torch.no_grad()
     def _build_step(self, step: int) -> tuple[float, torch.Tensor, Target]:
         """Builds the tree; what is told of the step is how a view looks by it."""
-        nodes, tree = build(self.model.splats())
-        self.model = self.new_model(
-            from_splats(nodes.select(slice(0)), self.parameters.sh_degree, self.device)
-        )
-        subtrees, upper = pieces(nodes, tree)
+        leaves = self.model.splats()
+        none = from_splats(leaves.select(slice(0)), self.parameters.sh_degree, self.device)
+        self.model = self.new_model(none)
         self.store = self._new_store()
-        self.store.fill(subtrees)
-        self.store.crown(upper)
+        self.store.fill(GrowingForest(leaves))
         view = self.choose_view(step)
         gaussians = self._take(view, step, self.parameters.pixels)
         drawing = Drawing(self.rasterize_model(view.camera, step, gaussians=gaussians))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from training.lod.forest import joined
 from training.lod.rules.cut import least_size
 from training.lod.selection import Choice, settings
 from training.lod.tree import size_of
@@ -38,7 +39,7 @@ def shown(tree, camera, pixels):
 
 def above_leaves(tree):
     """Which rows are of nodes above leaves."""
-    forest = tree.store.forest
+    forest = tree.store.shape
     place = np.concatenate([np.arange(2 * count - 1) - count for count in forest.counts.tolist()])
     return np.append(place, np.zeros(len(forest.counts) - 1)) >= 0
 
@@ -68,7 +69,7 @@ def test_leaves_come_first_and_all_nodes_last(data):
     assert tree.steps == tree.parameters.total_steps == 12 + 1 + 8 and tree.levels == 2
     first, above, leaves = trained(tree)
     assert [level.number for level in (first, above, leaves)] == [2, 1, 2]
-    assert len(first.splats) == len(leaves.splats) == len(above.splats) + 1 == tree.nodes()[1].leaves
+    assert len(first.splats) == len(leaves.splats) == len(above.splats) + 1 == joined(tree.store)[1].leaves
     camera = data.train[0]  # until there is a tree everything is shown
     weights = Choice(Bundle("tree", [first], "cut")).weights(camera.center, camera.focal, {"pixels": 16.0})
     assert weights.all()
@@ -96,7 +97,7 @@ def test_without_tuning_the_leaves_are_the_base_to_the_bit(data, base):
 def test_sizes_are_saturated_after_training(data, base):
     tree = make(data, base, lr_scales=0.5, lr_means_final=0.05)  # which moves nodes far
     levels = trained(tree)
-    splats, nodes = tree.nodes()
+    splats, nodes = joined(tree.store)
     sizes = nodes.sizes(splats.means, splats.log_scales)
     for node in range(nodes.leaves, len(nodes)):
         assert sizes[node] >= size_of(splats.log_scales[node : node + 1])[0]
