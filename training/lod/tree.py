@@ -53,15 +53,25 @@ class Tree:
             layer = self.children[layer - self.leaves].reshape(-1)
         return layers
 
-    def sizes(self, means: np.ndarray, log_scales: np.ndarray, below: np.ndarray | float = 0.0) -> np.ndarray:
+    @cached_property
+    def leaves_below(self) -> np.ndarray:
+        """(2N - 1,) int32: how many leaves each node stands for; 1 for a leaf."""
+        below = np.ones(len(self), np.int32)
+        for layer in reversed(self.layers):
+            below[layer] = below[self.children[layer - self.leaves]].sum(axis=1)
+        return below
+
+    def sizes(
+        self, means: np.ndarray, log_scales: np.ndarray, of_leaves: np.ndarray | float = 0.0
+    ) -> np.ndarray:
         """(2N - 1,) float32, saturated: of leaves 0, of others at least :func:`size_of` and ``least_size``.
 
         Args:
             means, log_scales: (2N - 1, 3) float32 of all nodes; of leaves log-scales are not looked at.
-            below: (N,) sizes of leaves that are themselves the roots of trees.
+            of_leaves: (N,) float32, where they are roots of other trees.
         """
         sizes = np.zeros(len(self), np.float32)
-        sizes[: self.leaves] = below
+        sizes[: self.leaves] = of_leaves
         for layer in reversed(self.layers):
             below = self.children[layer - self.leaves]
             apart = means[below].astype(np.float64) - means[layer, None].astype(np.float64)

@@ -3,8 +3,8 @@
 A LoD of Gaussians, Sec. 4.1 and 4.3: the upper tree is walked from the root down, and what is out of the
 image is left out with all below it; the subtrees under it are lists by size, which are looked at from the
 largest node down to where all are fine enough. The nodes found are those of the rule ``cut``
-(``lod.rules.cut``), to the bit. In the paper a list is cut by the distance of its root alone, finer than asked
-for behind it and, without M_d, coarser before it.
+(``lod.rules.cut``), to the bit. In the paper a list is cut by the distance of its root alone, finer than
+asked for behind it and, without M_d, coarser before it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from ..lod.blocks import PIXELS, REACH, SLANT
-from ..lod.forest import split
+from ..lod.forest import shape_of
 from ..lod.rules.cut import detail_of
 from ..lod.tree import Tree
 from ..scenes.cameras import Camera
@@ -128,8 +128,8 @@ class Hspt:
     def __init__(
         self, tree: Tree, means: np.ndarray, sizes: np.ndarray, log_scales: np.ndarray, longest: int = 0
     ) -> None:
-        order, forest = split(tree, longest or max(math.isqrt(len(tree)) // 6, 1))
-        names = self._names = order[forest.walked]
+        order, forest = shape_of(tree, longest or max(math.isqrt(len(tree)) // 6, 1))
+        names = self._names = order[forest.in_upper]
         inside = order[: forest.ends[-1]]
         bounds = bounds_of(means[inside], log_scales[inside], forest.begins)
         self._upper = Upper.over(forest.upper, means[names], log_scales[names], sizes[names], bounds)
@@ -168,7 +168,7 @@ def cut_off(sizes: np.ndarray, begins: np.ndarray, ends: np.ndarray, least: np.n
 
     Args:
         sizes: (E,) float32, falling from each list's begin, (L,) int64, to its end, (L,).
-        least: (L,) float32.
+        least: (L,) float64.
     """
     found = np.empty_like(begins)
     at_once(_cut_off, sizes, begins, ends, least, found)
