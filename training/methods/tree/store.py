@@ -8,7 +8,7 @@ looks at: sorted by size, with means and sizes as they were when sizes were last
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import pairwise
 from math import prod
 from pathlib import Path
@@ -36,6 +36,10 @@ ENTRY = Layout({"node": (), "pair": (2,), "family": (12,)})
 """Of a list: a node and its children, by their numbers in the subtree, and the mean and size of each."""
 
 
+RecordPiece = tuple[torch.Tensor, Tree]
+"""As ``lod.forest.Piece``: the nodes' records, (., width), and the tree."""
+
+
 def default_budget(device: torch.device | str = "cpu") -> int:
     """Bytes for the nodes that are in memory if nothing is said: half of what is free."""
     if torch.device(device).type == "cuda":
@@ -47,14 +51,14 @@ def layout_of(sh_degree: int) -> Layout:
     """What a node's record holds: NAMES, C numbers together, moments, and
 
     steps: how many steps of Adam have moved it;
-    grad: the largest norm of its gradient in the image plane since density control last asked;
+    score: its largest ``density.peak_score`` since density control last asked;
     seen: the last step, from 1, that had it in its image; 0: none.
     """
     shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": ()}
     values: dict[str, tuple[int, ...]] = shapes | {"sh": ((sh_degree + 1) ** 2, 3)}
     count = sum(map(prod, values.values()))
     moments: dict[str, tuple[int, ...]] = {"first": (count,), "second": (count,)}
-    return Layout({**values, **moments, "steps": (), "grad": (), "seen": ()})
+    return Layout({**values, **moments, "steps": (), "score": (), "seen": ()})
 
 
 class Store:
@@ -69,6 +73,7 @@ class Store:
         shape: where the pieces of the tree are among the rows.
         cache: of G + 1 groups: the subtrees, and the upper nodes, which are always all there.
         columns: where each array of a record begins.
+        budget: of the cache, in bytes.
     """
 
     shape: ForestShape
@@ -80,7 +85,7 @@ class Store:
         self.columns = dict(zip(self.layout.shapes, begins, strict=False))
         self.values = self.columns["first"]
         self._shapes = {name: self.layout.shapes[name] for name in NAMES}
-        self._budget, self._device = budget, device
+        self.budget, self._device = budget, device
         self.rows = FileRows(folder, self.layout)
         self._lists = FileRows(folder, ENTRY, name="lists")
 
@@ -90,9 +95,16 @@ class Store:
     # -- a tree comes in -------------------------------------------------------------------------------
 
     def fill(self, forest: Forest) -> None:
-        """Takes a tree's pieces, one after the other; with it, it can be cut."""
+        """Takes a tree's pieces, one after the other; with them, it can be cut."""
+        self.fill_records(
+            ((self._records_of(splats), tree) for splats, tree in forest),
+            lambda: (self._records_of(forest.upper[0]), forest.upper[1]),
+        )
+
+    def fill_records(self, subtrees: Iterable[RecordPiece], upper: Callable[[], RecordPiece]) -> None:
+        """The same with records, which have moments; the upper tree is asked for when all others are here."""
         counts, waiting, nodes = [], [], 0
-        for piece in forest:
+        for piece in subtrees:
             counts.append(piece[1].leaves)
             waiting.append(piece)
             nodes += len(piece[0])
@@ -100,15 +112,15 @@ class Store:
                 self._append(waiting)
                 waiting, nodes = [], 0
         self._append(waiting)
-        splats, upper = forest.upper
-        self.rows.append(self._records(splats))
-        self._take_shape(ForestShape(np.array(counts, np.int64), upper))
+        records, tree = upper()
+        self.rows.append(records)
+        self._take_shape(ForestShape(np.array(counts, np.int64), tree))
         self.resize()
 
-    def _append(self, subtrees: list[Piece]) -> None:
+    def _append(self, subtrees: list[RecordPiece]) -> None:
         if not subtrees:
             return
-        self.rows.append(torch.cat([self._records(splats) for splats, _ in subtrees]))
+        self.rows.append(torch.cat([records for records, _ in subtrees]))
         entries = []
         for _, tree in subtrees:
             entry = np.zeros((len(tree.children), ENTRY.width), np.float32)
@@ -117,7 +129,7 @@ class Store:
             entries.append(entry)
         self._lists.append(torch.from_numpy(np.concatenate(entries)))
 
-    def _records(self, splats: Splats) -> torch.Tensor:
+    def _records_of(self, splats: Splats) -> torch.Tensor:
         records = np.zeros((len(splats), self.layout.width), np.float32)
         arrays = [getattr(splats, name).reshape(len(splats), -1) for name in NAMES]
         np.concatenate(arrays, axis=1, out=records[:, : self.values])
@@ -126,7 +138,7 @@ class Store:
     def _take_shape(self, shape: ForestShape) -> None:
         self.shape = shape
         self._mark_ends = np.cumsum(-(-(shape.counts - 1) // MARK))
-        self.cache = CutCache(self.rows, len(self.shape.counts) + 1, self._budget, self._device)
+        self.cache = CutCache(self.rows, len(self.shape.counts) + 1, self.budget, self._device)
 
     # -- cuts ------------------------------------------------------------------------------------------
 
@@ -214,7 +226,8 @@ class Store:
             family = entries[:, :3].astype(np.int32) + begins[of_list, None].astype(np.int32)
             in_order = np.argsort(family[:, 0])
             order, tree = side_by_side(counts, family[in_order, 1:])
-            means, log_scales = (records[name].numpy() for name in ("means", "log_scales"))
+            values = self.layout.split(records)
+            means, log_scales = (values[name].numpy() for name in ("means", "log_scales"))
             sizes = np.empty(len(order), np.float32)
             sizes[order] = tree.sizes(means[order], log_scales[order])
             by_size = np.lexsort((-sizes[family[:, 0]], of_list))
@@ -236,11 +249,11 @@ class Store:
         low, high, reach = (np.concatenate(each) for each in zip(*bounds, strict=True))
         self._top = Upper.over(self.shape.upper, means, log_scales, sizes, (low, high, reach))
 
-    def _read(self, some: slice) -> tuple[dict[str, torch.Tensor], np.ndarray]:
-        """The records and the lists' entries (., 15) of some subtrees."""
+    def _read(self, some: slice) -> tuple[torch.Tensor, np.ndarray]:
+        """The records (., width) and the lists' entries (., 15) of some subtrees."""
         begin, end = int(self.shape.begins[some.start]), int(self.shape.ends[some.stop - 1])
         entries = self._lists.read(self._of_lists(some)).numpy()
-        return self.layout.split(self.rows.read(np.arange(begin, end))), entries
+        return self.rows.read(np.arange(begin, end)), entries
 
     def _of_lists(self, some: slice) -> np.ndarray:
         """Where the lists of some subtrees are."""
@@ -250,6 +263,17 @@ class Store:
 
     def __iter__(self) -> Iterator[Piece]:
         """The subtrees as they are now: a store is a ``Forest``."""
+        for records, tree in self.records():
+            yield self._splats(records), tree
+
+    @property
+    def upper(self) -> Piece:
+        """The upper tree as it is now."""
+        records, tree = self.upper_records()
+        return self._splats(records), tree
+
+    def records(self) -> Iterator[RecordPiece]:
+        """The subtrees' records as they are now, (2n - 1, width) each."""
         self.cache.write_back()
         for some in _batches(2 * self.shape.counts - 1):
             records, entries = self._read(some)
@@ -257,15 +281,23 @@ class Store:
             for leaves in self.shape.counts[some].tolist():
                 children = entries[entry : entry + leaves - 1, :3].astype(np.int32)
                 children = children[np.argsort(children[:, 0]), 1:]
-                yield _splats(records, slice(row, row + 2 * leaves - 1)), Tree(children)
+                yield records[row : row + 2 * leaves - 1], Tree(children)
                 row, entry = row + 2 * leaves - 1, entry + leaves - 1
 
-    @property
-    def upper(self) -> Piece:
-        """The upper tree as it is now."""
+    def upper_records(self) -> RecordPiece:
+        """The upper tree's, (G - 1, width)."""
         self.cache.write_back()
-        records = self.layout.split(self.rows.read(np.arange(self.shape.ends[-1], len(self))))
-        return _splats(records, slice(None)), self.shape.upper
+        return self.rows.read(np.arange(self.shape.ends[-1], len(self))), self.shape.upper
+
+    def _splats(self, records: torch.Tensor) -> Splats:
+        values = self.layout.split(records)
+        means, quats, log_scales, opacity_logits, sh = (values[name].numpy().copy() for name in NAMES)
+        return Splats(means, quats, log_scales, opacity_logits, sh)
+
+    def rest(self) -> None:
+        """Writes back what has changed, and gives the cache's memory back: no view can be taken any more."""
+        self.cache.write_back()
+        self.cache = CutCache(self.rows, 0, 0, self._device)
 
     # -- what lasts ------------------------------------------------------------------------------------
 
@@ -300,11 +332,6 @@ class Store:
         self._top = Upper(self.shape.upper, arrays["balls"], arrays["boxes"])
         self._lists.load_state_dict(state["lists"])
         self.cache.load_state_dict(state["cache"])
-
-
-def _splats(records: Mapping[str, torch.Tensor], some: slice) -> Splats:
-    means, quats, log_scales, opacity_logits, sh = (records[name][some].numpy().copy() for name in NAMES)
-    return Splats(means, quats, log_scales, opacity_logits, sh)
 
 
 def _batches(lengths: np.ndarray) -> Iterator[slice]:

@@ -5,7 +5,7 @@ draws its cut, a little coarser at random (A.6, "Varying level of detail"), and 
 alone, as if they were a scene of their own.
 
 From then on the nodes are outside memory (``store``), and views come in an order that stays near (Sec. 4.4).
-The paper's density control on the tree (Sec. 4.2) would stand in :meth:`Method.control_density`.
+Density control (Sec. 4.2) makes a new store of the old one (``density``).
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from ...splats.bundle import Level
 from ...splats.gaussians import Splats
 from ...splats.ply import Columns
 from ..data import TrainingView
+from ..density import peak_score
 from ..method import Drawing
 from ..model import NAMES
 from ..schedules import due
@@ -34,6 +35,7 @@ from ..threedgs.refining import Refining
 from ..walk import Walk
 from . import TreeParameters
 from .build import GrowingForest
+from .density import Growing
 from .store import Store, default_budget
 
 
@@ -57,10 +59,12 @@ class SeenRecords:
     def accumulate_stats(self, rendering: Rendering) -> None:
         """After ``backward``: what density control asks for."""
         records, columns = self._store.cache.records, self._store.columns
-        at = torch.from_numpy(self._places).to(records.device)
-        grad = records[:, columns["grad"]]
-        grad[at] = torch.maximum(grad[at], rendering.grad2d.norm(dim=1))
-        records[at[rendering.radii > 0], columns["seen"]] = float(self._most + 1)
+        seen = torch.nonzero(rendering.radii > 0).squeeze(1)
+        at = torch.from_numpy(self._places).to(records.device)[seen]
+        opacity_logits = self.leaves["opacity_logits"].detach()[seen]
+        score = peak_score(rendering.grad2d[seen].norm(dim=1), rendering.radii[seen], opacity_logits)
+        records[at, columns["score"]] = torch.maximum(records[at, columns["score"]], score)
+        records[at, columns["seen"]] = float(self._most + 1)
         self._store.cache.changed(self._places)
 
     def step(self) -> None:
@@ -180,6 +184,24 @@ class Method(Refining):
         super().accumulate_stats(drawings, view, step)
         if isinstance(self._optimizer, SeenRecords):
             self._optimizer.accumulate_stats(drawings[0].rendering)
+
+    def control_density(self, step: int) -> None:
+        super().control_density(step)
+        p, done = self.parameters, step - self.finest_steps
+        if self.store is None or done > p.grow_until * p.tune_steps or not due(p.grow_interval, done):
+            return
+        growing = Growing(
+            self.store,
+            threshold=p.max_threshold * self.data.threshold_scale,
+            min_opacity=p.min_opacity,
+            unseen_since=done + 1 - round(p.unseen_epochs * len(self.data.train)) if p.unseen_epochs else 0,
+            now=done + 1,
+            most=p.max_splats,
+        )
+        grown = self._new_store(self.store.budget)
+        grown.fill_records(growing, lambda: growing.upper)
+        self.store.close()
+        self.store = grown
 
     @torch.no_grad()
     def _build_step(self, step: int) -> tuple[float, torch.Tensor, Target]:
