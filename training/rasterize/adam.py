@@ -74,13 +74,22 @@ class Adam:
                 update_in_torch(*arrays, *rest)
 
     @torch.no_grad()
-    def step_rows(self, rows: torch.Tensor, grads: Mapping[str, torch.Tensor | None]) -> None:
+    def step_rows(
+        self,
+        rows: torch.Tensor,
+        grads: Mapping[str, torch.Tensor | None],
+        shares: torch.Tensor | None = None,
+    ) -> None:
         """One step in place for these rows (M,) int64 alone, by their gradients (M, ...); others stay.
 
         What is out of sight costs nothing, and keeps its moments.
+
+        Args:
+            shares: (M,) float32, each row's factor of the learning rates; rows of share 0 stay as they are.
         """
         from .cpu.adam import update_rows
 
+        shares = torch.ones(len(rows), device=rows.device) if shares is None else shares
         for name, tensor in self.tensors.items():
             gradient = grads.get(name)
             if gradient is None:
@@ -89,13 +98,17 @@ class Adam:
             rest = self.lr[name], self.betas, self.eps, self.steps[name]
             if tensor.device.type == "cpu":
                 arrays = tensor.detach(), rows, gradient.contiguous(), *self.state[name]
-                update_rows(*(array.numpy() for array in arrays), *rest)
+                parameter, at, *others = (array.numpy() for array in arrays)
+                update_rows(parameter, at, shares.numpy(), *others, *rest)
             else:
-                m, v = (moment[rows] for moment in self.state[name])
-                values = tensor.detach()[rows]
-                update_in_torch(values, gradient, m, v, *rest)
+                moved = shares != 0
+                some = rows[moved]
+                values, m, v = (whole[some] for whole in (tensor.detach(), *self.state[name]))
+                share = shares[moved].reshape(-1, *[1] * (values.ndim - 1))
+                rate = torch.as_tensor(self.lr[name], dtype=torch.float32, device=values.device) * share
+                update_in_torch(values, gradient[moved], m, v, rate, *rest[1:])
                 for whole, part in zip((tensor.detach(), *self.state[name]), (values, m, v), strict=True):
-                    whole[rows] = part
+                    whole[some] = part
 
     def zero_grad(self) -> None:
         """Forget the gradients, so that the next ``backward`` starts from nothing."""

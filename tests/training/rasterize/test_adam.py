@@ -93,6 +93,30 @@ def test_rows_come_and_go_with_their_moments():
     assert torch.equal(kept, alone[rows])
 
 
+def test_rows_move_by_their_shares_of_the_rate():
+    """A row's share is a learning rate of its own: against torch's Adam, group by group."""
+    start = torch.randn(9, 4, 3, generator=torch.Generator().manual_seed(99))
+    ours, rows = start.clone(), torch.tensor([1, 2, 4, 5, 8])
+    shares = torch.tensor([1.0, 0.25, 0.0, 0.25, 1.0])
+    rates = torch.tensor([[1e-2], [1e-3], [1e-3], [2e-3]])
+    adam = Adam({"sh": ours}, {"sh": rates})
+    alone = [start[row].double().requires_grad_() for row in rows]
+    groups = [
+        {"params": [alone[k]], "lr": torch.tensor(float(share))} for k, share in enumerate(shares)
+    ]  # of one rate each: a coefficient's own comes in by scaling what moved
+    expected = torch.optim.Adam(groups, eps=1e-15)
+    for step in range(20):
+        gradient = gradients(step, (5, 4, 3))
+        adam.step_rows(rows, {"sh": gradient}, shares)
+        for each, part in zip(alone, gradient, strict=True):
+            each.grad = part.double()
+        expected.step()
+    moved = torch.stack([each.detach() for each in alone]) - start[rows].double()
+    torch.testing.assert_close(ours[rows].double(), start[rows] + rates * moved, atol=2e-6, rtol=2e-6)
+    still = [0, 3, 4, 6, 7]
+    assert torch.equal(ours[still], start[still]) and not adam.state["sh"][0][still].any()
+
+
 def test_a_tensor_without_a_gradient_stays():
     tensors = {"a": torch.ones(3), "b": torch.ones(3)}
     adam = Adam(tensors, {"a": 0.1, "b": 0.1})

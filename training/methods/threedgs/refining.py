@@ -23,14 +23,22 @@ class SeenRows:
         adam: of all rows.
         rows: (M,) int64 of them.
         leaves: these rows of each tensor, from which the picture was made.
+        shares: (M,), see ``Adam.step_rows``.
     """
 
-    def __init__(self, adam: Adam, rows: torch.Tensor, leaves: dict[str, torch.Tensor]) -> None:
-        self._adam, self._rows, self._leaves = adam, rows, leaves
+    def __init__(
+        self,
+        adam: Adam,
+        rows: torch.Tensor,
+        leaves: dict[str, torch.Tensor],
+        shares: torch.Tensor | None = None,
+    ) -> None:
+        self._adam, self._rows, self._leaves, self._shares = adam, rows, leaves, shares
 
     def step(self) -> None:
         """One step of these rows."""
-        self._adam.step_rows(self._rows, {name: leaf.grad for name, leaf in self._leaves.items()})
+        gradients = {name: leaf.grad for name, leaf in self._leaves.items()}
+        self._adam.step_rows(self._rows, gradients, self._shares)
 
     def zero_grad(self) -> None:
         """The rows go with their gradients: the next picture has others."""
@@ -62,10 +70,14 @@ class Refining(threedgs_train.Method):
         """Whether a step comes after those of 3DGS."""
         return step >= self.finest_steps
 
-    def take_rows(self, rows: torch.Tensor) -> Gaussians:
-        """The splats (M,) of these rows, int64, to draw: they alone make the step."""
+    def take_rows(self, rows: torch.Tensor, shares: torch.Tensor | None = None) -> Gaussians:
+        """The splats (M,) of these rows, int64, to draw: they alone make the step.
+
+        Args:
+            shares: (M,) of the learning rates, see ``Adam.step_rows``.
+        """
         leaves = {name: tensor.requires_grad_() for name, tensor in self.model.rows(rows).items()}
-        self._optimizer = SeenRows(self.model.adam, rows, leaves)
+        self._optimizer = SeenRows(self.model.adam, rows, leaves, shares)
         return Gaussians(**leaves)
 
     def optimizers(self) -> Sequence[Adam | SeenRows]:

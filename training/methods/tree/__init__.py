@@ -24,6 +24,12 @@ class TreeParameters(ThreedgsParameters):
         "are coarse.",
         high=100,
     )
+    leaf_rate: float = parameter(
+        0.3,
+        "Learning rates of leaves, as a share of those of the nodes above them; they fall to a tenth of it. "
+        "0 leaves all leaves as they are.",
+        high=1,
+    )
     resize_interval: int = parameter(
         1000,
         "Steps after which cuts follow the sizes that nodes have by then; 0: those that the tree was built "

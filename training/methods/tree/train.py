@@ -29,6 +29,9 @@ from ..threedgs.refining import Refining
 from . import TreeParameters
 from .build import build
 
+LEAF_REST = 0.1
+"""The rate at which leaves move at the end of training, as a share of that at its beginning."""
+
 
 class Method(Refining):
     """One run of A LoD of Gaussians.
@@ -95,7 +98,8 @@ class Method(Refining):
     def draw(self, view: TrainingView, step: int) -> list[Drawing]:
         if not self.refines(step):
             return super().draw(view, step)
-        gaussians = self.take_rows(self.cut(view, self._pixels(step)))
+        rows = self.cut(view, self._pixels(step))
+        gaussians = self.take_rows(rows, self._shares(rows, step))
         return [Drawing(self.rasterize_model(view.camera, step, gaussians=gaussians))]
 
     def cut(self, view: TrainingView, pixels: float) -> torch.Tensor:
@@ -129,6 +133,16 @@ class Method(Refining):
         """A step's granularity (A.6: distances times 1 + 5 r⁴)."""
         r = np.random.default_rng([self.seed, step, 12]).random()
         return self.parameters.pixels * (1 + self.parameters.lod_noise * r**4)
+
+    def _shares(self, rows: torch.Tensor, step: int) -> torch.Tensor:
+        """The shares (M,) of the learning rates that nodes (M,) move with: leaves are slow, and come to rest.
+
+        They are good as they are, and nodes above them are not.
+        """
+        assert self.tree is not None
+        done = (step - self.finest_steps) / self.parameters.tune_steps
+        slow = self.parameters.leaf_rate * LEAF_REST**done
+        return torch.where(rows < self.tree.leaves, slow, 1.0)
 
     # -- what lasts ------------------------------------------------------------------------------------
 

@@ -44,25 +44,28 @@ def _update(begin, end, parameter, gradient, m, v, lr, keep_m, keep_v, scale_v, 
 
 
 @kernel(STRICT)
-def _update_rows(begin, end, parameter, rows, gradient, m, v, lr, keep_m, keep_v, scale_v, eps):
+def _update_rows(begin, end, parameter, rows, shares, gradient, m, v, lr, keep_m, keep_v, scale_v, eps):
     """The same for ``rows`` of the flat arrays, of the gradient's ``lr.shape[0]`` values each."""
     width = lr.shape[0]
     for k in range(begin, end):
+        if shares[k] == 0:
+            continue
         start = rows[k] * width
         for j in range(width):
-            i = start + j
-            parameter[i] -= _moved(i, gradient[k * width + j], m, v, lr[j], keep_m, keep_v, scale_v, eps)
+            i, rate = start + j, shares[k] * lr[j]
+            parameter[i] -= _moved(i, gradient[k * width + j], m, v, rate, keep_m, keep_v, scale_v, eps)
 
 
 @serialised
-def update_rows(parameter, rows, gradient, m, v, lr, betas, eps, step) -> None:
-    """One Adam step in place for ``rows`` (M,) int64; ``lr`` is a number or broadcasts against one row."""
+def update_rows(parameter, rows, shares, gradient, m, v, lr, betas, eps, step) -> None:
+    """One Adam step in place for ``rows`` (M,) int64; ``lr`` is a number or broadcasts against one row, and
+    ``shares`` (M,) float32 are each row's factors of it: rows of share 0 stay as they are."""
     width = int(np.prod(parameter.shape[1:], dtype=int))
     rate = np.asarray(lr, np.float32) / np.float32(1 - betas[0] ** step)
     row = np.ascontiguousarray(np.broadcast_to(rate, parameter.shape[1:])).reshape(-1)
     in_parallel(
         _update_rows, len(rows), max(VALUES // width, 1),
-        parameter.reshape(-1), rows, gradient.reshape(-1), m.reshape(-1), v.reshape(-1), row,
+        parameter.reshape(-1), rows, shares, gradient.reshape(-1), m.reshape(-1), v.reshape(-1), row,
         f32(betas[0]), f32(betas[1]), f32(1 / (1 - betas[1] ** step)), f32(eps),
     )  # fmt: skip
 

@@ -75,6 +75,29 @@ def test_without_tuning_the_leaves_are_the_base_to_the_bit(data, base):
     assert same(one, other) and above.number == 1
 
 
+def test_leaves_of_rate_0_stay_to_the_bit_while_nodes_learn(data, base):
+    tree = make(data, base, leaf_rate=0.0, pixels=4.0)
+    trained(tree, until=1)
+    built = tree.model.splats()
+    trained(tree, begin=1)
+    count = tree.tree.leaves
+    assert same(tree.model.splats().select(slice(count)), built.select(slice(count)))
+    assert (tree.model.splats().means[count:] != built.means[count:]).any()
+
+
+def test_leaves_come_to_rest(data, base):
+    """Their rate falls to a tenth, the nodes' does not."""
+    tree = make(data, base, leaf_rate=0.2, tune_steps=400)
+    trained(tree, until=1)
+    rows = torch.arange(len(tree.tree))
+    for step, share in ((1, 0.2), (201, 0.2 * 10**-0.5), (401, 0.02)):
+        found = tree._shares(rows, step)
+        torch.testing.assert_close(
+            found[: tree.tree.leaves], torch.tensor(share).expand(tree.tree.leaves), rtol=0.01, atol=0
+        )
+        assert (found[tree.tree.leaves :] == 1).all()
+
+
 def test_sizes_are_saturated_after_training(data, base):
     tree = make(data, base, lr_scales=0.5, lr_means_final=0.05)  # which moves nodes far
     levels = trained(tree)
