@@ -19,7 +19,7 @@ class TreeParameters(ThreedgsParameters):
         1.0, "Granularity of these cuts, in pixels of the training images.", low=0.1, high=100, unit="px"
     )
     lod_noise: float = parameter(
-        5.0,
+        15.0,
         "Each step's granularity is larger by this times r⁴, r random from 0 to 1: most cuts are fine, some "
         "are coarse.",
         high=100,
@@ -48,7 +48,9 @@ class TreeParameters(ThreedgsParameters):
 
 _DRAFT = TreeParameters()
 _STANDARD = replace(_DRAFT, **STANDARD, steps=30_000, densify_interval=100, tune_steps=10_000)
-_PAPER = replace(_STANDARD, **PAPER, pixels=3.0, sh_degree=1, tune_steps=150_000)
+_PAPER = replace(
+    _STANDARD, **PAPER, pixels=3.0, lod_noise=5.0, leaf_rate=1.0, sh_degree=1, tune_steps=150_000
+)
 
 METHOD = MethodInfo(
     name="tree",
@@ -61,4 +63,5 @@ METHOD = MethodInfo(
     offered=("max_splats", "tune_steps", "pixels"),
     from_base=True,
     for_splats=True,
+    captured={"leaf_rate": 0.0, "random_background": False},  # leaves are right, and black is nothing
 )

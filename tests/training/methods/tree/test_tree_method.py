@@ -160,7 +160,7 @@ def test_a_bundle_tells_which_blocks_an_eye_needs(data, base):
 
 
 def test_noise_is_coarser_most_at_its_end(data, base):
-    tree = make(data, base, pixels=2.0)
+    tree = make(data, base, pixels=2.0, lod_noise=5.0)
     found = np.array([tree._pixels(step) for step in range(4000)])
     assert found.min() >= 2 and found.max() <= 12
     # A.6: 1 + 5 r⁴ is below 2 for r < (1/5)^(1/4) = 0.669
