@@ -128,6 +128,7 @@ def step_records(
     lr: torch.Tensor,
     steps: int,
     most: int,
+    shares: torch.Tensor | None = None,
     betas: tuple[float, float] = BETAS,
     eps: float = EPS,
 ) -> None:
@@ -140,19 +141,26 @@ def step_records(
         lr: (C,) learning rates.
         steps: the column of the number of steps made.
         most: no record has made more.
+        shares: (M,) float32, each record's factor of the rates; those of share 0 stay as they are.
     """
     from .cpu.adam import update_records
 
+    shares = torch.ones(len(places)) if shares is None else shares
     if records.device.type == "cpu":
         rates = np.ascontiguousarray(lr.numpy(), np.float32)
         gradient = gradient.contiguous()
-        update_records(records.numpy(), places, gradient.numpy(), rates, steps, betas, eps, most)
+        arrays = records.numpy(), places, gradient.numpy(), rates, shares.numpy()
+        update_records(*arrays, steps, betas, eps, most)
         return
-    at, count = torch.from_numpy(places).to(records.device), len(lr)
+    arrays = (each.to(records.device) for each in (torch.from_numpy(places), gradient, shares))
+    at, gradient, share = (each[shares.to(records.device) != 0] for each in arrays)
+    count = len(lr)
     some = records[at]
     values, m, v = (some[:, i * count : (i + 1) * count] for i in range(3))
     some[:, steps] += 1
-    update_in_torch(values, gradient, m, v, lr, betas, eps, some[:, steps, None].double())
+    update_in_torch(
+        values, gradient, m, v, lr.to(share) * share[:, None], betas, eps, some[:, steps, None].double()
+    )
     records[at] = some
 
 

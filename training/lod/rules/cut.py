@@ -15,7 +15,7 @@ PARENT = ("parent_x", "parent_y", "parent_z")
 """Columns of the parent's mean."""
 ABOVE_ROOT = 3.0e38
 """The parent size of the root, which has none: larger than any distance, and finite, as files have it."""
-K_LEAST = 32.0
+K_LEAST = 8.0
 """The least detail of an eye: sizes are made so that cuts are proper from there on."""
 ROUNDING = 2.0**-20
 """Share by which a parent's size is larger still: 16 units in float32's last place, of which comparing a

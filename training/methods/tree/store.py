@@ -211,6 +211,12 @@ class Store:
             for (name, shape), part in zip(self._shapes.items(), parts, strict=True)
         }
 
+    def are_leaves(self, places: np.ndarray) -> np.ndarray:
+        """Which (M,) bool of the records at places (M,) are leaves."""
+        rows, groups = self.cache.rows_at(places), self.cache.groups_at(places)
+        begins, counts = np.append(self.shape.begins, 0), np.append(self.shape.counts, 0)
+        return rows - begins[groups] < counts[groups]
+
     # -- sizes -----------------------------------------------------------------------------------------
 
     def resize(self) -> None:

@@ -38,6 +38,9 @@ from .build import GrowingForest
 from .density import Growing
 from .store import Store, default_budget
 
+LEAF_REST = 0.1
+"""The rate at which leaves move at the end of training, as a share of that at its beginning."""
+
 
 class SeenRecords:
     """Adam's step for the records alone that a picture was made of.
@@ -46,14 +49,22 @@ class SeenRecords:
         store: of all records.
         places: (M,) int64 of them in its cache.
         lr: learning rates by name, as ``Adam`` has them when the step is made.
+        shares: (M,) of these rates, which each moves with.
         most: none of them has made more steps.
 
     Attributes:
         leaves: NAMES of these records, to make the picture from.
     """
 
-    def __init__(self, store: Store, places: np.ndarray, lr: Mapping[str, LearningRate], most: int) -> None:
-        self._store, self._places, self._lr, self._most = store, places, lr, most
+    def __init__(
+        self,
+        store: Store,
+        places: np.ndarray,
+        lr: Mapping[str, LearningRate],
+        shares: torch.Tensor,
+        most: int,
+    ) -> None:
+        self._store, self._places, self._lr, self._shares, self._most = store, places, lr, shares, most
         self.leaves = {name: values.requires_grad_() for name, values in store.values_at(places).items()}
 
     def accumulate_stats(self, rendering: Rendering) -> None:
@@ -77,7 +88,9 @@ class SeenRecords:
                 for name, leaf in self.leaves.items()
             ]
             records, steps = self._store.cache.records, self._store.columns["steps"]
-            step_records(records, self._places, gradient, torch.cat(rates), steps, self._most)
+            step_records(
+                records, self._places, gradient, torch.cat(rates), steps, self._most, shares=self._shares
+            )
             self._store.cache.changed(self._places)
 
     def zero_grad(self) -> None:
@@ -176,8 +189,8 @@ class Method(Refining):
         """The splats of a view's cut, to draw: they alone make the step."""
         assert self.store is not None
         places = self.store.take(view.camera, pixels, self.data.near)
-        seen = SeenRecords(self.store, places, self.model.adam.lr, step - self.finest_steps)
-        self._optimizer = seen
+        shares, done = self._shares(places, step), step - self.finest_steps
+        self._optimizer = seen = SeenRecords(self.store, places, self.model.adam.lr, shares, done)
         return Gaussians(**seen.leaves)
 
     def accumulate_stats(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> None:
@@ -225,6 +238,16 @@ class Method(Refining):
         """A step's granularity (A.6: distances times 1 + 5 r⁴)."""
         r = np.random.default_rng([self.seed, step, 12]).random()
         return self.parameters.pixels * (1 + self.parameters.lod_noise * r**4)
+
+    def _shares(self, places: np.ndarray, step: int) -> torch.Tensor:
+        """The shares (M,) of the learning rates that records move with: leaves are slow, and come to rest.
+
+        They are good as they are, and nodes above them are not.
+        """
+        assert self.store is not None
+        done = (step - self.finest_steps) / max(self.parameters.tune_steps, 1)
+        slow = self.parameters.leaf_rate * LEAF_REST**done
+        return torch.where(torch.from_numpy(self.store.are_leaves(places)), slow, 1.0)
 
     # -- what lasts ------------------------------------------------------------------------------------
 

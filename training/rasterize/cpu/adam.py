@@ -57,20 +57,22 @@ def _update_rows(begin, end, parameter, rows, gradient, m, v, lr, keep_m, keep_v
 
 @kernel(STRICT)
 def _update_records(
-    begin, end, records, places, gradient, lr, steps, first, second, keep_m, keep_v, eps, width
+    begin, end, records, places, gradient, lr, shares, steps, first, second, keep_m, keep_v, eps, width
 ):
     """The same for flat records of ``width`` numbers, at ``places``: values, moments, steps made."""
     count = lr.shape[0]
     m, v = records[count:], records[2 * count :]
     for k in range(begin, end):
+        if shares[k] == 0:
+            continue
         start = places[k] * width
         records[start + steps] += f32(1)
         made = int(records[start + steps])
-        keep, scale_v = first[made], second[made]
+        rate, scale_v = shares[k] / first[made], second[made]
         for j in range(count):
             i = start + j
             g = gradient[k * count + j]
-            records[i] -= _moved(i, g, m, v, lr[j] / keep, keep_m, keep_v, scale_v, eps)
+            records[i] -= _moved(i, g, m, v, lr[j] * rate, keep_m, keep_v, scale_v, eps)
 
 
 @lru_cache(4)
@@ -82,7 +84,7 @@ def _corrections(betas: tuple[float, float], count: int) -> tuple[np.ndarray, np
 
 
 @serialised
-def update_records(records, places, gradient, lr, steps, betas, eps, most) -> None:
+def update_records(records, places, gradient, lr, shares, steps, betas, eps, most) -> None:
     """One Adam step in place for records (N, width): values, both moments of each, and ``steps``.
 
     Args:
@@ -90,6 +92,7 @@ def update_records(records, places, gradient, lr, steps, betas, eps, most) -> No
         places: (M,) int64 of those that move, each once.
         gradient: (M, C) of the values.
         lr: (C,) learning rate of each value.
+        shares: (M,) float32, factors of these; records of share 0 stay as they are.
         steps: the column with the number of steps that a record has made.
         most: no record has made more.
     """
@@ -97,7 +100,7 @@ def update_records(records, places, gradient, lr, steps, betas, eps, most) -> No
     made = _corrections(betas, 1 << int(most + 1).bit_length())
     in_parallel(
         _update_records, len(places), max(VALUES // count, 1),
-        records.reshape(-1), places, gradient.reshape(-1), lr, steps, *made,
+        records.reshape(-1), places, gradient.reshape(-1), lr, shares, steps, *made,
         f32(betas[0]), f32(betas[1]), f32(eps), records.shape[1],
     )  # fmt: skip
 
