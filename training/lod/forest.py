@@ -95,7 +95,7 @@ def divided(splats: Splats, tree: Tree, longest: int) -> Grove:
     for begin, end, own in zip(begins[:-2].tolist(), begins[1:-1].tolist(), of_piece.tolist(), strict=False):
         children = numbers[order[begin + own : end] - leaves]
         subtrees.append((splats.select(slice(begin, end)), Tree(children)))
-    rest = slice(int(begins[-2]), count)
+    rest = np.arange(begins[-2], count)  # as a copy, which is there when the subtrees are gone
     return Grove(subtrees, (splats.select(rest), Tree(numbers[order[rest] - leaves])))
 
 
@@ -143,7 +143,7 @@ def levels_of(forest: Forest, folder: Path) -> tuple[list[Level], Columns]:
     for splats, tree in forest:
         columns = tree.columns(splats.means, tree.sizes(splats.means, splats.log_scales))
         splats = replace(splats, extras=columns)
-        roots.append(splats.select(slice(-1, None)))
+        roots.append(splats.select([-1]))  # a copy: a view would keep them all
         files[LEAVES].append(splats.select(slice(0, tree.leaves)))
         files[NODES].append(splats.select(slice(tree.leaves, None)))
         file = files[LEAVES if tree.leaves == 1 else NODES]
