@@ -27,9 +27,9 @@ from .gaussians import SplatRows, Splats
 from .ply import (
     Columns,
     Element,
+    all_columns,
     columns_of,
     columns_of_extras,
-    every_column,
     let_go,
     read_comments,
     read_elements,
@@ -122,6 +122,11 @@ class Bundle:
     def antialias(self) -> bool:
         """Whether the splats are drawn through Mip-Splatting's 2D filter, as they were trained."""
         return bool(self.meta.get("antialias"))
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether splats of a level are not in memory."""
+        return any(level.elsewhere is not None for level in self.levels)
 
     def upto(self, number: int) -> list[Level]:
         """The levels that are drawn at a level: it, and where levels add up the coarser ones before it."""
@@ -480,7 +485,7 @@ def describe(path: str | Path) -> str:
         f"{'level':>5}  {'splats':>10}  {'MB':>8}  {''.join(f'{name:>10}  ' for name in names)}extras",
     ]
     for level in bundle.levels:
-        columns = every_column(level.splats)
+        columns = all_columns(level.splats)
         size = Element.of("", columns).size / 1e6
         facts = "".join(
             f"{level.facts[name]:>10.6g}  " if name in level.facts else f"{'-':>10}  " for name in names

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import LodgsError
 from .gaussians import Splats
-from .ply import every_column, records_of, splats_from
+from .ply import all_columns, records_of, splats_from
 
 _PAGE = 64
 """Rows that are read together where some of them are wanted."""
@@ -57,7 +57,7 @@ class Scratch:
         Raises:
             LodgsError: the disk is full, or the file cannot be written.
         """
-        records = records_of(every_column(splats))
+        records = records_of(all_columns(splats))
         self._row = self._row if self._row.names else records.dtype
         assert records.dtype == self._row, "splats of other columns"
         self._count = max(self._count, begin + len(splats))
