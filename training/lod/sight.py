@@ -10,7 +10,7 @@ import numpy as np
 
 from ..scenes.cameras import Camera
 from ..splats.bundle import Bundle, open_bundle, read_head
-from ..splats.dialects import Warn, drawable, silent
+from ..splats.dialects import Warn, drawable, left_out, silent
 from ..splats.gaussians import SplatRows, Splats
 from .blocks import SIZE, Blocks
 from .choice import Choice
@@ -72,21 +72,19 @@ class Sight:
         self, rows: SplatRows, rule: Rule | None = None, path: object = "", warn: Warn = silent
     ) -> None:
         self._rows, self._rule, self._path = rows, rule, str(path)
-        parts, of_columns, left_out = [], [], 0
+        parts, of_columns, undrawable = [], [], 0
         for begin in range(0, len(rows), _AT_ONCE):
             splats = rows.select(slice(begin, begin + _AT_ONCE))
             missing = len(splats) - len(drawable(splats, self._path))
-            left_out += missing
+            undrawable += missing
             blocks = Blocks.of(splats.means, splats.log_scales)
             if missing:  # no numbers to go by
                 blocks.low[:], blocks.high[:] = -_ANYWHERE, _ANYWHERE
             parts.append((blocks.low, blocks.high, blocks.reach))
             columns = {} if rule is None else columns_of(rule, splats)
             of_columns.append({name: blocks.highest(column) for name, column in columns.items()})
-        if left_out:
-            warn(
-                f"{left_out:,} splats of {path} have values that are no numbers, or are too large: left out."
-            )
+        if undrawable:
+            warn(left_out(undrawable, self._path))
         none = Blocks.of(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
         low, high, reach = (
             np.concatenate([getattr(none, name), *(part[i] for part in parts)])

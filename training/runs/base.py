@@ -11,14 +11,26 @@ from scipy.special import expit, logit
 from ..errors import LodgsError
 from ..lod.rule import find_rule
 from ..lod.selection import complete, select, settings
-from ..splats.bundle import Bundle, read_bundle, read_folder
-from ..splats.dialects import Warn, silent
-from ..splats.gaussians import Splats
+from ..splats.bundle import Bundle, Rows, open_bundle, read_bundle, read_folder, read_head
+from ..splats.dialects import Warn, drawable, in_3dgs, left_out, silent
+from ..splats.gaussians import SplatRows, Splats
+from ..splats.ply import AT_ONCE
 from .folder import RunFolder
+
+_ROW = "row"
+"""Column that tells in which row of a file splats are."""
 
 
 def read_base(path: str | Path, warn: Warn = silent) -> tuple[Splats, bool]:
+    """:func:`open_base`, with all splats in memory."""
+    rows, antialias = open_base(path, warn)
+    return rows.select(slice(None)), antialias
+
+
+def open_base(path: str | Path, warn: Warn = silent) -> tuple[SplatRows, bool]:
     """The finest complete level of a finished run, of a bundle or an exported folder, or of a plain PLY.
+
+    They stay in the file where that has them as they are to begin with; it is read once to be sure of it.
 
     Args:
         path: a run's folder, one of levels with its manifest, or a PLY.
@@ -41,14 +53,48 @@ def read_base(path: str | Path, warn: Warn = silent) -> tuple[Splats, bool]:
                 f"{path.parent} holds no finished run (no {path.name}).",
                 "Train it to the end first, or choose a PLY of splats.",
             )
-    bundle = (read_folder if path.is_dir() else read_bundle)(path, warn)
-    splats = complete(bundle, bundle.levels[-1])
-    rule = find_rule(bundle.rule)
-    if rule is not None and rule.always and "camera_center" in bundle.meta:
-        splats = _as_seen(bundle, np.asarray(bundle.meta["camera_center"]))
+    head = None if path.is_dir() else read_head(path)
+    rule = None if head is None else find_rule(head.rule)
+    if head is None or head.cumulative or (rule is not None and rule.always):
+        bundle = (read_folder if path.is_dir() else read_bundle)(path, warn)
+        splats: SplatRows = _finest(bundle)
+    else:
+        bundle, rows = open_bundle(path)
+        splats = _InFile(rows[bundle.levels[-1].number], warn)
     if not len(splats):
         raise LodgsError(f"{path} holds no splats to begin with.", "Choose another run or PLY.")
     return splats, bundle.antialias
+
+
+class _InFile:
+    """The splats of a file that can be drawn, in the meaning of the 3DGS columns."""
+
+    def __init__(self, rows: Rows, warn: Warn) -> None:
+        self._rows, self._kept = rows, None
+        kept, tell = [], warn
+        for begin in range(0, len(rows), AT_ONCE):
+            splats = in_3dgs(rows.select(slice(begin, begin + AT_ONCE)), rows.path, tell)
+            splats.extras = {_ROW: begin + np.arange(len(splats))}
+            kept.append(drawable(splats, rows.path).extras[_ROW])
+            tell = silent
+        missing = len(rows) - sum(map(len, kept))
+        if missing:
+            self._kept = np.concatenate(kept)
+            warn(left_out(missing, rows.path))
+
+    def __len__(self) -> int:
+        return len(self._rows) if self._kept is None else len(self._kept)
+
+    def select(self, some: slice, /) -> Splats:
+        splats = self._rows.select(some if self._kept is None else self._kept[some])
+        return drawable(in_3dgs(splats, self._rows.path), self._rows.path)
+
+
+def _finest(bundle: Bundle) -> Splats:
+    rule = find_rule(bundle.rule)
+    if rule is not None and rule.always and "camera_center" in bundle.meta:
+        return _as_seen(bundle, np.asarray(bundle.meta["camera_center"]))
+    return complete(bundle, bundle.levels[-1])
 
 
 def _as_seen(bundle: Bundle, eye: np.ndarray) -> Splats:

@@ -267,16 +267,17 @@ class Rows:
 
 
 def open_bundle(path: str | Path) -> tuple[Bundle, dict[int, Rows]]:
-    """A bundle with its tables, but without splats, and each level's by number to read of: of a binary file
-    nothing else is read.
+    """A bundle with its tables, but without splats, and each level's by number to read of, as they stand
+    there: of a binary file nothing else is read. Any other PLY is one level of unknown method.
 
     Raises:
-        LodgsError: as `read_bundle`, or it is a PLY without levels.
+        LodgsError: as `read_bundle`.
     """
     elements, comments = read_elements(path)
     bundle, lines = _parse(comments, path)
     if bundle is None:
-        raise LodgsError(f"{path} is a PLY without levels.", "Choose a bundle.")
+        bundle = Bundle("", [Level(1, NO_SPLATS)], meta=meta_of(comments))
+        return bundle, {1: Rows(elements["vertex"], None, path)}
     return bundle, _rows_of_levels(bundle, lines, elements, path)
 
 
