@@ -11,14 +11,10 @@ from scipy.special import expit, logit
 from ..errors import LodgsError
 from ..lod.rule import find_rule
 from ..lod.selection import complete, select, settings
-from ..splats.bundle import Bundle, Rows, open_bundle, read_bundle, read_folder, read_head
-from ..splats.dialects import Warn, drawable, in_3dgs, left_out, silent
+from ..splats.bundle import Bundle, DrawableRows, open_bundle, read_bundle, read_folder, read_head
+from ..splats.dialects import Warn, silent
 from ..splats.gaussians import SplatRows, Splats
-from ..splats.ply import AT_ONCE
 from .folder import RunFolder
-
-_ROW = "row"
-"""Column that tells in which row of a file splats are."""
 
 
 def read_base(path: str | Path, warn: Warn = silent) -> tuple[Splats, bool]:
@@ -60,34 +56,10 @@ def open_base(path: str | Path, warn: Warn = silent) -> tuple[SplatRows, bool]:
         splats: SplatRows = _finest(bundle)
     else:
         bundle, rows = open_bundle(path)
-        splats = _InFile(rows[bundle.levels[-1].number], warn)
+        splats = DrawableRows(rows[bundle.levels[-1].number], warn)
     if not len(splats):
         raise LodgsError(f"{path} holds no splats to begin with.", "Choose another run or PLY.")
     return splats, bundle.antialias
-
-
-class _InFile:
-    """The splats of a file that can be drawn, in the meaning of the 3DGS columns."""
-
-    def __init__(self, rows: Rows, warn: Warn) -> None:
-        self._rows, self._kept = rows, None
-        kept, tell = [], warn
-        for begin in range(0, len(rows), AT_ONCE):
-            splats = in_3dgs(rows.select(slice(begin, begin + AT_ONCE)), rows.path, tell)
-            splats.extras = {_ROW: begin + np.arange(len(splats))}
-            kept.append(drawable(splats, rows.path).extras[_ROW])
-            tell = silent
-        missing = len(rows) - sum(map(len, kept))
-        if missing:
-            self._kept = np.concatenate(kept)
-            warn(left_out(missing, rows.path))
-
-    def __len__(self) -> int:
-        return len(self._rows) if self._kept is None else len(self._kept)
-
-    def select(self, some: slice, /) -> Splats:
-        splats = self._rows.select(some if self._kept is None else self._kept[some])
-        return drawable(in_3dgs(splats, self._rows.path), self._rows.path)
 
 
 def _finest(bundle: Bundle) -> Splats:

@@ -7,6 +7,7 @@ from training.errors import LodgsError
 from training.lod.selection import complete
 from training.runs import base
 from training.runs.base import read_base
+from training.splats import bundle as bundles
 from training.splats.bundle import Bundle, Level, read_bundle, write_bundle, write_folder
 from training.splats.dialects import comments_of
 from training.splats.gaussians import Splats
@@ -47,7 +48,7 @@ def test_a_folder_of_something_else_is_no_base(tmp_path):
 
 @pytest.mark.parametrize("kind", ["plain", "finest_first", "stream", "cumulative", "smoothed"])
 def test_splats_that_stay_in_their_file_are_those_that_are_read(tmp_path, monkeypatch, kind):
-    monkeypatch.setattr(base, "AT_ONCE", 7)
+    monkeypatch.setattr(bundles, "AT_ONCE", 7)
     path, told, finest = tmp_path / "b.ply", [], splats(50)
     finest.means[20] = np.nan
     finest.extras["size"] = np.arange(50, dtype=np.float32)
