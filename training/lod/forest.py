@@ -141,8 +141,8 @@ def divided(splats: Splats, tree: Tree, longest: int) -> Grove:
     order, shape = shape_of(tree, longest)
     splats, trees = splats.select(order), subtrees_of(tree, order, shape)
     pieces = [splats.select(slice(*ends)) for ends in shape.ranges]
-    upper = splats.select(slice(int(shape.ends[-1]), None)), shape.upper
-    return Grove(list(zip(pieces, trees, strict=True)), upper)
+    rest = np.arange(shape.ends[-1], len(tree))  # as a copy, which is there when the subtrees are gone
+    return Grove(list(zip(pieces, trees, strict=True)), (splats.select(rest), shape.upper))
 
 
 def subtrees_of(tree: Tree, order: np.ndarray, shape: ForestShape) -> list[Tree]:
@@ -218,7 +218,7 @@ def levels_of(forest: Forest, folder: Path) -> tuple[list[Level], Columns]:
     for splats, tree in forest:
         columns = tree.columns(splats.means, tree.sizes(splats.means, splats.log_scales))
         splats = replace(splats, extras=columns)
-        roots.append(splats.select(slice(-1, None)))
+        roots.append(splats.select([-1]))  # a copy: a view would keep them all
         files[LEAVES].append(splats.select(slice(0, tree.leaves)))
         files[NODES].append(splats.select(slice(tree.leaves, None)))
         file = files[LEAVES if tree.leaves == 1 else NODES]

@@ -105,7 +105,8 @@ class TreeFile:
         self.bundle, self._rows = open_bundle(path)
         if not is_tree(self.bundle):
             raise LodgsError(
-                f"{path} is no tree of splats: its levels are chosen by the rule '{self.bundle.rule}'.",
+                f"{path} is no tree of splats: it is made for "
+                + (f"the rule '{self.bundle.rule}'." if self.bundle.rule else "no distances."),
                 "Open it as a whole.",
             )
         numbers = [level.number for level in self.bundle.levels]

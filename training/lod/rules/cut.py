@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..colors import LEVEL_COLORS
-from ..rule import NO_TABLES, Control, Rule, Values, distances, distances_by_axes
+from ..rule import NO_COLUMNS, NO_TABLES, Control, Rule, Values, distances, distances_by_axes
 
 NODE_SIZE, PARENT_SIZE = "node_size", "parent_size"
 """Columns of sizes, in scene units: a splat's own, 0 for leaves, and its parent's."""
@@ -99,6 +99,13 @@ class Cut(Rule):
                 chosen &= acceptable([*means[block].T], sizes, eye, k)
             shown[block] = chosen
         return shown
+
+    def band(self, focal_px, facts, values, highest=NO_COLUMNS) -> tuple[float, float | np.ndarray]:
+        """As far as parents are too coarse: a node is at most K_LEAST of its parent's sizes away from it."""
+        if PARENT_SIZE not in highest:
+            return 0.0, np.inf
+        k = detail_of(focal_px, values["pixels"])
+        return 0.0, (k + K_LEAST) * (1 + 4 * ROUNDING) * highest[PARENT_SIZE].astype(np.float64)
 
     def told_level(self, columns, facts) -> np.ndarray:
         """The number of a colour: the octave of a node's size, OCTAVES + 1 for leaves."""

@@ -136,7 +136,7 @@ class Growing:
             for (first, last), part in zip(shape.ranges, subtrees_of(tree, order, shape), strict=True):
                 yield records[first:last], part
             uppers.append(shape.upper)
-            above.append(records[shape.ends[-1] :])
+            above.append(records[shape.ends[-1] :].clone())  # the subtree's need not stay for it
         records, upper = self._store.upper_records()
         self._upper = torch.cat([*above, records]), joined_trees(uppers, upper)
 
