@@ -20,14 +20,13 @@ from ...lod.forest import joined
 from ...lod.paging import table_of_pages
 from ...lod.streaming import BLOCKS
 from ...lod.tree import LEAVES, treeless_columns
-from ...rasterize import Gaussians, Rendering, Target
-from ...rasterize.adam import LearningRate, step_records
+from ...rasterize import Gaussians, Rendering, Target, records
+from ...rasterize.adam import LearningRate
 from ...splats.bundle import Level
 from ...splats.gaussians import Splats
 from ...splats.ply import Columns
 from ..data import TrainingView
 from ..method import Drawing
-from ..model import NAMES
 from ..schedules import due
 from ..start import from_splats
 from ..threedgs.refining import Refining
@@ -44,41 +43,37 @@ class SeenRecords:
         store: of all records.
         places: (M,) int64 of them in its cache.
         lr: learning rates by name, as ``Adam`` has them when the step is made.
-        most: none of them has made more steps.
+        number: of the step, from 1.
 
     Attributes:
-        leaves: NAMES of these records, to make the picture from.
+        gaussians: these splats, to make the picture from.
+        rendering: of them, once it has been made.
     """
 
-    def __init__(self, store: Store, places: np.ndarray, lr: Mapping[str, LearningRate], most: int) -> None:
-        self._store, self._places, self._lr, self._most = store, places, lr, most
-        self.leaves = {name: values.requires_grad_() for name, values in store.values_at(places).items()}
+    rendering: Rendering
 
-    def accumulate_stats(self, rendering: Rendering) -> None:
-        """After ``backward``: what density control asks for."""
-        records, columns = self._store.cache.records, self._store.columns
-        at = torch.from_numpy(self._places).to(records.device)
-        grad = records[:, columns["grad"]]
-        grad[at] = torch.maximum(grad[at], rendering.grad2d.norm(dim=1))
-        records[at[rendering.radii > 0], columns["seen"]] = float(self._most + 1)
-        self._store.cache.changed(self._places)
+    def __init__(self, store: Store, places: np.ndarray, lr: Mapping[str, LearningRate], number: int) -> None:
+        self._store, self._places, self._lr, self._number = store, places, lr, number
+        self.gaussians = store.gaussians_at(places)
+        for values in vars(self.gaussians).values():
+            values.requires_grad_()
 
     def step(self) -> None:
         """One step of these records."""
-        gradients = [leaf.grad for leaf in self.leaves.values() if leaf.grad is not None]
-        if len(gradients) == len(NAMES) and len(self._places):
-            gradient = torch.cat([each.reshape(len(each), -1) for each in gradients], 1)
-            rates = [
-                torch.as_tensor(self._lr[name]).float().expand(leaf.shape[1:]).reshape(-1)
-                for name, leaf in self.leaves.items()
-            ]
-            records, steps = self._store.cache.records, self._store.columns["steps"]
-            step_records(records, self._places, gradient, torch.cat(rates), steps, self._most)
-            self._store.cache.changed(self._places)
+        leaves = vars(self.gaussians)
+        gradients = [leaf.grad for leaf in leaves.values() if leaf.grad is not None]
+        if len(gradients) < len(leaves):  # nothing of them is in the picture
+            return
+        rates = [
+            torch.as_tensor(self._lr[name]).float().expand(leaf.shape[1:]).reshape(-1)
+            for name, leaf in leaves.items()
+        ]
+        cache = self._store.cache
+        records.step(cache.records, self._places, gradients, self.rendering, self._number, torch.cat(rates))
+        cache.changed(self._places)
 
     def zero_grad(self) -> None:
-        """The records go with their gradients: the next picture has others."""
-        self.leaves = {}
+        """The next picture has other records."""
 
 
 class Method(Refining):
@@ -172,14 +167,13 @@ class Method(Refining):
         """The splats of a view's cut, to draw: they alone make the step."""
         assert self.store is not None
         places = self.store.take(view.camera, pixels, self.data.near)
-        seen = SeenRecords(self.store, places, self.model.adam.lr, step - self.finest_steps)
-        self._optimizer = seen
-        return Gaussians(**seen.leaves)
+        self._optimizer = SeenRecords(self.store, places, self.model.adam.lr, step + 1 - self.finest_steps)
+        return self._optimizer.gaussians
 
     def accumulate_stats(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> None:
         super().accumulate_stats(drawings, view, step)
         if isinstance(self._optimizer, SeenRecords):
-            self._optimizer.accumulate_stats(drawings[0].rendering)
+            self._optimizer.rendering = drawings[0].rendering
 
     @torch.no_grad()
     def _build_step(self, step: int) -> tuple[float, torch.Tensor, Target]:

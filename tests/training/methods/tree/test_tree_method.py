@@ -132,7 +132,7 @@ def test_training_draws_what_the_bundle_shows(data, base):
     for pixels in (0.5, 3.0, 11.0):
         for camera in data.train[:3]:
             rows = shown(tree, camera, pixels)
-            gaussians = Gaussians(**tree.store.values_at(tree.store.take(camera, pixels, data.near)))
+            gaussians = tree.store.gaussians_at(tree.store.take(camera, pixels, data.near))
             one = tree.rasterize_model(camera, 0, gaussians=gaussians).image
             weights = choice.weights(camera.center, camera.focal, settings(bundle, {"pixels": pixels}))
             gaussians = Gaussians.of(choice.splats)
