@@ -21,6 +21,9 @@ REDUCED = 0.8
 BESIDE = 25
 """Bytes that are kept of each row beside its numbers."""
 
+FREE = -1
+"""The group of a place without a row."""
+
 Cut = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Told which (K,) of the groups asked for have to be cut, says the rows of each, one group's after the
 other's, (M,) int64, and how many each has, (K,)."""
@@ -29,10 +32,12 @@ other's, (M,) int64, and how many each has, (K,)."""
 class CutCache:
     """Rows in fast memory, in groups that come and go together: a group's is a cut of one point tree.
 
-    Changes stay here until a group goes, least recently used first, or everything is written back. Memory is
-    the budget, in which is a table of 4 bytes of every row there is. A group's rows are no other group's.
+    Rows that leave a cut stay here, and their changes with them, as long as there is room: what has been in
+    no cut for longest goes first, and where cuts themselves have no room, those least recently used. Memory
+    is the budget, in which is a table of 4 bytes of every row there is. A group's rows are no other group's.
 
-    What a step sees depends on which cuts are here, so ``state_dict`` tells that, too.
+    What a step sees depends on which cuts are here, so ``state_dict`` tells that, too; it does not depend on
+    which other rows are.
 
     Args:
         rows: where rows are otherwise; only this object may change them.
@@ -77,10 +82,11 @@ class CutCache:
             self.records = torch.zeros(self.capacity, self.layout.width, device=self._device)
         self._place = np.full(len(self.rows), -1, np.int32)  # of each row, where its record is; -1: not here
         self._row = np.zeros(self.capacity, np.int64)  # of each record, which row it is
-        self._group = np.full(self.capacity, -1, np.int64)
+        self._group = np.full(self.capacity, FREE, np.int64)  # or FREE - 1 - the clock when it left one
         self._dirty = np.zeros(self.capacity, bool)
         self._free, self._room = np.arange(self.capacity)[::-1].copy(), self.capacity  # a stack of places
-        self._places: dict[int, np.ndarray] = {}  # of each group that is here
+        self._places: dict[int, np.ndarray] = {}  # of each group whose cut is here
+        self._held = 0  # rows of all these
         self._distance = np.full(groups, np.nan)
         self._used = np.full(groups, -1)
         self._clock = 0
@@ -113,10 +119,12 @@ class CutCache:
             ValueError: a row is in two groups, or in one twice.
         """
         groups, distances = np.asarray(groups, np.int64), np.asarray(distances, np.float64)
-        known = self.reusable(groups, distances)
-        anew = np.flatnonzero(~known)
-        rows, counts = cut(anew) if len(anew) else (np.zeros(0, np.int64), np.zeros(0, np.int64))
-        there = sum(len(self._places[group]) for group in groups[known].tolist())
+        for known in (self.reusable(groups, distances), np.zeros(len(groups), bool)):
+            anew = np.flatnonzero(~known)
+            rows, counts = cut(anew) if len(anew) else (np.zeros(0, np.int64), np.zeros(0, np.int64))
+            there = sum(len(self._places[group]) for group in groups[known].tolist())
+            if there + len(rows) <= self.capacity or not known.any():
+                break  # otherwise cuts that are finer than they need be have no room
         if there + len(rows) > self.capacity:
             needed = (there + len(rows)) * (self._record + BESIDE) + 4 * len(self.rows)
             raise LodgsError(
@@ -155,15 +163,21 @@ class CutCache:
         self._dirty[places] = True
 
     def after(self, step: int) -> None:
-        """To be called after every step: everything goes back where that is due."""
+        """To be called after every step: cuts are forgotten where that is due."""
         if due(self._flush_interval, step + 1):
-            self.clear()
+            self.forget()
 
     # -- coming and going ------------------------------------------------------------------------------
 
     def write_back(self) -> None:
         """What has changed is written; all stays here."""
         self._write(np.flatnonzero(self._dirty))
+
+    def forget(self) -> None:
+        """No cut serves any more; rows stay here."""
+        self._leave(list(self._places.values()))
+        self._places = {}
+        self._distance[:] = np.nan
 
     def clear(self, groups: int | None = None) -> None:
         """Writes back, and keeps nothing.
@@ -194,17 +208,18 @@ class CutCache:
         self._place[coming] = np.arange(len(coming), dtype=np.int32)
         twice = not np.array_equal(self._place[coming], np.arange(len(coming)))
         self._place[coming] = -1
-        if twice or (self._group[stays] != owners[here]).any() or len(np.unique(stays)) < len(stays):
+        others = self._group[stays]
+        if twice or ((others >= 0) & (others != owners[here])).any() or len(np.unique(stays)) < len(stays):
             raise ValueError("a row is in two groups, or in one twice")
-        self._group[stays] = -1
-        before = [self._places.pop(group) for group in groups.tolist() if group in self._places]
-        leaving = np.concatenate(before) if before else np.zeros(0, np.int64)
-        leaving = leaving[self._group[leaving] >= 0]
+        self._leave([self._places.pop(group) for group in groups.tolist() if group in self._places])
         self._group[stays] = owners[here]
-        short = len(coming) - len(leaving) - self._room
+        over = self._held + len(rows) - self.capacity
+        if over > 0:
+            self._leave(self._least_used(over))
+        short = len(coming) - self._room
         if short > 0:
-            leaving = np.concatenate([leaving, *self._least_used(short)])
-        self._drop(leaving)
+            self._drop(self._longest_left(short))
+        self._held += len(rows)
         self._room -= len(coming)
         room = self._free[self._room : self._room + len(coming)].copy()
         for first in range(0, len(coming), self._at_once):
@@ -220,7 +235,7 @@ class CutCache:
         self.reused += len(stays)
 
     def _least_used(self, short: int) -> list[np.ndarray]:
-        """The places of groups that go, so that so many are free, and some more; none that are in use now."""
+        """The cuts of groups that go, so that so many rows fit, and some more; none that are in use now."""
         others = np.array([g for g in self._places if self._used[g] < self._clock], np.int64)
         others = others[np.lexsort((others, self._used[others]))]
         sizes = np.cumsum([len(self._places[group]) for group in others.tolist()])
@@ -229,10 +244,22 @@ class CutCache:
         self._distance[others[:many]] = np.nan
         return [self._places.pop(group) for group in others[:many].tolist()]
 
+    def _leave(self, cuts: list[np.ndarray]) -> None:
+        """The rows at these places are in no cut from now on."""
+        for places in cuts:
+            self._group[places] = FREE - 1 - self._clock
+            self._held -= len(places)
+
+    def _longest_left(self, short: int) -> np.ndarray:
+        """The places of rows in no cut that go, so that so many are free, and some more."""
+        others = np.flatnonzero(self._group < FREE)
+        enough = min(max(short, int((1 - self._reduced) * self.capacity)), len(others))
+        return others[np.argsort(-self._group[others], kind="stable")[:enough]]
+
     def _drop(self, places: np.ndarray) -> None:
         self._write(places[self._dirty[places]])
         self._place[self._row[places]] = -1
-        self._group[places] = -1
+        self._group[places] = FREE
         self._free[self._room : self._room + len(places)] = places
         self._room += len(places)
 

@@ -10,6 +10,7 @@ import torch
 
 LearningRate = float | torch.Tensor | np.ndarray
 BETAS, EPS = (0.9, 0.999), 1e-15
+"""3DGS's."""
 
 
 class Adam:
@@ -19,7 +20,7 @@ class Adam:
         tensors: leaf tensors (N, ...) by name, contiguous float32, on the CPU or on a GPU.
         lr: learning rate by name: a number, or an array that broadcasts against one row (for ``sh`` of shape
             (N, K, 3) a (K, 1) array gives each coefficient its own). Change it between steps as you like.
-        betas, eps: as in the paper; by default 3DGS's.
+        betas, eps: as in the paper.
 
     Attributes:
         tensors: the tensors by name.
@@ -118,50 +119,6 @@ class Adam:
         for name, tensor in self.tensors.items():
             self.replace(name, tensor, state["m"][name].clone(), state["v"][name].clone())
         self.steps = dict(state["steps"])
-
-
-@torch.no_grad()
-def step_records(
-    records: torch.Tensor,
-    places: np.ndarray,
-    gradient: torch.Tensor,
-    lr: torch.Tensor,
-    steps: int,
-    most: int,
-    shares: torch.Tensor | None = None,
-    betas: tuple[float, float] = BETAS,
-    eps: float = EPS,
-) -> None:
-    """One Adam step in place for some records, each with the moments and the number of steps of its own.
-
-    Args:
-        records: (N, width), C values in the columns from 0 on, then their first, then their second moments.
-        places: (M,) int64, each once.
-        gradient: (M, C) of the values.
-        lr: (C,) learning rates.
-        steps: the column of the number of steps made.
-        most: no record has made more.
-        shares: (M,) float32, each record's factor of the rates; those of share 0 stay as they are.
-    """
-    from .cpu.adam import update_records
-
-    shares = torch.ones(len(places)) if shares is None else shares
-    if records.device.type == "cpu":
-        rates = np.ascontiguousarray(lr.numpy(), np.float32)
-        gradient = gradient.contiguous()
-        arrays = records.numpy(), places, gradient.numpy(), rates, shares.numpy()
-        update_records(*arrays, steps, betas, eps, most)
-        return
-    arrays = (each.to(records.device) for each in (torch.from_numpy(places), gradient, shares))
-    at, gradient, share = (each[shares.to(records.device) != 0] for each in arrays)
-    count = len(lr)
-    some = records[at]
-    values, m, v = (some[:, i * count : (i + 1) * count] for i in range(3))
-    some[:, steps] += 1
-    update_in_torch(
-        values, gradient, m, v, lr.to(share) * share[:, None], betas, eps, some[:, steps, None].double()
-    )
-    records[at] = some
 
 
 def update_in_torch(parameter, gradient, m, v, lr, betas, eps, step) -> None:

@@ -20,7 +20,9 @@ import torch
 from ...lod.forest import Forest, ForestShape, Piece, side_by_side
 from ...lod.rules.cut import detail_of
 from ...lod.tree import Tree
+from ...rasterize import Gaussians
 from ...rasterize.hspt import Upper, bounds_of, cut_off, image_of, search
+from ...rasterize.records import gather
 from ...scenes.cameras import Camera
 from ...splats.gaussians import Splats
 from ..cuts import CutCache
@@ -48,12 +50,7 @@ def default_budget(device: torch.device | str = "cpu") -> int:
 
 
 def layout_of(sh_degree: int) -> Layout:
-    """What a node's record holds: NAMES, C numbers together, moments, and
-
-    steps: how many steps of Adam have moved it;
-    score: its largest ``density.peak_score`` since density control last asked;
-    seen: the last step, from 1, that had it in its image; 0: none.
-    """
+    """What a node's record holds, see ``rasterize.records``."""
     shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": ()}
     values: dict[str, tuple[int, ...]] = shapes | {"sh": ((sh_degree + 1) ** 2, 3)}
     count = sum(map(prod, values.values()))
@@ -72,7 +69,6 @@ class Store:
     Attributes:
         shape: where the pieces of the tree are among the rows.
         cache: of G + 1 groups: the subtrees, and the upper nodes, which are always all there.
-        columns: where each array of a record begins.
         budget: of the cache, in bytes.
     """
 
@@ -81,10 +77,7 @@ class Store:
 
     def __init__(self, folder: Path, sh_degree: int, budget: int, device: torch.device | str = "cpu") -> None:
         self.layout = layout_of(sh_degree)
-        begins = np.cumsum([0, *map(prod, self.layout.shapes.values())]).tolist()
-        self.columns = dict(zip(self.layout.shapes, begins, strict=False))
-        self.values = self.columns["first"]
-        self._shapes = {name: self.layout.shapes[name] for name in NAMES}
+        self._terms = (sh_degree + 1) ** 2
         self.budget, self._device = budget, device
         self.rows = FileRows(folder, self.layout)
         self._lists = FileRows(folder, ENTRY, name="lists")
@@ -131,8 +124,11 @@ class Store:
 
     def _records_of(self, splats: Splats) -> torch.Tensor:
         records = np.zeros((len(splats), self.layout.width), np.float32)
-        arrays = [getattr(splats, name).reshape(len(splats), -1) for name in NAMES]
-        np.concatenate(arrays, axis=1, out=records[:, : self.values])
+        begin = 0
+        for name in NAMES:
+            end = begin + prod(self.layout.shapes[name])
+            records[:, begin:end] = getattr(splats, name).reshape(len(splats), end - begin)
+            begin = end
         return torch.from_numpy(records)
 
     def _take_shape(self, shape: ForestShape) -> None:
@@ -201,15 +197,9 @@ class Store:
             rows.append(found)
         return np.sort(np.concatenate(rows).astype(np.int64)), counts
 
-    def values_at(self, places: np.ndarray) -> dict[str, torch.Tensor]:
-        """A copy of NAMES (M, ...) of the records at places (M,)."""
-        at = torch.from_numpy(places).to(self._device)
-        values = self.cache.records[:, : self.values].index_select(0, at)
-        parts = values.split([prod(shape) for shape in self._shapes.values()], dim=1)
-        return {
-            name: part.contiguous().view(len(places), *shape)
-            for (name, shape), part in zip(self._shapes.items(), parts, strict=True)
-        }
+    def gaussians_at(self, places: np.ndarray) -> Gaussians:
+        """A copy of the splats at places (M,) in the cache."""
+        return gather(self.cache.records, places, self._terms)
 
     def are_leaves(self, places: np.ndarray) -> np.ndarray:
         """Which (M,) bool of the records at places (M,) are leaves."""
@@ -221,7 +211,8 @@ class Store:
 
     def resize(self) -> None:
         """Cuts are made by the nodes as they are now."""
-        self.cache.clear()
+        self.cache.write_back()
+        self.cache.forget()
         shapes, bounds, roots, marks = [], [], [], []
         for some in _batches(2 * self.shape.counts - 1):
             records, entries = self._read(some)

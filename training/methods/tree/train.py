@@ -20,15 +20,13 @@ from ...lod.forest import joined
 from ...lod.paging import table_of_pages
 from ...lod.streaming import BLOCKS
 from ...lod.tree import LEAVES, treeless_columns
-from ...rasterize import Gaussians, Rendering, Target
-from ...rasterize.adam import LearningRate, step_records
+from ...rasterize import Gaussians, Rendering, Target, records
+from ...rasterize.adam import LearningRate
 from ...splats.bundle import Level
 from ...splats.gaussians import Splats
 from ...splats.ply import Columns
 from ..data import TrainingView
-from ..density import peak_score
 from ..method import Drawing
-from ..model import NAMES
 from ..schedules import due
 from ..start import from_splats
 from ..threedgs.refining import Refining
@@ -50,11 +48,14 @@ class SeenRecords:
         places: (M,) int64 of them in its cache.
         lr: learning rates by name, as ``Adam`` has them when the step is made.
         shares: (M,) of these rates, which each moves with.
-        most: none of them has made more steps.
+        number: of the step, from 1.
 
     Attributes:
-        leaves: NAMES of these records, to make the picture from.
+        gaussians: these splats, to make the picture from.
+        rendering: of them, once it has been made.
     """
+
+    rendering: Rendering
 
     def __init__(
         self,
@@ -62,40 +63,30 @@ class SeenRecords:
         places: np.ndarray,
         lr: Mapping[str, LearningRate],
         shares: torch.Tensor,
-        most: int,
+        number: int,
     ) -> None:
-        self._store, self._places, self._lr, self._shares, self._most = store, places, lr, shares, most
-        self.leaves = {name: values.requires_grad_() for name, values in store.values_at(places).items()}
-
-    def accumulate_stats(self, rendering: Rendering) -> None:
-        """After ``backward``: what density control asks for."""
-        records, columns = self._store.cache.records, self._store.columns
-        seen = torch.nonzero(rendering.radii > 0).squeeze(1)
-        at = torch.from_numpy(self._places).to(records.device)[seen]
-        opacity_logits = self.leaves["opacity_logits"].detach()[seen]
-        score = peak_score(rendering.grad2d[seen].norm(dim=1), rendering.radii[seen], opacity_logits)
-        records[at, columns["score"]] = torch.maximum(records[at, columns["score"]], score)
-        records[at, columns["seen"]] = float(self._most + 1)
-        self._store.cache.changed(self._places)
+        self._store, self._places, self._lr, self._shares, self._number = store, places, lr, shares, number
+        self.gaussians = store.gaussians_at(places)
+        for values in vars(self.gaussians).values():
+            values.requires_grad_()
 
     def step(self) -> None:
         """One step of these records."""
-        gradients = [leaf.grad for leaf in self.leaves.values() if leaf.grad is not None]
-        if len(gradients) == len(NAMES) and len(self._places):
-            gradient = torch.cat([each.reshape(len(each), -1) for each in gradients], 1)
-            rates = [
-                torch.as_tensor(self._lr[name]).float().expand(leaf.shape[1:]).reshape(-1)
-                for name, leaf in self.leaves.items()
-            ]
-            records, steps = self._store.cache.records, self._store.columns["steps"]
-            step_records(
-                records, self._places, gradient, torch.cat(rates), steps, self._most, shares=self._shares
-            )
-            self._store.cache.changed(self._places)
+        leaves = vars(self.gaussians)
+        gradients = [leaf.grad for leaf in leaves.values() if leaf.grad is not None]
+        if len(gradients) < len(leaves):  # nothing of them is in the picture
+            return
+        rates = [
+            torch.as_tensor(self._lr[name]).float().expand(leaf.shape[1:]).reshape(-1)
+            for name, leaf in leaves.items()
+        ]
+        cache = self._store.cache
+        told = self.rendering, self._number, torch.cat(rates), self._shares
+        records.step(cache.records, self._places, gradients, *told)
+        cache.changed(self._places)
 
     def zero_grad(self) -> None:
-        """The records go with their gradients: the next picture has others."""
-        self.leaves = {}
+        """The next picture has other records."""
 
 
 class Method(Refining):
@@ -189,14 +180,14 @@ class Method(Refining):
         """The splats of a view's cut, to draw: they alone make the step."""
         assert self.store is not None
         places = self.store.take(view.camera, pixels, self.data.near)
-        shares, done = self._shares(places, step), step - self.finest_steps
-        self._optimizer = seen = SeenRecords(self.store, places, self.model.adam.lr, shares, done)
-        return Gaussians(**seen.leaves)
+        shares, number = self._shares(places, step), step + 1 - self.finest_steps
+        self._optimizer = SeenRecords(self.store, places, self.model.adam.lr, shares, number)
+        return self._optimizer.gaussians
 
     def accumulate_stats(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> None:
         super().accumulate_stats(drawings, view, step)
         if isinstance(self._optimizer, SeenRecords):
-            self._optimizer.accumulate_stats(drawings[0].rendering)
+            self._optimizer.rendering = drawings[0].rendering
 
     def control_density(self, step: int) -> None:
         super().control_density(step)

@@ -1,0 +1,160 @@
+"""Nodes outside memory: cuts against HSPT in memory, training against itself with more room, going on."""
+
+import io
+
+import numpy as np
+import pytest
+import torch
+
+from tests.training.rasterize.test_hspt import cameras
+from training.errors import LodgsError
+from training.lod.forest import divided, joined, longest_of, shape_of
+from training.methods.cuts import BESIDE
+from training.methods.tree import store as store_module
+from training.methods.tree.build import build
+from training.methods.tree.store import Store, layout_of
+from training.rasterize.hspt import Hspt
+from training.splats.gaussians import Splats
+
+NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
+RECORD = 4 * layout_of(1).width + BESIDE
+
+
+@pytest.fixture(scope="module")
+def town():
+    """A tree over 8,000 splats on some surfaces: nodes and tree."""
+    rng = np.random.default_rng(4)
+    count = 8_000
+    means = rng.uniform(-10, 10, (count, 3))
+    means[: count // 2, 2] = 0.1 * np.sin(means[: count // 2, 0])
+    means[count // 2 :, 0] = 5 * np.sign(means[count // 2 :, 0])
+    return build(Splats(
+        means.astype(np.float32), rng.normal(size=(count, 4)).astype(np.float32),
+        rng.normal(-3, 0.5, (count, 3)).astype(np.float32), rng.normal(0, 2, count).astype(np.float32),
+        rng.normal(0, 0.2, (count, 4, 3)).astype(np.float32),
+    ))  # fmt: skip
+
+
+def stored(folder, town, budget=1 << 30, longest=0):
+    nodes, tree = town
+    folder.mkdir(parents=True, exist_ok=True)
+    made = Store(folder, 1, budget)
+    made.fill(divided(nodes, tree, longest or longest_of(tree.leaves)))
+    return made
+
+
+@pytest.mark.parametrize("longest", [1, 7, 0, 10_000])
+def test_a_cut_made_anew_is_that_of_hspt_in_memory(town, tmp_path, longest, monkeypatch):
+    monkeypatch.setattr(store_module, "AT_ONCE", 300)  # many parts of everything
+    nodes, tree = town
+    made = stored(tmp_path, town, longest=longest)
+    order, _ = shape_of(tree, longest or longest_of(tree.leaves))
+    sizes = tree.sizes(nodes.means, nodes.log_scales)
+    hspt = Hspt(tree, nodes.means, sizes, nodes.log_scales, longest or longest_of(tree.leaves))
+    found = 0
+    for camera in cameras(np.random.default_rng(longest)):
+        for pixels in (0.2, 0.7, 1.8):
+            made.cache.forget()
+            places = made.take(camera, pixels, 0.3)
+            rows = made.cache.rows_at(places)
+            assert (np.diff(rows) > 0).all(), "rows ascend, whatever was here before"
+            np.testing.assert_array_equal(np.sort(order[rows]), np.sort(hspt.cut(camera, pixels, 0.3)))
+            splats = made.gaussians_at(places)
+            for name in NAMES:
+                np.testing.assert_array_equal(getattr(splats, name), getattr(nodes, name)[order[rows]])
+            found += len(rows)
+    assert found > 1000
+
+
+def moved(made, seed):
+    """Moves all nodes by their rows."""
+    rng = np.random.default_rng(seed)
+    made.cache.write_back()
+    records = made.rows.read(np.arange(len(made)))
+    records[:, :3] += torch.from_numpy(rng.normal(0, 0.05, (len(made), 3)).astype(np.float32))
+    records[:, 7:10] += torch.from_numpy(rng.normal(0, 0.3, (len(made), 3)).astype(np.float32))
+    made.cache.clear()
+    made.rows.write(np.arange(len(made)), records)
+    return records
+
+
+def test_sizes_follow_what_has_moved(town, tmp_path, monkeypatch):
+    """Twice, as lists are sorted by the sizes before; against the same nodes as one tree in memory."""
+    monkeypatch.setattr(store_module, "AT_ONCE", 500)
+    made = stored(tmp_path, town)
+    for seed in range(2):
+        moved(made, seed)
+        made.resize()
+        nodes, tree = joined(made)
+        longest = longest_of(tree.leaves)
+        order, _ = shape_of(tree, longest)
+        sizes = tree.sizes(nodes.means, nodes.log_scales)
+        hspt = Hspt(tree, nodes.means, sizes, nodes.log_scales, longest)
+        for camera in cameras(np.random.default_rng(5), 4):
+            made.cache.forget()
+            rows = made.cache.rows_at(made.take(camera, 0.7, 0.3))
+            np.testing.assert_array_equal(np.sort(order[rows]), np.sort(hspt.cut(camera, 0.7, 0.3)))
+
+
+def test_what_comes_out_is_what_came_in(town, tmp_path):
+    nodes, tree = town
+    forest = divided(nodes, tree, longest_of(tree.leaves))
+    made = stored(tmp_path, town)
+    for (ours, shape), (theirs, other) in zip([*made, made.upper], [*forest, forest.upper], strict=True):
+        np.testing.assert_array_equal(shape.children, other.children)
+        for name in NAMES:
+            np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
+
+
+def steps(made, begin, end):
+    """As training goes: cuts of views that move, whose records change by what they are."""
+    views = list(cameras(np.random.default_rng(1), 40))
+    for step in range(begin, end):
+        if step % 15 == 14:
+            made.resize()
+        places = made.take(views[step], 1.0, 0.3)
+        made.cache.put(places, made.cache.get(places) * 1.001)
+        made.cache.after(step)
+    made.cache.write_back()
+    return made.rows.read(np.arange(len(made)))
+
+
+def exactly(made):
+    """Cuts serve for the same distance alone."""
+    made.cache._least = made.cache._most = 1.0
+    return made
+
+
+def test_with_little_room_the_bits_are_the_same(town, tmp_path):
+    most = stored(tmp_path / "all", town)
+    views = cameras(np.random.default_rng(1), 40)
+    needed = max(len(most.take(view, 1.0, 0.3)) for view in views) + len(most.shape.counts)
+    little = exactly(stored(tmp_path / "some", town, budget=needed * RECORD + 4 * len(most)))
+    assert little.cache.capacity == needed < len(most) / 3
+    truth, found = steps(exactly(stored(tmp_path / "more", town)), 0, 40), steps(little, 0, 40)
+    torch.testing.assert_close(found, truth, rtol=0, atol=0)
+    assert little.cache.loaded > 2 * needed
+
+
+@pytest.mark.parametrize("stop", [3, 14, 29])
+def test_a_store_goes_on_to_the_bit(town, tmp_path, stop):
+    """With cuts that serve from near by and little room, so that which are there matters."""
+    budget = 3500 * RECORD + 4 * 16_000
+    truth = steps(stored(tmp_path / "whole", town, budget), 0, 40)
+    first = stored(tmp_path / "parts", town, budget)
+    steps(first, 0, stop)
+    file = io.BytesIO()
+    torch.save(first.state_dict(), file)
+    steps(first, stop, min(stop + 9, 40))  # which is lost
+    first.close()
+    file.seek(0)
+    second = Store(tmp_path / "parts", 1, budget)
+    second.load_state_dict(torch.load(file, weights_only=True))
+    torch.testing.assert_close(steps(second, stop, 40), truth, rtol=0, atol=0)
+
+
+def test_too_little_room_is_told(town, tmp_path):
+    made = stored(tmp_path, town, budget=1 << 17)
+    camera = next(cameras(np.random.default_rng(0)))
+    with pytest.raises(LodgsError, match=r"at once; the memory budget has room for .* splat_memory"):
+        made.take(camera, 0.1, 0.3)

@@ -1,0 +1,94 @@
+"""Splats in records with Adam's moments: what is drawn of them, and the step that they make."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from .adam import moved
+from .compile import STRICT, f32, in_parallel, inlined, kernel, serialised
+
+_GRAIN = 1 << 12
+_EXTENTS = 3, 4, 3, 1
+"""Numbers of means, quaternions, log-scales and opacity logits; the harmonics follow."""
+
+
+@kernel(STRICT)
+def _gather(begin, end, records, width, places, means, quats, log_scales, opacity_logits, sh):
+    terms = sh.shape[1]
+    for k in range(begin, end):
+        i = places[k] * width
+        for j in range(3):
+            means[k, j] = records[i + j]
+            log_scales[k, j] = records[i + 7 + j]
+        for j in range(4):
+            quats[k, j] = records[i + 3 + j]
+        opacity_logits[k] = records[i + 10]
+        for j in range(terms):
+            sh[k, j] = records[i + 11 + j]
+
+
+@inlined(STRICT)
+def _move(records, first, count, extent, gradient, place, lr, keep, keep_m, keep_v, scale_v, eps):
+    """Values of a record from ``first`` of its ``count`` on, by a gradient's from ``place`` on."""
+    m, v = records[count:], records[2 * count :]
+    for j in range(extent):
+        g = gradient[place + j]
+        records[first + j] -= moved(first + j, g, m, v, lr[j] / keep, keep_m, keep_v, scale_v, eps)
+
+
+@kernel(STRICT)
+def _step(
+    begin, end, records, width, places, means, quats, log_scales, opacity_logits, sh, grad2d, radii, number,
+    lr, shares, bias_m, bias_v, keep_m, keep_v, eps,
+):  # fmt: skip
+    """All arrays flat."""
+    count = lr.shape[0]
+    terms = count - 11
+    for k in range(begin, end):
+        i = places[k] * width
+        told = i + 3 * count
+        x, y = grad2d[2 * k], grad2d[2 * k + 1]
+        opacity = 1 / (1 + np.exp(-records[i + 10]))
+        score = np.sqrt(x * x + y * y) * radii[k] * opacity ** f32(0.2)
+        records[told + 1] = max(records[told + 1], score)
+        if radii[k] > 0:
+            records[told + 2] = number
+        if shares[k] == 0:
+            continue
+        records[told] += f32(1)
+        made = int(records[told])
+        keep, scale_v = bias_m[made] / shares[k], bias_v[made]
+        rest = keep, keep_m, keep_v, scale_v, eps
+        _move(records, i, count, 3, means, 3 * k, lr, *rest)
+        _move(records, i + 3, count, 4, quats, 4 * k, lr[3:], *rest)
+        _move(records, i + 7, count, 3, log_scales, 3 * k, lr[7:], *rest)
+        _move(records, i + 10, count, 1, opacity_logits, k, lr[10:], *rest)
+        _move(records, i + 11, count, terms, sh, terms * k, lr[11:], *rest)
+
+
+@lru_cache(4)
+def _corrections(betas: tuple[float, float], count: int) -> tuple[np.ndarray, np.ndarray]:
+    """1 - b1^t and 1 / (1 - b2^t), (count,) float32, of t from 0, which is no step's number."""
+    first, second = (1 - np.power(beta, np.arange(count)) for beta in betas)
+    first[0] = second[0] = 1
+    return first.astype(np.float32), (1 / second).astype(np.float32)
+
+
+def gather(records, places, arrays) -> None:
+    """Copies the values of records (N, width) at places (M,) int64 to arrays (M, ...), in their order."""
+    *arrays, sh = arrays
+    sh = sh.reshape(len(places), 3 * sh.shape[1])
+    in_parallel(_gather, len(places), _GRAIN, records.reshape(-1), records.shape[1], places, *arrays, sh)
+
+
+@serialised
+def step(records, places, gradients, grad2d, radii, number, lr, shares, betas, eps) -> None:
+    """As ``rasterize.records.step``, of arrays."""
+    made = _corrections(betas, 1 << int(number + 1).bit_length())
+    flat = (array.reshape(-1) for array in (*gradients, grad2d))
+    in_parallel(
+        _step, len(places), _GRAIN, records.reshape(-1), records.shape[1], places, *flat, radii, f32(number),
+        lr, shares, *made, f32(betas[0]), f32(betas[1]), f32(eps),
+    )  # fmt: skip
