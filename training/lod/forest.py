@@ -95,7 +95,7 @@ def divided(splats: Splats, tree: Tree, longest: int) -> Grove:
     for begin, end, own in zip(begins[:-2].tolist(), begins[1:-1].tolist(), of_piece.tolist(), strict=False):
         children = numbers[order[begin + own : end] - leaves]
         subtrees.append((splats.select(slice(begin, end)), Tree(children)))
-    rest = np.arange(begins[-2], count)  # as a copy, which is there when the subtrees are gone
+    rest = slice(int(begins[-2]), count)
     return Grove(subtrees, (splats.select(rest), Tree(numbers[order[rest] - leaves])))
 
 
