@@ -141,8 +141,8 @@ def divided(splats: Splats, tree: Tree, longest: int) -> Grove:
     order, shape = shape_of(tree, longest)
     splats, trees = splats.select(order), subtrees_of(tree, order, shape)
     pieces = [splats.select(slice(*ends)) for ends in shape.ranges]
-    rest = np.arange(shape.ends[-1], len(tree))  # as a copy, which is there when the subtrees are gone
-    return Grove(list(zip(pieces, trees, strict=True)), (splats.select(rest), shape.upper))
+    upper = splats.select(slice(int(shape.ends[-1]), None)), shape.upper
+    return Grove(list(zip(pieces, trees, strict=True)), upper)
 
 
 def subtrees_of(tree: Tree, order: np.ndarray, shape: ForestShape) -> list[Tree]:

@@ -93,8 +93,9 @@ class GrowingForest:
             moments.append(root)
             harmonics.append(nodes.sh[-1].copy())
             grove = divided(nodes, tree, self._longest)
-            uppers.append(grove.upper)
-            del nodes, leaves
+            above, upper = grove.upper
+            uppers.append((above.select(np.arange(len(above))), upper))  # a copy: a view would keep all nodes
+            del nodes, leaves, above
             yield from grove
         above, top = _merged_up(np.stack(moments))
         nodes = _drawn(above, top, np.stack(harmonics), np.stack(moments)[:, 9])
