@@ -8,6 +8,7 @@ import pytest
 
 from tests.training.lod.trees import random_leaves, tree_of
 from training.errors import LodgsError
+from training.lod import paging
 from training.lod.blocks import SIZE
 from training.lod.paging import Pager, TreeFile, read_within, standing, streaming_order, table_of_pages
 from training.lod.rule import rules
@@ -72,18 +73,32 @@ def path(request, truth, tmp_path):
     return file
 
 
-def shown(memory, eye, pixels):
-    """The means of what an eye is shown of what is in memory."""
-    splats = memory.splats
-    weights = CUT.weights(splats.means, np.float32(eye), FOCAL, splats.extras, {}, {"pixels": pixels})
-    return splats.means[weights > 0]
+class Memory:
+    """Takes over what comes."""
+
+    def __init__(self, pager):
+        self.means = np.zeros((pager.rows, 3), np.float32)
+        self.columns = {name: np.zeros(pager.rows, np.float32) for name in CUT.columns}
+
+    def take(self, update):
+        for begin, splats in update.pages:
+            rows = slice(begin, begin + len(splats))
+            self.means[rows] = splats.means
+            for name in CUT.columns[2:]:
+                self.columns[name][rows] = splats.extras[name]
+        self.columns["node_size"], self.columns["parent_size"] = update.sizes
+
+    def shown(self, eye, pixels):
+        """The means of what an eye is shown."""
+        weights = CUT.weights(self.means, np.float32(eye), FOCAL, self.columns, {}, {"pixels": pixels})
+        return self.means[weights > 0]
 
 
-def come_in(pager, eye, pixels):
-    """All that an eye needs comes in, page by page."""
+def come_in(pager, memory, eye, pixels):
+    """All that an eye needs comes in, update by update."""
     while (update := pager.step(np.array(eye), max(FOCAL / pixels, 32))) is not None:
-        for _ in pager.memory.pieces(update):
-            yield
+        memory.take(update)
+        yield
 
 
 EYES = [(0, 0, 3), (0.5, 0.2, 2), (-8, 8, 1), (7, -7, 0.5), (7, -6, 0.2), (60, 0, 20), (0, 0, 3)]
@@ -91,26 +106,30 @@ EYES = [(0, 0, 3), (0.5, 0.2, 2), (-8, 8, 1), (7, -7, 0.5), (7, -6, 0.2), (60, 0
 
 def test_with_room_for_all_it_is_the_whole_files_cut(truth, path):
     pager = Pager(path, 10**6)
+    memory = Memory(pager)
     for eye in EYES:
         for pixels in (1.0, 4.0, 30.0):
-            list(come_in(pager, eye, pixels))
-            drawn = truth.nodes(shown(pager.memory, eye, pixels))
+            list(come_in(pager, memory, eye, pixels))
+            drawn = truth.nodes(memory.shown(eye, pixels))
             np.testing.assert_array_equal(np.sort(drawn), truth.cut(eye, pixels))
 
 
 @pytest.mark.parametrize("budget", [SIZE, 5000, 20_000])
-def test_within_a_budget_cuts_are_complete_whatever_is_there(truth, path, budget):
+def test_within_a_budget_cuts_are_complete_whatever_is_there(truth, path, budget, monkeypatch):
     """Also while pages come in, and from an eye that they are not for."""
+    monkeypatch.setattr(paging, "AT_ONCE", 3)
     pager, equal = Pager(path, budget), 0
-    assert len(pager.memory.splats) <= budget
-    list(pager.memory.pieces(pager.step(None, 0.0)))  # nothing is there before
+    memory = Memory(pager)
+    assert pager.rows <= budget
+    memory.take(pager.step(None, 0.0))  # nothing is there before
     for eye in EYES:
         for pixels in (30.0, 3.0):
-            for number, _ in enumerate(come_in(pager, eye, pixels)):
-                if number % 37 == 0:
+            for number, _ in enumerate(come_in(pager, memory, eye, pixels)):
+                assert pager.splats <= budget
+                if number % 5 == 0:
                     for other in (eye, (3, 3, 1)):
-                        truth.require_complete(truth.nodes(shown(pager.memory, other, pixels)))
-            drawn = truth.nodes(shown(pager.memory, eye, pixels))
+                        truth.require_complete(truth.nodes(memory.shown(other, pixels)))
+            drawn = truth.nodes(memory.shown(eye, pixels))
             truth.require_complete(drawn)
             needed = np.flatnonzero(pager._index.detail(np.array(eye)) < FOCAL / pixels * 1.001)
             if len(needed) <= budget // SIZE:
@@ -128,28 +147,28 @@ def test_coarse_pages_come_first_and_those_of_no_use_for_longest_go_first(path):
     a, b, c = ((0, 0, 40), 300.0), ((9, 9, 1), 60.0), ((-9, -9, 1), 60.0)
     there = []
     for eye, pixels in (a, b, c, a, b):
-        list(come_in(pager, eye, pixels))
+        list(come_in(pager, Memory(pager), eye, pixels))
         there.append(set(np.flatnonzero(pager._slot_of >= 0)))
-        assert pager.pages == len(there[-1]) <= 12
+        assert len(there[-1]) <= 12 and pager.splats <= 12 * SIZE
     assert there[0] <= there[1]  # there was room
 
 
 def test_a_thread_brings_in_what_is_asked_for(truth, path):
     pager = Pager(path, 10**6)
+    memory, taken = Memory(pager), 0
     pager.start()
     try:
         for eye in EYES[:4]:
             pager.ask(np.array(eye), FOCAL)
             wanted, until = truth.cut(eye, 1.0), time.monotonic() + 60
-            while True:
-                pager.take(0.001)
-                drawn = np.sort(truth.nodes(shown(pager.memory, eye, 1.0)))
-                if np.array_equal(drawn, wanted) or time.monotonic() > until:
-                    break
-                if len(drawn):  # nothing before the first page
-                    truth.require_complete(drawn)
+            while not pager.idle and time.monotonic() < until:
+                if (update := pager.take()) is not None:
+                    memory.take(update)
+                    taken += 1
+                    truth.require_complete(truth.nodes(memory.shown(eye, 1.0)))
                 time.sleep(0.01)
-            np.testing.assert_array_equal(drawn, wanted)
+            np.testing.assert_array_equal(np.sort(truth.nodes(memory.shown(eye, 1.0))), wanted)
+            assert taken == pager.arrived
     finally:
         pager.stop()
     assert not pager.problem
@@ -240,8 +259,9 @@ def test_splats_that_cannot_be_drawn_leave_no_holes(truth, tmp_path):
     leaves = replace(leaves, means=means)
     write_bundle(tmp_path / "tree.ply", replace(truth.bundle, levels=[Level(1, above), Level(2, leaves)]))
     pager = Pager(tmp_path / "tree.ply", 10**6)
-    list(come_in(pager, (0, 0, 3), 1.0))
-    truth.require_complete(truth.nodes(shown(pager.memory, (0, 0, 3), 1.0)))
+    memory = Memory(pager)
+    list(come_in(pager, memory, (0, 0, 3), 1.0))
+    truth.require_complete(truth.nodes(memory.shown((0, 0, 3), 1.0)))
 
 
 def test_what_is_no_tree_or_has_no_room_is_a_sentence(truth, tmp_path):
