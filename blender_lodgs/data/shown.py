@@ -104,6 +104,24 @@ def without_coarser(instances: list[SplatInstance]) -> list[SplatInstance]:
     return [each for each in instances if each.source is None or each.level == each.source.level]
 
 
+def choice_of_picture(instance: SplatInstance, depsgraph: bpy.types.Depsgraph) -> selection.Choice | None:
+    """By what a picture of the scene's camera chooses an instance's splats; None where all are shown.
+
+    That is what modifiers choose by. Where the eye is the viewport's, there is more to be read of a file than
+    that has seen: the camera asks for itself.
+    """
+    choice = selection.choice(instance.evaluated, depsgraph)
+    root, camera = scenes.root_of(instance.object), depsgraph.scene.camera
+    if choice is None or instance.source is None or root is None or camera is None:
+        return choice
+    settings = root.lodgs
+    if settings.eye != "VIEW" or settings.freeze:
+        return choice
+    own, place = root.evaluated_get(depsgraph), camera.evaluated_get(depsgraph).matrix_world.translation
+    eye = tuple(own.matrix_world.inverted_safe() @ place)
+    return replace(choice, eye=eye, focal_px=own.lodgs.focal_px)
+
+
 def _with_sources(found: list[SplatInstance], depsgraph: bpy.types.Depsgraph) -> list[SplatInstance]:
     """The same, with sources where all levels stand together, chosen by nothing but their rule."""
     sources = {root: source for root in scenes.roots(depsgraph.scene) if (source := streams.source_of(root))}

@@ -71,17 +71,3 @@ def changed(root: bpy.types.Object) -> bool:
 
 def _held(root: bpy.types.Object) -> int:
     return sum(len(item.object.data.points) for item in root.lodgs.levels if item.exists)
-
-
-def eye_of_picture(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> tuple | None:
-    """From where, in the splats' own space, and with which focal length in pixels a picture of the scene's
-    camera asks for detail, where the eye is the viewport's; None where the choice says it.
-
-    There is more to be read for it than the viewport saw.
-    """
-    settings, camera = root.lodgs, depsgraph.scene.camera
-    if settings.eye != "VIEW" or settings.freeze or camera is None:
-        return None
-    place = camera.evaluated_get(depsgraph).matrix_world.translation
-    own = root.evaluated_get(depsgraph)
-    return tuple(own.matrix_world.inverted_safe() @ place), own.lodgs.focal_px

@@ -24,7 +24,7 @@ import gpu
 import numpy as np
 from mathutils import Matrix
 
-from ..data import changes, scenes, selection, shown, streams
+from ..data import changes, scenes, selection, shown
 from . import eye, resident, splats
 from .arranging import Arrangement, Placement, Request, arrange
 from .resident import Cloud, Resident, Store
@@ -339,15 +339,13 @@ def _choice(
     instance: shown.SplatInstance, depsgraph: bpy.types.Depsgraph, moving: bool
 ) -> selection.Choice | None:
     """By what an instance's splats are chosen, from where the eye is now."""
-    choice = selection.choice(instance.evaluated, depsgraph) if _plain(instance, depsgraph) else None
-    root = scenes.root_of(instance.object)
-    if choice is None or root is None:
-        return choice
-    if moving:
-        seen = eye.moved(depsgraph.scene, root)
-    else:
-        seen = streams.eye_of_picture(root, depsgraph) if instance.source else None
-    return choice if seen is None else replace(choice, eye=seen[0], focal_px=seen[1])
+    if not _plain(instance, depsgraph):
+        return None
+    if not moving:
+        return shown.choice_of_picture(instance, depsgraph)
+    choice, root = selection.choice(instance.evaluated, depsgraph), scenes.root_of(instance.object)
+    seen = eye.moved(depsgraph.scene, root) if root is not None else None
+    return choice if choice is None or seen is None else replace(choice, eye=seen[0], focal_px=seen[1])
 
 
 def _arrange(view: ViewState, of: Resident, request: Request, wait: bool, take_over: bool) -> None:

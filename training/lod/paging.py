@@ -21,12 +21,14 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LodgsError
+from ..scenes.cameras import Camera
 from ..splats.bundle import Bundle, Level, Rows, open_bundle
 from ..splats.dialects import drawable
 from ..splats.gaussians import Splats
-from .blocks import SIZE, spatial_order
+from .blocks import SIZE, Blocks, spatial_order
+from .choice import Choice
 from .rule import distances_by_axes
-from .rules.cut import ABOVE_ROOT, K_LEAST, NODE_SIZE, PARENT, PARENT_SIZE, RULE
+from .rules.cut import ABOVE_ROOT, K_LEAST, NODE_SIZE, PARENT, PARENT_SIZE, RULE, detail_of
 from .streaming import BLOCKS
 
 BOUNDS = tuple(f"{end}_{axis}" for end in ("low", "high") for axis in "xyz")
@@ -114,7 +116,7 @@ class TreeFile:
         self.levels = np.repeat(numbers, pages)
         self.begins = np.concatenate([np.arange(0, length, SIZE) for length in lengths])
         self.counts = np.minimum(SIZE, np.repeat(lengths, pages) - self.begins)
-        self._finest = numbers[-1]
+        self._finest, self._index = numbers[-1], None
 
     def __len__(self) -> int:
         return len(self.levels)
@@ -160,6 +162,48 @@ class TreeFile:
             on_progress: called with the share that is done; where it returns False, an InterruptedError is
                 raised.
         """
+        if self._index is None:
+            self._index = self._make_index(on_progress)
+        return self._index
+
+    def cut(self, choice: Choice, camera: Camera | None = None, near: float = 0.0) -> dict[int, Splats]:
+        """By the level's number, the splats that a choice of the rule ``cut`` shows; those that cannot be
+        drawn are missing.
+
+        Memory holds little more than these.
+
+        Args:
+            camera: in the splats' own space; splats that are out of its sight may be left out.
+            near: depth at which its drawing begins, in the splats' units.
+        """
+        k = detail_of(choice.focal_px, dict(choice.values)["pixels"])
+        pages = np.sort(self.index().order(np.array(choice.eye, np.float32), k))
+        found: dict[int, list[Splats]] = {
+            number: [self.read_rows(number, pages[:0])] for number in self._rows
+        }
+        for begin in range(0, len(pages), AT_ONCE):
+            for number, rows in self._rows_of(pages[begin : begin + AT_ONCE]).items():
+                columns = self._rows[number].columns(rows, (*COLUMNS, *"xyz"))
+                means = np.stack([columns.pop(axis) for axis in "xyz"], axis=1)
+                zeros = dict.fromkeys(COLUMNS, np.zeros(len(rows), np.float32))
+                weights = choice.weights(means, zeros | columns)
+                splats = self.read_rows(number, rows[weights > 0])
+                if camera is not None:
+                    blocks = Blocks.of(splats.means, splats.log_scales)
+                    splats = splats.select(blocks.rows(blocks.in_view(camera, near)))
+                found[number].append(splats)
+        return {number: Splats.concatenated(parts) for number, parts in found.items()}
+
+    def _rows_of(self, pages: np.ndarray) -> dict[int, np.ndarray]:
+        """The rows (M,) of some pages, ascending, by the level's number."""
+        found = {}
+        for number in self._rows:
+            mine = pages[self.levels[pages] == number]
+            there = np.arange(SIZE) < self.counts[mine, None]
+            found[number] = (self.begins[mine, None] + np.arange(SIZE))[there]
+        return found
+
+    def _make_index(self, on_progress: Callable[[float], bool]) -> PageIndex:
         table = self.bundle.tables.get(BLOCKS, {})
         wanted = {"level", PARENT_SIZE, *BOUNDS}
         if wanted <= table.keys() and np.array_equal(table["level"], self.levels):

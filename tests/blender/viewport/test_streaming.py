@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.training.lod.test_paging import Truth
-from tests.training.lod.trees import random_leaves, tree_of
+from tests.training.lod.trees import random_leaves, tree_of, write_in_pages
 
 LEAVES, BUDGET, SIZE = 12_000, 18_000, 96
 EYES = [(0, 0, 30), (9, 9, 1), (-9, 8, 1), (8, -9, 2), (0, 0, 30)]
@@ -20,16 +20,9 @@ def tree():
 
 
 @pytest.fixture
-def path(lodgs, tree, tmp_path):
-    bundle = lodgs("training.splats.bundle")
-    levels = []
-    for level in tree.levels:
-        order = lodgs("training.lod.paging").streaming_order(level.splats.extras)
-        levels.append(bundle.Level(level.number, level.splats.select(order)))
-    table = lodgs("training.lod.paging").table_of_pages({x.number: x.splats.extras for x in levels})
-    file = tmp_path / "town.ply"
-    bundle.write_bundle(file, bundle.Bundle("tree", levels, "cut", tables={"blocks": table}))
-    return file
+def path(tree, tmp_path):
+    write_in_pages(tmp_path / "town.ply", tree)
+    return tmp_path / "town.ply"
 
 
 @pytest.fixture
