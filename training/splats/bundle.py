@@ -242,8 +242,8 @@ class Rows:
     def __len__(self) -> int:
         return len(self.vertices)
 
-    def columns(self, some: slice, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """Columns (M,) of a range of rows, of those of these names that there are; nothing else is read."""
+    def columns(self, some: slice | np.ndarray, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """Columns (M,) of some rows, of those of these names that there are; nothing else is read."""
         found = {}
         for rows in (self.vertices, self.extras):
             there = () if rows is None else rows.dtype.names or ()
