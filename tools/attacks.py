@@ -2,10 +2,11 @@
 
     python tools/attacks.py [--kills 60] [--disks 20] [--seed 0]
 
-Runs of seconds on a tiny scene with a distorted lens; not on Windows, where processes do not fork. A killed
-run is resumed, and killed again, and must end with the bits of an undisturbed one, with no file too many. A
-disk (a tmpfs, for which one has to be root on Linux) that is too small must be told as Blender's panel tells
-it, in a sentence, and given room the run must end as well as any. Figures go to build/attacks.json.
+Runs of seconds on a tiny scene with a distorted lens, one of a tree without room for its nodes; not on Windows,
+where processes do not fork. A killed run is resumed, and killed again, and must end with the
+bits of an undisturbed one, with no file too many. A disk (a tmpfs, for which one has to be root on Linux) that
+is too small must be told as Blender's panel tells it, in a sentence, and given room the run must end as well
+as any. Figures go to build/attacks.json.
 """
 
 from __future__ import annotations
@@ -30,21 +31,29 @@ sys.path.insert(0, str(ROOT))
 
 os.environ |= {"LODGS_CHECKPOINT_SECONDS": "0", "OMP_NUM_THREADS": "1"}
 
+import numpy as np  # noqa: E402
+
 import training.runs.train  # noqa: E402, F401 - loaded once for all that are killed
 from tests.training.conftest import FOCAL, HEIGHT, WIDTH, write_tiny_scene  # noqa: E402
 from training import __main__, files  # noqa: E402
 from training.errors import LodgsError  # noqa: E402
+from training.methods import rows  # noqa: E402
 from training.methods.method import Method  # noqa: E402
 from training.runs.endings import ending  # noqa: E402
 from training.runs.events import Events  # noqa: E402
 from training.runs.folder import RunFolder  # noqa: E402
 from training.runs.job import Job  # noqa: E402
+from training.splats.gaussians import Splats  # noqa: E402
+from training.splats.ply import write_ply  # noqa: E402
 
-PARAMETERS = {
+PARAMETERS: dict[str, dict] = {
     "flod": {"levels": 3, "steps": [10, 12, 14], "finish_share": 0.4, "footprint": 6.0, "max_splats": 300},
     "octree": {"levels": 3, "steps": 40, "footprint": 6.0, "far_share": 0.2, "max_splats": 300},
+    "tree": {"tune_steps": 40, "pixels": 3.0, "resize_interval": 9, "sh_degree": 3},
 }
-KINDS = ("undistort", "checkpoint", "level", "bundle", "event", "step")
+BASE_SPLATS = 3000
+"""Of the base of a tree, whose nodes take several times the one megabyte that its job gives them."""
+KINDS = ("undistort", "checkpoint", "level", "bundle", "event", "step", "rows")
 """What a trainer is busy with when it is killed."""
 KILLS_A_RUN = 3
 FORK = get_context("fork")
@@ -78,6 +87,7 @@ def victim(job: Path, kind: str, number: int, share: float, counts_file: Path | 
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     os.dup2(1, 2)
     fsync, replace, train_step, append = os.fsync, os.replace, Method.train_step, Events._append
+    write = rows._write
 
     def sync(descriptor: int) -> None:
         place = f"/proc/self/fd/{descriptor}"
@@ -105,6 +115,11 @@ def victim(job: Path, kind: str, number: int, share: float, counts_file: Path | 
         moment("event", lambda: self._file.write(data[: int(len(data) * share)]))
         append(self, data)
 
+    def write_back(file, blocks) -> None:
+        moment("rows", lambda: write(file, blocks.reshape(-1)[: int(blocks.size * share)]))
+        write(file, blocks)
+
+    rows._write = write_back
     files.os.fsync, files.os.replace = sync, move  # type: ignore[assignment]
     Method.train_step, Events._append = step, say  # pyright: ignore
     code = __main__.main(["train", str(job)])
@@ -133,6 +148,7 @@ class Bench:
         points = (model / "points3D.txt").read_text().splitlines()
         without_tracks = [" ".join(line.split()[:8]) + "\n" for line in points]
         (model / "points3D.txt").write_text("".join(without_tracks))
+        write_ply(work / "base.ply", base())
         self.counts, self.truth = {}, {}
         for method in PARAMETERS:
             out = work / f"undisturbed-{method}"
@@ -148,6 +164,8 @@ class Bench:
             "scene": str(self.scene), "out": str(out), "method": method, "backend": "cpu", "image_scale": 1.0,
             "test_every": 4, "parameters": PARAMETERS[method],
         }  # fmt: skip
+        if method == "tree":
+            keys |= {"base": str(self.work / "base.ply"), "splat_memory": 1}
         path.write_text(json.dumps(keys))
         return path
 
@@ -167,11 +185,12 @@ class Bench:
             shutil.rmtree(out, ignore_errors=True)
             job = self.job(method, out)
             for _ in range(KILLS_A_RUN):
-                kind = next(k for k in kinds if k != "undistort" or not any(out.glob("undistorted/*")))
+                possible = {"undistort": not any(out.glob("undistorted/*")), "rows": method == "tree"}
+                kind = next((k for k in kinds if possible.get(k, True)), "-")
                 if kind == "undistort":
                     dead = self._kill_undistorting(job, out, found)
                 else:
-                    most = self.counts[method][kind]
+                    most = self.counts[method].get(kind, 0)
                     number = self.chance.randrange(max(most // (1 if most < 9 else KILLS_A_RUN), 1))
                     dead = ended(self._victim(job, kind, number, self.chance.random())) == -signal.SIGKILL
                 if dead:
@@ -243,6 +262,17 @@ class Bench:
         odd = [name for name in truth.keys() | now.keys() if truth.get(name) != now.get(name)]
         if code or odd:
             found["wrong"].append(f"{method}, {about}: code {code}, otherwise: {sorted(odd)}")
+
+
+def base() -> Splats:
+    """Splats about where the tiny scene's points are."""
+    rng = np.random.default_rng(0)
+    means = rng.normal(0, rng.choice([0.2, 0.8], (BASE_SPLATS, 1)), (BASE_SPLATS, 3))
+    quats, log_scales = rng.normal(size=(BASE_SPLATS, 4)), rng.normal(-4.5, 0.4, (BASE_SPLATS, 3))
+    logits, sh = rng.normal(0, 2, BASE_SPLATS), rng.normal(0, 0.3, (BASE_SPLATS, 16, 3))
+    arrays = (each.astype(np.float32) for each in (means, quats, log_scales, logits, sh))
+    means, quats, log_scales, logits, sh = arrays
+    return Splats(means, quats, log_scales, logits, sh)
 
 
 def contents(run: Path) -> dict[str, bytes]:

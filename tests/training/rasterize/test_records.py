@@ -1,4 +1,4 @@
-"""Records of splats: what is copied out of them, and their step of Adam, against float64."""
+"""Records of splats: what is copied out of them, and their step of Adam against float64."""
 
 import numpy as np
 import torch
