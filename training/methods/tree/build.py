@@ -95,8 +95,9 @@ class GrowingForest:
             grove = divided(nodes, tree, self._longest)
             above, upper = grove.upper
             uppers.append((above.select(np.arange(len(above))), upper))  # a copy: a view would keep all nodes
-            del nodes, leaves, above
+            del nodes, leaves
             yield from grove
+            del grove, above
         above, top = _merged_up(np.stack(moments))
         nodes = _drawn(above, top, np.stack(harmonics), np.stack(moments)[:, 9])
         splats = Splats.concatenated([*(splats for splats, _ in uppers), nodes])
