@@ -71,7 +71,7 @@ def on_the_card(view):
 def test_finer_ones_come_and_what_is_drawn_is_complete_at_any_time(bpy, lodgs, tree, path, root, look):
     views, truth = lodgs("viewport.views"), Truth(tree)
     index = lodgs("training.lod.paging").TreeFile(path).index()
-    view, streamed, numbers = views.ViewState(), 0, []
+    view, streamed, numbers, begun = views.ViewState(), 0, [], False
     for eye in EYES:
         for pixels in (30.0, 8.0):
             until = time.monotonic() + 30
@@ -79,7 +79,8 @@ def test_finer_ones_come_and_what_is_drawn_is_complete_at_any_time(bpy, lodgs, t
                 before = views.stream(root)
                 settled = before is not None and before.ready and not before.busy
                 look(root, view, eye, pixels)
-                if view.count and view.arrangement is not view.loading:  # at first they come bit by bit
+                begun |= 0 < view.count == view.arrangement.count  # at first they come bit by bit
+                if begun:
                     numbers.append(truth.nodes(on_the_card(view)))
                     truth.require_complete(numbers[-1])
                 stream = views.stream(root)
@@ -110,14 +111,17 @@ def test_it_is_the_picture_of_the_whole_file(bpy, lodgs, path, root, look):
 
 def test_two_viewports_draw_complete_cuts(bpy, lodgs, tree, root, look):
     views, truth = lodgs("viewport.views"), Truth(tree)
-    one, other = views.ViewState(), views.ViewState()
+    one, other, begun = views.ViewState(), views.ViewState(), set()
     for eye in EYES:
         for _ in range(25):
             for view in (one, other):
                 look(root, view, eye, 12.0)
-                if view.count and view.arrangement is not view.loading:
+                if 0 < view.count == view.arrangement.count:
+                    begun.add(view)
+                if view in begun:
                     truth.require_complete(truth.nodes(on_the_card(view)))
             time.sleep(0.002)
+    assert len(begun) == 2
 
 
 def test_a_file_that_is_gone_leaves_what_the_scene_holds(bpy, lodgs, path, tree, root, look, tmp_path):
