@@ -206,7 +206,7 @@ def prepare(
         view.pending = view.loading = view.missing = None
         return Request((), (0.0, 0.0, 1.0), budget)
     _all.add(view)
-    instances = _from_files(instances, depsgraph, moving, wait)
+    instances = _from_files(view, instances, depsgraph, moving, wait)
     of, clouds = _read(instances, depsgraph)
     take_over = wait or not any(other.reads(of) for other in _all if other is not view)
     if take_over:
@@ -229,7 +229,11 @@ def stream(root: bpy.types.Object) -> Stream | None:
 
 
 def _from_files(
-    instances: list[shown.SplatInstance], depsgraph: bpy.types.Depsgraph, moving: bool, wait: bool
+    view: ViewState,
+    instances: list[shown.SplatInstance],
+    depsgraph: bpy.types.Depsgraph,
+    moving: bool,
+    wait: bool,
 ) -> list[shown.SplatInstance]:
     """The instances, in which what is read from a file stands for a scene's levels as soon as it can; and
     files are asked for what the eye needs."""
@@ -249,7 +253,9 @@ def _from_files(
                 if there.ready:
                     _beside().submit(there.take).result()
                 time.sleep(0.01)
-            if there.ready:
+            # at first what the scene holds is drawn, which is there at once
+            begun = wait or there in _keys.values() or (view.arrangement and not view.loading)
+            if there.ready and begun:
                 ready.append(source)
     kept = [each if each.source in ready else replace(each, source=None) for each in instances]
     return shown.without_coarser(kept)

@@ -19,6 +19,10 @@ PIXELS = 2.0
 
 ROUNDING = 1e-4
 """Share of a distance that single precision may get wrong."""
+AXIS_BITS = 21
+"""Halvings of space along each axis that the curve tells apart."""
+_AT_ONCE = 1 << 16
+"""Places that are found at a time."""
 
 
 @dataclass(frozen=True)
@@ -125,17 +129,26 @@ def block_quantiles(values: np.ndarray, quantile: float) -> np.ndarray:
 
 def spatial_order(means: np.ndarray) -> np.ndarray:
     """(N,) int64, an order of rows in which neighbours in space come near each other (a Z-order curve)."""
+    return np.argsort(places_on_curve(means), kind="stable")
+
+
+def places_on_curve(means: np.ndarray) -> np.ndarray:
+    """(N,) uint64, where means (N, 3) are on a Z-order curve through a grid, of 2^AXIS_BITS cells along its
+    longest side; each bit halves a box of cells, three one along each axis."""
     if not len(means):
-        return np.zeros(0, np.int64)
+        return np.zeros(0, np.uint64)
     low, high = np.quantile(means[:: max(len(means) // 100_000, 1)], (0.01, 0.99), axis=0)
     low, high = low - (high - low) / 4, high + (high - low) / 4  # the few beyond crowd at the border
-    cells = (means - low) * (((1 << 21) - 1) / max(float((high - low).max()), 1e-30))
+    unit = ((1 << AXIS_BITS) - 1) / max(float((high - low).max()), 1e-30)
     code = np.zeros(len(means), np.uint64)
-    for axis, cell in enumerate(np.clip(cells, 0, (1 << 21) - 1).astype(np.uint64).T):
-        for shift, mask in (
-            (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
-            (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249),
-        ):  # fmt: skip
-            cell = (cell | (cell << np.uint64(shift))) & np.uint64(mask)
-        code |= cell << np.uint64(axis)
-    return np.argsort(code, kind="stable")
+    for begin in range(0, len(means), _AT_ONCE):
+        some = slice(begin, begin + _AT_ONCE)
+        cells = np.clip((means[some] - low) * unit, 0, (1 << AXIS_BITS) - 1)
+        for axis, cell in enumerate(cells.astype(np.uint64).T):
+            for shift, mask in (
+                (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
+                (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249),
+            ):  # fmt: skip
+                cell = (cell | (cell << np.uint64(shift))) & np.uint64(mask)
+            code[some] |= cell << np.uint64(axis)
+    return code

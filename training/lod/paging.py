@@ -25,7 +25,7 @@ from ..scenes.cameras import Camera
 from ..splats.bundle import Bundle, Level, Rows, open_bundle
 from ..splats.dialects import drawable
 from ..splats.gaussians import Splats
-from .blocks import SIZE, Blocks, spatial_order
+from .blocks import SIZE, Blocks, places_on_curve
 from .choice import Choice
 from .rule import distances_by_axes
 from .rules.cut import ABOVE_ROOT, K_LEAST, NODE_SIZE, PARENT, PARENT_SIZE, RULE, detail_of
@@ -56,9 +56,9 @@ def streaming_order(columns: Columns) -> np.ndarray:
     Args:
         columns: of the rule, (N,) each.
     """
-    place = np.empty(len(columns[PARENT_SIZE]), np.int64)
-    place[spatial_order(np.stack([columns[name] for name in PARENT], axis=1))] = np.arange(len(place))
-    return np.lexsort((place, -np.floor(np.log2(np.maximum(columns[PARENT_SIZE], 1e-30)))))
+    places = places_on_curve(np.stack([columns[name] for name in PARENT], axis=1))
+    octaves = -np.floor(np.log2(np.maximum(columns[PARENT_SIZE], 1e-30)))
+    return np.lexsort((places, octaves.astype(np.int16)))
 
 
 def table_of_pages(columns: Mapping[int, Columns]) -> dict[str, np.ndarray]:
@@ -137,7 +137,7 @@ class TreeFile:
     def read_rows(self, number: int, rows: np.ndarray, beside: Columns | None = None) -> Splats:
         """The splats of some rows (M,) of a level, with further columns (M,); those that cannot be drawn are
         missing."""
-        splats = self._rows[number].read(rows)
+        splats = self._rows[number].select(rows)
         nothing = np.zeros(len(splats), np.float32)
         splats.extras = dict.fromkeys(COLUMNS, nothing) | splats.extras | dict(beside or {})
         return drawable(splats, self.path)

@@ -23,21 +23,23 @@ class Tree:
 
     Attributes:
         children: (N - 1, 2) int32, of the nodes N, N + 1, ...; the last of these is the root.
+        trees: how many stand side by side, T; then there are N - T nodes above leaves, roots anywhere.
     """
 
     children: np.ndarray
+    trees: int = 1
 
     @property
     def leaves(self) -> int:
         """N."""
-        return len(self.children) + 1
+        return len(self.children) + self.trees
 
     def __len__(self) -> int:
-        return 2 * self.leaves - 1
+        return 2 * self.leaves - self.trees
 
     @cached_property
     def parents(self) -> np.ndarray:
-        """(2N - 1,) int32; -1 for the root."""
+        """(2N - 1,) int32; -1 for roots."""
         parents = np.full(len(self), -1, np.int32)
         parents[self.children] = np.arange(self.leaves, len(self), dtype=np.int32)[:, None]
         return parents
@@ -45,19 +47,31 @@ class Tree:
     @cached_property
     def layers(self) -> list[np.ndarray]:
         """The nodes above leaves, (M,) int32 each, by their number of nodes above them: the root first."""
-        layers, layer = [], np.array([len(self) - 1], np.int32)
+        layers, layer = [], np.flatnonzero(self.parents < 0).astype(np.int32)
         while len(layer := layer[layer >= self.leaves]):
             layers.append(layer)
             layer = self.children[layer - self.leaves].reshape(-1)
         return layers
 
-    def sizes(self, means: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
+    @cached_property
+    def leaves_below(self) -> np.ndarray:
+        """(2N - 1,) int32: how many leaves each node stands for; 1 for a leaf."""
+        below = np.ones(len(self), np.int32)
+        for layer in reversed(self.layers):
+            below[layer] = below[self.children[layer - self.leaves]].sum(axis=1)
+        return below
+
+    def sizes(
+        self, means: np.ndarray, log_scales: np.ndarray, of_leaves: np.ndarray | float = 0.0
+    ) -> np.ndarray:
         """(2N - 1,) float32, saturated: of leaves 0, of others at least :func:`size_of` and ``least_size``.
 
         Args:
-            means, log_scales: (2N - 1, 3) float32 of all nodes.
+            means, log_scales: (2N - 1, 3) float32 of all nodes; of leaves log-scales are not looked at.
+            of_leaves: (N,) float32, where they are roots of other trees.
         """
         sizes = np.zeros(len(self), np.float32)
+        sizes[: self.leaves] = of_leaves
         for layer in reversed(self.layers):
             below = self.children[layer - self.leaves]
             apart = means[below].astype(np.float64) - means[layer, None].astype(np.float64)

@@ -30,7 +30,7 @@ class CutCache:
     """Rows in fast memory, in groups that come and go together: a group's is a cut of one point tree.
 
     Changes stay here until a group goes, least recently used first, or everything is written back. Memory is
-    the budget and, of every row there is, 4 bytes. A group's rows are no other group's.
+    the budget, in which is a table of 4 bytes of every row there is. A group's rows are no other group's.
 
     What a step sees depends on which cuts are here, so ``state_dict`` tells that, too.
 
@@ -44,6 +44,8 @@ class CutCache:
         reduced: see REDUCED.
 
     Attributes:
+        capacity: rows for which there is room.
+        records: (capacity, width) on the device; who changes some in place says so by :meth:`changed`.
         loaded: rows that have been brought in so far.
         reused: rows that were there when they were asked for.
     """
@@ -61,14 +63,18 @@ class CutCache:
         self.rows, self.layout, self._device = rows, rows.layout, torch.device(device)
         self._least, self._most = reuse
         self._flush_interval, self._reduced = flush_interval, reduced
-        record = 4 * self.layout.width
-        self.capacity = budget // (record + BESIDE)
-        self._at_once = max(STAGING // record, 1)
-        self._records = torch.zeros(self.capacity, self.layout.width, device=self._device)
+        self._record, self.budget = 4 * self.layout.width, budget
+        self._at_once = max(STAGING // self._record, 1)
+        self.records = torch.zeros(0, self.layout.width, device=self._device)
         self.loaded = self.reused = 0
         self._forget(groups)
 
     def _forget(self, groups: int) -> None:
+        most = max(self.budget - 4 * len(self.rows), 0) // (self._record + BESIDE)
+        self.capacity = min(most, len(self.rows))
+        if len(self.records) != self.capacity:
+            self.records = self.records[:0].clone()
+            self.records = torch.zeros(self.capacity, self.layout.width, device=self._device)
         self._place = np.full(len(self.rows), -1, np.int32)  # of each row, where its record is; -1: not here
         self._row = np.zeros(self.capacity, np.int64)  # of each record, which row it is
         self._group = np.full(self.capacity, -1, np.int64)
@@ -112,10 +118,11 @@ class CutCache:
         rows, counts = cut(anew) if len(anew) else (np.zeros(0, np.int64), np.zeros(0, np.int64))
         there = sum(len(self._places[group]) for group in groups[known].tolist())
         if there + len(rows) > self.capacity:
+            needed = (there + len(rows)) * (self._record + BESIDE) + 4 * len(self.rows)
             raise LodgsError(
                 f"A view needs {there + len(rows):,} splats at once; the memory budget has room for "
                 f"{self.capacity:,}.",
-                "Give more memory, or ask for coarser detail.",
+                f"Give at least {-(-needed // 10**6):,} MB as splat_memory, or ask for coarser detail.",
             )
         self._clock += 1
         self._used[groups] = self._clock
@@ -132,11 +139,15 @@ class CutCache:
 
     def get(self, places: np.ndarray) -> torch.Tensor:
         """A copy of the records (M, width) at places (M,), on the device."""
-        return self._records.index_select(0, torch.from_numpy(places).to(self._device))
+        return self.records.index_select(0, torch.from_numpy(places).to(self._device))
 
     def put(self, places: np.ndarray, records: torch.Tensor) -> None:
         """Puts records (M, width) at places (M,), each named once."""
-        self._records.index_copy_(0, torch.from_numpy(places).to(self._device), records)
+        self.records.index_copy_(0, torch.from_numpy(places).to(self._device), records)
+        self.changed(places)
+
+    def changed(self, places: np.ndarray) -> None:
+        """The records at places (M,) are to be written back."""
         self._dirty[places] = True
 
     def after(self, step: int) -> None:
@@ -195,7 +206,7 @@ class CutCache:
         for first in range(0, len(coming), self._at_once):
             some = slice(first, first + self._at_once)
             records = self.rows.read(coming[some]).to(self._device, non_blocking=True)
-            self._records.index_copy_(0, torch.from_numpy(room[some]).to(self._device), records)
+            self.records.index_copy_(0, torch.from_numpy(room[some]).to(self._device), records)
         self._place[coming], self._row[room] = room, coming
         places[~here] = room
         self._group[places] = owners
@@ -244,21 +255,22 @@ class CutCache:
             "distance": torch.from_numpy(self._distance.copy()),
             "used": torch.from_numpy(self._used.copy()),
             "clock": self._clock,
+            "budget": self.budget,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes on from what ``state_dict`` gave.
+        """Goes on from what ``state_dict`` gave, with a budget that may be another one.
 
         Raises:
-            ValueError: the rows cannot be read, or there are more groups' here than there is room for.
+            ValueError: the rows cannot be read.
         """
         self.rows.load_state_dict(state["rows"])
         groups, counts, here, distance, used = (
             state[name].cpu().numpy().copy() for name in ("groups", "counts", "here", "distance", "used")
         )
-        if len(here) > self.capacity:
-            raise ValueError("its cache has no room in the memory budget")
         self._forget(len(used))
+        if len(here) > self.capacity:
+            return
         if len(groups):
             self._bring(groups, here, counts)
         self._distance, self._used, self._clock = distance, used, state["clock"]

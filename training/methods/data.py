@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -44,6 +46,8 @@ class TrainingData:
     Args:
         photo_memory: bytes of photographs that are kept; None: ``targets.default_budget``. What is trained
             does not depend on it.
+        splat_memory: bytes of splats that are kept by methods that have them in files; None: as they choose.
+        scratch: where such methods make files, which a checkpoint tells of; None: in a temporary folder.
 
     Attributes:
         train, test: cameras at training size; test views are every n-th by name (see ``Scene.split``).
@@ -58,6 +62,8 @@ class TrainingData:
         exposure: float = 0.0,
         validation: bool = False,
         photo_memory: int | None = None,
+        splat_memory: int | None = None,
+        scratch: Path | None = None,
     ) -> None:
         if len(scene.points) == 0:
             raise LodgsError(
@@ -74,7 +80,16 @@ class TrainingData:
         self.train = [camera.scaled(image_scale) for camera in train]
         self.test = [camera.scaled(image_scale) for camera in test]
         self.photographs = Targets(self._read, default_budget() if photo_memory is None else photo_memory)
+        self.splat_memory, self._scratch = splat_memory, scratch
         self._planned: Planned | None = None
+
+    @cached_property
+    def scratch(self) -> Path:
+        """A folder for files of the run that methods go on with after a checkpoint."""
+        if self._scratch is not None:
+            return self._scratch
+        self._temporary = tempfile.TemporaryDirectory(prefix="lodgs-")
+        return Path(self._temporary.name)
 
     @cached_property
     def extent(self) -> float:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 import torch
 
-from ..rasterize import Adam, Gaussians, Rendering, Target, device_of, photometric_loss, rasterize
+from ..rasterize import Gaussians, Rendering, Target, device_of, photometric_loss, rasterize
 from ..scenes.cameras import Camera
 from ..splats.bundle import Level
 from ..splats.gaussians import Splats
@@ -30,6 +30,16 @@ class Drawing:
     """One picture that a step draws; methods add what they have to know of it after ``backward``."""
 
     rendering: Rendering
+
+
+class Optimizer(Protocol):
+    """What moves what is trained."""
+
+    def step(self) -> None:
+        """One step, by the gradients that ``backward`` has left."""
+
+    def zero_grad(self) -> None:
+        """Forgets these gradients."""
 
 
 P = TypeVar("P", bound=Parameters)
@@ -193,7 +203,7 @@ class Method(ABC, Generic[P, D]):
     def set_learning_rates(self, step: int) -> None:
         """Gives the optimizers their rates of this step."""
 
-    def optimizers(self) -> Sequence[Adam]:
+    def optimizers(self) -> Sequence[Optimizer]:
         """Those that make a step together."""
         return (self.model.adam,)
 
@@ -318,6 +328,9 @@ class Method(ABC, Generic[P, D]):
     def picture(self, camera: Camera) -> torch.Tensor:
         """What the model itself shows a camera, (H, W, 3); asked only where ``arrays`` gives some."""
         raise NotImplementedError("the levels hold all")
+
+    def close(self) -> None:
+        """Closes files that are no longer needed."""
 
     def state_dict(self) -> dict:
         """Everything that the next step depends on, as tensors and numbers."""

@@ -37,8 +37,6 @@ STAGING = 4 << 20
 KEPT = 2
 """Checkpoints before the newest one whose blocks stay: a run has as many, the newest may not be whole yet."""
 
-_NAME = re.compile(r"rows_[0-9a-f]{8}\.bin")
-
 
 class Layout:
     """What a row holds: arrays by name, one after the other, float32.
@@ -142,10 +140,13 @@ class FileRows:
         folder: where the file is made, when first written to, under a name of its own.
         block: rows that are read and written together at least.
         staging: bytes, see STAGING.
+        name: what the file's name begins with; others in the same folder have other ones.
     """
 
-    def __init__(self, folder: Path, layout: Layout, block: int = BLOCK, staging: int = STAGING) -> None:
-        self.layout, self._folder, self._block = layout, folder, block
+    def __init__(
+        self, folder: Path, layout: Layout, block: int = BLOCK, staging: int = STAGING, name: str = "rows"
+    ) -> None:
+        self.layout, self._folder, self._block, self._name = layout, folder, block, name
         self._blocks_at_once = max(staging // (4 * layout.width * block), 1)
         self._file: FileIO | None = None
         self._broken: LodgsError | None = None
@@ -284,7 +285,7 @@ class FileRows:
         if not (0 <= self._count <= len(self._slots) * self._block and len(self._slots) == len(self._checks)):
             raise ValueError("its table of rows is damaged")
         if state["file"]:
-            if not _NAME.fullmatch(state["file"]):
+            if not self._may_be(state["file"]):
                 raise ValueError("its file of rows has an impossible name")
             path = self._folder / state["file"]
             if path.is_symlink() or not path.is_file():
@@ -324,12 +325,14 @@ class FileRows:
 
     def _remove_others(self) -> None:
         """Removes files that earlier lives of the run have left."""
-        for path in self._folder.glob("rows_*.bin"):
-            if _NAME.fullmatch(path.name) and (
-                self._file is None or path.name != Path(str(self._file.name)).name
-            ):
+        ours = "" if self._file is None else Path(str(self._file.name)).name
+        for path in self._folder.glob(f"{self._name}_*.bin"):
+            if self._may_be(path.name) and path.name != ours:
                 with suppress(OSError):
                     path.unlink()
+
+    def _may_be(self, name: str) -> bool:
+        return re.fullmatch(rf"{self._name}_[0-9a-f]{{8}}\.bin", name) is not None
 
     # -- blocks ----------------------------------------------------------------------------------------
 
@@ -345,7 +348,7 @@ class FileRows:
         slots[~fresh] = self._new_slots(int((~fresh).sum()))
         order = np.argsort(slots)
         with self._telling():
-            file = self._file or self._open(self._folder / f"rows_{uuid4().hex[:8]}.bin", new=True)
+            file = self._file or self._open(self._folder / f"{self._name}_{uuid4().hex[:8]}.bin", new=True)
             for run in _runs(slots[order]):
                 some = order[run]
                 file.seek(int(slots[some[0]]) * buffer[0].nbytes)
@@ -374,14 +377,20 @@ class FileRows:
 
     def _read_places(self, places: np.ndarray, to: np.ndarray, found: np.ndarray) -> None:
         """Reads the rows at places (M,), counted through all slots, to rows ``to`` (M,) of ``found``."""
-        order = np.argsort(places)
-        places, to, width = places[order], to[order], self.layout.width
+        if (np.diff(places) < 0).any():
+            order = np.argsort(places)
+            places, to = places[order], to[order]
+        width = self.layout.width
+        gaps = np.append(0, np.cumsum((np.diff(places) != 1) | (np.diff(to) != 1)))[: len(places)]
         with self._telling():
             for run in _runs(places // self._block, places // (self._blocks_at_once * self._block)):
                 first, last = int(places[run.start]), int(places[run.stop - 1])
-                part = np.empty((last - first + 1, width), np.float32)
                 assert self._file is not None, "where a block has a slot there is a file"
                 self._file.seek(first * 4 * width)
+                if gaps[run.start] == gaps[run.stop - 1]:  # as they lie there
+                    _read(self._file, found[to[run.start] : to[run.stop - 1] + 1])
+                    continue
+                part = np.empty((last - first + 1, width), np.float32)
                 _read(self._file, part)
                 found[to[run]] = part[places[run] - first]
 

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 LearningRate = float | torch.Tensor | np.ndarray
+BETAS, EPS = (0.9, 0.999), 1e-15
 
 
 class Adam:
@@ -18,7 +19,7 @@ class Adam:
         tensors: leaf tensors (N, ...) by name, contiguous float32, on the CPU or on a GPU.
         lr: learning rate by name: a number, or an array that broadcasts against one row (for ``sh`` of shape
             (N, K, 3) a (K, 1) array gives each coefficient its own). Change it between steps as you like.
-        betas, eps: as in the paper; 3DGS uses eps 1e-15.
+        betas, eps: as in the paper; by default 3DGS's.
 
     Attributes:
         tensors: the tensors by name.
@@ -30,8 +31,8 @@ class Adam:
         self,
         tensors: Mapping[str, torch.Tensor],
         lr: Mapping[str, LearningRate],
-        betas: tuple[float, float] = (0.9, 0.999),
-        eps: float = 1e-15,
+        betas: tuple[float, float] = BETAS,
+        eps: float = EPS,
     ) -> None:
         if set(tensors) != set(lr):
             raise ValueError(f"learning rates for {sorted(lr)}, tensors for {sorted(tensors)}")
@@ -117,6 +118,42 @@ class Adam:
         for name, tensor in self.tensors.items():
             self.replace(name, tensor, state["m"][name].clone(), state["v"][name].clone())
         self.steps = dict(state["steps"])
+
+
+@torch.no_grad()
+def step_records(
+    records: torch.Tensor,
+    places: np.ndarray,
+    gradient: torch.Tensor,
+    lr: torch.Tensor,
+    steps: int,
+    most: int,
+    betas: tuple[float, float] = BETAS,
+    eps: float = EPS,
+) -> None:
+    """One Adam step in place for some records, each with the moments and the number of steps of its own.
+
+    Args:
+        records: (N, width), C values in the columns from 0 on, then their first, then their second moments.
+        places: (M,) int64, each once.
+        gradient: (M, C) of the values.
+        lr: (C,) learning rates.
+        steps: the column of the number of steps made.
+        most: no record has made more.
+    """
+    from .cpu.adam import update_records
+
+    if records.device.type == "cpu":
+        rates = np.ascontiguousarray(lr.numpy(), np.float32)
+        gradient = gradient.contiguous()
+        update_records(records.numpy(), places, gradient.numpy(), rates, steps, betas, eps, most)
+        return
+    at, count = torch.from_numpy(places).to(records.device), len(lr)
+    some = records[at]
+    values, m, v = (some[:, i * count : (i + 1) * count] for i in range(3))
+    some[:, steps] += 1
+    update_in_torch(values, gradient, m, v, lr, betas, eps, some[:, steps, None].double())
+    records[at] = some
 
 
 def update_in_torch(parameter, gradient, m, v, lr, betas, eps, step) -> None:

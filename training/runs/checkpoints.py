@@ -46,7 +46,7 @@ def write_checkpoint(folder: RunFolder, step: int, levels: list[dict], method: d
 
 def remove_checkpoints(folder: RunFolder) -> None:
     """Removes all checkpoints: a finished run has no more use for them."""
-    for path in [*_newest_first(folder), *folder.checkpoints.glob("rows_*.bin")]:
+    for path in [*_newest_first(folder), *folder.checkpoints.glob("*_????????.bin")]:
         path.unlink(missing_ok=True)
 
 

@@ -48,6 +48,8 @@ def training_data(
     return TrainingData(
         scene, job.image_scale, job.test_every, job.exposure, job.validation,
         photo_memory=job.photo_memory * 10**6 or None,
+        splat_memory=job.splat_memory * 10**6 or None,
+        scratch=folder.checkpoints,
     )  # fmt: skip
 
 

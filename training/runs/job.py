@@ -15,7 +15,7 @@ from ..methods.parameters import Parameters
 from .folder import RunFolder
 
 BACKENDS = ("auto", "cpu", "cuda", "reference")
-CHANGEABLE = ("backend", "out", "photo_memory")
+CHANGEABLE = ("backend", "out", "photo_memory", "splat_memory")
 """The keys that a run may go on with other values of: they say where it is trained, not what."""
 MOST_STOPS = 32
 """Most stops that a job lightens or darkens linear images by."""
@@ -58,6 +58,9 @@ class Job:
         exposure: stops added to linear (EXR) images before they are trained on.
         photo_memory: megabytes of photographs that are kept; others are read ahead while steps go on. 0: a
             quarter of the memory that is free, 2 GB at most. What is trained does not depend on it.
+        splat_memory: megabytes of splats, with what training keeps of each, that are in memory at a time,
+            where a method can have the others in a file (tree). 0: half of the memory that is free. With less
+            than all need, what is trained depends on it a little.
         model, images: the COLMAP model's and the photographs' folder where they are not found by themselves.
         parameters: changes to the preset's parameters by name.
     """
@@ -77,6 +80,7 @@ class Job:
     validation: bool = False
     exposure: float = 0.0
     photo_memory: int = 0
+    splat_memory: int = 0
     model: str = ""
     images: str = ""
     parameters: dict = field(default_factory=dict)
@@ -145,10 +149,11 @@ class Job:
                 f"exposure = {self.exposure!r} is not possible.",
                 f"Give stops from {-MOST_STOPS} to {MOST_STOPS}.",
             )
-        if not 0 <= self.photo_memory < 2**31:
-            raise LodgsError(
-                f"photo_memory = {self.photo_memory!r} is not possible.", "Give megabytes, or 0 to let it be."
-            )
+        for key in ("photo_memory", "splat_memory"):
+            if not 0 <= getattr(self, key) < 2**31:
+                raise LodgsError(
+                    f"{key} = {getattr(self, key)!r} is not possible.", "Give megabytes, or 0 to let it be."
+                )
         if self.backend not in BACKENDS:
             raise LodgsError(
                 f"There is no backend {shown(self.backend)}.", f"Choose one of: {', '.join(BACKENDS)}."

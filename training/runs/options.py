@@ -44,6 +44,11 @@ _OPTIONS: dict[str, dict] = {
         "type": _whole,
         "help": "photographs that are kept; 0 is a quarter of the free memory, 2048 at most",
     },
+    "splat_memory": {
+        "metavar": "MB",
+        "type": _whole,
+        "help": "splats in memory, where others can be in a file (tree); 0 is half of the free memory",
+    },
     "model": {"metavar": "DIR", "help": "folder of the COLMAP model, where it is not found by itself"},
     "images": {"metavar": "DIR", "help": "folder of the photographs, where it is not found by itself"},
 }

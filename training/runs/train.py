@@ -126,6 +126,7 @@ def _train(job: Job, folder: RunFolder, events: Events) -> int:
     seconds = round(time.monotonic() - started, 1)
     events("status", message="Measuring the result")
     events("done", bundle=folder.bundle.name, seconds=seconds, **summary(run.evaluation, bundle))
+    run.method.close()
     remove_checkpoints(folder)
     return DONE
 

@@ -23,12 +23,14 @@ from ..documents import json_object, read_json, shown
 from ..errors import LodgsError
 from ..files import atomic_write
 from .dialects import FARTHEST, Warn, as_3dgs, comments_of, drawable, meta_of, silent
-from .gaussians import Splats
+from .gaussians import SplatRows, Splats
 from .ply import (
     Columns,
     Element,
     columns_of,
     columns_of_extras,
+    every_column,
+    let_go,
     read_comments,
     read_elements,
     read_ply,
@@ -66,11 +68,23 @@ class Level:
         number: 1 is the coarsest.
         splats: the level's splats with final scales and opacities.
         facts: numbers of this level by name that its rule needs, such as FLoD's ``s_min``.
+        elsewhere: the splats, where they are not in memory but read a few at a time to be written.
     """
 
     number: int
     splats: Splats
     facts: dict[str, float] = field(default_factory=dict)
+    elsewhere: SplatRows | None = None
+
+    @property
+    def rows(self) -> SplatRows:
+        """The splats, wherever they are."""
+        return self.splats if self.elsewhere is None else self.elsewhere
+
+    @property
+    def sh_degree(self) -> int:
+        """Of the splats, wherever they are."""
+        return self.rows.select(slice(0, 0)).sh_degree
 
 
 NO_SPLATS = Splats(
@@ -136,16 +150,17 @@ def write_bundle(path: str | Path, bundle: Bundle, order: str = "finest_first") 
     if order == "stream" or bundle.cumulative:
         levels.reverse()
     if bundle.cumulative:
-        elements = [Element("vertex", [columns_of(level.splats) for _, level in levels])]
+        elements = [Element.of_splats("vertex", [level.rows for _, level in levels], columns_of)]
     else:
         names = ["vertex", *(f"lod_{lod}_vertex" for lod, _ in levels[1:])]
         elements = [
-            Element(name, [columns_of(level.splats)]) for name, (_, level) in zip(names, levels, strict=True)
+            Element.of_splats(name, [level.rows], columns_of)
+            for name, (_, level) in zip(names, levels, strict=True)
         ]
     extras = {
-        lod: Element(f"lod_extra_{lod}", [columns])
+        lod: Element.of_splats(f"lod_extra_{lod}", [level.rows], columns_of_extras)
         for lod, level in levels
-        if (columns := columns_of_extras(level.splats))
+        if columns_of_extras(level.rows.select(slice(0, 0)))
     }
     comments = [_comment(_head(bundle, order=order))]
     offset = 0
@@ -155,7 +170,7 @@ def write_bundle(path: str | Path, bundle: Bundle, order: str = "finest_first") 
         if lod in extras:
             line["extras"] = extras[lod].name
         comments.append(_comment(line))
-        offset += len(level.splats) * element.dtype.itemsize
+        offset += len(level.rows) * element.dtype.itemsize
     comments += [_comment(line) for line in _table_lines(bundle)]
     comments.append(_comment({"meta": bundle.meta}))
     if sum(len(comment) + 9 for comment in comments) > _MAX_COMMENTS:
@@ -197,7 +212,7 @@ def read_bundle(path: str | Path, warn: Warn = silent, rows_of: RowsOf | None = 
         for level in bundle.levels:
             found, some = rows[level.number], wanted.get(level.number, slice(None))
             some = some if isinstance(some, slice) else some[some < len(found)]
-            level.splats = drawable(found.read(some), path, warn)
+            level.splats = drawable(found.select(some), path, warn)
         return bundle
     except _CONTRADICTIONS as error:
         raise _contradiction(path, error) from error
@@ -226,10 +241,12 @@ class Rows:
         for rows in (self.vertices, self.extras):
             there = () if rows is None else rows.dtype.names or ()
             found |= {name: np.array(rows[name][some]) for name in names if name in there}  # type: ignore[index]
+            if rows is not None:
+                let_go(rows)
         return found
 
-    def read(self, some: slice | np.ndarray) -> Splats:
-        """The splats of some rows, drawable or not.
+    def select(self, some: slice | np.ndarray) -> Splats:
+        """The splats of some rows, drawable or not; none of the file stays in memory.
 
         Raises:
             LodgsError: as ``splats_from``.
@@ -238,6 +255,9 @@ class Rows:
         if self.extras is not None:
             extras = self.extras[some]
             splats.extras |= {column: np.array(extras[column]) for column in extras.dtype.names or ()}
+        let_go(self.vertices)
+        if self.extras is not None:
+            let_go(self.extras)
         return splats
 
 
@@ -253,6 +273,15 @@ def open_bundle(path: str | Path) -> tuple[Bundle, dict[int, Rows]]:
     if bundle is None:
         raise LodgsError(f"{path} is a PLY without levels.", "Choose a bundle.")
     return bundle, _rows_of_levels(bundle, lines, elements, path)
+
+
+def open_ply(path: str | Path) -> Rows:
+    """The splats of a plain PLY to read of, as they stand in the file.
+
+    Raises:
+        LodgsError: as ``read_elements``.
+    """
+    return Rows(read_elements(path)[0]["vertex"], None, path)
 
 
 def _rows_of_levels(
@@ -343,10 +372,11 @@ def write_folder(folder: str | Path, bundle: Bundle) -> str:
             path = folder / f"lod{lod}.ply"
             temporary = stack.enter_context(atomic_write(path))
             drawn = bundle.upto(level.number)
-            parts = [
-                columns_of(x.splats) | {name: x.splats.extras[name] for name in sorted(shared)} for x in drawn
-            ]
-            element = Element("vertex", parts)
+            element = Element.of_splats(
+                "vertex",
+                [x.splats for x in drawn],
+                lambda some: columns_of(some) | {name: some.extras[name] for name in sorted(shared)},
+            )
             write_elements(temporary, [element], comments_of(bundle.meta))
             with open(temporary, "rb") as file:
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
@@ -363,7 +393,7 @@ def write_folder(folder: str | Path, bundle: Bundle) -> str:
             command += [str(path), "-l", str(lod)]
         if bundle.tables:
             temporary = stack.enter_context(atomic_write(folder / TABLES_FILE))
-            no_splats = Element("vertex", [columns_of(NO_SPLATS)])
+            no_splats = Element.of("vertex", columns_of(NO_SPLATS))
             write_elements(temporary, [no_splats, *_table_elements(bundle)])
         manifest_file.write_text(
             json.dumps(manifest, indent=1, default=_plain, allow_nan=False) + "\n", "ascii"
@@ -450,8 +480,8 @@ def describe(path: str | Path) -> str:
         f"{'level':>5}  {'splats':>10}  {'MB':>8}  {''.join(f'{name:>10}  ' for name in names)}extras",
     ]
     for level in bundle.levels:
-        columns = columns_of(level.splats) | columns_of_extras(level.splats)
-        size = Element("", [columns]).size / 1e6
+        columns = every_column(level.splats)
+        size = Element.of("", columns).size / 1e6
         facts = "".join(
             f"{level.facts[name]:>10.6g}  " if name in level.facts else f"{'-':>10}  " for name in names
         )
@@ -469,7 +499,7 @@ def _check(bundle: Bundle) -> None:
     numbers = [level.number for level in bundle.levels]
     if not numbers or numbers != sorted(set(numbers)):
         raise ValueError(f"a bundle needs levels in ascending number, not {numbers}")
-    degrees = {level.splats.sh_degree for level in bundle.levels}
+    degrees = {level.sh_degree for level in bundle.levels}
     if len(degrees) > 1:
         raise LodgsError(
             f"The levels have spherical harmonics of different degrees {sorted(degrees)}.",
@@ -481,17 +511,17 @@ def _head(bundle: Bundle, **further) -> dict:
     return {
         "v": FORMAT_VERSION, "method": bundle.method, "rule": bundle.rule, "facts": bundle.facts,
         "controls": bundle.controls, "cumulative": bundle.cumulative,
-        "sh": bundle.levels[0].splats.sh_degree, **further,
+        "sh": bundle.levels[0].sh_degree, **further,
     }  # fmt: skip
 
 
 def _level_line(lod: int, level: Level) -> dict:
-    line = {"level": level.number, "lod": lod, "count": len(level.splats)}
+    line = {"level": level.number, "lod": lod, "count": len(level.rows)}
     return line | {"facts": level.facts} if level.facts else line
 
 
 def _table_elements(bundle: Bundle) -> list[Element]:
-    return [Element(f"lod_{name}", [columns]) for name, columns in bundle.tables.items()]
+    return [Element.of(f"lod_{name}", columns) for name, columns in bundle.tables.items()]
 
 
 def _table_lines(bundle: Bundle) -> list[dict]:

@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from typing import Protocol
 
 import numpy as np
 
 SH_C0 = 0.28209479177387814
 """The harmonic of degree 0, sqrt(1 / 4π): a base colour is 0.5 + SH_C0 · sh[:, 0]."""
+
+
+class SplatRows(Protocol):
+    """Splats that are handed over some rows at a time, from wherever they are: ``Splats`` from memory."""
+
+    def __len__(self) -> int: ...
+
+    def select(self, index: slice, /) -> Splats:
+        """The splats of a range of rows."""
+        ...
 
 
 @dataclass

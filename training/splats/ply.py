@@ -7,13 +7,15 @@ coefficients first, then green, then blue), opacity, scale_0..2, rot_0..3 (Kerbl
 from __future__ import annotations
 
 import io
+import mmap
 import os
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
@@ -22,7 +24,7 @@ from ..documents import open_file
 from ..errors import LodgsError
 from ..files import atomic_write
 from .dialects import Warn, as_3dgs, refuse, silent
-from .gaussians import Splats
+from .gaussians import SplatRows, Splats
 
 MOST_HEADER, MOST_COLUMNS = 1 << 20, 1000
 """Most bytes of a header, and most columns of all elements; ours have 70 columns a level."""
@@ -40,8 +42,17 @@ _TYPES = {
 }
 # Rows are moved between a file's records and our columns in blocks that stay in the processor's cache.
 _BLOCK = 4096
+AT_ONCE = 1 << 15
+"""Rows that are in memory at a time, of splats that are not."""
 
 Columns = dict[str, np.ndarray]
+
+
+class Part(NamedTuple):
+    """Some rows of an element: how many, and what gives the columns of a range of them."""
+
+    count: int
+    columns: Callable[[slice], Columns]
 
 
 @dataclass
@@ -49,17 +60,30 @@ class Element:
     """One element of a PLY: rows of named columns, given in parts that follow one another."""
 
     name: str
-    parts: Sequence[Columns]
+    parts: Sequence[Part]
 
-    @property
+    @classmethod
+    def of(cls, name: str, columns: Columns) -> Element:
+        """The element of columns (N,) in memory."""
+        count = len(next(iter(columns.values())))
+        return cls(name, [Part(count, lambda some: {key: rows[some] for key, rows in columns.items()})])
+
+    @classmethod
+    def of_splats(cls, name: str, sets: Sequence[SplatRows], columns: Callable[[Splats], Columns]) -> Element:
+        """The element of columns of splats, of one set after the other."""
+        return cls(
+            name, [Part(len(rows), lambda some, rows=rows: columns(rows.select(some))) for rows in sets]
+        )
+
+    @cached_property
     def dtype(self) -> np.dtype:
         """One row as the file holds it: packed and little-endian."""
-        return np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in self.parts[0].items()])
+        return _row_of(self.parts[0].columns(slice(0, 0)))
 
     @property
     def count(self) -> int:
         """Rows of the element, of all its parts."""
-        return sum(len(next(iter(part.values()))) for part in self.parts)
+        return sum(part.count for part in self.parts)
 
     @property
     def size(self) -> int:
@@ -85,16 +109,17 @@ def read_ply(path: str | Path, warn: Warn = silent) -> Splats:
     return as_3dgs(splats_from(elements["vertex"], path), path, warn)
 
 
-def write_ply(path: str | Path, splats: Splats, comments: Sequence[str] = ()) -> None:
+def write_ply(path: str | Path, splats: SplatRows, comments: Sequence[str] = ()) -> None:
     """Write splats as one binary little-endian ``vertex``, extras behind the 3DGS columns.
 
     Args:
+        splats: in memory, or where they are read a few at a time.
         comments: for the header, such as `dialects.comments_of` a bundle's meta.
 
     Raises:
         LodgsError: the file cannot be written, or an extra has a name or a type that PLY does not know.
     """
-    write_elements(path, [Element("vertex", [columns_of(splats) | columns_of_extras(splats)])], comments)
+    write_elements(path, [Element.of_splats("vertex", [splats], every_column)], comments)
 
 
 def columns_of(splats: Splats) -> Columns:
@@ -112,9 +137,23 @@ def columns_of(splats: Splats) -> Columns:
     }
 
 
+def every_column(splats: Splats) -> Columns:
+    """The 3DGS columns, and the extras."""
+    return columns_of(splats) | columns_of_extras(splats)
+
+
 def columns_of_extras(splats: Splats) -> Columns:
     """The extras that are columns of their own (normals have their place in the 3DGS layout)."""
     return {name: column for name, column in splats.extras.items() if name not in NORMALS}
+
+
+def records_of(columns: Columns) -> np.ndarray:
+    """Columns (N,) as rows of a file, (N,) structured: packed and little-endian."""
+    records = np.empty(len(next(iter(columns.values()))), _row_of(columns))
+    for block in _blocks(len(records)):
+        for name, column in columns.items():
+            records[name][block] = column[block]
+    return records
 
 
 def splats_from(rows: np.ndarray, path: str | Path) -> Splats:
@@ -192,6 +231,15 @@ def read_elements(path: str | Path) -> tuple[dict[str, np.ndarray], list[str]]:
     return elements, _comments(header)
 
 
+def let_go(rows: np.ndarray) -> None:
+    """Gives back the pages of a mapped file that have been read, which count as the process's own memory."""
+    base = rows
+    while isinstance(base, np.ndarray):
+        base = base.base
+    if isinstance(base, mmap.mmap) and hasattr(base, "madvise"):
+        base.madvise(mmap.MADV_DONTNEED)
+
+
 def read_comments(path: str | Path) -> list[str]:
     """The comments of a PLY of splats, in the time that its header takes.
 
@@ -223,17 +271,18 @@ def write_elements(path: str | Path, elements: Iterable[Element], comments: Sequ
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         file.write("\n".join(lines).encode("ascii"))
         for element in elements:
-            records = np.empty(_BLOCK, element.dtype)
             for part in element.parts:
-                for block in _blocks(len(next(iter(part.values())))):
-                    for name, column in part.items():
-                        records[name][: block.stop - block.start] = column[block]
-                    file.write(records[: block.stop - block.start].data)
+                for some in _blocks(part.count, AT_ONCE):
+                    file.write(records_of(part.columns(some)).data)
+
+
+def _row_of(columns: Columns) -> np.dtype:
+    return np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
 
 
 def _header_of(element: Element) -> list[str]:
     lines = [f"element {element.name} {element.count}"]
-    for name, column in element.parts[0].items():
+    for name, column in element.parts[0].columns(slice(0, 0)).items():
         kind = _TYPES.get(column.dtype.str[1:])
         if kind is None or not re.fullmatch(r"[!-~]+", name):
             raise LodgsError(
@@ -333,6 +382,6 @@ def _empty_splats(count: int, degree: int) -> Splats:
     )
 
 
-def _blocks(count: int) -> Iterator[slice]:
-    for start in range(0, count, _BLOCK):
-        yield slice(start, min(start + _BLOCK, count))
+def _blocks(count: int, size: int = _BLOCK) -> Iterator[slice]:
+    for start in range(0, count, size):
+        yield slice(start, min(start + size, count))

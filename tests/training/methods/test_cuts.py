@@ -11,7 +11,7 @@ from training.methods.rows import FileRows, Layout, MemoryRows
 LAYOUT = Layout({"values": (4,)})
 GROUPS, SIZE = 20, 30
 """Group g is the rows from SIZE * g; those of a cut are the first few, more for nearer ones."""
-ROW = 4 * LAYOUT.width + BESIDE
+ROW, TABLE = 4 * LAYOUT.width + BESIDE, 4 * GROUPS * SIZE
 
 
 def filled(rows):
@@ -42,8 +42,8 @@ def made(request, tmp_path):
 def test_what_is_taken_is_what_was_put_last(made, room):
     """Against an array, over random views; the rows of each group in its cut's order."""
     rows, truth = made
-    cache = CutCache(rows, GROUPS, room * ROW, flush_interval=17)
-    assert cache.capacity == room
+    cache = CutCache(rows, GROUPS, room * ROW + TABLE, flush_interval=17)
+    assert cache.capacity == min(room, GROUPS * SIZE)
     rng, most = np.random.default_rng(1), 0
     here: dict[int, tuple[float, int]] = {}
     for step in range(150):
@@ -84,7 +84,7 @@ def test_what_is_taken_is_what_was_put_last(made, room):
 
 def test_the_least_recently_used_go_first_and_only_as_many_as_need_be(made):
     rows, _ = made
-    cache = CutCache(rows, GROUPS, 5 * SIZE * ROW, reduced=1.0)
+    cache = CutCache(rows, GROUPS, 5 * SIZE * ROW + TABLE, reduced=1.0)
 
     def take(*groups: int) -> list[int]:
         some = np.array(groups)
@@ -102,7 +102,7 @@ def test_the_least_recently_used_go_first_and_only_as_many_as_need_be(made):
     with pytest.raises(LodgsError, match=r"needs 180 splats at once; .* room for 150"):
         take(0, 1, 2, 3, 4, 5)
     assert take(2, 3, 4, 7, 1) == [], "what is refused changes nothing"
-    cache = CutCache(rows, GROUPS, 5 * SIZE * ROW, reduced=0.5)
+    cache = CutCache(rows, GROUPS, 5 * SIZE * ROW + TABLE, reduced=0.5)
     for group in range(6):
         take(group)
     assert len(cache) == 2 * SIZE
@@ -110,7 +110,7 @@ def test_the_least_recently_used_go_first_and_only_as_many_as_need_be(made):
 
 def test_a_cut_for_another_distance_brings_only_what_is_new(made):
     rows, truth = made
-    cache = CutCache(rows, GROUPS, 300 * ROW)
+    cache = CutCache(rows, GROUPS, 300 * ROW + TABLE)
     one = np.array([3])
 
     def take(distance: float) -> tuple[np.ndarray, bool]:
@@ -131,7 +131,7 @@ def test_a_cut_for_another_distance_brings_only_what_is_new(made):
 
 def test_rows_that_come_and_go_are_seen_and_what_changed_before_is_kept(made):
     rows, truth = made
-    cache = CutCache(rows, GROUPS, 300 * ROW)
+    cache = CutCache(rows, GROUPS, 300 * ROW + TABLE)
     groups, distances = np.arange(4), np.ones(4)
     places = cache.take(groups, distances, cut_for(groups, distances)[0])
     cache.put(places, cache.get(places) + 5)
@@ -147,13 +147,13 @@ def test_rows_that_come_and_go_are_seen_and_what_changed_before_is_kept(made):
 
 def test_groups_share_no_rows(made):
     rows, _ = made
-    cache = CutCache(rows, GROUPS, 300 * ROW)
+    cache = CutCache(rows, GROUPS, 300 * ROW + TABLE)
     two = np.array([0, 1])
     wrong = [([1, 2, 3, 3], [2, 2]), ([1, 2, 1], [2, 1])]
     for chosen, counts in wrong:
         with pytest.raises(ValueError, match="two groups, or in one twice"):
             cache.take(two, np.ones(2), lambda _, c=chosen, n=counts: (np.array(c), np.array(n)))
-    cache = CutCache(rows, GROUPS, 300 * ROW)
+    cache = CutCache(rows, GROUPS, 300 * ROW + TABLE)
     cache.take(two[:1], np.ones(1), lambda _: (np.array([5, 6]), np.array([2])))
     with pytest.raises(ValueError, match="two groups"):
         cache.take(two[1:], np.ones(1), lambda _: (np.array([6]), np.array([1])))
@@ -178,7 +178,7 @@ def test_a_resumed_run_has_the_same_bits(tmp_path):
     def fresh(name: str) -> CutCache:
         (tmp_path / name).mkdir(exist_ok=True)
         rows, _ = filled(FileRows(tmp_path / name, LAYOUT, block=7))
-        return CutCache(rows, GROUPS, 130 * ROW, flush_interval=40)
+        return CutCache(rows, GROUPS, 130 * ROW + TABLE, flush_interval=40)
 
     truth = steps(fresh("whole"), 0, 60)
     cache = fresh("parts")
@@ -192,5 +192,7 @@ def test_a_resumed_run_has_the_same_bits(tmp_path):
     assert all(np.array_equal(a, b) for a, b in zip(truth, seen, strict=True))
     small = CutCache(filled(FileRows(tmp_path, LAYOUT, block=7))[0], GROUPS, 5 * ROW)
     state["rows"] = small.rows.state_dict()
-    with pytest.raises(ValueError, match="no room"):
-        small.load_state_dict(state)
+    small.load_state_dict(state)  # in which there is no room for what was here
+    assert not len(small)
+    with pytest.raises(LodgsError, match="at least 1 MB"):
+        steps(small, 23, 24)

@@ -11,7 +11,7 @@ from ...lod.blocks import spatial_order
 from ...rasterize import Adam, Gaussians
 from ...splats.gaussians import Splats
 from ..data import TrainingView
-from ..method import Drawing
+from ..method import Drawing, Optimizer
 from ..start import from_splats
 from . import train as threedgs_train
 
@@ -49,7 +49,7 @@ class Refining(threedgs_train.Method):
     def setup(self, base: Splats | None) -> None:
         p = self.parameters
         self.finest_steps = 0 if base is not None else p.steps
-        self._optimizer: SeenRows | None = None
+        self._optimizer: Optimizer | None = None
         if base is None:
             super().setup(None)
             return
@@ -68,7 +68,7 @@ class Refining(threedgs_train.Method):
         self._optimizer = SeenRows(self.model.adam, rows, leaves)
         return Gaussians(**leaves)
 
-    def optimizers(self) -> Sequence[Adam | SeenRows]:
+    def optimizers(self) -> Sequence[Optimizer]:
         return super().optimizers() if self._optimizer is None else (self._optimizer,)
 
     def shrink(self, step: int) -> float:

@@ -8,15 +8,22 @@ splat of their moments can makes it larger instead, up to ``SPREAD``.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit, spence
 
 from ...errors import LodgsError
-from ...lod.blocks import spatial_order
+from ...lod.blocks import AXIS_BITS, places_on_curve
+from ...lod.forest import Piece, divided, joined, joined_trees, longest_of
 from ...lod.tree import Tree, area_of
 from ...rasterize.cpu.compile import STRICT, in_parallel, inlined, kernel
-from ...splats.gaussians import SH_C0, Splats
+from ...splats.gaussians import SH_C0, SplatRows, Splats
+from ...splats.scratch import Scratch
 
 RADIUS = 16
 """A splat's partner is among so many on either side of it on a curve through space."""
@@ -29,47 +36,164 @@ SPREAD = 3.0
 standard deviation of 0.29 of its side, which leaves gaps to its neighbours; half of the side closes them."""
 LEAST_PROGRESS = 1 / 16
 """Where fewer of all splats than this find a partner in a round, neighbours on the curve merge."""
+CELL = 1 << 18
+"""Most leaves whose tree is built at a time."""
 _ROWS = 1 << 18
-"""Covariances that are taken apart at a time."""
+"""Leaves that are read, and covariances that are taken apart, at a time."""
 
 
 def build(leaves: Splats) -> tuple[Splats, Tree]:
-    """The nodes of a tree over splats: the leaves in spatial order, then those above them.
+    """The nodes of a tree over splats in memory, 2N - 1: the leaves in spatial order, then those above them.
+
+    Raises:
+        LodgsError: as :class:`GrowingForest`.
+    """
+    return joined(GrowingForest(leaves))
+
+
+class GrowingForest:
+    """A tree over splats, built while its subtrees are asked for, which is once (``lod.forest.Forest``).
 
     The partner that two splats choose is the one with which they make the least area (of the merged
     covariance, more where colours differ); those that choose each other merge (parallel locally-ordered
     clustering, Meister and Bittner 2018). Deterministic, on any number of threads.
 
+    Cells of space, halved until none has more than CELL leaves, are built one after the other; their roots
+    are then merged in the same way. In memory are one cell, 12 bytes of each leaf, and the upper tree.
+
     Args:
         leaves: N of them; their extras go.
+        scratch: a folder where they are put in order; None: they are in memory.
+        longest: most leaves of a subtree; 0: ``longest_of``.
+        cell: see CELL.
 
     Raises:
         LodgsError: there are fewer than two.
     """
-    if len(leaves) < 2:
-        raise LodgsError("One splat makes no tree.", "Begin with more splats.")
-    leaves = leaves.select(spatial_order(leaves.means))
-    leaves.extras = {}
+
+    def __init__(
+        self, leaves: SplatRows, scratch: Path | None = None, longest: int = 0, cell: int = CELL
+    ) -> None:
+        if len(leaves) < 2:
+            raise LodgsError("One splat makes no tree.", "Begin with more splats.")
+        self._leaves, self._scratch, self._cell = leaves, scratch, cell
+        self._longest = longest or longest_of(len(leaves))
+        self._upper: Piece | None = None
+
+    @property
+    def upper(self) -> Piece:
+        """The tree above the subtrees, as soon as all have been asked for."""
+        assert self._upper is not None, "the subtrees come first"
+        return self._upper
+
+    def __iter__(self) -> Iterator[Piece]:
+        uppers, moments, harmonics = [], [], []
+        for leaves in _by_cells(self._leaves, self._scratch, self._cell):
+            nodes, tree, root = _grown(leaves)
+            moments.append(root)
+            harmonics.append(nodes.sh[-1])
+            grove = divided(nodes, tree, self._longest)
+            uppers.append(grove.upper)
+            del nodes, leaves
+            yield from grove
+        above, top = _merged_up(np.stack(moments))
+        nodes = _drawn(above, top, np.stack(harmonics), np.stack(moments)[:, 9])
+        splats = Splats.concatenated([*(splats for splats, _ in uppers), nodes])
+        self._upper = splats, joined_trees([tree for _, tree in uppers], top)
+
+
+def _by_cells(leaves: SplatRows, scratch: Path | None, most: int) -> Iterator[Splats]:
+    """Leaves in spatial order, those of a cell of space at a time, which are at most so many."""
+    means = np.empty((len(leaves), 3), np.float32)
+    for part in _parts(len(leaves)):
+        means[part] = leaves.select(part).means
+    places = places_on_curve(means)
+    del means
+    order = np.argsort(places, kind="stable")
+    borders = _cells(places[order], most)
+    del places
+    if scratch is None:
+        assert isinstance(leaves, Splats)
+        for cell in pairwise(borders):
+            yield _bare(leaves.select(order[slice(*cell)]))
+        return
+    cell_of = np.empty(len(leaves), np.int32)
+    for number, cell in enumerate(pairwise(borders)):
+        cell_of[order[slice(*cell)]] = number
+    filled = np.array(borders[:-1])
+    with Scratch(scratch) as file:
+        for part in _parts(len(leaves)):
+            splats, cells = _bare(leaves.select(part)), cell_of[part]
+            by_cell = np.argsort(cells, kind="stable")
+            found, begins = np.unique(cells[by_cell], return_index=True)
+            for number, rows in zip(found.tolist(), np.split(by_cell, begins[1:]), strict=True):
+                file.write(int(filled[number]), splats.select(rows))
+                filled[number] += len(rows)
+        for cell in pairwise(borders):  # whose leaves are there as they were read
+            ranks = np.argsort(np.argsort(order[slice(*cell)]))
+            yield file.select(slice(*cell)).select(ranks)
+
+
+def _cells(places: np.ndarray, most: int) -> list[int]:
+    """Where cells begin in places (N,) on the curve, ascending, and N: halves of cells, until none has more
+    than so many places; those that are in one are told apart by their rows."""
+    borders, ahead = [0], [(0, len(places), 3 * AXIS_BITS)]
+    while ahead:
+        begin, end, bit = ahead.pop()
+        if end - begin <= most:
+            borders.append(end)
+            continue
+        middle = begin + most
+        if bit:
+            bit -= 1
+            half = (places[begin] >> np.uint64(bit) | np.uint64(1)) << np.uint64(bit)
+            middle = begin + int(np.searchsorted(places[begin:end], half))
+        ahead += [part for part in ((middle, end, bit), (begin, middle, bit)) if part[0] < part[1]]
+    return borders
+
+
+def _parts(count: int) -> Iterator[slice]:
+    for begin in range(0, count, _ROWS):
+        yield slice(begin, min(begin + _ROWS, count))
+
+
+def _bare(splats: Splats) -> Splats:
+    return replace(splats, extras={})
+
+
+def _grown(leaves: Splats) -> tuple[Splats, Tree, np.ndarray]:
+    """The nodes of a tree over splats in spatial order, the tree, and the moments (13,) of its root."""
     means, covariances, depths = _moments(leaves)
     colors = 0.5 + SH_C0 * leaves.sh[:, 0].astype(np.float64)
     moments = np.concatenate([means, covariances, depths[:, None], colors], axis=1)
-    numbers = np.arange(len(leaves), dtype=np.int32)
-    nodes, children = [], []
-    best = np.zeros(len(leaves), np.int32)
+    above, tree = _merged_up(moments)
+    nodes = Splats.concatenated([leaves, _drawn(above, tree, leaves.sh, depths)])
+    return nodes, tree, (above if len(above) else moments)[-1]
+
+
+def _merged_up(moments: np.ndarray) -> tuple[np.ndarray, Tree]:
+    """The moments (N - 1, 13) of the nodes above N splats in spatial order, and the tree.
+
+    Args:
+        moments: (N, 13) of the splats; they are overwritten.
+    """
+    leaves = len(moments)
+    numbers = np.arange(leaves, dtype=np.int32)
+    nodes, children = [np.empty((0, moments.shape[1]))], [np.empty((0, 2), np.int32)]
+    best = np.zeros(leaves, np.int32)
     while len(moments) > 1:
         count = len(moments)
         in_parallel(_choose_partners, count, 1 << 12, moments, RADIUS, COLOR, best)
         first, second = _pairs(best[:count])
         merged = _merged(moments[first], moments[second])
         children.append(np.stack([numbers[first], numbers[second]], axis=1))
-        numbers[first] = len(leaves) + sum(map(len, nodes)) + np.arange(len(first))
-        nodes.append(merged)
-        moments[first] = merged
         kept = np.ones(count, bool)
         kept[second] = False
+        numbers[first] = leaves + sum(map(len, nodes)) + np.arange(len(first))
+        nodes.append(merged)
+        moments[first] = merged
         moments, numbers = moments[kept], numbers[kept]
-    tree = Tree(np.concatenate(children))
-    return Splats.concatenated([leaves, _drawn(np.concatenate(nodes), tree, leaves.sh, depths)]), tree
+    return np.concatenate(nodes), Tree(np.concatenate(children))
 
 
 def optical_depth(opacities: np.ndarray) -> np.ndarray:

@@ -4,47 +4,99 @@ The leaves are a base, or 3DGS in the first steps. One step builds the tree; in 
 draws its cut, a little coarser at random (A.6, "Varying level of detail"), and moves the nodes of this cut
 alone, as if they were a scene of their own.
 
-All nodes are rows of one model in memory. The paper's external memory (Sec. 4.4) would stand behind
-:meth:`Refining.take_rows`, its density control on the tree (Sec. 4.2) in :meth:`Method.control_density`.
+From then on the nodes are outside memory (``store``), and views come in an order that stays near (Sec. 4.4).
+Density control (Sec. 4.2) makes a new store of the old one (``density``).
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+
 import numpy as np
 import torch
 
+from ...lod.forest import joined
 from ...lod.paging import table_of_pages
 from ...lod.streaming import BLOCKS
-from ...lod.tree import LEAVES, Tree, treeless_columns
-from ...rasterize import Target
-from ...rasterize.hspt import Hspt
+from ...lod.tree import LEAVES, treeless_columns
+from ...rasterize import Gaussians, Rendering, Target
+from ...rasterize.adam import LearningRate, step_records
 from ...splats.bundle import Level
 from ...splats.gaussians import Splats
 from ...splats.ply import Columns
 from ..data import TrainingView
+from ..density import peak_score
 from ..method import Drawing
+from ..model import NAMES
 from ..schedules import due
 from ..start import from_splats
 from ..threedgs.refining import Refining
+from ..walk import Walk
 from . import TreeParameters
-from .build import build
+from .build import GrowingForest
+from .density import Growing
+from .store import Store, default_budget
+
+
+class SeenRecords:
+    """Adam's step for the records alone that a picture was made of.
+
+    Args:
+        store: of all records.
+        places: (M,) int64 of them in its cache.
+        lr: learning rates by name, as ``Adam`` has them when the step is made.
+        most: none of them has made more steps.
+
+    Attributes:
+        leaves: NAMES of these records, to make the picture from.
+    """
+
+    def __init__(self, store: Store, places: np.ndarray, lr: Mapping[str, LearningRate], most: int) -> None:
+        self._store, self._places, self._lr, self._most = store, places, lr, most
+        self.leaves = {name: values.requires_grad_() for name, values in store.values_at(places).items()}
+
+    def accumulate_stats(self, rendering: Rendering) -> None:
+        """After ``backward``: what density control asks for."""
+        records, columns = self._store.cache.records, self._store.columns
+        seen = torch.nonzero(rendering.radii > 0).squeeze(1)
+        at = torch.from_numpy(self._places).to(records.device)[seen]
+        opacity_logits = self.leaves["opacity_logits"].detach()[seen]
+        score = peak_score(rendering.grad2d[seen].norm(dim=1), rendering.radii[seen], opacity_logits)
+        records[at, columns["score"]] = torch.maximum(records[at, columns["score"]], score)
+        records[at, columns["seen"]] = float(self._most + 1)
+        self._store.cache.changed(self._places)
+
+    def step(self) -> None:
+        """One step of these records."""
+        gradients = [leaf.grad for leaf in self.leaves.values() if leaf.grad is not None]
+        if len(gradients) == len(NAMES) and len(self._places):
+            gradient = torch.cat([each.reshape(len(each), -1) for each in gradients], 1)
+            rates = [
+                torch.as_tensor(self._lr[name]).float().expand(leaf.shape[1:]).reshape(-1)
+                for name, leaf in self.leaves.items()
+            ]
+            records, steps = self._store.cache.records, self._store.columns["steps"]
+            step_records(records, self._places, gradient, torch.cat(rates), steps, self._most)
+            self._store.cache.changed(self._places)
+
+    def zero_grad(self) -> None:
+        """The records go with their gradients: the next picture has others."""
+        self.leaves = {}
 
 
 class Method(Refining):
     """One run of A LoD of Gaussians.
 
     Attributes:
-        tree: over the model's rows, as soon as it is built.
-        cuts: of the nodes as they were when sizes were last made, (2N - 1, 3) each: ``means`` and
-            ``log_scales``.
+        store: all nodes, as soon as the tree is built.
     """
 
     parameters: TreeParameters
 
     def setup(self, base: Splats | None) -> None:
         super().setup(base)
-        self.tree: Tree | None = None
-        self.cuts: dict[str, torch.Tensor] = {}
+        self.store: Store | None = None
 
     @property
     def steps(self) -> int:
@@ -53,6 +105,10 @@ class Method(Refining):
     @property
     def levels(self) -> int:
         return LEAVES
+
+    @property
+    def splats(self) -> int:
+        return super().splats if self.store is None else len(self.store)
 
     def level_at(self, step: int) -> int:
         return LEAVES
@@ -68,8 +124,7 @@ class Method(Refining):
     def levels_after(self, step: int) -> list[Level]:
         """The leaves as soon as they are there, for whoever waits; all nodes at the end."""
         if step + 1 == self.steps:
-            assert self.tree is not None
-            return self.tree.levels(self.model.splats())
+            return self._levels()
         if step + 1 == self.finest_steps:
             splats = self.model.splats()
             splats.extras |= treeless_columns(len(splats))
@@ -78,52 +133,93 @@ class Method(Refining):
 
     def tables(self) -> dict[str, Columns]:
         """Which blocks of rows an eye needs, by which a part of the file can be read."""
-        if self.tree is None:
+        if self.store is None:
             return {}
-        levels = self.tree.levels(self.model.splats())
-        return {BLOCKS: table_of_pages({level.number: level.splats.extras for level in levels})}
+        return {BLOCKS: table_of_pages({level.number: level.splats.extras for level in self._levels()})}
+
+    def _levels(self) -> list[Level]:
+        assert self.store is not None
+        splats, tree = joined(self.store)
+        return tree.levels(splats)
 
     # -- a step ----------------------------------------------------------------------------------------
+
+    @cached_property
+    def _walk(self) -> Walk:
+        return Walk(np.array([camera.center for camera in self.data.train]), self.seed)
+
+    def view_index(self, step: int) -> int:
+        """The training view of a step; of those that draw cuts most are near the one before."""
+        if not self.refines(step):
+            return super().view_index(step)
+        return self._walk(step - self.finest_steps)
 
     def train_step(self, step: int) -> tuple[float, torch.Tensor, Target]:
         if step == self.finest_steps:
             return self._build_step(step)
-        if step > self.finest_steps and due(self.parameters.resize_interval, step - self.finest_steps):
-            self._follow_sizes()
-        return super().train_step(step)
+        if step < self.finest_steps:
+            return super().train_step(step)
+        assert self.store is not None
+        if due(self.parameters.resize_interval, step - self.finest_steps):
+            self.store.resize()
+        told = super().train_step(step)
+        self.store.cache.after(step - self.finest_steps)
+        return told
 
     def draw(self, view: TrainingView, step: int) -> list[Drawing]:
         if not self.refines(step):
             return super().draw(view, step)
-        gaussians = self.take_rows(self.cut(view, self._pixels(step)))
+        gaussians = self._take(view, step, self._pixels(step))
         return [Drawing(self.rasterize_model(view.camera, step, gaussians=gaussians))]
 
-    def cut(self, view: TrainingView, pixels: float) -> torch.Tensor:
-        """The rows (M,) int64 that a view is shown at a granularity, ascending."""
-        rows = np.sort(self._hspt.cut(view.camera, pixels, self.data.near))
-        return torch.from_numpy(rows).long().to(self.device)
+    def _take(self, view: TrainingView, step: int, pixels: float) -> Gaussians:
+        """The splats of a view's cut, to draw: they alone make the step."""
+        assert self.store is not None
+        places = self.store.take(view.camera, pixels, self.data.near)
+        seen = SeenRecords(self.store, places, self.model.adam.lr, step - self.finest_steps)
+        self._optimizer = seen
+        return Gaussians(**seen.leaves)
+
+    def accumulate_stats(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> None:
+        super().accumulate_stats(drawings, view, step)
+        if isinstance(self._optimizer, SeenRecords):
+            self._optimizer.accumulate_stats(drawings[0].rendering)
+
+    def control_density(self, step: int) -> None:
+        super().control_density(step)
+        p, done = self.parameters, step - self.finest_steps
+        if self.store is None or done > p.grow_until * p.tune_steps or not due(p.grow_interval, done):
+            return
+        growing = Growing(
+            self.store,
+            threshold=p.max_threshold * self.data.threshold_scale,
+            min_opacity=p.min_opacity,
+            unseen_since=done + 1 - round(p.unseen_epochs * len(self.data.train)) if p.unseen_epochs else 0,
+            now=done + 1,
+            most=p.max_splats,
+        )
+        grown = self._new_store(self.store.budget)
+        grown.fill_records(growing, lambda: growing.upper)
+        self.store.close()
+        self.store = grown
 
     @torch.no_grad()
     def _build_step(self, step: int) -> tuple[float, torch.Tensor, Target]:
         """Builds the tree; what is told of the step is how a view looks by it."""
-        nodes, self.tree = build(self.model.splats())
-        self.model = self.new_model(from_splats(nodes, self.parameters.sh_degree, self.device))
-        self._follow_sizes()
+        leaves = self.model.splats()
+        none = from_splats(leaves.select(slice(0)), self.parameters.sh_degree, self.device)
+        self.model = self.new_model(none)
+        self.store = self._new_store()
+        self.store.fill(GrowingForest(leaves))
         view = self.choose_view(step)
-        gaussians = self.model.gaussians.select(self.cut(view, self.parameters.pixels))
+        gaussians = self._take(view, step, self.parameters.pixels)
         drawing = Drawing(self.rasterize_model(view.camera, step, gaussians=gaussians))
         loss = self.loss([drawing], view, step)
         return float(loss), self.over_black(drawing.rendering, step), view.target
 
-    def _follow_sizes(self) -> None:
-        """Cuts are made by the nodes as they are now."""
-        self.cuts = {name: self.model[name].detach().clone() for name in ("means", "log_scales")}
-        self._make_cuts()
-
-    def _make_cuts(self) -> None:
-        assert self.tree is not None
-        means, log_scales = (self.cuts[name].cpu().numpy() for name in ("means", "log_scales"))
-        self._hspt = Hspt(self.tree, means, self.tree.sizes(means, log_scales), log_scales)
+    def _new_store(self, budget: int | None = None) -> Store:
+        budget = self.data.splat_memory or budget or default_budget(self.device)
+        return Store(self.data.scratch, self.parameters.sh_degree, budget, self.device)
 
     def _pixels(self, step: int) -> float:
         """A step's granularity (A.6: distances times 1 + 5 r⁴)."""
@@ -132,13 +228,15 @@ class Method(Refining):
 
     # -- what lasts ------------------------------------------------------------------------------------
 
+    def close(self) -> None:
+        if self.store is not None:
+            self.store.close()
+
     def state_dict(self) -> dict:
-        children = None if self.tree is None else torch.from_numpy(self.tree.children)
-        return {**super().state_dict(), "children": children, "cuts": self.cuts}
+        return {**super().state_dict(), "store": None if self.store is None else self.store.state_dict()}
 
     def load_state_dict(self, state: dict) -> None:
         super().load_state_dict(state)
-        self.tree, self.cuts = None, state["cuts"]
-        if state["children"] is not None:
-            self.tree = Tree(state["children"].numpy())
-            self._make_cuts()
+        if (kept := state["store"]) is not None:
+            self.store = self._new_store(kept["cache"]["budget"])
+            self.store.load_state_dict(kept)

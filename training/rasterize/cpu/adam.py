@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
@@ -52,6 +53,53 @@ def _update_rows(begin, end, parameter, rows, gradient, m, v, lr, keep_m, keep_v
         for j in range(width):
             i = start + j
             parameter[i] -= _moved(i, gradient[k * width + j], m, v, lr[j], keep_m, keep_v, scale_v, eps)
+
+
+@kernel(STRICT)
+def _update_records(
+    begin, end, records, places, gradient, lr, steps, first, second, keep_m, keep_v, eps, width
+):
+    """The same for flat records of ``width`` numbers, at ``places``: values, moments, steps made."""
+    count = lr.shape[0]
+    m, v = records[count:], records[2 * count :]
+    for k in range(begin, end):
+        start = places[k] * width
+        records[start + steps] += f32(1)
+        made = int(records[start + steps])
+        keep, scale_v = first[made], second[made]
+        for j in range(count):
+            i = start + j
+            g = gradient[k * count + j]
+            records[i] -= _moved(i, g, m, v, lr[j] / keep, keep_m, keep_v, scale_v, eps)
+
+
+@lru_cache(4)
+def _corrections(betas: tuple[float, float], count: int) -> tuple[np.ndarray, np.ndarray]:
+    """1 - b1^t and 1 / (1 - b2^t), (count,) float32, for t from 0."""
+    first, second = (1 - np.power(beta, np.arange(count)) for beta in betas)
+    first[0] = second[0] = 1  # no step has number 0
+    return first.astype(np.float32), (1 / second).astype(np.float32)
+
+
+@serialised
+def update_records(records, places, gradient, lr, steps, betas, eps, most) -> None:
+    """One Adam step in place for records (N, width): values, both moments of each, and ``steps``.
+
+    Args:
+        records: values in the columns from 0 on, then first, then second moments.
+        places: (M,) int64 of those that move, each once.
+        gradient: (M, C) of the values.
+        lr: (C,) learning rate of each value.
+        steps: the column with the number of steps that a record has made.
+        most: no record has made more.
+    """
+    count = gradient.shape[1]
+    made = _corrections(betas, 1 << int(most + 1).bit_length())
+    in_parallel(
+        _update_records, len(places), max(VALUES // count, 1),
+        records.reshape(-1), places, gradient.reshape(-1), lr, steps, *made,
+        f32(betas[0]), f32(betas[1]), f32(eps), records.shape[1],
+    )  # fmt: skip
 
 
 @serialised

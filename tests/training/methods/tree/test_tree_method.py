@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import torch
 
+from training.lod.forest import joined
 from training.lod.rules.cut import least_size
 from training.lod.selection import Choice, settings
 from training.lod.tree import size_of
 from training.methods import create, method_info
 from training.methods.parameters import override
-from training.rasterize import rasterize
+from training.rasterize import Gaussians, rasterize
 from training.splats.bundle import Bundle
 from training.splats.gaussians import Splats
 
@@ -28,6 +29,24 @@ def trained(tree, begin=0, until=None):
         tree.train_step(step)
         levels += tree.levels_after(step)
     return levels
+
+
+def shown(tree, camera, pixels):
+    """The rows of a view's cut, made anew."""
+    tree.store.cache.clear()
+    return tree.store.cache.rows_at(tree.store.take(camera, pixels, tree.data.near))
+
+
+def above_leaves(tree):
+    """Which rows are of nodes above leaves."""
+    forest = tree.store.shape
+    place = np.concatenate([np.arange(2 * count - 1) - count for count in forest.counts.tolist()])
+    return np.append(place, np.zeros(len(forest.counts) - 1)) >= 0
+
+
+def records(tree):
+    tree.store.cache.write_back()
+    return tree.store.rows.read(np.arange(len(tree.store)))
 
 
 def same(one: Splats, other: Splats) -> bool:
@@ -50,10 +69,10 @@ def test_leaves_come_first_and_all_nodes_last(data):
     assert tree.steps == tree.parameters.total_steps == 12 + 1 + 8 and tree.levels == 2
     first, above, leaves = trained(tree)
     assert [level.number for level in (first, above, leaves)] == [2, 1, 2]
-    assert len(first.splats) == len(leaves.splats) == len(above.splats) + 1 == tree.tree.leaves
+    assert len(first.splats) == len(leaves.splats) == len(above.splats) + 1 == joined(tree.store)[1].leaves
     camera = data.train[0]  # until there is a tree everything is shown
-    shown = Choice(Bundle("tree", [first], "cut")).weights(camera.center, camera.focal, {"pixels": 16.0})
-    assert shown.all()
+    weights = Choice(Bundle("tree", [first], "cut")).weights(camera.center, camera.focal, {"pixels": 16.0})
+    assert weights.all()
 
 
 def test_until_the_tree_is_built_it_is_3dgs(data):
@@ -78,7 +97,7 @@ def test_without_tuning_the_leaves_are_the_base_to_the_bit(data, base):
 def test_sizes_are_saturated_after_training(data, base):
     tree = make(data, base, lr_scales=0.5, lr_means_final=0.05)  # which moves nodes far
     levels = trained(tree)
-    nodes, splats = tree.tree, tree.model.splats()
+    splats, nodes = joined(tree.store)
     sizes = nodes.sizes(splats.means, splats.log_scales)
     for node in range(nodes.leaves, len(nodes)):
         assert sizes[node] >= size_of(splats.log_scales[node : node + 1])[0]
@@ -95,16 +114,15 @@ def test_a_step_moves_the_cut_of_its_view_alone(data, base):
     far = replace(base, means=middle + (base.means - middle) / 30, log_scales=base.log_scales - np.float32(3))
     tree = make(data, far, lod_noise=0.0)
     trained(tree, until=4)
-    before = {name: tensor.detach().clone() for name, tensor in tree.model.adam.tensors.items()}
+    before = records(tree)
+    tree.store.cache.clear()
     tree.train_step(4)
-    moved = torch.zeros(len(tree.model), dtype=torch.bool)
-    for name, tensor in tree.model.adam.tensors.items():
-        moved |= (tensor.detach() != before[name]).reshape(len(moved), -1).any(dim=1)
-    rows = tree.cut(tree.choose_view(4), tree.parameters.pixels)
+    moved = (records(tree) != before).any(dim=1)
+    rows = shown(tree, tree.choose_view(4).camera, tree.parameters.pixels)
     cut = torch.zeros_like(moved)
     cut[rows] = True
     assert moved.sum() > 0 and not (moved & ~cut).any()
-    assert moved[tree.tree.leaves :].any()  # nodes above leaves are trained, too
+    assert moved[above_leaves(tree)].any()  # which are trained, too
 
 
 def test_training_draws_what_the_bundle_shows(data, base):
@@ -113,11 +131,11 @@ def test_training_draws_what_the_bundle_shows(data, base):
     choice = Choice(bundle)
     for pixels in (0.5, 3.0, 11.0):
         for camera in data.train[:3]:
-            view = replace(tree.choose_view(0), camera=camera)
-            rows = tree.cut(view, pixels)
-            one = tree.rasterize_model(camera, 0, gaussians=tree.model.gaussians.select(rows)).image
+            rows = shown(tree, camera, pixels)
+            gaussians = Gaussians(**tree.store.values_at(tree.store.take(camera, pixels, data.near)))
+            one = tree.rasterize_model(camera, 0, gaussians=gaussians).image
             weights = choice.weights(camera.center, camera.focal, settings(bundle, {"pixels": pixels}))
-            gaussians = type(tree.model.gaussians).of(choice.splats)
+            gaussians = Gaussians.of(choice.splats)
             other = rasterize(
                 gaussians, camera, weights=torch.from_numpy(weights), near=data.near,
                 background=tree.background(0), sh_degree=tree.sh_degree(0), backend="reference",
@@ -154,7 +172,7 @@ def test_a_view_of_nothing_makes_its_step(data, base):
     tree = make(data, behind)
     trained(tree, until=1)
     view = replace(tree.choose_view(1), camera=camera)
-    assert len(tree.cut(view, 1.0)) == 0
+    assert len(shown(tree, camera, 1.0)) == 0
     tree.choose_view = lambda step: view
     assert np.isfinite(tree.train_step(1)[0])
 
@@ -174,3 +192,34 @@ def test_a_run_goes_on_to_the_bit(data, stop):
     after = before + trained(second, stop)
     assert [level.number for level in after] == [level.number for level in levels]
     assert all(same(one.splats, other.splats) for one, other in zip(levels, after, strict=True))
+
+
+def test_a_tree_grows_where_photographs_ask_for_it(data, base):
+    """As far as there is room; and it goes on to the bit from before and after."""
+    values = {
+        "tune_steps": 24,
+        "grow_interval": 6,
+        "grow_until": 0.6,
+        "max_threshold": 1e-5,
+        "unseen_epochs": 1.0,
+    }
+    values["max_splats"] = len(base) + 60
+    tree = make(data, base, **values)
+    counts = []
+    for step in range(tree.steps):
+        tree.train_step(step)
+        counts.append(int(tree.store.shape.counts.sum()))
+    assert counts[5] == len(base) and counts[6] == len(base) + 60
+    assert counts[-1] == counts[13] <= len(base) + 60
+    (above, leaves), *_ = [tree.levels_after(tree.steps - 1)]
+    assert len(leaves.splats) == counts[-1] == len(above.splats) + 1
+    for pause in (4, 9, 14):
+        other = make(data, base, **values)
+        trained(other, until=pause)
+        kept = io.BytesIO()
+        torch.save(other.state_dict(), kept)
+        kept.seek(0)
+        again = make(data, base, **values)
+        again.load_state_dict(torch.load(kept, weights_only=True))
+        trained(again, begin=pause)
+        assert torch.equal(records(again), records(tree))

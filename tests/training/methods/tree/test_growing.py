@@ -1,0 +1,91 @@
+"""A tree that is built cell by cell: proper, with all leaves, and hardly another one than in one piece."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from training.lod.forest import joined, levels_of
+from training.methods.tree.build import GrowingForest, _cells
+from training.splats.bundle import open_ply
+from training.splats.ply import write_ply
+
+from .test_build import below, covariances, scene
+
+
+def test_cells_are_boxes_of_space_with_few_enough():
+    """Every cell is all places with one beginning of their bits, and its half before it had too many."""
+    rng = np.random.default_rng(0)
+    places = np.sort(
+        np.concatenate([rng.integers(0, 1 << 63, 3000), np.full(90, 12345), rng.integers(0, 4000, 500)])
+    ).astype(np.uint64)
+    borders = _cells(places, 40)
+    assert borders[0] == 0 and borders[-1] == len(places) and (np.diff(borders) > 0).all()
+    assert np.diff(borders).max() <= 40
+    for begin, end in pairwise(borders):
+        shared = 63 - int(places[begin] ^ places[end - 1]).bit_length()
+        prefix = places >> np.uint64(63 - shared) if shared else places * 0
+        inside = prefix == prefix[begin]
+        assert inside.sum() == end - begin or (places[inside] == 12345).sum() > 40
+    assert _cells(places, len(places)) == [0, len(places)]
+    assert len(_cells(np.zeros(100, np.uint64), 30)) == 5
+
+
+@pytest.mark.parametrize("cell", [1, 2, 50, 5000])
+def test_every_node_stands_for_its_leaves(cell):
+    leaves = scene(600)
+    forest = GrowingForest(leaves, longest=8, cell=cell)
+    nodes, tree = joined(forest)
+    assert len(nodes) == len(tree) == 1199 and tree.leaves == 600
+    assert sorted(below(tree, len(tree) - 1)) == list(range(600))
+    order = np.lexsort(nodes.means[:600].T)
+    expected = leaves.select(np.lexsort(leaves.means.T))
+    for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):  # leaves are untouched
+        np.testing.assert_array_equal(getattr(nodes, name)[:600][order], getattr(expected, name))
+    one, _ = joined(GrowingForest(leaves))
+    np.testing.assert_allclose(nodes.means[-1], one.means[-1], atol=1e-4)  # the root's, of all leaves
+    np.testing.assert_allclose(covariances(nodes)[-1], covariances(one)[-1], rtol=1e-3)
+    np.testing.assert_allclose(nodes.sh[-1], one.sh[-1], atol=1e-4)
+    assert nodes.opacity_logits[-1] == pytest.approx(one.opacity_logits[-1], abs=1e-3)
+
+
+def test_leaves_in_a_file_make_the_same_tree(tmp_path, monkeypatch):
+    from training.methods.tree import build
+
+    monkeypatch.setattr(build, "_ROWS", 700)
+    leaves = scene(5000)
+    write_ply(tmp_path / "a.ply", leaves)
+    (tmp_path / "scratch").mkdir()
+    of_file = GrowingForest(open_ply(tmp_path / "a.ply"), tmp_path / "scratch", cell=300)
+    for (one, tree), (other, same) in zip(GrowingForest(leaves, cell=300), of_file, strict=True):
+        np.testing.assert_array_equal(tree.children, same.children)
+        np.testing.assert_array_equal(one.sh, other.sh)
+        np.testing.assert_array_equal(one.quats, other.quats)
+    assert not list((tmp_path / "scratch").iterdir())
+
+
+def test_cells_leave_no_seam():
+    """Nearly all nodes are those of a tree in one piece; the others are as large as cells."""
+    leaves = scene(30_000)
+
+    def found(cell):
+        nodes, tree = joined(GrowingForest(leaves, cell=cell))
+        rows = np.concatenate([nodes.means, nodes.log_scales], axis=1)[tree.leaves :]
+        return {
+            row.tobytes(): int(count)
+            for row, count in zip(rows, tree.leaves_below[tree.leaves :], strict=True)
+        }
+
+    whole, pieces = found(1 << 20), found(2000)
+    others = [count for row, count in pieces.items() if row not in whole]
+    assert 0 < len(others) < 0.02 * len(whole) and np.median(others) > 100
+
+
+def test_levels_of_what_grows_are_all_nodes(tmp_path):
+    leaves = scene(3000)
+    levels, table = levels_of(GrowingForest(leaves, cell=500), tmp_path)
+    assert [len(level.rows) for level in levels] == [2999, 3000] and table["level"].tolist() == [1] * 6 + [
+        2
+    ] * 6
+    sizes = levels[0].rows.select(slice(0, 2999)).extras
+    assert (sizes["parent_size"] > sizes["node_size"]).all() and (sizes["node_size"] > 0).all()

@@ -1,0 +1,78 @@
+"""Splats that are put away in a file and come back to the bit."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from training.errors import LodgsError
+from training.splats.bundle import NO_SPLATS, Bundle, Level, open_bundle, open_ply, write_bundle
+from training.splats.gaussians import Splats
+from training.splats.ply import AT_ONCE, read_ply, write_ply
+from training.splats.scratch import Scratch
+
+
+def random_splats(count, seed=0):
+    rng = np.random.default_rng(seed)
+    shapes = ((3,), (4,), (3,), (), (4, 3))
+    columns = [rng.normal(size=(count, *shape)).astype(np.float32) for shape in shapes]
+    return Splats(
+        *columns, extras={"size": rng.random(count).astype(np.float32), "kind": np.arange(count) % 200}
+    )
+
+
+def same(one, other):
+    names = ("means", "quats", "log_scales", "opacity_logits", "sh")
+    assert all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names)
+    assert one.extras.keys() == other.extras.keys()
+    assert all(np.array_equal(one.extras[name], other.extras[name]) for name in one.extras)
+
+
+def test_rows_come_back_in_any_order(tmp_path):
+    splats = random_splats(40_000)
+    splats.extras["kind"] = splats.extras["kind"].astype(np.uint8)
+    with Scratch(tmp_path) as file:
+        file.write(30_000, splats.select(slice(30_000, None)))
+        file.write(0, splats.select(slice(0, 17)))
+        file.write(17, splats.select(slice(17, 30_000)))
+        assert len(file) == 40_000 and not list(tmp_path.iterdir())
+        rng = np.random.default_rng(1)
+        for rows in (slice(5, 9), slice(0, 0), slice(None), rng.integers(0, 40_000, 3000), np.array([], int)):
+            same(file.select(rows), splats.select(rows))
+        file.write(99, splats.select(slice(3, 4)))
+        same(file.select(slice(99, 101)), splats.select(np.array([3, 100])))
+        file.append(splats.select(slice(0, 2)))
+        same(file.select(slice(-2, None)), splats.select(slice(0, 2)))
+
+
+def test_a_folder_that_takes_no_file_is_a_sentence(tmp_path):
+    with pytest.raises(LodgsError, match="could not be read or written"):
+        Scratch(tmp_path / "none")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no such device here")
+def test_a_full_disk_is_a_sentence(tmp_path):
+    with Scratch(tmp_path) as file:
+        file.append(splats := random_splats(5))
+        file._file.close()
+        file._file = open("/dev/full", "r+b", buffering=0)  # noqa: SIM115
+        with pytest.raises(LodgsError, match="No space left"):
+            file.append(splats)
+
+
+def test_levels_that_are_elsewhere_are_written_as_those_in_memory(tmp_path):
+    levels = [random_splats(700, 1), random_splats(AT_ONCE + 900, 2)]
+    for each in levels:
+        each.extras["kind"] = each.extras["kind"].astype(np.int16)
+    for number, each in enumerate(levels, 1):
+        write_ply(tmp_path / f"{number}.ply", each)
+    for cumulative in (False, True):
+        known = Bundle("a", [Level(n, each) for n, each in enumerate(levels, 1)], cumulative=cumulative)
+        write_bundle(tmp_path / "whole.ply", known)
+        found = [Level(n, NO_SPLATS, elsewhere=open_ply(tmp_path / f"{n}.ply")) for n in (1, 2)]
+        write_bundle(tmp_path / "parts.ply", Bundle("a", found, cumulative=cumulative))
+        assert (tmp_path / "whole.ply").read_bytes() == (tmp_path / "parts.ply").read_bytes()
+    _, rows = open_bundle(tmp_path / "parts.ply")
+    same(rows[2].select(slice(100, 200)), levels[1].select(slice(100, 200)))
+    write_ply(tmp_path / "again.ply", rows[2])
+    same(read_ply(tmp_path / "again.ply"), levels[1])

@@ -1,0 +1,348 @@
+"""The nodes of a tree outside memory: their records in a file of the run, cuts of subtrees in a cache.
+
+In memory are the upper tree, what the cache holds within its budget, and some numbers for each subtree
+(A LoD of Gaussians, Sec. 4.4). Of each node there are in the file the trained numbers, their moments and how
+many steps they have made; in another one, for each subtree, the list of its nodes above leaves that HSPT
+looks at: sorted by size, with means and sizes as they were when sizes were last made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import pairwise
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ...lod.forest import Forest, ForestShape, Piece, side_by_side
+from ...lod.rules.cut import detail_of
+from ...lod.tree import Tree
+from ...rasterize.hspt import Upper, bounds_of, cut_off, image_of, search
+from ...scenes.cameras import Camera
+from ...splats.gaussians import Splats
+from ..cuts import CutCache
+from ..memory import free_memory
+from ..model import NAMES
+from ..rows import FileRows, Layout
+
+AT_ONCE = 1 << 15
+"""Nodes that are looked at together where all are."""
+MARK = 32
+"""Of every so many entries of a list the size of the first is in memory."""
+ENTRY = Layout({"node": (), "pair": (2,), "family": (12,)})
+"""Of a list: a node and its children, by their numbers in the subtree, and the mean and size of each."""
+
+
+RecordPiece = tuple[torch.Tensor, Tree]
+"""As ``lod.forest.Piece``: the nodes' records, (., width), and the tree."""
+
+
+def default_budget(device: torch.device | str = "cpu") -> int:
+    """Bytes for the nodes that are in memory if nothing is said: half of what is free."""
+    if torch.device(device).type == "cuda":
+        return torch.cuda.mem_get_info(device)[0] // 2
+    return free_memory() // 2
+
+
+def layout_of(sh_degree: int) -> Layout:
+    """What a node's record holds: NAMES, C numbers together, moments, and
+
+    steps: how many steps of Adam have moved it;
+    score: its largest ``density.peak_score`` since density control last asked;
+    seen: the last step, from 1, that had it in its image; 0: none.
+    """
+    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": ()}
+    values: dict[str, tuple[int, ...]] = shapes | {"sh": ((sh_degree + 1) ** 2, 3)}
+    count = sum(map(prod, values.values()))
+    moments: dict[str, tuple[int, ...]] = {"first": (count,), "second": (count,)}
+    return Layout({**values, **moments, "steps": (), "score": (), "seen": ()})
+
+
+class Store:
+    """The nodes of one tree.
+
+    Args:
+        folder: of the run, for files.
+        budget: bytes of the cache.
+        device: where what is drawn lives.
+
+    Attributes:
+        shape: where the pieces of the tree are among the rows.
+        cache: of G + 1 groups: the subtrees, and the upper nodes, which are always all there.
+        columns: where each array of a record begins.
+        budget: of the cache, in bytes.
+    """
+
+    shape: ForestShape
+    cache: CutCache
+
+    def __init__(self, folder: Path, sh_degree: int, budget: int, device: torch.device | str = "cpu") -> None:
+        self.layout = layout_of(sh_degree)
+        begins = np.cumsum([0, *map(prod, self.layout.shapes.values())]).tolist()
+        self.columns = dict(zip(self.layout.shapes, begins, strict=False))
+        self.values = self.columns["first"]
+        self._shapes = {name: self.layout.shapes[name] for name in NAMES}
+        self.budget, self._device = budget, device
+        self.rows = FileRows(folder, self.layout)
+        self._lists = FileRows(folder, ENTRY, name="lists")
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    # -- a tree comes in -------------------------------------------------------------------------------
+
+    def fill(self, forest: Forest) -> None:
+        """Takes a tree's pieces, one after the other; with them, it can be cut."""
+        self.fill_records(
+            ((self._records_of(splats), tree) for splats, tree in forest),
+            lambda: (self._records_of(forest.upper[0]), forest.upper[1]),
+        )
+
+    def fill_records(self, subtrees: Iterable[RecordPiece], upper: Callable[[], RecordPiece]) -> None:
+        """The same with records, which have moments; the upper tree is asked for when all others are here."""
+        counts, waiting, nodes = [], [], 0
+        for piece in subtrees:
+            counts.append(piece[1].leaves)
+            waiting.append(piece)
+            nodes += len(piece[0])
+            if nodes >= AT_ONCE:
+                self._append(waiting)
+                waiting, nodes = [], 0
+        self._append(waiting)
+        records, tree = upper()
+        self.rows.append(records)
+        self._take_shape(ForestShape(np.array(counts, np.int64), tree))
+        self.resize()
+
+    def _append(self, subtrees: list[RecordPiece]) -> None:
+        if not subtrees:
+            return
+        self.rows.append(torch.cat([records for records, _ in subtrees]))
+        entries = []
+        for _, tree in subtrees:
+            entry = np.zeros((len(tree.children), ENTRY.width), np.float32)
+            entry[:, 0] = np.arange(tree.leaves, len(tree))
+            entry[:, 1:3] = tree.children
+            entries.append(entry)
+        self._lists.append(torch.from_numpy(np.concatenate(entries)))
+
+    def _records_of(self, splats: Splats) -> torch.Tensor:
+        records = np.zeros((len(splats), self.layout.width), np.float32)
+        arrays = [getattr(splats, name).reshape(len(splats), -1) for name in NAMES]
+        np.concatenate(arrays, axis=1, out=records[:, : self.values])
+        return torch.from_numpy(records)
+
+    def _take_shape(self, shape: ForestShape) -> None:
+        self.shape = shape
+        self._mark_ends = np.cumsum(-(-(shape.counts - 1) // MARK))
+        self.cache = CutCache(self.rows, len(self.shape.counts) + 1, self.budget, self._device)
+
+    # -- cuts ------------------------------------------------------------------------------------------
+
+    def take(self, camera: Camera, pixels: float, near: float) -> np.ndarray:
+        """Brings in what a view is shown at a granularity: places (M,) int64 in the cache, by their rows.
+
+        A subtree's cut that is here serves from where it is not much too coarse or too fine (Eq. 7): the
+        distances compared are those from its root, over the focal length, times the granularity.
+
+        Raises:
+            LodgsError: there is no room for it.
+        """
+        k, eye = detail_of(camera.focal, pixels), camera.center
+        nodes, lists, bands = self._top.walk(eye, k, image_of(camera, near))
+        subtrees = len(self.shape.counts)
+        alone, above = nodes[nodes < subtrees], nodes[nodes >= subtrees] - subtrees
+        groups = np.append(alone, lists)
+        bands = np.append(np.full((len(alone), 2), np.inf, np.float32), bands, axis=0)
+        order = np.argsort(groups)
+        groups, bands = groups[order], bands[order]
+        distances = np.linalg.norm(self._top.balls[groups, :3] - eye, axis=1) / k
+
+        def cut(anew: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            own = anew[anew < len(groups)]
+            rows, counts = self.cut(groups[own], bands[own], eye, k)
+            if len(own) < len(anew):
+                rows = np.append(rows, np.arange(self.shape.ends[-1], len(self)))
+                counts = np.append(counts, subtrees - 1)
+            return rows, counts
+
+        places = self.cache.take(np.append(groups, subtrees), np.append(distances, 1.0), cut)
+        below, top = np.split(places, [len(places) - (subtrees - 1)])
+        return np.append(below, top[np.sort(above)])
+
+    def cut(
+        self, groups: np.ndarray, bands: np.ndarray, eye: np.ndarray, k: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The rows (M,) int64 that an eye is shown of subtrees, ascending, and how many of each, (G,) int64.
+
+        Args:
+            groups: (G,) ascending.
+            bands: (G, 2) as ``Upper.walk`` says them; infinite where the root is fine enough.
+        """
+        counts = np.ones(len(groups), np.int64)
+        alone = np.isinf(bands[:, 0])
+        rows = [self.shape.ends[groups[alone]] - 1]
+        searched = np.flatnonzero(~alone)
+        lists, bands = groups[searched], bands[searched]
+        begins, marks = self.shape.list_begins[lists], self._mark_ends[lists - 1] * (lists > 0)
+        lengths = MARK * (cut_off(self._marks, marks, self._mark_ends[lists], bands[:, 0]) - marks)
+        lengths = np.minimum(lengths, self.shape.list_ends[lists] - begins)
+        for some in _batches(lengths):
+            entries = self._lists.read(_ranges(begins[some], lengths[some])).numpy()
+            first = np.repeat(self.shape.begins[lists[some]], lengths[some])
+            pairs = (entries[:, 1:3] + first[:, None]).astype(np.int32)
+            stops = np.cumsum(lengths[some])
+            families = np.ascontiguousarray(entries[:, 3:])
+            lists_of = pairs, np.ascontiguousarray(families[:, 3::4]), families, stops - lengths[some], stops
+            found, counts[searched[some]] = search(*lists_of, bands[some], eye, k)
+            rows.append(found)
+        return np.sort(np.concatenate(rows).astype(np.int64)), counts
+
+    def values_at(self, places: np.ndarray) -> dict[str, torch.Tensor]:
+        """A copy of NAMES (M, ...) of the records at places (M,)."""
+        at = torch.from_numpy(places).to(self._device)
+        values = self.cache.records[:, : self.values].index_select(0, at)
+        parts = values.split([prod(shape) for shape in self._shapes.values()], dim=1)
+        return {
+            name: part.contiguous().view(len(places), *shape)
+            for (name, shape), part in zip(self._shapes.items(), parts, strict=True)
+        }
+
+    # -- sizes -----------------------------------------------------------------------------------------
+
+    def resize(self) -> None:
+        """Cuts are made by the nodes as they are now."""
+        self.cache.clear()
+        shapes, bounds, roots, marks = [], [], [], []
+        for some in _batches(2 * self.shape.counts - 1):
+            records, entries = self._read(some)
+            counts = self.shape.counts[some]
+            ends = np.cumsum(2 * counts - 1)
+            begins = ends - (2 * counts - 1)
+            of_list = np.repeat(np.arange(len(counts)), counts - 1)
+            family = entries[:, :3].astype(np.int32) + begins[of_list, None].astype(np.int32)
+            in_order = np.argsort(family[:, 0])
+            order, tree = side_by_side(counts, family[in_order, 1:])
+            values = self.layout.split(records)
+            means, log_scales = (values[name].numpy() for name in ("means", "log_scales"))
+            sizes = np.empty(len(order), np.float32)
+            sizes[order] = tree.sizes(means[order], log_scales[order])
+            by_size = np.lexsort((-sizes[family[:, 0]], of_list))
+            entries[:, :3] = entries[by_size, :3]
+            balls = np.concatenate([means, sizes[:, None]], axis=1)
+            entries[:, 3:] = balls[family[by_size]].reshape(-1, 12)
+            self._lists.write(self._of_lists(some), torch.from_numpy(entries))
+            within = np.arange(len(entries)) - np.repeat(np.cumsum(counts - 1) - (counts - 1), counts - 1)
+            marks.append(entries[within % MARK == 0, 6])
+            bounds.append(bounds_of(means, log_scales, begins))
+            shapes.append(log_scales[ends - 1])
+            roots.append(balls[ends - 1])
+        self._marks = np.concatenate(marks)
+        upper = self.layout.split(self.rows.read(np.arange(self.shape.ends[-1], len(self))))
+        below = np.concatenate(roots)
+        means = np.append(below[:, :3], upper["means"].numpy(), axis=0)
+        log_scales = np.append(np.concatenate(shapes), upper["log_scales"].numpy(), axis=0)
+        sizes = self.shape.upper.sizes(means, log_scales, below[:, 3])
+        low, high, reach = (np.concatenate(each) for each in zip(*bounds, strict=True))
+        self._top = Upper.over(self.shape.upper, means, log_scales, sizes, (low, high, reach))
+
+    def _read(self, some: slice) -> tuple[torch.Tensor, np.ndarray]:
+        """The records (., width) and the lists' entries (., 15) of some subtrees."""
+        begin, end = int(self.shape.begins[some.start]), int(self.shape.ends[some.stop - 1])
+        entries = self._lists.read(self._of_lists(some)).numpy()
+        return self.rows.read(np.arange(begin, end)), entries
+
+    def _of_lists(self, some: slice) -> np.ndarray:
+        """Where the lists of some subtrees are."""
+        return np.arange(self.shape.list_begins[some.start], self.shape.list_ends[some.stop - 1])
+
+    # -- the tree goes out -----------------------------------------------------------------------------
+
+    def __iter__(self) -> Iterator[Piece]:
+        """The subtrees as they are now: a store is a ``Forest``."""
+        for records, tree in self.records():
+            yield self._splats(records), tree
+
+    @property
+    def upper(self) -> Piece:
+        """The upper tree as it is now."""
+        records, tree = self.upper_records()
+        return self._splats(records), tree
+
+    def records(self) -> Iterator[RecordPiece]:
+        """The subtrees' records as they are now, (2n - 1, width) each."""
+        self.cache.write_back()
+        for some in _batches(2 * self.shape.counts - 1):
+            records, entries = self._read(some)
+            row = entry = 0
+            for leaves in self.shape.counts[some].tolist():
+                children = entries[entry : entry + leaves - 1, :3].astype(np.int32)
+                children = children[np.argsort(children[:, 0]), 1:]
+                yield records[row : row + 2 * leaves - 1], Tree(children)
+                row, entry = row + 2 * leaves - 1, entry + leaves - 1
+
+    def upper_records(self) -> RecordPiece:
+        """The upper tree's, (G - 1, width)."""
+        self.cache.write_back()
+        return self.rows.read(np.arange(self.shape.ends[-1], len(self))), self.shape.upper
+
+    def _splats(self, records: torch.Tensor) -> Splats:
+        values = self.layout.split(records)
+        means, quats, log_scales, opacity_logits, sh = (values[name].numpy().copy() for name in NAMES)
+        return Splats(means, quats, log_scales, opacity_logits, sh)
+
+    def rest(self) -> None:
+        """Writes back what has changed, and gives the cache's memory back: no view can be taken any more."""
+        self.cache.write_back()
+        self.cache = CutCache(self.rows, 0, 0, self._device)
+
+    # -- what lasts ------------------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """Closes the files."""
+        self.rows.close()
+        self._lists.close()
+
+    def state_dict(self) -> dict[str, Any]:
+        """A checkpoint, for the file that is then written, see ``FileRows.state_dict``."""
+        arrays = {
+            "counts": self.shape.counts, "upper": self.shape.upper.children, "marks": self._marks,
+            "balls": self._top.balls, "boxes": self._top.boxes,
+        }  # fmt: skip
+        return {
+            "cache": self.cache.state_dict(),
+            "lists": self._lists.state_dict(),
+            **{name: torch.from_numpy(array.copy()) for name, array in arrays.items()},
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Goes on from what ``state_dict`` gave.
+
+        Raises:
+            ValueError: the files are not there, or are damaged.
+        """
+        arrays = {
+            name: state[name].cpu().numpy().copy() for name in ("counts", "upper", "marks", "balls", "boxes")
+        }
+        self._take_shape(ForestShape(arrays["counts"], Tree(arrays["upper"])))
+        self._marks = arrays["marks"]
+        self._top = Upper(self.shape.upper, arrays["balls"], arrays["boxes"])
+        self._lists.load_state_dict(state["lists"])
+        self.cache.load_state_dict(state["cache"])
+
+
+def _batches(lengths: np.ndarray) -> Iterator[slice]:
+    """Consecutive ones, of about AT_ONCE together."""
+    if len(lengths):
+        number = (np.cumsum(lengths) - 1) // AT_ONCE
+        borders = [0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), len(lengths)]
+        yield from (slice(*ends) for ends in pairwise(borders))
+
+
+def _ranges(begins: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """All numbers of some ranges, one after the other, int64."""
+    ends = np.cumsum(lengths)
+    return np.repeat(begins - (ends - lengths), lengths) + np.arange(ends[-1] if len(ends) else 0)
