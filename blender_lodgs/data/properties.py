@@ -118,8 +118,8 @@ class SplatStream(bpy.types.PropertyGroup):
     )
     budget: bpy.props.IntProperty(
         name="Splats at Most",
-        description="How many splats of the file are in memory at most, besides those that the scene holds. "
-        "Where the view needs more, they are coarser everywhere",
+        description="How many splats are in memory at most: those that the scene holds, and those that are "
+        "read from the file. Where the view needs more, they are coarser everywhere",
         default=1_000_000,
         min=1024,
         soft_max=16_000_000,

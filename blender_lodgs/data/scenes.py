@@ -17,7 +17,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...training.errors import LodgsError
-from ...training.lod.paging import is_tree, read_within
+from ...training.lod.paging import TreeFile, is_tree, read_within
 from ...training.lod.rule import Control, Tables, find_rule
 from ...training.lod.selection import complete, known_rule, not_alone, unknown_rule
 from ...training.methods import METHODS
@@ -162,9 +162,9 @@ def import_splats(
     """A bundle, a folder of levels, or any 3DGS PLY as a single level, as a new splat scene.
 
     Args:
-        budget: most splats of a tree of splats, whose coarser ones stand for the others then; 0: all. Where
-            LODGS itself draws, others are read from the file as the eye comes near (``streams``), at most as
-            many again.
+        budget: most splats of a tree of splats in memory; 0: all. Of a larger one the coarsest are imported,
+            which stand for the others; where LODGS itself draws, others are read from the file as the eye
+            comes near (``streams``).
         upright: turn the root as the bundle says, or without that so that -y, which is up in most splat
             files, is up; otherwise leave the axes.
         warn: receives a sentence for each thing that is shown otherwise than the file's maker shows it.
@@ -177,7 +177,8 @@ def import_splats(
     """
     path, missing = Path(path), 0
     if budget and not path.is_dir() and is_tree(read_head(path)):
-        bundle, total = read_within(path, budget)
+        total = TreeFile(path).total
+        bundle, _ = read_within(path, budget if total <= budget else max(int(streams.HELD * budget), 1))
         here = sum(len(level.splats) for level in bundle.levels)
         missing = total - here
         if missing:

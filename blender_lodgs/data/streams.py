@@ -1,7 +1,8 @@
 """Scenes that hold the top of a tree of splats, and read the rest from its file as it is needed.
 
-The scene's objects hold the coarse splats within a budget, as a tree complete by itself: modifiers, exports
-and files work with these. What LODGS itself draws is read from the file, wherever the eye comes near.
+The scene's objects hold the coarsest splats, as a tree complete by itself: modifiers, exports and saved files
+work with these. What LODGS itself draws is read from the file, wherever the eye comes near. There is a budget
+for both together.
 """
 
 from __future__ import annotations
@@ -10,6 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
+
+HELD = 0.25
+"""Share of the budget that the scene's objects hold: Blender evaluates them anew whenever an eye rests."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +24,7 @@ class Source:
         scene: its root's ``session_uid``.
         path: the bundle.
         total: its splats.
-        budget: how many of them may be in memory.
+        budget: how many of them may be in memory besides those that the scene's objects hold.
         here: how many the scene's objects hold.
         level: number of the finest level, in whose place all are drawn.
     """
@@ -61,7 +65,8 @@ def source_of(root: bpy.types.Object) -> Source | None:
         return None
     stream = settings.stream
     finest = max(item.number for item in settings.levels if item.exists)
-    return Source(root.session_uid, path, stream.total, stream.budget, stream.here, finest)
+    budget = max(stream.budget - stream.here, 0)
+    return Source(root.session_uid, path, stream.total, budget, stream.here, finest)
 
 
 def changed(root: bpy.types.Object) -> bool:

@@ -7,6 +7,7 @@ is made from what the pool says of all splats.
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -24,6 +25,9 @@ ROUGHLY = 1.05
 
 WIDTH = 8192
 """Texels in a row of every texture that holds one texel for each of many splats."""
+
+
+_serials = itertools.count()
 
 
 class Paged(Protocol):
@@ -46,7 +50,8 @@ class Pool:
         opacities: (N,) float32 in [0, 1].
         columns: (N,) float32 by name: what rules need to know of splats; zeros where an object lacks one.
         paged: from where on splats are others by and by, and which.
-        serial: another one after :meth:`take_over` has changed some.
+        serial: another one after :meth:`take_over` has changed some, and in every pool.
+        changed: (M,) int32 each, at which places others are since then: for who keeps what they are.
     """
 
     means: np.ndarray
@@ -54,7 +59,8 @@ class Pool:
     opacities: np.ndarray
     columns: dict[str, np.ndarray] = field(default_factory=dict)
     paged: Sequence[tuple[int, Paged]] = ()
-    serial: int = 0
+    serial: int = field(default_factory=lambda: next(_serials))
+    changed: list[np.ndarray] = field(default_factory=list)
     _seen: dict[int, int] = field(default_factory=dict)
     _choosers: dict[tuple[int, int], Chooser] = field(default_factory=dict, compare=False)
     _drawn: list[Drawn] = field(default_factory=list, compare=False)
@@ -88,9 +94,8 @@ class Pool:
             self._drawn[:] = [_drawn(self, request)]
         return self._drawn[0]
 
-    def take_over(self) -> np.ndarray:
-        """Takes over what has come of paged splats; the places (M,) int32 at which others are now."""
-        changed = []
+    def take_over(self) -> None:
+        """Takes over what has come of paged splats, which nobody must be reading."""
         for first, paged in self.paged:
             before, some = paged.taken, paged.take()
             if self._seen.get(first) != before:  # another pool took something, or this is a new one
@@ -105,11 +110,8 @@ class Pool:
                 self.columns[name][first : first + len(column)] = column
             self._choosers = {key: each for key, each in self._choosers.items() if key[0] != first}
             self._drawn.clear()
-            changed.append(here)
-        if not changed:
-            return np.zeros(0, np.int32)
-        self.serial += 1
-        return np.concatenate(changed)
+            self.changed.append(here)
+            self.serial = next(_serials)
 
 
 @dataclass(frozen=True)
@@ -190,7 +192,6 @@ class Arrangement:
         splats: (M,) int32, the same places in the pool.
         left_out: how many were left out, to stay within the budget.
         serial: the pool's: in a later one some places are other splats'.
-        changed: (M,) int32 at which places others are than before.
     """
 
     request: Request
@@ -198,7 +199,6 @@ class Arrangement:
     splats: np.ndarray
     left_out: int
     serial: int
-    changed: np.ndarray
 
     @property
     def count(self) -> int:
@@ -213,9 +213,10 @@ def arrange(pool: Pool, request: Request, take_over: bool = False) -> Arrangemen
     objects move, it is put in another order alone.
 
     Args:
-        take_over: first what has come of paged splats, which nobody must be reading.
+        take_over: first what has come of paged splats, see ``Pool.take_over``.
     """
-    changed = pool.take_over() if take_over else np.zeros(0, np.int32)
+    if take_over:
+        pool.take_over()
     drawn, count = pool.drawn(request), 0
     depths = np.empty(len(drawn.table), np.float32)
     backward = np.append(request.backward, 0.0)
@@ -225,7 +226,7 @@ def arrange(pool: Pool, request: Request, take_over: bool = False) -> Arrangemen
         count += len(means)
     instances = drawn.table[ascending(depths)]
     places = instances[:, 0].astype(np.int32)
-    return Arrangement(request, instances, places, drawn.left_out, pool.serial, changed)
+    return Arrangement(request, instances, places, drawn.left_out, pool.serial)
 
 
 def ascending(values: np.ndarray) -> np.ndarray:

@@ -24,6 +24,7 @@ import gpu
 import numpy as np
 from mathutils import Matrix
 
+from .. import extension
 from ..data import changes, scenes, selection, shown
 from . import eye, resident, splats
 from .arranging import Arrangement, Placement, Request, arrange
@@ -32,8 +33,9 @@ from .streaming import Stream
 
 STILL = 0.2
 """Seconds after which a view that no longer moves is drawn in full resolution."""
-LOADING = 0.02, 0.1
-"""Seconds after which a redraw leaves further splats to the next one: at least, and at most."""
+LOADING = 0.01, 0.03
+"""Seconds after which a redraw leaves further splats to the next one: at least, and at most. What is begun is
+finished: no redraw is to be held up for 0.05 seconds."""
 GROWTH = 1.5
 """By how much more splats a picture that is not complete is drawn again."""
 
@@ -73,6 +75,11 @@ class ViewState:
     arrived: int = 0
     resolution: float = 1.0
 
+    def reads(self, of: Resident) -> bool:
+        """Whether splats are on their way, or will be, so that they must stay what they are."""
+        on_their_way = self.loading is not None and self.loading.serial == of.pool.serial
+        return on_their_way or (self.pending is not None and self.pending[0] is of)
+
     def lists(self, of: Resident) -> list[np.ndarray]:
         """The splats (M,) that it draws, and those that are on their way."""
         drawn = self.arrangement if self.resident is of else None
@@ -91,6 +98,8 @@ _keys: dict[int, changes.Version | Stream | None] = {}
 which version, None for one that only a render shows. Roots of scenes that are read from a file."""
 _streams: dict[int, Stream] = {}
 """Those files, by the roots' ``session_uid``."""
+_told: list[tuple[int, bool]] = []
+"""What panels say of them."""
 
 
 def draw(context: bpy.types.Context) -> None:
@@ -197,10 +206,9 @@ def prepare(
         view.pending = view.loading = view.missing = None
         return Request((), (0.0, 0.0, 1.0), budget)
     _all.add(view)
-    instances = _from_files(instances, depsgraph, moving, wait)
+    instances = _from_files(view, instances, depsgraph, moving, wait)
     of, clouds = _read(instances, depsgraph)
-    # what has come is taken over while nobody reads it
-    take_over = wait or not any(other.pending or other.loading for other in _all if other is not view)
+    take_over = wait or not any(other.reads(of) for other in _all if other is not view)
     if take_over:
         view.arrived = _arrived()
     placements = _placements(instances, of, depsgraph, moving, take_over)
@@ -221,7 +229,11 @@ def stream(root: bpy.types.Object) -> Stream | None:
 
 
 def _from_files(
-    instances: list[shown.SplatInstance], depsgraph: bpy.types.Depsgraph, moving: bool, wait: bool
+    view: ViewState,
+    instances: list[shown.SplatInstance],
+    depsgraph: bpy.types.Depsgraph,
+    moving: bool,
+    wait: bool,
 ) -> list[shown.SplatInstance]:
     """The instances, in which what is read from a file stands for a scene's levels as soon as it can; and
     files are asked for what the eye needs."""
@@ -241,7 +253,9 @@ def _from_files(
                 if there.ready:
                     _beside().submit(there.take).result()
                 time.sleep(0.01)
-            if there.ready:
+            # at first what the scene holds is drawn, which is there at once
+            begun = wait or there in _keys.values() or (view.arrangement and not view.loading)
+            if there.ready and begun:
                 ready.append(source)
     kept = [each if each.source in ready else replace(each, source=None) for each in instances]
     return shown.without_coarser(kept)
@@ -350,6 +364,8 @@ def _choice(
 
 def _arrange(view: ViewState, of: Resident, request: Request, wait: bool, take_over: bool) -> None:
     """Takes over an arrangement that has been found, and asks for another where one is wanted."""
+    if view.loading is not None and view.loading.serial != of.pool.serial:  # of splats that are others now
+        view.loading = view.missing = None
     if view.pending is not None and (wait or view.pending[2].done()):
         found_of, _, found = view.pending
         view.pending = None
@@ -376,8 +392,10 @@ def _beside() -> ThreadPoolExecutor:
 
 def _found(view: ViewState, of: Resident, arrangement: Arrangement) -> None:
     """Goes on with an arrangement, unless others are where its splats were."""
-    if of.store is not None:
-        of.store.forget(arrangement.changed)
+    while of.pool.changed:  # whoever had it taken over
+        changed = of.pool.changed.pop()
+        if of.store is not None:
+            of.store.forget(changed)
     if arrangement.serial == of.pool.serial:
         view.loading, view.missing = arrangement, None
 
@@ -390,7 +408,7 @@ def _load(view: ViewState, of: Resident, clouds: Sequence[bpy.types.PointCloud |
         view.loading = view.arrangement  # into the store that another viewport has made
     loading = view.loading
     if loading is None or loading.serial != of.pool.serial:
-        view.loading = view.missing = None
+        view.loading = None
         return
     store, missing = view.missing or (None, None)
     if not (begun := store is not None and store is of.store):
@@ -399,7 +417,8 @@ def _load(view: ViewState, of: Resident, clouds: Sequence[bpy.types.PointCloud |
     # where redraws take long, as much is loaded in each
     end = now + min(max(now - view.loaded if begun else 0, LOADING[0]), LOADING[1])
     view.loaded, begin = now, 0
-    while begin < len(missing) and (wait or not begin or time.monotonic() < end):
+    shown = begun and _show(view, of, loading, store, missing)  # what redraws before this one have brought
+    while begin < len(missing) and (wait or (begun and not shown and not begin) or time.monotonic() < end):
         piece = missing[begin : begin + resident.PIECE]
         piece = piece[: of.of_one_cloud(piece)]
         records = of.read(clouds, piece)
@@ -409,17 +428,26 @@ def _load(view: ViewState, of: Resident, clouds: Sequence[bpy.types.PointCloud |
         store.put(piece, records)
         begin += len(piece)
     missing = missing[begin:]
+    view.missing = store, missing
+    if wait or (not shown and not len(missing) and time.monotonic() < end):
+        _show(view, of, loading, store, missing)
+
+
+def _show(view: ViewState, of: Resident, loading: Arrangement, store: Store, missing: np.ndarray) -> bool:
+    """Draws an arrangement from now on: as soon as none of its splats (M,) is missing, or where there is
+    nothing else to draw as much of it as is there, if that is worth it. Whether it does."""
     part = view.arrangement is loading and view.store is store
     part = part and len(loading.splats) - len(missing) > GROWTH * view.count
-    if not len(missing) or part or view.arrangement is None:
-        view.resident, view.arrangement, view.store = of, loading, store
-        view.instances, view.count = splats.instances_texture(loading, store.places)
-        drawn = [other.arrangement for other in _all if other.store is store and other.arrangement]
-        if all(each.serial == loading.serial for each in drawn):
-            store.release()
-    view.missing = (store, missing) if len(missing) else None
+    if len(missing) and not part and view.arrangement is not None:
+        return False
+    view.resident, view.arrangement, view.store = of, loading, store
+    view.instances, view.count = splats.instances_texture(loading, store.places)
+    drawn = [other.arrangement for other in _all if other.store is store and other.arrangement]
+    if all(each.serial == loading.serial for each in drawn):
+        store.release()
     if not len(missing):
-        view.loading = None
+        view.loading = view.missing = None
+    return True
 
 
 def _alike(one: tuple[Placement, ...], other: tuple[Placement, ...]) -> bool:
@@ -434,6 +462,7 @@ def _wake_later() -> None:
 
 def _wake() -> float | None:
     """Redraws viewports for which something is ready; asks to be called again while there is more to come."""
+    global _told
     now, waiting = time.monotonic(), _busy()
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
@@ -446,6 +475,9 @@ def _wake() -> float | None:
                 if still or more or (view.pending and view.pending[2].done()):
                     region.tag_redraw()
                 waiting |= bool(view.loading or view.pending) or view.resolution < 1
+    if (told := [(each.splats, each.busy) for each in _streams.values()]) != _told:
+        _told = told
+        extension.redraw()
     return 0.01 if waiting else None
 
 

@@ -85,7 +85,7 @@ def test_viewport_quality_waits_for_what_it_needs(bpy, lodgs, path, camera, fram
     if not hasattr(gpu, "init"):
         pytest.skip("no graphics in background before Blender 5.2")
     views, pictures = lodgs("viewport.views"), []
-    for budget in (12_000, 0):
+    for budget in (16_000, 0):
         root = lodgs("data.scenes").import_splats(bpy.context, path, budget=budget)
         frame(root, 20.0)
         lodgs("render.quick").render(bpy.context)
