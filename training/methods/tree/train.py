@@ -86,6 +86,10 @@ class Method(Refining):
         levels = self.tree.levels(self.model.splats())
         return {BLOCKS: table_of_pages({level.number: level.splats.extras for level in levels})}
 
+    def controls(self) -> dict[str, float]:
+        """Pictures begin with the granularity that was trained."""
+        return {"pixels": self.parameters.pixels}
+
     # -- a step ----------------------------------------------------------------------------------------
 
     def train_step(self, step: int) -> tuple[float, torch.Tensor, Target]:
