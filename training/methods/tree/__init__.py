@@ -16,16 +16,20 @@ class TreeParameters(ThreedgsParameters):
         600, "Steps that train the cut which each view sees of the tree; 0 leaves it as built.", unit="steps"
     )
     pixels: float = parameter(
-        1.0, "Granularity of these cuts, in pixels of the training images.", low=0.1, high=100, unit="px"
+        0.5,
+        "Granularity of these cuts, in pixels of the training images; pictures begin with the same.",
+        low=0.1,
+        high=100,
+        unit="px",
     )
     lod_noise: float = parameter(
-        15.0,
+        30.0,
         "Each step's granularity is larger by this times r⁴, r random from 0 to 1: most cuts are fine, some "
         "are coarse.",
         high=100,
     )
     leaf_rate: float = parameter(
-        0.3,
+        0.1,
         "Learning rates of leaves, as a share of those of the nodes above them; they fall to a tenth of it. "
         "0 leaves all leaves as they are.",
         high=1,

@@ -146,6 +146,10 @@ class Method(Refining):
         splats, tree = joined(self.store)
         return tree.levels(splats)
 
+    def controls(self) -> dict[str, float]:
+        """Pictures begin with the granularity that was trained."""
+        return {"pixels": self.parameters.pixels}
+
     # -- a step ----------------------------------------------------------------------------------------
 
     @cached_property
