@@ -67,14 +67,19 @@ class TreeParameters(ThreedgsParameters):
 
 _DRAFT = TreeParameters()
 _STANDARD = replace(
-    _DRAFT, **STANDARD, steps=30_000, densify_interval=100, tune_steps=10_000, grow_interval=1000
+    _DRAFT,
+    **STANDARD,
+    steps=30_000,
+    densify_interval=100,
+    tune_steps=10_000,
+    grow_interval=1000,
+    leaf_rate=1.0,  # those that grow have to learn
 )
 _PAPER = replace(
     _STANDARD,
     **PAPER,
     pixels=3.0,
     lod_noise=5.0,
-    leaf_rate=1.0,
     sh_degree=1,
     tune_steps=150_000,
     max_threshold=0.0075,
