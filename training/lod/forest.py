@@ -94,6 +94,11 @@ class ForestShape:
         return np.cumsum(self.counts - 1)
 
     @property
+    def ranges(self) -> list[tuple[int, int]]:
+        """The first node of each subtree, and one after its last."""
+        return list(zip(self.begins.tolist(), self.ends.tolist(), strict=True))
+
+    @property
     def in_upper(self) -> np.ndarray:
         """(2G - 1,) int64: the nodes of the upper tree, with its leaves, in its own numbering."""
         return np.append(self.ends - 1, np.arange(self.ends[-1], len(self)))
@@ -134,13 +139,20 @@ def divided(splats: Splats, tree: Tree, longest: int) -> Grove:
         splats: its 2N - 1 nodes.
     """
     order, shape = shape_of(tree, longest)
-    splats, place = splats.select(order), np.empty(len(tree), np.int32)
+    splats, trees = splats.select(order), subtrees_of(tree, order, shape)
+    pieces = [splats.select(slice(*ends)) for ends in shape.ranges]
+    upper = splats.select(slice(int(shape.ends[-1]), None)), shape.upper
+    return Grove(list(zip(pieces, trees, strict=True)), upper)
+
+
+def subtrees_of(tree: Tree, order: np.ndarray, shape: ForestShape) -> list[Tree]:
+    """The subtrees of a tree that :func:`shape_of` has found."""
+    place = np.empty(len(tree), np.int32)
     place[order] = np.arange(len(tree), dtype=np.int32)
-    subtrees = []
-    for begin, end, own in zip(*(x.tolist() for x in (shape.begins, shape.ends, shape.counts)), strict=True):
-        children = place[tree.children[order[begin + own : end] - tree.leaves]] - np.int32(begin)
-        subtrees.append((splats.select(slice(begin, end)), Tree(children)))
-    return Grove(subtrees, (splats.select(slice(int(shape.ends[-1]), None)), shape.upper))
+    trees = []
+    for (begin, end), own in zip(shape.ranges, shape.counts.tolist(), strict=True):
+        trees.append(Tree(place[tree.children[order[begin + own : end] - tree.leaves]] - np.int32(begin)))
+    return trees
 
 
 def side_by_side(leaves: np.ndarray, children: np.ndarray) -> tuple[np.ndarray, Tree]:

@@ -28,12 +28,17 @@ FAINTER = 0.6
 
 
 def peak_scores(model: Model) -> torch.Tensor:
-    """What decides by maxima (N,): the largest gradient times the largest radius times opacity^(1/5).
+    """What decides by maxima (N,): :func:`peak_score` of the largest gradient and the largest radius."""
+    gradient, radius = (model.stats[name] for name in PEAKS)
+    return peak_score(gradient, radius, model["opacity_logits"].detach())
+
+
+def peak_score(gradient: torch.Tensor, radius: torch.Tensor, opacity_logits: torch.Tensor) -> torch.Tensor:
+    """Gradient times radius times opacity^(1/5), (N,).
 
     LODGE, Eq. 6, after H3DGS: gradients in 3DGS units, radii of three standard deviations in pixels.
     """
-    gradient, radius = (model.stats[name] for name in PEAKS)
-    return gradient * radius * model["opacity_logits"].detach().sigmoid() ** 0.2
+    return gradient * radius * opacity_logits.sigmoid() ** 0.2
 
 
 @torch.no_grad()
@@ -76,7 +81,7 @@ def densify(
     clones = model.rows(chosen[cloned])
     parents, scales = chosen[~cloned], scales[~cloned]
     if clone_below is None:
-        children, scales = _along_longest_axis(model.rows(parents.repeat(2)), scales)
+        children, scales = along_longest_axis(model.rows(parents.repeat(2)), scales)
     else:
         children = model.rows(parents.repeat(2))
         children["means"] += sample_inside(children["quats"], scales.repeat(2, 1), rng)
@@ -89,7 +94,7 @@ def densify(
     return len(chosen)
 
 
-def _along_longest_axis(
+def along_longest_axis(
     children: dict[str, torch.Tensor], scales: torch.Tensor
 ) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
     """Two children on either side of each parent, which together look much as it did.

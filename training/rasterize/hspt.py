@@ -1,9 +1,10 @@
 """Cuts of a large tree of splats for one camera after another: the hierarchical sequential point tree.
 
 A LoD of Gaussians, Sec. 4.1 and 4.3: the upper tree is walked from the root down, and what is out of the
-image is left out with all below it; the subtrees under it are lists, of which a binary search finds the part
-to look at. The nodes found are those of the rule ``cut`` (``lod.rules.cut``), to the bit. In the paper a list
-is cut by the distance of its root alone, finer than asked for behind it and, without M_d, coarser before it.
+image is left out with all below it; the subtrees under it are lists by size, which are looked at from the
+largest node down to where all are fine enough. The nodes found are those of the rule ``cut``
+(``lod.rules.cut``), to the bit. In the paper a list is cut by the distance of its root alone, finer than
+asked for behind it and, without M_d, coarser before it.
 """
 
 from __future__ import annotations
@@ -13,16 +14,17 @@ import math
 import numpy as np
 
 from ..lod.blocks import PIXELS, REACH, SLANT
-from ..lod.forest import longest_of, shape_of
+from ..lod.forest import shape_of
 from ..lod.rules.cut import detail_of
 from ..lod.tree import Tree
 from ..scenes.cameras import Camera
-from .cpu.compile import STRICT, at_once, f32, in_parallel, inlined, kernel
+from .cpu.compile import STRICT, Buffers, at_once, f32, in_parallel, inlined, kernel
 
 SLACK = 1e-5
 """Share by which single precision may get distances and sizes wrong, and more."""
-_GRAIN = 8
+_GRAIN = 64
 """Lists that a thread takes at a time."""
+NONE = np.empty(0, np.int32)
 
 
 class Upper:
@@ -37,7 +39,8 @@ class Upper:
 
     def __init__(self, tree: Tree, balls: np.ndarray, boxes: np.ndarray) -> None:
         self.balls, self.boxes = balls, boxes
-        self._children = np.concatenate([np.full((tree.leaves, 2), -1, np.int32), tree.children])
+        order, beyond = _preorder(tree)
+        self._walked = order, beyond, order < tree.leaves, balls[order], boxes[order]
 
     @classmethod
     def over(
@@ -63,15 +66,35 @@ class Upper:
             image: as of :func:`image_of`; None: nothing is left out.
 
         Returns:
-            Nodes to draw, (M,) int32, those below G roots of lists; lists, (L,) int32, and of each the least
-            size, (L,) float64, that a node in it has which is not fine enough.
+            Nodes to draw, (M,) int32, those below G roots of lists; lists, (L,) int32, ascending; and of
+            each, (L, 2) float32, two sizes: a node in it that is smaller than the first is fine enough, and
+            one that is larger than the second is not.
         """
         image = np.zeros((0, 6)) if image is None else image
         nodes, lists = np.empty((2, len(self.balls)), np.int32)
-        least, counts = np.empty(len(self.balls)), np.zeros(2, np.int64)
-        arrays = self._children, self.balls, self.boxes, np.asarray(eye, np.float32), f32(k), image
-        at_once(_walk, *arrays, nodes, lists, least, counts)
-        return nodes[: counts[0]], lists[: counts[1]], least[: counts[1]]
+        bands, counts = np.empty((len(self.balls), 2), np.float32), np.zeros(2, np.int64)
+        at_once(_walk, *self._walked, np.asarray(eye, np.float32), f32(k), image, nodes, lists, bands, counts)
+        return nodes[: counts[0]], lists[: counts[1]], bands[: counts[1]]
+
+
+def _preorder(tree: Tree) -> tuple[np.ndarray, np.ndarray]:
+    """The nodes (2G - 1,) int32 from the root, each before those below it and these in the order of leaves;
+    and where (2G - 1,) int32 in this order what is below each has an end."""
+    leaves, count = tree.leaves, len(tree)
+    many, first = np.ones(count, np.int32), np.arange(count)
+    for layer in reversed(tree.layers):
+        below = tree.children[layer - leaves]
+        many[layer] += many[below].sum(axis=1)
+        first[layer] = first[below].min(axis=1)
+    place = np.zeros(count, np.int32)
+    for layer in tree.layers:
+        one, other = tree.children[layer - leaves].T
+        one, other = np.where(first[one] < first[other], [one, other], [other, one])
+        place[one] = place[layer] + 1
+        place[other] = place[one] + many[one]
+    order = np.empty(count, np.int32)
+    order[place] = np.arange(count, dtype=np.int32)
+    return order, place[order] + many[order]
 
 
 Bounds = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -95,8 +118,8 @@ class Hspt:
         means: (2N - 1, 3) float32 of all nodes.
         sizes: (2N - 1,) float32, saturated (``Tree.sizes``).
         log_scales: (2N - 1, 3) float32.
-        longest: most leaves below the root of a list; 0: half the square root of the number of nodes, so
-            that the upper tree and a list are about as long.
+        longest: most leaves below the root of a list; 0: a sixth of the square root of the number of nodes.
+            The longer, the more is found that is out of the image; the shorter, the more is walked.
 
     Attributes:
         lists: how many there are.
@@ -105,7 +128,7 @@ class Hspt:
     def __init__(
         self, tree: Tree, means: np.ndarray, sizes: np.ndarray, log_scales: np.ndarray, longest: int = 0
     ) -> None:
-        order, forest = shape_of(tree, longest or longest_of(tree.leaves))
+        order, forest = shape_of(tree, longest or max(math.isqrt(len(tree)) // 6, 1))
         names = self._names = order[forest.in_upper]
         inside = order[: forest.ends[-1]]
         bounds = bounds_of(means[inside], log_scales[inside], forest.begins)
@@ -117,7 +140,7 @@ class Hspt:
         balls = np.concatenate([means, sizes[:, None]], axis=1)
         pairs = tree.children[entries - tree.leaves]
         families = np.concatenate([balls[entries], balls[pairs].reshape(-1, 8)], axis=1)
-        self._lists = pairs, families
+        self._lists = pairs, np.ascontiguousarray(families[:, 3::4]), families
 
     def cut(self, camera: Camera, pixels: float, near: float = 0.01) -> np.ndarray:
         """The nodes (M,) int32 to draw for a camera, but for those that are out of its image; in any order.
@@ -134,11 +157,10 @@ class Hspt:
         Args:
             image: as of :func:`image_of`; None: nothing is left out.
         """
-        nodes, lists, least = self._upper.walk(eye, k, image)
+        nodes, lists, bands = self._upper.walk(eye, k, image)
         begins, ends = self._forest.list_begins[lists], self._forest.list_ends[lists]
-        ends = cut_off(self._lists[1][:, 3], begins, ends, least)
-        found, _ = search(*self._lists, begins, ends, eye, k)
-        return np.append(self._names[nodes], found)
+        found, _ = search(*self._lists, begins, ends, bands, eye, k, self._names[nodes])
+        return found
 
 
 def cut_off(sizes: np.ndarray, begins: np.ndarray, ends: np.ndarray, least: np.ndarray) -> np.ndarray:
@@ -154,28 +176,44 @@ def cut_off(sizes: np.ndarray, begins: np.ndarray, ends: np.ndarray, least: np.n
 
 
 def search(
-    pairs: np.ndarray, families: np.ndarray, begins: np.ndarray, ends: np.ndarray, eye: np.ndarray, k: float
+    pairs: np.ndarray,
+    sizes: np.ndarray,
+    families: np.ndarray,
+    begins: np.ndarray,
+    ends: np.ndarray,
+    bands: np.ndarray,
+    eye: np.ndarray,
+    k: float,
+    before: np.ndarray = NONE,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of parts of lists, the children that are fine enough of nodes that are not (Eq. 5).
+    """Of lists, the children that are fine enough of nodes that are not (Eq. 5).
 
     Args:
         pairs: (E, 2) int32, the children of each node of the lists.
+        sizes: (E, 3) float32, the size of each node, which falls within a list, and of its children.
         families: (E, 12) float32, mean and size of each node and of its children.
-        begins, ends: (L,) int64 of the parts, among the E.
+        begins, ends: (L,) int64 of lists among the E, or of their first parts.
+        bands: (L, 2) as ``Upper.walk`` says them.
         eye: (3,).
         k: the detail.
+        before: nodes to begin with.
 
     Returns:
-        Nodes (M,) int32, one part's after the other's; and how many are of each, (L,) int64.
+        Nodes (M,) int32, one list's after the other's; and how many are of each list, (L,) int64.
     """
     lengths = ends - begins
-    parts = np.stack([begins, ends, 2 * (np.cumsum(lengths) - lengths), np.zeros_like(begins)], axis=1)
-    buffer = np.empty(2 * int(lengths.sum()), np.int32)
-    eye = np.asarray(eye, np.float32)
-    in_parallel(_search, len(parts), _GRAIN, pairs, families, eye, f32(k), parts, buffer)
-    found = np.empty(int(parts[:, 3].sum()), np.int32)
-    at_once(_gather, parts, buffer, found)
-    return found, parts[:, 3]
+    firsts = 2 * (np.cumsum(lengths) - lengths)
+    longest = int(lengths.max(initial=0))
+    buffers = Buffers()
+    found = buffers.take("cut", np.int32, 2 * int(lengths.sum()))
+    counts = np.zeros_like(begins)
+    lists = pairs, sizes, families, begins, ends, bands
+    asked = np.asarray(eye, np.float32), f32(k), longest
+    in_parallel(_search, len(begins), _GRAIN, *lists, *asked, firsts, found, counts)
+    chunks = range(0, len(begins), _GRAIN)
+    sums = np.add.reduceat(counts, chunks) if chunks else chunks
+    parts = [found[first : first + count] for first, count in zip(firsts[chunks], sums, strict=True)]
+    return np.concatenate([before, *parts]), counts
 
 
 def image_of(camera: Camera, near: float) -> np.ndarray:
@@ -203,55 +241,66 @@ def _fine(balls, i, first, eye, k):
     return np.sqrt(x * x + y * y + z * z) >= k * balls[i, first + 3]
 
 
-@inlined(STRICT)
-def _in_image(box, image):
-    depth = 0.0
-    for i in range(len(image)):
-        row = image[i]
-        away, room = row[3], 0.0
-        for axis in range(3):
-            away += row[axis] * box[axis]
-            room += abs(row[axis]) * box[3 + axis]
-        if i == 0:
-            depth = max(room - away + row[5], 0.0)
-        else:
-            room += row[4] * box[6] + row[5] * depth
-        if away > room:
-            return False
-    return True
-
-
-@inlined(STRICT)
-def _distance(box, eye):
-    """From an eye to a box, 0 within."""
-    squares = 0.0
-    for axis in range(3):
-        away = max(abs(np.float64(eye[axis]) - box[axis]) - box[3 + axis], 0.0)
-        squares += away * away
-    return np.sqrt(squares)
-
-
 @kernel(STRICT)
-def _walk(children, balls, boxes, eye, k, image, nodes, lists, least, counts):
-    """From the root, which is the last, down the upper tree: nodes to draw, and lists to look at."""
-    count, used, top = 0, 0, 1
-    stack = np.empty(len(children) + 1, np.int32)
-    stack[0] = len(children) - 1
-    while top:
-        top -= 1
-        i = stack[top]
-        if not _in_image(boxes[i], image):
-            continue
+def _walk(order, beyond, is_list, balls, boxes, eye, k, image, nodes, lists, bands, counts):
+    """Down the upper tree, from the root: nodes to draw, and lists to look at.
+
+    What is within a border of the image is not asked again below; ``asked`` has a bit for each border that is
+    to be, for as long as ``until`` says.
+    """
+    count, used, top, i = 0, 0, 0, 0
+    until, asked = np.empty(len(order) + 1, np.int32), np.empty(len(order) + 1, np.int32)
+    until[0], asked[0] = len(order), (1 << len(image)) - 1
+    while i < len(order):
+        while i >= until[top]:
+            top -= 1
+        crossed = asked[top]
+        if crossed:
+            crossed = _borders(boxes[i], image, crossed)
+            if crossed < 0:
+                i = beyond[i]
+                continue
+            if crossed != asked[top] and not is_list[i]:
+                top += 1
+                until[top], asked[top] = beyond[i], crossed
         if _fine(balls, i, 0, eye, k):
-            nodes[count] = i
+            nodes[count] = order[i]
             count += 1
-        elif children[i, 0] >= 0:
-            stack[top], stack[top + 1] = children[i, 1], children[i, 0]
-            top += 2
-        else:
-            lists[used], least[used] = i, _distance(boxes[i], eye) * (1 - SLACK) / k
+            i = beyond[i]
+            continue
+        if is_list[i]:
+            near, far = 0.0, 0.0
+            for axis in range(3):
+                away, half = abs(np.float64(eye[axis]) - boxes[i, axis]), boxes[i, 3 + axis]
+                near += max(away - half, 0.0) ** 2
+                far += (away + half) ** 2
+            lists[used] = order[i]
+            bands[used, 0] = f32(np.sqrt(near) * (1 - SLACK) / k)
+            bands[used, 1] = f32(np.sqrt(far) * (1 + SLACK) / k)
             used += 1
+        i += 1
     counts[0], counts[1] = count, used
+
+
+@inlined(STRICT)
+def _borders(box, image, asked):
+    """Of the borders that are asked for those that a box crosses; -1 where it is beyond one."""
+    x, y, z = box[0], box[1], box[2]
+    a, b, c = box[3], box[4], box[5]
+    ahead = image[0, 0] * x + image[0, 1] * y + image[0, 2] * z + image[0, 3]
+    across = abs(image[0, 0]) * a + abs(image[0, 1]) * b + abs(image[0, 2]) * c
+    depth = max(across - ahead + image[0, 5], 0.0)
+    crossed = asked
+    for i in range(len(image)):
+        if (asked >> i) & 1:
+            row = image[i]
+            away = row[0] * x + row[1] * y + row[2] * z + row[3]
+            room = abs(row[0]) * a + abs(row[1]) * b + abs(row[2]) * c
+            if away > room + (row[4] * box[6] + row[5] * depth if i else 0.0):
+                return -1
+            if away < -room:
+                crossed &= ~(1 << i)
+    return crossed
 
 
 @kernel(STRICT)
@@ -268,26 +317,37 @@ def _cut_off(sizes, begins, ends, least, found):
 
 
 @kernel(STRICT)
-def _search(begin, end, pairs, families, eye, k, parts, buffer):
-    """Of parts of lists, the children that are fine enough of nodes that are not (Eq. 5)."""
+def _search(begin, end, pairs, sizes, families, begins, ends, bands, eye, k, longest, firsts, found, counts):
+    """Of lists, the children that are fine enough of nodes that are not (Eq. 5).
+
+    Sizes alone decide about most. Nothing branches where it cannot be foreseen: every child is written, and
+    the next one over it where it is not wanted.
+    """
+    doubtful, children = np.empty(2 * longest, np.int64), pairs.reshape(-1)
+    place = firsts[begin]
     for part in range(begin, end):
-        first = parts[part, 2]
-        place = first
-        for i in range(parts[part, 0], parts[part, 1]):
-            if not _fine(families, i, 0, eye, k):
-                if _fine(families, i, 4, eye, k):
-                    buffer[place] = pairs[i, 0]
-                    place += 1
-                if _fine(families, i, 8, eye, k):
-                    buffer[place] = pairs[i, 1]
-                    place += 1
-        parts[part, 3] = place - first
-
-
-@kernel(STRICT)
-def _gather(parts, buffer, found):
-    place = 0
-    for part in range(len(parts)):
-        first, count = parts[part, 2], parts[part, 3]
-        found[place : place + count] = buffer[first : first + count]
-        place += count
+        first, i, last = place, begins[part], ends[part]
+        least, most = bands[part, 0], bands[part, 1]
+        many = 0
+        while i < last and sizes[i, 0] > most:
+            for child in range(2):
+                size = sizes[i, 1 + child]
+                found[place] = pairs[i, child]
+                place += size < least
+                doubtful[many] = 2 * i + child
+                many += (size >= least) & (size <= most)
+            i += 1
+        while i < last and sizes[i, 0] >= least:
+            coarse = not _fine(families, i, 0, eye, k)
+            for child in range(2):
+                size = sizes[i, 1 + child]
+                found[place] = pairs[i, child]
+                place += coarse & (size < least)
+                doubtful[many] = 2 * i + child
+                many += coarse & (size >= least)
+            i += 1
+        for j in range(many):
+            child = doubtful[j]
+            found[place] = children[child]
+            place += _fine(families, child >> 1, 4 + 4 * (child & 1), eye, k)
+        counts[part] = place - first

@@ -1,8 +1,8 @@
 """Splats in records, one after the other, with Adam's moments and what density control asks for.
 
 A record holds C values (means, quaternions, log-scales, opacity logits, harmonics), their first and their
-second moments, and STEPS, how many steps it has made; GRAD, the largest norm of its gradient in the image
-plane; SEEN, the number of the last step that had it in its image, all three counted from column 3 C.
+second moments, and from column 3 C on: STEPS, how many steps it has made; SCORE, the largest of those that it
+has been given; SEEN, the number of the last step that had it in its image, 0 for none.
 """
 
 from __future__ import annotations
@@ -14,9 +14,8 @@ import torch
 
 from . import adam
 from .gaussians import Gaussians
-from .rendering import Rendering
 
-STEPS, GRAD, SEEN = range(3)
+STEPS, SCORE, SEEN = range(3)
 
 
 def gather(records: torch.Tensor, places: np.ndarray, terms: int) -> Gaussians:
@@ -39,7 +38,8 @@ def step(
     records: torch.Tensor,
     places: np.ndarray,
     gradients: Sequence[torch.Tensor],
-    rendering: Rendering,
+    score: torch.Tensor,
+    seen: torch.Tensor,
     number: int,
     lr: torch.Tensor,
     betas: tuple[float, float] = adam.BETAS,
@@ -51,7 +51,8 @@ def step(
         records: (N, width).
         places: (M,) int64 of those that move, each once.
         gradients: (M, ...) of their values, in the order of ``Gaussians``.
-        rendering: of these splats, after ``backward``.
+        score: (M,).
+        seen: (M,) bool.
         number: of the step, from 1; no record has made more.
         lr: (C,) learning rates.
     """
@@ -60,10 +61,9 @@ def step(
     if records.device.type == "cpu":
         from .cpu.records import step as step_on_cpu
 
-        told = [each.contiguous().numpy() for each in (*gradients, rendering.grad2d)]
-        *told, grad2d = told
-        radii, rates = rendering.radii.numpy(), np.ascontiguousarray(lr.numpy(), np.float32)
-        step_on_cpu(records.numpy(), places, told, grad2d, radii, number, rates, betas, eps)
+        arrays = [each.contiguous().numpy() for each in gradients]
+        rates = np.ascontiguousarray(lr.numpy(), np.float32)
+        step_on_cpu(records.numpy(), places, arrays, score.numpy(), seen.numpy(), number, rates, betas, eps)
         return
     at, count = torch.from_numpy(places).to(records.device), len(lr)
     some = records[at]
@@ -72,6 +72,6 @@ def step(
     told[:, STEPS] += 1
     gradient = torch.cat([each.reshape(len(places), -1) for each in gradients], 1)
     adam.update_in_torch(values, gradient, m, v, lr, betas, eps, told[:, STEPS, None].double())
-    told[:, GRAD] = torch.maximum(told[:, GRAD], rendering.grad2d.norm(dim=1))
-    told[:, SEEN] = torch.where(rendering.radii > 0, float(number), told[:, SEEN])
+    told[:, SCORE] = torch.maximum(told[:, SCORE], score)
+    told[:, SEEN] = torch.where(seen, float(number), told[:, SEEN])
     records[at] = some

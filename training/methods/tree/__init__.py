@@ -31,6 +31,21 @@ class TreeParameters(ThreedgsParameters):
         unit="steps",
     )
 
+    grow_interval: int = parameter(
+        0,
+        "Steps between two density controls of the tree, after which leaves are split where the product of "
+        "'max_threshold' says so, as far as 'max_splats' leaves have room; 0: none.",
+        unit="steps",
+    )
+    grow_until: float = parameter(
+        0.85, "Share of 'tune_steps' after which the tree no longer changes its shape.", high=1
+    )
+    unseen_epochs: float = parameter(
+        0.0,
+        "With density control, leaves go that were in no image for so many times as many steps as there are "
+        "photographs; 0: none does.",
+    )
+
     @property
     def total_steps(self) -> int:
         return self.steps + self.base_steps
@@ -41,8 +56,12 @@ class TreeParameters(ThreedgsParameters):
 
 
 _DRAFT = TreeParameters()
-_STANDARD = replace(_DRAFT, **STANDARD, steps=30_000, densify_interval=100, tune_steps=10_000)
-_PAPER = replace(_STANDARD, **PAPER, pixels=3.0, sh_degree=1, tune_steps=150_000)
+_STANDARD = replace(
+    _DRAFT, **STANDARD, steps=30_000, densify_interval=100, tune_steps=10_000, grow_interval=1000
+)
+_PAPER = replace(
+    _STANDARD, **PAPER, pixels=3.0, sh_degree=1, tune_steps=150_000, max_threshold=0.0075, unseen_epochs=2.0
+)
 
 METHOD = MethodInfo(
     name="tree",

@@ -8,7 +8,7 @@ looks at: sorted by size, with means and sizes as they were when sizes were last
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import pairwise
 from math import prod
 from pathlib import Path
@@ -38,6 +38,10 @@ ENTRY = Layout({"node": (), "pair": (2,), "family": (12,)})
 """Of a list: a node and its children, by their numbers in the subtree, and the mean and size of each."""
 
 
+RecordPiece = tuple[torch.Tensor, Tree]
+"""As ``lod.forest.Piece``: the nodes' records, (., width), and the tree."""
+
+
 def default_budget(device: torch.device | str = "cpu") -> int:
     """Bytes for the nodes that are in memory if nothing is said: half of what is free."""
     if torch.device(device).type == "cuda":
@@ -46,12 +50,12 @@ def default_budget(device: torch.device | str = "cpu") -> int:
 
 
 def layout_of(sh_degree: int) -> Layout:
-    """What a node's record holds, see ``rasterize.records``."""
+    """What a node's record holds, see ``rasterize.records``: the score is ``density.peak_score``."""
     shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": ()}
     values: dict[str, tuple[int, ...]] = shapes | {"sh": ((sh_degree + 1) ** 2, 3)}
     count = sum(map(prod, values.values()))
     moments: dict[str, tuple[int, ...]] = {"first": (count,), "second": (count,)}
-    return Layout({**values, **moments, "steps": (), "grad": (), "seen": ()})
+    return Layout({**values, **moments, "steps": (), "score": (), "seen": ()})
 
 
 class Store:
@@ -65,6 +69,8 @@ class Store:
     Attributes:
         shape: where the pieces of the tree are among the rows.
         cache: of G + 1 groups: the subtrees, and the upper nodes, which are always all there.
+        columns: where each array of a record begins.
+        budget: of the cache, in bytes.
     """
 
     shape: ForestShape
@@ -72,8 +78,10 @@ class Store:
 
     def __init__(self, folder: Path, sh_degree: int, budget: int, device: torch.device | str = "cpu") -> None:
         self.layout = layout_of(sh_degree)
+        begins = np.cumsum([0, *map(prod, self.layout.shapes.values())]).tolist()
+        self.columns = dict(zip(self.layout.shapes, begins, strict=False))
         self._terms = (sh_degree + 1) ** 2
-        self._budget, self._device = budget, device
+        self.budget, self._device = budget, device
         self.rows = FileRows(folder, self.layout)
         self._lists = FileRows(folder, ENTRY, name="lists")
 
@@ -83,9 +91,16 @@ class Store:
     # -- a tree comes in -------------------------------------------------------------------------------
 
     def fill(self, forest: Forest) -> None:
-        """Takes a tree's pieces, one after the other; with it, it can be cut."""
+        """Takes a tree's pieces, one after the other; with them, it can be cut."""
+        self.fill_records(
+            ((self._records_of(splats), tree) for splats, tree in forest),
+            lambda: (self._records_of(forest.upper[0]), forest.upper[1]),
+        )
+
+    def fill_records(self, subtrees: Iterable[RecordPiece], upper: Callable[[], RecordPiece]) -> None:
+        """The same with records, which have moments; the upper tree is asked for when all others are here."""
         counts, waiting, nodes = [], [], 0
-        for piece in forest:
+        for piece in subtrees:
             counts.append(piece[1].leaves)
             waiting.append(piece)
             nodes += len(piece[0])
@@ -93,15 +108,15 @@ class Store:
                 self._append(waiting)
                 waiting, nodes = [], 0
         self._append(waiting)
-        splats, upper = forest.upper
-        self.rows.append(self._records(splats))
-        self._take_shape(ForestShape(np.array(counts, np.int64), upper))
+        records, tree = upper()
+        self.rows.append(records)
+        self._take_shape(ForestShape(np.array(counts, np.int64), tree))
         self.resize()
 
-    def _append(self, subtrees: list[Piece]) -> None:
+    def _append(self, subtrees: list[RecordPiece]) -> None:
         if not subtrees:
             return
-        self.rows.append(torch.cat([self._records(splats) for splats, _ in subtrees]))
+        self.rows.append(torch.cat([records for records, _ in subtrees]))
         entries = []
         for _, tree in subtrees:
             entry = np.zeros((len(tree.children), ENTRY.width), np.float32)
@@ -110,19 +125,17 @@ class Store:
             entries.append(entry)
         self._lists.append(torch.from_numpy(np.concatenate(entries)))
 
-    def _records(self, splats: Splats) -> torch.Tensor:
+    def _records_of(self, splats: Splats) -> torch.Tensor:
         records = np.zeros((len(splats), self.layout.width), np.float32)
-        begin = 0
         for name in NAMES:
-            end = begin + prod(self.layout.shapes[name])
-            records[:, begin:end] = getattr(splats, name).reshape(len(splats), end - begin)
-            begin = end
+            begin, size = self.columns[name], prod(self.layout.shapes[name])
+            records[:, begin : begin + size] = getattr(splats, name).reshape(len(splats), size)
         return torch.from_numpy(records)
 
     def _take_shape(self, shape: ForestShape) -> None:
         self.shape = shape
         self._mark_ends = np.cumsum(-(-(shape.counts - 1) // MARK))
-        self.cache = CutCache(self.rows, len(self.shape.counts) + 1, self._budget, self._device)
+        self.cache = CutCache(self.rows, len(self.shape.counts) + 1, self.budget, self._device)
 
     # -- cuts ------------------------------------------------------------------------------------------
 
@@ -136,18 +149,18 @@ class Store:
             LodgsError: there is no room for it.
         """
         k, eye = detail_of(camera.focal, pixels), camera.center
-        nodes, lists, least = self._top.walk(eye, k, image_of(camera, near))
+        nodes, lists, bands = self._top.walk(eye, k, image_of(camera, near))
         subtrees = len(self.shape.counts)
         alone, above = nodes[nodes < subtrees], nodes[nodes >= subtrees] - subtrees
         groups = np.append(alone, lists)
-        least = np.append(np.full(len(alone), np.inf), least)
+        bands = np.append(np.full((len(alone), 2), np.inf, np.float32), bands, axis=0)
         order = np.argsort(groups)
-        groups, least = groups[order], least[order]
+        groups, bands = groups[order], bands[order]
         distances = np.linalg.norm(self._top.balls[groups, :3] - eye, axis=1) / k
 
         def cut(anew: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             own = anew[anew < len(groups)]
-            rows, counts = self.cut(groups[own], least[own], eye, k)
+            rows, counts = self.cut(groups[own], bands[own], eye, k)
             if len(own) < len(anew):
                 rows = np.append(rows, np.arange(self.shape.ends[-1], len(self)))
                 counts = np.append(counts, subtrees - 1)
@@ -158,20 +171,21 @@ class Store:
         return np.append(below, top[np.sort(above)])
 
     def cut(
-        self, groups: np.ndarray, least: np.ndarray, eye: np.ndarray, k: float
+        self, groups: np.ndarray, bands: np.ndarray, eye: np.ndarray, k: float
     ) -> tuple[np.ndarray, np.ndarray]:
         """The rows (M,) int64 that an eye is shown of subtrees, ascending, and how many of each, (G,) int64.
 
         Args:
             groups: (G,) ascending.
-            least: (G,) as ``Upper.walk`` says it; infinite where the root is fine enough.
+            bands: (G, 2) as ``Upper.walk`` says them; infinite where the root is fine enough.
         """
         counts = np.ones(len(groups), np.int64)
-        rows = [self.shape.ends[groups[np.isinf(least)]] - 1]
-        searched = np.flatnonzero(np.isfinite(least))
-        lists, least = groups[searched], least[searched]
+        alone = np.isinf(bands[:, 0])
+        rows = [self.shape.ends[groups[alone]] - 1]
+        searched = np.flatnonzero(~alone)
+        lists, bands = groups[searched], bands[searched]
         begins, marks = self.shape.list_begins[lists], self._mark_ends[lists - 1] * (lists > 0)
-        lengths = MARK * (cut_off(self._marks, marks, self._mark_ends[lists], least) - marks)
+        lengths = MARK * (cut_off(self._marks, marks, self._mark_ends[lists], bands[:, 0]) - marks)
         lengths = np.minimum(lengths, self.shape.list_ends[lists] - begins)
         for some in _batches(lengths):
             entries = self._lists.read(_ranges(begins[some], lengths[some])).numpy()
@@ -179,7 +193,8 @@ class Store:
             pairs = (entries[:, 1:3] + first[:, None]).astype(np.int32)
             stops = np.cumsum(lengths[some])
             families = np.ascontiguousarray(entries[:, 3:])
-            found, counts[searched[some]] = search(pairs, families, stops - lengths[some], stops, eye, k)
+            lists_of = pairs, np.ascontiguousarray(families[:, 3::4]), families, stops - lengths[some], stops
+            found, counts[searched[some]] = search(*lists_of, bands[some], eye, k)
             rows.append(found)
         return np.sort(np.concatenate(rows).astype(np.int64)), counts
 
@@ -203,7 +218,8 @@ class Store:
             family = entries[:, :3].astype(np.int32) + begins[of_list, None].astype(np.int32)
             in_order = np.argsort(family[:, 0])
             order, tree = side_by_side(counts, family[in_order, 1:])
-            means, log_scales = (records[name].numpy() for name in ("means", "log_scales"))
+            values = self.layout.split(records)
+            means, log_scales = (values[name].numpy() for name in ("means", "log_scales"))
             sizes = np.empty(len(order), np.float32)
             sizes[order] = tree.sizes(means[order], log_scales[order])
             by_size = np.lexsort((-sizes[family[:, 0]], of_list))
@@ -225,11 +241,11 @@ class Store:
         low, high, reach = (np.concatenate(each) for each in zip(*bounds, strict=True))
         self._top = Upper.over(self.shape.upper, means, log_scales, sizes, (low, high, reach))
 
-    def _read(self, some: slice) -> tuple[dict[str, torch.Tensor], np.ndarray]:
-        """The records and the lists' entries (., 15) of some subtrees."""
+    def _read(self, some: slice) -> tuple[torch.Tensor, np.ndarray]:
+        """The records (., width) and the lists' entries (., 15) of some subtrees."""
         begin, end = int(self.shape.begins[some.start]), int(self.shape.ends[some.stop - 1])
         entries = self._lists.read(self._of_lists(some)).numpy()
-        return self.layout.split(self.rows.read(np.arange(begin, end))), entries
+        return self.rows.read(np.arange(begin, end)), entries
 
     def _of_lists(self, some: slice) -> np.ndarray:
         """Where the lists of some subtrees are."""
@@ -239,6 +255,17 @@ class Store:
 
     def __iter__(self) -> Iterator[Piece]:
         """The subtrees as they are now: a store is a ``Forest``."""
+        for records, tree in self.records():
+            yield self._splats(records), tree
+
+    @property
+    def upper(self) -> Piece:
+        """The upper tree as it is now."""
+        records, tree = self.upper_records()
+        return self._splats(records), tree
+
+    def records(self) -> Iterator[RecordPiece]:
+        """The subtrees' records as they are now, (2n - 1, width) each."""
         self.cache.write_back()
         for some in _batches(2 * self.shape.counts - 1):
             records, entries = self._read(some)
@@ -246,15 +273,23 @@ class Store:
             for leaves in self.shape.counts[some].tolist():
                 children = entries[entry : entry + leaves - 1, :3].astype(np.int32)
                 children = children[np.argsort(children[:, 0]), 1:]
-                yield _splats(records, slice(row, row + 2 * leaves - 1)), Tree(children)
+                yield records[row : row + 2 * leaves - 1], Tree(children)
                 row, entry = row + 2 * leaves - 1, entry + leaves - 1
 
-    @property
-    def upper(self) -> Piece:
-        """The upper tree as it is now."""
+    def upper_records(self) -> RecordPiece:
+        """The upper tree's, (G - 1, width)."""
         self.cache.write_back()
-        records = self.layout.split(self.rows.read(np.arange(self.shape.ends[-1], len(self))))
-        return _splats(records, slice(None)), self.shape.upper
+        return self.rows.read(np.arange(self.shape.ends[-1], len(self))), self.shape.upper
+
+    def _splats(self, records: torch.Tensor) -> Splats:
+        values = self.layout.split(records)
+        means, quats, log_scales, opacity_logits, sh = (values[name].numpy().copy() for name in NAMES)
+        return Splats(means, quats, log_scales, opacity_logits, sh)
+
+    def rest(self) -> None:
+        """Writes back what has changed, and gives the cache's memory back: no view can be taken any more."""
+        self.cache.write_back()
+        self.cache = CutCache(self.rows, 0, 0, self._device)
 
     # -- what lasts ------------------------------------------------------------------------------------
 
@@ -289,11 +324,6 @@ class Store:
         self._top = Upper(self.shape.upper, arrays["balls"], arrays["boxes"])
         self._lists.load_state_dict(state["lists"])
         self.cache.load_state_dict(state["cache"])
-
-
-def _splats(records: Mapping[str, torch.Tensor], some: slice) -> Splats:
-    means, quats, log_scales, opacity_logits, sh = (records[name][some].numpy().copy() for name in NAMES)
-    return Splats(means, quats, log_scales, opacity_logits, sh)
 
 
 def _batches(lengths: np.ndarray) -> Iterator[slice]:

@@ -5,7 +5,7 @@ draws its cut, a little coarser at random (A.6, "Varying level of detail"), and 
 alone, as if they were a scene of their own.
 
 From then on the nodes are outside memory (``store``), and views come in an order that stays near (Sec. 4.4).
-The paper's density control on the tree (Sec. 4.2) would stand in :meth:`Method.control_density`.
+Density control (Sec. 4.2) makes a new store of the old one (``density``).
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from ...splats.bundle import Level
 from ...splats.gaussians import Splats
 from ...splats.ply import Columns
 from ..data import TrainingView
+from ..density import peak_score
 from ..method import Drawing
 from ..schedules import due
 from ..start import from_splats
@@ -33,6 +34,7 @@ from ..threedgs.refining import Refining
 from ..walk import Walk
 from . import TreeParameters
 from .build import GrowingForest
+from .density import Growing
 from .store import Store, default_budget
 
 
@@ -58,8 +60,9 @@ class SeenRecords:
         for values in vars(self.gaussians).values():
             values.requires_grad_()
 
+    @torch.no_grad()
     def step(self) -> None:
-        """One step of these records."""
+        """One step of these records, and what density control asks for."""
         leaves = vars(self.gaussians)
         gradients = [leaf.grad for leaf in leaves.values() if leaf.grad is not None]
         if len(gradients) < len(leaves):  # nothing of them is in the picture
@@ -68,8 +71,10 @@ class SeenRecords:
             torch.as_tensor(self._lr[name]).float().expand(leaf.shape[1:]).reshape(-1)
             for name, leaf in leaves.items()
         ]
-        cache = self._store.cache
-        records.step(cache.records, self._places, gradients, self.rendering, self._number, torch.cat(rates))
+        cache, drawn = self._store.cache, self.rendering
+        score = peak_score(drawn.grad2d.norm(dim=1), drawn.radii, self.gaussians.opacity_logits)
+        told = score, drawn.radii > 0, self._number
+        records.step(cache.records, self._places, gradients, *told, torch.cat(rates))
         cache.changed(self._places)
 
     def zero_grad(self) -> None:
@@ -174,6 +179,24 @@ class Method(Refining):
         super().accumulate_stats(drawings, view, step)
         if isinstance(self._optimizer, SeenRecords):
             self._optimizer.rendering = drawings[0].rendering
+
+    def control_density(self, step: int) -> None:
+        super().control_density(step)
+        p, done = self.parameters, step - self.finest_steps
+        if self.store is None or done > p.grow_until * p.tune_steps or not due(p.grow_interval, done):
+            return
+        growing = Growing(
+            self.store,
+            threshold=p.max_threshold * self.data.threshold_scale,
+            min_opacity=p.min_opacity,
+            unseen_since=done + 1 - round(p.unseen_epochs * len(self.data.train)) if p.unseen_epochs else 0,
+            now=done + 1,
+            most=p.max_splats,
+        )
+        grown = self._new_store(self.store.budget)
+        grown.fill_records(growing, lambda: growing.upper)
+        self.store.close()
+        self.store = grown
 
     @torch.no_grad()
     def _build_step(self, step: int) -> tuple[float, torch.Tensor, Target]:

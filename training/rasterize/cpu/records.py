@@ -40,7 +40,7 @@ def _move(records, first, count, extent, gradient, place, lr, keep, keep_m, keep
 
 @kernel(STRICT)
 def _step(
-    begin, end, records, width, places, means, quats, log_scales, opacity_logits, sh, grad2d, radii, number,
+    begin, end, records, width, places, means, quats, log_scales, opacity_logits, sh, score, seen, number,
     lr, bias_m, bias_v, keep_m, keep_v, eps,
 ):  # fmt: skip
     """All arrays flat."""
@@ -58,9 +58,8 @@ def _step(
         _move(records, i + 7, count, 3, log_scales, 3 * k, lr[7:], *rest)
         _move(records, i + 10, count, 1, opacity_logits, k, lr[10:], *rest)
         _move(records, i + 11, count, terms, sh, terms * k, lr[11:], *rest)
-        x, y = grad2d[2 * k], grad2d[2 * k + 1]
-        records[told + 1] = max(records[told + 1], np.sqrt(x * x + y * y))
-        if radii[k] > 0:
+        records[told + 1] = max(records[told + 1], score[k])
+        if seen[k]:
             records[told + 2] = number
 
 
@@ -80,11 +79,11 @@ def gather(records, places, arrays) -> None:
 
 
 @serialised
-def step(records, places, gradients, grad2d, radii, number, lr, betas, eps) -> None:
+def step(records, places, gradients, score, seen, number, lr, betas, eps) -> None:
     """As ``rasterize.records.step``, of arrays."""
     made = _corrections(betas, 1 << int(number + 1).bit_length())
-    flat = (array.reshape(-1) for array in (*gradients, grad2d))
+    flat = (array.reshape(-1) for array in gradients)
     in_parallel(
-        _step, len(places), _GRAIN, records.reshape(-1), records.shape[1], places, *flat, radii, f32(number),
-        lr, *made, f32(betas[0]), f32(betas[1]), f32(eps),
+        _step, len(places), _GRAIN, records.reshape(-1), records.shape[1], places, *flat, score, seen,
+        f32(number), lr, *made, f32(betas[0]), f32(betas[1]), f32(eps),
     )  # fmt: skip

@@ -48,7 +48,8 @@ def test_a_cut_made_anew_is_that_of_hspt_in_memory(town, tmp_path, longest, monk
     monkeypatch.setattr(store_module, "AT_ONCE", 300)  # many parts of everything
     nodes, tree = town
     made = stored(tmp_path, town, longest=longest)
-    order, _ = shape_of(tree, longest or longest_of(tree.leaves))
+    longest = longest or longest_of(tree.leaves)
+    order, _ = shape_of(tree, longest)
     sizes = tree.sizes(nodes.means, nodes.log_scales)
     hspt = Hspt(tree, nodes.means, sizes, nodes.log_scales, longest)
     found = 0
@@ -86,8 +87,9 @@ def test_sizes_follow_what_has_moved(town, tmp_path, monkeypatch):
         moved(made, seed)
         made.resize()
         nodes, tree = joined(made)
-        order, _ = shape_of(tree, longest_of(tree.leaves))
-        hspt = Hspt(tree, nodes.means, tree.sizes(nodes.means, nodes.log_scales), nodes.log_scales)
+        longest, sizes = longest_of(tree.leaves), tree.sizes(nodes.means, nodes.log_scales)
+        order, _ = shape_of(tree, longest)
+        hspt = Hspt(tree, nodes.means, sizes, nodes.log_scales, longest)
         for camera in cameras(np.random.default_rng(5), 4):
             made.cache.forget()
             rows = made.cache.rows_at(made.take(camera, 0.7, 0.3))

@@ -192,3 +192,34 @@ def test_a_run_goes_on_to_the_bit(data, stop):
     after = before + trained(second, stop)
     assert [level.number for level in after] == [level.number for level in levels]
     assert all(same(one.splats, other.splats) for one, other in zip(levels, after, strict=True))
+
+
+def test_a_tree_grows_where_photographs_ask_for_it(data, base):
+    """As far as there is room; and it goes on to the bit from before and after."""
+    values = {
+        "tune_steps": 24,
+        "grow_interval": 6,
+        "grow_until": 0.6,
+        "max_threshold": 1e-5,
+        "unseen_epochs": 1.0,
+    }
+    values["max_splats"] = len(base) + 60
+    tree = make(data, base, **values)
+    counts = []
+    for step in range(tree.steps):
+        tree.train_step(step)
+        counts.append(int(tree.store.shape.counts.sum()))
+    assert counts[5] == len(base) and counts[6] == len(base) + 60
+    assert counts[-1] == counts[13] <= len(base) + 60
+    (above, leaves), *_ = [tree.levels_after(tree.steps - 1)]
+    assert len(leaves.splats) == counts[-1] == len(above.splats) + 1
+    for pause in (4, 9, 14):
+        other = make(data, base, **values)
+        trained(other, until=pause)
+        kept = io.BytesIO()
+        torch.save(other.state_dict(), kept)
+        kept.seek(0)
+        again = make(data, base, **values)
+        again.load_state_dict(torch.load(kept, weights_only=True))
+        trained(again, begin=pause)
+        assert torch.equal(records(again), records(tree))
