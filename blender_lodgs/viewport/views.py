@@ -39,6 +39,9 @@ finished: no redraw is to be held up for 0.05 seconds."""
 GROWTH = 1.5
 """By how much more splats a picture that is not complete is drawn again."""
 
+NOTHING = -1
+"""Of what has come from files, until a viewport has drawn what the scene itself holds."""
+
 reads = 0
 """How often all splats were read since Blender started."""
 
@@ -120,7 +123,8 @@ def draw(context: bpy.types.Context) -> None:
         region_data.view_matrix, region_data.window_matrix, settings.budget, moving=True,
         under_overlays=space.overlay.show_overlays and not _shows_photograph(context),
     )  # fmt: skip
-    if view.pending is not None or view.loading is not None or view.resolution < 1 or _busy():
+    waits = view.pending is not None or view.loading is not None or view.arrived != _arrived()
+    if waits or view.resolution < 1 or _busy():
         _wake_later()
 
 
@@ -206,11 +210,12 @@ def prepare(
         view.pending = view.loading = view.missing = None
         return Request((), (0.0, 0.0, 1.0), budget)
     _all.add(view)
+    before, view.arrived = view.arrived, 0
     instances = _from_files(view, instances, depsgraph, moving, wait)
     of, clouds = _read(instances, depsgraph)
     take_over = wait or not any(other.reads(of) for other in _all if other is not view)
-    if take_over:
-        view.arrived = _arrived()
+    if view.arrived != NOTHING:
+        view.arrived = _arrived() if take_over else before
     placements = _placements(instances, of, depsgraph, moving, take_over)
     request = Request(placements, tuple(view_matrix[2][:3]), budget)
     _arrange(view, of, request, wait, take_over)
@@ -257,6 +262,8 @@ def _from_files(
             begun = wait or there in _keys.values() or (view.arrangement and not view.loading)
             if there.ready and begun:
                 ready.append(source)
+            elif there.ready:
+                view.arrived = NOTHING
     kept = [each if each.source in ready else replace(each, source=None) for each in instances]
     return shown.without_coarser(kept)
 
@@ -474,7 +481,7 @@ def _wake() -> float | None:
                 more = view.loading is not None or view.arrived != _arrived()
                 if still or more or (view.pending and view.pending[2].done()):
                     region.tag_redraw()
-                waiting |= bool(view.loading or view.pending) or view.resolution < 1
+                waiting |= more or view.pending is not None or view.resolution < 1
     if (told := [(each.splats, each.busy) for each in _streams.values()]) != _told:
         _told = told
         extension.redraw()
