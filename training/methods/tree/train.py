@@ -139,14 +139,11 @@ class Method(Refining):
         return self.parameters.pixels * (1 + self.parameters.lod_noise * r**4)
 
     def _shares(self, rows: torch.Tensor, step: int) -> torch.Tensor:
-        """The shares (M,) of the learning rates that nodes (M,) move with: leaves are slow, and come to rest.
-
-        They are good as they are, and nodes above them are not.
-        """
+        """The shares (M,) of the learning rates that nodes (M,) move with: leaves come to rest."""
         assert self.tree is not None
         done = (step - self.finest_steps) / self.parameters.tune_steps
         slow = self.parameters.leaf_rate * LEAF_REST**done
-        return torch.where(rows < self.tree.leaves, slow, 1.0)
+        return torch.where(rows < self.tree.leaves, slow, self.parameters.node_rate)
 
     # -- what lasts ------------------------------------------------------------------------------------
 

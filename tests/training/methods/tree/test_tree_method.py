@@ -87,7 +87,7 @@ def test_leaves_of_rate_0_stay_to_the_bit_while_nodes_learn(data, base):
 
 def test_leaves_come_to_rest(data, base):
     """Their rate falls to a tenth, the nodes' does not."""
-    tree = make(data, base, leaf_rate=0.2, tune_steps=400)
+    tree = make(data, base, leaf_rate=0.2, node_rate=3.0, tune_steps=400)
     trained(tree, until=1)
     rows = torch.arange(len(tree.tree))
     for step, share in ((1, 0.2), (201, 0.2 * 10**-0.5), (401, 0.02)):
@@ -95,7 +95,7 @@ def test_leaves_come_to_rest(data, base):
         torch.testing.assert_close(
             found[: tree.tree.leaves], torch.tensor(share).expand(tree.tree.leaves), rtol=0.01, atol=0
         )
-        assert (found[tree.tree.leaves :] == 1).all()
+        assert (found[tree.tree.leaves :] == 3).all()
 
 
 def test_sizes_are_saturated_after_training(data, base):
