@@ -32,7 +32,7 @@ class TreeParameters(ThreedgsParameters):
         2.0, "Learning rates of nodes above leaves, in multiples of those that 3DGS ends with.", high=100
     )
     leaf_rate: float = parameter(
-        0.1, "The same of leaves, which falls to a tenth of it; 0 leaves all leaves as they are.", high=100
+        0.3, "The same of leaves, which falls to a tenth of it; 0 leaves all leaves as they are.", high=100
     )
     resize_interval: int = parameter(
         1000,
