@@ -159,6 +159,12 @@ def test_a_bundle_tells_which_blocks_an_eye_needs(data, base):
         assert table["parent_size"][row] == level.splats.extras["parent_size"].max()
 
 
+def test_pictures_begin_with_the_granularity_that_was_trained(data, base):
+    tree = make(data, base, tune_steps=0, pixels=3.0)
+    bundle = Bundle("tree", trained(tree), "cut", controls=tree.controls())
+    assert settings(bundle, {})["pixels"] == 3
+
+
 def test_noise_is_coarser_most_at_its_end(data, base):
     tree = make(data, base, pixels=2.0, lod_noise=5.0)
     found = np.array([tree._pixels(step) for step in range(4000)])
