@@ -28,11 +28,11 @@ class TreeParameters(ThreedgsParameters):
         "are coarse.",
         high=100,
     )
+    node_rate: float = parameter(
+        2.0, "Learning rates of nodes above leaves, in multiples of those that 3DGS ends with.", high=100
+    )
     leaf_rate: float = parameter(
-        0.1,
-        "Learning rates of leaves, as a share of those of the nodes above them; they fall to a tenth of it. "
-        "0 leaves all leaves as they are.",
-        high=1,
+        0.3, "The same of leaves, which falls to a tenth of it; 0 leaves all leaves as they are.", high=100
     )
     resize_interval: int = parameter(
         1000,
@@ -80,6 +80,7 @@ _PAPER = replace(
     **PAPER,
     pixels=3.0,
     lod_noise=5.0,
+    node_rate=1.0,
     sh_degree=1,
     tune_steps=150_000,
     max_threshold=0.0075,

@@ -235,14 +235,11 @@ class Method(Refining):
         return self.parameters.pixels * (1 + self.parameters.lod_noise * r**4)
 
     def _shares(self, places: np.ndarray, step: int) -> torch.Tensor:
-        """The shares (M,) of the learning rates that records move with: leaves are slow, and come to rest.
-
-        They are good as they are, and nodes above them are not.
-        """
+        """The shares (M,) of the learning rates that records (M,) move with: leaves come to rest."""
         assert self.store is not None
         done = (step - self.finest_steps) / max(self.parameters.tune_steps, 1)
         slow = self.parameters.leaf_rate * LEAF_REST**done
-        return torch.where(torch.from_numpy(self.store.are_leaves(places)), slow, 1.0)
+        return torch.where(torch.from_numpy(self.store.are_leaves(places)), slow, self.parameters.node_rate)
 
     # -- what lasts ------------------------------------------------------------------------------------
 

@@ -106,7 +106,7 @@ def test_leaves_of_rate_0_stay_to_the_bit_while_nodes_learn(data, base):
 
 def test_leaves_come_to_rest(data, base):
     """Their rate falls to a tenth, the nodes' does not."""
-    tree = make(data, base, leaf_rate=0.2, tune_steps=400)
+    tree = make(data, base, leaf_rate=0.2, node_rate=3.0, tune_steps=400)
     trained(tree, until=1)
     camera = data.train[0]
     places = tree.store.take(camera, 16.0, data.near)
@@ -114,7 +114,7 @@ def test_leaves_come_to_rest(data, base):
     assert above.any() and not above.all()
     for step, share in ((1, 0.2), (201, 0.2 * 10**-0.5), (401, 0.02)):
         found = tree._shares(places, step).numpy()
-        np.testing.assert_allclose(found, np.where(above, 1, share), rtol=0.01)
+        np.testing.assert_allclose(found, np.where(above, 3, share), rtol=0.01)
 
 
 def test_sizes_are_saturated_after_training(data, base):
@@ -175,6 +175,12 @@ def test_a_bundle_tells_which_blocks_an_eye_needs(data, base):
     assert table["level"].tolist() == [1, 2]  # of fewer than 512 rows each
     for row, level in enumerate(levels):
         assert table["parent_size"][row] == level.splats.extras["parent_size"].max()
+
+
+def test_pictures_begin_with_the_granularity_that_was_trained(data, base):
+    tree = make(data, base, tune_steps=0, pixels=3.0)
+    bundle = Bundle("tree", trained(tree), "cut", controls=tree.controls())
+    assert settings(bundle, {})["pixels"] == 3
 
 
 def test_noise_is_coarser_most_at_its_end(data, base):
