@@ -14,11 +14,12 @@ import bpy
 
 from ..training.errors import LodgsError
 from ..training.evaluate.words import summary_lines
+from ..training.lod.describe import describe
 from ..training.methods.describe import describe_method, describe_methods
 from ..training.runs.folder import RunFolder
 from ..training.runs.job import Job
 from ..training.runs.options import add_options, job_from
-from ..training.splats.bundle import describe, write_bundle
+from ..training.splats.bundle import write_bundle
 from . import extension
 from .data import scenes
 from .runs import environment, jobs

@@ -2,11 +2,11 @@
 
     python tools/attacks.py [--kills 60] [--disks 20] [--seed 0]
 
-Runs of seconds on a tiny scene with a distorted lens, one of a tree without room for its nodes; not where
-processes do not fork, on Windows. A killed run is resumed, and killed again, and must end with the bits of an
-undisturbed one, with no file too many. A disk (a tmpfs, for which one has to be root on Linux) that is too
-small must be told as Blender's panel tells it, in a sentence, and given room the run must end as well as any.
-Figures go to build/attacks.json.
+Runs of seconds on a tiny scene with a distorted lens, one of a tree without room for its nodes; not on
+Windows, where processes do not fork. A killed run is resumed, and killed again, and must end with the bits of
+an undisturbed one, with no file too many. A disk (a tmpfs, for which one has to be root on Linux) that is too
+small must be told as Blender's panel tells it, in a sentence, and given room the run must end as well
+as any. Figures go to build/attacks.json.
 """
 
 from __future__ import annotations

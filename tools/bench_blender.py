@@ -9,10 +9,14 @@ Viewport, where this Blender has graphics in background: what the main thread do
 Blender's own evaluation (the rules, the list of splats onto the graphics card), what the thread beside it
 does (choosing and sorting), how long the first picture's splats take onto the card, from their attributes,
 and what comes there later.
+Streaming, there as well: a tree is flown through of which a part fits into the budget. How long each redraw
+holds up the main thread, all that LODGS does there but drawing itself, and how soon all has come at the end.
+``--tree FILE --budget N`` takes a bundle of your own, of ten million splats say.
 """
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import os
 import sys
@@ -20,6 +24,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import patch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
@@ -27,6 +32,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import numpy as np
 import plyfile
 
+from tests.training.lod.trees import random_leaves, tree_of, write_in_pages
 from tools.blender_module import EXTENSION, start_blender
 
 COUNTS = (10_000, 100_000, 1_000_000)
@@ -176,8 +182,81 @@ def viewport(bpy, count: int) -> None:
     )
 
 
+def streaming(bpy, path: Path, budget: int, frames: int = 100) -> None:
+    """Prints what a flight through a tree in a file costs the main thread."""
+    import gpu
+    from mathutils import Matrix
+
+    if not hasattr(gpu, "init"):
+        print("streaming: not measured, this Blender has no graphics in background")
+        return
+    gpu.init()
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    views, eye, shown = (
+        load(f"blender_lodgs.{name}") for name in ("viewport.views", "viewport.eye", "data.shown")
+    )
+    begun = time.perf_counter()
+    root = load("blender_lodgs.data.scenes").import_splats(bpy.context, path, upright=False, budget=budget)
+    imported = time.perf_counter() - begun
+    means = load("blender_lodgs.data.objects").read_splats(root.lodgs.levels[-1].object).means
+    low, high = np.quantile(means, (0.2, 0.8), axis=0)
+    region, view = SimpleNamespace(as_pointer=lambda: 1, width=1000), views.ViewState()
+    projection = Matrix(((2, 0, 0, 0), (0, 2, 0, 0), (0, 0, -1, -0.1), (0, 0, -1, 0)))
+
+    def redraw(place: np.ndarray) -> tuple[float, float]:
+        look = Matrix.Translation(-place)
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        wall, own = time.perf_counter(), time.thread_time()
+        looks = SimpleNamespace(view_matrix=look, window_matrix=projection @ look, view_distance=1.0)
+        eye.on_draw(region, bpy.context.scene, looks, splats=True)
+        views.prepare(view, shown.splat_instances(depsgraph), depsgraph, look, 2_000_000, moving=True)
+        return time.perf_counter() - wall, time.thread_time() - own
+
+    def wait() -> float:
+        begun = time.perf_counter()
+        while not (stream := views.stream(root)) or stream.busy or view.pending or view.loading:
+            spent.append(redraw(places[-1]))
+            time.sleep(1 / 60)
+        return time.perf_counter() - begun
+
+    spent: list[tuple[float, float]] = []
+    places = [low]
+    first = redraw(low)  # of what the scene holds, as after any import
+    came = wait()
+    way = np.linspace(0, 1, frames)[:, None]
+    places = list(low + (high - low) * way)
+    for place in places:
+        spent.append(redraw(place))
+        time.sleep(1 / 60)
+    settled = wait()
+    update = least(
+        lambda: (eye.follow(bpy.context.scene, tuple(low), 1000.0), bpy.context.view_layer.update()), 1
+    )
+    stream = views.stream(root)
+    assert stream is not None and not stream.problem, stream and stream.problem
+    wall, own = 1e3 * np.array(spent).T
+    print(
+        f"streaming, {stream.source.total:,} splats with a budget of {budget:,}, {stream.splats:,} read;"
+        f" ms of the main thread, {len(spent)} redraws:\n"
+        f"  longest {wall.max():.1f} ({own.max():.1f} of the processor), 99 % {np.quantile(wall, 0.99):.1f},"
+        f" median {np.median(wall):.1f}; import {1e3 * imported:.0f}, first redraw {1e3 * first[0]:.0f},"
+        f" modifiers when the view rests {1e3 * update:.0f};\n"
+        f"  all there {came:.1f} s after opening, {settled:.1f} s after the flight"
+    )
+    views.clear()
+    views.close_streams()
+
+
 def main() -> None:
+    parser = argparse.ArgumentParser(description="what LODGS costs in Blender, against the number of splats")
+    parser.add_argument("--tree", type=Path, help="measure only streaming, of this bundle")
+    parser.add_argument("--budget", type=int, default=1_000_000, help="splats in memory of --tree")
+    chosen = parser.parse_args()
     bpy = start_blender()
+    if chosen.tree:
+        streaming(bpy, chosen.tree, chosen.budget)
+        sys.stdout.flush()
+        os._exit(0)
     print(f"Blender {bpy.app.version_string}; seconds, SH degree 3")
     print(f"{'splats':>9} {'import':>8} {'plyfile':>8} {'ratio':>6} {'select':>8} {'numpy':>8} {'ratio':>6}")
     with tempfile.TemporaryDirectory() as folder:
@@ -203,6 +282,11 @@ def main() -> None:
     else:
         print("F12: not measured, set LODGS_TRAINER_PYTHON")
     viewport(bpy, 500_000)
+    with tempfile.TemporaryDirectory() as folder:
+        write_in_pages(
+            Path(folder) / "tree.ply", tree_of(random_leaves(150_000, np.random.default_rng(0), 3))
+        )
+        streaming(bpy, Path(folder) / "tree.ply", 100_000)
     sys.stdout.flush()
     os._exit(0)  # Blender 4.5 as a module can hang when Python ends
 

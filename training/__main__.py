@@ -273,7 +273,7 @@ def _serve(chosen: argparse.Namespace) -> int:
 
 
 def _info(chosen: argparse.Namespace) -> int:
-    from .splats.bundle import describe
+    from .lod.describe import describe
 
     print(describe(chosen.file))
     return 0

@@ -106,6 +106,32 @@ class SplatTable(bpy.types.PropertyGroup):
         return obj is not None and obj.type == "MESH" and bool(obj.users_collection)
 
 
+class SplatStream(bpy.types.PropertyGroup):
+    """The file of a tree of which a splat scene holds the top; see ``streams``."""
+
+    file: bpy.props.StringProperty(
+        name="File",
+        description="The bundle from which finer splats are read as the eye comes near",
+        subtype="FILE_PATH",
+        update=_changed,
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
+    )
+    budget: bpy.props.IntProperty(
+        name="Splats at Most",
+        description="How many splats are in memory at most: those that the scene holds, and those that are "
+        "read from the file. Where the view needs more, they are coarser everywhere",
+        default=1_000_000,
+        min=1024,
+        soft_max=16_000_000,
+        max=16_000_000,
+        step=10_000,
+        update=_changed,
+        options=set(),
+    )
+    total: bpy.props.IntProperty(name="Splats", description="How many splats the file has")
+    here: bpy.props.IntProperty(name="Splats Here", description="How many of them the scene's levels hold")
+
+
 def _level_set(rule: Rule, control: Control):
     """For a control that names a level: it stays among those that there are, and takes the other along."""
 
@@ -229,6 +255,10 @@ class SplatScene(bpy.types.PropertyGroup):
         type=SplatTable, name="Tables", description="What the rule knows besides the splats"
     )
 
+    stream: bpy.props.PointerProperty(
+        name="Streaming", description="The file of which the levels are the top", type=SplatStream
+    )
+
     mode: bpy.props.EnumProperty(
         name="Detail",
         description="Which levels are shown",
@@ -261,7 +291,8 @@ class SplatScene(bpy.types.PropertyGroup):
                 "VIEW",
                 "Viewport",
                 "Your own view, of the 3D viewport that moved last. Renders keep what it saw: choose the "
-                "scene camera for them",
+                "scene camera for them. Of a scene that is read from its file they show what their camera "
+                "needs",
             ),
         ],
         update=_whose_eye_changed,
@@ -462,7 +493,7 @@ SplatScene.__annotations__ |= {
 
 CLASSES = (
     ViewSettings, ViewportSettings, *PARAMETERS.values(), TrainingSettings, SplatLevel, SplatTable,
-    *CONTROLS.values(), SplatScene, RenderSettings,
+    SplatStream, *CONTROLS.values(), SplatScene, RenderSettings,
 )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...training.errors import LodgsError
-from ...training.lod.paging import is_tree, read_within
+from ...training.lod.paging import TreeFile, is_tree, read_within
 from ...training.lod.rule import Control, Tables, find_rule
 from ...training.lod.selection import complete, known_rule, not_alone, unknown_rule
 from ...training.methods import METHODS
@@ -25,7 +25,7 @@ from ...training.scenes.colmap import Scene, read_scene
 from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder, read_head
 from ...training.splats.gaussians import Splats
 from ..nodes import ellipsoids
-from . import objects, selection, tables
+from . import objects, selection, streams, tables
 from .photographs import match_render, new_camera, views
 
 LINKED = (
@@ -162,7 +162,9 @@ def import_splats(
     """A bundle, a folder of levels, or any 3DGS PLY as a single level, as a new splat scene.
 
     Args:
-        budget: most splats of a tree of splats, whose coarser ones stand for the others then; 0: all.
+        budget: most splats of a tree of splats in memory; 0: all. Of a larger one the coarsest are imported,
+            which stand for the others; where LODGS itself draws, others are read from the file as the eye
+            comes near (``streams``).
         upright: turn the root as the bundle says, or without that so that -y, which is up in most splat
             files, is up; otherwise leave the axes.
         warn: receives a sentence for each thing that is shown otherwise than the file's maker shows it.
@@ -173,12 +175,17 @@ def import_splats(
     Raises:
         LodgsError: the file cannot be read, or what it says is not possible. Nothing is left behind then.
     """
-    path = Path(path)
+    path, missing = Path(path), 0
     if budget and not path.is_dir() and is_tree(read_head(path)):
-        bundle, total = read_within(path, budget)
+        total = TreeFile(path).total
+        bundle, _ = read_within(path, budget if total <= budget else max(int(streams.HELD * budget), 1))
         here = sum(len(level.splats) for level in bundle.levels)
-        if here < total:
-            warn(f"{here:,} of {total:,} splats are here: coarser ones stand for the others.")
+        missing = total - here
+        if missing:
+            warn(
+                f"{here:,} of {total:,} splats are here: coarser ones stand for the others, which are read "
+                f"from {path.name} where viewports and renders of LODGS need them."
+            )
     else:
         bundle = (read_folder if path.is_dir() else read_bundle)(path, warn)
     with _new_scene(context, path.stem) as root:
@@ -191,6 +198,9 @@ def import_splats(
         set_tables(root, bundle.tables)
         root.lodgs.single_level = bundle.levels[-1].number
         root.lodgs.training.method = next(info.name for info in METHODS.values() if info.for_splats)
+        if missing:
+            streams.begin(root, path, budget, total)
+            root.lodgs.eye = "VIEW"  # so that what is looked at comes
     if bundle.rule and not root.lodgs.by_distance:
         warn(" ".join(unknown_rule(bundle.rule)))
     return root

@@ -7,13 +7,13 @@ what its modifiers leave, so that distances and fading count.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import bpy
 import numpy as np
 
 from .. import attributes
-from . import scenes
+from . import scenes, selection, streams
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,8 @@ class SplatInstance:
         matrix_world: (4, 4) float64, from the splats' space to Blender's world.
         level: number of the level in its splat scene, 1 is the coarsest; 0 for splats that are no level.
         antialias: see ``SplatScene.antialias``.
+        source: from where finer splats are to be read than the levels of its scene hold. All of them are
+            instances beside it then, and what is read stands for them all, in the place of the finest.
     """
 
     object: bpy.types.Object
@@ -33,6 +35,7 @@ class SplatInstance:
     matrix_world: np.ndarray
     level: int
     antialias: bool
+    source: streams.Source | None = None
 
 
 @dataclass(frozen=True)
@@ -92,7 +95,51 @@ def splat_instances(
         level, root = levels.get(original) or (0, scenes.root_of(original))
         antialias = root is not None and root.lodgs.antialias
         found.append(SplatInstance(original, evaluated, matrix, level, antialias))
-    return sorted(found, key=lambda instance: (instance.level, instance.object.name))
+    found.sort(key=lambda instance: (instance.level, instance.object.name))
+    return _with_sources(found, depsgraph)
+
+
+def without_coarser(instances: list[SplatInstance]) -> list[SplatInstance]:
+    """The same, where what is read from files stands for all levels of its scene."""
+    return [each for each in instances if each.source is None or each.level == each.source.level]
+
+
+def choice_of_picture(instance: SplatInstance, depsgraph: bpy.types.Depsgraph) -> selection.Choice | None:
+    """By what a picture of the scene's camera chooses an instance's splats; None where all are shown.
+
+    That is what modifiers choose by. Where the eye is the viewport's, there is more to be read of a file than
+    that has seen: the camera asks for itself.
+    """
+    choice = selection.choice(instance.evaluated, depsgraph)
+    root, camera = scenes.root_of(instance.object), depsgraph.scene.camera
+    if choice is None or instance.source is None or root is None or camera is None:
+        return choice
+    settings = root.lodgs
+    if settings.eye != "VIEW" or settings.freeze:
+        return choice
+    own, place = root.evaluated_get(depsgraph), camera.evaluated_get(depsgraph).matrix_world.translation
+    eye = tuple(own.matrix_world.inverted_safe() @ place)
+    return replace(choice, eye=eye, focal_px=own.lodgs.focal_px)
+
+
+def _with_sources(found: list[SplatInstance], depsgraph: bpy.types.Depsgraph) -> list[SplatInstance]:
+    """The same, with sources where all levels stand together, chosen by nothing but their rule."""
+    sources = {root: source for root in scenes.roots(depsgraph.scene) if (source := streams.source_of(root))}
+    if not sources:
+        return found
+    of = {item.object: root for root in sources for item in root.lodgs.levels if item.exists}
+    together: dict[tuple, set[int]] = {}
+    for each in found:
+        if each.object in of and selection.only_chosen(each.evaluated, depsgraph):
+            together.setdefault((of[each.object], each.matrix_world.tobytes()), set()).add(each.level)
+    numbers = {root: {item.number for item in root.lodgs.levels if item.exists} for root in sources}
+    return [
+        replace(each, source=sources[root])
+        if (root := of.get(each.object)) in sources
+        and together.get((root, each.matrix_world.tobytes())) == numbers[root]
+        else each
+        for each in found
+    ]
 
 
 def is_splats(cloud: bpy.types.PointCloud) -> bool:

@@ -8,6 +8,8 @@ import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ...training.errors import LodgsError
+from ...training.lod.paging import is_tree
+from ...training.lod.tree import complete_levels
 from ...training.splats.bundle import write_bundle, write_folder
 from ...training.splats.dialects import comments_of
 from ...training.splats.ply import write_ply
@@ -108,7 +110,7 @@ class LODGS_OT_export_plain(_Export, bpy.types.Operator):
 
 
 class LODGS_OT_export_folder(OnLevels, bpy.types.Operator):
-    """Export every level as its own file; splat-transform makes streamed levels for the web of them"""
+    """Export levels as files of their own, whole scenes each; splat-transform streams them for the web"""
 
     bl_idname = "lodgs.export_folder"
     bl_label = "Export Folder of Levels"
@@ -133,12 +135,9 @@ class LODGS_OT_export_folder(OnLevels, bpy.types.Operator):
         if not self.replace and any(folder.glob("lod*.ply")):
             raise LodgsError(f"{folder} already holds levels.", "Choose another folder, or tick Replace.")
         root = scenes.active_root(context)
-        if not root.lodgs.complete:
-            raise LodgsError(
-                "The coarser level of these splats is no scene by itself, as a folder's levels are.",
-                "Export the bundle, or what is shown as a plain PLY.",
-            )
         bundle = scenes.read_levels(root)
+        if is_tree(bundle):
+            bundle = complete_levels(bundle)
         command = write_folder(folder, bundle)
         self.report({"INFO"}, f"{len(bundle.levels)} levels written. For the web: {command}")
         return {"FINISHED"}

@@ -33,8 +33,9 @@ class LODGS_OT_import_splats(bpy.types.Operator):
 
     budget: bpy.props.IntProperty(
         name="Splats at Most",
-        description="How many splats of a tree are imported at most: the coarse ones first, which stand for "
-        "those that are left out. 0 is no limit. Files without a tree are imported whole",
+        description="How many splats of a tree are in memory at most. Of a larger one the coarse ones are "
+        "imported, and finer ones are read from the file as the eye comes near. 0 is no limit. Files without "
+        "a tree are imported whole",
         default=0,
         min=0,
         step=100_000,

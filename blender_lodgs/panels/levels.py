@@ -6,8 +6,9 @@ import bpy
 
 from ...training.lod.rule import find_rule
 from ...training.lod.selection import unknown_rule
-from ..data import loaded, objects, scenes, selection
-from .parts import LevelsPanel, say
+from ..data import loaded, objects, scenes, selection, streams
+from ..viewport import views
+from .parts import LevelsPanel, say, split_column
 
 
 def _columns(row: bpy.types.UILayout, *texts: str) -> None:
@@ -125,11 +126,39 @@ def _counts(layout: bpy.types.UILayout, context: bpy.types.Context, root: bpy.ty
     where = choice.where() if choice else ""
     if where:
         column.label(text=where)
-    shown, everything = scenes.count_shown(context, root)
-    column.label(text=f"{shown:,} of {everything:,} splats shown")
+    if not streams.file_of(root):  # else viewports draw more than the levels hold
+        shown, everything = scenes.count_shown(context, root)
+        column.label(text=f"{shown:,} of {everything:,} splats shown")
     if choice and where:
         splats, megabytes = loaded.count_loaded(root, choice)
         column.label(text=f"{splats:,} loaded, {megabytes:.1f} MB")
 
 
-CLASSES = (LODGS_UL_levels, LODGS_PT_levels, LODGS_PT_detail)
+class LODGS_PT_stream(LevelsPanel):
+    bl_label = "Streaming"
+    bl_parent_id = "LODGS_PT_detail"
+
+    @classmethod
+    def poll(cls, context):
+        root = scenes.root_with_levels(context)
+        return root is not None and streams.file_of(root) is not None
+
+    def draw(self, context):
+        root, layout = scenes.active_root(context), self.layout
+        stream, settings = views.stream(root), root.lodgs.stream
+        here = settings.here if stream is None or not stream.ready else stream.splats
+        layout.label(text=f"{_short(here)} of {_short(settings.total)} splats here")
+        if streams.changed(root):
+            say(layout, "Its splats are other ones than the file's now: they are drawn as they are.", "INFO")
+        elif root.lodgs.mode != "SELECTIVE":
+            say(layout, "Finer ones are drawn By Distance.", "INFO")
+        elif stream is not None and stream.problem:
+            say(layout, f"{stream.problem} What the scene holds is drawn.", "ERROR")
+        elif stream is not None and stream.busy:
+            layout.label(text="Reading finer ones…", icon="SORTTIME")
+        column = split_column(layout)
+        column.prop(settings, "file")
+        column.prop(settings, "budget")
+
+
+CLASSES = (LODGS_UL_levels, LODGS_PT_levels, LODGS_PT_detail, LODGS_PT_stream)

@@ -150,16 +150,19 @@ def at_frame(pattern: str, scene: bpy.types.Scene, frame: int) -> Path:
     return path.with_name(re.sub(r"#+(?=[^#]*$)", number, path.name))
 
 
-def placed_splats(depsgraph: bpy.types.Depsgraph) -> list[renderer.PlacedSplats]:
+def placed_splats(depsgraph: bpy.types.Depsgraph) -> list[renderer.PlacedSplats | renderer.PlacedTree]:
     """What a depsgraph shows of splats, in the form that files have: so its pixels are those of the files.
 
     What only a rule chooses from is all of an object's splats, with the choice. Else it is what modifiers
     leave.
     """
     found = []
-    for instance in shown.splat_instances(depsgraph):
+    for instance in shown.without_coarser(shown.splat_instances(depsgraph)):
         evaluated, matrix, level = instance.evaluated, instance.matrix_world, instance.level
         place, empty = (matrix, level, instance.antialias), not len(evaluated.data.points)
+        if instance.source is not None and (choice := shown.choice_of_picture(instance, depsgraph)):
+            found.append(renderer.PlacedTree(instance.source.path, matrix, instance.antialias, choice))
+            continue
         if not _chosen_by_rule(instance, depsgraph):
             if not empty:
                 read = partial(_splats_of, evaluated.data)

@@ -82,6 +82,21 @@ class PlacedSplats:
     empty: bool = False
 
 
+@dataclass(frozen=True)
+class PlacedTree:
+    """A tree of splats in a file, for one frame, of which the renderer reads what the frame shows.
+
+    Attributes:
+        path: a bundle of the rule ``cut``.
+        matrix, antialias, choice: see :class:`PlacedSplats`.
+    """
+
+    path: Path
+    matrix: np.ndarray
+    antialias: bool
+    choice: Choice
+
+
 class _Known(NamedTuple):
     """A set that the program has, or can read: its file, what is in it, and what it was made of."""
 
@@ -128,7 +143,7 @@ class Renderer:
 
     def frame(
         self,
-        sets: list[PlacedSplats],
+        sets: list[PlacedSplats | PlacedTree],
         camera: Camera,
         near: float,
         on_progress: OnProgress,
@@ -205,10 +220,18 @@ class Renderer:
             last = []
         return " ".join([f"The renderer stopped with exit code {code}.", *last])
 
-    def _write_sets(self, sets: list[PlacedSplats]) -> list[dict]:
+    def _write_sets(self, sets: list[PlacedSplats | PlacedTree]) -> list[dict]:
         """Writes the splats that are new or have changed, and names all."""
         known, named = {}, []
         for one in sets:
+            if isinstance(one, PlacedTree):
+                named.append(
+                    {
+                        "tree": str(one.path), "matrix": one.matrix.tolist(), "antialias": one.antialias,
+                        "choice": one.choice.as_dict(),
+                    }
+                )  # fmt: skip
+                continue
             if one.empty and one.key not in self._known:
                 continue
             if one.key not in known:
@@ -280,7 +303,7 @@ _used = 0.0
 
 
 def frame(
-    sets: list[PlacedSplats], camera: Camera, near: float, on_progress: OnProgress, **options
+    sets: list[PlacedSplats | PlacedTree], camera: Camera, near: float, on_progress: OnProgress, **options
 ) -> Frame | None:
     """:meth:`Renderer.frame` by the one renderer; started when there is none, and once again when it dies.
 

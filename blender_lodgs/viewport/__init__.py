@@ -88,6 +88,11 @@ def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
 
 
 @bpy.app.handlers.persistent
+def _on_file(*_) -> None:
+    views.close_streams()
+
+
+@bpy.app.handlers.persistent
 def _on_load(*_) -> None:
     global problem
     problem = ""
@@ -105,6 +110,7 @@ def register() -> None:
         changes.append(_on_update)
     for changes in (handlers.load_post, handlers.undo_post, handlers.redo_post):
         changes.append(_on_load)
+    handlers.load_pre.append(_on_file)
 
 
 def unregister() -> None:
@@ -116,6 +122,7 @@ def unregister() -> None:
         changes.remove(_on_update)
     for changes in (handlers.load_post, handlers.undo_post, handlers.redo_post):
         changes.remove(_on_load)
+    handlers.load_pre.remove(_on_file)
     _on_load()
     splats.clear()
     views.stop()

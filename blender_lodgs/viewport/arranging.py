@@ -7,9 +7,11 @@ is made from what the pool says of all splats.
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -25,7 +27,20 @@ WIDTH = 8192
 """Texels in a row of every texture that holds one texel for each of many splats."""
 
 
-@dataclass(frozen=True)
+_serials = itertools.count()
+
+
+class Paged(Protocol):
+    """Splats that change by and by: see ``streaming.Stream``."""
+
+    taken: int
+    records: np.ndarray
+    columns: dict[str, np.ndarray]
+
+    def take(self) -> np.ndarray: ...
+
+
+@dataclass
 class Pool:
     """N splats of any number of objects, one after the other.
 
@@ -34,12 +49,19 @@ class Pool:
         areas: (N,) float32, the sum of their squared standard deviations.
         opacities: (N,) float32 in [0, 1].
         columns: (N,) float32 by name: what rules need to know of splats; zeros where an object lacks one.
+        paged: from where on splats are others by and by, and which.
+        serial: another one after :meth:`take_over` has changed some, and in every pool.
+        changed: (M,) int32 each, at which places others are since then: for who keeps what they are.
     """
 
     means: np.ndarray
     areas: np.ndarray
     opacities: np.ndarray
     columns: dict[str, np.ndarray] = field(default_factory=dict)
+    paged: Sequence[tuple[int, Paged]] = ()
+    serial: int = field(default_factory=lambda: next(_serials))
+    changed: list[np.ndarray] = field(default_factory=list)
+    _seen: dict[int, int] = field(default_factory=dict)
     _choosers: dict[tuple[int, int], Chooser] = field(default_factory=dict, compare=False)
     _drawn: list[Drawn] = field(default_factory=list, compare=False)
 
@@ -72,6 +94,25 @@ class Pool:
             self._drawn[:] = [_drawn(self, request)]
         return self._drawn[0]
 
+    def take_over(self) -> None:
+        """Takes over what has come of paged splats, which nobody must be reading."""
+        for first, paged in self.paged:
+            before, some = paged.taken, paged.take()
+            if self._seen.get(first) != before:  # another pool took something, or this is a new one
+                some = np.arange(len(paged.records), dtype=np.int32)
+            if self._seen.get(first) == paged.taken:
+                continue
+            self._seen[first] = paged.taken
+            records, here = paged.records[some], some + np.int32(first)
+            self.means[here], self.opacities[here] = records[:, 0:3], records[:, 3]
+            self.areas[here] = np.einsum("ij,ij->i", records[:, 8:11], records[:, 8:11])
+            for name, column in paged.columns.items():  # sizes of all: who stands for others changes
+                self.columns[name][first : first + len(column)] = column
+            self._choosers = {key: each for key, each in self._choosers.items() if key[0] != first}
+            self._drawn.clear()
+            self.changed.append(here)
+            self.serial = next(_serials)
+
 
 @dataclass(frozen=True)
 class Drawn:
@@ -101,6 +142,7 @@ class Placement:
         scene: of which splat scene it is a level, a number.
         tell: what its colours tell, see ``SplatScene.tell``.
         antialias: see ``SplatScene.antialias``.
+        arrived: of paged splats, how much has come.
     """
 
     first: int
@@ -111,6 +153,7 @@ class Placement:
     scene: int
     tell: str
     antialias: bool = False
+    arrived: int = 0
 
     @property
     def world(self) -> np.ndarray:
@@ -148,12 +191,14 @@ class Arrangement:
             placement's number, and the level or band whose colour it gets (0: its own).
         splats: (M,) int32, the same places in the pool.
         left_out: how many were left out, to stay within the budget.
+        serial: the pool's: in a later one some places are other splats'.
     """
 
     request: Request
     instances: np.ndarray
     splats: np.ndarray
     left_out: int
+    serial: int
 
     @property
     def count(self) -> int:
@@ -161,12 +206,17 @@ class Arrangement:
         return len(self.splats)
 
 
-def arrange(pool: Pool, request: Request) -> Arrangement:
+def arrange(pool: Pool, request: Request, take_over: bool = False) -> Arrangement:
     """The splats to draw for a request, from back to front.
 
     What is drawn is found anew where the choices or the budget have changed; while only the view turns, or
     objects move, it is put in another order alone.
+
+    Args:
+        take_over: first what has come of paged splats, see ``Pool.take_over``.
     """
+    if take_over:
+        pool.take_over()
     drawn, count = pool.drawn(request), 0
     depths = np.empty(len(drawn.table), np.float32)
     backward = np.append(request.backward, 0.0)
@@ -175,7 +225,8 @@ def arrange(pool: Pool, request: Request) -> Arrangement:
         np.add(means @ toward[:3], toward[3], out=depths[count : count + len(means)])
         count += len(means)
     instances = drawn.table[ascending(depths)]
-    return Arrangement(request, instances, instances[:, 0].astype(np.int32), drawn.left_out)
+    places = instances[:, 0].astype(np.int32)
+    return Arrangement(request, instances, places, drawn.left_out, pool.serial)
 
 
 def ascending(values: np.ndarray) -> np.ndarray:

@@ -1,8 +1,9 @@
 """Splats on the graphics card: those that viewports draw, brought there when they are first needed.
 
-Of all splats memory holds what choosing needs (the pool). The rest is read from Blender's attributes a piece
-at a time, for splats that are drawn and not there yet. On the card they lie in a store somewhat larger than
-what is drawn: who comes takes the place of whoever has not been drawn for the longest time.
+Of all splats memory holds what choosing needs (the pool). The rest is read a piece at a time from Blender's
+attributes, or from what has come from a file (``streaming``), for splats that are drawn and not there yet. On
+the card they lie in a store somewhat larger than what is drawn: who comes takes the place of whoever has not
+been drawn for the longest time.
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ from ...training.lod.rule import every_column
 from .. import attributes
 from . import splats
 from .arranging import WIDTH, Pool
+from .streaming import Stream, record_texels
 
-PIECE = 1 << 16
+PIECE = 1 << 14
 """Splats that are brought to the graphics card at a time."""
 LEAST, SPARE, WASTE = 1 << 16, 1.25, 2.0
 """The smallest store, in splats; how much more than is drawn a new one holds; and from how much more on it
@@ -27,6 +29,10 @@ gives way to a smaller one."""
 
 bytes_uploaded = 0
 """What was brought to the graphics card since Blender started, in bytes."""
+
+
+Cloud = bpy.types.PointCloud | Stream
+"""What has splats: Blender's, or a file of which what the eye needs is here."""
 
 
 @dataclass
@@ -58,8 +64,9 @@ class Resident:
         held = np.zeros(self.total, bool)
         for each in lists:
             held[each] = True
-        wanted = int(np.count_nonzero(held))
-        room = min(max(round(SPARE * wanted), LEAST), self.total)
+        orphans = 0 if self.store is None else len(self.store.orphans)
+        wanted = int(np.count_nonzero(held)) + orphans
+        room = min(max(round(SPARE * wanted), LEAST), self.total + orphans)
         if self.store is None or not wanted <= len(self.store.owners) <= WASTE * room:
             self.store = Store(self.total, room, self.higher)
         self.store.hold(held)
@@ -70,7 +77,7 @@ class Resident:
         number = self._cloud(wanted)
         return int(np.searchsorted(wanted, self.starts[number] + self.counts[number]))
 
-    def read(self, clouds: Sequence[bpy.types.PointCloud | None], wanted: np.ndarray) -> np.ndarray | None:
+    def read(self, clouds: Sequence[Cloud | None], wanted: np.ndarray) -> np.ndarray | None:
         """The records of splats (M,), ascending, of one cloud: see :func:`read_records`.
 
         Returns:
@@ -78,9 +85,12 @@ class Resident:
         """
         number = self._cloud(wanted)
         cloud = clouds[number]
-        if cloud is None or len(cloud.points) != self.counts[number] or self.store is None:
+        if cloud is None or count_of(cloud) != self.counts[number] or self.store is None:
             return None
-        return read_records(cloud, wanted - self.starts[number], self.store.higher)
+        rows, texels = wanted - self.starts[number], record_texels(self.store.higher)
+        if isinstance(cloud, Stream):
+            return _as_wide(cloud.records[rows], texels)
+        return read_records(cloud, rows, self.store.higher)
 
     def _cloud(self, wanted: np.ndarray) -> int:
         return int(np.searchsorted(self.starts, wanted[0], side="right")) - 1
@@ -93,6 +103,7 @@ class Store:
         places: (N,) int32 where each splat is; -1 where it is not there.
         owners: (room,) int32 which splat is at each place; -1 where none is.
         higher: how many coefficients beyond the first it has of each splat.
+        orphans: (M,) places whose splats are no more, but may still be drawn.
         texture: WIDTH texels wide.
     """
 
@@ -101,7 +112,7 @@ class Store:
         while higher and record_texels(higher) * room > most:  # rather fewer harmonics than no splats
             higher = {24: 15, 15: 8, 8: 3}.get(higher, 0)
         self.places, self.owners = np.full(total, -1, np.int32), np.full(room, -1, np.int32)
-        self.higher = higher
+        self.higher, self.orphans = higher, np.zeros(0, np.int32)
         self._drawn, self._now, self._filled = np.zeros(room, np.int32), 0, 0
         height = max(-(-record_texels(higher) * room // WIDTH), 1)
         self.texture = gpu.types.GPUTexture((WIDTH, height), format="RGBA32F")
@@ -112,7 +123,18 @@ class Store:
         self._now += 1
         there = self.owners >= 0
         there[there] = held[self.owners[there]]
-        self._drawn[there] = self._now
+        self._drawn[there] = self._drawn[self.orphans] = self._now
+
+    def forget(self, splats_: np.ndarray) -> None:
+        """Splats (M,) are others from now on. What there was of them stays until :meth:`release`."""
+        places = self.places[splats_]
+        places = places[places >= 0]
+        self.places[splats_] = self.owners[places] = -1
+        self.orphans = np.concatenate([self.orphans, places])
+
+    def release(self) -> None:
+        """Nobody draws any more what splats were before they were others."""
+        self.orphans = self.orphans[:0]
 
     def missing(self, wanted: np.ndarray) -> np.ndarray:
         """Those of the wanted splats (M,) that are not there, ascending; copies want the same ones."""
@@ -145,22 +167,25 @@ class Store:
         return np.sort(np.argpartition(self._drawn, count - 1)[:count]).astype(np.int32)
 
 
-def record_texels(higher: int) -> int:
-    """How many texels of four floats a splat's record has: see :func:`read_records`."""
-    return -(-(14 + 3 * higher) // 4)
+def count_of(cloud: Cloud) -> int:
+    """How many splats there are, or room for them."""
+    return len(cloud.records) if isinstance(cloud, Stream) else len(cloud.points)
 
 
-def higher_of(cloud: bpy.types.PointCloud) -> int:
+def higher_of(cloud: Cloud) -> int:
     """How many coefficients beyond the first a cloud has, of whole degrees up to 4."""
+    if isinstance(cloud, Stream):
+        return cloud.higher
     count = 0
     while count < splats.MOST_COEFFICIENTS and attributes.SH.format(count + 1) in cloud.attributes:
         count += 1
     return int((count + 1) ** 0.5) ** 2 - 1
 
 
-def read_pool(clouds: Sequence[bpy.types.PointCloud]) -> Resident:
-    """What choosing needs of the splats of point clouds, one cloud after the other."""
-    counts = [len(cloud.points) for cloud in clouds]
+def read_pool(clouds: Sequence[Cloud]) -> Resident:
+    """What choosing needs of the splats of point clouds, one cloud after the other. What has come from files
+    is taken over when something is arranged (``Pool.take_over``)."""
+    counts = [count_of(cloud) for cloud in clouds]
     starts = [sum(counts[:i]) for i in range(len(counts))]
     total = sum(counts)
     means, areas = np.zeros((total, 3), np.float32), np.zeros(total, np.float32)
@@ -168,7 +193,7 @@ def read_pool(clouds: Sequence[bpy.types.PointCloud]) -> Resident:
     columns = {name: np.zeros(total, np.float32) for name in every_column()}
     for cloud, start, count in zip(clouds, starts, counts, strict=True):
         part = slice(start, start + count)
-        if not count:
+        if not count or isinstance(cloud, Stream):
             continue
         cloud.attributes["position"].data.foreach_get("vector", means[part].reshape(-1))
         scales = attributes.view_attribute(cloud, attributes.SCALE)
@@ -180,7 +205,8 @@ def read_pool(clouds: Sequence[bpy.types.PointCloud]) -> Resident:
         for name, values in columns.items():
             if (column := attributes.read_attribute(cloud, name)) is not None:
                 values[part] = column
-    pool = Pool(means, areas, opacities, columns)
+    paged = [(start, each) for start, each in zip(starts, clouds, strict=True) if isinstance(each, Stream)]
+    pool = Pool(means, areas, opacities, columns, paged)
     return Resident(pool, starts, counts, max(map(higher_of, clouds), default=0))
 
 
@@ -205,3 +231,11 @@ def read_records(cloud: bpy.types.PointCloud, rows: np.ndarray, higher: int) -> 
     if (weights := attributes.view_attribute(cloud, attributes.WEIGHT)) is not None:
         records[:, 3] *= weights[rows]
     return records
+
+
+def _as_wide(records: np.ndarray, texels: int) -> np.ndarray:
+    """Records (M, any) with as many numbers as the store has, (M, 4 * texels): with fewer harmonics."""
+    found = np.zeros((len(records), 4 * texels), np.float32)
+    width = min(records.shape[1], 4 * texels)
+    found[:, :width] = records[:, :width]
+    return found

@@ -6,13 +6,16 @@ the modifiers' settings (``selection.choice``), so neither time nor view changes
 modifiers is read as they leave it, whenever they do so anew. Which splats are drawn is found in a thread when
 the choice changes, in which order also when the view turns; until all that is drawn is there, the last
 arrangement stays. Only where there is none to stay is the new one drawn as far as it has come.
+
+Of a tree that is read from its file (``streaming``) that thread takes over what has come, while no viewport
+reads it to bring it to the graphics card.
 """
 
 from __future__ import annotations
 
 import time
 import weakref
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
@@ -21,17 +24,23 @@ import gpu
 import numpy as np
 from mathutils import Matrix
 
+from .. import extension
 from ..data import changes, scenes, selection, shown
 from . import eye, resident, splats
 from .arranging import Arrangement, Placement, Request, arrange
-from .resident import Resident, Store
+from .resident import Cloud, Resident, Store
+from .streaming import Stream
 
 STILL = 0.2
 """Seconds after which a view that no longer moves is drawn in full resolution."""
-LOADING = 0.02, 0.1
-"""Seconds after which a redraw leaves further splats to the next one: at least, and at most."""
+LOADING = 0.01, 0.03
+"""Seconds after which a redraw leaves further splats to the next one: at least, and at most. What is begun is
+finished: no redraw is to be held up for 0.05 seconds."""
 GROWTH = 1.5
 """By how much more splats a picture that is not complete is drawn again."""
+
+NOTHING = -1
+"""Of what has come from files, until a viewport has drawn what the scene itself holds."""
 
 reads = 0
 """How often all splats were read since Blender started."""
@@ -51,6 +60,7 @@ class ViewState:
         loaded: when some of them were brought there last.
         matrix: from the world to clip space when it was last drawn.
         moved: when it last moved.
+        arrived: how much had come from files when it last asked for an arrangement with all of it.
     """
 
     canvas: splats.Canvas = field(default_factory=splats.Canvas)
@@ -65,7 +75,13 @@ class ViewState:
     loaded: float = 0.0
     matrix: Matrix | None = None
     moved: float = 0.0
+    arrived: int = 0
     resolution: float = 1.0
+
+    def reads(self, of: Resident) -> bool:
+        """Whether splats are on their way, or will be, so that they must stay what they are."""
+        on_their_way = self.loading is not None and self.loading.serial == of.pool.serial
+        return on_their_way or (self.pending is not None and self.pending[0] is of)
 
     def lists(self, of: Resident) -> list[np.ndarray]:
         """The splats (M,) that it draws, and those that are on their way."""
@@ -80,9 +96,13 @@ _all: weakref.WeakSet[ViewState] = weakref.WeakSet()
 _thread: ThreadPoolExecutor | None = None
 
 _resident: Resident | None = None
-_keys: dict[int, changes.Version | None] = {}
+_keys: dict[int, changes.Version | Stream | None] = {}
 """Whose splats were read: point clouds, or objects whose modifiers change them, by ``session_uid``; and in
-which version, None for one that only a render shows."""
+which version, None for one that only a render shows. Roots of scenes that are read from a file."""
+_streams: dict[int, Stream] = {}
+"""Those files, by the roots' ``session_uid``."""
+_told: list[tuple[int, bool]] = []
+"""What panels say of them."""
 
 
 def draw(context: bpy.types.Context) -> None:
@@ -103,7 +123,8 @@ def draw(context: bpy.types.Context) -> None:
         region_data.view_matrix, region_data.window_matrix, settings.budget, moving=True,
         under_overlays=space.overlay.show_overlays and not _shows_photograph(context),
     )  # fmt: skip
-    if view.pending is not None or view.loading is not None or view.resolution < 1:
+    waits = view.pending is not None or view.loading is not None or view.arrived != _arrived()
+    if waits or view.resolution < 1 or _busy():
         _wake_later()
 
 
@@ -189,9 +210,15 @@ def prepare(
         view.pending = view.loading = view.missing = None
         return Request((), (0.0, 0.0, 1.0), budget)
     _all.add(view)
+    before, view.arrived = view.arrived, 0
+    instances = _from_files(view, instances, depsgraph, moving, wait)
     of, clouds = _read(instances, depsgraph)
-    request = Request(_placements(instances, of, depsgraph, moving), tuple(view_matrix[2][:3]), budget)
-    _arrange(view, of, request, wait)
+    take_over = wait or not any(other.reads(of) for other in _all if other is not view)
+    if view.arrived != NOTHING:
+        view.arrived = _arrived() if take_over else before
+    placements = _placements(instances, of, depsgraph, moving, take_over)
+    request = Request(placements, tuple(view_matrix[2][:3]), budget)
+    _arrange(view, of, request, wait, take_over)
     _load(view, of, clouds, wait)
     return request
 
@@ -201,23 +228,87 @@ def left_out() -> int:
     return max((view.arrangement.left_out for view in _views.values() if view.arrangement), default=0)
 
 
+def stream(root: bpy.types.Object) -> Stream | None:
+    """What viewports read of a splat scene's file; None where they do not."""
+    return _streams.get(root.session_uid)
+
+
+def _from_files(
+    view: ViewState,
+    instances: list[shown.SplatInstance],
+    depsgraph: bpy.types.Depsgraph,
+    moving: bool,
+    wait: bool,
+) -> list[shown.SplatInstance]:
+    """The instances, in which what is read from a file stands for a scene's levels as soon as it can; and
+    files are asked for what the eye needs."""
+    ready = []
+    for instance in shown.without_coarser(instances):
+        if (source := instance.source) is None:
+            continue
+        there = _streams.get(source.scene)
+        if there is None or there.source != source:
+            if there is not None:
+                there.stop()
+            there = _streams[source.scene] = Stream(source)
+        choice = _choice(instance, depsgraph, moving)
+        if choice is not None and not (there.problem and not there.ready):
+            there.ask(choice)
+            while wait and there.busy and not there.problem:
+                if there.ready:
+                    _beside().submit(there.take).result()
+                time.sleep(0.01)
+            # at first what the scene holds is drawn, which is there at once
+            begun = wait or there in _keys.values() or (view.arrangement and not view.loading)
+            if there.ready and begun:
+                ready.append(source)
+            elif there.ready:
+                view.arrived = NOTHING
+    kept = [each if each.source in ready else replace(each, source=None) for each in instances]
+    return shown.without_coarser(kept)
+
+
+def _stood_for(instances: list[shown.SplatInstance]) -> Iterator[bpy.types.PointCloud]:
+    """The levels in whose place what is read from a file is drawn."""
+    for instance in instances:
+        root = scenes.root_of(instance.object) if instance.source is not None else None
+        for item in root.lodgs.levels if root is not None else ():
+            if item.exists:
+                yield item.object.data
+
+
+def _busy() -> bool:
+    return any(stream.busy for stream in _streams.values())
+
+
+def _arrived() -> int:
+    return sum(stream.ready + stream.arrived for stream in _streams.values())
+
+
 def _plain(instance: shown.SplatInstance, depsgraph: bpy.types.Depsgraph) -> bool:
     return selection.only_chosen(instance.evaluated, depsgraph)
 
 
 def _key(instance: shown.SplatInstance, depsgraph: bpy.types.Depsgraph) -> int:
-    """Whose splats are uploaded for an instance: the object's own, or what its modifiers make of them."""
+    """Whose splats are uploaded for an instance: the object's own, what its modifiers make of them, or its
+    scene's from a file."""
+    if instance.source is not None:
+        return instance.source.scene
     return (instance.object.data if _plain(instance, depsgraph) else instance.object).session_uid
 
 
 def _read(
     instances: list[shown.SplatInstance], depsgraph: bpy.types.Depsgraph
-) -> tuple[Resident, list[bpy.types.PointCloud | None]]:
+) -> tuple[Resident, list[Cloud | None]]:
     """The splats of all instances, read anew only where some have changed; and their clouds."""
     global _resident, _keys, reads
-    clouds: dict[int, bpy.types.PointCloud] = {}
-    versions: dict[int, changes.Version | None] = {}
+    clouds: dict[int, Cloud] = {}
+    versions: dict[int, changes.Version | Stream | None] = {}
     for instance in instances:
+        if instance.source is not None:
+            key = instance.source.scene
+            clouds[key] = versions[key] = _streams[key]
+            continue
         plain, key = _plain(instance, depsgraph), _key(instance, depsgraph)
         clouds.setdefault(key, instance.object.data if plain else instance.evaluated.data)
         versions[key] = changes.version(instance.object.data if plain else instance.object)
@@ -226,11 +317,14 @@ def _read(
     if _resident is None or any(_keys.get(key) != each or each is None for key, each in versions.items()):
         # A level that is hidden just now stays: artists step through levels.
         there = {cloud.session_uid: cloud for cloud in bpy.data.pointclouds if shown.is_splats(cloud)}
+        for cloud in _stood_for(instances):  # nor do those that a file stands for, which takes its room
+            there.pop(cloud.session_uid, None)
         stay = {key: there[key] for key in _keys if key in there and key not in clouds}
         versions |= {key: changes.version(cloud) for key, cloud in stay.items()}
         clouds |= stay
         _resident, _keys = resident.read_pool(list(clouds.values())), {key: versions[key] for key in clouds}
         reads += 1
+        close_streams({obj.session_uid for obj in bpy.data.objects if obj.lodgs.is_root})
     return _resident, [clouds.get(key) for key in _keys]
 
 
@@ -239,57 +333,89 @@ def _placements(
     of: Resident,
     depsgraph: bpy.types.Depsgraph,
     moving: bool,
+    take_over: bool,
 ) -> tuple[Placement, ...]:
     roots = {item.object: root for root in scenes.roots(depsgraph.scene) for item in root.lodgs.levels}
     numbers, found = {key: number for number, key in enumerate(_keys)}, []
     for instance in instances:
         number = numbers[_key(instance, depsgraph)]
-        plain, root = _plain(instance, depsgraph), roots.get(instance.object)
-        choice = selection.choice(instance.evaluated, depsgraph) if plain else None
-        if moving and choice is not None and root and (seen := eye.moved(depsgraph.scene, root)):
-            choice = replace(choice, eye=seen[0], focal_px=seen[1])
+        root, paged = roots.get(instance.object), instance.source and _streams[instance.source.scene]
         found.append(
             Placement(
                 first=of.starts[number],
                 count=of.counts[number],
                 matrix=instance.matrix_world.tobytes(),
                 level=instance.level,
-                choice=choice,
+                choice=_choice(instance, depsgraph, moving),
                 scene=(root or instance.object).session_uid,
                 tell=root.lodgs.tell if root else "OWN",
                 antialias=instance.antialias,
+                arrived=(paged.arrived if take_over else paged.taken) if paged else 0,
             )
         )
     return tuple(found)
 
 
-def _arrange(view: ViewState, of: Resident, request: Request, wait: bool) -> None:
+def _choice(
+    instance: shown.SplatInstance, depsgraph: bpy.types.Depsgraph, moving: bool
+) -> selection.Choice | None:
+    """By what an instance's splats are chosen, from where the eye is now."""
+    if not _plain(instance, depsgraph):
+        return None
+    if not moving:
+        return shown.choice_of_picture(instance, depsgraph)
+    choice, root = selection.choice(instance.evaluated, depsgraph), scenes.root_of(instance.object)
+    seen = eye.moved(depsgraph.scene, root) if root is not None else None
+    return choice if choice is None or seen is None else replace(choice, eye=seen[0], focal_px=seen[1])
+
+
+def _arrange(view: ViewState, of: Resident, request: Request, wait: bool, take_over: bool) -> None:
     """Takes over an arrangement that has been found, and asks for another where one is wanted."""
-    global _thread
+    if view.loading is not None and view.loading.serial != of.pool.serial:  # of splats that are others now
+        view.loading = view.missing = None
     if view.pending is not None and (wait or view.pending[2].done()):
         found_of, _, found = view.pending
         view.pending = None
         if found_of is of:
-            view.loading, view.missing = found.result(), None
+            _found(view, of, found.result())
     current = view.loading or (view.arrangement if view.resident is of else None)
     if (current is not None and current.request == request) or view.pending is not None:
         return
     if view.loading is not None and not wait:  # what comes now, comes whole
         return
+    view.pending = (of, request, _beside().submit(arrange, of.pool, request, take_over))
+    if wait:
+        found, view.pending = view.pending[2].result(), None
+        _found(view, of, found)
+
+
+def _beside() -> ThreadPoolExecutor:
+    """The one thread that arranges, and takes over what has come from files."""
+    global _thread
     if _thread is None:
         _thread = ThreadPoolExecutor(1, "lodgs-order")
-    view.pending = (of, request, _thread.submit(arrange, of.pool, request))
-    if wait:
-        view.loading, view.missing, view.pending = view.pending[2].result(), None, None
+    return _thread
+
+
+def _found(view: ViewState, of: Resident, arrangement: Arrangement) -> None:
+    """Goes on with an arrangement, unless others are where its splats were."""
+    while of.pool.changed:  # whoever had it taken over
+        changed = of.pool.changed.pop()
+        if of.store is not None:
+            of.store.forget(changed)
+    if arrangement.serial == of.pool.serial:
+        view.loading, view.missing = arrangement, None
 
 
 def _load(view: ViewState, of: Resident, clouds: Sequence[bpy.types.PointCloud | None], wait: bool) -> None:
     """Brings splats of an arrangement to the graphics card, and takes it over when they all are there."""
     now = time.monotonic()
-    if view.loading is None and view.resident is of and view.store is not of.store:
+    idle = view.loading is None and not any(other.pending for other in _all)
+    if idle and view.resident is of and view.store is not of.store:
         view.loading = view.arrangement  # into the store that another viewport has made
     loading = view.loading
-    if loading is None:
+    if loading is None or loading.serial != of.pool.serial:
+        view.loading = None
         return
     store, missing = view.missing or (None, None)
     if not (begun := store is not None and store is of.store):
@@ -298,7 +424,8 @@ def _load(view: ViewState, of: Resident, clouds: Sequence[bpy.types.PointCloud |
     # where redraws take long, as much is loaded in each
     end = now + min(max(now - view.loaded if begun else 0, LOADING[0]), LOADING[1])
     view.loaded, begin = now, 0
-    while begin < len(missing) and (wait or not begin or time.monotonic() < end):
+    shown = begun and _show(view, of, loading, store, missing)  # what redraws before this one have brought
+    while begin < len(missing) and (wait or (begun and not shown and not begin) or time.monotonic() < end):
         piece = missing[begin : begin + resident.PIECE]
         piece = piece[: of.of_one_cloud(piece)]
         records = of.read(clouds, piece)
@@ -308,14 +435,26 @@ def _load(view: ViewState, of: Resident, clouds: Sequence[bpy.types.PointCloud |
         store.put(piece, records)
         begin += len(piece)
     missing = missing[begin:]
+    view.missing = store, missing
+    if wait or (not shown and not len(missing) and time.monotonic() < end):
+        _show(view, of, loading, store, missing)
+
+
+def _show(view: ViewState, of: Resident, loading: Arrangement, store: Store, missing: np.ndarray) -> bool:
+    """Draws an arrangement from now on: as soon as none of its splats (M,) is missing, or where there is
+    nothing else to draw as much of it as is there, if that is worth it. Whether it does."""
     part = view.arrangement is loading and view.store is store
     part = part and len(loading.splats) - len(missing) > GROWTH * view.count
-    if not len(missing) or part or view.arrangement is None:
-        view.resident, view.arrangement, view.store = of, loading, store
-        view.instances, view.count = splats.instances_texture(loading, store.places)
-    view.missing = (store, missing) if len(missing) else None
+    if len(missing) and not part and view.arrangement is not None:
+        return False
+    view.resident, view.arrangement, view.store = of, loading, store
+    view.instances, view.count = splats.instances_texture(loading, store.places)
+    drawn = [other.arrangement for other in _all if other.store is store and other.arrangement]
+    if all(each.serial == loading.serial for each in drawn):
+        store.release()
     if not len(missing):
-        view.loading = None
+        view.loading = view.missing = None
+    return True
 
 
 def _alike(one: tuple[Placement, ...], other: tuple[Placement, ...]) -> bool:
@@ -330,7 +469,8 @@ def _wake_later() -> None:
 
 def _wake() -> float | None:
     """Redraws viewports for which something is ready; asks to be called again while there is more to come."""
-    now, waiting = time.monotonic(), False
+    global _told
+    now, waiting = time.monotonic(), _busy()
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             for region in area.regions if area.type == "VIEW_3D" else ():
@@ -338,9 +478,13 @@ def _wake() -> float | None:
                 if view is None:
                     continue
                 still = view.resolution < 1 and now - view.moved >= STILL
-                if still or view.loading is not None or (view.pending and view.pending[2].done()):
+                more = view.loading is not None or view.arrived != _arrived()
+                if still or more or (view.pending and view.pending[2].done()):
                     region.tag_redraw()
-                waiting |= bool(view.loading or view.pending) or view.resolution < 1
+                waiting |= more or view.pending is not None or view.resolution < 1
+    if (told := [(each.splats, each.busy) for each in _streams.values()]) != _told:
+        _told = told
+        extension.redraw()
     return 0.01 if waiting else None
 
 
@@ -352,9 +496,16 @@ def clear() -> None:
     _resident, _keys = None, {}
 
 
+def close_streams(but: Collection[int] = ()) -> None:
+    """Ends reading from files, but of those roots (``session_uid``)."""
+    for key in _streams.keys() - but:
+        _streams.pop(key).stop()
+
+
 def stop() -> None:
-    """Ends the thread."""
+    """Ends the threads."""
     global _thread
+    close_streams()
     if _thread is not None:
         _thread.shutdown(wait=False, cancel_futures=True)
     _thread = None

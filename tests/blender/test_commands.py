@@ -133,7 +133,7 @@ def test_train_has_the_trainers_options(lodgs, lodgs_command, capfd):
         (["train", "--scene", SCENE, "--out", "run", "--set", "wings=2"], "unknown parameter 'wings'"),
         (["train", "--scene", SCENE, "--out", "run", "--method", "magic"], "magic"),
         (["train", "--scene", SCENE, "--out", "run", "--image-scale", "7"], "image_scale = 7"),
-        (["train", "--scene", SCENE, "--out", "run", "--seed", "-1"], "-1 is not between"),
+        (["train", "--scene", SCENE, "--out", "run", "--seed", "-1"], "-1 is no whole number from 0"),
         (["train", "--scene", SCENE, "--out", "run", "--test-every", "1"], "test_every"),
         (["import", "nothing.ply", "--blend", "x.blend"], "nothing.ply"),
         (["export", "nothing.blend", "x.ply"], "nothing.blend"),

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from tests.fuzz.doors import attempt
 from tests.fuzz.mutations import spoiled, spoiled_value
+from training.lod.describe import describe
 from training.splats.bundle import (
     Bundle,
     Level,
-    describe,
     read_bundle,
     read_folder,
     write_bundle,

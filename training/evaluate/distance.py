@@ -42,7 +42,7 @@ def farther(evaluation: Evaluation, bundle: Bundle, values: Values) -> list[dict
         found = []
         for camera in evaluation.cameras:
             view = pulled_back(camera, factor, evaluation.data.median_depth)
-            everything, fixed = full_detail(camera)
+            everything, fixed = full_detail(view if bundle.elsewhere else camera)
             full = evaluation.render(everything, view, fixed)
             some = resident.draw(view, values, near=evaluation.data.near)
             counts = [int((rendering.radii > 0).sum()) for rendering in (some, full)]
@@ -69,8 +69,9 @@ def jumps(evaluation: Evaluation, bundle: Bundle, values: Values, camera: Camera
         The largest jump, by what it is of: ``by distance``; where the rule's levels fade, ``faded`` and
         ``hard``, with levels switched on and off.
     """
-    everything, fixed = shown_at(bundle, bundle.levels[-1])(camera)
-    everything, resident = evaluation.load(everything), Resident(bundle, evaluation.backend)
+    shown, resident = shown_at(bundle, bundle.levels[-1]), Resident(bundle, evaluation.backend)
+    everything, fixed = shown(camera)
+    everything = evaluation.load(everything)
     views = [
         pulled_back(camera, factor, evaluation.data.median_depth)
         for factor in np.geomspace(FACTORS[0], FACTORS[-1], FRAMES)
@@ -84,7 +85,11 @@ def jumps(evaluation: Evaluation, bundle: Bundle, values: Values, camera: Camera
         pictures = (rendering.image.cpu().numpy() for rendering in drawn)
         return round(float((differences(pictures) / still).max()), 3)
 
-    still = differences(evaluation.draw(everything, view, fixed).numpy() for view in views)
+    def full(view: Camera) -> np.ndarray:
+        splats = shown(view)[0] if bundle.elsewhere else everything
+        return evaluation.draw(splats, view, fixed).numpy()
+
+    still = differences(map(full, views))
     if any(control.name == "fade" for control in rule_of(bundle).controls):
         return {"faded": largest({**values, "fade": 1}), "hard": largest({**values, "fade": 0})}
     return {"by distance": largest(values)}

@@ -12,6 +12,7 @@ from ..files import atomic_write
 from ..lod.colors import level_color
 from ..lod.rule import Values, find_rule
 from ..lod.selection import complete, levels_alone, select
+from ..lod.sight import in_sight
 from ..scenes.cameras import Camera
 from ..scenes.images import write_png
 from ..splats.bundle import Bundle
@@ -25,10 +26,12 @@ def level_picture(path: Path, bundle: Bundle, evaluation: Evaluation, camera: Ca
 
     Args:
         path: file to write.
-        camera: a view with its photograph.
+        camera: a view with its photograph. Of levels that are not in memory only what it has in sight counts.
         values: of the rule's controls, for what is chosen by distance; without use where there is no rule.
     """
     target = evaluation.target(camera)
+    if bundle.elsewhere:
+        bundle = in_sight(bundle, camera)
 
     def tile(name: str, splats: Splats, weights: np.ndarray | None = None) -> tuple[str, torch.Tensor]:
         image = evaluation.draw(splats, camera, weights)

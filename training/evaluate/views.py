@@ -11,6 +11,7 @@ import torch
 
 from ..lod.rule import Values, find_rule
 from ..lod.selection import Choice, complete, settings
+from ..lod.sight import Sight
 from ..methods.data import TrainingData
 from ..rasterize import Gaussians, Rendering, device_of, rasterize
 from ..rasterize.resident import Chosen, Resident, SplatSet, draw
@@ -25,15 +26,19 @@ REPEATS = 3
 """How often a view is drawn to time it."""
 
 ShownTo = Callable[[Camera], tuple[Splats, np.ndarray | None]]
-"""What a camera is shown: splats, the same for all, and weights (N,) in [0, 1] on opacities; None: all 1."""
+"""What a camera is shown: splats, all that there are or those in its sight, and weights (N,) in [0, 1] on
+opacities; None: all 1."""
 
 
 def shown_at(bundle: Bundle, level: Level) -> ShownTo:
     """What a camera is shown at full detail up to a level.
 
     That is all that is drawn at the level, but for rules whose weights always count: there splats without
-    them are not what was trained, and each camera is shown what the rule gives it.
+    them are not what was trained, and each camera is shown what the rule gives it. Of levels that are not in
+    memory it is what the camera has in sight.
     """
+    if bundle.elsewhere:
+        return _in_sight(bundle, level)
     rule = find_rule(bundle.rule)
     if rule is None or not rule.always:
         everything = complete(bundle, level)
@@ -41,6 +46,21 @@ def shown_at(bundle: Bundle, level: Level) -> ShownTo:
     alone = replace(bundle, levels=bundle.upto(level.number))
     choice, values = Choice(alone), settings(alone, {})
     return lambda camera: (choice.splats, choice.weights(camera.center, camera.focal, values))
+
+
+def _in_sight(bundle: Bundle, level: Level) -> ShownTo:
+    sights = [Sight(each.rows) for each in bundle.upto(level.number)]
+    parts: list[Splats | None] = [None] * len(sights)
+
+    def shown_to(camera: Camera) -> tuple[Splats, None]:
+        for i, sight in enumerate(sights):
+            missing = sight.missing(camera)
+            if missing is not None:
+                parts[i] = None  # so that both are never in memory
+                parts[i] = sight.read(missing)
+        return Splats.concatenated([part for part in parts if part is not None]), None
+
+    return shown_to
 
 
 class Evaluation:
@@ -156,7 +176,7 @@ class Evaluation:
         resident = Resident(alone, self.backend)
         if rule is not None and rule.always:
             return self.measure_by_distance(resident, settings(alone, {}))
-        total = sum(len(each.splats) for each in alone.levels)
+        total = sum(len(each.rows) for each in alone.levels)
         return self.measure(
             lambda camera: resident.draw_level(level.number, camera, **self._options), lambda camera: total
         )

@@ -218,7 +218,7 @@ def levels_of(forest: Forest, folder: Path) -> tuple[list[Level], Columns]:
     for splats, tree in forest:
         columns = tree.columns(splats.means, tree.sizes(splats.means, splats.log_scales))
         splats = replace(splats, extras=columns)
-        roots.append(splats.select(slice(-1, None)))
+        roots.append(splats.select([-1]))  # a copy: a view would keep them all
         files[LEAVES].append(splats.select(slice(0, tree.leaves)))
         files[NODES].append(splats.select(slice(tree.leaves, None)))
         file = files[LEAVES if tree.leaves == 1 else NODES]

@@ -5,16 +5,15 @@ a node of which not both children are there stands for all that is below it, as 
 cut is complete. Pages come in coarse to fine, as the eye comes near; at most so many splats as the budget
 says are there, and the pages that were of no use for longest go first.
 
-numpy only. Files are read in a thread (:class:`Pager`); what it has found, the thread that draws takes over
-in pieces, for as long as it has time (:meth:`Pager.take`).
+numpy only. Files are read in a thread (:class:`Pager`); what it has found is taken over by whoever chooses
+and draws (:meth:`Pager.take`).
 """
 
 from __future__ import annotations
 
 import threading
-import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from itertools import pairwise
 from math import inf
 from pathlib import Path
@@ -22,12 +21,14 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LodgsError
+from ..scenes.cameras import Camera
 from ..splats.bundle import Bundle, Level, Rows, open_bundle
 from ..splats.dialects import drawable
 from ..splats.gaussians import Splats
-from .blocks import SIZE, places_on_curve
+from .blocks import SIZE, Blocks, places_on_curve
+from .choice import Choice
 from .rule import distances_by_axes
-from .rules.cut import ABOVE_ROOT, K_LEAST, NODE_SIZE, PARENT, PARENT_SIZE, RULE
+from .rules.cut import ABOVE_ROOT, K_LEAST, NODE_SIZE, PARENT, PARENT_SIZE, RULE, detail_of
 from .streaming import BLOCKS
 
 BOUNDS = tuple(f"{end}_{axis}" for end in ("low", "high") for axis in "xyz")
@@ -105,7 +106,8 @@ class TreeFile:
         self.bundle, self._rows = open_bundle(path)
         if not is_tree(self.bundle):
             raise LodgsError(
-                f"{path} is no tree of splats: its levels are chosen by the rule '{self.bundle.rule}'.",
+                f"{path} is no tree of splats: it is made for "
+                + (f"the rule '{self.bundle.rule}'." if self.bundle.rule else "no distances."),
                 "Open it as a whole.",
             )
         numbers = [level.number for level in self.bundle.levels]
@@ -115,7 +117,7 @@ class TreeFile:
         self.levels = np.repeat(numbers, pages)
         self.begins = np.concatenate([np.arange(0, length, SIZE) for length in lengths])
         self.counts = np.minimum(SIZE, np.repeat(lengths, pages) - self.begins)
-        self._finest = numbers[-1]
+        self._finest, self._index = numbers[-1], None
 
     def __len__(self) -> int:
         return len(self.levels)
@@ -161,6 +163,48 @@ class TreeFile:
             on_progress: called with the share that is done; where it returns False, an InterruptedError is
                 raised.
         """
+        if self._index is None:
+            self._index = self._make_index(on_progress)
+        return self._index
+
+    def cut(self, choice: Choice, camera: Camera | None = None, near: float = 0.0) -> dict[int, Splats]:
+        """By the level's number, the splats that a choice of the rule ``cut`` shows; those that cannot be
+        drawn are missing.
+
+        Memory holds little more than these.
+
+        Args:
+            camera: in the splats' own space; splats that are out of its sight may be left out.
+            near: depth at which its drawing begins, in the splats' units.
+        """
+        k = detail_of(choice.focal_px, dict(choice.values)["pixels"])
+        pages = np.sort(self.index().order(np.array(choice.eye, np.float32), k))
+        found: dict[int, list[Splats]] = {
+            number: [self.read_rows(number, pages[:0])] for number in self._rows
+        }
+        for begin in range(0, len(pages), AT_ONCE):
+            for number, rows in self._rows_of(pages[begin : begin + AT_ONCE]).items():
+                columns = self._rows[number].columns(rows, (*COLUMNS, *"xyz"))
+                means = np.stack([columns.pop(axis) for axis in "xyz"], axis=1)
+                zeros = dict.fromkeys(COLUMNS, np.zeros(len(rows), np.float32))
+                weights = choice.weights(means, zeros | columns)
+                splats = self.read_rows(number, rows[weights > 0])
+                if camera is not None:
+                    blocks = Blocks.of(splats.means, splats.log_scales)
+                    splats = splats.select(blocks.rows(blocks.in_view(camera, near)))
+                found[number].append(splats)
+        return {number: Splats.concatenated(parts) for number, parts in found.items()}
+
+    def _rows_of(self, pages: np.ndarray) -> dict[int, np.ndarray]:
+        """The rows (M,) of some pages, ascending, by the level's number."""
+        found = {}
+        for number in self._rows:
+            mine = pages[self.levels[pages] == number]
+            there = np.arange(SIZE) < self.counts[mine, None]
+            found[number] = (self.begins[mine, None] + np.arange(SIZE))[there]
+        return found
+
+    def _make_index(self, on_progress: Callable[[float], bool]) -> PageIndex:
         table = self.bundle.tables.get(BLOCKS, {})
         wanted = {"level", PARENT_SIZE, *BOUNDS}
         if wanted <= table.keys() and np.array_equal(table["level"], self.levels):
@@ -309,52 +353,21 @@ class Update:
     """What comes in at once.
 
     Attributes:
-        before: the sizes of all rows, their own and their parents', without those that are replaced.
-        pages: where in memory each begins, and its splats.
-        after: the sizes with them.
+        pages: from which row in memory on each stands, and its splats.
+        sizes: ``node_size`` and ``parent_size`` that the rule is to have then of all rows, (rows,) each.
     """
 
-    before: tuple[np.ndarray, np.ndarray]
     pages: list[tuple[int, Splats]]
-    after: tuple[np.ndarray, np.ndarray]
-
-
-class Memory:
-    """Splats of a tree in memory, N rows: those that are there, and room. Its thread is the one that draws.
-
-    Attributes:
-        splats: all rows; those without a splat have a parent size of 0, so that no eye is shown them. The
-            extras are the columns of the rule ``cut``, whose weights make a complete cut of what is there.
-    """
-
-    def __init__(self, rows: int, degree: int) -> None:
-        shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": ()}
-        arrays = {name: np.zeros((rows, *shape), np.float32) for name, shape in shapes.items()}
-        sh = np.zeros((rows, (degree + 1) ** 2, 3), np.float32)
-        extras = {name: np.zeros(rows, np.float32) for name in COLUMNS}
-        self.splats = Splats(**arrays, sh=sh, extras=extras)
-
-    def pieces(self, update: Update) -> Iterator[None]:
-        """Takes an update over, a little at each step; after every one, what is there is complete."""
-        self._set(update.before)
-        yield
-        for begin, page in update.pages:
-            rows = slice(begin, begin + len(page))
-            for each in fields(Splats):
-                if each.name != "extras":
-                    getattr(self.splats, each.name)[rows] = getattr(page, each.name)
-            for name in PARENT:
-                self.splats.extras[name][rows] = page.extras[name]
-            yield
-        self._set(update.after)
-        yield
-
-    def _set(self, sizes: tuple[np.ndarray, np.ndarray]) -> None:
-        self.splats.extras[NODE_SIZE], self.splats.extras[PARENT_SIZE] = sizes
+    sizes: tuple[np.ndarray, np.ndarray]
 
 
 class Pager:
-    """Keeps of a tree in a file what an eye needs in memory, in a thread.
+    """Finds out, in a thread, what of a tree in a file an eye needs in memory, and reads it.
+
+    Memory is kept by who takes what comes (:meth:`take`): ``rows`` splats, of which pages take the place of
+    others. With the sizes of the last update the weights of the rule ``cut`` make a complete cut of what is
+    there; rows without a splat have a parent size of 0, so that no eye is shown them, as all rows have at
+    first.
 
     Args:
         path: a bundle of the rule ``cut``.
@@ -362,7 +375,9 @@ class Pager:
 
     Attributes:
         file: what is read.
-        memory: what is in memory.
+        rows: of memory.
+        sh_degree: of the splats.
+        arrived: how many updates there have been to take.
         problem: why the thread has ended by itself; empty as long as it has not.
 
     Raises:
@@ -375,23 +390,29 @@ class Pager:
         if not slots:
             raise LodgsError(*_too_few(budget, path))
         (first,) = self.file.read(np.array([0]))
-        self.memory, self.problem = Memory(slots * SIZE, first.sh_degree), ""
-        self._columns = {name: np.zeros(slots * SIZE, np.float32) for name in (*COLUMNS, *"xyz")}
+        self.rows, self.sh_degree = slots * SIZE, first.sh_degree
+        self.arrived, self.problem = 0, ""
+        self._columns = {name: np.zeros(self.rows, np.float32) for name in (*COLUMNS, *"xyz")}
         self._slot_of, self._page_in = np.full(len(self.file), -1), np.full(slots, -1)
         self._used, self._tick = np.zeros(len(self.file), np.int64), 0
-        self._last = self._sizes()
         self._index: PageIndex | None = None
         self._asked: tuple[np.ndarray, float] | None = None
         self._done = self._asked
+        self._settled: tuple[np.ndarray, float] | None = None
         self._changed, self._stopping = threading.Condition(), False
         self._ready: Update | None = None
-        self._taking: Iterator[None] | None = None
         self._thread: threading.Thread | None = None
 
     @property
-    def pages(self) -> int:
-        """How many pages are in memory, or on their way."""
-        return int((self._page_in >= 0).sum())
+    def splats(self) -> int:
+        """How many splats are in memory, or on their way."""
+        return int(self.file.counts[self._page_in[self._page_in >= 0]].sum())
+
+    @property
+    def idle(self) -> bool:
+        """Whether all has been taken that the eye needs, as far as there is room; or nothing more comes."""
+        with self._changed:
+            return self._ready is None and (bool(self.problem) or self._settled is self._asked)
 
     def step(self, eye: np.ndarray | None, k: float) -> Update | None:
         """The next pages for an eye: what the thread does again and again; None where there are no more.
@@ -417,23 +438,18 @@ class Pager:
             there = np.flatnonzero(self._page_in >= 0)
             oldest = np.argsort(self._used[self._page_in[there]], kind="stable")
             gone = there[oldest[: len(missing) - len(free)]]
-            for name in COLUMNS:
-                self._columns[name].reshape(-1, SIZE)[gone] = 0
-            self._last = self._sizes()
             self._slot_of[self._page_in[gone]] = self._page_in[gone] = -1
             free = np.concatenate([free, gone])
-        before, pages = self._last, []
+        pages = []
         for page, slot, splats in zip(missing, free, self.file.read(missing), strict=False):
             begin = int(slot) * SIZE
             rows = slice(begin, begin + len(splats))
-            for name in COLUMNS:
-                self._columns[name][rows] = splats.extras[name]
-            for name, column in zip("xyz", splats.means.T, strict=True):
-                self._columns[name][rows] = column
+            for name, column in self._columns.items():
+                column[begin : begin + SIZE] = 0
+                column[rows] = splats.extras[name] if name in COLUMNS else splats.means[:, "xyz".index(name)]
             self._slot_of[page], self._page_in[slot] = slot, page
             pages.append((begin, splats))
-        self._last = self._sizes()
-        return Update(before, pages, self._last)
+        return Update(pages, self._sizes())
 
     def _sizes(self) -> tuple[np.ndarray, np.ndarray]:
         """The sizes of all rows as the rule is to have them: of nodes that stand for all below them 0, their
@@ -441,7 +457,7 @@ class Pager:
         some = np.flatnonzero(self._columns[PARENT_SIZE] > 0)
         columns = {name: column[some] for name, column in self._columns.items()}
         inner, reached = standing(columns)
-        sizes, parents = np.zeros((2, len(self._columns[NODE_SIZE])), np.float32)
+        sizes, parents = np.zeros((2, self.rows), np.float32)
         sizes[some[inner]], parents[some[reached]] = columns[NODE_SIZE][inner], columns[PARENT_SIZE][reached]
         return sizes, parents
 
@@ -456,33 +472,18 @@ class Pager:
             self._asked = np.array(eye, np.float64), float(k)
             self._changed.notify_all()
 
-    def take(self, seconds: float = 0.01) -> bool:
-        """Takes over what has come in, for about so long at most; whether anything has changed.
-
-        For the thread that draws. Between two calls, what is in memory makes complete cuts.
-        """
-        until, changed = time.perf_counter() + seconds, False
-        while True:
-            if self._taking is None:
-                with self._changed:
-                    update, self._ready = self._ready, None
-                    self._changed.notify_all()
-                if update is None:
-                    return changed
-                self._taking = self.memory.pieces(update)
-            for _ in self._taking:
-                changed = True
-                if time.perf_counter() >= until:
-                    return True
-            self._taking = None
+    def take(self) -> Update | None:
+        """What has come in, to be taken over before the next is asked for; None where there is nothing."""
+        with self._changed:
+            update, self._ready = self._ready, None
+            self._changed.notify_all()
+        return update
 
     def stop(self) -> None:
-        """Ends the thread."""
+        """Ends the thread; does not wait for it, which may be reading from a slow disk."""
         with self._changed:
             self._stopping = True
             self._changed.notify_all()
-        if self._thread is not None:
-            self._thread.join()
 
     def _run(self) -> None:
         try:
@@ -494,10 +495,12 @@ class Pager:
                     update = self.step(*self._done)
                 with self._changed:
                     if update is None:
+                        self._settled = self._done
                         self._changed.wait_for(lambda: self._stopping or self._asked is not self._done)
                     else:
                         self._changed.wait_for(lambda: self._stopping or self._ready is None)
                         self._ready = update
+                        self.arrived += 1
         except InterruptedError:
             return
         except Exception as error:  # a disk that is gone, a file that is not what it says

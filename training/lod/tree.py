@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from ..splats.bundle import Level
+from ..splats.bundle import MOST_LEVELS, Bundle, Level
 from ..splats.gaussians import Splats
 from .paging import streaming_order
+from .rules.bands import RULE as BANDS
 from .rules.cut import ABOVE_ROOT, NODE_SIZE, PARENT, PARENT_SIZE, RULE, least_size
 
 NODES, LEAVES = 1, 2
 """Numbers of the levels: the nodes above, and the leaves, which are the full scene."""
+THINNING = 4
+"""How many times fewer splats a complete level has than the next finer one: half the detail of a surface."""
+FEWEST = 500
+"""Levels of fewer splats are not worth a file."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +119,34 @@ def treeless_columns(count: int) -> Mapping[str, np.ndarray]:
     nothing = np.zeros(count, np.float32)
     above = np.full(count, ABOVE_ROOT, np.float32)
     return {NODE_SIZE: nothing, PARENT_SIZE: above} | dict.fromkeys(PARENT, nothing)
+
+
+def complete_levels(bundle: Bundle) -> Bundle:
+    """A tree as levels each of which is complete by itself, for whoever has no rule for trees.
+
+    The finest has the leaves; each coarser one is a cut at one size, the least at which it has no more than
+    1 / THINNING of the finer one's splats, down to FEWEST. The rule ``bands`` chooses them by distance: where
+    the size of a cut covers no more pixels than a node of the tree may.
+    """
+    splats = Splats.concatenated([level.splats for level in bundle.levels])
+    own, above = (splats.extras[name] for name in (NODE_SIZE, PARENT_SIZE))
+    splats = replace(
+        splats, extras={name: x for name, x in splats.extras.items() if name not in RULE.columns}
+    )
+    sizes = np.unique(own)
+    counts = np.searchsorted(np.sort(own), sizes, "right") - np.searchsorted(np.sort(above), sizes, "right")
+    cuts = [0.0]
+    most = counts[0] // THINNING
+    while most >= FEWEST and len(cuts) < MOST_LEVELS:
+        place = int(np.argmax(counts <= most))  # counts fall
+        cuts.append(float(sizes[place]))
+        most = counts[place] // THINNING
+    levels = [
+        Level(number, splats.select((own <= size) & (above > size)), {"s_min": size})
+        for number, size in enumerate(reversed(cuts), 1)
+    ]
+    controls = {"gamma": bundle.controls.get("pixels", RULE.controls[0].default), "first": 1}
+    return replace(bundle, levels=levels, rule=BANDS.name, controls=controls, tables={})
 
 
 def _rounded_up(values: np.ndarray) -> np.ndarray:

@@ -145,6 +145,10 @@ class CutCache:
         """Which rows (M,) are at places (M,)."""
         return self._row[places]
 
+    def groups_at(self, places: np.ndarray) -> np.ndarray:
+        """Which groups (M,) these are of."""
+        return self._group[places]
+
     def get(self, places: np.ndarray) -> torch.Tensor:
         """A copy of the records (M, width) at places (M,), on the device."""
         return self.records.index_select(0, torch.from_numpy(places).to(self._device))

@@ -28,17 +28,12 @@ FAINTER = 0.6
 
 
 def peak_scores(model: Model) -> torch.Tensor:
-    """What decides by maxima (N,): :func:`peak_score` of the largest gradient and the largest radius."""
-    gradient, radius = (model.stats[name] for name in PEAKS)
-    return peak_score(gradient, radius, model["opacity_logits"].detach())
-
-
-def peak_score(gradient: torch.Tensor, radius: torch.Tensor, opacity_logits: torch.Tensor) -> torch.Tensor:
-    """Gradient times radius times opacity^(1/5), (N,).
+    """What decides by maxima (N,): the largest gradient times the largest radius times opacity^(1/5).
 
     LODGE, Eq. 6, after H3DGS: gradients in 3DGS units, radii of three standard deviations in pixels.
     """
-    return gradient * radius * opacity_logits.sigmoid() ** 0.2
+    gradient, radius = (model.stats[name] for name in PEAKS)
+    return gradient * radius * model["opacity_logits"].detach().sigmoid() ** 0.2
 
 
 @torch.no_grad()

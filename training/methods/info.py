@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 from ..documents import shown
 from ..errors import LodgsError
@@ -32,6 +33,8 @@ class MethodInfo:
         offered: the parameters that a panel shows, beside the presets.
         from_base: whether training can begin with splats (a job's ``base``) instead of the scene's points.
         for_splats: whether it is what to offer first for splats that are there already.
+        captured: values of parameters that are others where the photographs are the base's own pictures, by
+            name, whatever the preset.
         retired: names of parameters that earlier versions wrote into job files without any effect.
         package: the folder as a module, set where the method is found.
     """
@@ -46,6 +49,7 @@ class MethodInfo:
     offered: tuple[str, ...] = ()
     from_base: bool = False
     for_splats: bool = False
+    captured: Mapping[str, Any] = field(default_factory=dict)
     retired: tuple[str, ...] = ()
     package: str = ""
 

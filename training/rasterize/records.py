@@ -1,8 +1,9 @@
 """Splats in records, one after the other, with Adam's moments and what density control asks for.
 
 A record holds C values (means, quaternions, log-scales, opacity logits, harmonics), their first and their
-second moments, and from column 3 C on: STEPS, how many steps it has made; SCORE, the largest of those that it
-has been given; SEEN, the number of the last step that had it in its image, 0 for none.
+second moments, and from column 3 C on STEPS, how many steps it has made; SCORE, the largest product of its
+gradient's norm in the image plane, its radius and opacity^(1/5) (LODGE, Eq. 6); SEEN, the number of the last
+step that had it in its image.
 """
 
 from __future__ import annotations
@@ -14,8 +15,11 @@ import torch
 
 from . import adam
 from .gaussians import Gaussians
+from .rendering import Rendering
 
 STEPS, SCORE, SEEN = range(3)
+OPACITY_LOGIT = 10
+"""Its column."""
 
 
 def gather(records: torch.Tensor, places: np.ndarray, terms: int) -> Gaussians:
@@ -38,10 +42,10 @@ def step(
     records: torch.Tensor,
     places: np.ndarray,
     gradients: Sequence[torch.Tensor],
-    score: torch.Tensor,
-    seen: torch.Tensor,
+    rendering: Rendering,
     number: int,
     lr: torch.Tensor,
+    shares: torch.Tensor | None = None,
     betas: tuple[float, float] = adam.BETAS,
     eps: float = adam.EPS,
 ) -> None:
@@ -51,27 +55,34 @@ def step(
         records: (N, width).
         places: (M,) int64 of those that move, each once.
         gradients: (M, ...) of their values, in the order of ``Gaussians``.
-        score: (M,).
-        seen: (M,) bool.
+        rendering: of these splats, after ``backward``.
         number: of the step, from 1; no record has made more.
         lr: (C,) learning rates.
+        shares: (M,) float32, each record's factor of them, 1 if None; those of share 0 stay as they are.
     """
     if not len(places):
         return
+    shares = torch.ones(len(places), device=records.device) if shares is None else shares.to(records.device)
     if records.device.type == "cpu":
         from .cpu.records import step as step_on_cpu
 
-        arrays = [each.contiguous().numpy() for each in gradients]
-        rates = np.ascontiguousarray(lr.numpy(), np.float32)
-        step_on_cpu(records.numpy(), places, arrays, score.numpy(), seen.numpy(), number, rates, betas, eps)
+        told = [each.contiguous().numpy() for each in (*gradients, rendering.grad2d)]
+        *told, grad2d = told
+        radii, rates = rendering.radii.numpy(), np.ascontiguousarray(lr.numpy(), np.float32)
+        step_on_cpu(records.numpy(), places, told, grad2d, radii, number, rates, shares.numpy(), betas, eps)
         return
     at, count = torch.from_numpy(places).to(records.device), len(lr)
     some = records[at]
-    values, m, v = (some[:, i * count : (i + 1) * count] for i in range(3))
     told = some[:, 3 * count :]
-    told[:, STEPS] += 1
-    gradient = torch.cat([each.reshape(len(places), -1) for each in gradients], 1)
-    adam.update_in_torch(values, gradient, m, v, lr, betas, eps, told[:, STEPS, None].double())
+    score = rendering.grad2d.norm(dim=1) * rendering.radii * some[:, OPACITY_LOGIT].sigmoid() ** 0.2
     told[:, SCORE] = torch.maximum(told[:, SCORE], score)
-    told[:, SEEN] = torch.where(seen, float(number), told[:, SEEN])
+    told[:, SEEN] = torch.where(rendering.radii > 0, float(number), told[:, SEEN])
+    moves = shares != 0
+    moving, share = some[moves], shares[moves, None]
+    moving[:, 3 * count + STEPS] += 1
+    values, m, v = (moving[:, i * count : (i + 1) * count] for i in range(3))
+    gradient = torch.cat([each.reshape(len(places), -1) for each in gradients], 1)[moves]
+    times = moving[:, 3 * count + STEPS, None].double()
+    adam.update_in_torch(values, gradient, m, v, lr.to(share) * share, betas, eps, times)
+    some[moves] = moving
     records[at] = some

@@ -22,11 +22,13 @@ from ..lod.blocks import SIZE, spatial_order
 from ..lod.choice import Choice, Chooser
 from ..lod.rule import OPACITY, Region, Values, every_column, facts_of
 from ..lod.selection import known_rule, levels_alone, not_alone, rule_of
+from ..lod.sight import Sight, open_if_large
 from ..lod.streaming import BLOCKS, read_head_and_tables, read_part
 from ..scenes.cameras import Camera
 from ..splats.bundle import Bundle
 from ..splats.dialects import Warn, silent
 from ..splats.gaussians import Splats
+from ..splats.ply import Element, all_columns
 from . import device_of, rasterize
 from .gaussians import Gaussians
 from .placing import transformed
@@ -178,11 +180,13 @@ class Resident:
     """A bundle's levels, for one picture after another.
 
     Args:
-        source: a bundle, all of whose splats are kept ready; or the file of one. Of that is read what is
-            asked for: where it has a table of blocks (``lod.streaming``), and the rule tells for a region
-            which splats may be shown in it, these alone, which stay while the eye is there.
+        source: a bundle, all of whose splats are kept ready, but for levels that are elsewhere: of these each
+            camera has read what it may see (``lod.sight``). Or the file of one. Of that is read what is asked
+            for: where it has a table of blocks (``lod.streaming``), and the rule tells for a region which
+            splats may be shown in it, these alone, which stay while the eye is there.
         backend: rasterizer.
         warn: as for ``read_bundle``.
+        most: see ``open_if_large``, for a file without such regions.
 
     Attributes:
         bundle: what is known of it; without splats where it is a file.
@@ -193,7 +197,13 @@ class Resident:
         LodgsError: as ``read_bundle``, or the bundle contradicts its rule.
     """
 
-    def __init__(self, source: Bundle | str | Path, backend: str = "auto", warn: Warn = silent) -> None:
+    def __init__(
+        self,
+        source: Bundle | str | Path,
+        backend: str = "auto",
+        warn: Warn = silent,
+        most: int = 0,
+    ) -> None:
         self._path = None if isinstance(source, Bundle) else Path(source)
         self.bundle = source if isinstance(source, Bundle) else read_head_and_tables(source)
         self._backend, self._warn = backend, warn
@@ -201,6 +211,10 @@ class Resident:
         self._sets: dict[int, SplatSet] = {}
         self._holds: tuple[Region | None, frozenset[int]] | None = None
         self._rule = known_rule(self.bundle)
+        if self._path is not None:
+            self.bundle = open_if_large(self._path, most) or self.bundle
+        self._sights: dict[int, Sight] = {}
+        self._row_bytes = 0
         self._facts: dict[int, tuple[tuple[str, float], ...]] = {}
         self._tables = tuple(
             (name, tuple((column, rows.dtype.str, rows.tobytes()) for column, rows in table.items()))
@@ -224,11 +238,13 @@ class Resident:
             number: Choice(rule.name, (x, y, z), camera.focal, facts, tuple(values.items()), self._tables)
             for number, facts in self._all_facts().items()
         }
+        if self.bundle.elsewhere:
+            return {n: Chosen(self._in_sight(n, camera, choice), choice) for n, choice in choices.items()}
         self._hold(next(iter(choices.values())).region(), frozenset(choices))
         return {number: Chosen(self._sets[number], choice) for number, choice in choices.items()}
 
-    def complete(self, number: int) -> dict[int, Chosen]:
-        """All that is drawn at a level: the level, and where levels add up the coarser ones before it.
+    def complete(self, number: int, camera: Camera) -> dict[int, Chosen]:
+        """All that a camera sees of a level: the level, and where levels add up the coarser ones before it.
 
         Raises:
             LodgsError: there is no such level, or it is no scene by itself; or as ``read_bundle``.
@@ -241,6 +257,8 @@ class Resident:
         if number not in [level.number for level in levels_alone(self.bundle)]:
             raise LodgsError(*not_alone(number, known[-1]))
         numbers = [level.number for level in self.bundle.upto(number)]
+        if self.bundle.elsewhere:
+            return {number: Chosen(self._in_sight(number, camera, None), None) for number in numbers}
         self._hold(None, frozenset(numbers))
         return {number: Chosen(self._sets[number], None) for number in numbers}
 
@@ -250,7 +268,7 @@ class Resident:
 
     def draw_level(self, number: int, camera: Camera, *, near: float = 0.01, **options: Any) -> Rendering:
         """What a camera sees at a level; arguments as of :meth:`complete` and :func:`draw`."""
-        return self._draw(self.complete(number), camera, near, options)
+        return self._draw(self.complete(number, camera), camera, near, options)
 
     def _draw(self, shown: dict[int, Chosen], camera: Camera, near: float, options: dict) -> Rendering:
         options = {"antialias": self.bundle.antialias, "backend": self._backend} | options
@@ -267,6 +285,22 @@ class Resident:
                 found = facts_of(rule, self.bundle.facts, numbered, number)
                 self._facts[number] = tuple(found.items())
         return self._facts
+
+    def _in_sight(self, number: int, camera: Camera, choice: Choice | None) -> SplatSet:
+        """The splats of a level that a camera may see, where they are drawn."""
+        if number not in self._sights:
+            (level,) = (level for level in self.bundle.levels if level.number == number)
+            self._sights[number] = Sight(level.rows, self._rule, self._path or "", self._warn)
+        sight = self._sights[number]
+        missing = sight.missing(camera, choice)
+        if missing is not None:
+            self._sets.pop(number, None)  # so that both are never in memory
+            splats = sight.read(missing)
+            self._sets[number] = SplatSet(splats, None, self._backend, ordered=True)
+            self._row_bytes = Element.of("", all_columns(splats)).dtype.itemsize
+        self.loaded = sum(map(len, self._sets.values()))
+        self.bytes_read = self._row_bytes * sum(each.count for each in self._sights.values())
+        return self._sets[number]
 
     def _hold(self, region: Region | None, numbers: frozenset[int]) -> None:
         """Has these levels ready, or at least what a region shows of them."""

@@ -129,7 +129,7 @@ def render(
     if given is not None or (rule is not None and rule.always and not level):
         shown = resident.by_distance(camera, settings(bundle, given or {}))
     else:
-        shown = resident.complete(level or bundle.levels[-1].number)
+        shown = resident.complete(level or bundle.levels[-1].number, camera)
     instances = [
         Instance(one.splats, level=number, antialias=bundle.antialias, choice=one.choice)
         for number, one in shown.items()

@@ -13,6 +13,7 @@ from ..documents import json_object
 from ..errors import LodgsError
 from ..lod.choice import Choice
 from ..lod.rule import Rule, fact_names, find_rule
+from ..lod.rules.cut import RULE as CUT
 from ..scenes.cameras import FARTHEST, Camera, camera_from_dict, check_size
 
 BRIGHTEST = 1e6
@@ -41,6 +42,8 @@ class NamedSet:
 
     Attributes:
         file: a name in the folder of arrays.
+        tree: a bundle of the rule ``cut`` somewhere else, of which the choice's cut is read instead, with its
+            levels; or None.
         count: of its splats.
         antialias: see ``scene.Instance``.
         columns: names of the further columns that the file has.
@@ -54,6 +57,7 @@ class NamedSet:
     antialias: bool = False
     columns: tuple[str, ...] = ()
     choice: Choice | None = None
+    tree: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -137,14 +141,19 @@ def _named_set(values: Any) -> NamedSet:
     matrix = np.reshape(_numbers({"matrix": matrix.ravel().tolist()}, "matrix", 16, FARTHEST), (4, 4))
     if matrix[3].tolist() != [0, 0, 0, 1]:
         raise _refused("matrix", values["matrix"])
+    tree = _path(values, "tree")
+    choice = _choice(_of_kind(values, "choice", dict)) if values.get("choice") is not None else None
+    if tree is not None and (choice is None or choice.rule != CUT.name):
+        raise _refused("choice", "given with a tree")
     return NamedSet(
-        file=_name(values, "file"),
-        count=_whole(values, "count", 0, MOST_SPLATS),
+        file="" if tree else _name(values, "file"),
+        count=0 if tree else _whole(values, "count", 0, MOST_SPLATS),
         matrix=matrix,
-        level=_whole(values, "level", 0, LAST_LEVEL),
+        level=0 if tree else _whole(values, "level", 0, LAST_LEVEL),
         antialias=bool(values.get("antialias")),
         columns=_columns(values),
-        choice=_choice(_of_kind(values, "choice", dict)) if values.get("choice") is not None else None,
+        choice=choice,
+        tree=tree,
     )
 
 

@@ -8,7 +8,8 @@ is removed when standard input ends, however the other program ended.
      "depth": true, "levels": true, "window": [left, top, width, height] or null,
      "photograph": PATH or null, "holdout": PATH or null,
      "sets": [{"file": NAME, "count": N, "matrix": 4x4, "level": 3,
-               "columns": [NAME, ...], "choice": {...} or null}, ...]}
+               "columns": [NAME, ...], "choice": {...} or null},
+              {"tree": PATH, "matrix": 4x4, "choice": {...}}, ...]}
     {"cancel": 7}
 
 answer ``progress`` (frame, share) and ``warning`` (frame, message), then one of ``frame`` (frame, passes,
@@ -20,17 +21,20 @@ the window's.
 A set is read when its file is first named, and forgotten when a frame does not name it; its file may go after
 an answer ``frame``. With a choice (``lod.choice``: ``rule``, ``eye`` in the set's coordinates, ``focal_px``,
 and by name ``facts``, ``values`` and ``tables``) its splats are weighted as the rule says, times the file's
-weights; what the rule knows of each splat are the file's columns of these names.
+weights; what the rule knows of each splat are the file's columns of these names. A tree is a bundle of the
+rule ``cut``, of which is read what the frame shows.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import queue
 import sys
 import threading
 import time
 import traceback
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO
 
@@ -40,8 +44,11 @@ import torch
 from .. import VERSION
 from ..errors import LodgsError, out_of_memory
 from ..evaluate.metrics import psnr
+from ..lod.paging import TreeFile
 from ..rasterize import resolve
+from ..rasterize.placing import similarity
 from ..runs.events import event_line
+from ..scenes.cameras import camera_as_dict
 from ..scenes.images import load_image
 from ..splats.dialects import drawable
 from . import wire
@@ -75,6 +82,8 @@ class _Server:
     def __init__(self, folder: Path, backend: str, answers: IO[str]) -> None:
         self._folder, self._backend, self._answers = folder, backend, answers
         self._sets: dict[str, SplatSet] = {}
+        self._trees: dict[Path, tuple[tuple[int, int], TreeFile]] = {}
+        self._cuts: dict[tuple, list[tuple[int, SplatSet]]] = {}
         self._requests: queue.SimpleQueue[FrameRequest] = queue.SimpleQueue()
         self._cancelled: set[int] = set()
 
@@ -128,7 +137,7 @@ class _Server:
         limit = None
         if request.holdout:
             limit = read_depth(request.holdout, camera.width, camera.height, window)
-        instances = self._instances(frame, request.sets)
+        instances = self._instances(frame, request)
         if frame in self._cancelled:
             self.say("cancelled", frame=frame)
             return
@@ -156,15 +165,58 @@ class _Server:
             seconds=round(time.perf_counter() - started, 4), **measured,
         )  # fmt: skip
 
-    def _instances(self, frame: int, sets: list[NamedSet]) -> list[Instance]:
+    def _instances(self, frame: int, request: FrameRequest) -> list[Instance]:
         """The sets of a frame; those of the last frame that are named again stay as they are."""
         kept, instances = {}, []
-        for one in sets:
+        cuts = {i: self._cut_of(one, request) for i, one in enumerate(request.sets) if one.tree is not None}
+        self._cuts = {key: self._cuts[key] for key, _ in cuts.values() if key in self._cuts}
+        for i, one in enumerate(request.sets):
+            if i in cuts:
+                key, read = cuts[i]
+                if key not in self._cuts:
+                    self._cuts[key] = read()
+                instances += [
+                    Instance(splats, one.matrix, level, one.antialias, one.choice)
+                    for level, splats in self._cuts[key]
+                ]
+                continue
             if one.file not in kept:
                 kept[one.file] = self._sets.get(one.file) or self._read_set(frame, one)
             instances.append(Instance(kept[one.file], one.matrix, one.level, one.antialias, one.choice))
         self._sets = kept
         return instances
+
+    def _cut_of(
+        self, one: NamedSet, request: FrameRequest
+    ) -> tuple[tuple, Callable[[], list[tuple[int, SplatSet]]]]:
+        """What a tree's cut depends on, and what reads it: sets by their levels' numbers.
+
+        Raises:
+            LodgsError: the file cannot be read.
+        """
+        path, choice, camera, unit = one.tree, one.choice, None, 1.0
+        assert path is not None and choice is not None
+        try:
+            stat = path.stat()
+        except OSError as error:
+            raise LodgsError(
+                f"{path} cannot be read: {error.strerror}.",
+                "Choose where the file is under Streaming, or clear it to draw what the scene holds.",
+            ) from error
+        stamp = stat.st_mtime_ns, stat.st_size
+        if path not in self._trees or self._trees[path][0] != stamp:
+            self._trees[path] = stamp, TreeFile(path)
+        file = self._trees[path][1]
+        if similarity(one.matrix):
+            camera, unit = request.camera.within(one.matrix)
+        near = request.near / unit
+        where = None if camera is None else json.dumps(camera_as_dict(camera, near))
+
+        def read() -> list[tuple[int, SplatSet]]:
+            cut = file.cut(choice, camera, near)
+            return [(level, SplatSet(splats, None, self._backend)) for level, splats in cut.items()]
+
+        return (path, stamp, choice, where), read
 
     def _read_set(self, frame: int, one: NamedSet) -> SplatSet:
         """A set from its file, without what cannot be drawn."""

@@ -11,14 +11,22 @@ from scipy.special import expit, logit
 from ..errors import LodgsError
 from ..lod.rule import find_rule
 from ..lod.selection import complete, select, settings
-from ..splats.bundle import Bundle, read_bundle, read_folder
+from ..splats.bundle import Bundle, DrawableRows, open_bundle, read_bundle, read_folder, read_head
 from ..splats.dialects import Warn, silent
-from ..splats.gaussians import Splats
+from ..splats.gaussians import SplatRows, Splats
 from .folder import RunFolder
 
 
 def read_base(path: str | Path, warn: Warn = silent) -> tuple[Splats, bool]:
+    """:func:`open_base`, with all splats in memory."""
+    rows, antialias = open_base(path, warn)
+    return rows.select(slice(None)), antialias
+
+
+def open_base(path: str | Path, warn: Warn = silent) -> tuple[SplatRows, bool]:
     """The finest complete level of a finished run, of a bundle or an exported folder, or of a plain PLY.
+
+    They stay in the file where that has them as they are to begin with; it is read once to be sure of it.
 
     Args:
         path: a run's folder, one of levels with its manifest, or a PLY.
@@ -41,14 +49,24 @@ def read_base(path: str | Path, warn: Warn = silent) -> tuple[Splats, bool]:
                 f"{path.parent} holds no finished run (no {path.name}).",
                 "Train it to the end first, or choose a PLY of splats.",
             )
-    bundle = (read_folder if path.is_dir() else read_bundle)(path, warn)
-    splats = complete(bundle, bundle.levels[-1])
-    rule = find_rule(bundle.rule)
-    if rule is not None and rule.always and "camera_center" in bundle.meta:
-        splats = _as_seen(bundle, np.asarray(bundle.meta["camera_center"]))
+    head = None if path.is_dir() else read_head(path)
+    rule = None if head is None else find_rule(head.rule)
+    if head is None or head.cumulative or (rule is not None and rule.always):
+        bundle = (read_folder if path.is_dir() else read_bundle)(path, warn)
+        splats: SplatRows = _finest(bundle)
+    else:
+        bundle, rows = open_bundle(path)
+        splats = DrawableRows(rows[bundle.levels[-1].number], warn)
     if not len(splats):
         raise LodgsError(f"{path} holds no splats to begin with.", "Choose another run or PLY.")
     return splats, bundle.antialias
+
+
+def _finest(bundle: Bundle) -> Splats:
+    rule = find_rule(bundle.rule)
+    if rule is not None and rule.always and "camera_center" in bundle.meta:
+        return _as_seen(bundle, np.asarray(bundle.meta["camera_center"]))
+    return complete(bundle, bundle.levels[-1])
 
 
 def _as_seen(bundle: Bundle, eye: np.ndarray) -> Splats:

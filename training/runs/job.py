@@ -186,7 +186,8 @@ class Job:
 
     @cached_property
     def _parameters(self) -> Parameters:
-        return parameters_of(self.method, self.preset, self.parameters)
+        captured = method_info(self.method).captured if self.capture else {}
+        return parameters_of(self.method, self.preset, {**captured, **self.parameters})
 
     def resolved(self) -> Job:
         """The same job with every parameter written out, so that a later version repeats it unchanged."""

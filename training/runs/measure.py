@@ -16,6 +16,7 @@ from ..evaluate.words import summary_lines
 from ..files import atomic_write
 from ..lod.rule import Values, find_rule
 from ..lod.selection import levels_alone, select, settings, unknown_rule
+from ..lod.sight import open_if_large
 from ..methods import create
 from ..rasterize.resident import Resident
 from ..scenes.aside import read_aside
@@ -43,8 +44,9 @@ def evaluate_run(
         with all coarser ones. Of the finest,
         ``train_psnr``, ``veil``, ``oversized``, ``worst`` (``evaluate.summary``), and ``aside`` where the
         scene has views off its path (``scenes.aside``): their mean ``psnr`` and the names of the ``views``.
-        By the rule, ``selective``: per view and predetermined (chosen from the mean training camera), with
-        the values of the rule's controls; none where the levels have no rule. ``frame_s``: seconds a frame
+        By the rule, ``selective``: per view and predetermined (chosen from the mean training camera; not of a
+        file that is too large for memory), with the values of the rule's controls; none where the levels have
+        no rule. ``frame_s``: seconds a frame
         ``by_distance``, choosing included, and in ``full`` detail, drawn in turn; not for rules whose weights
         always count. ``curve``: as ``selective`` for each value of the rule's ``sweep``, where it has one.
         ``networks``: of a model that was baked, before that.
@@ -63,7 +65,7 @@ def evaluate_run(
         raise LodgsError(f"{run} holds no finished run (no bundle.ply).", "Train it to the end first.")
     job = Job.from_file(folder.job)
     data = training_data(job, folder)
-    bundle = read_bundle(folder.bundle)
+    bundle = open_if_large(folder.bundle) or read_bundle(folder.bundle)
     evaluation = Evaluation(data, job.backend, bundle.antialias)
     rule = find_rule(bundle.rule)
     if rule is None and (given or bundle.rule):
@@ -91,12 +93,13 @@ def evaluate_run(
         report["aside"] = {"psnr": round(quality, 3), "views": [camera.name for camera in aside]}
     values = settings(bundle, given or {}) if rule else {}
     if rule:
-        predetermined = select(bundle, data.mean_camera, data.focal, values)
         resident = Resident(bundle, job.backend)
-        report["selective"] = [
-            {"set": "per view", **values, **evaluation.measure_by_distance(resident, values)},
-            {"set": "predetermined", **values, **evaluation.measure_set(*predetermined)},
-        ]
+        per_view = evaluation.measure_by_distance(resident, values)
+        report["selective"] = [{"set": "per view", **values, **per_view}]
+        if not bundle.elsewhere:
+            predetermined = select(bundle, data.mean_camera, data.focal, values)
+            found = evaluation.measure_set(*predetermined)
+            report["selective"].append({"set": "predetermined", **values, **found})
         if rule.sweep:
             name, steps = rule.sweep
             report["curve"] = [

@@ -13,9 +13,12 @@ from .job import BACKENDS, Job
 
 
 def _whole(text: str) -> int:
-    if not 0 <= int(text) < 2**31:
-        raise argparse.ArgumentTypeError(f"{text} is not between 0 and {2**31 - 1}")
-    return int(text)
+    try:
+        if 0 <= (value := int(text)) < 2**31:
+            return value
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f"{text} is no whole number from 0 to {2**31 - 1}")
 
 
 _OPTIONS: dict[str, dict] = {

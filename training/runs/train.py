@@ -27,13 +27,14 @@ from ..evaluate.views import Evaluation
 from ..files import atomic_write
 from ..lod.rule import find_rule
 from ..lod.selection import levels_alone, settings
+from ..lod.sight import IN_MEMORY, in_parts
 from ..methods import METHODS, create
 from ..methods.data import TrainingData
 from ..methods.method import Method
 from ..rasterize import cuda, device_of, resolve, warm_up
 from ..rasterize.resident import Resident
 from ..scenes.orientation import up_rotation
-from ..splats.bundle import Bundle, Level, write_bundle
+from ..splats.bundle import NO_SPLATS, Bundle, Level, open_ply, write_bundle
 from ..splats.dialects import comments_of
 from ..splats.ply import read_ply, write_ply
 from .base import read_base
@@ -203,10 +204,7 @@ class _Run:
     def write_bundle(self) -> Bundle:
         """All levels, as they were written one by one, in one file."""
         self.folder.require_held()
-        levels = [
-            Level(record["level"], read_ply(self.folder.file(record["path"])), record["facts"])
-            for record in self.levels
-        ]
+        levels = [self._written(record) for record in self.levels]
         up = up_rotation(self.data.scene.cameras).round(6)
         meta = {**self.method.meta(), "up_rotation": up, "seed": self.job.seed}
         if self.job.test_every:
@@ -224,6 +222,13 @@ class _Run:
                 self._warn(message)
         write_bundle(self.folder.bundle, bundle)
         return bundle
+
+    def _written(self, record: dict) -> Level:
+        """A level as it was written; large ones stay in their file."""
+        path = self.folder.file(record["path"])
+        if record["splats"] > IN_MEMORY and in_parts(METHODS[self.job.method].rule):
+            return Level(record["level"], NO_SPLATS, record["facts"], open_ply(path))
+        return Level(record["level"], read_ply(path), record["facts"])
 
     def _without_splats(self) -> Bundle:
         """What the method says of its levels, as a bundle that has none yet."""
@@ -257,14 +262,19 @@ class _Run:
         alone = [level.number for level in levels_alone(bundle)]
         for place, level in enumerate(levels, 1):
             path = self.folder.levels_folder / f"level_{level.number}.ply"
-            write_ply(path, level.splats, comments_of(bundle.meta))
+            write_ply(path, level.rows, comments_of(bundle.meta))
             record = {
                 "level": level.number,
                 "path": f"levels/{path.name}",
-                "splats": len(level.splats),
+                "splats": len(level.rows),
                 "facts": level.facts,
             }
-            quality = self.evaluation.measure_level(bundle, level) if level.number in alone else {}
+            quality = {}
+            if level.number in alone:
+                if level.elsewhere is not None:
+                    level = self._written(record)
+                coarser = [other for other in levels if other.number < level.number]
+                quality = self.evaluation.measure_level(replace(bundle, levels=[*coarser, level]), level)
             self.events(
                 "level", **(quality | record), rule=bundle.rule, scene_facts=bundle.facts,
                 controls=bundle.controls, cumulative=bundle.cumulative, meta=bundle.meta,

@@ -22,14 +22,14 @@ import numpy as np
 from ..documents import json_object, read_json, shown
 from ..errors import LodgsError
 from ..files import atomic_write
-from .dialects import FARTHEST, Warn, as_3dgs, comments_of, drawable, meta_of, silent
+from .dialects import FARTHEST, Warn, as_3dgs, comments_of, drawable, in_3dgs, left_out, meta_of, silent
 from .gaussians import SplatRows, Splats
 from .ply import (
+    AT_ONCE,
     Columns,
     Element,
     columns_of,
     columns_of_extras,
-    every_column,
     let_go,
     read_comments,
     read_elements,
@@ -46,6 +46,8 @@ MOST_LEVELS_READ = 64
 ORDERS = ("finest_first", "stream")
 TABLES_FILE = "tables.ply"
 """What holds the tables of a folder of levels."""
+_ROW = "row"
+"""Column that tells in which row of a file splats are."""
 _TAG = "lodsplat "
 # Some viewers search the whole header for these words, so no comment may hold one.
 _FORBIDDEN = ("packed_", "f_rest_", "end_header", "element chunk")
@@ -122,6 +124,11 @@ class Bundle:
     def antialias(self) -> bool:
         """Whether the splats are drawn through Mip-Splatting's 2D filter, as they were trained."""
         return bool(self.meta.get("antialias"))
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether splats of a level are not in memory."""
+        return any(level.elsewhere is not None for level in self.levels)
 
     def upto(self, number: int) -> list[Level]:
         """The levels that are drawn at a level: it, and where levels add up the coarser ones before it."""
@@ -235,8 +242,8 @@ class Rows:
     def __len__(self) -> int:
         return len(self.vertices)
 
-    def columns(self, some: slice, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """Columns (M,) of a range of rows, of those of these names that there are; nothing else is read."""
+    def columns(self, some: slice | np.ndarray, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """Columns (M,) of some rows, of those of these names that there are; nothing else is read."""
         found = {}
         for rows in (self.vertices, self.extras):
             there = () if rows is None else rows.dtype.names or ()
@@ -261,17 +268,52 @@ class Rows:
         return splats
 
 
+class DrawableRows:
+    """Of the splats of a file those that can be drawn, in the meaning of the 3DGS columns.
+
+    All are read once for it.
+
+    Args:
+        warn: as for `read_ply`.
+    """
+
+    def __init__(self, rows: Rows, warn: Warn = silent) -> None:
+        self._rows, self._kept = rows, None
+        kept, tell = [], warn
+        for begin in range(0, len(rows), AT_ONCE):
+            splats = self._meant(slice(begin, begin + AT_ONCE), tell)
+            splats.extras = {_ROW: begin + np.arange(len(splats))}
+            kept.append(drawable(splats, rows.path).extras[_ROW])
+            tell = silent
+        missing = len(rows) - sum(map(len, kept))
+        if missing:
+            self._kept = np.concatenate(kept)
+            warn(left_out(missing, rows.path))
+
+    def __len__(self) -> int:
+        return len(self._rows) if self._kept is None else len(self._kept)
+
+    def select(self, some: slice, /) -> Splats:
+        """The splats of a range of rows."""
+        return drawable(self._meant(some if self._kept is None else self._kept[some]), self._rows.path)
+
+    def _meant(self, some: slice | np.ndarray, warn: Warn = silent) -> Splats:
+        splats = self._rows.select(some)
+        return splats if self._rows.extras is not None else in_3dgs(splats, self._rows.path, warn)
+
+
 def open_bundle(path: str | Path) -> tuple[Bundle, dict[int, Rows]]:
-    """A bundle with its tables, but without splats, and each level's by number to read of: of a binary file
-    nothing else is read.
+    """A bundle with its tables, but without splats, and each level's by number to read of, as they stand
+    there: of a binary file nothing else is read. Any other PLY is one level of unknown method.
 
     Raises:
-        LodgsError: as `read_bundle`, or it is a PLY without levels.
+        LodgsError: as `read_bundle`.
     """
     elements, comments = read_elements(path)
     bundle, lines = _parse(comments, path)
     if bundle is None:
-        raise LodgsError(f"{path} is a PLY without levels.", "Choose a bundle.")
+        bundle = Bundle("", [Level(1, NO_SPLATS)], meta=meta_of(comments))
+        return bundle, {1: Rows(elements["vertex"], None, path)}
     return bundle, _rows_of_levels(bundle, lines, elements, path)
 
 
@@ -388,7 +430,7 @@ def write_folder(folder: str | Path, bundle: Bundle) -> str:
                     "bytes": temporary.stat().st_size,
                     "sha256": digest,
                 }
-                | {"bounds": _bounds([x.splats for x in drawn])}
+                | {"bounds": bounds_of([x.rows for x in drawn])}
             )
             command += [str(path), "-l", str(lod)]
         if bundle.tables:
@@ -396,7 +438,7 @@ def write_folder(folder: str | Path, bundle: Bundle) -> str:
             no_splats = Element.of("vertex", columns_of(NO_SPLATS))
             write_elements(temporary, [no_splats, *_table_elements(bundle)])
         manifest_file.write_text(
-            json.dumps(manifest, indent=1, default=_plain, allow_nan=False) + "\n", "ascii"
+            json.dumps(manifest, indent=1, default=as_plain, allow_nan=False) + "\n", "ascii"
         )
     unused = [
         file
@@ -458,41 +500,6 @@ def read_folder(folder: str | Path, warn: Warn = silent) -> Bundle:
         )
     levels = [Level(i, read_ply(file, warn)) for i, file in enumerate(coarse_first, 1)]
     return Bundle("", levels, meta=read_head(coarse_first[-1]).meta)
-
-
-def describe(path: str | Path) -> str:
-    """What a bundle, a plain PLY or a folder of levels holds, as a few lines of text.
-
-    Raises:
-        LodgsError: as `read_bundle` and `read_folder`.
-    """
-    warnings: list[str] = []
-    bundle = (read_folder if Path(path).is_dir() else read_bundle)(path, warnings.append)
-    splats = [level.splats for level in bundle.levels]
-    low, high = (", ".join(f"{x:.4g}" for x in corner) for corner in _bounds(splats))
-    names = sorted({name for level in bundle.levels for name in level.facts})
-    lines = [
-        f"{path}: {bundle.method or 'plain 3DGS PLY'}, {len(splats)} level{'s'[: len(splats) > 1]}, "
-        f"{'each adding to the coarser ones' if bundle.cumulative else 'each complete'}, "
-        f"SH degree {splats[0].sh_degree}",
-        f"chosen by the rule {bundle.rule}" if bundle.rule else "not made for distances",
-        f"bounds  ({low}) to ({high})",
-        f"{'level':>5}  {'splats':>10}  {'MB':>8}  {''.join(f'{name:>10}  ' for name in names)}extras",
-    ]
-    for level in bundle.levels:
-        columns = every_column(level.splats)
-        size = Element.of("", columns).size / 1e6
-        facts = "".join(
-            f"{level.facts[name]:>10.6g}  " if name in level.facts else f"{'-':>10}  " for name in names
-        )
-        extras = ", ".join(level.splats.extras) or "-"
-        lines.append(f"{level.number:>5}  {len(level.splats):>10,}  {size:>8.2f}  {facts}{extras}")
-    for name, table in bundle.tables.items():
-        rows = len(next(iter(table.values()), ()))
-        lines.append(f"table {name}: {rows:,} rows of {', '.join(table)}")
-    said = {**bundle.facts, **bundle.controls, **bundle.meta}
-    lines += [f"{name}: {json.dumps(value, default=_plain)}" for name, value in said.items()]
-    return "\n".join([*lines, *warnings])
 
 
 def _check(bundle: Bundle) -> None:
@@ -654,24 +661,25 @@ def _contradiction(path: str | Path, error: Exception) -> LodgsError:
     )
 
 
-def _bounds(splats: list[Splats]) -> list[list[float]]:
-    """Smallest and largest x, y, z of the means that are numbers."""
-    parts = [means for x in splats if len(means := x.means[np.isfinite(x.means).all(1)])]
-    if not parts:
-        return [[0.0] * 3] * 2
-    return [
-        np.min([x.min(axis=0) for x in parts], axis=0).tolist(),
-        np.max([x.max(axis=0) for x in parts], axis=0).tolist(),
-    ]
+def bounds_of(sets: Sequence[SplatRows]) -> list[list[float]]:
+    """Smallest and largest x, y, z of the means that are numbers, of all sets of splats together."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for rows in sets:
+        for begin in range(0, len(rows), AT_ONCE):
+            means = rows.select(slice(begin, begin + AT_ONCE)).means
+            means = means[np.isfinite(means).all(axis=1)]
+            low = np.minimum(low, means.min(axis=0, initial=np.inf))
+            high = np.maximum(high, means.max(axis=0, initial=-np.inf))
+    return [low.tolist(), high.tolist()] if (low <= high).all() else [[0.0] * 3] * 2
 
 
 def _comment(facts: dict) -> str:
-    text = json.dumps(facts, separators=(",", ":"), default=_plain, allow_nan=False)
+    text = json.dumps(facts, separators=(",", ":"), default=as_plain, allow_nan=False)
     for word in _FORBIDDEN:  # such words only occur inside JSON strings, where an escape means the same
         text = text.replace(word, f"{word[:-1]}\\u{ord(word[-1]):04x}")
     return _TAG + text
 
 
-def _plain(value):
-    """A numpy scalar or array as json knows it."""
+def as_plain(value):
+    """A numpy scalar or array as json knows it: its ``default``."""
     return value.tolist()

@@ -46,12 +46,17 @@ def refuse(columns: Collection[str], comments: Iterable[str], path: str | Path) 
         raise LodgsError(f"{path} {what}", remedy)
 
 
-@np.errstate(all="ignore")  # what is no number stays none, and is left out
 def as_3dgs(splats: Splats, path: str | Path, warn: Warn = silent) -> Splats:
+    """`in_3dgs`, without what cannot be drawn (`drawable`)."""
+    return drawable(in_3dgs(splats, path, warn), path, warn)
+
+
+@np.errstate(all="ignore")  # what is no number stays none
+def in_3dgs(splats: Splats, path: str | Path, warn: Warn = silent) -> Splats:
     """Splats of any dialect that `refuse` lets pass, in the meaning of the 3DGS columns.
 
     The columns that are worked into others are gone, so that nothing is applied twice when the splats are
-    written and read again. What cannot be drawn is left out (`drawable`).
+    written and read again.
 
     - ``filter_3D`` (Mip-Splatting, before fusing): widened and fainter by its Eq. 9.
     - ``f_offset_0..2`` and six scales (Octree-AnyGS, explicit): mean = anchor + offset · exp(scale_0..2), and
@@ -70,7 +75,12 @@ def as_3dgs(splats: Splats, path: str | Path, warn: Warn = silent) -> Splats:
     if "filter_3D" in extras:
         log_scales, logits = _smoothed(splats.log_scales, splats.opacity_logits, extras.pop("filter_3D"))
         splats = replace(splats, log_scales=log_scales, opacity_logits=logits)
-    return drawable(replace(splats, extras=extras), path, warn)
+    return replace(splats, extras=extras)
+
+
+def left_out(count: int, path: str | Path) -> str:
+    """What to say of so many splats that `drawable` has left out."""
+    return f"{count:,} splats of {path} have values that are no numbers, or too large to draw: left out."
 
 
 @np.errstate(invalid="ignore")
@@ -97,8 +107,7 @@ def drawable(splats: Splats, path: str | Path, warn: Warn = silent) -> Splats:
         splats = replace(splats, quats=quats)
     if kept.all():
         return splats
-    left_out = np.count_nonzero(~kept)
-    warn(f"{left_out:,} splats of {path} have values that are no numbers, or too large to draw: left out.")
+    warn(left_out(int(np.count_nonzero(~kept)), path))
     return splats.select(kept)
 
 

@@ -119,7 +119,7 @@ def write_ply(path: str | Path, splats: SplatRows, comments: Sequence[str] = ())
     Raises:
         LodgsError: the file cannot be written, or an extra has a name or a type that PLY does not know.
     """
-    write_elements(path, [Element.of_splats("vertex", [splats], every_column)], comments)
+    write_elements(path, [Element.of_splats("vertex", [splats], all_columns)], comments)
 
 
 def columns_of(splats: Splats) -> Columns:
@@ -137,7 +137,7 @@ def columns_of(splats: Splats) -> Columns:
     }
 
 
-def every_column(splats: Splats) -> Columns:
+def all_columns(splats: Splats) -> Columns:
     """The 3DGS columns, and the extras."""
     return columns_of(splats) | columns_of_extras(splats)
 

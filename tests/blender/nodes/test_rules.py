@@ -10,7 +10,7 @@ RANGES = {
     "tau": (0.002, 0.02), "reference": (-3, 20), "sigma_d": (-0.5, 3), "s_v": (1, 4),
     "at_most": (-1500, 3000), "d_l": (1, 6), "coarser_d_l": (7, 14), "distance_scale": (0.7, 1.6),
     "chunks_0": (0, 2**24), "chunks_1": (0, 2**24), "chunks_2": (0, 2**24), "chunks_3": (0, 2**24),
-    "node_size": (-0.05, 0.1), "parent_size": (0, 0.4), "parent_x": (-8, 8), "parent_y": (-8, 8),
+    "node_size": (-0.05, 0.1), "parent_size": (0, 1.6), "parent_x": (-8, 8), "parent_y": (-8, 8),
     "parent_z": (-8, 8),
 }  # fmt: skip
 """Of facts, controls and columns for which the usual ones would show everything or nothing."""

@@ -188,3 +188,30 @@ def test_panels_say_what_a_trees_coarser_level_is(tree, draw_panel):
     tree.lodgs.tell = "LEVELS"
     notes = draw_panel("viewport", "LODGS_PT_viewport")
     assert not notes.colors and any("half as large" in text for text in notes.texts)
+
+
+def test_what_is_read_from_a_file_is_told(bpy, lodgs, draw, draw_panel, tmp_path, monkeypatch):
+    bundles, tree = lodgs("training.splats.bundle"), tree_of(random_leaves(3000, np.random.default_rng(0)))
+    bundles.write_bundle(tmp_path / "town.ply", tree)
+    panel = lodgs("panels.levels").LODGS_PT_stream
+    whole = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "town.ply")
+    assert not panel.poll(bpy.context)
+    lodgs("data.removal").remove(whole)
+    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "town.ply", budget=2000)
+    assert panel.poll(bpy.context) and not any("splats shown" in text for text in draw().texts)
+
+    def texts():
+        return draw_panel("levels", "LODGS_PT_stream").texts
+
+    views, streaming = lodgs("viewport.views"), lodgs("viewport.streaming")
+    assert texts() == ["499 of 5,999 splats here"]
+    monkeypatch.setattr(streaming.Stream, "_open", lambda self: None)
+    stream = streaming.Stream(lodgs("data.streams").source_of(root))
+    monkeypatch.setitem(views._streams, root.session_uid, stream)
+    assert texts()[1:] == ["Reading finer ones…"]
+    stream.problem = "The disk is gone."
+    assert "The disk is gone." in " ".join(texts())
+    root.lodgs.mode = "SINGLE"
+    assert "By Distance" in " ".join(texts())
+    bpy.data.objects.remove(root.lodgs.levels[0].object)
+    assert "drawn as they are" in " ".join(texts())

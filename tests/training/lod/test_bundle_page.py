@@ -135,7 +135,7 @@ class Page:
         return u * ((1 - share) * inside(a) + share * inside(b)) + (1 - u) * w
 
     def cut(self, n: int, d: np.ndarray, f: float, values: dict) -> np.ndarray:
-        k, columns = np.float32(max(f / values["pixels"], 32)), self.columns[n]
+        k, columns = np.float32(max(f / values["pixels"], 8)), self.columns[n]
         parent = np.stack([columns[f"parent_{axis}"] for axis in "xyz"], axis=1)
         to_parent = np.sqrt(((parent - np.float32(self.eye)) ** 2).sum(axis=1))
         with np.errstate(over="ignore"):

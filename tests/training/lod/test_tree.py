@@ -6,8 +6,8 @@ import pytest
 from training.lod.rule import rules
 from training.lod.rules.cut import ABOVE_ROOT, K_LEAST
 from training.lod.selection import select_levels, settings
-from training.lod.tree import Tree, area_of, size_of, treeless_columns
-from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
+from training.lod.tree import Tree, area_of, complete_levels, size_of, treeless_columns
+from training.splats.bundle import Bundle, Level, read_bundle, read_folder, write_bundle, write_folder
 from training.splats.gaussians import Splats
 
 
@@ -101,6 +101,35 @@ def test_levels_in_a_file_are_a_proper_cut_from_everywhere(tmp_path):
                 assert seen[path].sum() == 1
             drawn.append(len(found))
     assert min(drawn) == 1 and max(drawn) == 300
+
+
+def test_levels_for_whoever_knows_no_trees_are_whole_scenes(tmp_path):
+    rng = np.random.default_rng(4)
+    tree = random_tree(rng, 9000)
+    splats = nodes(rng, len(tree))
+    splats.sh[:, 0, 0] = np.arange(len(tree))
+    splats.extras["own"] = np.arange(len(tree), dtype=np.float32)
+    bundle = Bundle("tree", tree.levels(splats), "cut", controls={"pixels": 2.0}, meta={"seed": 3})
+    found = complete_levels(bundle)
+    counts = [len(level.splats) for level in found.levels]
+    assert len(counts) == 3 and counts[2] == 9000 and counts[1] <= 2250 and 500 <= counts[0] <= counts[1] / 4
+    assert counts[1] > 1000 and [level.number for level in found.levels] == [1, 2, 3]
+    sizes = tree.sizes(splats.means, splats.log_scales)
+    for level in found.levels:
+        seen = np.zeros(len(tree), bool)
+        seen[level.splats.sh[:, 0, 0].astype(int)] = True
+        covered = seen.copy()  # by itself, or by one above: never by two
+        for layer in tree.layers:
+            below = tree.children[layer - tree.leaves]
+            assert not (covered[layer][:, None] & seen[below]).any()
+            covered[below] |= covered[layer][:, None]
+        assert covered[: tree.leaves].all() and sizes[seen].max() <= level.facts["s_min"]
+        assert list(level.splats.extras) == ["own"]
+    write_folder(tmp_path, found)
+    again = read_folder(tmp_path)
+    assert (again.rule, again.controls) == ("bands", {"gamma": 2.0, "first": 1}) and again.meta == {"seed": 3}
+    near, far = (select_levels(again, np.full(3, away), 100.0, settings(again, {})) for away in (0.0, 1e6))
+    assert [len(one.splats) for one in far] == [counts[0], 0, 0] and len(near[2].splats) > 0
 
 
 def test_leaves_without_a_tree_are_all_shown():

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from training.lod.blocks import spatial_order
+from training.lod.paging import streaming_order, table_of_pages
 from training.lod.rules.cut import ABOVE_ROOT, least_size
-from training.splats.bundle import Bundle, Level
+from training.lod.streaming import BLOCKS
+from training.splats.bundle import Bundle, Level, write_bundle
 from training.splats.gaussians import Splats
 
 
@@ -66,3 +68,10 @@ def tree_of(leaves: Splats) -> Bundle:
     leaves.extras = {name: column[:count] for name, column in extras.items()}
     above = nodes.select(np.argsort(-sizes[count:], kind="stable") + count)
     return Bundle("tree", [Level(1, above), Level(2, leaves)], "cut")
+
+
+def write_in_pages(path, tree):
+    """A tree as a file whose ranges are of one place, with the table that says of which."""
+    levels = [Level(x.number, x.splats.select(streaming_order(x.splats.extras))) for x in tree.levels]
+    table = table_of_pages({level.number: level.splats.extras for level in levels})
+    write_bundle(path, Bundle("tree", levels, "cut", tables={BLOCKS: table}))

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from training.rasterize import records
+from training.rasterize import Rendering, records
 
 COUNT, TERMS = 500, 4
 C = 11 + 3 * TERMS
@@ -14,6 +14,12 @@ def made():
     found = torch.randn(COUNT, 3 * C + 3, generator=NUMBERS)
     found[:, C:] = 0
     return found
+
+
+def rendering(count):
+    nothing = torch.zeros(0)
+    radii = torch.arange(count) % 3
+    return Rendering(nothing, nothing, radii, torch.randn(count, 2, generator=NUMBERS), nothing, None)
 
 
 def test_what_is_gathered_lies_in_the_order_of_gaussians():
@@ -34,15 +40,20 @@ def test_each_record_makes_steps_of_its_own():
         at = torch.from_numpy(places)
         shapes = (3,), (4,), (3,), (), (TERMS, 3)
         gradients = [torch.randn(200, *shape, generator=NUMBERS) * (number % 3) for shape in shapes]
-        score, seen = torch.rand(200, generator=NUMBERS), torch.arange(200) % 3 > 0
-        records.step(some, places, gradients, score, seen, number, rates)
+        drawn = rendering(200)
+        opacity = some[at, 10].sigmoid()
+        shares = torch.tensor([0.0, 0.25, 1.0])[torch.arange(200) % 3] if number % 2 else None
+        records.step(some, places, gradients, drawn, number, rates, shares)
+        score = drawn.grad2d.norm(dim=1) * drawn.radii * opacity**0.2
         g = torch.cat([each.reshape(200, -1) for each in gradients], 1).double()
+        largest[at] = torch.maximum(largest[at], score)
+        last[at[drawn.radii > 0]] = float(number)
+        share = torch.ones(200, 1).double() if shares is None else shares[:, None].double()
+        at, g, share = (each[share[:, 0] > 0] for each in (at, g, share))
         times[at] += 1
         m[at], v[at] = 0.9 * m[at] + 0.1 * g, 0.999 * v[at] + 0.001 * g**2
         first, second = (1 - beta ** times[at].double() for beta in (0.9, 0.999))
-        values[at] -= rates.double() * (m[at] / first) / ((v[at] / second).sqrt() + 1e-15)
-        largest[at] = torch.maximum(largest[at], score)
-        last[at[seen]] = float(number)
+        values[at] -= share * rates.double() * (m[at] / first) / ((v[at] / second).sqrt() + 1e-15)
     torch.testing.assert_close(some[:, :C].double(), values, rtol=2e-5, atol=2e-6)
     torch.testing.assert_close(some[:, C : 2 * C].double(), m, rtol=2e-5, atol=2e-6)
     torch.testing.assert_close(some[:, 3 * C :], torch.stack([times[:, 0], largest, last], 1))

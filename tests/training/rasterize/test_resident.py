@@ -7,15 +7,17 @@ import pytest
 import torch
 
 from training.errors import LodgsError
+from training.lod import sight
 from training.lod.blocks import SIZE, spatial_order
 from training.lod.rule import rules
 from training.lod.rules.chunks import member_columns
 from training.lod.selection import complete, select, settings
 from training.lod.streaming import BLOCKS, table_of_blocks
+from training.methods.tree.build import build
 from training.rasterize import Gaussians, rasterize
 from training.rasterize.resident import MANY, Resident
 from training.scenes.cameras import Camera, look_at
-from training.splats.bundle import Bundle, Level, write_bundle
+from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
 from training.splats.gaussians import Splats
 
 NEAR = 0.1
@@ -51,6 +53,9 @@ def bundle(rule: str) -> Bundle:
             sigma = np.abs(rng.normal(0.5, 0.2, counts[3])).astype(np.float32)
             only = level(1, counts[3], {}, sigma_d=sigma)
             return Bundle("clod", [only], rule, {"reference": 0.0, "tau": 0.01})
+        case "cut":
+            nodes, tree = build(level(2, counts[3], {}).splats)
+            return Bundle("tree", tree.levels(nodes), rule)
     d_l = {1: 9.0, 2: 4.0, 3: 0.0}
     levels = [
         level(n, counts[n], {"d_l": d_l[n]}, **member_columns(rng.random((3, counts[n])) < 0.3))
@@ -74,7 +79,7 @@ def views():
     [
         ("bands", {}), ("bands", {"gamma": 2.0, "last": 2}), ("octree", {}), ("octree", {"fade": 0}),
         ("decay", {}), ("decay", {"at_most": 2900}), ("chunks", {}), ("chunks", {"fade": 0}),
-        ("chunks", {"chunks": 0, "distance_scale": 0.6}),
+        ("chunks", {"chunks": 0, "distance_scale": 0.6}), ("cut", {}), ("cut", {"pixels": 1.8}),
     ],
 )  # fmt: skip
 def test_pictures_are_those_of_what_is_selected(rule, given):
@@ -100,6 +105,33 @@ def test_a_level_is_drawn_with_all_that_belongs_to_it(rule):
         one = next(level for level in shown.levels if level.number == number)
         whole = rasterize(Gaussians.of(complete(shown, one)), camera, near=NEAR, backend="cpu").image
         torch.testing.assert_close(resident.draw_level(number, camera, near=NEAR).image, whole)
+
+
+@pytest.mark.parametrize("rule", ["bands", "octree", "cut"])
+def test_of_a_large_file_a_camera_has_read_what_it_may_see(tmp_path, monkeypatch, rule):
+    monkeypatch.setattr(sight, "_GAP", 1)
+    monkeypatch.setattr(sight, "_AT_ONCE", 2 * SIZE)
+    shown = bundle(rule)
+    for each in shown.levels:  # a tree's are in an order already
+        if rule != "cut":
+            each.splats = each.splats.select(spatial_order(each.splats.means))
+    shown.levels[-1].splats.means[700] = np.nan  # which is left out
+    write_bundle(tmp_path / "bundle.ply", shown)
+    shown = read_bundle(tmp_path / "bundle.ply")
+    told, values, total = [], settings(shown, {}), sum(len(each.splats) for each in shown.levels)
+    whole, part = Resident(shown, "cpu"), Resident(tmp_path / "bundle.ply", "cpu", told.append, most=1000)
+    finest, loaded, read = shown.levels[-1].number, [], []
+    for camera in views():
+        for draw in (lambda one, c=camera: one.draw(c, values, near=NEAR),
+                     lambda one, c=camera: one.draw_level(finest, c, near=NEAR)):  # fmt: skip
+            ours, theirs = draw(part), draw(whole)
+            torch.testing.assert_close(ours.image, theirs.image, atol=2e-5, rtol=1e-5)
+            assert int((ours.radii > 0).sum()) == int((theirs.radii > 0).sum())
+            loaded.append(part.loaded)
+            read.append(part.bytes_read)
+    assert min(loaded) < 0.9 * total and len(told) == 1 and "left out" in told[0]
+    part.draw_level(finest, camera, near=NEAR)
+    assert part.bytes_read == read[-1] > read[0] > 0  # what is there does
 
 
 def indexed(path) -> Bundle:

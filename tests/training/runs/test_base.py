@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 
 from training.errors import LodgsError
+from training.lod.selection import complete
+from training.runs import base
 from training.runs.base import read_base
-from training.splats.bundle import Bundle, Level, write_bundle, write_folder
+from training.splats import bundle as bundles
+from training.splats.bundle import Bundle, Level, read_bundle, write_bundle, write_folder
 from training.splats.dialects import comments_of
 from training.splats.gaussians import Splats
 from training.splats.ply import write_ply
@@ -41,3 +44,27 @@ def test_a_base_says_whether_it_is_antialiased(tmp_path):
 def test_a_folder_of_something_else_is_no_base(tmp_path):
     with pytest.raises(LodgsError, match="holds no finished run"):
         read_base(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["plain", "finest_first", "stream", "cumulative", "smoothed"])
+def test_splats_that_stay_in_their_file_are_those_that_are_read(tmp_path, monkeypatch, kind):
+    monkeypatch.setattr(bundles, "AT_ONCE", 7)
+    path, told, finest = tmp_path / "b.ply", [], splats(50)
+    finest.means[20] = np.nan
+    finest.extras["size"] = np.arange(50, dtype=np.float32)
+    if kind in ("plain", "smoothed"):
+        finest.extras |= {"filter_3D": np.full(50, 0.3, np.float32)} if kind == "smoothed" else {}
+        write_ply(path, finest)
+    else:
+        bundle = Bundle("", [Level(1, splats(10)), Level(2, finest)], cumulative=kind == "cumulative")
+        write_bundle(path, bundle, "stream" if kind == "stream" else "finest_first")
+    expected = read_bundle(path)
+    expected = complete(expected, expected.levels[-1])
+    rows, _ = base.open_base(path, told.append)
+    assert len(rows) == len(expected) == (59 if kind == "cumulative" else 49)
+    assert len(told) == 1 and told[0].startswith("1 splats of")
+    for some in (slice(None), slice(17, 23), slice(40, 90)):
+        one, other = rows.select(some), expected.select(some)
+        for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    assert kind == "cumulative" or "size" in rows.select(slice(3)).extras

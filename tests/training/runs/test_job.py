@@ -46,6 +46,17 @@ def test_one_number_serves_every_level_and_fewer_levels_keep_the_finest():
     assert parameters.steps == Job("s", "o").resolved_parameters().steps[-3:]
 
 
+def test_where_splats_are_their_own_truth_parameters_can_be_others():
+    values = {"scene": "s", "out": "o", "method": "tree", "base": "b"}
+    photographed = Job.from_dict(values).resolved_parameters()
+    values |= {"capture": "dome", "scene": ""}
+    captured = Job.from_dict(values).resolved_parameters()
+    assert (captured.leaf_rate, captured.random_background) == (0, False)
+    assert photographed.leaf_rate > 0 and photographed.random_background
+    chosen = Job.from_dict(values | {"parameters": {"leaf_rate": 0.5}})
+    assert chosen.resolved_parameters().leaf_rate == chosen.resolved().resolved_parameters().leaf_rate == 0.5
+
+
 def test_what_lies_in_the_run_is_found_where_the_run_lies(tmp_path):
     run = tmp_path / "run"
     values = {"out": str(run), "method": "lodge", "base": str(run / "base.ply"), "capture": str(run / "dome")}

@@ -11,6 +11,7 @@ from PIL import Image
 from tests.training.lod.trees import tree_of
 from training.__main__ import main
 from training.errors import LodgsError
+from training.lod import sight
 from training.rasterize import Gaussians, rasterize
 from training.runs.folder import RunFolder
 from training.runs.job import Job
@@ -65,6 +66,24 @@ def test_of_a_tree_the_finest_level_alone_is_measured(finished, splats, tmp_path
     assert (row["level"], row["splats"]) == (2, len(splats)) and row["veil"] == report["veil"]
     assert [row["pixels"] for row in report["curve"]] == [0.5, 1, 2, 4, 8, 16]
     assert "level 1" not in table(report)
+
+
+def test_of_a_large_tree_the_same_is_measured_in_parts(finished, splats, tmp_path, monkeypatch):
+    run = finished(test_every=4)
+    write_bundle(RunFolder(run).bundle, tree_of(splats))
+    expected = evaluate_run(run, far=True)
+    monkeypatch.setattr(sight, "IN_MEMORY", 100)
+    report = evaluate_run(run, picture=tmp_path / "levels.png", far=True)
+    assert (tmp_path / "levels.png").is_file()
+    assert [row["set"] for row in report["selective"]] == ["per view"]
+    assert report["levels"][0]["splats"] == len(splats)
+    for name in ("train_psnr", "veil", "worst", "farther", "oversized", "jumps"):
+        assert report[name] == expected[name]
+    for name in ("levels", "curve"):
+        for row, other in zip(report[name], expected[name], strict=True):
+            assert [row[key] for key in ("drawn", "psnr", "ssim")] == [
+                other[key] for key in ("drawn", "psnr", "ssim")
+            ]
 
 
 def quality(splats: Splats, camera) -> float:

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 
+from training.lod import sight
 from training.methods import METHODS
 from training.runs import train as training_loop
 from training.runs.events import Events
@@ -23,8 +24,9 @@ from training.runs.folder import RunFolder
 from training.runs.job import Job
 from training.scenes.colmap import read_scene
 from training.scenes.orientation import up_rotation
-from training.splats.bundle import read_bundle
+from training.splats.bundle import NO_SPLATS, read_bundle
 from training.splats.ply import read_ply
+from training.splats.scratch import Scratch
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -511,3 +513,37 @@ def test_reading_events_goes_on_where_it_stopped_and_leaves_half_lines(tmp_path)
     events, end = folder.events(offset)
     assert [event["event"] for event in events] == ["cancelled"]
     assert folder.events(end) == ([], end)
+
+
+def test_levels_that_are_elsewhere_end_in_the_same_bundle(tiny_scene, tmp_path, monkeypatch):
+    """A tree whose nodes are handed over in a file, and a run that keeps hardly any splats in memory."""
+    few = {"steps": 10, "tune_steps": 4, "densify_until": 0.2, "margin": 0.0}
+    keys = {
+        "scene": str(tiny_scene), "out": str(tmp_path / "whole"), "image_scale": 1.0, "test_every": 4,
+        "method": "tree", "backend": "cpu", "parameters": few,
+    }  # fmt: skip
+    code, whole = run_in_process(keys)
+    assert code == 0
+    method = method_of(keys)
+
+    levels_after = method.levels_after
+
+    def in_files(self, step):
+        levels = levels_after(self, step)
+        for level in levels if len(levels) > 1 else []:
+            file = Scratch(tmp_path)
+            file.append(level.splats)
+            level.elsewhere, level.splats = file, NO_SPLATS
+        return levels
+
+    monkeypatch.setattr(method, "levels_after", in_files)
+    for module in (training_loop, sight):
+        monkeypatch.setattr(module, "IN_MEMORY", 20)
+    code, parts = run_in_process({**keys, "out": str(tmp_path / "parts")})
+    assert code == 0
+    bundles = [(tmp_path / name / "bundle.ply").read_bytes() for name in ("whole", "parts")]
+    assert bundles[0] == bundles[1]
+    said = [[event for event in run if event["event"] in ("level", "done")] for run in (whole, parts)]
+    for one, other in zip(*said, strict=True):
+        for name in ("splats", "drawn", "psnr", "ssim", "train_psnr", "veil", "oversized", "worst"):
+            assert one.get(name) == other.get(name)

@@ -10,10 +10,10 @@ import pytest
 from plyfile import PlyData
 
 from training.errors import LodgsError
+from training.lod.describe import describe
 from training.splats.bundle import (
     Bundle,
     Level,
-    describe,
     read_bundle,
     read_folder,
     read_head,

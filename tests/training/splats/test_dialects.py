@@ -8,13 +8,13 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from training.errors import LodgsError
+from training.lod.describe import describe
 from training.rasterize.filter3d import smoothed
 from training.render.scene import Instance, SplatSet, draw
 from training.scenes.cameras import Camera
 from training.splats.bundle import (
     Bundle,
     Level,
-    describe,
     read_bundle,
     read_folder,
     read_head,

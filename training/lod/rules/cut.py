@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..colors import LEVEL_COLORS
-from ..rule import NO_TABLES, Control, Rule, Values, distances, distances_by_axes
+from ..rule import NO_COLUMNS, NO_TABLES, Control, Rule, Values, distances, distances_by_axes
 
 NODE_SIZE, PARENT_SIZE = "node_size", "parent_size"
 """Columns of sizes, in scene units: a splat's own, 0 for leaves, and its parent's."""
@@ -15,7 +15,7 @@ PARENT = ("parent_x", "parent_y", "parent_z")
 """Columns of the parent's mean."""
 ABOVE_ROOT = 3.0e38
 """The parent size of the root, which has none: larger than any distance, and finite, as files have it."""
-K_LEAST = 32.0
+K_LEAST = 8.0
 """The least detail of an eye: sizes are made so that cuts are proper from there on."""
 ROUNDING = 2.0**-20
 """Share by which a parent's size is larger still: 16 units in float32's last place, of which comparing a
@@ -99,6 +99,13 @@ class Cut(Rule):
                 chosen &= acceptable([*means[block].T], sizes, eye, k)
             shown[block] = chosen
         return shown
+
+    def band(self, focal_px, facts, values, highest=NO_COLUMNS) -> tuple[float, float | np.ndarray]:
+        """As far as parents are too coarse: a node is at most K_LEAST of its parent's sizes away from it."""
+        if PARENT_SIZE not in highest:
+            return 0.0, np.inf
+        k = detail_of(focal_px, values["pixels"])
+        return 0.0, (k + K_LEAST) * (1 + 4 * ROUNDING) * highest[PARENT_SIZE].astype(np.float64)
 
     def told_level(self, columns, facts) -> np.ndarray:
         """The number of a colour: the octave of a node's size, OCTAVES + 1 for leaves."""

@@ -16,13 +16,23 @@ class TreeParameters(ThreedgsParameters):
         600, "Steps that train the cut which each view sees of the tree; 0 leaves it as built.", unit="steps"
     )
     pixels: float = parameter(
-        1.0, "Granularity of these cuts, in pixels of the training images.", low=0.1, high=100, unit="px"
+        0.5,
+        "Granularity of these cuts, in pixels of the training images; pictures begin with the same.",
+        low=0.1,
+        high=100,
+        unit="px",
     )
     lod_noise: float = parameter(
-        5.0,
+        30.0,
         "Each step's granularity is larger by this times r⁴, r random from 0 to 1: most cuts are fine, some "
         "are coarse.",
         high=100,
+    )
+    leaf_rate: float = parameter(
+        0.1,
+        "Learning rates of leaves, as a share of those of the nodes above them; they fall to a tenth of it. "
+        "0 leaves all leaves as they are.",
+        high=1,
     )
     resize_interval: int = parameter(
         1000,
@@ -57,10 +67,23 @@ class TreeParameters(ThreedgsParameters):
 
 _DRAFT = TreeParameters()
 _STANDARD = replace(
-    _DRAFT, **STANDARD, steps=30_000, densify_interval=100, tune_steps=10_000, grow_interval=1000
+    _DRAFT,
+    **STANDARD,
+    steps=30_000,
+    densify_interval=100,
+    tune_steps=10_000,
+    grow_interval=1000,
+    leaf_rate=1.0,  # those that grow have to learn
 )
 _PAPER = replace(
-    _STANDARD, **PAPER, pixels=3.0, sh_degree=1, tune_steps=150_000, max_threshold=0.0075, unseen_epochs=2.0
+    _STANDARD,
+    **PAPER,
+    pixels=3.0,
+    lod_noise=5.0,
+    sh_degree=1,
+    tune_steps=150_000,
+    max_threshold=0.0075,
+    unseen_epochs=2.0,
 )
 
 METHOD = MethodInfo(
@@ -74,4 +97,5 @@ METHOD = MethodInfo(
     offered=("max_splats", "tune_steps", "pixels"),
     from_base=True,
     for_splats=True,
+    captured={"leaf_rate": 0.0, "random_background": False},  # leaves are right, and black is nothing
 )

@@ -91,11 +91,13 @@ class GrowingForest:
         for leaves in _by_cells(self._leaves, self._scratch, self._cell):
             nodes, tree, root = _grown(leaves)
             moments.append(root)
-            harmonics.append(nodes.sh[-1])
+            harmonics.append(nodes.sh[-1].copy())
             grove = divided(nodes, tree, self._longest)
-            uppers.append(grove.upper)
+            above, upper = grove.upper
+            uppers.append((above.select(np.arange(len(above))), upper))  # a copy: a view would keep all nodes
             del nodes, leaves
             yield from grove
+            del grove, above
         above, top = _merged_up(np.stack(moments))
         nodes = _drawn(above, top, np.stack(harmonics), np.stack(moments)[:, 9])
         splats = Splats.concatenated([*(splats for splats, _ in uppers), nodes])
@@ -168,7 +170,7 @@ def _grown(leaves: Splats) -> tuple[Splats, Tree, np.ndarray]:
     moments = np.concatenate([means, covariances, depths[:, None], colors], axis=1)
     above, tree = _merged_up(moments)
     nodes = Splats.concatenated([leaves, _drawn(above, tree, leaves.sh, depths)])
-    return nodes, tree, (above if len(above) else moments)[-1]
+    return nodes, tree, (above if len(above) else moments)[-1].copy()
 
 
 def _merged_up(moments: np.ndarray) -> tuple[np.ndarray, Tree]:

@@ -104,9 +104,8 @@ class Growing:
         store.rest()
         scores, wanted, count, self.removed = [], [], 0, 0
         for records, tree in store.records():
-            leaves = records[: tree.leaves]
-            dead = self._dead(leaves)
-            score = leaves[:, store.columns["score"]].numpy()
+            dead = self._dead(records[: tree.leaves])
+            score = store.layout.split(records[: tree.leaves])["score"].numpy()
             chosen = np.flatnonzero((score > threshold) & ~dead)
             scores.append(score[chosen])
             wanted.append(count + chosen)
@@ -136,7 +135,7 @@ class Growing:
             for (first, last), part in zip(shape.ranges, subtrees_of(tree, order, shape), strict=True):
                 yield records[first:last], part
             uppers.append(shape.upper)
-            above.append(records[shape.ends[-1] :])
+            above.append(records[shape.ends[-1] :].clone())  # the subtree's need not stay for it
         records, upper = self._store.upper_records()
         self._upper = torch.cat([*above, records]), joined_trees(uppers, upper)
 
@@ -147,14 +146,14 @@ class Growing:
         return self._upper
 
     def _dead(self, leaves: torch.Tensor) -> np.ndarray:
-        columns = self._store.columns
-        faint = leaves[:, columns["opacity_logits"]] < self._least_logit
-        return (faint | (leaves[:, columns["seen"]] < self._unseen_since)).numpy()
+        values = self._store.layout.split(leaves)
+        return (
+            (values["opacity_logits"] < self._least_logit) | (values["seen"] < self._unseen_since)
+        ).numpy()
 
     def _with_children(self, records: torch.Tensor, born: np.ndarray) -> torch.Tensor:
         """Records of which some rows (2P,), pairs of copies of P leaves, become their children."""
-        columns = self._store.columns
-        records[:, columns["score"]] = 0
+        self._store.layout.split(records)["score"].zero_()
         if len(born):
             rows = torch.from_numpy(np.concatenate([born[0::2], born[1::2]]))
             values = {name: part.clone() for name, part in self._store.layout.split(records[rows]).items()}

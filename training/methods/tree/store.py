@@ -50,7 +50,7 @@ def default_budget(device: torch.device | str = "cpu") -> int:
 
 
 def layout_of(sh_degree: int) -> Layout:
-    """What a node's record holds, see ``rasterize.records``: the score is ``density.peak_score``."""
+    """What a node's record holds, see ``rasterize.records``."""
     shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": ()}
     values: dict[str, tuple[int, ...]] = shapes | {"sh": ((sh_degree + 1) ** 2, 3)}
     count = sum(map(prod, values.values()))
@@ -69,7 +69,6 @@ class Store:
     Attributes:
         shape: where the pieces of the tree are among the rows.
         cache: of G + 1 groups: the subtrees, and the upper nodes, which are always all there.
-        columns: where each array of a record begins.
         budget: of the cache, in bytes.
     """
 
@@ -78,8 +77,6 @@ class Store:
 
     def __init__(self, folder: Path, sh_degree: int, budget: int, device: torch.device | str = "cpu") -> None:
         self.layout = layout_of(sh_degree)
-        begins = np.cumsum([0, *map(prod, self.layout.shapes.values())]).tolist()
-        self.columns = dict(zip(self.layout.shapes, begins, strict=False))
         self._terms = (sh_degree + 1) ** 2
         self.budget, self._device = budget, device
         self.rows = FileRows(folder, self.layout)
@@ -127,9 +124,11 @@ class Store:
 
     def _records_of(self, splats: Splats) -> torch.Tensor:
         records = np.zeros((len(splats), self.layout.width), np.float32)
+        begin = 0
         for name in NAMES:
-            begin, size = self.columns[name], prod(self.layout.shapes[name])
-            records[:, begin : begin + size] = getattr(splats, name).reshape(len(splats), size)
+            end = begin + prod(self.layout.shapes[name])
+            records[:, begin:end] = getattr(splats, name).reshape(len(splats), end - begin)
+            begin = end
         return torch.from_numpy(records)
 
     def _take_shape(self, shape: ForestShape) -> None:
@@ -201,6 +200,12 @@ class Store:
     def gaussians_at(self, places: np.ndarray) -> Gaussians:
         """A copy of the splats at places (M,) in the cache."""
         return gather(self.cache.records, places, self._terms)
+
+    def are_leaves(self, places: np.ndarray) -> np.ndarray:
+        """Which (M,) bool of the records at places (M,) are leaves."""
+        rows, groups = self.cache.rows_at(places), self.cache.groups_at(places)
+        begins, counts = np.append(self.shape.begins, 0), np.append(self.shape.counts, 0)
+        return rows - begins[groups] < counts[groups]
 
     # -- sizes -----------------------------------------------------------------------------------------
 

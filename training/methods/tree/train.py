@@ -26,7 +26,6 @@ from ...splats.bundle import Level
 from ...splats.gaussians import Splats
 from ...splats.ply import Columns
 from ..data import TrainingView
-from ..density import peak_score
 from ..method import Drawing
 from ..schedules import due
 from ..start import from_splats
@@ -37,6 +36,9 @@ from .build import GrowingForest
 from .density import Growing
 from .store import Store, default_budget
 
+LEAF_REST = 0.1
+"""The rate at which leaves move at the end of training, as a share of that at its beginning."""
+
 
 class SeenRecords:
     """Adam's step for the records alone that a picture was made of.
@@ -45,6 +47,7 @@ class SeenRecords:
         store: of all records.
         places: (M,) int64 of them in its cache.
         lr: learning rates by name, as ``Adam`` has them when the step is made.
+        shares: (M,) of these rates, which each moves with.
         number: of the step, from 1.
 
     Attributes:
@@ -54,15 +57,21 @@ class SeenRecords:
 
     rendering: Rendering
 
-    def __init__(self, store: Store, places: np.ndarray, lr: Mapping[str, LearningRate], number: int) -> None:
-        self._store, self._places, self._lr, self._number = store, places, lr, number
+    def __init__(
+        self,
+        store: Store,
+        places: np.ndarray,
+        lr: Mapping[str, LearningRate],
+        shares: torch.Tensor,
+        number: int,
+    ) -> None:
+        self._store, self._places, self._lr, self._shares, self._number = store, places, lr, shares, number
         self.gaussians = store.gaussians_at(places)
         for values in vars(self.gaussians).values():
             values.requires_grad_()
 
-    @torch.no_grad()
     def step(self) -> None:
-        """One step of these records, and what density control asks for."""
+        """One step of these records."""
         leaves = vars(self.gaussians)
         gradients = [leaf.grad for leaf in leaves.values() if leaf.grad is not None]
         if len(gradients) < len(leaves):  # nothing of them is in the picture
@@ -71,10 +80,9 @@ class SeenRecords:
             torch.as_tensor(self._lr[name]).float().expand(leaf.shape[1:]).reshape(-1)
             for name, leaf in leaves.items()
         ]
-        cache, drawn = self._store.cache, self.rendering
-        score = peak_score(drawn.grad2d.norm(dim=1), drawn.radii, self.gaussians.opacity_logits)
-        told = score, drawn.radii > 0, self._number
-        records.step(cache.records, self._places, gradients, *told, torch.cat(rates))
+        cache = self._store.cache
+        told = self.rendering, self._number, torch.cat(rates), self._shares
+        records.step(cache.records, self._places, gradients, *told)
         cache.changed(self._places)
 
     def zero_grad(self) -> None:
@@ -138,6 +146,10 @@ class Method(Refining):
         splats, tree = joined(self.store)
         return tree.levels(splats)
 
+    def controls(self) -> dict[str, float]:
+        """Pictures begin with the granularity that was trained."""
+        return {"pixels": self.parameters.pixels}
+
     # -- a step ----------------------------------------------------------------------------------------
 
     @cached_property
@@ -172,7 +184,8 @@ class Method(Refining):
         """The splats of a view's cut, to draw: they alone make the step."""
         assert self.store is not None
         places = self.store.take(view.camera, pixels, self.data.near)
-        self._optimizer = SeenRecords(self.store, places, self.model.adam.lr, step + 1 - self.finest_steps)
+        shares, number = self._shares(places, step), step + 1 - self.finest_steps
+        self._optimizer = SeenRecords(self.store, places, self.model.adam.lr, shares, number)
         return self._optimizer.gaussians
 
     def accumulate_stats(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> None:
@@ -220,6 +233,16 @@ class Method(Refining):
         """A step's granularity (A.6: distances times 1 + 5 r⁴)."""
         r = np.random.default_rng([self.seed, step, 12]).random()
         return self.parameters.pixels * (1 + self.parameters.lod_noise * r**4)
+
+    def _shares(self, places: np.ndarray, step: int) -> torch.Tensor:
+        """The shares (M,) of the learning rates that records move with: leaves are slow, and come to rest.
+
+        They are good as they are, and nodes above them are not.
+        """
+        assert self.store is not None
+        done = (step - self.finest_steps) / max(self.parameters.tune_steps, 1)
+        slow = self.parameters.leaf_rate * LEAF_REST**done
+        return torch.where(torch.from_numpy(self.store.are_leaves(places)), slow, 1.0)
 
     # -- what lasts ------------------------------------------------------------------------------------
 

@@ -40,8 +40,8 @@ def _move(records, first, count, extent, gradient, place, lr, keep, keep_m, keep
 
 @kernel(STRICT)
 def _step(
-    begin, end, records, width, places, means, quats, log_scales, opacity_logits, sh, score, seen, number,
-    lr, bias_m, bias_v, keep_m, keep_v, eps,
+    begin, end, records, width, places, means, quats, log_scales, opacity_logits, sh, grad2d, radii, number,
+    lr, shares, bias_m, bias_v, keep_m, keep_v, eps,
 ):  # fmt: skip
     """All arrays flat."""
     count = lr.shape[0]
@@ -49,18 +49,23 @@ def _step(
     for k in range(begin, end):
         i = places[k] * width
         told = i + 3 * count
+        x, y = grad2d[2 * k], grad2d[2 * k + 1]
+        opacity = 1 / (1 + np.exp(-records[i + 10]))
+        score = np.sqrt(x * x + y * y) * radii[k] * opacity ** f32(0.2)
+        records[told + 1] = max(records[told + 1], score)
+        if radii[k] > 0:
+            records[told + 2] = number
+        if shares[k] == 0:
+            continue
         records[told] += f32(1)
         made = int(records[told])
-        keep, scale_v = bias_m[made], bias_v[made]
+        keep, scale_v = bias_m[made] / shares[k], bias_v[made]
         rest = keep, keep_m, keep_v, scale_v, eps
         _move(records, i, count, 3, means, 3 * k, lr, *rest)
         _move(records, i + 3, count, 4, quats, 4 * k, lr[3:], *rest)
         _move(records, i + 7, count, 3, log_scales, 3 * k, lr[7:], *rest)
         _move(records, i + 10, count, 1, opacity_logits, k, lr[10:], *rest)
         _move(records, i + 11, count, terms, sh, terms * k, lr[11:], *rest)
-        records[told + 1] = max(records[told + 1], score[k])
-        if seen[k]:
-            records[told + 2] = number
 
 
 @lru_cache(4)
@@ -79,11 +84,11 @@ def gather(records, places, arrays) -> None:
 
 
 @serialised
-def step(records, places, gradients, score, seen, number, lr, betas, eps) -> None:
+def step(records, places, gradients, grad2d, radii, number, lr, shares, betas, eps) -> None:
     """As ``rasterize.records.step``, of arrays."""
     made = _corrections(betas, 1 << int(number + 1).bit_length())
-    flat = (array.reshape(-1) for array in gradients)
+    flat = (array.reshape(-1) for array in (*gradients, grad2d))
     in_parallel(
-        _step, len(places), _GRAIN, records.reshape(-1), records.shape[1], places, *flat, score, seen,
-        f32(number), lr, *made, f32(betas[0]), f32(betas[1]), f32(eps),
+        _step, len(places), _GRAIN, records.reshape(-1), records.shape[1], places, *flat, radii, f32(number),
+        lr, shares, *made, f32(betas[0]), f32(betas[1]), f32(eps),
     )  # fmt: skip

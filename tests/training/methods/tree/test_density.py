@@ -98,11 +98,11 @@ def store(tmp_path):
 
 
 def with_stats(store, **values):
-    """Sets columns of all records; what a value is asked for are the node's numbers in its piece."""
+    """Sets columns of all records."""
     store.cache.clear()
     records = store.rows.read(np.arange(len(store)))
     for name, column in values.items():
-        records[:, store.columns[name]] = torch.as_tensor(column, dtype=torch.float32)
+        store.layout.split(records)[name][:] = torch.as_tensor(column, dtype=torch.float32)
     store.rows.write(np.arange(len(store)), records)
 
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from training.lod.forest import joined, levels_of
+from training.lod.selection import select_levels, settings
 from training.methods.tree.build import GrowingForest, _cells
-from training.splats.bundle import open_ply
+from training.splats.bundle import Bundle, open_ply, read_bundle, write_bundle
 from training.splats.ply import write_ply
 
 from .test_build import below, covariances, scene
@@ -89,3 +90,32 @@ def test_levels_of_what_grows_are_all_nodes(tmp_path):
     ] * 6
     sizes = levels[0].rows.select(slice(0, 2999)).extras
     assert (sizes["parent_size"] > sizes["node_size"]).all() and (sizes["node_size"] > 0).all()
+
+
+@pytest.mark.parametrize(("cell", "longest"), [(1, 1), (7, 3), (60, 200)])
+def test_cuts_of_what_grew_in_cells_are_proper(tmp_path, cell, longest):
+    """One node on each path from a leaf to the root, for any eye: sizes fit where cells and pieces meet."""
+    leaves = scene(500)
+    levels, _ = levels_of(GrowingForest(leaves, longest=longest, cell=cell), tmp_path)
+    write_bundle(tmp_path / "a.ply", Bundle("tree", levels, "cut"))
+    bundle, drawn = read_bundle(tmp_path / "a.ply"), []
+    nodes, tree = joined(GrowingForest(leaves, longest=longest, cell=cell))
+
+    def keys(splats):
+        return [row.tobytes() for row in np.concatenate([splats.means, splats.quats, splats.log_scales], 1)]
+
+    number = {key: node for node, key in enumerate(keys(nodes))}
+    assert len(number) == len(tree) == sum(len(level.splats) for level in bundle.levels)
+    for eye in (np.zeros(3), np.array([30.0, 3, 1]), np.array([900.0, 0, 0]), nodes.means[7]):
+        for pixels in (0.5, 4, 15):
+            seen = np.zeros(len(tree), bool)
+            for one in select_levels(bundle, eye, 500.0, settings(bundle, {"pixels": pixels})):
+                seen[[number[key] for key in keys(one.splats)]] = True
+            above = np.zeros(len(tree), int)  # how many of a node and those above it are drawn
+            above[-1] = seen[-1]
+            for layer in tree.layers:
+                below = tree.children[layer - tree.leaves]
+                above[below] = above[layer][:, None] + seen[below]
+            assert (above[: tree.leaves] == 1).all()
+            drawn.append(seen.sum())
+    assert min(drawn) < 20 and max(drawn) == 500

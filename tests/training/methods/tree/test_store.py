@@ -48,10 +48,9 @@ def test_a_cut_made_anew_is_that_of_hspt_in_memory(town, tmp_path, longest, monk
     monkeypatch.setattr(store_module, "AT_ONCE", 300)  # many parts of everything
     nodes, tree = town
     made = stored(tmp_path, town, longest=longest)
-    longest = longest or longest_of(tree.leaves)
-    order, _ = shape_of(tree, longest)
+    order, _ = shape_of(tree, longest or longest_of(tree.leaves))
     sizes = tree.sizes(nodes.means, nodes.log_scales)
-    hspt = Hspt(tree, nodes.means, sizes, nodes.log_scales, longest)
+    hspt = Hspt(tree, nodes.means, sizes, nodes.log_scales, longest or longest_of(tree.leaves))
     found = 0
     for camera in cameras(np.random.default_rng(longest)):
         for pixels in (0.2, 0.7, 1.8):
@@ -87,8 +86,9 @@ def test_sizes_follow_what_has_moved(town, tmp_path, monkeypatch):
         moved(made, seed)
         made.resize()
         nodes, tree = joined(made)
-        longest, sizes = longest_of(tree.leaves), tree.sizes(nodes.means, nodes.log_scales)
+        longest = longest_of(tree.leaves)
         order, _ = shape_of(tree, longest)
+        sizes = tree.sizes(nodes.means, nodes.log_scales)
         hspt = Hspt(tree, nodes.means, sizes, nodes.log_scales, longest)
         for camera in cameras(np.random.default_rng(5), 4):
             made.cache.forget()

@@ -94,6 +94,29 @@ def test_without_tuning_the_leaves_are_the_base_to_the_bit(data, base):
     assert same(one, other) and above.number == 1
 
 
+def test_leaves_of_rate_0_stay_to_the_bit_while_nodes_learn(data, base):
+    tree = make(data, base, leaf_rate=0.0, pixels=16.0)
+    trained(tree, until=1)
+    built, above = records(tree), above_leaves(tree)
+    trained(tree, begin=1)
+    values = slice(11 + 3 * 16)
+    assert torch.equal(records(tree)[~above, values], built[~above, values])
+    assert (records(tree)[above, values] != built[above, values]).any()
+
+
+def test_leaves_come_to_rest(data, base):
+    """Their rate falls to a tenth, the nodes' does not."""
+    tree = make(data, base, leaf_rate=0.2, tune_steps=400)
+    trained(tree, until=1)
+    camera = data.train[0]
+    places = tree.store.take(camera, 16.0, data.near)
+    above = above_leaves(tree)[tree.store.cache.rows_at(places)]
+    assert above.any() and not above.all()
+    for step, share in ((1, 0.2), (201, 0.2 * 10**-0.5), (401, 0.02)):
+        found = tree._shares(places, step).numpy()
+        np.testing.assert_allclose(found, np.where(above, 1, share), rtol=0.01)
+
+
 def test_sizes_are_saturated_after_training(data, base):
     tree = make(data, base, lr_scales=0.5, lr_means_final=0.05)  # which moves nodes far
     levels = trained(tree)
@@ -155,7 +178,7 @@ def test_a_bundle_tells_which_blocks_an_eye_needs(data, base):
 
 
 def test_noise_is_coarser_most_at_its_end(data, base):
-    tree = make(data, base, pixels=2.0)
+    tree = make(data, base, pixels=2.0, lod_noise=5.0)
     found = np.array([tree._pixels(step) for step in range(4000)])
     assert found.min() >= 2 and found.max() <= 12
     # A.6: 1 + 5 r⁴ is below 2 for r < (1/5)^(1/4) = 0.669

@@ -1,0 +1,101 @@
+"""F12 and pictures in viewport quality of a tree of which the scene holds the top: all that the file has."""
+
+import numpy as np
+import pytest
+
+from tests.training.lod.trees import random_leaves, tree_of, write_in_pages
+
+pytestmark = pytest.mark.usefixtures("renderer")
+LEAVES, BUDGET = 9000, 3000
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / "town.ply"
+    write_in_pages(path, tree_of(random_leaves(LEAVES, np.random.default_rng(3), degree=1)))
+    return path
+
+
+@pytest.fixture
+def camera(bpy):
+    scene = bpy.context.scene
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    camera.location, camera.rotation_euler = (3.0, -18.0, 6.0), (1.3, 0, 0.1)
+    scene.render.resolution_x, scene.render.resolution_y = 160, 120
+    scene.render.resolution_percentage = 100
+    return camera
+
+
+@pytest.fixture
+def frame(bpy, lodgs):
+    def drawn(root, pixels=2.0):
+        root.lodgs.controls.pixels = pixels
+        root.location, root.scale, root.rotation_euler = (0.3, 0.2, -1), (1.2,) * 3, (0.1, 0.2, 0.7)
+        bpy.context.view_layer.update()
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        planes = lodgs("render.engine").frame(depsgraph, 160, 120, (0, 0, 160, 120)).planes
+        return np.stack([planes[f"Combined.{channel}"] for channel in "RGB"], axis=2)
+
+    return drawn
+
+
+def test_frames_show_what_the_file_has(bpy, lodgs, path, camera, frame):
+    """Wherever the viewport has looked from, and whatever its budget."""
+    scenes = lodgs("data.scenes")
+    root = scenes.import_splats(bpy.context, path, budget=BUDGET)
+    assert sum(len(item.object.data.points) for item in root.lodgs.levels) <= BUDGET
+    assert root.lodgs.eye == "VIEW"
+    lodgs("data.selection").hold(root, (500, 500, 500), 20.0)
+    pictures = {pixels: frame(root, pixels) for pixels in (1.0, 8.0)}
+    root.lodgs.stream.file = ""
+    held = frame(root, 1.0)
+    lodgs("data.removal").remove(root)
+    whole = scenes.import_splats(bpy.context, path)
+    assert (whole.lodgs.eye, whole.lodgs.stream.file) == ("CAMERA", "")
+    for pixels, picture in pictures.items():
+        np.testing.assert_allclose(picture, frame(whole, pixels), atol=1e-4)
+    assert np.abs(held - pictures[1.0]).max() > 0.05 and np.abs(pictures[8.0] - pictures[1.0]).max() > 0.01
+
+
+def test_a_held_eye_stays_where_it_is(bpy, lodgs, path, camera, frame):
+    scenes, found = lodgs("data.scenes"), []
+    for budget in (BUDGET, 0):
+        root = scenes.import_splats(bpy.context, path, budget=budget)
+        root.lodgs.eye, root.lodgs.freeze = "CAMERA", True
+        lodgs("data.selection").hold(root, (9, 9, 1), 100.0)
+        found.append(frame(root, 2.0))
+        lodgs("data.removal").remove(root)
+    np.testing.assert_allclose(*found, atol=1e-4)
+
+
+def test_a_file_that_is_gone_is_a_sentence(bpy, lodgs, path, camera, frame):
+    root = lodgs("data.scenes").import_splats(bpy.context, path, budget=BUDGET)
+    path.rename(path.with_name("elsewhere.ply"))
+    with pytest.raises(lodgs("training.errors").LodgsError, match=r"town\.ply cannot be read.*Streaming"):
+        frame(root)
+    root.lodgs.stream.file = str(path.with_name("elsewhere.ply"))
+    assert frame(root).max() > 0.1
+    write_in_pages(path, tree_of(random_leaves(50, np.random.default_rng(3), degree=1)))
+
+
+def test_viewport_quality_waits_for_what_it_needs(bpy, lodgs, path, camera, frame):
+    gpu = pytest.importorskip("gpu")
+    if not hasattr(gpu, "init"):
+        pytest.skip("no graphics in background before Blender 5.2")
+    views, pictures = lodgs("viewport.views"), []
+    for budget in (16_000, 0):
+        root = lodgs("data.scenes").import_splats(bpy.context, path, budget=budget)
+        frame(root, 20.0)
+        lodgs("render.quick").render(bpy.context)
+        if budget:
+            assert views.stream(root).ready and views.stream(root).splats <= budget
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        drawn = lodgs("render.quick")._frame(depsgraph, 160, 120, (0, 0, 160, 120), lambda *_: True).planes
+        pictures.append(np.stack([drawn[f"Combined.{channel}"] for channel in "RGB"], axis=2))
+        views.clear()
+        views.close_streams()
+        lodgs("data.removal").remove(root)
+    np.testing.assert_allclose(*pictures, atol=2e-3)
+    assert pictures[0].max() > 0.1
