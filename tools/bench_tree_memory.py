@@ -32,8 +32,9 @@ from training.methods.tree.build import GrowingForest
 from training.methods.tree.store import layout_of
 from training.methods.tree.train import Method, SeenRecords
 from training.rasterize import Gaussians, rasterize
+from training.runs.capture import read_views
 from training.runs.train import _keep_freed_memory
-from training.scenes.cameras import Camera
+from training.scenes.cameras import write_camera
 from training.scenes.colmap import Scene
 from training.scenes.images import write_png
 from training.splats.gaussians import Splats
@@ -51,24 +52,15 @@ PHOTOGRAPHS = 100 << 20
 # -- in a process of its own -----------------------------------------------------------------------------
 
 
-def views(leaves: int, count: int, size: float) -> list[Camera]:
-    """Views of the town of so many leaves, from its streets and from over its roofs."""
-    plan = town.plan_for(leaves)
-    both = [*town.walk(plan, count), *town.flight(plan, count)]
-    return [camera.scaled(size) for camera in both]
-
-
 def method_in(folder: Path, options: argparse.Namespace) -> Method:
     """A run whose files are in a folder, before a tree is in it."""
-    cameras = [
-        replace(camera, image=folder / f"{camera.name}.png")
-        for camera in views(options.leaves, options.views, options.size)
-    ]
+    cameras, near = read_views(folder)  # a plan of the town would take memory
+    cameras = [replace(camera, image=folder / f"{camera.name}.png") for camera in cameras]
     scene = Scene(folder, folder, folder, cameras, np.zeros((4, 3), np.float32), np.zeros((4, 3), np.uint8))
     data = TrainingData(
-        scene, 1.0, 0, photo_memory=PHOTOGRAPHS, splat_memory=options.budget * 10**6, scratch=folder
+        scene, 1.0, 0, photo_memory=PHOTOGRAPHS, splat_memory=options.budget * 10**6 or None, scratch=folder
     )
-    data.__dict__["near"] = town.NEAR
+    data.__dict__["near"] = near
     numbers = {"tune_steps": options.steps, "resize_interval": options.steps // 2, "grow_interval": 0}
     values = numbers | {"pixels": options.pixels, "lod_noise": 0.0, "sh_degree": 0}
     parameters = override(method_info("tree").preset("draft"), values)
@@ -81,7 +73,10 @@ def build_store(options: argparse.Namespace) -> dict:
     """Makes a town, its tree, and its photographs."""
     folder = options.folder
     folder.mkdir(parents=True)
-    leaves = town.build(town.plan_for(options.leaves), options.leaves, 0)
+    plan, options.budget = town.plan_for(options.leaves), 0
+    for camera in [*town.walk(plan, options.views), *town.flight(plan, options.views)]:
+        write_camera(folder / f"{camera.name}.json", camera.scaled(options.size), town.NEAR)
+    leaves = town.build(plan, options.leaves, 0)
     method = method_in(folder, options)
     method.model.keep(torch.zeros(len(method.model), dtype=torch.bool))
     begun = time.perf_counter()
