@@ -27,7 +27,7 @@ help:
 	@echo "make bench      how fast it is, as ratios from one run"
 	@echo "make bench-quality  PSNR and veil against seconds, all methods (SCENES=\"DIR ...\", BASE=another checkout)"
 	@echo "make bench-lod  levels and chunks on a town of 3 million splats (over an hour the first time; STAGES=\"town lodge others table\")"
-	@echo "make bench-tree cuts of trees of up to 10 million nodes (some minutes)"
+	@echo "make bench-tree cuts of trees of up to 10 million nodes, and training them in 400 MB (an hour and 10 GB the first time)"
 	@echo "make extension  dist/lodgs-VERSION.zip, checked by Blender"
 	@echo "make pins       requirements/*.txt anew from requirements/*.in (UPGRADE=1 takes the newest of what these leave open)"
 	@echo "make window     a tour in a real Blender window, with pictures (METHOD=flod; needs Blender, Xvfb, ImageMagick)"
@@ -83,6 +83,7 @@ bench-lod: setup
 
 bench-tree: setup
 	$(VENV) tools/bench_tree.py
+	$(VENV) tools/bench_tree_memory.py
 
 extension: setup
 	$(VENV) tools/extension.py
