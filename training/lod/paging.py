@@ -40,7 +40,7 @@ ROUNDING = 1e-4
 """Share of a distance that single precision may get wrong."""
 SIGHT = np.radians(50.0)
 """An angle that images reach from where their eye looks."""
-BEHIND = 4.0
+BEHIND = 2.0
 """What an eye does not look at comes in as if seen with so many times less detail, while there is room."""
 _PAGE = "page"
 """Column that tells of rows in which page they are, while they are read."""
