@@ -18,6 +18,8 @@ from ...training.lod.rules.cut import NODE_SIZE, PARENT, PARENT_SIZE, detail_of
 from ...training.splats.gaussians import Splats
 from ..data.streams import Source
 
+Direction = tuple[float, float, float]
+
 PAUSE = 0.02
 """Seconds between two looks at what has come, until there is as much as the scene itself holds."""
 
@@ -39,7 +41,7 @@ class Stream:
         self.source, self.ready, self.problem = source, False, ""
         self.records, self.columns, self.higher, self.taken = np.zeros((0, 0), np.float32), {}, 0, 0
         self._pager: Pager | None = None
-        self._asked: Choice | None = None
+        self._asked: tuple[Choice, Direction | None] | None = None
         self._stopping = False
         threading.Thread(target=self._open, name="lodgs-stream", daemon=True).start()
 
@@ -60,10 +62,14 @@ class Stream:
             return self.arrived != self.taken
         return self._pager is None or not self.ready or not self._pager.idle
 
-    def ask(self, choice: Choice) -> None:
-        """Says by what splats are chosen from now on. Returns at once."""
-        if choice != self._asked:
-            self._asked = choice
+    def ask(self, choice: Choice, direction: Direction | None) -> None:
+        """Says by what splats are chosen from now on. Returns at once.
+
+        Args:
+            direction: in which the eye looks, in the splats' own space; None: everywhere.
+        """
+        if (choice, direction) != self._asked:
+            self._asked = choice, direction
             self._ask()
 
     def take(self) -> np.ndarray:
@@ -93,8 +99,9 @@ class Stream:
 
     def _ask(self) -> None:
         if self._pager is not None and self._asked is not None:
-            pixels = dict(self._asked.values)["pixels"]
-            self._pager.ask(np.array(self._asked.eye), detail_of(self._asked.focal_px, pixels))
+            choice, direction = self._asked
+            k = detail_of(choice.focal_px, dict(choice.values)["pixels"])
+            self._pager.ask(np.array(choice.eye), k, None if direction is None else np.array(direction))
 
     def _open(self) -> None:
         """In a thread of its own, which ends when there is something to show."""

@@ -29,7 +29,7 @@ from ..data import changes, scenes, selection, shown
 from . import eye, resident, splats
 from .arranging import Arrangement, Placement, Request, arrange
 from .resident import Cloud, Resident, Store
-from .streaming import Stream
+from .streaming import Direction, Stream
 
 STILL = 0.2
 """Seconds after which a view that no longer moves is drawn in full resolution."""
@@ -39,6 +39,8 @@ finished: no redraw is to be held up for 0.05 seconds."""
 GROWTH = 1.5
 """By how much more splats a picture that is not complete is drawn again."""
 
+ROUNDING = 1e-4
+"""Share by which places may differ that are the same."""
 NOTHING = -1
 """Of what has come from files, until a viewport has drawn what the scene itself holds."""
 
@@ -211,7 +213,7 @@ def prepare(
         return Request((), (0.0, 0.0, 1.0), budget)
     _all.add(view)
     before, view.arrived = view.arrived, 0
-    instances = _from_files(view, instances, depsgraph, moving, wait)
+    instances = _from_files(view, instances, depsgraph, view_matrix, moving, wait)
     of, clouds = _read(instances, depsgraph)
     take_over = wait or not any(other.reads(of) for other in _all if other is not view)
     if view.arrived != NOTHING:
@@ -237,6 +239,7 @@ def _from_files(
     view: ViewState,
     instances: list[shown.SplatInstance],
     depsgraph: bpy.types.Depsgraph,
+    view_matrix: Matrix,
     moving: bool,
     wait: bool,
 ) -> list[shown.SplatInstance]:
@@ -253,7 +256,7 @@ def _from_files(
             there = _streams[source.scene] = Stream(source)
         choice = _choice(instance, depsgraph, moving)
         if choice is not None and not (there.problem and not there.ready):
-            there.ask(choice)
+            there.ask(choice, _direction(instance, choice, view_matrix))
             while wait and there.busy and not there.problem:
                 if there.ready:
                     _beside().submit(there.take).result()
@@ -266,6 +269,19 @@ def _from_files(
                 view.arrived = NOTHING
     kept = [each if each.source in ready else replace(each, source=None) for each in instances]
     return shown.without_coarser(kept)
+
+
+def _direction(
+    instance: shown.SplatInstance, choice: selection.Choice, view_matrix: Matrix
+) -> Direction | None:
+    """In which direction, in the splats' own space, an eye looks that is where the view is; None for one that
+    is elsewhere."""
+    to_own = np.linalg.pinv(instance.matrix_world) @ np.array(view_matrix.inverted(), np.float64)
+    apart = np.linalg.norm(to_own[:3, 3] - choice.eye)
+    if apart > ROUNDING * (1 + np.linalg.norm(to_own[:3, 3])):
+        return None
+    x, y, z = (-to_own[:3, 2] / max(np.linalg.norm(to_own[:3, 2]), 1e-30)).tolist()
+    return x, y, z
 
 
 def _stood_for(instances: list[shown.SplatInstance]) -> Iterator[bpy.types.PointCloud]:

@@ -38,6 +38,10 @@ AT_ONCE = 256
 """Pages that come in between two looks at where the eye is."""
 ROUNDING = 1e-4
 """Share of a distance that single precision may get wrong."""
+SIGHT = np.radians(50.0)
+"""An angle that images reach from where their eye looks."""
+BEHIND = 2.0
+"""What an eye does not look at comes in as if seen with so many times less detail, while there is room."""
 _PAGE = "page"
 """Column that tells of rows in which page they are, while they are read."""
 _INDEXED = 1 << 11
@@ -253,16 +257,37 @@ class PageIndex:
         away = np.sqrt(np.square(beside).sum(axis=1)) * (1 - ROUNDING)
         return away / np.maximum(self.parent_size, 1e-30)
 
-    def order(self, eye: np.ndarray, k: float) -> np.ndarray:
+    def ahead(self, eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """(P,) bool, which pages are within SIGHT of where an eye looks, or have what others there need.
+
+        Where a node's ball of K_LEAST size is, its parent's is, too.
+
+        Args:
+            direction: (3,) of length 1.
+        """
+        middle, half = (self.low + self.high) / 2, (self.high - self.low) / 2
+        reach = np.sqrt(np.square(half).sum(axis=1)) + K_LEAST * self.parent_size
+        to = middle - np.asarray(eye, np.float64)
+        away = np.sqrt(np.square(to).sum(axis=1))
+        aside = np.arccos(np.clip(to @ direction / np.maximum(away, 1e-30), -1, 1))
+        return (away <= reach) | (aside <= SIGHT + np.arcsin(np.clip(reach / np.maximum(away, 1e-30), 0, 1)))
+
+    def order(self, eye: np.ndarray, k: float, direction: np.ndarray | None = None) -> np.ndarray:
         """The pages (M,) that an eye needs at a detail, those first without which others are of no use.
 
         Balls of k size around nodes lie within their parents' for every k of at least K_LEAST, so parents
         are needed from a lower k on; what is needed from K_LEAST on goes by size.
+
+        Args:
+            direction: (3,) of length 1, in which the eye looks: elsewhere so much detail can wait as BEHIND
+                says; None: it looks everywhere.
         """
         detail = self.detail(eye)
         some = np.flatnonzero(detail < k * (1 + ROUNDING))
-        keys = (-self.parent_size[some], np.maximum(detail[some], K_LEAST))
-        return some[np.lexsort(keys)]
+        wanted = np.maximum(detail[some], K_LEAST)
+        if direction is not None:
+            wanted[~self.ahead(eye, direction)[some]] *= BEHIND
+        return some[np.lexsort((-self.parent_size[some], wanted))]
 
 
 def standing(columns: Columns) -> tuple[np.ndarray, np.ndarray]:
@@ -396,9 +421,9 @@ class Pager:
         self._slot_of, self._page_in = np.full(len(self.file), -1), np.full(slots, -1)
         self._used, self._tick = np.zeros(len(self.file), np.int64), 0
         self._index: PageIndex | None = None
-        self._asked: tuple[np.ndarray, float] | None = None
+        self._asked: tuple[np.ndarray, float, np.ndarray | None] | None = None
         self._done = self._asked
-        self._settled: tuple[np.ndarray, float] | None = None
+        self._settled = self._asked
         self._changed, self._stopping = threading.Condition(), False
         self._ready: Update | None = None
         self._thread: threading.Thread | None = None
@@ -414,12 +439,13 @@ class Pager:
         with self._changed:
             return self._ready is None and (bool(self.problem) or self._settled is self._asked)
 
-    def step(self, eye: np.ndarray | None, k: float) -> Update | None:
+    def step(self, eye: np.ndarray | None, k: float, direction: np.ndarray | None = None) -> Update | None:
         """The next pages for an eye: what the thread does again and again; None where there are no more.
 
         Args:
             eye: (3,) in the splats' space; None: nowhere yet, the first pages of the file.
             k: its detail, see ``cut.detail_of``.
+            direction: see ``PageIndex.order``.
         """
         slots = len(self._page_in)
         if eye is None:
@@ -427,7 +453,7 @@ class Pager:
         else:
             if self._index is None:
                 self._index = self.file.index(lambda share: not self._stopping)
-            order = self._index.order(eye, k)[:slots]
+            order = self._index.order(eye, k, direction)[:slots]
         self._tick += 1
         self._used[order] = self._tick
         missing = order[self._slot_of[order] < 0][:AT_ONCE]
@@ -466,10 +492,10 @@ class Pager:
         self._thread = threading.Thread(target=self._run, name="lodgs-paging", daemon=True)
         self._thread.start()
 
-    def ask(self, eye: np.ndarray, k: float) -> None:
-        """Says where the eye is, and its detail. Returns at once."""
+    def ask(self, eye: np.ndarray, k: float, direction: np.ndarray | None = None) -> None:
+        """Says where the eye is, its detail, and in which direction it looks. Returns at once."""
         with self._changed:
-            self._asked = np.array(eye, np.float64), float(k)
+            self._asked = np.array(eye, np.float64), float(k), direction
             self._changed.notify_all()
 
     def take(self) -> Update | None:

@@ -298,3 +298,34 @@ def test_the_cut_of_a_file_is_read_from_it(truth, path, pixels):
         assert set(wanted[camera.sees(truth.choice.splats.means[wanted], 0.1)]) <= set(seen)
         shares.append(len(seen) / len(wanted))
     assert min(shares) < 0.75 or pixels > 1 or path.stem == "by size"  # few splats are in wide blocks
+
+
+def test_what_an_eye_looks_at_comes_first(truth):
+    """Of what is as far away; and with it the nodes above, wherever these are."""
+    rng, eye = np.random.default_rng(4), np.array([1.0, 2.0, 3.0])
+    direction = np.array([2.0, -1.0, 2.0]) / 3
+    towards = rng.normal(size=(500, 3))
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    places = eye + 7 * towards
+    index = paging.PageIndex(places, places, np.full(500, 1e-4))
+    for k, found in ((1e6, 500), (6e4, 0)):
+        assert len(index.order(eye, k, direction)) == found
+    ahead = np.degrees(np.arccos(towards @ direction)) < 50
+    order = index.order(eye, 1e6, direction)
+    assert 20 < ahead.sum() < 200 and ahead[order[: ahead.sum()]].all()
+
+    columns, below = truth.choice.splats.extras, truth.parents >= 0
+    above = np.stack([columns[f"parent_{axis}"] for axis in "xyz"], 1).astype(np.float64)
+    index = paging.PageIndex(above, above, columns["parent_size"].astype(np.float64))
+    found = index.ahead(np.array([-3.0, 2, 0.5]), direction)
+    assert 0.1 < found.mean() < 0.9
+    assert found[truth.parents[found & below]].all()
+
+
+def test_within_a_budget_cuts_are_complete_wherever_an_eye_looks(truth, path):
+    pager = Pager(path, 24 * SIZE)
+    memory, eye = Memory(pager), np.array([0, 0, 0.5])
+    for direction in ((1, 0, 0), (-1, 0, 0), (0, 1, 0)):
+        while (update := pager.step(eye, FOCAL, np.array(direction, float))) is not None:
+            memory.take(update)
+            truth.require_complete(truth.nodes(memory.shown(eye, 1.0)))
