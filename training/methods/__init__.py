@@ -18,7 +18,7 @@ from .info import PRESETS, MethodInfo
 from .parameters import Parameters, override
 
 if TYPE_CHECKING:
-    from ..splats.gaussians import Splats
+    from ..splats.gaussians import SplatRows
     from .data import TrainingData
     from .method import Method
 
@@ -62,14 +62,15 @@ def create(
     parameters: Parameters,
     seed: int,
     backend: str,
-    base: Splats | None = None,
+    base: SplatRows | None = None,
 ) -> Method:
     """The method of a job, ready for its first step.
 
     Args:
         name: a key of METHODS.
         backend: the rasterizer's; the tensors live where it draws (``rasterize.device_of``).
-        base: splats to begin with instead of the scene's points, where the method can (``from_base``).
+        base: splats to begin with instead of the scene's points, where the method can (``from_base``); in
+            memory, but for methods that take them in parts (``base_in_parts``).
 
     Raises:
         LodgsError: the scene has too few points, or no view sees any.

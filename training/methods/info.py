@@ -32,6 +32,7 @@ class MethodInfo:
         rule: the name of the rule that chooses its detail (``training.lod``); "" for none.
         offered: the parameters that a panel shows, beside the presets.
         from_base: whether training can begin with splats (a job's ``base``) instead of the scene's points.
+        base_in_parts: whether a base may stay in its file (``SplatRows``).
         for_splats: whether it is what to offer first for splats that are there already.
         captured: values of parameters that are others where the photographs are the base's own pictures, by
             name, whatever the preset.
@@ -48,6 +49,7 @@ class MethodInfo:
     rule: str = ""
     offered: tuple[str, ...] = ()
     from_base: bool = False
+    base_in_parts: bool = False
     for_splats: bool = False
     captured: Mapping[str, Any] = field(default_factory=dict)
     retired: tuple[str, ...] = ()

@@ -36,8 +36,9 @@ from ..rasterize.resident import Resident
 from ..scenes.orientation import up_rotation
 from ..splats.bundle import NO_SPLATS, Bundle, Level, open_ply, write_bundle
 from ..splats.dialects import comments_of
-from ..splats.ply import read_ply, write_ply
-from .base import read_base
+from ..splats.gaussians import SplatRows
+from ..splats.ply import AT_ONCE, read_ply, write_ply
+from .base import open_base
 from .checkpoints import read_newest, remove_checkpoints, write_checkpoint
 from .data import training_data
 from .events import PROTOCOL, Events, event_line
@@ -154,11 +155,13 @@ class _Run:
         """The job's method before its first step."""
         job, data, base, parameters = self.job, self.data, None, self.job.resolved_parameters()
         if job.base:
-            base, antialias = read_base(job.base, self._warn)
+            base, antialias = open_base(job.base, self._warn)
+            if not METHODS[job.method].base_in_parts:
+                base = base.select(slice(None))
             if antialias != parameters.antialias:
                 self._warn(f"The base is {'' if antialias else 'not '}antialiased, and so is this run.")
                 parameters = replace(parameters, antialias=antialias)
-            if not any(camera.sees(base.means, near=data.near).any() for camera in data.train):
+            if not _seen(base, data):
                 raise LodgsError(
                     f"No training view sees a splat of {job.base}.",
                     "Choose splats that were made from these photographs, in the same coordinates.",
@@ -305,6 +308,15 @@ class _Run:
             raise
 
 
+def _seen(base: SplatRows, data: TrainingData) -> bool:
+    """Whether a training view sees any of the splats."""
+    for begin in range(0, len(base), AT_ONCE):
+        means = base.select(slice(begin, begin + AT_ONCE)).means
+        if any(camera.sees(means, near=data.near).any() for camera in data.train):
+            return True
+    return False
+
+
 def _keep_job(job: Job, folder: RunFolder) -> None:
     """Writes the job into the run; a run folder keeps to the job that it began with, but for the backend."""
     if folder.job.exists():
@@ -353,6 +365,10 @@ def _interrupted_by_cancel(folder: RunFolder):
                     _interrupt()
                     return
 
+    before = None
+    with suppress(ValueError):  # not in the main thread
+        # shells have programs in the background ignore it
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
     watching = threading.Thread(target=watch, daemon=True)
     watching.start()
     try:
@@ -360,6 +376,8 @@ def _interrupted_by_cancel(folder: RunFolder):
     finally:
         over.set()
         watching.join()
+        if before is not None:
+            signal.signal(signal.SIGINT, before)
 
 
 def _interrupt() -> None:

@@ -407,7 +407,9 @@ def test_a_finished_run_keeps_no_checkpoints_and_says_its_end_again(unbroken, ca
     assert folder.events_file.read_bytes() == before
 
 
-def test_cancel_is_heard_while_the_trainer_starts(unbroken, tmp_path, monkeypatch):
+@pytest.mark.parametrize("of_ctrl_c", [signal.default_int_handler, signal.SIG_IGN])
+def test_cancel_is_heard_while_the_trainer_starts(unbroken, tmp_path, monkeypatch, of_ctrl_c):
+    """In the background of a shell, too, which has programs ignore Ctrl-C."""
     keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
     folder = RunFolder(keys["out"])
     folder.make()
@@ -419,7 +421,12 @@ def test_cancel_is_heard_while_the_trainer_starts(unbroken, tmp_path, monkeypatc
         time.sleep(60)
 
     monkeypatch.setattr(training_loop, "warm_up", slow)
-    assert run_in_process(keys)[0] == training_loop.CANCELLED
+    before = signal.signal(signal.SIGINT, of_ctrl_c)
+    try:
+        assert run_in_process(keys)[0] == training_loop.CANCELLED
+        assert signal.getsignal(signal.SIGINT) is of_ctrl_c
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert not folder.take_cancel()
 
 

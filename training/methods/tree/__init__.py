@@ -97,6 +97,7 @@ METHOD = MethodInfo(
     rule="cut",
     offered=("max_splats", "tune_steps", "pixels"),
     from_base=True,
+    base_in_parts=True,
     for_splats=True,
     captured={"leaf_rate": 0.0, "random_background": False},  # leaves are right, and black is nothing
 )

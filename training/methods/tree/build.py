@@ -64,6 +64,7 @@ class GrowingForest:
     Args:
         leaves: N of them; their extras go.
         scratch: a folder where they are put in order; None: they are in memory.
+        sh_degree: of their harmonics at most; what is above goes.
         longest: most leaves of a subtree; 0: ``longest_of``.
         cell: see CELL.
 
@@ -72,11 +73,17 @@ class GrowingForest:
     """
 
     def __init__(
-        self, leaves: SplatRows, scratch: Path | None = None, longest: int = 0, cell: int = CELL
+        self,
+        leaves: SplatRows,
+        scratch: Path | None = None,
+        sh_degree: int = 4,
+        longest: int = 0,
+        cell: int = CELL,
     ) -> None:
         if len(leaves) < 2:
             raise LodgsError("One splat makes no tree.", "Begin with more splats.")
         self._leaves, self._scratch, self._cell = leaves, scratch, cell
+        self._coefficients = (sh_degree + 1) ** 2
         self._longest = longest or longest_of(len(leaves))
         self._upper: Piece | None = None
 
@@ -89,6 +96,7 @@ class GrowingForest:
     def __iter__(self) -> Iterator[Piece]:
         uppers, moments, harmonics = [], [], []
         for leaves in _by_cells(self._leaves, self._scratch, self._cell):
+            leaves.sh = leaves.sh[:, : self._coefficients]
             nodes, tree, root = _grown(leaves)
             moments.append(root)
             harmonics.append(nodes.sh[-1].copy())

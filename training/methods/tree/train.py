@@ -16,14 +16,13 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from ...lod.forest import joined
-from ...lod.paging import table_of_pages
+from ...lod.forest import levels_of
 from ...lod.streaming import BLOCKS
 from ...lod.tree import LEAVES, treeless_columns
 from ...rasterize import Gaussians, Rendering, Target, records
 from ...rasterize.adam import LearningRate
 from ...splats.bundle import Level
-from ...splats.gaussians import Splats
+from ...splats.gaussians import SplatRows
 from ...splats.ply import Columns
 from ..data import TrainingView
 from ..method import Drawing
@@ -98,9 +97,11 @@ class Method(Refining):
 
     parameters: TreeParameters
 
-    def setup(self, base: Splats | None) -> None:
-        super().setup(base)
+    def setup(self, base: SplatRows | None) -> None:
+        super().setup(None if base is None else base.select(slice(0, 0)))
         self.store: Store | None = None
+        self._base = base
+        self._table: Columns = {}
 
     @property
     def steps(self) -> int:
@@ -112,7 +113,9 @@ class Method(Refining):
 
     @property
     def splats(self) -> int:
-        return super().splats if self.store is None else len(self.store)
+        if self.store is not None:
+            return len(self.store)
+        return super().splats if self._base is None else len(self._base)
 
     def level_at(self, step: int) -> int:
         return LEAVES
@@ -128,7 +131,9 @@ class Method(Refining):
     def levels_after(self, step: int) -> list[Level]:
         """The leaves as soon as they are there, for whoever waits; all nodes at the end."""
         if step + 1 == self.steps:
-            return self._levels()
+            assert self.store is not None
+            levels, self._table = levels_of(self.store, self.data.scratch)
+            return levels
         if step + 1 == self.finest_steps:
             splats = self.model.splats()
             splats.extras |= treeless_columns(len(splats))
@@ -139,12 +144,7 @@ class Method(Refining):
         """Which blocks of rows an eye needs, by which a part of the file can be read."""
         if self.store is None:
             return {}
-        return {BLOCKS: table_of_pages({level.number: level.splats.extras for level in self._levels()})}
-
-    def _levels(self) -> list[Level]:
-        assert self.store is not None
-        splats, tree = joined(self.store)
-        return tree.levels(splats)
+        return {BLOCKS: self._table or levels_of(self.store, self.data.scratch)[1]}
 
     def controls(self) -> dict[str, float]:
         """Pictures begin with the granularity that was trained."""
@@ -214,11 +214,14 @@ class Method(Refining):
     @torch.no_grad()
     def _build_step(self, step: int) -> tuple[float, torch.Tensor, Target]:
         """Builds the tree; what is told of the step is how a view looks by it."""
-        leaves = self.model.splats()
-        none = from_splats(leaves.select(slice(0)), self.parameters.sh_degree, self.device)
-        self.model = self.new_model(none)
         self.store = self._new_store()
-        self.store.fill(GrowingForest(leaves))
+        if self._base is not None:
+            self.store.fill(GrowingForest(self._base, self.data.scratch, self.parameters.sh_degree))
+        else:
+            leaves = self.model.splats()
+            none = from_splats(leaves.select(slice(0)), self.parameters.sh_degree, self.device)
+            self.model = self.new_model(none)
+            self.store.fill(GrowingForest(leaves))
         view = self.choose_view(step)
         gaussians = self._take(view, step, self.parameters.pixels)
         drawing = Drawing(self.rasterize_model(view.camera, step, gaussians=gaussians))

@@ -27,7 +27,10 @@ def trained(tree, begin=0, until=None):
     levels = []
     for step in range(begin, until or tree.steps):
         tree.train_step(step)
-        levels += tree.levels_after(step)
+        levels += [
+            replace(level, splats=level.rows.select(slice(None)), elsewhere=None)
+            for level in tree.levels_after(step)
+        ]
     return levels
 
 
@@ -241,7 +244,7 @@ def test_a_tree_grows_where_photographs_ask_for_it(data, base):
     assert counts[5] == len(base) and counts[6] == len(base) + 60
     assert counts[-1] == counts[13] <= len(base) + 60
     (above, leaves), *_ = [tree.levels_after(tree.steps - 1)]
-    assert len(leaves.splats) == counts[-1] == len(above.splats) + 1
+    assert len(leaves.rows) == counts[-1] == len(above.rows) + 1
     for pause in (4, 9, 14):
         other = make(data, base, **values)
         trained(other, until=pause)
