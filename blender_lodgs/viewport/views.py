@@ -216,11 +216,12 @@ def prepare(
     instances = _from_files(view, instances, depsgraph, view_matrix, moving, wait)
     of, clouds = _read(instances, depsgraph)
     take_over = wait or not any(other.reads(of) for other in _all if other is not view)
-    if view.arrived != NOTHING:
-        view.arrived = _arrived() if take_over else before
+    arrived = _arrived()
     placements = _placements(instances, of, depsgraph, moving, take_over)
     request = Request(placements, tuple(view_matrix[2][:3]), budget)
-    _arrange(view, of, request, wait, take_over)
+    asked = _arrange(view, of, request, wait, take_over)
+    if view.arrived != NOTHING:  # what is not asked for yet has the view redrawn again
+        view.arrived = arrived if take_over and asked else before
     _load(view, of, clouds, wait)
     return request
 
@@ -385,8 +386,12 @@ def _choice(
     return choice if choice is None or seen is None else replace(choice, eye=seen[0], focal_px=seen[1])
 
 
-def _arrange(view: ViewState, of: Resident, request: Request, wait: bool, take_over: bool) -> None:
-    """Takes over an arrangement that has been found, and asks for another where one is wanted."""
+def _arrange(view: ViewState, of: Resident, request: Request, wait: bool, take_over: bool) -> bool:
+    """Takes over an arrangement that has been found, and asks for another where one is wanted.
+
+    Returns:
+        Whether the request has been answered, or will be.
+    """
     if view.loading is not None and view.loading.serial != of.pool.serial:  # of splats that are others now
         view.loading = view.missing = None
     if view.pending is not None and (wait or view.pending[2].done()):
@@ -395,14 +400,17 @@ def _arrange(view: ViewState, of: Resident, request: Request, wait: bool, take_o
         if found_of is of:
             _found(view, of, found.result())
     current = view.loading or (view.arrangement if view.resident is of else None)
-    if (current is not None and current.request == request) or view.pending is not None:
-        return
+    if current is not None and current.request == request:
+        return True
+    if view.pending is not None:
+        return view.pending[1] == request
     if view.loading is not None and not wait:  # what comes now, comes whole
-        return
+        return False
     view.pending = (of, request, _beside().submit(arrange, of.pool, request, take_over))
     if wait:
         found, view.pending = view.pending[2].result(), None
         _found(view, of, found)
+    return True
 
 
 def _beside() -> ThreadPoolExecutor:
