@@ -125,8 +125,7 @@ def draw(context: bpy.types.Context) -> None:
         region_data.view_matrix, region_data.window_matrix, settings.budget, moving=True,
         under_overlays=space.overlay.show_overlays and not _shows_photograph(context),
     )  # fmt: skip
-    waits = view.pending is not None or view.loading is not None or view.arrived != _arrived()
-    if waits or view.resolution < 1 or _busy():
+    if _unfinished(view) or view.pending is not None or view.resolution < 1 or _busy():
         _wake_later()
 
 
@@ -491,6 +490,15 @@ def _wake_later() -> None:
         bpy.app.timers.register(_wake, first_interval=0.01)
 
 
+def wants_redraw(view: ViewState) -> bool:
+    """Whether drawing a view again would show more, or have more come."""
+    return _unfinished(view) or (view.pending is not None and view.pending[2].done())
+
+
+def _unfinished(view: ViewState) -> bool:
+    return view.loading is not None or view.arrived != _arrived()
+
+
 def _wake() -> float | None:
     """Redraws viewports for which something is ready; asks to be called again while there is more to come."""
     global _told
@@ -502,10 +510,9 @@ def _wake() -> float | None:
                 if view is None:
                     continue
                 still = view.resolution < 1 and now - view.moved >= STILL
-                more = view.loading is not None or view.arrived != _arrived()
-                if still or more or (view.pending and view.pending[2].done()):
+                if still or wants_redraw(view):
                     region.tag_redraw()
-                waiting |= more or view.pending is not None or view.resolution < 1
+                waiting |= _unfinished(view) or view.pending is not None or view.resolution < 1
     if (told := [(each.splats, each.busy) for each in _streams.values()]) != _told:
         _told = told
         extension.redraw()

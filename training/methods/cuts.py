@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ..errors import LodgsError
-from .rows import STAGING, Rows
+from .rows import STAGING, FileRows
 from .schedules import due
 
 REUSE = 0.77, 2.0
@@ -43,7 +43,7 @@ class CutCache:
         rows: where rows are otherwise; only this object may change them.
         groups: how many groups there are.
         budget: bytes.
-        device: where records live; with a GPU ``rows`` are best pinned, in ordinary memory.
+        device: where records live.
         reuse: smallest and largest distance, over that of its making, for which a cut is used again.
         flush_interval: steps, see :meth:`after`.
         reduced: see REDUCED.
@@ -57,7 +57,7 @@ class CutCache:
 
     def __init__(
         self,
-        rows: Rows,
+        rows: FileRows,
         groups: int,
         budget: int,
         device: torch.device | str = "cpu",
@@ -179,26 +179,10 @@ class CutCache:
         self._places = {}
         self._distance[:] = np.nan
 
-    def clear(self, groups: int | None = None) -> None:
-        """Writes back, and keeps nothing.
-
-        Args:
-            groups: how many there are from now on.
-        """
+    def clear(self) -> None:
+        """Writes back, and keeps nothing."""
         self.write_back()
-        self._forget(len(self._used) if groups is None else groups)
-
-    def append(self, records: torch.Tensor, groups: int | None = None) -> None:
-        """Adds rows (M, width) at the end; nothing stays here."""
-        self.clear()
-        self.rows.append(records)
-        self._forget(len(self._used) if groups is None else groups)
-
-    def remove(self, rows: np.ndarray, groups: int | None = None) -> None:
-        """Removes rows; those behind close up in their order. Nothing stays here."""
-        self.clear()
-        self.rows.remove(rows)
-        self._forget(len(self._used) if groups is None else groups)
+        self._forget(len(self._used))
 
     def _bring(self, groups: np.ndarray, rows: np.ndarray, counts: np.ndarray) -> None:
         """Makes some groups consist of these rows; what they have in common with before stays."""

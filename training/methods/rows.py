@@ -22,7 +22,7 @@ from io import FileIO
 from itertools import pairwise
 from math import prod
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 from uuid import uuid4
 
 import numpy as np
@@ -59,75 +59,6 @@ class Layout:
     def join(self, tensors: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """Records (M, width) of tensors (M, ...) by name."""
         return torch.cat([tensors[name].reshape(len(tensors[name]), -1) for name in self.shapes], 1)
-
-
-class Rows(Protocol):
-    """Rows that are read and written by their numbers, wherever they are."""
-
-    layout: Layout
-
-    def __len__(self) -> int: ...
-
-    def read(self, rows: np.ndarray) -> torch.Tensor:
-        """Records (M, width) at rows (M,) int64, in any order, on the CPU."""
-        ...
-
-    def write(self, rows: np.ndarray, records: torch.Tensor) -> None:
-        """Puts records (M, width) at rows (M,) int64, each named once, in any order."""
-
-    def append(self, records: torch.Tensor) -> None:
-        """Adds rows (M, width) at the end."""
-
-    def remove(self, rows: np.ndarray) -> None:
-        """Removes rows (M,), each named once; those behind close up in their order."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """A checkpoint, as ``torch.load(weights_only=True)`` reads it."""
-        ...
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Becomes what ``state_dict`` gave."""
-
-
-class MemoryRows:
-    """Rows in ordinary memory, pinned where a GPU takes them from there."""
-
-    def __init__(self, layout: Layout, pinned: bool = False) -> None:
-        self.layout, self._pinned = layout, pinned
-        self._records = torch.zeros(0, layout.width)
-
-    def __len__(self) -> int:
-        return len(self._records)
-
-    def read(self, rows: np.ndarray) -> torch.Tensor:
-        """Records (M, width) at rows (M,)."""
-        found = torch.empty(len(rows), self.layout.width, pin_memory=self._pinned)
-        return torch.index_select(self._records, 0, torch.from_numpy(_checked(rows, len(self))), out=found)
-
-    def write(self, rows: np.ndarray, records: torch.Tensor) -> None:
-        """Puts records (M, width) at rows (M,), each named once."""
-        self._records[torch.from_numpy(_checked(rows, len(self)))] = records
-
-    def append(self, records: torch.Tensor) -> None:
-        """Adds rows at the end."""
-        self._keep(torch.cat([self._records, records]))
-
-    def remove(self, rows: np.ndarray) -> None:
-        """Removes rows; those behind close up in their order."""
-        mask = torch.ones(len(self), dtype=torch.bool)
-        mask[torch.from_numpy(_checked(rows, len(self)))] = False
-        self._keep(self._records[mask])
-
-    def state_dict(self) -> dict[str, Any]:
-        """All rows."""
-        return {"records": self._records}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Becomes what ``state_dict`` gave."""
-        self._keep(state["records"].clone())
-
-    def _keep(self, records: torch.Tensor) -> None:
-        self._records = records.pin_memory() if self._pinned else records
 
 
 class FileRows:
@@ -213,30 +144,6 @@ class FileRows:
         self._checks = np.append(self._checks, np.zeros(more, np.int64))
         self._fresh = np.append(self._fresh, np.zeros(more, bool))
         self.write(np.arange(begin, self._count), records)
-
-    def remove(self, rows: np.ndarray) -> None:
-        """Removes rows (M,), each named once; those behind close up in their order.
-
-        Raises:
-            LodgsError: as :meth:`write`.
-        """
-        gone = np.sort(_checked(rows, self._count))
-        if not len(gone):
-            return
-        if (np.diff(gone) == 0).any():
-            raise ValueError("a row is removed twice")
-        to, at_once = int(gone[0]), self._blocks_at_once * self._block
-        for begin in range(to, self._count, at_once):
-            some = np.arange(begin, min(begin + at_once, self._count))
-            left = some[gone[np.searchsorted(gone, some).clip(max=len(gone) - 1)] != some]
-            self.write(np.arange(to, to + len(left)), self.read(left))
-            to += len(left)
-        self._count = to
-        blocks = -(-to // self._block)
-        self._release(self._slots[blocks:], self._fresh[blocks:])
-        self._slots, self._checks, self._fresh = (
-            column[:blocks].copy() for column in (self._slots, self._checks, self._fresh)
-        )
 
     # -- checkpoints -----------------------------------------------------------------------------------
 
@@ -354,7 +261,7 @@ class FileRows:
                 file.seek(int(slots[some[0]]) * buffer[0].nbytes)
                 _write(file, buffer[some])
         self._slots[blocks], self._checks[blocks], self._fresh[blocks] = slots, _checksums(buffer), True
-        self._release(before[~fresh], np.zeros(int((~fresh).sum()), bool))
+        self._retiring.append(before[~fresh & (before >= 0)])
 
     def _new_slots(self, count: int) -> np.ndarray:
         """Slots that nobody needs, ascending; at the end of the file where there are no others."""
@@ -362,12 +269,6 @@ class FileRows:
         end = np.arange(self._size, self._size + count - len(found))
         self._size += len(end)
         return np.append(found, end)
-
-    def _release(self, slots: np.ndarray, fresh: np.ndarray) -> None:
-        """Gives slots up: those that no checkpoint has at once, others when their checkpoints are gone."""
-        if fresh.any():
-            self._free = np.sort(np.append(self._free, slots[fresh]))
-        self._retiring.append(slots[~fresh & (slots >= 0)])
 
     def _read_slots(self, slots: np.ndarray, to: np.ndarray, found: np.ndarray) -> None:
         """Reads the blocks in slots (B,) to places ``to`` (B,) among blocks ``found`` (., block, width)."""

@@ -24,7 +24,7 @@ SLACK = 1e-5
 """Share by which single precision may get distances and sizes wrong, and more."""
 _GRAIN = 64
 """Lists that a thread takes at a time."""
-NONE = np.empty(0, np.int32)
+_NONE = np.empty(0, np.int32)
 
 
 class Upper:
@@ -184,7 +184,7 @@ def search(
     bands: np.ndarray,
     eye: np.ndarray,
     k: float,
-    before: np.ndarray = NONE,
+    before: np.ndarray = _NONE,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Of lists, the children that are fine enough of nodes that are not (Eq. 5).
 

@@ -96,6 +96,24 @@ def test_finer_ones_come_and_what_is_drawn_is_complete_at_any_time(bpy, lodgs, t
     assert len({len(each) for each in numbers}) > 12, "it came at once"
 
 
+def test_a_view_at_rest_is_redrawn_until_all_has_come(lodgs, root, look, monkeypatch):
+    """As in windows, which are drawn again only when that is asked for; what comes takes several redraws."""
+    views, eye = lodgs("viewport.views"), EYES[0]
+    view, slices = views.ViewState(), 0
+    monkeypatch.setattr(views, "LOADING", (0.0, 0.0))
+    look(root, view, eye, 30.0)
+    until = time.monotonic() + 30
+    while time.monotonic() < until:
+        stream = views.stream(root)
+        if views.wants_redraw(view):
+            look(root, view, eye, 30.0)
+            slices += view.loading is not None
+        elif view.pending is None and stream.ready and not stream.busy:
+            break
+        time.sleep(0.002)
+    assert not stream.busy and view.arrived == stream.ready + stream.taken and slices > 3
+
+
 def test_it_is_the_picture_of_the_whole_file(bpy, lodgs, path, root, look):
     view = lodgs("viewport.views").ViewState()
     pictures = [look(root, view, eye, 30.0, wait=True) for eye in EYES]

@@ -11,7 +11,8 @@ from training.lod.selection import select_levels, settings
 from training.lod.tree import Tree
 from training.splats.bundle import Bundle, read_bundle, write_bundle
 
-from .test_tree import nodes, random_tree
+from .test_tree import nodes
+from .trees import random_tree
 
 
 def tagged(seed, leaves):

@@ -6,19 +6,11 @@ import pytest
 from training.lod.rule import rules
 from training.lod.rules.cut import ABOVE_ROOT, K_LEAST
 from training.lod.selection import select_levels, settings
-from training.lod.tree import Tree, area_of, complete_levels, size_of, treeless_columns
+from training.lod.tree import area_of, complete_levels, size_of, treeless_columns
 from training.splats.bundle import Bundle, Level, read_bundle, read_folder, write_bundle, write_folder
 from training.splats.gaussians import Splats
 
-
-def random_tree(rng, leaves):
-    """Pairs merged at random: deep and shallow ones."""
-    free, children = list(range(leaves)), []
-    while len(free) > 1:
-        pair = [free.pop(rng.integers(len(free))) for _ in range(2)]
-        free.append(leaves + len(children))
-        children.append(pair)
-    return Tree(np.array(children, np.int32).reshape(-1, 2))
+from .trees import random_tree
 
 
 def nodes(rng, count):

@@ -8,8 +8,32 @@ from training.lod.blocks import spatial_order
 from training.lod.paging import streaming_order, table_of_pages
 from training.lod.rules.cut import ABOVE_ROOT, least_size
 from training.lod.streaming import BLOCKS
+from training.lod.tree import Tree
 from training.splats.bundle import Bundle, Level, write_bundle
 from training.splats.gaussians import Splats
+
+
+def random_tree(rng: np.random.Generator, leaves: int) -> Tree:
+    """Pairs merged at random: deep and shallow, and children far from each other."""
+    free, children = list(range(leaves)), []
+    while len(free) > 1:
+        pair = [free.pop(rng.integers(len(free))) for _ in range(2)]
+        free.append(leaves + len(children))
+        children.append(pair)
+    return Tree(np.array(children, np.int32).reshape(-1, 2))
+
+
+def surfaces(count: int, degree: int = 0) -> Splats:
+    """Splats on a wavy ground and two walls, 20 units wide."""
+    rng = np.random.default_rng(4)
+    means = rng.uniform(-10, 10, (count, 3))
+    means[: count // 2, 2] = 0.1 * np.sin(means[: count // 2, 0])
+    means[count // 2 :, 0] = 5 * np.sign(means[count // 2 :, 0])
+    return Splats(
+        means.astype(np.float32), rng.normal(size=(count, 4)).astype(np.float32),
+        rng.normal(-3, 0.5, (count, 3)).astype(np.float32), rng.normal(0, 2, count).astype(np.float32),
+        rng.normal(0, 0.2, (count, (degree + 1) ** 2, 3)).astype(np.float32),
+    )  # fmt: skip
 
 
 def random_leaves(count: int, rng: np.random.Generator, degree: int = 0, extent: float = 10.0) -> Splats:

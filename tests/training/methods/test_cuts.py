@@ -6,7 +6,7 @@ import torch
 
 from training.errors import LodgsError
 from training.methods.cuts import BESIDE, CutCache
-from training.methods.rows import FileRows, Layout, MemoryRows
+from training.methods.rows import FileRows, Layout
 
 LAYOUT = Layout({"values": (4,)})
 GROUPS, SIZE = 20, 30
@@ -33,9 +33,9 @@ def cut_for(groups: np.ndarray, distances: np.ndarray):
     return cut, asked
 
 
-@pytest.fixture(params=["file", "memory"])
-def made(request, tmp_path):
-    return filled(FileRows(tmp_path, LAYOUT, block=7) if request.param == "file" else MemoryRows(LAYOUT))
+@pytest.fixture
+def made(tmp_path):
+    return filled(FileRows(tmp_path, LAYOUT, block=7))
 
 
 @pytest.mark.parametrize("room", [140, 200, 1000])
@@ -132,22 +132,6 @@ def test_a_cut_for_another_distance_brings_only_what_is_new(made):
     np.testing.assert_array_equal(cache.get(places), 2 * truth[90:97])
     cache.write_back()
     np.testing.assert_array_equal(rows.read(SIZE * 3 + np.arange(7)), 2 * truth[90:97])
-
-
-def test_rows_that_come_and_go_are_seen_and_what_changed_before_is_kept(made):
-    rows, truth = made
-    cache = CutCache(rows, GROUPS, 300 * ROW + TABLE)
-    groups, distances = np.arange(4), np.ones(4)
-    places = cache.take(groups, distances, cut_for(groups, distances)[0])
-    cache.put(places, cache.get(places) + 5)
-    truth[:120] += 5
-    cache.remove(np.arange(100, 110))
-    cache.append(torch.ones(7, 4), groups=GROUPS + 1)
-    truth = np.concatenate([np.delete(truth, np.arange(100, 110), 0), np.ones((7, 4), np.float32)])
-    np.testing.assert_array_equal(rows.read(np.arange(len(truth))), truth)
-    last = np.array([GROUPS])
-    places = cache.take(last, np.ones(1), lambda _: (np.arange(590, 597), np.array([7])))
-    np.testing.assert_array_equal(cache.get(places), truth[590:597])
 
 
 def test_groups_share_no_rows(made):

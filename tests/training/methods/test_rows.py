@@ -19,7 +19,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from training.errors import LodgsError
 from training.methods import rows as rows_module
-from training.methods.rows import FileRows, Layout, MemoryRows
+from training.methods.rows import FileRows, Layout
 from training.runs.checkpoints import read_newest, remove_checkpoints, write_checkpoint
 from training.runs.folder import RunFolder
 
@@ -77,13 +77,6 @@ class AsInMemory(RuleBasedStateMachine):
         some = np.array(data.draw(st.lists(st.integers(0, len(self.truth) - 1))), np.int64)
         np.testing.assert_array_equal(self.rows.read(some), self.truth[some])
 
-    @precondition(lambda self: len(self.truth) > 0)
-    @rule(data=st.data())
-    def remove(self, data):
-        some = np.array(data.draw(st.lists(st.integers(0, len(self.truth) - 1), unique=True)), np.int64)
-        self.rows.remove(some)
-        self.truth = np.delete(self.truth, some, axis=0)
-
     @rule()
     def checkpoint(self):
         self.taken = [*self.taken[-2:], (self.rows.state_dict(), self.truth.copy())]
@@ -113,26 +106,15 @@ TestAsInMemory = AsInMemory.TestCase
 TestAsInMemory.settings = settings(max_examples=25, stateful_step_count=25, deadline=None)
 
 
-def test_rows_in_memory_do_the_same(tmp_path):
-    file, memory = FileRows(tmp_path, LAYOUT, block=4), MemoryRows(LAYOUT)
-    for rows in (file, memory):
-        rows.append(records(0, 30))
-        rows.write(np.array([29, 3, 11]), records(1, 3))
-        rows.remove(np.array([0, 7, 28]))
-        rows.append(records(2, 5))
-    order = np.random.default_rng(0).permutation(32)
-    assert len(file) == len(memory) == 32
-    assert torch.equal(file.read(order), memory.read(order))
-    again = MemoryRows(LAYOUT)
-    again.load_state_dict(memory.state_dict())
-    assert torch.equal(again.read(order), memory.read(order))
-    for rows in (file, memory):
-        with pytest.raises(IndexError):
-            rows.read(np.array([32]))
-        with pytest.raises(IndexError):
-            rows.write(np.array([-1]), records(0, 1))
+def test_rows_that_are_not_there_are_refused(tmp_path):
+    rows = FileRows(tmp_path, LAYOUT, block=4)
+    rows.append(records(0, 32))
+    with pytest.raises(IndexError):
+        rows.read(np.array([32]))
+    with pytest.raises(IndexError):
+        rows.write(np.array([-1]), records(0, 1))
     with pytest.raises(ValueError, match="twice"):
-        file.write(np.array([1, 1]), records(0, 2))
+        rows.write(np.array([1, 1]), records(0, 2))
 
 
 def test_a_checkpoint_costs_what_has_changed(tmp_path):
@@ -181,7 +163,7 @@ def test_damage_is_found_before_anything_is_taken(tmp_path):
 
 
 def life(folder: RunFolder, first: int, last: int, count: list[int] | None = None) -> None:
-    """Goes on with a small run where its newest checkpoint is; every step changes, adds and removes rows."""
+    """Goes on with a small run where its newest checkpoint is; every step changes rows, and adds some."""
     rows = FileRows(folder.checkpoints, LAYOUT, block=4, staging=4 * 4 * 4 * LAYOUT.width)
     rows.append(records(99, 25))  # as a method begins before it takes up a checkpoint
     found = read_newest(folder, "cpu", lambda state: rows.load_state_dict(state["rows"]), print)
@@ -190,7 +172,6 @@ def life(folder: RunFolder, first: int, last: int, count: list[int] | None = Non
         some = rng.permutation(len(rows))[:9]
         rows.write(some, rows.read(some) + records(step, 9))
         rows.append(records(step, 3))
-        rows.remove(rng.permutation(len(rows))[:2])
         if step % 2:
             write_checkpoint(folder, step + 1, [], {"rows": rows.state_dict()})
     rows.close()
@@ -354,7 +335,6 @@ warm = CutCache(rows, 1, 1 << 20)  # what libraries take when they are first use
 places = warm.take(np.zeros(1), np.ones(1), lambda _: (rng.permutation(64), np.array([64])))
 warm.put(places, warm.get(places) + 1)
 warm.state_dict()
-warm.remove(np.arange(64))
 before = peak()
 for begin in range(0, count, at_once):
     rows.append(torch.zeros(min(at_once, count - begin), 70))

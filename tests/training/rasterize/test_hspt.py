@@ -8,25 +8,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.training.lod.trees import random_tree, surfaces
 from training.lod.rule import rules
 from training.lod.tree import Tree
 from training.methods.tree.build import build
 from training.rasterize import Gaussians, rasterize
 from training.rasterize.hspt import Hspt
 from training.scenes.cameras import Camera, look_at
-from training.splats.gaussians import Splats
 
 CUT = rules()["cut"]
-
-
-def random_tree(rng, leaves):
-    """Pairs merged at random: deep and shallow, and children far from each other."""
-    free, children = list(range(leaves)), []
-    while len(free) > 1:
-        pair = [free.pop(rng.integers(len(free))) for _ in range(2)]
-        free.append(leaves + len(children))
-        children.append(pair)
-    return Tree(np.array(children, np.int32))
 
 
 def places(rng, count):
@@ -67,17 +57,7 @@ def test_on_small_trees_it_is_the_walk_from_the_root(seed, leaves, longest, k, r
 @pytest.fixture(scope="module")
 def large():
     """A tree over 30,000 splats on some surfaces: nodes, tree, sizes."""
-    rng = np.random.default_rng(4)
-    count = 30_000
-    means = rng.uniform(-10, 10, (count, 3))
-    means[: count // 2, 2] = 0.1 * np.sin(means[: count // 2, 0])
-    means[count // 2 :, 0] = 5 * np.sign(means[count // 2 :, 0])
-    splats = Splats(
-        means.astype(np.float32), rng.normal(size=(count, 4)).astype(np.float32),
-        rng.normal(-3, 0.5, (count, 3)).astype(np.float32), rng.normal(0, 2, count).astype(np.float32),
-        rng.normal(0, 0.2, (count, 1, 3)).astype(np.float32),
-    )  # fmt: skip
-    nodes, tree = build(splats)
+    nodes, tree = build(surfaces(30_000))
     return nodes, tree, tree.sizes(nodes.means, nodes.log_scales)
 
 

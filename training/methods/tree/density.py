@@ -125,9 +125,7 @@ class Growing:
             split[self._split[begin:end] - count] = True
             count += tree.leaves
             tree, source = edited(tree, split, self._dead(records[: tree.leaves]))
-            born = np.flatnonzero(
-                np.append(split, np.zeros(len(records) - len(split), bool))[source[: tree.leaves]]
-            )
+            born = np.flatnonzero(split[source[: tree.leaves]])
             records = self._with_children(records[torch.from_numpy(source)], born)
             grown = tree.leaves > GROWN * self._longest
             order, shape = shape_of(tree, self._longest if grown else tree.leaves)

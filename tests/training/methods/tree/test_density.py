@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.training.lod.trees import random_tree
 from training.lod.forest import joined, longest_of
 from training.lod.tree import Tree
 from training.methods.tree.build import GrowingForest
@@ -11,16 +12,6 @@ from training.methods.tree.density import GROWN, Growing, edited
 from training.methods.tree.store import Store
 
 from .test_build import below, scene
-
-
-def random_tree(rng, leaves):
-    """Pairs merged at random: deep and shallow ones."""
-    free, children = list(range(leaves)), []
-    while len(free) > 1:
-        pair = [free.pop(rng.integers(len(free))) for _ in range(2)]
-        free.append(leaves + len(children))
-        children.append(pair)
-    return Tree(np.array(children, np.int32).reshape(-1, 2))
 
 
 def nested(tree, names):

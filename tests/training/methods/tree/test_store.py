@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.training.lod.trees import surfaces
 from tests.training.rasterize.test_hspt import cameras
 from training.errors import LodgsError
 from training.lod.forest import divided, joined, longest_of, shape_of
@@ -14,7 +15,6 @@ from training.methods.tree import store as store_module
 from training.methods.tree.build import build
 from training.methods.tree.store import Store, layout_of
 from training.rasterize.hspt import Hspt
-from training.splats.gaussians import Splats
 
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
 RECORD = 4 * layout_of(1).width + BESIDE
@@ -23,16 +23,7 @@ RECORD = 4 * layout_of(1).width + BESIDE
 @pytest.fixture(scope="module")
 def town():
     """A tree over 8,000 splats on some surfaces: nodes and tree."""
-    rng = np.random.default_rng(4)
-    count = 8_000
-    means = rng.uniform(-10, 10, (count, 3))
-    means[: count // 2, 2] = 0.1 * np.sin(means[: count // 2, 0])
-    means[count // 2 :, 0] = 5 * np.sign(means[count // 2 :, 0])
-    return build(Splats(
-        means.astype(np.float32), rng.normal(size=(count, 4)).astype(np.float32),
-        rng.normal(-3, 0.5, (count, 3)).astype(np.float32), rng.normal(0, 2, count).astype(np.float32),
-        rng.normal(0, 0.2, (count, 4, 3)).astype(np.float32),
-    ))  # fmt: skip
+    return build(surfaces(8_000, degree=1))
 
 
 def stored(folder, town, budget=1 << 30, longest=0):
