@@ -113,14 +113,38 @@ class Store:
     def _append(self, subtrees: list[RecordPiece]) -> None:
         if not subtrees:
             return
-        self.rows.append(torch.cat([records for records, _ in subtrees]))
-        entries = []
-        for _, tree in subtrees:
-            entry = np.zeros((len(tree.children), ENTRY.width), np.float32)
-            entry[:, 0] = np.arange(tree.leaves, len(tree))
-            entry[:, 1:3] = tree.children
-            entries.append(entry)
-        self._lists.append(torch.from_numpy(np.concatenate(entries)))
+        records = torch.cat([records for records, _ in subtrees])
+        counts = np.array([tree.leaves for _, tree in subtrees])
+        many = 2 * counts - 1
+        begins = np.cumsum(many) - many
+        of_tree = np.repeat(np.arange(len(counts)), many)
+        inside = np.arange(len(records)) - begins[of_tree] >= counts[of_tree]  # of the tree: not a leaf
+        inner = np.flatnonzero(inside)
+        children = np.concatenate([tree.children for _, tree in subtrees]) + begins[of_tree[inner], None]
+        above = np.full(len(records), np.inf, np.float32)  # the size of the node above
+        above[children] = self._sizes_of(counts, children, records)[inner, None]
+        # what one cut has of a subtree has about as large ones above it: so it lies together in the file;
+        # leaves are first all the same, and the root, above which is nothing, is last
+        order = np.lexsort((above, inside, of_tree))
+        number = np.empty_like(order)
+        number[order] = np.arange(len(order))
+        within = number - begins[of_tree]
+        entries = np.zeros((len(inner), ENTRY.width), np.float32)
+        entries[:, 0], entries[:, 1:3] = within[inner], within[children]
+        self.rows.append(records[torch.from_numpy(order)])
+        self._lists.append(torch.from_numpy(entries))
+
+    def _sizes_of(self, counts: np.ndarray, children: np.ndarray, records: torch.Tensor) -> np.ndarray:
+        """Sizes (N,) float32 of the records (N, width) of subtrees of so many leaves each.
+
+        Args:
+            children: (., 2) of the nodes above leaves in the order of their numbers, by number among all.
+        """
+        values = self.layout.split(records)
+        order, tree = side_by_side(counts, children.astype(np.int32))
+        sizes = np.empty(len(order), np.float32)
+        sizes[order] = tree.sizes(values["means"].numpy()[order], values["log_scales"].numpy()[order])
+        return sizes
 
     def _records_of(self, splats: Splats) -> torch.Tensor:
         records = np.zeros((len(splats), self.layout.width), np.float32)
@@ -221,12 +245,9 @@ class Store:
             begins = ends - (2 * counts - 1)
             of_list = np.repeat(np.arange(len(counts)), counts - 1)
             family = entries[:, :3].astype(np.int32) + begins[of_list, None].astype(np.int32)
-            in_order = np.argsort(family[:, 0])
-            order, tree = side_by_side(counts, family[in_order, 1:])
+            sizes = self._sizes_of(counts, family[np.argsort(family[:, 0]), 1:], records)
             values = self.layout.split(records)
             means, log_scales = (values[name].numpy() for name in ("means", "log_scales"))
-            sizes = np.empty(len(order), np.float32)
-            sizes[order] = tree.sizes(means[order], log_scales[order])
             by_size = np.lexsort((-sizes[family[:, 0]], of_list))
             entries[:, :3] = entries[by_size, :3]
             balls = np.concatenate([means, sizes[:, None]], axis=1)
