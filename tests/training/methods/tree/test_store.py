@@ -177,8 +177,32 @@ def test_a_store_goes_on_to_the_bit(town, tmp_path, stop):
     torch.testing.assert_close(steps(second, stop, 40), truth, rtol=0, atol=0)
 
 
-def test_too_little_room_is_told(town, tmp_path):
-    made = stored(tmp_path, town, budget=1 << 17)
+def test_a_view_without_room_is_coarsened_until_it_has(town, tmp_path):
+    """And what it is shown then is the cut for that granularity; a budget as told has room."""
+    made, whole = stored(tmp_path / "some", town, budget=700 * RECORD + 4 * 16_000), stored(tmp_path, town)
+    coarser = 0
+    for camera in cameras(np.random.default_rng(0)):
+        made.cache.forget()
+        made.coarsened, made.wanted = 1.0, 0
+        rows = made.cache.rows_at(made.take(camera, 0.2, 0.3))
+        whole.cache.forget()
+        truth = whole.cache.rows_at(whole.take(camera, 0.2 * made.coarsened, 0.3))
+        np.testing.assert_array_equal(rows, truth)
+        assert len(rows) <= made.cache.capacity == 700
+        if made.coarsened == 1:
+            assert made.wanted == 0
+            continue
+        assert len(rows) > 200, "no coarser than it need be"
+        coarser += 1
+        enough = stored(tmp_path / f"{coarser}", town, budget=made.wanted)
+        enough.take(camera, 0.2, 0.3)
+        assert enough.coarsened == 1 and whole.coarsened == 1
+        enough.close()
+    assert coarser > 3
+
+
+def test_too_little_room_for_the_coarsest_is_told(town, tmp_path):
+    made = stored(tmp_path, town, budget=3 * RECORD + 4 * 16_000)
     camera = next(cameras(np.random.default_rng(0)))
     with pytest.raises(LodgsError, match=r"at once; .* room for .* splat_memory"):
         made.take(camera, 0.1, 0.3)
