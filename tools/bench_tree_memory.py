@@ -29,7 +29,7 @@ import torch
 from examples import town
 from training.lod.rules.cut import detail_of
 from training.methods import method_info
-from training.methods.cuts import BESIDE
+from training.methods.cuts import BESIDE, LARGE
 from training.methods.data import TrainingData
 from training.methods.memory import keep_freed_memory
 from training.methods.parameters import override
@@ -186,6 +186,7 @@ def train(options: argparse.Namespace) -> dict:
 
 def draw(options: argparse.Namespace) -> dict:
     """Draws the largest cut of a run some times, with gradients and the loss, and knows nothing of trees."""
+    keep_freed_memory(LARGE)  # as a run does
     method = method_in(options.folder, options)
     with np.load(options.folder / "largest.npz") as file:
         arrays = dict(file)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from ..errors import LodgsError
+from .memory import keep_freed_memory
 from .rows import STAGING, FileRows
 from .schedules import due
 
@@ -20,6 +21,11 @@ REDUCED = 0.8
 """Share of the room that is taken after the least recently used has gone."""
 BESIDE = 25
 """Bytes that are kept of each row beside its numbers."""
+
+LARGE = 1 << 20
+"""Bytes from which on an array's memory is the system's again when it is freed, where not all rows have room:
+what is made of cuts has another size each step, and a heap would keep half as much again in pieces that fit
+nothing. It costs some 10 % of a step's time."""
 
 FREE = -1
 """The group of a place without a row."""
@@ -94,6 +100,8 @@ class CutCache:
     def _forget(self, groups: int) -> None:
         most = max(self.budget - 4 * len(self.rows), 0) // (self._record + BESIDE)
         self.capacity = min(most, len(self.rows))
+        if self.capacity < len(self.rows):
+            keep_freed_memory(LARGE)
         if len(self.records) != self.capacity:
             self.records = self.records[:0].clone()
             self.records = torch.zeros(self.capacity, self.layout.width, device=self._device)

@@ -32,7 +32,7 @@ from ..errors import LodgsError
 
 BLOCK = 64
 """Rows of a block."""
-STAGING = 4 << 20
+STAGING = 3 << 18
 """Bytes of blocks that are between file and tensors at a time; in up to six copies, all told."""
 KEPT = 2
 """Checkpoints before the newest one whose blocks stay: a run has as many, the newest may not be whole yet."""

@@ -26,15 +26,12 @@ from ...rasterize.records import gather
 from ...scenes.cameras import Camera
 from ...splats.gaussians import Splats
 from ..cuts import CutCache, NoRoom
-from ..memory import free_memory, keep_freed_memory
+from ..memory import free_memory
 from ..model import NAMES
 from ..rows import FileRows, Layout
 
-AT_ONCE = 1 << 15
+AT_ONCE = 1 << 14
 """Nodes that are looked at together where all are."""
-LARGE = 4 << 20
-"""Bytes from which on an array's memory is the system's again when it is freed: cuts, and what is made of
-them, have another size each step, and a heap would keep half as much again in pieces that fit nothing."""
 MARK = 32
 """Of every so many entries of a list the size of the first is in memory."""
 ENTRY = Layout({"node": (), "pair": (2,), "family": (12,)})
@@ -87,7 +84,6 @@ class Store:
         self.coarsened, self.wanted = 1.0, 0
         self.rows = FileRows(folder, self.layout)
         self._lists = FileRows(folder, ENTRY, name="lists")
-        keep_freed_memory(LARGE)
 
     def __len__(self) -> int:
         return len(self.rows)
