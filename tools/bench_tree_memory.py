@@ -3,11 +3,11 @@
 Towns whose nodes, with their moments, take 1, 3 and 10 times a budget are trained for some steps each, at
 equal splats in view: a town's granularity is that at which its views show so many on average. Then sizes are
 made anew, two more steps made, and a checkpoint is written. Every run is a process of its own, and peak
-memory is what the system says of it (VmHWM). What a run takes beside its budget is measured as well, once,
-and is the same for all towns: ``program``, the trainer at work on a small tree of which half has room, less
-this half (Python, torch, kernels, photographs, what passes between file and memory), and ``drawing``, by how
-much more it takes to draw the largest cut of the smallest town, with its gradients, than that of the small
-tree. Rows are added to build/bench/tree.json; towns are kept beside it.
+memory is what the system says of it (VmHWM). What a run takes beside its budget is measured as well:
+``program``, the trainer at work on a small tree of which half has room, less this half (Python, torch,
+kernels, photographs, what passes between file and memory), and ``drawing``, by how much more it takes to draw
+the run's largest cut, with its gradients, than that of the small tree: equal on average, cuts are not all
+equal. Rows are added to build/bench/tree.json; towns are kept beside it.
 """
 
 from __future__ import annotations
@@ -224,7 +224,8 @@ def run(stage: str, leaves: int, options: argparse.Namespace, **others: object) 
 def told(row: dict) -> str:
     """A row of the table."""
     return (
-        f"peak {row['peak_mb']:>6,.0f} MB of {row['allowed_mb']:>6,.0f}  step {row['step_s']:.3f} s, "
+        f"peak {row['peak_mb']:>6,.0f} MB of {row['allowed_mb']:>6,.0f} (drawing "
+        f"{row['drawing_mb']:.0f})  step {row['step_s']:.3f} s, "
         f"{row['s_per_million']:.3f} s a million of {row['drawn']:,.0f} drawn, cut {row['cut_ms']:.0f} ms, "
         f"{row['reused']:.0%} were there, sizes {row['resize_s']:.1f} s, "
         f"checkpoint {row['checkpoint_s']:.1f} s"
@@ -264,7 +265,8 @@ def main() -> None:
     half = options.small * 4e-6 * layout_of(0).width  # MB of the small tree's nodes
     program = [run("train", options.small, options, budget=half) for _ in range(2)][1]  # one may compile
     program, small = program["peak_mb"] - program["cache_mb"], run("draw", options.small, options)["peak_mb"]
-    rows, drawing = [], None
+    print(f"beside the budget and a tenth: program {program:.0f} MB, and drawing")
+    rows = []
     for times in options.times:
         leaves = round(options.budget * 1e6 * times / (4 * layout_of(0).width) / 2)
         made = run("build", leaves, options)
@@ -273,9 +275,7 @@ def main() -> None:
         pixels = run("level", leaves, options)["pixels"]
         for way in options.ways:
             row = run("train", leaves, options, way=way, pixels=pixels)
-            if drawing is None:
-                drawing = max(run("draw", leaves, options)["peak_mb"] - small, 0)
-                print(f"beside the budget and a tenth: program {program:.0f} MB, drawing {drawing:.0f} MB")
+            drawing = max(run("draw", leaves, options)["peak_mb"] - small, 0)
             allowed = 1.1 * options.budget + program + drawing
             row |= {"name": way, "times": times, "budget_mb": options.budget, "program_mb": program,
                     "drawing_mb": drawing, "allowed_mb": allowed, "pixels": pixels}  # fmt: skip
