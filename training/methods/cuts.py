@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from ..errors import LodgsError
+from .memory import keep_freed_memory
 from .rows import STAGING, FileRows
 from .schedules import due
 
@@ -21,8 +22,30 @@ REDUCED = 0.8
 BESIDE = 25
 """Bytes that are kept of each row beside its numbers."""
 
+LARGE = 1 << 20
+"""Bytes from which on an array's memory is the system's again when it is freed, where not all rows have room:
+what is made of cuts has another size each step, and a heap would keep half as much again in pieces that fit
+nothing. It costs some 10 % of a step's time."""
+
 FREE = -1
 """The group of a place without a row."""
+
+
+class NoRoom(LodgsError):
+    """What a view needs at once is more than the budget has room for.
+
+    Attributes:
+        needed, room: rows.
+        budget: bytes that would do.
+    """
+
+    def __init__(self, needed: int, room: int, budget: int) -> None:
+        super().__init__(
+            f"A view needs {needed:,} splats at once; the memory budget has room for {room:,}.",
+            f"Give at least {-(-budget // 10**6):,} MB as splat_memory, or ask for coarser detail.",
+        )
+        self.needed, self.room, self.budget = needed, room, budget
+
 
 Cut = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Told which (K,) of the groups asked for have to be cut, says the rows of each, one group's after the
@@ -77,6 +100,8 @@ class CutCache:
     def _forget(self, groups: int) -> None:
         most = max(self.budget - 4 * len(self.rows), 0) // (self._record + BESIDE)
         self.capacity = min(most, len(self.rows))
+        if self.capacity < len(self.rows):
+            keep_freed_memory(LARGE)
         if len(self.records) != self.capacity:
             self.records = self.records[:0].clone()
             self.records = torch.zeros(self.capacity, self.layout.width, device=self._device)
@@ -115,7 +140,7 @@ class CutCache:
             (M,) int64 places, for :meth:`get` and :meth:`put`: group after group, each in its cut's order.
 
         Raises:
-            LodgsError: there is no room for them all.
+            NoRoom: there is none for them all; nothing has changed.
             ValueError: a row is in two groups, or in one twice.
         """
         groups, distances = np.asarray(groups, np.int64), np.asarray(distances, np.float64)
@@ -126,12 +151,9 @@ class CutCache:
             if there + len(rows) <= self.capacity or not known.any():
                 break  # otherwise cuts that are finer than they need be have no room
         if there + len(rows) > self.capacity:
-            needed = (there + len(rows)) * (self._record + BESIDE) + 4 * len(self.rows)
-            raise LodgsError(
-                f"A view needs {there + len(rows):,} splats at once; the memory budget has room for "
-                f"{self.capacity:,}.",
-                f"Give at least {-(-needed // 10**6):,} MB as splat_memory, or ask for coarser detail.",
-            )
+            needed = there + len(rows)
+            budget = needed * (self._record + BESIDE) + 4 * len(self.rows)
+            raise NoRoom(needed, self.capacity, budget)
         self._clock += 1
         self._used[groups] = self._clock
         self.reused += there
@@ -181,8 +203,8 @@ class CutCache:
 
     def clear(self) -> None:
         """Writes back, and keeps nothing."""
-        self.write_back()
-        self._forget(len(self._used))
+        self.forget()
+        self._drop(np.flatnonzero(self._group != FREE))
 
     def _bring(self, groups: np.ndarray, rows: np.ndarray, counts: np.ndarray) -> None:
         """Makes some groups consist of these rows; what they have in common with before stays."""

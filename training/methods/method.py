@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
@@ -55,6 +55,7 @@ class Method(ABC, Generic[P, D]):
     Attributes:
         model: the rows that are trained.
         device: where tensors live.
+        warn: told in a sentence what somebody should know of the run; who runs it says where that goes.
 
     Args:
         backend: the rasterizer's.
@@ -62,6 +63,7 @@ class Method(ABC, Generic[P, D]):
     """
 
     model: Model
+    warn: Callable[[str], None] = staticmethod(lambda _: None)
 
     def __init__(
         self, data: TrainingData, parameters: P, seed: int, backend: str, base: Splats | None = None

@@ -32,7 +32,7 @@ from ..errors import LodgsError
 
 BLOCK = 64
 """Rows of a block."""
-STAGING = 4 << 20
+STAGING = 3 << 18
 """Bytes of blocks that are between file and tensors at a time; in up to six copies, all told."""
 KEPT = 2
 """Checkpoints before the newest one whose blocks stay: a run has as many, the newest may not be whole yet."""
@@ -120,17 +120,18 @@ class FileRows:
         """
         self._require_whole()
         rows = _checked(rows, self._count)
-        order = np.argsort(rows)
-        rows = rows[order]
+        values = records.detach().numpy()
+        if (np.diff(rows) < 0).any():
+            order = np.argsort(rows)
+            rows, values = rows[order], values[order]
         if (np.diff(rows) == 0).any():
             raise ValueError("a row is written twice")
-        values = records.detach().numpy()
-        blocks, begins = np.unique(rows // self._block, return_index=True)
+        begins = _begins(rows // self._block)
         ends = np.append(begins[1:], len(rows))
-        for first in range(0, len(blocks), self._blocks_at_once):
+        for first in range(0, len(begins), self._blocks_at_once):
             some = slice(first, first + self._blocks_at_once)
             part = slice(begins[some][0], ends[some][-1])
-            self._write_blocks(blocks[some], (ends - begins)[some], rows[part], values[order[part]])
+            self._write_blocks((ends - begins)[some], rows[part], values[part])
 
     def append(self, records: torch.Tensor) -> None:
         """Adds rows (M, width) at the end.
@@ -243,24 +244,30 @@ class FileRows:
 
     # -- blocks ----------------------------------------------------------------------------------------
 
-    def _write_blocks(self, blocks: np.ndarray, given: np.ndarray, rows: np.ndarray, values: np.ndarray):
-        """Writes blocks (B,), of which ``given`` (B,) rows each are new: ``rows`` (M,), ascending."""
-        buffer = np.zeros((len(blocks), self._block, self.layout.width), np.float32)
-        held = np.minimum(self._count - blocks * self._block, self._block)
+    def _write_blocks(self, given: np.ndarray, rows: np.ndarray, values: np.ndarray) -> None:
+        """Writes the blocks (B,) of rows (M,), ascending, of which each has so many: ``given`` (B,)."""
+        blocks = rows[np.cumsum(given) - given] // self._block
         before, fresh = self._slots[blocks], self._fresh[blocks]
-        old = np.flatnonzero((given < held) & (before >= 0))
-        self._read_slots(before[old], old, buffer)
-        buffer[np.searchsorted(blocks, rows // self._block), rows % self._block] = values
+        held = np.minimum(self._count - blocks * self._block, self._block)
         slots = before.copy()
         slots[~fresh] = self._new_slots(int((~fresh).sum()))
-        order = np.argsort(slots)
+        place = np.empty_like(slots)  # of each block in the buffer, which is in the order of the file
+        place[np.argsort(slots)] = np.arange(len(slots))
+        buffer = np.zeros((len(slots), self._block, self.layout.width), np.float32)
+        old = np.flatnonzero((given < held) & (before >= 0))
+        self._read_slots(before[old], place[old], buffer)
+        buffer[np.repeat(place, given), rows % self._block] = values
         with self._telling():
             file = self._file or self._open(self._folder / f"{self._name}_{uuid4().hex[:8]}.bin", new=True)
-            for run in _runs(slots[order]):
-                some = order[run]
-                file.seek(int(slots[some[0]]) * buffer[0].nbytes)
-                _write(file, buffer[some])
-        self._slots[blocks], self._checks[blocks], self._fresh[blocks] = slots, _checksums(buffer), True
+            in_order = np.sort(slots)
+            for run in _runs(in_order):
+                file.seek(int(in_order[run.start]) * self._block_bytes)
+                _write(file, buffer[run])
+        self._slots[blocks], self._checks[blocks], self._fresh[blocks] = (
+            slots,
+            _checksums(buffer)[place],
+            True,
+        )
         self._retiring.append(before[~fresh & (before >= 0)])
 
     def _new_slots(self, count: int) -> np.ndarray:
@@ -277,23 +284,38 @@ class FileRows:
         self._read_places(places, to, found.reshape(-1, self.layout.width))
 
     def _read_places(self, places: np.ndarray, to: np.ndarray, found: np.ndarray) -> None:
-        """Reads the rows at places (M,), counted through all slots, to rows ``to`` (M,) of ``found``."""
+        """Reads the rows at places (M,), counted through all slots, to rows ``to`` (M,) of ``found``.
+
+        Blocks that follow each other are read at once, with the rows between. What does not go where it
+        belongs as it lies there is put in its places afterwards, as much of it together as STAGING has.
+        """
         if (np.diff(places) < 0).any():
             order = np.argsort(places)
             places, to = places[order], to[order]
-        width = self.layout.width
+        most = self._blocks_at_once * self._block
+        runs = _runs(places // self._block, places // most)
         gaps = np.append(0, np.cumsum((np.diff(places) != 1) | (np.diff(to) != 1)))[: len(places)]
+        staged = np.empty((0, self.layout.width), np.float32)
+        at, used, begin, end = np.empty_like(places), 0, 0, 0  # rows of ``staged``; runs that wait in it
         with self._telling():
-            for run in _runs(places // self._block, places // (self._blocks_at_once * self._block)):
+            for run in runs:
                 first, last = int(places[run.start]), int(places[run.stop - 1])
+                as_they_lie = gaps[run.start] == gaps[run.stop - 1] and last - first >= self._block
+                count = 0 if as_they_lie else last - first + 1
+                if begin < end and (as_they_lie or used + count > most):
+                    found[to[begin:end]] = staged[at[begin:end]]
+                    used = begin = end = 0
                 assert self._file is not None, "where a block has a slot there is a file"
-                self._file.seek(first * 4 * width)
-                if gaps[run.start] == gaps[run.stop - 1]:  # as they lie there
+                self._file.seek(first * 4 * self.layout.width)
+                if as_they_lie:
                     _read(self._file, found[to[run.start] : to[run.stop - 1] + 1])
                     continue
-                part = np.empty((last - first + 1, width), np.float32)
-                _read(self._file, part)
-                found[to[run]] = part[places[run] - first]
+                if not len(staged):
+                    staged = np.empty((most, self.layout.width), np.float32)
+                _read(self._file, staged[used : used + count])
+                np.add(places[run], used - first, out=at[run])
+                used, begin, end = used + count, begin if used else run.start, run.stop
+            found[to[begin:end]] = staged[at[begin:end]]
 
     # -- the file --------------------------------------------------------------------------------------
 
@@ -344,6 +366,11 @@ def _runs(numbers: np.ndarray, cells: np.ndarray | None = None) -> list[slice]:
         breaks |= np.diff(cells) > 0
     borders = [0, *(np.flatnonzero(breaks) + 1).tolist(), len(numbers)]
     return [slice(*ends) for ends in pairwise(borders)]
+
+
+def _begins(numbers: np.ndarray) -> np.ndarray:
+    """Where each of ascending numbers (M,) is the first time."""
+    return np.flatnonzero(np.append(True, np.diff(numbers) > 0)[: len(numbers)])
 
 
 def _checksums(blocks: np.ndarray) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 import os
 import signal
@@ -30,6 +29,7 @@ from ..lod.selection import levels_alone, settings
 from ..lod.sight import IN_MEMORY, in_parts
 from ..methods import METHODS, create
 from ..methods.data import TrainingData
+from ..methods.memory import keep_freed_memory
 from ..methods.method import Method
 from ..rasterize import cuda, device_of, resolve, warm_up
 from ..rasterize.resident import Resident
@@ -116,7 +116,7 @@ def _train(job: Job, folder: RunFolder, events: Events) -> int:
         data = training_data(job, folder, events)
         events("status", message="Preparing to train (the first time on a computer up to a minute)")
         torch.set_num_threads(1)  # torch's thread pool beside the kernels' slows both
-        _keep_freed_memory()
+        keep_freed_memory()
         backend = resolve(job.backend)
         warm_up(backend)
         _tell_backend(backend, events)
@@ -166,7 +166,9 @@ class _Run:
                     f"No training view sees a splat of {job.base}.",
                     "Choose splats that were made from these photographs, in the same coordinates.",
                 )
-        return create(job.method, data, parameters, job.seed, self._backend, base)
+        method = create(job.method, data, parameters, job.seed, self._backend, base)
+        method.warn = self._warn
+        return method
 
     def _warn(self, message: str) -> None:
         self.events("warning", message=message)
@@ -339,15 +341,6 @@ def _tell_backend(backend: str, events: Events) -> None:
     if backend == "cpu" and torch.cuda.is_available() and (problem := cuda.problem()):
         events("warning", message=f"The NVIDIA GPU is not used. {problem}")
     events("status", message=f"Training on {names[backend]}", backend=backend)
-
-
-def _keep_freed_memory() -> None:
-    """Keeps freed arrays for the next ones; glibc would fetch fresh pages, some 6 % of a step's time."""
-    if sys.platform == "linux":
-        with suppress(OSError, AttributeError):  # another C library
-            mallopt = ctypes.CDLL(None).mallopt
-            mallopt(-4, 0)  # M_MMAP_MAX: large arrays come from the heap, too,
-            mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD: and the heap stays
 
 
 # -- being stopped ------------------------------------------------------------

@@ -18,19 +18,19 @@ import numpy as np
 import torch
 
 from ...lod.forest import Forest, ForestShape, Piece, side_by_side
-from ...lod.rules.cut import detail_of
+from ...lod.rules.cut import K_LEAST, detail_of
 from ...lod.tree import Tree
 from ...rasterize import Gaussians
 from ...rasterize.hspt import Upper, bounds_of, cut_off, image_of, search
 from ...rasterize.records import gather
 from ...scenes.cameras import Camera
 from ...splats.gaussians import Splats
-from ..cuts import CutCache
+from ..cuts import CutCache, NoRoom
 from ..memory import free_memory
 from ..model import NAMES
 from ..rows import FileRows, Layout
 
-AT_ONCE = 1 << 15
+AT_ONCE = 1 << 14
 """Nodes that are looked at together where all are."""
 MARK = 32
 """Of every so many entries of a list the size of the first is in memory."""
@@ -70,6 +70,8 @@ class Store:
         shape: where the pieces of the tree are among the rows.
         cache: of G + 1 groups: the subtrees, and the upper nodes, which are always all there.
         budget: of the cache, in bytes.
+        coarsened: how many times coarser than asked for a view was shown at most; 1: none was.
+        wanted: bytes of budget with which no view would have been.
     """
 
     shape: ForestShape
@@ -79,6 +81,7 @@ class Store:
         self.layout = layout_of(sh_degree)
         self._terms = (sh_degree + 1) ** 2
         self.budget, self._device = budget, device
+        self.coarsened, self.wanted = 1.0, 0
         self.rows = FileRows(folder, self.layout)
         self._lists = FileRows(folder, ENTRY, name="lists")
 
@@ -113,14 +116,38 @@ class Store:
     def _append(self, subtrees: list[RecordPiece]) -> None:
         if not subtrees:
             return
-        self.rows.append(torch.cat([records for records, _ in subtrees]))
-        entries = []
-        for _, tree in subtrees:
-            entry = np.zeros((len(tree.children), ENTRY.width), np.float32)
-            entry[:, 0] = np.arange(tree.leaves, len(tree))
-            entry[:, 1:3] = tree.children
-            entries.append(entry)
-        self._lists.append(torch.from_numpy(np.concatenate(entries)))
+        records = torch.cat([records for records, _ in subtrees])
+        counts = np.array([tree.leaves for _, tree in subtrees])
+        many = 2 * counts - 1
+        begins = np.cumsum(many) - many
+        of_tree = np.repeat(np.arange(len(counts)), many)
+        inside = np.arange(len(records)) - begins[of_tree] >= counts[of_tree]  # of the tree: not a leaf
+        inner = np.flatnonzero(inside)
+        children = np.concatenate([tree.children for _, tree in subtrees]) + begins[of_tree[inner], None]
+        above = np.full(len(records), np.inf, np.float32)  # the size of the node above
+        above[children] = self._sizes_of(counts, children, records)[inner, None]
+        # what one cut has of a subtree has about as large ones above it: so it lies together in the file;
+        # leaves are first all the same, and the root, above which is nothing, is last
+        order = np.lexsort((above, inside, of_tree))
+        number = np.empty_like(order)
+        number[order] = np.arange(len(order))
+        within = number - begins[of_tree]
+        entries = np.zeros((len(inner), ENTRY.width), np.float32)
+        entries[:, 0], entries[:, 1:3] = within[inner], within[children]
+        self.rows.append(records[torch.from_numpy(order)])
+        self._lists.append(torch.from_numpy(entries))
+
+    def _sizes_of(self, counts: np.ndarray, children: np.ndarray, records: torch.Tensor) -> np.ndarray:
+        """Sizes (N,) float32 of the records (N, width) of subtrees of so many leaves each.
+
+        Args:
+            children: (., 2) of the nodes above leaves in the order of their numbers, by number among all.
+        """
+        values = self.layout.split(records)
+        order, tree = side_by_side(counts, children.astype(np.int32))
+        sizes = np.empty(len(order), np.float32)
+        sizes[order] = tree.sizes(values["means"].numpy()[order], values["log_scales"].numpy()[order])
+        return sizes
 
     def _records_of(self, splats: Splats) -> torch.Tensor:
         records = np.zeros((len(splats), self.layout.width), np.float32)
@@ -141,11 +168,29 @@ class Store:
     def take(self, camera: Camera, pixels: float, near: float) -> np.ndarray:
         """Brings in what a view is shown at a granularity: places (M,) int64 in the cache, by their rows.
 
-        A subtree's cut that is here serves from where it is not much too coarse or too fine (Eq. 7): the
-        distances compared are those from its root, over the focal length, times the granularity.
+        Where there is no room for it, it is made coarser until there is.
 
         Raises:
-            LodgsError: there is no room for it.
+            NoRoom: there is none for the coarsest.
+        """
+        coarser = 1.0
+        while True:
+            try:
+                return self._take(camera, coarser * pixels, near)
+            except NoRoom as error:
+                if detail_of(camera.focal, coarser * pixels) == K_LEAST:
+                    raise
+                if coarser == 1:
+                    self.wanted = max(self.wanted, error.budget)
+                # about as many times as few splats, as of a surface, but not so few that much room is left
+                coarser *= min(max((error.needed / max(error.room, 1)) ** 0.5, 1.05), 4)
+                self.coarsened = max(self.coarsened, coarser)
+
+    def _take(self, camera: Camera, pixels: float, near: float) -> np.ndarray:
+        """The same where there is room.
+
+        A subtree's cut that is here serves from where it is not much too coarse or too fine (Eq. 7): the
+        distances compared are those from its root, over the focal length, times the granularity.
         """
         k, eye = detail_of(camera.focal, pixels), camera.center
         nodes, lists, bands = self._top.walk(eye, k, image_of(camera, near))
@@ -213,38 +258,35 @@ class Store:
         """Cuts are made by the nodes as they are now."""
         self.cache.write_back()
         self.cache.forget()
-        shapes, bounds, roots, marks = [], [], [], []
-        for some in _batches(2 * self.shape.counts - 1):
-            records, entries = self._read(some)
-            counts = self.shape.counts[some]
-            ends = np.cumsum(2 * counts - 1)
-            begins = ends - (2 * counts - 1)
-            of_list = np.repeat(np.arange(len(counts)), counts - 1)
-            family = entries[:, :3].astype(np.int32) + begins[of_list, None].astype(np.int32)
-            in_order = np.argsort(family[:, 0])
-            order, tree = side_by_side(counts, family[in_order, 1:])
-            values = self.layout.split(records)
-            means, log_scales = (values[name].numpy() for name in ("means", "log_scales"))
-            sizes = np.empty(len(order), np.float32)
-            sizes[order] = tree.sizes(means[order], log_scales[order])
-            by_size = np.lexsort((-sizes[family[:, 0]], of_list))
-            entries[:, :3] = entries[by_size, :3]
-            balls = np.concatenate([means, sizes[:, None]], axis=1)
-            entries[:, 3:] = balls[family[by_size]].reshape(-1, 12)
-            self._lists.write(self._of_lists(some), torch.from_numpy(entries))
-            within = np.arange(len(entries)) - np.repeat(np.cumsum(counts - 1) - (counts - 1), counts - 1)
-            marks.append(entries[within % MARK == 0, 6])
-            bounds.append(bounds_of(means, log_scales, begins))
-            shapes.append(log_scales[ends - 1])
-            roots.append(balls[ends - 1])
-        self._marks = np.concatenate(marks)
+        found = [self._resized(some) for some in _batches(2 * self.shape.counts - 1)]
+        self._marks, roots, shapes, *bounds = (np.concatenate(each) for each in zip(*found, strict=True))
         upper = self.layout.split(self.rows.read(np.arange(self.shape.ends[-1], len(self))))
-        below = np.concatenate(roots)
-        means = np.append(below[:, :3], upper["means"].numpy(), axis=0)
-        log_scales = np.append(np.concatenate(shapes), upper["log_scales"].numpy(), axis=0)
-        sizes = self.shape.upper.sizes(means, log_scales, below[:, 3])
-        low, high, reach = (np.concatenate(each) for each in zip(*bounds, strict=True))
+        means = np.append(roots[:, :3], upper["means"].numpy(), axis=0)
+        log_scales = np.append(shapes, upper["log_scales"].numpy(), axis=0)
+        sizes = self.shape.upper.sizes(means, log_scales, roots[:, 3])
+        low, high, reach = bounds
         self._top = Upper.over(self.shape.upper, means, log_scales, sizes, (low, high, reach))
+
+    def _resized(self, some: slice) -> tuple[np.ndarray, ...]:
+        """Sorts the lists of some subtrees anew; their marks, and of each subtree what stands above it has to
+        know: mean and size of its root, (., 4), its log-scales, (., 3), and ``Bounds`` of all its nodes."""
+        records, entries = self._read(some)
+        counts = self.shape.counts[some]
+        ends = np.cumsum(2 * counts - 1)
+        begins = ends - (2 * counts - 1)
+        of_list = np.repeat(np.arange(len(counts)), counts - 1)
+        family = entries[:, :3].astype(np.int32) + begins[of_list, None].astype(np.int32)
+        sizes = self._sizes_of(counts, family[np.argsort(family[:, 0]), 1:], records)
+        values = self.layout.split(records)
+        means, log_scales = (values[name].numpy() for name in ("means", "log_scales"))
+        by_size = np.lexsort((-sizes[family[:, 0]], of_list))
+        entries[:, :3] = entries[by_size, :3]
+        balls = np.concatenate([means, sizes[:, None]], axis=1)
+        entries[:, 3:] = balls[family[by_size]].reshape(-1, 12)
+        self._lists.write(self._of_lists(some), torch.from_numpy(entries))
+        within = np.arange(len(entries)) - np.repeat(np.cumsum(counts - 1) - (counts - 1), counts - 1)
+        bounds = bounds_of(means, log_scales, begins)
+        return entries[within % MARK == 0, 6], balls[ends - 1], log_scales[ends - 1], *bounds
 
     def _read(self, some: slice) -> tuple[torch.Tensor, np.ndarray]:
         """The records (., width) and the lists' entries (., 15) of some subtrees."""

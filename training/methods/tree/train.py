@@ -102,6 +102,7 @@ class Method(Refining):
         self.store: Store | None = None
         self._base = base
         self._table: Columns = {}
+        self._told = 0  # bytes of splat_memory that somebody was told of
 
     @property
     def steps(self) -> int:
@@ -184,6 +185,13 @@ class Method(Refining):
         """The splats of a view's cut, to draw: they alone make the step."""
         assert self.store is not None
         places = self.store.take(view.camera, pixels, self.data.near)
+        if self.store.wanted > 2 * self._told:  # once, as a rule
+            self._told = self.store.wanted
+            self.warn(
+                "The memory budget has no room for what some views show: they are trained coarser, up to "
+                f"{self.store.coarsened:.1f} times so far. {-(-self._told // 10**6):,} MB as splat_memory "
+                "would have room for these."
+            )
         shares, number = self._shares(places, step), step + 1 - self.finest_steps
         self._optimizer = SeenRecords(self.store, places, self.model.adam.lr, shares, number)
         return self._optimizer.gaussians

@@ -34,12 +34,24 @@ def stored(folder, town, budget=1 << 30, longest=0):
     return made
 
 
+def names_of(rows, names):
+    """Which of nodes, by their means (N, 3), each of as many rows is, by its mean."""
+    found = np.empty(len(rows), np.int64)
+    found[np.lexsort(rows.T)] = np.lexsort(names.T)
+    np.testing.assert_array_equal(rows, names[found])
+    return found
+
+
+def means_of(made):
+    return made.layout.split(made.rows.read(np.arange(len(made))))["means"].numpy()
+
+
 @pytest.mark.parametrize("longest", [1, 7, 0, 10_000])
 def test_a_cut_made_anew_is_that_of_hspt_in_memory(town, tmp_path, longest, monkeypatch):
     monkeypatch.setattr(store_module, "AT_ONCE", 300)  # many parts of everything
     nodes, tree = town
     made = stored(tmp_path, town, longest=longest)
-    order, _ = shape_of(tree, longest or longest_of(tree.leaves))
+    order = names_of(means_of(made), nodes.means)
     sizes = tree.sizes(nodes.means, nodes.log_scales)
     hspt = Hspt(tree, nodes.means, sizes, nodes.log_scales, longest or longest_of(tree.leaves))
     found = 0
@@ -88,13 +100,34 @@ def test_sizes_follow_what_has_moved(town, tmp_path, monkeypatch):
 
 
 def test_what_comes_out_is_what_came_in(town, tmp_path):
+    """But for the order of a subtree's leaves, and of its nodes above leaves."""
     nodes, tree = town
     forest = divided(nodes, tree, longest_of(tree.leaves))
     made = stored(tmp_path, town)
     for (ours, shape), (theirs, other) in zip([*made, made.upper], [*forest, forest.upper], strict=True):
-        np.testing.assert_array_equal(shape.children, other.children)
+        if not len(ours):
+            continue
+        names = names_of(ours.means, theirs.means)
         for name in NAMES:
-            np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
+            np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name)[names])
+        if len(ours) < len(shape):  # the upper tree, whose leaves are elsewhere
+            np.testing.assert_array_equal(names, np.arange(len(names)))
+            np.testing.assert_array_equal(shape.children, other.children)
+            continue
+        assert (names[: shape.leaves] < shape.leaves).all() and names[-1] == len(shape) - 1
+        np.testing.assert_array_equal(
+            names[shape.children], other.children[names[shape.leaves :] - shape.leaves]
+        )
+
+
+def test_what_has_parents_of_one_size_lies_together(town, tmp_path):
+    made, many = stored(tmp_path, town), 0
+    for splats, tree in made:
+        sizes, parents = tree.sizes(splats.means, splats.log_scales), tree.parents
+        for some in (slice(0, tree.leaves), slice(tree.leaves, -1)):
+            assert (np.diff(sizes[parents[some]]) >= 0).all()
+        many += len(tree) > 10
+    assert many > 50
 
 
 def steps(made, begin, end):
@@ -144,8 +177,32 @@ def test_a_store_goes_on_to_the_bit(town, tmp_path, stop):
     torch.testing.assert_close(steps(second, stop, 40), truth, rtol=0, atol=0)
 
 
-def test_too_little_room_is_told(town, tmp_path):
-    made = stored(tmp_path, town, budget=1 << 17)
+def test_a_view_without_room_is_coarsened_until_it_has(town, tmp_path):
+    """And what it is shown then is the cut for that granularity; a budget as told has room."""
+    made, whole = stored(tmp_path / "some", town, budget=700 * RECORD + 4 * 16_000), stored(tmp_path, town)
+    coarser = 0
+    for camera in cameras(np.random.default_rng(0)):
+        made.cache.forget()
+        made.coarsened, made.wanted = 1.0, 0
+        rows = made.cache.rows_at(made.take(camera, 0.2, 0.3))
+        whole.cache.forget()
+        truth = whole.cache.rows_at(whole.take(camera, 0.2 * made.coarsened, 0.3))
+        np.testing.assert_array_equal(rows, truth)
+        assert len(rows) <= made.cache.capacity == 700
+        if made.coarsened == 1:
+            assert made.wanted == 0
+            continue
+        assert len(rows) > 200, "no coarser than it need be"
+        coarser += 1
+        enough = stored(tmp_path / f"{coarser}", town, budget=made.wanted)
+        enough.take(camera, 0.2, 0.3)
+        assert enough.coarsened == 1 and whole.coarsened == 1
+        enough.close()
+    assert coarser > 3
+
+
+def test_too_little_room_for_the_coarsest_is_told(town, tmp_path):
+    made = stored(tmp_path, town, budget=3 * RECORD + 4 * 16_000)
     camera = next(cameras(np.random.default_rng(0)))
     with pytest.raises(LodgsError, match=r"at once; .* room for .* splat_memory"):
         made.take(camera, 0.1, 0.3)

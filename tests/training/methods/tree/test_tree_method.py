@@ -7,12 +7,15 @@ import numpy as np
 import pytest
 import torch
 
+from tests.training.lod.trees import surfaces
 from training.lod.forest import joined
 from training.lod.rules.cut import least_size
 from training.lod.selection import Choice, settings
 from training.lod.tree import size_of
 from training.methods import create, method_info
+from training.methods.cuts import BESIDE
 from training.methods.parameters import override
+from training.methods.tree.store import layout_of
 from training.rasterize import Gaussians, rasterize
 from training.splats.bundle import Bundle
 from training.splats.gaussians import Splats
@@ -255,3 +258,17 @@ def test_a_tree_grows_where_photographs_ask_for_it(data, base):
         again.load_state_dict(torch.load(kept, weights_only=True))
         trained(again, begin=pause)
         assert torch.equal(records(again), records(tree))
+
+
+def test_that_views_are_coarsened_for_the_budget_is_said_once(data, monkeypatch):
+    leaves = surfaces(3_000, degree=0)
+    leaves.means = (0.03 * leaves.means + data.scene.points.mean(axis=0)).astype(np.float32)
+    leaves.log_scales = (leaves.log_scales + np.log(0.03)).astype(np.float32)
+    record = BESIDE + 4 * layout_of(0).width
+    for room, many in ((600, 1), (10_000, 0)):
+        monkeypatch.setattr(data, "splat_memory", room * record + 4 * (2 * len(leaves) - 1))
+        tree, told = make(data, leaves, sh_degree=0, pixels=0.1, lod_noise=0.0), []
+        tree.warn = told.append
+        trained(tree)
+        assert len(told) == many and all("coarser" in each and "MB as splat_memory" in each for each in told)
+        assert (tree.store.coarsened > 1) == bool(many)
