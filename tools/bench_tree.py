@@ -158,7 +158,8 @@ def rows_of(nodes: int, pixels: float) -> list[dict]:
             check(cuts, camera, pixels)
         for name, (cut_ms, found) in measure(cuts, cameras, pixels).items():
             row = {"name": name, "views": kind, "splats": leaves, "nodes": len(tree), "pixels": pixels}
-            rows.append(row | {"found": round(found), "cut_ms": round(cut_ms, 3)})
+            row |= {"found": round(found), "cut_ms": round(cut_ms, 3)}
+            rows.append(row | dict.fromkeys(("budget_mb", "peak_mb", "step_s")))  # nothing is trained here
             print(f"  {kind:<7} {name:<24} {cut_ms:>9.2f} ms {found:>11,.0f} nodes found")
     return rows
 
@@ -188,7 +189,7 @@ def plot(path: Path, rows: Sequence[dict]) -> None:
         each.set(xscale="log", yscale="log", xlabel="nodes", title=kind)
         each.grid(alpha=0.3)
     axes[0].set_ylabel("ms a cut")
-    axes[0].legend()
+    axes[1].legend(loc="lower right")
     figure.tight_layout()
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
@@ -205,7 +206,9 @@ def main() -> None:
     for name, times in faster.items():
         print(f"At {max(row['nodes'] for row in rows):,} nodes HSPT is {times:.1f} times faster than: {name}")
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    report = {"threads": threads(), "hspt_times_faster": faster, "rows": rows}
+    known = json.loads(options.out.read_text(encoding="utf-8"))["rows"] if options.out.exists() else []
+    trained = [row for row in known if row.get("peak_mb") is not None]  # tools/bench_tree_memory.py's
+    report = {"threads": threads(), "hspt_times_faster": faster, "rows": rows + trained}
     options.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     plot(options.out.with_suffix(".png"), rows)
     print(f"{options.out} and {options.out.with_suffix('.png').name}")

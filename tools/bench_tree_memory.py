@@ -282,7 +282,7 @@ def main() -> None:
             rows.append({key: round(x, 4) if isinstance(x, float) else x for key, x in row.items()})
             print(f"  {times:>4g} x {pixels:.2f} px  {way:<17} {told(row)}", flush=True)
     report = json.loads(options.out.read_text(encoding="utf-8")) if options.out.exists() else {"rows": []}
-    report["rows"] = [row for row in report["rows"] if "peak_mb" not in row] + rows
+    report["rows"] = [row for row in report["rows"] if row.get("peak_mb") is None] + rows
     options.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
 
 

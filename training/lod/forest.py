@@ -17,7 +17,7 @@ from ..splats.ply import Columns
 from ..splats.scratch import Scratch
 from .paging import streaming_order, table_of_pages
 from .rules.cut import NODE_SIZE, PARENT, PARENT_SIZE
-from .tree import LEAVES, NODES, Tree
+from .tree import LEAVES, NODES, Apart, Tree
 
 Piece = tuple[Splats, Tree]
 """Splats, and the tree that they are the nodes of."""
@@ -204,8 +204,8 @@ def joined_trees(trees: Sequence[Tree], upper: Tree) -> Tree:
 def levels_of(forest: Forest, folder: Path) -> tuple[list[Level], Columns]:
     """The levels of a bundle, in the order of their rows, and its table of blocks; the splats stay in files.
 
-    What they are is what ``Tree.levels`` makes of the same tree. In memory are 16 bytes of each node, and up
-    to 45 of those of one level.
+    What they are is what ``Tree.levels`` makes of the same tree, but that of nodes alike another one may be
+    the larger. In memory are 20 bytes of each node, and up to 45 of those of one level.
 
     Args:
         folder: where the files are, which have no names and go with the levels.
@@ -214,9 +214,9 @@ def levels_of(forest: Forest, folder: Path) -> tuple[list[Level], Columns]:
         LodgsError: the folder takes no files.
     """
     files = {number: _LevelFile(folder) for number in (NODES, LEAVES)}
-    roots, places = [], []
+    roots, places, apart = [], [], Apart()
     for splats, tree in forest:
-        columns = tree.columns(splats.means, tree.sizes(splats.means, splats.log_scales))
+        columns = tree.columns(splats.means, apart.sizes(tree, splats.means, splats.log_scales))
         splats = replace(splats, extras=columns)
         roots.append(splats.select([-1]))  # a copy: a view would keep them all
         files[LEAVES].append(splats.select(slice(0, tree.leaves)))
@@ -226,7 +226,7 @@ def levels_of(forest: Forest, folder: Path) -> tuple[list[Level], Columns]:
     above, upper = forest.upper
     ends = Splats.concatenated(roots)
     means, log_scales = np.concatenate([ends.means, above.means]), [ends.log_scales, above.log_scales]
-    sizes = upper.sizes(means, np.concatenate(log_scales), ends.extras[NODE_SIZE])
+    sizes = apart.sizes(upper, means, np.concatenate(log_scales), ends.extras[NODE_SIZE])
     columns = upper.columns(means, sizes)
     for i, (root, (file, part, row)) in enumerate(zip(roots, places, strict=True)):  # parents are known now
         root.extras = {name: column[i : i + 1] for name, column in columns.items()}

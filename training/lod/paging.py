@@ -294,7 +294,7 @@ def standing(columns: Columns) -> tuple[np.ndarray, np.ndarray]:
     """Which of N splats of a tree can be told apart by a cut where others may be missing.
 
     Children know their parent by its size and place, bit for bit. (Of several nodes of one size at one place
-    none is told apart.)
+    none is told apart; ``tree.Apart`` sees to it that a file has none.)
 
     Args:
         columns: of the rule, and x, y, z, (N,) float32 each.
@@ -308,7 +308,7 @@ def standing(columns: Columns) -> tuple[np.ndarray, np.ndarray]:
     own = np.stack([size, *(columns[axis] for axis in "xyz")], 1) + np.float32(0)  # no zero below zero
     sought = np.stack([above, *(columns[name] for name in PARENT)], 1) + np.float32(0)
     nodes = np.flatnonzero(size > 0)
-    keys, wanted = _hashed(own[nodes]), _hashed(sought)
+    keys, wanted = hashed(own[nodes]), hashed(sought)
     order = np.argsort(keys, kind="stable")
     place = np.searchsorted(keys[order], wanted).clip(max=max(len(nodes) - 1, 0))
     parent = nodes[order[place]] if len(nodes) else np.zeros(count, np.int64)
@@ -325,7 +325,7 @@ def standing(columns: Columns) -> tuple[np.ndarray, np.ndarray]:
     return inner, reached
 
 
-def _hashed(rows: np.ndarray) -> np.ndarray:
+def hashed(rows: np.ndarray) -> np.ndarray:
     """(N,) uint64 of rows (N, 4) float32: equal ones have equal numbers, and hardly any others."""
     words = np.ascontiguousarray(rows).view(np.uint32).astype(np.uint64)
     found = np.zeros(len(rows), np.uint64)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from ..splats.bundle import MOST_LEVELS, Bundle, Level
 from ..splats.gaussians import Splats
-from .paging import streaming_order
+from .paging import hashed, streaming_order
 from .rules.bands import RULE as BANDS
 from .rules.cut import ABOVE_ROOT, NODE_SIZE, PARENT, PARENT_SIZE, RULE, least_size
 
@@ -67,13 +67,18 @@ class Tree:
         return below
 
     def sizes(
-        self, means: np.ndarray, log_scales: np.ndarray, of_leaves: np.ndarray | float = 0.0
+        self,
+        means: np.ndarray,
+        log_scales: np.ndarray,
+        of_leaves: np.ndarray | float = 0.0,
+        larger: Callable[[np.ndarray, np.ndarray], np.ndarray] = lambda sizes, means: sizes,
     ) -> np.ndarray:
         """(2N - 1,) float32, saturated: of leaves 0, of others at least :func:`size_of` and ``least_size``.
 
         Args:
             means, log_scales: (2N - 1, 3) float32 of all nodes; of leaves log-scales are not looked at.
             of_leaves: (N,) float32, where they are roots of other trees.
+            larger: given such sizes (M,) and means (M, 3) says sizes that are to be instead, not smaller.
         """
         sizes = np.zeros(len(self), np.float32)
         sizes[: self.leaves] = of_leaves
@@ -81,7 +86,7 @@ class Tree:
             below = self.children[layer - self.leaves]
             apart = means[below].astype(np.float64) - means[layer, None].astype(np.float64)
             least = least_size(sizes[below], np.sqrt(np.square(apart).sum(axis=2))).max(axis=1)
-            sizes[layer] = _rounded_up(np.maximum(least, size_of(log_scales[layer])))
+            sizes[layer] = larger(_rounded_up(np.maximum(least, size_of(log_scales[layer]))), means[layer])
         return sizes
 
     def columns(self, means: np.ndarray, sizes: np.ndarray) -> dict[str, np.ndarray]:
@@ -94,13 +99,69 @@ class Tree:
     def levels(self, splats: Splats) -> list[Level]:
         """All nodes, (2N - 1), as a bundle has them: those above, and the leaves, both from coarse to fine in
         the order in which ranges are of one place (``paging.streaming_order``)."""
-        sizes = self.sizes(splats.means, splats.log_scales)
+        sizes = Apart().sizes(self, splats.means, splats.log_scales)
         splats.extras |= self.columns(splats.means, sizes)
         levels = []
         for number, begin, end in ((NODES, self.leaves, len(self)), (LEAVES, 0, self.leaves)):
             columns = {name: splats.extras[name][begin:end] for name in RULE.columns}
             levels.append(Level(number, splats.select(streaming_order(columns) + begin)))
         return levels
+
+
+class Apart:
+    """Sizes of nodes, no two of which are the same at the same place.
+
+    By size and place children know their parent where a part of a tree is read (``paging.standing``), and
+    equal splats make equal nodes. In memory are 8 bytes of each node.
+    """
+
+    def __init__(self) -> None:
+        self._taken: list[np.ndarray] = []  # sorted, each less than half as long as the one before
+        self._rng = np.random.default_rng(0)
+
+    def sizes(
+        self, tree: Tree, means: np.ndarray, log_scales: np.ndarray, of_leaves: np.ndarray | float = 0.0
+    ) -> np.ndarray:
+        """Those of ``Tree.sizes``; larger in the last places where a node has them that was here before."""
+        sizes = tree.sizes(means, log_scales, of_leaves)
+        some = np.flatnonzero(sizes[tree.leaves :]) + tree.leaves
+        keys = _identities(sizes[some], means[some])
+        if self._free(keys).all():
+            self._take(keys)
+            return sizes
+        return tree.sizes(means, log_scales, of_leaves, self._apart)
+
+    def _apart(self, sizes: np.ndarray, means: np.ndarray) -> np.ndarray:
+        sizes, waiting, most = sizes.copy(), np.flatnonzero(sizes), 1
+        while len(waiting):
+            keys = _identities(sizes[waiting], means[waiting])
+            free = self._free(keys)
+            self._take(keys[free])
+            waiting = waiting[~free]
+            # by chance: others that are alike have begun here, too
+            further = self._rng.integers(1, most, len(waiting), np.int32, endpoint=True)
+            sizes.view(np.int32)[waiting] += further
+            most = min(2 * most, 1 << 20)
+        return sizes
+
+    def _free(self, keys: np.ndarray) -> np.ndarray:
+        """(N,) bool, which nobody has yet, nor an earlier one of these."""
+        free = np.zeros(len(keys), bool)
+        free[np.unique(keys, return_index=True)[1]] = True
+        for taken in self._taken:
+            free &= taken[np.searchsorted(taken, keys).clip(max=len(taken) - 1)] != keys
+        return free
+
+    def _take(self, keys: np.ndarray) -> None:
+        while self._taken and len(self._taken[-1]) <= 2 * len(keys):
+            keys = np.concatenate([self._taken.pop(), keys])
+        if len(keys):
+            self._taken.append(np.sort(keys))
+
+
+def _identities(sizes: np.ndarray, means: np.ndarray) -> np.ndarray:
+    """(N,) uint64 of sizes (N,) and means (N, 3) float32: of equal ones equal, and hardly of any others."""
+    return hashed(np.concatenate([sizes[:, None], means], axis=1) + np.float32(0))  # no zero below zero
 
 
 def size_of(log_scales: np.ndarray) -> np.ndarray:

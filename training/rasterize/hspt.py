@@ -22,7 +22,9 @@ from .cpu.compile import STRICT, Buffers, at_once, f32, in_parallel, inlined, ke
 
 SLACK = 1e-5
 """Share by which single precision may get distances and sizes wrong, and more."""
-_GRAIN = 64
+LEAF = 1 << 24
+"""Rank of leaves in lists, which they are not in: after all others."""
+_GRAIN = 128
 """Lists that a thread takes at a time."""
 _NONE = np.empty(0, np.int32)
 
@@ -66,9 +68,9 @@ class Upper:
             image: as of :func:`image_of`; None: nothing is left out.
 
         Returns:
-            Nodes to draw, (M,) int32, those below G roots of lists; lists, (L,) int32, ascending; and of
-            each, (L, 2) float32, two sizes: a node in it that is smaller than the first is fine enough, and
-            one that is larger than the second is not.
+            Nodes to draw, (M,) int32, those below G roots of lists; lists, (L,) int32, neighbours together;
+            and of each, (L, 2) float32, two sizes: a node in it that is smaller than the first is fine
+            enough, and one that is larger than the second is not.
         """
         image = np.zeros((0, 6)) if image is None else image
         nodes, lists = np.empty((2, len(self.balls)), np.int32)
@@ -133,14 +135,18 @@ class Hspt:
         inside = order[: forest.ends[-1]]
         bounds = bounds_of(means[inside], log_scales[inside], forest.begins)
         self._upper = Upper.over(forest.upper, means[names], log_scales[names], sizes[names], bounds)
-        self.lists, self._forest = len(forest.counts), forest
-        of_list = np.repeat(np.arange(self.lists, dtype=np.int32), 2 * forest.counts - 1)
-        above = inside >= tree.leaves
-        entries = inside[above][np.lexsort((-sizes[inside[above]], of_list[above]))]
-        balls = np.concatenate([means, sizes[:, None]], axis=1)
-        pairs = tree.children[entries - tree.leaves]
-        families = np.concatenate([balls[entries], balls[pairs].reshape(-1, 8)], axis=1)
-        self._lists = pairs, np.ascontiguousarray(families[:, 3::4]), families
+        self.lists = len(forest.counts)
+        above = inside[inside >= tree.leaves]
+        of_list = np.repeat(np.arange(self.lists, dtype=np.int32), forest.counts - 1)
+        nodes = above[np.lexsort((-sizes[above], of_list))]
+        ranks = np.full(len(tree), LEAF, np.int32)
+        ranks[nodes] = np.arange(len(nodes)) - np.repeat(forest.list_begins, forest.counts - 1)
+        entries = np.empty((len(nodes), 8), np.float32)
+        links, balls = entries.view(np.int32)[:, :4], entries[:, 4:]
+        self._lists = links, balls, np.append(0, forest.list_ends)
+        links[:, :2] = tree.children[nodes - tree.leaves]
+        links[:, 2:] = ranks[links[:, :2]]
+        balls[:, :3], balls[:, 3] = means[nodes], sizes[nodes]
 
     def cut(self, camera: Camera, pixels: float, near: float = 0.01) -> np.ndarray:
         """The nodes (M,) int32 to draw for a camera, but for those that are out of its image; in any order.
@@ -158,8 +164,7 @@ class Hspt:
             image: as of :func:`image_of`; None: nothing is left out.
         """
         nodes, lists, bands = self._upper.walk(eye, k, image)
-        begins, ends = self._forest.list_begins[lists], self._forest.list_ends[lists]
-        found, _ = search(*self._lists, begins, ends, bands, eye, k, self._names[nodes])
+        found, _ = search(*self._lists, lists, bands, eye, k, self._names[nodes])
         return found
 
 
@@ -176,23 +181,24 @@ def cut_off(sizes: np.ndarray, begins: np.ndarray, ends: np.ndarray, least: np.n
 
 
 def search(
-    pairs: np.ndarray,
-    sizes: np.ndarray,
-    families: np.ndarray,
-    begins: np.ndarray,
-    ends: np.ndarray,
+    links: np.ndarray,
+    balls: np.ndarray,
+    borders: np.ndarray,
+    lists: np.ndarray,
     bands: np.ndarray,
     eye: np.ndarray,
     k: float,
     before: np.ndarray = _NONE,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of lists, the children that are fine enough of nodes that are not (Eq. 5).
+    """Of lists whose roots are not fine enough, the nodes that are and whose parents are not (Eq. 5).
 
     Args:
-        pairs: (E, 2) int32, the children of each node of the lists.
-        sizes: (E, 3) float32, the size of each node, which falls within a list, and of its children.
-        families: (E, 12) float32, mean and size of each node and of its children.
-        begins, ends: (L,) int64 of lists among the E, or of their first parts.
+        links: (E, 4) int32, of each node of the lists its two children, and their ranks: where they are in
+            the list, or LEAF.
+        balls: (E, 4) float32, mean and size, which falls within a list. Quickest where ``links`` and these
+            lie side by side in memory.
+        borders: (G + 1,) int64, where each list, or its first part, begins, and the last one's end.
+        lists: (L,), which of these.
         bands: (L, 2) as ``Upper.walk`` says them.
         eye: (3,).
         k: the detail.
@@ -201,18 +207,16 @@ def search(
     Returns:
         Nodes (M,) int32, one list's after the other's; and how many are of each list, (L,) int64.
     """
-    lengths = ends - begins
-    firsts = 2 * (np.cumsum(lengths) - lengths)
-    longest = int(lengths.max(initial=0))
+    longest = int(np.diff(borders).max(initial=0))
     buffers = Buffers()
-    found = buffers.take("cut", np.int32, 2 * int(lengths.sum()))
-    counts = np.zeros_like(begins)
-    lists = pairs, sizes, families, begins, ends, bands
+    found = buffers.take("cut", np.int32, 2 * longest * len(lists))
+    counts = np.empty(len(lists), np.int64)
     asked = np.asarray(eye, np.float32), f32(k), longest
-    in_parallel(_search, len(begins), _GRAIN, *lists, *asked, firsts, found, counts)
-    chunks = range(0, len(begins), _GRAIN)
+    in_parallel(_search, len(lists), _GRAIN, links, balls, borders, lists, bands, *asked, found, counts)
+    chunks = range(0, len(lists), _GRAIN)
     sums = np.add.reduceat(counts, chunks) if chunks else chunks
-    parts = [found[first : first + count] for first, count in zip(firsts[chunks], sums, strict=True)]
+    places = (2 * longest * chunk for chunk in chunks)
+    parts = [found[place : place + count] for place, count in zip(places, sums, strict=True)]
     return np.concatenate([before, *parts]), counts
 
 
@@ -235,10 +239,10 @@ def image_of(camera: Camera, near: float) -> np.ndarray:
 
 
 @inlined(STRICT)
-def _fine(balls, i, first, eye, k):
-    """``lod.rules.cut.acceptable`` of the node whose mean and size begin at ``first``, bit for bit."""
-    x, y, z = balls[i, first] - eye[0], balls[i, first + 1] - eye[1], balls[i, first + 2] - eye[2]
-    return np.sqrt(x * x + y * y + z * z) >= k * balls[i, first + 3]
+def _fine(balls, i, eye, k):
+    """``lod.rules.cut.acceptable`` of a node, bit for bit."""
+    x, y, z = balls[i, 0] - eye[0], balls[i, 1] - eye[1], balls[i, 2] - eye[2]
+    return np.sqrt(x * x + y * y + z * z) >= k * balls[i, 3]
 
 
 @kernel(STRICT)
@@ -263,7 +267,7 @@ def _walk(order, beyond, is_list, balls, boxes, eye, k, image, nodes, lists, ban
             if crossed != asked[top] and not is_list[i]:
                 top += 1
                 until[top], asked[top] = beyond[i], crossed
-        if _fine(balls, i, 0, eye, k):
+        if _fine(balls, i, eye, k):
             nodes[count] = order[i]
             count += 1
             i = beyond[i]
@@ -317,37 +321,44 @@ def _cut_off(sizes, begins, ends, least, found):
 
 
 @kernel(STRICT)
-def _search(begin, end, pairs, sizes, families, begins, ends, bands, eye, k, longest, firsts, found, counts):
-    """Of lists, the children that are fine enough of nodes that are not (Eq. 5).
+def _search(begin, end, links, balls, borders, lists, bands, eye, k, longest, found, counts):
+    """Of lists, the nodes that are fine enough and whose parents are not (Eq. 5).
 
-    Sizes alone decide about most. Nothing branches where it cannot be foreseen: every child is written, and
-    the next one over it where it is not wanted.
+    Sizes alone decide about most. A parent comes before its children: those whose sizes say nothing wait at
+    their ranks until it is their turn. Where there are many, nothing branches that cannot be foreseen: every
+    child is written, and the next one over it where it is not wanted. Numbers have no sign, as those that
+    have are looked at for whether they count from the end.
     """
-    doubtful, children = np.empty(2 * longest, np.int64), pairs.reshape(-1)
-    place = firsts[begin]
+    waiting, leaf = np.empty(longest + 1, np.int32), np.uint32(longest)  # what leaves leave there is not read
+    place, one = np.uint64(2 * longest * begin), np.uint64(1)
     for part in range(begin, end):
-        first, i, last = place, begins[part], ends[part]
+        before, first, last = place, np.uint64(borders[lists[part]]), np.uint64(borders[lists[part] + 1])
         least, most = bands[part, 0], bands[part, 1]
-        many = 0
-        while i < last and sizes[i, 0] > most:
-            for child in range(2):
-                size = sizes[i, 1 + child]
-                found[place] = pairs[i, child]
-                place += size < least
-                doubtful[many] = 2 * i + child
-                many += (size >= least) & (size <= most)
-            i += 1
-        while i < last and sizes[i, 0] >= least:
-            coarse = not _fine(families, i, 0, eye, k)
-            for child in range(2):
-                size = sizes[i, 1 + child]
-                found[place] = pairs[i, child]
-                place += coarse & (size < least)
-                doubtful[many] = 2 * i + child
-                many += coarse & (size >= least)
-            i += 1
-        for j in range(many):
-            child = doubtful[j]
-            found[place] = children[child]
-            place += _fine(families, child >> 1, 4 + 4 * (child & 1), eye, k)
-        counts[part] = place - first
+        sure = first
+        while sure < last and balls[sure, 3] > most:
+            sure += one
+        many = sure
+        while many < last and balls[many, 3] >= least:
+            waiting[many - first] = -1
+            many += one
+        ranks = np.uint32(many - first)
+        for i in range(first, sure):
+            place = _hand_down(links, i, ranks, leaf, waiting, found, place)
+        for i in range(sure, many):
+            if _fine(balls, i, eye, k):
+                found[place] = waiting[i - first]
+                place += np.uint64(waiting[i - first] >= 0)
+            else:
+                place = _hand_down(links, i, ranks, leaf, waiting, found, place)
+        counts[part] = place - before
+
+
+@inlined(STRICT)
+def _hand_down(links, i, ranks, leaf, waiting, found, place):
+    """The children of a node that is not fine enough: those beyond ``ranks`` are found, others wait."""
+    for child in range(2):
+        node, rank = links[i, child], np.uint32(links[i, 2 + child])
+        found[place] = node
+        place += np.uint64(rank >= ranks)
+        waiting[min(rank, leaf)] = node
+    return place

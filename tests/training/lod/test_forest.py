@@ -5,14 +5,20 @@ from itertools import count
 import numpy as np
 import pytest
 
+from training.lod import paging
 from training.lod.forest import divided, joined, levels_of, longest_of
-from training.lod.paging import table_of_pages
-from training.lod.selection import select_levels, settings
+from training.lod.paging import Pager, table_of_pages
+from training.lod.rule import rules
+from training.lod.selection import Choice, select_levels, settings
 from training.lod.tree import Tree
+from training.methods.tree.build import build
 from training.splats.bundle import Bundle, read_bundle, write_bundle
 
 from .test_tree import nodes
-from .trees import random_tree
+from .trees import random_leaves, random_tree
+
+CUT = rules()["cut"]
+FOCAL = 1000.0
 
 
 def tagged(seed, leaves):
@@ -94,3 +100,71 @@ def test_cuts_of_a_file_of_pieces_are_proper(tmp_path):
                 assert seen[path].sum() == 1
             drawn.append(seen.sum())
     assert min(drawn) == 1 and max(drawn) == 400
+
+
+def with_twins():
+    """A tree over splats some of which are there six times, and one 2,000 times; nodes bear their numbers."""
+    rng = np.random.default_rng(3)
+    leaves = random_leaves(700, rng)
+    splats, tree = build(leaves.select(np.append(np.repeat(np.arange(700), 6), np.zeros(2000, int))))
+    splats.sh[:, 0, 0] = np.arange(len(tree))
+    return splats, tree
+
+
+def read_back(folder, forest):
+    """A forest's levels, of the file a.ply."""
+    levels, table = levels_of(forest, folder)
+    write_bundle(folder / "a.ply", Bundle("tree", levels, "cut", tables={"blocks": table}))
+    return read_bundle(folder / "a.ply").levels
+
+
+@pytest.mark.parametrize("budget", [2000, 10**6])
+@pytest.mark.parametrize("longest", [40, 10**6])
+def test_equal_splats_stream_as_others_do(tmp_path, longest, budget, monkeypatch):
+    """One of each leaf and the nodes above it is drawn while pages come in, in the end the whole's cut."""
+    monkeypatch.setattr(paging, "AT_ONCE", 2)
+    splats, tree = with_twins()
+    whole = Choice(Bundle("tree", read_back(tmp_path, divided(splats, tree, longest)), "cut"))
+    pager = Pager(tmp_path / "a.ply", budget)
+    tags, means = np.zeros(pager.rows, int), np.zeros((pager.rows, 3), np.float32)
+    columns = {name: np.zeros(pager.rows, np.float32) for name in CUT.columns}
+
+    def drawn(eye, pixels):
+        found = tags[CUT.weights(means, eye, FOCAL, columns, {}, {"pixels": pixels}) > 0]
+        times = np.bincount(found, minlength=len(tree))
+        for layer in tree.layers:
+            times[tree.children[layer - tree.leaves]] += times[layer][:, None]
+        assert (times[: tree.leaves] == 1).all()
+        return np.sort(found)
+
+    for eye in (np.float32([0, 0, 3]), np.float32([-8, 8, 1]), splats.means[0], np.float32([60, 0, 20])):
+        for pixels in (30.0, 1.0):
+            while (update := pager.step(eye, FOCAL / pixels)) is not None:
+                for begin, page in update.pages:
+                    rows = slice(begin, begin + len(page))
+                    tags[rows], means[rows] = page.sh[:, 0, 0], page.means
+                    for name in CUT.columns[2:]:
+                        columns[name][rows] = page.extras[name]
+                columns["node_size"], columns["parent_size"] = update.sizes
+                drawn(eye, pixels)
+            if budget > len(tree):
+                shown = whole.weights(eye, FOCAL, {"pixels": pixels}) > 0
+                np.testing.assert_array_equal(drawn(eye, pixels), np.sort(whole.splats.sh[shown, 0, 0]))
+
+
+def test_equal_splats_stay_as_they_are_and_sizes_fit(tmp_path):
+    splats, tree = with_twins()
+    inner, leaves = (level.splats for level in read_back(tmp_path, divided(splats, tree, 40)))
+    of_leaves = np.argsort(leaves.sh[:, 0, 0])
+    for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
+        np.testing.assert_array_equal(getattr(leaves, name)[of_leaves], getattr(splats, name)[: tree.leaves])
+    assert not leaves.extras["node_size"].any()
+    sizes = np.zeros(len(tree))
+    sizes[inner.sh[:, 0, 0].astype(int)] = inner.extras["node_size"]
+    means = splats.means.astype(float)
+    away = np.linalg.norm(means[tree.children] - means[tree.leaves :, None], axis=2)
+    assert (sizes[tree.leaves :, None] >= (sizes[tree.children] + away / 8) * (1 + 2**-20)).all()
+    least = tree.sizes(splats.means, splats.log_scales)[tree.leaves :]
+    assert (sizes[tree.leaves :] >= least).all() and (sizes[tree.leaves :] <= least * 1.01).all()
+    known = np.column_stack([inner.extras["node_size"], inner.means])
+    assert len(np.unique(known, axis=0)) == len(known)

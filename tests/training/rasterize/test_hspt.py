@@ -13,6 +13,7 @@ from training.lod.rule import rules
 from training.lod.tree import Tree
 from training.methods.tree.build import build
 from training.rasterize import Gaussians, rasterize
+from training.rasterize.cpu.compile import set_threads, threads
 from training.rasterize.hspt import Hspt
 from training.scenes.cameras import Camera, look_at
 
@@ -21,7 +22,10 @@ CUT = rules()["cut"]
 
 def places(rng, count):
     means = rng.normal(0, rng.choice([0.01, 1, 50]), (count, 3)).astype(np.float32)
-    return means, rng.normal(-3, 1.5, (count, 3)).astype(np.float32)
+    log_scales = rng.normal(-3, 1.5, (count, 3)).astype(np.float32)
+    if rng.random() < 0.3:  # many in one place, and without a size
+        means, log_scales = means.round(), np.where(log_scales < -3, np.float32(-300), log_scales)
+    return means, log_scales
 
 
 def walked(tree, means, sizes, eye, k):
@@ -105,6 +109,20 @@ def test_what_is_left_out_is_not_in_the_image(large):
             assert (one.radii > 0).sum() == (other.radii > 0).sum()
             left_out += len(everything) - len(some)
     assert left_out > 50_000
+
+
+def test_the_order_is_the_same_on_any_number_of_threads(large):
+    nodes, tree, sizes = large
+    hspt, used = Hspt(tree, nodes.means, sizes, nodes.log_scales, 20), threads()
+    try:
+        for camera in cameras(np.random.default_rng(5), 3):
+            found = []
+            for count in (1, 2, 5):
+                set_threads(count)
+                found.append(hspt.cut(camera, 0.5))
+            assert all(np.array_equal(found[0], other) for other in found[1:])
+    finally:
+        set_threads(used)
 
 
 def test_more_pixels_draw_less(large):

@@ -21,7 +21,7 @@ from ...lod.forest import Forest, ForestShape, Piece, side_by_side
 from ...lod.rules.cut import K_LEAST, detail_of
 from ...lod.tree import Tree
 from ...rasterize import Gaussians
-from ...rasterize.hspt import Upper, bounds_of, cut_off, image_of, search
+from ...rasterize.hspt import LEAF, Upper, bounds_of, cut_off, image_of, search
 from ...rasterize.records import gather
 from ...scenes.cameras import Camera
 from ...splats.gaussians import Splats
@@ -34,8 +34,9 @@ AT_ONCE = 1 << 14
 """Nodes that are looked at together where all are."""
 MARK = 32
 """Of every so many entries of a list the size of the first is in memory."""
-ENTRY = Layout({"node": (), "pair": (2,), "family": (12,)})
-"""Of a list: a node and its children, by their numbers in the subtree, and the mean and size of each."""
+ENTRY = Layout({"node": (), "pair": (2,), "ranks": (2,), "ball": (4,)})
+"""Of a list: a node and its children, by their numbers in the subtree, and these by their ranks in the list;
+the node's mean and size."""
 
 
 RecordPiece = tuple[torch.Tensor, Tree]
@@ -234,11 +235,11 @@ class Store:
         for some in _batches(lengths):
             entries = self._lists.read(_ranges(begins[some], lengths[some])).numpy()
             first = np.repeat(self.shape.begins[lists[some]], lengths[some])
-            pairs = (entries[:, 1:3] + first[:, None]).astype(np.int32)
-            stops = np.cumsum(lengths[some])
-            families = np.ascontiguousarray(entries[:, 3:])
-            lists_of = pairs, np.ascontiguousarray(families[:, 3::4]), families, stops - lengths[some], stops
-            found, counts[searched[some]] = search(*lists_of, bands[some], eye, k)
+            links = entries.view(np.int32)[:, 1:5]  # in the place of the same as float32
+            links[:, :2], links[:, 2:] = entries[:, 1:3] + first[:, None], entries[:, 3:5]
+            borders = np.append(0, np.cumsum(lengths[some]))
+            these = np.arange(len(borders) - 1, dtype=np.int32)
+            found, counts[searched[some]] = search(links, entries[:, 5:], borders, these, bands[some], eye, k)
             rows.append(found)
         return np.sort(np.concatenate(rows).astype(np.int64)), counts
 
@@ -280,16 +281,18 @@ class Store:
         values = self.layout.split(records)
         means, log_scales = (values[name].numpy() for name in ("means", "log_scales"))
         by_size = np.lexsort((-sizes[family[:, 0]], of_list))
-        entries[:, :3] = entries[by_size, :3]
-        balls = np.concatenate([means, sizes[:, None]], axis=1)
-        entries[:, 3:] = balls[family[by_size]].reshape(-1, 12)
-        self._lists.write(self._of_lists(some), torch.from_numpy(entries))
         within = np.arange(len(entries)) - np.repeat(np.cumsum(counts - 1) - (counts - 1), counts - 1)
+        balls = np.concatenate([means, sizes[:, None]], axis=1)
+        ranks = np.full(len(balls), LEAF, np.float32)
+        ranks[family[by_size, 0]] = within
+        entries[:, :3] = entries[by_size, :3]
+        entries[:, 3:5], entries[:, 5:] = ranks[family[by_size, 1:]], balls[family[by_size, 0]]
+        self._lists.write(self._of_lists(some), torch.from_numpy(entries))
         bounds = bounds_of(means, log_scales, begins)
-        return entries[within % MARK == 0, 6], balls[ends - 1], log_scales[ends - 1], *bounds
+        return entries[within % MARK == 0, 8], balls[ends - 1], log_scales[ends - 1], *bounds
 
     def _read(self, some: slice) -> tuple[torch.Tensor, np.ndarray]:
-        """The records (., width) and the lists' entries (., 15) of some subtrees."""
+        """The records (., width) and the lists' entries (., 9) of some subtrees."""
         begin, end = int(self.shape.begins[some.start]), int(self.shape.ends[some.stop - 1])
         entries = self._lists.read(self._of_lists(some)).numpy()
         return self.rows.read(np.arange(begin, end)), entries
