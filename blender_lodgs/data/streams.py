@@ -12,8 +12,9 @@ from pathlib import Path
 
 import bpy
 
-HELD = 0.25
-"""Share of the budget that the scene's objects hold: Blender evaluates them anew whenever an eye rests."""
+HELD, MOST_HELD = 0.25, 250_000
+"""Share of the budget that the scene's objects hold, and how many splats at most: Blender evaluates them anew
+whenever an eye rests, and all that is done with them holds its main thread."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,11 @@ class Source:
     budget: int
     here: int
     level: int
+
+
+def held_of(budget: int) -> int:
+    """How many splats of a larger tree the scene's objects may hold."""
+    return max(min(int(HELD * budget), MOST_HELD), 1)
 
 
 def begin(root: bpy.types.Object, path: Path, budget: int, total: int) -> None:

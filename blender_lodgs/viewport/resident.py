@@ -8,8 +8,10 @@ been drawn for the longest time.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import inf
 
 import bpy
 import gpu
@@ -182,32 +184,71 @@ def higher_of(cloud: Cloud) -> int:
     return int((count + 1) ** 0.5) ** 2 - 1
 
 
+class Reading:
+    """What choosing needs of the splats of point clouds, one cloud after the other, while it is being read:
+    an attribute at a time, so that no redraw waits for all.
+
+    What has come from files is taken over when something is arranged (``Pool.take_over``).
+    """
+
+    def __init__(self, clouds: Sequence[Cloud]) -> None:
+        counts = [count_of(cloud) for cloud in clouds]
+        starts = [sum(counts[:i]) for i in range(len(counts))]
+        total = sum(counts)
+        means, areas = np.zeros((total, 3), np.float32), np.zeros(total, np.float32)
+        opacities = np.zeros(total, np.float32)
+        columns = {name: np.zeros(total, np.float32) for name in every_column()}
+        paged = [
+            (start, each) for start, each in zip(starts, clouds, strict=True) if isinstance(each, Stream)
+        ]
+        pool = Pool(means, areas, opacities, columns, paged)
+        self._resident = Resident(pool, starts, counts, max(map(higher_of, clouds), default=0))
+        names = ("position", attributes.SCALE, attributes.BASE, *columns)
+        self._left = [
+            (number, name)
+            for number, cloud in enumerate(clouds)
+            for name in names
+            if counts[number] and not isinstance(cloud, Stream)
+        ]
+
+    def go_on(self, clouds: Sequence[Cloud], until: float = inf) -> Resident | None:
+        """Reads on, at least one attribute; None where there is more at a time (``time.monotonic``).
+
+        Args:
+            clouds: the same splats as at first. Blender may have moved them, so they are given anew.
+        """
+        pool, starts, counts = self._resident.pool, self._resident.starts, self._resident.counts
+        while self._left:
+            number, name = self._left.pop(0)
+            part = slice(starts[number], starts[number] + counts[number])
+            _read_attribute(pool, part, clouds[number], name)
+            if self._left and time.monotonic() >= until:
+                return None
+        return self._resident
+
+
+def _read_attribute(pool: Pool, part: slice, cloud: bpy.types.PointCloud, name: str) -> None:
+    """Brings what an attribute of a cloud says of its splats into their part of a pool."""
+    values = attributes.view_attribute(cloud, name)
+    if values is None:
+        return
+    if name == "position":
+        pool.means[part] = values
+    elif name == attributes.SCALE:
+        pool.areas[part] = np.einsum("ij,ij->i", values, values)
+    elif name == attributes.BASE:
+        pool.opacities[part] = values[:, 3]
+        if (weights := attributes.view_attribute(cloud, attributes.WEIGHT)) is not None:
+            pool.opacities[part] *= weights
+    else:
+        pool.columns[name][part] = values
+
+
 def read_pool(clouds: Sequence[Cloud]) -> Resident:
-    """What choosing needs of the splats of point clouds, one cloud after the other. What has come from files
-    is taken over when something is arranged (``Pool.take_over``)."""
-    counts = [count_of(cloud) for cloud in clouds]
-    starts = [sum(counts[:i]) for i in range(len(counts))]
-    total = sum(counts)
-    means, areas = np.zeros((total, 3), np.float32), np.zeros(total, np.float32)
-    opacities = np.zeros(total, np.float32)
-    columns = {name: np.zeros(total, np.float32) for name in every_column()}
-    for cloud, start, count in zip(clouds, starts, counts, strict=True):
-        part = slice(start, start + count)
-        if not count or isinstance(cloud, Stream):
-            continue
-        cloud.attributes["position"].data.foreach_get("vector", means[part].reshape(-1))
-        scales = attributes.view_attribute(cloud, attributes.SCALE)
-        assert scales is not None
-        areas[part] = np.einsum("ij,ij->i", scales, scales)
-        opacities[part] = attributes.view_attribute(cloud, attributes.BASE)[:, 3]
-        if (weights := attributes.read_attribute(cloud, attributes.WEIGHT)) is not None:
-            opacities[part] *= weights
-        for name, values in columns.items():
-            if (column := attributes.read_attribute(cloud, name)) is not None:
-                values[part] = column
-    paged = [(start, each) for start, each in zip(starts, clouds, strict=True) if isinstance(each, Stream)]
-    pool = Pool(means, areas, opacities, columns, paged)
-    return Resident(pool, starts, counts, max(map(higher_of, clouds), default=0))
+    """All of :class:`Reading` at once."""
+    found = Reading(clouds).go_on(clouds)
+    assert found is not None
+    return found
 
 
 def read_records(cloud: bpy.types.PointCloud, rows: np.ndarray, higher: int) -> np.ndarray:

@@ -263,3 +263,41 @@ def test_everything_shown_has_a_tooltip(bpy):
             if ours and not prop.is_hidden and "filter" not in prop.identifier:
                 assert prop.description, (kind.identifier, prop.identifier)
                 assert len(prop.name) <= 24, (kind.identifier, prop.name)
+
+
+def test_imported_piece_by_piece_and_ended_early(bpy, lodgs, tmp_path):
+    """As a window does it, which goes on between two pieces: the same scene, or nothing."""
+    parts = [Level(number, splats(500 + number), {"s_min": 0.0}) for number in (1, 2)]
+    write_bundle(tmp_path / "b.ply", Bundle("flod", parts, "bands", {"footprint": 1.0}))
+    operator, told = lodgs("operators.import_splats").LODGS_OT_import_splats, []
+    path = tmp_path / "b.ply"
+
+    def begun():
+        pressed = SimpleNamespace(
+            paths=lambda: [path], report=lambda kind, text: told.append(text), budget=0, upright=True,
+            _beside=True,
+        )  # fmt: skip
+        return operator.work(pressed, bpy.context)
+
+    def there():
+        return [len(kind) for kind in (bpy.data.objects, bpy.data.pointclouds, bpy.data.collections)]
+
+    nothing = there()
+    for pieces in (1, 2, 3):
+        work = begun()
+        for _ in range(pieces):
+            while next(work, 1) is None and there() == nothing and pieces > 1:
+                pass
+        work.close()
+        if not lodgs("data.scenes").roots(bpy.context.scene):
+            assert there() == nothing
+    for root in lodgs("data.scenes").roots(bpy.context.scene):
+        lodgs("data.removal").remove(root)
+    assert sum(1 for _ in begun()) >= 3
+    (root,) = lodgs("data.scenes").roots(bpy.context.scene)
+    whole = lodgs("data.scenes").import_splats(bpy.context, path)
+    one, other = (lodgs("data.scenes").read_levels(each) for each in (root, whole))
+    assert root.name == "b" and [item.object.name for item in root.lodgs.levels] == ["b level 1", "b level 2"]
+    for mine, level in zip(one.levels, other.levels, strict=True):
+        np.testing.assert_array_equal(mine.splats.means, level.splats.means)
+    assert not told

@@ -142,7 +142,7 @@ def test_a_few_come_at_each_redraw(bpy, lodgs, seen, monkeypatch):
             pictures.append(seen(view, x, wait=False))
             assert resident.bytes_uploaded - before <= 100 * 16 * resident.record_texels(3)
             counts.append(view.count)
-            if view.pending is None and view.loading is None:
+            if view.arrangement is not None and view.pending is None and view.loading is None:
                 return counts, pictures
             time.sleep(0.01)
         raise AssertionError("it never came")
@@ -155,6 +155,40 @@ def test_a_few_come_at_each_redraw(bpy, lodgs, seen, monkeypatch):
     assert set(counts[:-1]) == {first.count} and view.arrangement is not first
     views.clear()
     np.testing.assert_array_equal(pictures[-1], seen(views.ViewState(), 3.0))
+
+
+def test_splats_are_read_an_attribute_at_a_time(bpy, lodgs, seen, scene, monkeypatch):
+    """What is drawn stays until all that choosing needs has been read; and others begin anew."""
+    views, view = lodgs("viewport.views"), lodgs("viewport.views").ViewState()
+    before, cloud = seen(view, 0.0), scene.lodgs.levels[1].object.data
+    positions = np.zeros(3 * COUNT, np.float32)
+    cloud.attributes["position"].data.foreach_get("vector", positions)
+
+    def change(by):
+        cloud.attributes["position"].data.foreach_set("vector", positions + np.float32(by))
+        cloud.update_tag()
+        bpy.context.view_layer.update()
+
+    def redraws(most=1000):
+        reads, count = views.reads, 0
+        while views.reads == reads and count < most:
+            picture, count = seen(view, 0.0, wait=False), count + 1
+            assert views.reads > reads or views.wants_redraw(view)
+            np.testing.assert_array_equal(picture, before)
+        return count
+
+    monkeypatch.setattr(views, "LOADING", (0.0, 0.0))
+    change(0.1)
+    whole = redraws()
+    assert 6 < whole < 100
+    change(0.2)
+    assert redraws(whole - 2) == whole - 2
+    change(0.3)
+    assert redraws() == whole, "it went on with what it had of others"
+    after = seen(view, 0.0)
+    views.clear()
+    np.testing.assert_array_equal(after, seen(views.ViewState(), 0.0))
+    assert not np.array_equal(after, before)
 
 
 def test_splats_that_vanish_while_they_are_loaded(bpy, lodgs, seen, scene, monkeypatch):
