@@ -299,7 +299,7 @@ def pose(one, other=None, share: float = 0.0) -> Matrix:
     if other is not None:
         to, turned, _ = _own(other).decompose()
         place, turn = place.lerp(to, share), turn.slerp(turned, share)
-    return Matrix.Translation(place) @ turn.to_matrix().to_4x4()
+    return Matrix.Translation(place) @ turn.to_matrix().to_4x4()  # type: ignore[arg-type]
 
 
 def _own(camera) -> Matrix:

@@ -8,7 +8,7 @@ may call.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -245,21 +245,32 @@ def place_splats(
             if upright:
                 rows = bundle.meta.get("up_rotation", ((1, 0, 0), (0, 0, 1), (0, -1, 0)))
                 root.rotation_euler = Matrix(rows).to_euler()
-            for level, obj in zip(bundle.levels, made, strict=True):
-                _put_level(root, level, obj)
-            set_bundle_facts(root, bundle)
-            set_tables(root, bundle.tables)
-            root.lodgs.single_level = bundle.levels[-1].number
+            _fill(root, file, made)
             root.lodgs.training.method = next(info.name for info in METHODS.values() if info.for_splats)
-            if file.total:
-                streams.begin(root, file.path, file.budget, file.total)
-                root.lodgs.eye = "VIEW"  # so that what is looked at comes
     except BaseException:
         bpy.data.batch_remove([obj.data for obj in made])  # which takes the objects along
         raise
     if bundle.rule and not root.lodgs.by_distance:
         warn(" ".join(unknown_rule(bundle.rule)))
     return root
+
+
+def refill(root: bpy.types.Object, file: SplatsFile) -> None:
+    """Gives a splat scene what a file holds, in place of the levels that it has."""
+    make_room(root, file.bundle.levels[-1].number)
+    _fill(root, file, [None] * len(file.bundle.levels))
+
+
+def _fill(root: bpy.types.Object, file: SplatsFile, made: Sequence[bpy.types.Object | None]) -> None:
+    """Puts a file's levels, of which there may be objects, and all that it says of them into a scene."""
+    for level, obj in zip(file.bundle.levels, made, strict=True):
+        _put_level(root, level, obj)
+    set_bundle_facts(root, file.bundle)
+    set_tables(root, file.bundle.tables)
+    root.lodgs.single_level = file.bundle.levels[-1].number
+    if file.total:
+        streams.begin(root, file.path, file.budget, file.total)
+        root.lodgs.eye = "VIEW"  # so that what is looked at comes
 
 
 def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
@@ -330,12 +341,14 @@ def contents(root: bpy.types.Object) -> str:
 
 
 def make_room(root: bpy.types.Object, number: int) -> None:
-    """Removes tables and all levels but one, whose object the next set's first level takes over.
+    """Removes tables and all levels but one, whose object the next set's first level takes over, and ends
+    reading from a file.
 
     Args:
         number: of that level. Where there is none of this number, the finest of those here takes it.
     """
     tables.remove_tables(root)
+    streams.end(root)
     there = [item for item in root.lodgs.levels if item.exists]
     kept = next((item for item in there if item.number == number), there[-1] if there else None)
     for item in there:
