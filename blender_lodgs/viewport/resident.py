@@ -99,26 +99,27 @@ class Resident:
 
 
 class Store:
-    """A texture with room for some of N splats, each a record of texels in a row.
+    """Textures with room for some of N splats, each a record of texels in a row.
 
     Attributes:
         places: (N,) int32 where each splat is; -1 where it is not there.
         owners: (room,) int32 which splat is at each place; -1 where none is.
         higher: how many coefficients beyond the first it has of each splat.
         orphans: (M,) places whose splats are no more, but may still be drawn.
-        texture: WIDTH texels wide.
+        part: how many places each texture has.
+        textures: WIDTH texels wide; each is made when it is first needed, so that no redraw waits for all.
     """
 
     def __init__(self, total: int, room: int, higher: int) -> None:
         most = gpu.capabilities.max_texture_size_get() * WIDTH
-        while higher and record_texels(higher) * room > most:  # rather fewer harmonics than no splats
+        self.part = max(-(-room // splats.PARTS), 1)
+        while higher and record_texels(higher) * self.part > most:  # rather fewer harmonics than no splats
             higher = {24: 15, 15: 8, 8: 3}.get(higher, 0)
         self.places, self.owners = np.full(total, -1, np.int32), np.full(room, -1, np.int32)
         self.higher, self.orphans = higher, np.zeros(0, np.int32)
         self._drawn, self._now, self._filled = np.zeros(room, np.int32), 0, 0
-        height = max(-(-record_texels(higher) * room // WIDTH), 1)
-        self.texture = gpu.types.GPUTexture((WIDTH, height), format="RGBA32F")
-        self._frame = gpu.types.GPUFrameBuffer(color_slots=self.texture)
+        self.textures: list[gpu.types.GPUTexture | None] = [None] * -(-room // self.part)
+        self._frames: list[gpu.types.GPUFrameBuffer | None] = [None] * len(self.textures)
 
     def hold(self, held: np.ndarray) -> None:
         """From now on these splats, (N,) bool, keep their places, and others may lose theirs."""
@@ -157,8 +158,21 @@ class Store:
         gone = gone[gone >= 0]
         self.places[gone] = -1
         self.owners[places], self.places[splats_], self._drawn[places] = splats_, places, self._now
-        splats.copy_records(self._frame, self.texture, places, records)
+        for number in range(places[0] // self.part, places[-1] // self.part + 1):
+            begin, end = np.searchsorted(places, (number * self.part, (number + 1) * self.part))
+            if begin < end:
+                here = places[begin:end] - np.int32(number * self.part)
+                splats.copy_records(*self._texture(number), here, records[begin:end])
         bytes_uploaded += records.nbytes
+
+    def _texture(self, number: int) -> tuple[gpu.types.GPUFrameBuffer, gpu.types.GPUTexture]:
+        """One of the textures, made where there is none yet."""
+        texture, frame = self.textures[number], self._frames[number]
+        if texture is None or frame is None:
+            height = max(-(-record_texels(self.higher) * self.part // WIDTH), 1)
+            texture = self.textures[number] = gpu.types.GPUTexture((WIDTH, height), format="RGBA32F")
+            frame = self._frames[number] = gpu.types.GPUFrameBuffer(color_slots=texture)
+        return frame, texture
 
     def _free(self, count: int) -> np.ndarray:
         """Places (M,), ascending: what was never used, then what was drawn longest ago."""

@@ -183,7 +183,7 @@ def draw_splats(
     if _alike(placements, request.placements):  # what moves, moves at once; its order follows
         placements = request.placements
     splats.draw(
-        view.store.texture, view.store.higher, view.instances, view.count,
+        view.store.textures, view.store.part, view.store.higher, view.instances, view.count,
         [placement.world for placement in placements], view_matrix, projection, view.canvas,
         antialias=[placement.antialias for placement in placements], resolution=view.resolution,
         under_overlays=under_overlays,

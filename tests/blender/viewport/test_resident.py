@@ -51,6 +51,18 @@ def seen(bpy, lodgs, frame, scene):
     views.clear()
 
 
+def stored(store, width):
+    """What the graphics card has at each place, (room, width)."""
+    nothing = np.zeros((store.part, width), np.float32)
+    parts = [
+        nothing
+        if texture is None
+        else np.array(texture.read(), np.float32).reshape(-1)[: nothing.size].reshape(nothing.shape)
+        for texture in store.textures
+    ]
+    return np.concatenate(parts)
+
+
 def test_a_viewed_attribute_is_the_read_one(bpy, lodgs, scene):
     attributes, cloud = lodgs("attributes"), scene.lodgs.levels[0].object.data
     kinds = set()
@@ -101,9 +113,7 @@ def test_places_change_hands(lodgs, frame):
             assert (store.places[wanted] >= 0).all() and (store.places[stay] >= 0).all()
             owned = np.flatnonzero(store.owners >= 0)
             assert np.array_equal(store.places[store.owners[owned]], owned)
-            texels = np.array(store.texture.read(), np.float32).reshape(-1)
-            there = texels[: 2500 * records.shape[1]].reshape(2500, -1)
-            assert np.array_equal(there[store.places[wanted]], records[wanted])
+            assert np.array_equal(stored(store, records.shape[1])[store.places[wanted]], records[wanted])
             last = wanted
 
     frame(8, steps)
