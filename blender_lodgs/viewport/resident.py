@@ -23,7 +23,7 @@ from . import splats
 from .arranging import WIDTH, Pool
 from .streaming import Stream, record_texels
 
-PIECE = 1 << 14
+PIECE = 1 << 13
 """Splats that are brought to the graphics card at a time."""
 LEAST, SPARE, WASTE = 1 << 16, 1.25, 2.0
 """The smallest store, in splats; how much more than is drawn a new one holds; and from how much more on it

@@ -34,7 +34,7 @@ from .streaming import Direction, Stream
 
 STILL = 0.2
 """Seconds after which a view that no longer moves is drawn in full resolution."""
-LOADING = 0.01, 0.03
+LOADING = 0.01, 0.02
 """Seconds after which a redraw leaves further splats to the next one: at least, and at most. What is begun is
 finished: no redraw is to be held up for 0.05 seconds."""
 GROWTH = 1.5
