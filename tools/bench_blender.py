@@ -214,7 +214,7 @@ def streaming(bpy, path: Path, budget: int, frames: int = 100) -> None:
 
     def wait() -> float:
         begun = time.perf_counter()
-        while not (stream := views.stream(root)) or stream.busy or view.pending or view.loading:
+        while not (stream := views.stream(root)) or stream.busy or view.pending or views.wants_redraw(view):
             spent.append(redraw(places[-1]))
             time.sleep(1 / 60)
         return time.perf_counter() - begun

@@ -4,6 +4,9 @@ Installs the built zip into a Blender that has fresh settings of its own, opens 
 has ``window_tour.py`` import the example scene, train it, look at it and render it. The pictures come to
 ``build/window``. The exit code is 0 only when every step did what it should, so this is a test as well.
 
+``--flight BUNDLE --cameras DIR`` has ``window_flight.py`` open a tree of splats instead and fly through it,
+along the cameras of a folder's files, and prints how long each piece of our work holds Blender's main thread.
+
 Always on a virtual display (Xvfb), photographed from outside by ImageMagick: the same pictures on every
 computer, nothing of the desktop in them, and nobody's screen is taken. Blender's own screenshots are black
 where software draws, as it does there.
@@ -40,7 +43,14 @@ def main() -> int:
     with_detail = [name for name, method in METHODS.items() if method.rule]
     parser.add_argument("--method", choices=with_detail, default="flod")
     parser.add_argument("--long", action="store_true", help="train for some minutes: for pictures to show")
+    parser.add_argument("--flight", type=Path, help="a tree of splats to fly through, instead of the tour")
+    parser.add_argument(
+        "--cameras", type=Path, help="folder of cameras to fly along, as examples.town has it"
+    )
+    parser.add_argument("--budget", type=int, default=1_000_000, help="splats of that tree in memory")
     chosen = parser.parse_args()
+    if chosen.flight and not chosen.cameras:
+        parser.error("--flight needs --cameras")
     blender, x_server, camera = find_programs()
     archive = extension.build(ROOT / "dist")
     out: Path = chosen.out.resolve()
@@ -59,6 +69,9 @@ def main() -> int:
         "long": chosen.long,
         "camera": [camera, "-window", "root"],
     }
+    if chosen.flight:
+        plan |= {"flight": str(chosen.flight.resolve()), "cameras": str(chosen.cameras.resolve())}
+        plan["budget"] = chosen.budget
     with display(x_server) as os.environ["DISPLAY"]:
         problem = tour(blender, plan, out / "blender.log")
     for line in facts(out):
@@ -111,10 +124,11 @@ def display(x_server: str) -> Iterator[str]:
 
 
 def tour(blender: str, plan: dict, log: Path) -> str:
-    """Have Blender take the tour; return why it failed, or nothing."""
+    """Have Blender take the tour, or fly; return why it failed, or nothing."""
+    script = ROOT / "tools" / ("window_flight.py" if "flight" in plan else "window_tour.py")
     command = [
         blender, "--gpu-backend", "opengl", "--window-geometry", "0", "0", *map(str, SIZE),
-        "--python-exit-code", "1", "--python", str(ROOT / "tools" / "window_tour.py"), "--", json.dumps(plan),
+        "--python-exit-code", "1", "--python", str(script), "--", json.dumps(plan),
     ]  # fmt: skip
     with open(log, "wb") as said:
         try:

@@ -118,8 +118,8 @@ class SplatStream(bpy.types.PropertyGroup):
     )
     budget: bpy.props.IntProperty(
         name="Splats at Most",
-        description="How many splats are in memory at most: those that the scene holds, and those that are "
-        "read from the file. Where the view needs more, they are coarser everywhere",
+        description="How many splats of a tree are in memory at most: those that the scene holds, and those "
+        "that are read from the file. Where the view needs more, they are coarser everywhere",
         default=1_000_000,
         min=1024,
         soft_max=16_000_000,
@@ -130,6 +130,7 @@ class SplatStream(bpy.types.PropertyGroup):
     )
     total: bpy.props.IntProperty(name="Splats", description="How many splats the file has")
     here: bpy.props.IntProperty(name="Splats Here", description="How many of them the scene's levels hold")
+    begun: bpy.props.IntProperty(name="Begun", description="How often a file has taken the place of another")
 
 
 def _level_set(rule: Rule, control: Control):

@@ -8,8 +8,9 @@ may call.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
@@ -162,9 +163,7 @@ def import_splats(
     """A bundle, a folder of levels, or any 3DGS PLY as a single level, as a new splat scene.
 
     Args:
-        budget: most splats of a tree of splats in memory; 0: all. Of a larger one the coarsest are imported,
-            which stand for the others; where LODGS itself draws, others are read from the file as the eye
-            comes near (``streams``).
+        budget: see :func:`read_splats_file`.
         upright: turn the root as the bundle says, or without that so that -y, which is up in most splat
             files, is up; otherwise leave the axes.
         warn: receives a sentence for each thing that is shown otherwise than the file's maker shows it.
@@ -175,35 +174,103 @@ def import_splats(
     Raises:
         LodgsError: the file cannot be read, or what it says is not possible. Nothing is left behind then.
     """
-    path, missing = Path(path), 0
+    pieces = place_splats(context, read_splats_file(path, budget), upright, warn)
+    while True:
+        try:
+            next(pieces)
+        except StopIteration as end:
+            return end.value
+
+
+@dataclass(frozen=True)
+class SplatsFile:
+    """What a file of splats holds.
+
+    Attributes:
+        bundle: its levels; the coarsest splats of a tree that stays in its file.
+        total: splats of such a tree; 0 where all are in the bundle.
+        budget: most splats of such a tree in memory.
+        warnings: a sentence for each thing that is shown otherwise than the file's maker shows it.
+    """
+
+    path: Path
+    bundle: Bundle
+    total: int
+    budget: int
+    warnings: list[str]
+
+
+def read_splats_file(path: Path | str, budget: int = 0) -> SplatsFile:
+    """What :func:`place_splats` places: a bundle, a folder of levels, or any 3DGS PLY as a single level.
+
+    Nothing of Blender is touched, so that a thread may do it.
+
+    Args:
+        budget: most splats of a tree of splats in memory; 0: all. Of a larger one the coarsest are imported,
+            which stand for the others; where LODGS itself draws, others are read from the file as the eye
+            comes near (``streams``).
+
+    Raises:
+        LodgsError: the file cannot be read.
+    """
+    path, warnings, total = Path(path), [], 0
     if budget and not path.is_dir() and is_tree(read_head(path)):
         total = TreeFile(path).total
-        bundle, _ = read_within(path, budget if total <= budget else max(int(streams.HELD * budget), 1))
+        bundle, _ = read_within(path, budget if total <= budget else streams.held_of(budget))
         here = sum(len(level.splats) for level in bundle.levels)
-        missing = total - here
-        if missing:
-            warn(
+        if here < total:
+            warnings.append(
                 f"{here:,} of {total:,} splats are here: coarser ones stand for the others, which are read "
                 f"from {path.name} where viewports and renders of LODGS need them."
             )
+        total = total if here < total else 0
     else:
-        bundle = (read_folder if path.is_dir() else read_bundle)(path, warn)
-    with _new_scene(context, path.stem) as root:
-        if upright:
-            rows = bundle.meta.get("up_rotation", ((1, 0, 0), (0, 0, 1), (0, -1, 0)))
-            root.rotation_euler = Matrix(rows).to_euler()
+        bundle = (read_folder if path.is_dir() else read_bundle)(path, warnings.append)
+    return SplatsFile(path, bundle, total, budget, warnings)
+
+
+def place_splats(
+    context: bpy.types.Context, file: SplatsFile, upright: bool, warn: Callable[[str], object]
+) -> Generator[None, None, bpy.types.Object]:
+    """Makes a new splat scene of what a file holds, level by level, and yields between two; see
+    :func:`import_splats`. Ended early, it leaves nothing behind."""
+    for message in file.warnings:
+        warn(message)
+    bundle, made = file.bundle, []
+    try:
         for level in bundle.levels:
-            _put_level(root, level)
-        set_bundle_facts(root, bundle)
-        set_tables(root, bundle.tables)
-        root.lodgs.single_level = bundle.levels[-1].number
-        root.lodgs.training.method = next(info.name for info in METHODS.values() if info.for_splats)
-        if missing:
-            streams.begin(root, path, budget, total)
-            root.lodgs.eye = "VIEW"  # so that what is looked at comes
+            made.append(objects.new_splats(f"{file.path.stem} {level.number}", level.splats))
+            yield
+        with _new_scene(context, file.path.stem) as root:
+            if upright:
+                rows = bundle.meta.get("up_rotation", ((1, 0, 0), (0, 0, 1), (0, -1, 0)))
+                root.rotation_euler = Matrix(rows).to_euler()
+            _fill(root, file, made)
+            root.lodgs.training.method = next(info.name for info in METHODS.values() if info.for_splats)
+    except BaseException:
+        bpy.data.batch_remove([obj.data for obj in made])  # which takes the objects along
+        raise
     if bundle.rule and not root.lodgs.by_distance:
         warn(" ".join(unknown_rule(bundle.rule)))
     return root
+
+
+def refill(root: bpy.types.Object, file: SplatsFile) -> None:
+    """Gives a splat scene what a file holds, in place of the levels that it has."""
+    make_room(root, file.bundle.levels[-1].number)
+    _fill(root, file, [None] * len(file.bundle.levels))
+
+
+def _fill(root: bpy.types.Object, file: SplatsFile, made: Sequence[bpy.types.Object | None]) -> None:
+    """Puts a file's levels, of which there may be objects, and all that it says of them into a scene."""
+    for level, obj in zip(file.bundle.levels, made, strict=True):
+        _put_level(root, level, obj)
+    set_bundle_facts(root, file.bundle)
+    set_tables(root, file.bundle.tables)
+    root.lodgs.single_level = file.bundle.levels[-1].number
+    if file.total:
+        streams.begin(root, file.path, file.budget, file.total)
+        root.lodgs.eye = "VIEW"  # so that what is looked at comes
 
 
 def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
@@ -274,12 +341,14 @@ def contents(root: bpy.types.Object) -> str:
 
 
 def make_room(root: bpy.types.Object, number: int) -> None:
-    """Removes tables and all levels but one, whose object the next set's first level takes over.
+    """Removes tables and all levels but one, whose object the next set's first level takes over, and ends
+    reading from a file.
 
     Args:
         number: of that level. Where there is none of this number, the finest of those here takes it.
     """
     tables.remove_tables(root)
+    streams.end(root)
     there = [item for item in root.lodgs.levels if item.exists]
     kept = next((item for item in there if item.number == number), there[-1] if there else None)
     for item in there:
@@ -500,10 +569,17 @@ def _short(value: float) -> float:
     return value if isinstance(value, int) else float(f"{value:.7g}")
 
 
-def _put_level(root: bpy.types.Object, level: Level) -> bpy.types.Object:
-    """The level's object in the scene and its entry in the list, without what depends on the whole list."""
+def _put_level(
+    root: bpy.types.Object, level: Level, made: bpy.types.Object | None = None
+) -> bpy.types.Object:
+    """The level's object in the scene and its entry in the list, without what depends on the whole list.
+
+    Args:
+        made: an object of the level's splats that is in no collection; None: there is none yet.
+    """
     settings = root.lodgs
-    fresh = objects.new_splats(_level_name(root, level.number), level.splats)
+    fresh = made or objects.new_splats("", level.splats)
+    fresh.name = fresh.data.name = _level_name(root, level.number)
     item = next((entry for entry in settings.levels if entry.number == level.number), None)
     if item is None:
         item = settings.levels.add()

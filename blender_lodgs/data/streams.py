@@ -12,8 +12,9 @@ from pathlib import Path
 
 import bpy
 
-HELD = 0.25
-"""Share of the budget that the scene's objects hold: Blender evaluates them anew whenever an eye rests."""
+HELD, MOST_HELD = 0.25, 250_000
+"""Share of the budget that the scene's objects hold, and how many splats at most: Blender evaluates them anew
+whenever an eye rests, and all that is done with them holds its main thread."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,7 @@ class Source:
         budget: how many of them may be in memory besides those that the scene's objects hold.
         here: how many the scene's objects hold.
         level: number of the finest level, in whose place all are drawn.
+        begun: another one where another file may be in the place of the last.
     """
 
     scene: int
@@ -35,6 +37,12 @@ class Source:
     budget: int
     here: int
     level: int
+    begun: int
+
+
+def held_of(budget: int) -> int:
+    """How many splats of a larger tree the scene's objects may hold."""
+    return max(min(int(HELD * budget), MOST_HELD), 1)
 
 
 def begin(root: bpy.types.Object, path: Path, budget: int, total: int) -> None:
@@ -44,11 +52,12 @@ def begin(root: bpy.types.Object, path: Path, budget: int, total: int) -> None:
     relative = bpy.data.filepath and bpy.context.preferences.filepaths.use_relative_paths
     stream.file = bpy.path.relpath(absolute) if relative else absolute
     stream.budget, stream.total, stream.here = budget, total, _held(root)
+    stream.begun += 1
 
 
 def end(root: bpy.types.Object) -> None:
     """Has a scene show what it holds, and no file."""
-    root.lodgs.property_unset("stream")
+    root.lodgs.stream.file = ""
 
 
 def file_of(root: bpy.types.Object) -> Path | None:
@@ -66,7 +75,7 @@ def source_of(root: bpy.types.Object) -> Source | None:
     stream = settings.stream
     finest = max(item.number for item in settings.levels if item.exists)
     budget = max(stream.budget - stream.here, 0)
-    return Source(root.session_uid, path, stream.total, budget, stream.here, finest)
+    return Source(root.session_uid, path, stream.total, budget, stream.here, finest, stream.begun)
 
 
 def changed(root: bpy.types.Object) -> bool:

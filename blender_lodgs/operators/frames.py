@@ -1,4 +1,4 @@
-"""Operators that work through frames: with progress, and in a window Escape stops them between two."""
+"""Operators that work piece by piece: in a window Blender goes on between two, and Escape stops them."""
 
 from __future__ import annotations
 
@@ -9,43 +9,41 @@ import bpy
 from .parts import report_errors
 
 
-class FrameByFrame:
-    """What such an operator inherits; ``animation`` says whether there is more than one frame."""
-
-    animation: bpy.props.BoolProperty(options={"HIDDEN", "SKIP_SAVE"})
-
-    def frames(self, context: bpy.types.Context) -> range:
-        """The frame that is shown, or all of the scene's range."""
-        scene = context.scene
-        if self.animation:
-            return range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
-        return range(scene.frame_current, scene.frame_current + 1)
+class PieceByPiece:
+    """What such an operator inherits: a script waits for all pieces, and a window may :meth:`begin` them."""
 
     def work(self, context: bpy.types.Context) -> Iterator[object]:
-        """Does one frame after the other and yields after each; closed early, it leaves things tidy.
+        """Does one piece after the other and yields after each; closed early, it leaves things tidy.
 
         Raises:
-            LodgsError: a frame is not possible.
+            LodgsError: a piece is not possible.
         """
         raise NotImplementedError
 
     def done(self, count: int) -> str:
-        """The report after so many frames."""
+        """The report after so many pieces."""
         raise NotImplementedError
+
+    def status(self, context: bpy.types.Context, count: int) -> str:
+        """What is told after so many pieces, while there are more."""
+        raise NotImplementedError
+
+    def pieces(self, context: bpy.types.Context) -> int:
+        """How many there are; 1 where that is not known."""
+        return 1
 
     @report_errors
     def execute(self, context):
         self.report({"INFO"}, self.done(sum(1 for _ in self.work(context))))
         return {"FINISHED"}
 
-    def invoke(self, context, event):
-        if not self.animation or bpy.app.background:
-            return self.execute(context)
+    def begin(self, context):
+        """Has the pieces done while Blender goes on; what ``invoke`` returns."""
         manager = context.window_manager
         self._work, self._done = self.work(context), 0
         self._timer = manager.event_timer_add(0.01, window=context.window)
         manager.modal_handler_add(self)
-        manager.progress_begin(0, len(self.frames(context)))
+        manager.progress_begin(0, self.pieces(context))
         return {"RUNNING_MODAL"}
 
     def modal(self, context, event):
@@ -59,9 +57,8 @@ class FrameByFrame:
         result = self._one(context)
         if result == {"RUNNING_MODAL"}:
             self._done += 1
-            text = f"Frame {self._done} of {len(self.frames(context))}; Esc stops"
-            context.window_manager.progress_update(self._done)
-            context.workspace.status_text_set(text)
+            context.window_manager.progress_update(min(self._done, self.pieces(context)))
+            context.workspace.status_text_set(self.status(context, self._done))
             return result
         message = self.done(self._done) if result == {"FINISHED"} else ""
         return self._finish(context, result, message)
@@ -78,3 +75,27 @@ class FrameByFrame:
         if message:
             self.report({"INFO"}, message)
         return result
+
+
+class FrameByFrame(PieceByPiece):
+    """What an operator inherits that draws frames; ``animation`` says whether there is more than one."""
+
+    animation: bpy.props.BoolProperty(options={"HIDDEN", "SKIP_SAVE"})
+
+    def frames(self, context: bpy.types.Context) -> range:
+        """The frame that is shown, or all of the scene's range."""
+        scene = context.scene
+        if self.animation:
+            return range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
+        return range(scene.frame_current, scene.frame_current + 1)
+
+    def pieces(self, context):
+        return len(self.frames(context))
+
+    def status(self, context, count):
+        return f"Frame {count} of {self.pieces(context)}; Esc stops"
+
+    def invoke(self, context, event):
+        if not self.animation or bpy.app.background:
+            return self.execute(context)
+        return self.begin(context)

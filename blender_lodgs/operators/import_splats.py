@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import bpy
 
 from ..data import photographs, scenes
-from .parts import report_errors
+from .frames import PieceByPiece
 
 
-class LODGS_OT_import_splats(bpy.types.Operator):
+class LODGS_OT_import_splats(PieceByPiece, bpy.types.Operator):
     """Import a bundle of levels, or any Gaussian splat PLY as a single level"""
 
     bl_idname = "lodgs.import_splats"
@@ -47,27 +48,40 @@ class LODGS_OT_import_splats(bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    @report_errors
     def execute(self, context):
-        paths = [Path(self.directory, file.name) for file in self.files if file.name]
+        pressed = self.options.is_invoke and not self.options.is_repeat
+        self._beside = pressed and not bpy.app.background and context.window is not None
+        return self.begin(context) if self._beside else super().execute(context)
 
+    def paths(self) -> list[Path]:
+        found = [Path(self.directory, file.name) for file in self.files if file.name]
+        return found or [Path(self.filepath)]
+
+    def work(self, context):
         def warn(message: str) -> None:
             self.report({"WARNING"}, message)
 
         first = not scenes.roots(context.scene)
-        for path in paths or [Path(self.filepath)]:
-            root = scenes.import_splats(
-                context,
-                bpy.path.abspath(str(path)),
-                upright=self.upright,
-                budget=self.budget,
-                warn=warn,
-            )
-            if first:  # otherwise the artist is looking at something
-                photographs.look_at_scene(context, root, warn)
-                first = False
-            self.report({"INFO"}, f"'{root.name}': {scenes.contents(root)}")
-        return {"FINISHED"}
+        reader, self._placed = ThreadPoolExecutor(1, "lodgs-import"), []
+        try:
+            for path in self.paths():
+                read = reader.submit(scenes.read_splats_file, bpy.path.abspath(str(path)), self.budget)
+                while self._beside and not read.done():
+                    yield
+                root = yield from scenes.place_splats(context, read.result(), self.upright, warn)
+                yield
+                if first:  # otherwise the artist is looking at something
+                    photographs.look_at_scene(context, root, warn)
+                    first = False
+                self._placed.append(f"'{root.name}': {scenes.contents(root)}")
+        finally:
+            reader.shutdown(wait=False, cancel_futures=True)
+
+    def done(self, count):
+        return "; ".join(self._placed)
+
+    def status(self, context, count):
+        return f"Reading {', '.join(path.name for path in self.paths())}; Esc stops"
 
 
 class LODGS_FH_splats(bpy.types.FileHandler):

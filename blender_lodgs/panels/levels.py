@@ -146,16 +146,22 @@ class LODGS_PT_stream(LevelsPanel):
     def draw(self, context):
         root, layout = scenes.active_root(context), self.layout
         stream, settings = views.stream(root), root.lodgs.stream
-        here = settings.here if stream is None or not stream.ready else stream.splats
-        layout.label(text=f"{_short(here)} of {_short(settings.total)} splats here")
+        here = settings.here + (stream.splats if stream is not None and stream.ready else 0)
+        layout.label(text=f"{_short(here)} of {_short(settings.total)} splats in memory")
         if streams.changed(root):
             say(layout, "Its splats are other ones than the file's now: they are drawn as they are.", "INFO")
         elif root.lodgs.mode != "SELECTIVE":
             say(layout, "Finer ones are drawn By Distance.", "INFO")
         elif stream is not None and stream.problem:
             say(layout, f"{stream.problem} What the scene holds is drawn.", "ERROR")
-        elif stream is not None and stream.busy:
+        elif stream is None:  # no viewport draws splats
+            layout.label(text="Finer ones are read when drawn", icon="INFO")
+        elif stream.busy:
             layout.label(text="Reading finer ones…", icon="SORTTIME")
+        elif stream.short:
+            layout.label(text="No room for finer ones", icon="INFO")
+        else:
+            layout.label(text="All that is needed is here", icon="CHECKMARK")
         column = split_column(layout)
         column.prop(settings, "file")
         column.prop(settings, "budget")

@@ -6,6 +6,7 @@ import bpy
 
 from ...training.errors import LodgsError
 from ...training.evaluate.words import summary_lines
+from ...training.lod.rules.cut import RULE as CUT
 from ...training.methods import method_info
 from ..data import scenes, viewpoints
 from ..data.training import chooses_distances, hold_out, level_distances, offered
@@ -66,6 +67,8 @@ class LODGS_PT_training_advanced(Panel):
         if root.lodgs.scene_folder:
             layout.prop(settings, "model")
             layout.prop(settings, "images")
+        if method_info(settings.method).rule == CUT.name:
+            layout.prop(root.lodgs.stream, "budget")
         layout.prop(settings, "output")
         layout.operator("lodgs.open_run", icon="FILE_FOLDER", text="Open Run…")
 

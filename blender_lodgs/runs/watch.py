@@ -9,11 +9,13 @@ from __future__ import annotations
 import subprocess
 import time
 import traceback
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import bpy
 
 from ...training.errors import LodgsError
+from ...training.lod.rules.cut import RULE as CUT
 from ...training.runs.endings import ending
 from ...training.runs.folder import RunFolder
 from ...training.splats.bundle import Bundle, Level, read_head, read_tables
@@ -45,6 +47,7 @@ class Watch:
         method: what it trains.
         last_event: when an event came last, in seconds since the epoch.
         offset: bytes of the run's events that have been read.
+        reading: a finished tree that is larger than it may be in memory, while its top is read.
     """
 
     folder: RunFolder
@@ -62,6 +65,7 @@ class Watch:
     method: str = ""
     last_event: float = field(default_factory=time.time)
     offset: int = 0
+    reading: Future[scenes.SplatsFile] | None = None
 
     @property
     def running(self) -> bool:
@@ -89,6 +93,9 @@ class Watch:
             events, self.offset = self.folder.events(self.offset)
             for event in events:
                 self._handle_event(root, event)
+            if self.reading is not None:
+                self._place(root, self.reading)
+                return True
             if not alive:
                 self._set_end()
             if events or not alive:
@@ -139,6 +146,9 @@ class Watch:
                 self._finish(root)
 
     def _add_level(self, root: bpy.types.Object, event: dict) -> None:
+        if self._stays_in_file(root, event):
+            self.levels[event["level"]] = event
+            return
         level = self._read_level(event)
         with extension.in_window():
             if not root.lodgs.training.read:  # what is here is not this run's, and two never mix
@@ -151,6 +161,10 @@ class Watch:
                 extension.undo_step(f"Level {event['level']}")
         self.levels[event["level"]] = event
 
+    def _stays_in_file(self, root: bpy.types.Object, event: dict) -> bool:
+        """Whether a level is of a tree larger than may be in memory, of which half are leaves."""
+        return event.get("rule") == CUT.name and 2 * event["splats"] >= root.lodgs.stream.budget
+
     def _read_level(self, event: dict) -> Level:
         splats = read_ply(self.folder.file(event["path"]))
         return Level(event["level"], splats, event.get("facts", {}))
@@ -162,7 +176,27 @@ class Watch:
             event.get("controls", {}), event.get("cumulative", False), event["meta"],
         )  # fmt: skip
 
+    def _place(self, root: bpy.types.Object, reading: Future[scenes.SplatsFile]) -> None:
+        """Shows a finished tree as soon as its top has been read."""
+        if not reading.done():
+            return
+        self.reading = None
+        try:
+            with extension.in_window():
+                scenes.refill(root, reading.result())
+                root.lodgs.training.read = self.offset
+                extension.undo_step("Training finished")
+        except Exception as error:
+            self.problem = self._trouble(error)
+
     def _finish(self, root: bpy.types.Object) -> None:
+        if any(self._stays_in_file(root, event) for event in self.levels.values()):
+            reader = ThreadPoolExecutor(1, "lodgs-run")
+            self.reading = reader.submit(
+                scenes.read_splats_file, self.folder.bundle, root.lodgs.stream.budget
+            )
+            reader.shutdown(wait=False)
+            return
         head = read_head(self.folder.bundle)
         head.tables = read_tables(self.folder.bundle)
         with extension.in_window():

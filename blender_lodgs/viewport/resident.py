@@ -8,8 +8,10 @@ been drawn for the longest time.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import inf
 
 import bpy
 import gpu
@@ -21,7 +23,7 @@ from . import splats
 from .arranging import WIDTH, Pool
 from .streaming import Stream, record_texels
 
-PIECE = 1 << 14
+PIECE = 1 << 13
 """Splats that are brought to the graphics card at a time."""
 LEAST, SPARE, WASTE = 1 << 16, 1.25, 2.0
 """The smallest store, in splats; how much more than is drawn a new one holds; and from how much more on it
@@ -97,26 +99,27 @@ class Resident:
 
 
 class Store:
-    """A texture with room for some of N splats, each a record of texels in a row.
+    """Textures with room for some of N splats, each a record of texels in a row.
 
     Attributes:
         places: (N,) int32 where each splat is; -1 where it is not there.
         owners: (room,) int32 which splat is at each place; -1 where none is.
         higher: how many coefficients beyond the first it has of each splat.
         orphans: (M,) places whose splats are no more, but may still be drawn.
-        texture: WIDTH texels wide.
+        part: how many places each texture has.
+        textures: WIDTH texels wide; each is made when it is first needed, so that no redraw waits for all.
     """
 
     def __init__(self, total: int, room: int, higher: int) -> None:
         most = gpu.capabilities.max_texture_size_get() * WIDTH
-        while higher and record_texels(higher) * room > most:  # rather fewer harmonics than no splats
+        self.part = max(-(-room // splats.PARTS), 1)
+        while higher and record_texels(higher) * self.part > most:  # rather fewer harmonics than no splats
             higher = {24: 15, 15: 8, 8: 3}.get(higher, 0)
         self.places, self.owners = np.full(total, -1, np.int32), np.full(room, -1, np.int32)
         self.higher, self.orphans = higher, np.zeros(0, np.int32)
         self._drawn, self._now, self._filled = np.zeros(room, np.int32), 0, 0
-        height = max(-(-record_texels(higher) * room // WIDTH), 1)
-        self.texture = gpu.types.GPUTexture((WIDTH, height), format="RGBA32F")
-        self._frame = gpu.types.GPUFrameBuffer(color_slots=self.texture)
+        self.textures: list[gpu.types.GPUTexture | None] = [None] * -(-room // self.part)
+        self._frames: list[gpu.types.GPUFrameBuffer | None] = [None] * len(self.textures)
 
     def hold(self, held: np.ndarray) -> None:
         """From now on these splats, (N,) bool, keep their places, and others may lose theirs."""
@@ -155,8 +158,21 @@ class Store:
         gone = gone[gone >= 0]
         self.places[gone] = -1
         self.owners[places], self.places[splats_], self._drawn[places] = splats_, places, self._now
-        splats.copy_records(self._frame, self.texture, places, records)
+        for number in range(places[0] // self.part, places[-1] // self.part + 1):
+            begin, end = np.searchsorted(places, (number * self.part, (number + 1) * self.part))
+            if begin < end:
+                here = places[begin:end] - np.int32(number * self.part)
+                splats.copy_records(*self._texture(number), here, records[begin:end])
         bytes_uploaded += records.nbytes
+
+    def _texture(self, number: int) -> tuple[gpu.types.GPUFrameBuffer, gpu.types.GPUTexture]:
+        """One of the textures, made where there is none yet."""
+        texture, frame = self.textures[number], self._frames[number]
+        if texture is None or frame is None:
+            height = max(-(-record_texels(self.higher) * self.part // WIDTH), 1)
+            texture = self.textures[number] = gpu.types.GPUTexture((WIDTH, height), format="RGBA32F")
+            frame = self._frames[number] = gpu.types.GPUFrameBuffer(color_slots=texture)
+        return frame, texture
 
     def _free(self, count: int) -> np.ndarray:
         """Places (M,), ascending: what was never used, then what was drawn longest ago."""
@@ -182,32 +198,71 @@ def higher_of(cloud: Cloud) -> int:
     return int((count + 1) ** 0.5) ** 2 - 1
 
 
+class Reading:
+    """What choosing needs of the splats of point clouds, one cloud after the other, while it is being read:
+    an attribute at a time, so that no redraw waits for all.
+
+    What has come from files is taken over when something is arranged (``Pool.take_over``).
+    """
+
+    def __init__(self, clouds: Sequence[Cloud]) -> None:
+        counts = [count_of(cloud) for cloud in clouds]
+        starts = [sum(counts[:i]) for i in range(len(counts))]
+        total = sum(counts)
+        means, areas = np.zeros((total, 3), np.float32), np.zeros(total, np.float32)
+        opacities = np.zeros(total, np.float32)
+        columns = {name: np.zeros(total, np.float32) for name in every_column()}
+        paged = [
+            (start, each) for start, each in zip(starts, clouds, strict=True) if isinstance(each, Stream)
+        ]
+        pool = Pool(means, areas, opacities, columns, paged)
+        self._resident = Resident(pool, starts, counts, max(map(higher_of, clouds), default=0))
+        names = ("position", attributes.SCALE, attributes.BASE, *columns)
+        self._left = [
+            (number, name)
+            for number, cloud in enumerate(clouds)
+            for name in names
+            if counts[number] and not isinstance(cloud, Stream)
+        ]
+
+    def go_on(self, clouds: Sequence[Cloud], until: float = inf) -> Resident | None:
+        """Reads on, at least one attribute; None where there is more at a time (``time.monotonic``).
+
+        Args:
+            clouds: the same splats as at first. Blender may have moved them, so they are given anew.
+        """
+        pool, starts, counts = self._resident.pool, self._resident.starts, self._resident.counts
+        while self._left:
+            number, name = self._left.pop(0)
+            part = slice(starts[number], starts[number] + counts[number])
+            _read_attribute(pool, part, clouds[number], name)
+            if self._left and time.monotonic() >= until:
+                return None
+        return self._resident
+
+
+def _read_attribute(pool: Pool, part: slice, cloud: bpy.types.PointCloud, name: str) -> None:
+    """Brings what an attribute of a cloud says of its splats into their part of a pool."""
+    values = attributes.view_attribute(cloud, name)
+    if values is None:
+        return
+    if name == "position":
+        pool.means[part] = values
+    elif name == attributes.SCALE:
+        pool.areas[part] = np.einsum("ij,ij->i", values, values)
+    elif name == attributes.BASE:
+        pool.opacities[part] = values[:, 3]
+        if (weights := attributes.view_attribute(cloud, attributes.WEIGHT)) is not None:
+            pool.opacities[part] *= weights
+    else:
+        pool.columns[name][part] = values
+
+
 def read_pool(clouds: Sequence[Cloud]) -> Resident:
-    """What choosing needs of the splats of point clouds, one cloud after the other. What has come from files
-    is taken over when something is arranged (``Pool.take_over``)."""
-    counts = [count_of(cloud) for cloud in clouds]
-    starts = [sum(counts[:i]) for i in range(len(counts))]
-    total = sum(counts)
-    means, areas = np.zeros((total, 3), np.float32), np.zeros(total, np.float32)
-    opacities = np.zeros(total, np.float32)
-    columns = {name: np.zeros(total, np.float32) for name in every_column()}
-    for cloud, start, count in zip(clouds, starts, counts, strict=True):
-        part = slice(start, start + count)
-        if not count or isinstance(cloud, Stream):
-            continue
-        cloud.attributes["position"].data.foreach_get("vector", means[part].reshape(-1))
-        scales = attributes.view_attribute(cloud, attributes.SCALE)
-        assert scales is not None
-        areas[part] = np.einsum("ij,ij->i", scales, scales)
-        opacities[part] = attributes.view_attribute(cloud, attributes.BASE)[:, 3]
-        if (weights := attributes.read_attribute(cloud, attributes.WEIGHT)) is not None:
-            opacities[part] *= weights
-        for name, values in columns.items():
-            if (column := attributes.read_attribute(cloud, name)) is not None:
-                values[part] = column
-    paged = [(start, each) for start, each in zip(starts, clouds, strict=True) if isinstance(each, Stream)]
-    pool = Pool(means, areas, opacities, columns, paged)
-    return Resident(pool, starts, counts, max(map(higher_of, clouds), default=0))
+    """All of :class:`Reading` at once."""
+    found = Reading(clouds).go_on(clouds)
+    assert found is not None
+    return found
 
 
 def read_records(cloud: bpy.types.PointCloud, rows: np.ndarray, higher: int) -> np.ndarray:

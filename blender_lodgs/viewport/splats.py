@@ -21,6 +21,9 @@ from .arranging import WIDTH, Arrangement
 MOST_COEFFICIENTS = 24
 """Coefficients beyond the first: degree 4."""
 
+PARTS = 8
+"""Textures that splats' records are in at most: a driver may take long for one that holds them all."""
+
 DILATION, MIP_FILTER = (0.3, 0.0), (0.1, 1.0)
 """Variance added to projected splats, in square pixels, and whether their opacity pays for it: 3DGS's, and
 Mip-Splatting's 2D filter."""
@@ -28,22 +31,32 @@ Mip-Splatting's 2D filter."""
 _FETCH = """
 vec4 texel(sampler2D data, int i) { return texelFetch(data, ivec2(i % WIDTH, i / WIDTH), 0); }
 """
+_STORED = (
+    "vec4 stored(ivec2 record, int i)\n{\n"
+    + "".join(
+        f"  if (record.x == {part}) {{ return texel(records_{part}, record.y + i); }}\n"
+        for part in range(PARTS)
+    )
+    + "  return vec4(0.0);\n}\n"
+)
+"""A texel of a record, which is the number of its texture and its first texel there."""
 _VERTEX = (
     _FETCH
+    + _STORED
     + """
 // Three floats of a splat's record, as ``resident.read_records`` makes them.
-vec3 coefficient(int k, int record)
+vec3 coefficient(int k, ivec2 record)
 {
   int start = 11 + 3 * k;
-  vec4 a = texel(records, record + start / 4);
+  vec4 a = stored(record, start / 4);
   int part = start % 4;
   if (part == 0) { return a.xyz; }
   if (part == 1) { return a.yzw; }
-  vec4 b = texel(records, record + start / 4 + 1);
+  vec4 b = stored(record, start / 4 + 1);
   return part == 2 ? vec3(a.zw, b.x) : vec3(a.w, b.xy);
 }
 
-vec3 seen_color(int record, vec3 base, vec3 d)
+vec3 seen_color(ivec2 record, vec3 base, vec3 d)
 {
   vec3 c = 0.5 + 0.28209479177387814 * base;
   if (degree >= 1) {
@@ -88,8 +101,9 @@ void main()
   color_opacity = vec4(0.0);
 
   vec4 instance = texel(instances, gl_InstanceID);  // splat, weight, placement, level whose colour it gets
-  int record = int(instance.x) * texels, row = int(instance.z) * 5;
-  vec4 mean = texel(records, record);
+  int slot = int(instance.x), row = int(instance.z) * 5;
+  ivec2 record = ivec2(slot / part_size, slot % part_size * texels);
+  vec4 mean = stored(record, 0);
   float opacity = mean.w * instance.y;
   if (opacity <= 1.0 / 255.0) {
     return;
@@ -109,8 +123,8 @@ void main()
   mat4 rows = transpose(projection);
   vec3 by_x = (rows[0].xyz - held.x * rows[3].xyz) * (0.5 * size.x / clip.w);
   vec3 by_y = (rows[1].xyz - held.y * rows[3].xyz) * (0.5 * size.y / clip.w);
-  vec4 q = texel(records, record + 1);  // w, x, y, z
-  vec4 s = texel(records, record + 2);  // and of the colour the first number
+  vec4 q = stored(record, 1);  // w, x, y, z
+  vec4 s = stored(record, 2);  // and of the colour the first number
   mat3 turn = mat3(
     1.0 - 2.0 * (q.z * q.z + q.w * q.w), 2.0 * (q.y * q.z + q.x * q.w), 2.0 * (q.y * q.w - q.x * q.z),
     2.0 * (q.y * q.z - q.x * q.w), 1.0 - 2.0 * (q.y * q.y + q.w * q.w), 2.0 * (q.z * q.w + q.x * q.y),
@@ -140,7 +154,7 @@ void main()
   place = corner * reach;
   gl_Position = vec4(ndc.xy + offset * 2.0 / size, ndc.z, 1.0);
 
-  vec3 base = vec3(s.w, texel(records, record + 3).xy);
+  vec3 base = vec3(s.w, stored(record, 3).xy);
   vec3 color = seen_color(record, base, normalize(mean.xyz * eye.w - eye.xyz));
   if (instance.w > 0.0) {  // in the lightness of its own colour, so that the scene stays readable
     float lightness = min(dot(color, vec3(1.0 / 3.0)), 1.0);
@@ -312,7 +326,8 @@ class Canvas:
 
 
 def draw(
-    records: gpu.types.GPUTexture,
+    records: Sequence[gpu.types.GPUTexture | None],
+    part: int,
     higher: int,
     instances: gpu.types.GPUTexture,
     count: int,
@@ -328,7 +343,8 @@ def draw(
     """Draws splats into the active framebuffer, tested against its depth.
 
     Args:
-        records, higher: the texture of a ``resident.Store``, and how many coefficients it has.
+        records, part, higher: the textures of a ``resident.Store``, how many places each has, and how many
+            coefficients it has.
         instances, count: an arrangement's list.
         worlds: each placement's ``matrix_world``, (4, 4) float64.
         view, projection: from the world to the camera's space, and on to clip space.
@@ -364,7 +380,11 @@ def draw(
         gpu.state.blend_set("ALPHA_PREMULT")
         shader, quad = _program("splats")
         shader.bind()
-        shader.uniform_sampler("records", records)
+        # those that are not there yet are alike, or drivers would compile for other formats again and again
+        alike = next(texture for texture in records if texture is not None)
+        for number in range(PARTS):
+            texture = records[number] if number < len(records) else None
+            shader.uniform_sampler(f"records_{number}", texture or alike)
         shader.uniform_sampler("instances", instances)
         shader.uniform_sampler("placements", placements)
         shader.uniform_sampler("palette", _palette())
@@ -372,6 +392,7 @@ def draw(
         shader.uniform_float("size", size)
         shader.uniform_int("degree", round((higher + 1) ** 0.5) - 1)
         shader.uniform_int("texels", -(-(14 + 3 * higher) // 4))
+        shader.uniform_int("part_size", part)
         quad.draw_instanced(shader, instance_count=count)
 
     gpu.state.depth_test_set("NONE")
@@ -461,7 +482,7 @@ def _splat_shader() -> gpu.types.GPUShader:
     info, between = _shader("splats")
     between.smooth("VEC2", "place")
     between.flat("VEC4", "color_opacity")
-    names = ("instances", "placements", "records", "palette")
+    names = ("instances", "placements", "palette", *(f"records_{part}" for part in range(PARTS)))
     for slot, name in enumerate(names):
         info.sampler(slot, "FLOAT_2D", name)
     info.define("WIDTH", str(WIDTH))
@@ -470,6 +491,7 @@ def _splat_shader() -> gpu.types.GPUShader:
     info.push_constant("VEC2", "size")
     info.push_constant("INT", "degree")
     info.push_constant("INT", "texels")
+    info.push_constant("INT", "part_size")
     return _made(info, between, _VERTEX, _FRAGMENT)
 
 

@@ -56,6 +56,11 @@ class Stream:
         return 0 if self._pager is None else self._pager.splats
 
     @property
+    def short(self) -> bool:
+        """Whether the eye needs more of them than there is room for."""
+        return self._pager is not None and self._pager.short
+
+    @property
     def busy(self) -> bool:
         """Whether something is on its way."""
         if self.problem:

@@ -18,6 +18,7 @@ import weakref
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from math import inf
 
 import bpy
 import gpu
@@ -28,12 +29,12 @@ from .. import extension
 from ..data import changes, scenes, selection, shown
 from . import eye, resident, splats
 from .arranging import Arrangement, Placement, Request, arrange
-from .resident import Cloud, Resident, Store
+from .resident import Cloud, Reading, Resident, Store
 from .streaming import Direction, Stream
 
 STILL = 0.2
 """Seconds after which a view that no longer moves is drawn in full resolution."""
-LOADING = 0.01, 0.03
+LOADING = 0.01, 0.02
 """Seconds after which a redraw leaves further splats to the next one: at least, and at most. What is begun is
 finished: no redraw is to be held up for 0.05 seconds."""
 GROWTH = 1.5
@@ -101,9 +102,11 @@ _resident: Resident | None = None
 _keys: dict[int, changes.Version | Stream | None] = {}
 """Whose splats were read: point clouds, or objects whose modifiers change them, by ``session_uid``; and in
 which version, None for one that only a render shows. Roots of scenes that are read from a file."""
+_reading: tuple[tuple, Reading] | None = None
+"""What is being read in their place: whose splats and how many, and what there is of them."""
 _streams: dict[int, Stream] = {}
 """Those files, by the roots' ``session_uid``."""
-_told: list[tuple[int, bool]] = []
+_told: list[tuple[int, bool, bool]] = []
 """What panels say of them."""
 
 
@@ -180,7 +183,7 @@ def draw_splats(
     if _alike(placements, request.placements):  # what moves, moves at once; its order follows
         placements = request.placements
     splats.draw(
-        view.store.texture, view.store.higher, view.instances, view.count,
+        view.store.textures, view.store.part, view.store.higher, view.instances, view.count,
         [placement.world for placement in placements], view_matrix, projection, view.canvas,
         antialias=[placement.antialias for placement in placements], resolution=view.resolution,
         under_overlays=under_overlays,
@@ -206,18 +209,23 @@ def prepare(
     Returns:
         What is to be drawn, which ``view.arrangement`` may not answer yet.
     """
+    nothing = Request((), tuple(view_matrix[2][:3]), budget)
     if not instances:
         view.resident = view.arrangement = view.store = view.instances = None
         view.pending = view.loading = view.missing = None
-        return Request((), (0.0, 0.0, 1.0), budget)
+        return nothing
     _all.add(view)
     before, view.arrived = view.arrived, 0
     instances = _from_files(view, instances, depsgraph, view_matrix, moving, wait)
-    of, clouds = _read(instances, depsgraph)
+    read = _read(instances, depsgraph, wait)
+    if read is None:
+        view.arrived = NOTHING
+        return nothing
+    of, clouds = read
     take_over = wait or not any(other.reads(of) for other in _all if other is not view)
     arrived = _arrived()
     placements = _placements(instances, of, depsgraph, moving, take_over)
-    request = Request(placements, tuple(view_matrix[2][:3]), budget)
+    request = replace(nothing, placements=placements)
     asked = _arrange(view, of, request, wait, take_over)
     if view.arrived != NOTHING:  # what is not asked for yet has the view redrawn again
         view.arrived = arrived if take_over and asked else before
@@ -314,10 +322,13 @@ def _key(instance: shown.SplatInstance, depsgraph: bpy.types.Depsgraph) -> int:
 
 
 def _read(
-    instances: list[shown.SplatInstance], depsgraph: bpy.types.Depsgraph
-) -> tuple[Resident, list[Cloud | None]]:
-    """The splats of all instances, read anew only where some have changed; and their clouds."""
-    global _resident, _keys, reads
+    instances: list[shown.SplatInstance], depsgraph: bpy.types.Depsgraph, wait: bool
+) -> tuple[Resident, list[Cloud | None]] | None:
+    """The splats of all instances, read anew only where some have changed; and their clouds.
+
+    None where that takes longer than a redraw may, which is not to wait for it: the next one goes on.
+    """
+    global _resident, _keys, _reading, reads
     clouds: dict[int, Cloud] = {}
     versions: dict[int, changes.Version | Stream | None] = {}
     for instance in instances:
@@ -338,9 +349,19 @@ def _read(
         stay = {key: there[key] for key in _keys if key in there and key not in clouds}
         versions |= {key: changes.version(cloud) for key, cloud in stay.items()}
         clouds |= stay
-        _resident, _keys = resident.read_pool(list(clouds.values())), {key: versions[key] for key in clouds}
+        keys, each = {key: versions[key] for key in clouds}, list(clouds.values())
+        whose = keys, list(keys), list(map(resident.count_of, each))
+        if _reading is None or _reading[0] != whose:
+            _reading = whose, resident.Reading(each)
+        begun = time.monotonic()
+        found = _reading[1].go_on(each, inf if wait else begun + LOADING[1])
+        if found is None:
+            return None
+        _resident, _keys, _reading = found, keys, None
         reads += 1
         close_streams({obj.session_uid for obj in bpy.data.objects if obj.lodgs.is_root})
+        if not wait and time.monotonic() > begun + LOADING[0]:
+            return None
     return _resident, [clouds.get(key) for key in _keys]
 
 
@@ -513,7 +534,7 @@ def _wake() -> float | None:
                 if still or wants_redraw(view):
                     region.tag_redraw()
                 waiting |= _unfinished(view) or view.pending is not None or view.resolution < 1
-    if (told := [(each.splats, each.busy) for each in _streams.values()]) != _told:
+    if (told := [(each.splats, each.busy, each.short) for each in _streams.values()]) != _told:
         _told = told
         extension.redraw()
     return 0.01 if waiting else None
@@ -521,10 +542,10 @@ def _wake() -> float | None:
 
 def clear() -> None:
     """Frees everything that is kept between drawings."""
-    global _resident, _keys
+    global _resident, _keys, _reading
     _views.clear()
     _all.clear()
-    _resident, _keys = None, {}
+    _resident, _keys, _reading = None, {}, None
 
 
 def close_streams(but: Collection[int] = ()) -> None:

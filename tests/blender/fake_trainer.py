@@ -2,6 +2,7 @@
 
 - ``""``        two levels and done
 - ``chunks``    two levels of LODGE, which come again with what chunks have of them
+- ``tree``      leaves, then all nodes of a tree
 - ``two halves``  two levels, and done when the file ``go on`` is there
 - ``slow``      steps until it is asked to stop
 - ``killed``    one level, then SIGKILL to itself
@@ -36,6 +37,8 @@ from training.splats.ply import write_ply
 
 COUNTS = {1: 5, 2: 20}
 """Splats by level."""
+LEAVES = 3000
+"""Of a tree."""
 
 
 def splats(count: int) -> Splats:
@@ -87,6 +90,8 @@ def run(mode: str, job: Job, folder: RunFolder, say: Events) -> int:
             return 3
         if mode == "slow":
             time.sleep(0.02)
+    if mode == "tree":
+        return tree(folder, say)
     levels, tables = [], {}
     for number, count in COUNTS.items():
         path = folder.levels_folder / f"level_{number}.ply"
@@ -124,6 +129,26 @@ def run(mode: str, job: Job, folder: RunFolder, say: Events) -> int:
     write_bundle(folder.bundle, Bundle(job.method, levels, rule, {}, controls, meta=meta, tables=tables))
     say("done", bundle=folder.bundle.name, seconds=1.0, train_psnr=21.5, veil={"mean": 0.01, "max": 0.25},
         oversized=0)  # fmt: skip
+    return 0
+
+
+def tree(folder: RunFolder, say: Events) -> int:
+    """As the method has it: its leaves when they are there, and all at the end."""
+    from tests.training.lod.trees import random_leaves, tree_of, write_in_pages
+
+    whole = tree_of(random_leaves(LEAVES, np.random.default_rng(5)))
+    for numbers in ((2,), (1, 2)):
+        for level in whole.levels:
+            if level.number in numbers:
+                path = folder.levels_folder / f"level_{level.number}.ply"
+                write_ply(path, level.splats)
+                say(
+                    "level", level=level.number, path=f"levels/{path.name}", splats=len(level.splats),
+                    facts={}, rule="cut", scene_facts={}, controls={}, cumulative=False, meta={},
+                    more=level.number < 2,
+                )  # fmt: skip
+    write_in_pages(folder.bundle, whole)
+    say("done", bundle=folder.bundle.name, seconds=1.0)
     return 0
 
 

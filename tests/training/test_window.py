@@ -40,6 +40,19 @@ def test_tour_passes_only_when_all_steps_did(tmp_path, does, problem):
     assert found.startswith(problem) and bool(found) == bool(problem)
 
 
+@pytest.mark.parametrize(("more", "script"), [({}, "window_tour.py"), ({"flight": "x"}, "window_flight.py")])
+def test_a_flight_has_its_own_steps(tmp_path, more, script):
+    blender = program(
+        tmp_path / "blender",
+        "import pathlib, sys\n"
+        f"pathlib.Path({str(tmp_path)!r}, 'facts.txt').write_text('passed')\n"
+        "print(sys.argv[sys.argv.index('--python') + 1])",
+    )
+    plan = {"out": str(tmp_path), "run": str(tmp_path / "run")} | more
+    assert not window.tour(str(blender), plan, tmp_path / "blender.log")
+    assert (tmp_path / "blender.log").read_text().strip().endswith(f"tools/{script}")
+
+
 def program(path, code):
     path.write_text(f"#!{sys.executable}\n{code}\n")
     path.chmod(0o755)

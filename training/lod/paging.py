@@ -12,7 +12,7 @@ and draws (:meth:`Pager.take`).
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import inf
@@ -290,39 +290,66 @@ class PageIndex:
         return some[np.lexsort((-self.parent_size[some], wanted))]
 
 
-def standing(columns: Columns) -> tuple[np.ndarray, np.ndarray]:
-    """Which of N splats of a tree can be told apart by a cut where others may be missing.
+class Standing:
+    """Which splats of a tree, at N places in memory, a cut can tell apart where others may be missing.
 
     Children know their parent by its size and place, bit for bit. (Of several nodes of one size at one place
-    none is told apart; ``tree.Apart`` sees to it that a file has none.)
+    none is told apart; ``tree.Apart`` sees to it that a file has none.) Who is whose parent is kept, and
+    looked for only where it may have changed.
 
     Args:
-        columns: of the rule, and x, y, z, (N,) float32 each.
-
-    Returns:
-        inner: (N,) bool, both children are there. Others stand for all below them.
-        reached: (N,) bool, all nodes above are there and inner. Others are never drawn.
+        columns: of the rule, and x, y, z, (N,) float32 each. No splat is where the parent's size is 0.
     """
-    size, above = columns[NODE_SIZE], columns[PARENT_SIZE]
-    count = len(size)
-    own = np.stack([size, *(columns[axis] for axis in "xyz")], 1) + np.float32(0)  # no zero below zero
-    sought = np.stack([above, *(columns[name] for name in PARENT)], 1) + np.float32(0)
-    nodes = np.flatnonzero(size > 0)
-    keys, wanted = hashed(own[nodes]), hashed(sought)
-    order = np.argsort(keys, kind="stable")
-    place = np.searchsorted(keys[order], wanted).clip(max=max(len(nodes) - 1, 0))
-    parent = nodes[order[place]] if len(nodes) else np.zeros(count, np.int64)
-    root = above >= np.float32(ABOVE_ROOT)
-    known = (own[parent] == sought).all(axis=1) & (above > size) & ~root
-    inner = np.bincount(parent[known], minlength=count)[:count] == 2
-    # whether all nodes above are inner: twice as far up at every step
-    reached, up = root | (known & inner[parent]), np.where(known, parent, np.arange(count))
-    for _ in range(count.bit_length()):
-        further = reached & reached[up]
-        if np.array_equal(further, reached) and np.array_equal(up, up[up]):
-            break
-        reached, up = further, up[up]
-    return inner, reached
+
+    def __init__(self, columns: Columns) -> None:
+        self._columns = columns
+        self._parents = np.full(len(columns[NODE_SIZE]), -1, np.int32)
+        self._keys, self._nodes = np.zeros(0, np.uint64), np.zeros(0, np.int32)  # of all nodes, by their keys
+
+    def update(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Looks again after columns have changed at some places (M,).
+
+        Returns:
+            inner: (N,) bool, both children are there. Others stand for all below them.
+            reached: (N,) bool, all nodes above are there and inner. Others are never drawn.
+        """
+        size, above, count = self._columns[NODE_SIZE], self._columns[PARENT_SIZE], len(self._parents)
+        changed = np.zeros(count, bool)
+        changed[places] = True
+        stay = ~changed[self._nodes]
+        keys, nodes = self._keys[stay], self._nodes[stay]
+        come = places[size[places] > 0]
+        new = hashed(self._family(come, NODE_SIZE, "xyz"))
+        order = np.argsort(new, kind="stable")
+        here = np.searchsorted(keys, new[order], side="right")
+        self._keys, self._nodes = np.insert(keys, here, new[order]), np.insert(nodes, here, come[order])
+
+        root = above >= np.float32(ABOVE_ROOT)
+        self._parents[changed | changed[self._parents]] = -1
+        seek = np.flatnonzero((self._parents < 0) & (above > size) & ~root)
+        if len(self._nodes):
+            sought = self._family(seek, PARENT_SIZE, PARENT)
+            place = np.searchsorted(self._keys, hashed(sought)).clip(max=len(self._nodes) - 1)
+            found = self._nodes[place]
+            known = (self._family(found, NODE_SIZE, "xyz") == sought).all(axis=1)
+            self._parents[seek[known]] = found[known]
+
+        known = self._parents >= 0
+        inner = np.bincount(self._parents[known], minlength=count)[:count] == 2
+        # whether all nodes above are inner: twice as far up at every step
+        up = np.where(known, self._parents, np.arange(count, dtype=np.int32))
+        reached = root | (known & inner[up])
+        for _ in range(count.bit_length()):
+            further, higher = reached & reached[up], up[up]
+            if np.array_equal(further, reached) and np.array_equal(up, higher):
+                break
+            reached, up = further, higher
+        return inner, reached
+
+    def _family(self, places: np.ndarray, size: str, axes: Sequence[str]) -> np.ndarray:
+        """(M, 4) by which children and parents know each other."""
+        columns = [self._columns[name][places] for name in (size, *axes)]
+        return np.stack(columns, axis=1) + np.float32(0)  # no zero below zero
 
 
 def hashed(rows: np.ndarray) -> np.ndarray:
@@ -360,7 +387,8 @@ def read_within(
     )
     if not len(splats):
         raise LodgsError(*_too_few(budget, path))
-    inner, reached = standing(splats.extras | dict(zip("xyz", splats.means.T, strict=True)))
+    columns = splats.extras | dict(zip("xyz", splats.means.T, strict=True))
+    inner, reached = Standing(columns).update(np.arange(len(splats)))
     coarse, fine = splats.select(inner & reached), splats.select(~inner & reached)
     fine.extras[NODE_SIZE] = np.zeros(len(fine), np.float32)
     parts = zip((bundle.levels[0], bundle.levels[-1]), (coarse, fine), strict=True)
@@ -403,6 +431,7 @@ class Pager:
         rows: of memory.
         sh_degree: of the splats.
         arrived: how many updates there have been to take.
+        short: whether the eye needs more than there is room for.
         problem: why the thread has ended by itself; empty as long as it has not.
 
     Raises:
@@ -416,8 +445,9 @@ class Pager:
             raise LodgsError(*_too_few(budget, path))
         (first,) = self.file.read(np.array([0]))
         self.rows, self.sh_degree = slots * SIZE, first.sh_degree
-        self.arrived, self.problem = 0, ""
+        self.arrived, self.short, self.problem = 0, False, ""
         self._columns = {name: np.zeros(self.rows, np.float32) for name in (*COLUMNS, *"xyz")}
+        self._standing = Standing(self._columns)
         self._slot_of, self._page_in = np.full(len(self.file), -1), np.full(slots, -1)
         self._used, self._tick = np.zeros(len(self.file), np.int64), 0
         self._index: PageIndex | None = None
@@ -453,7 +483,8 @@ class Pager:
         else:
             if self._index is None:
                 self._index = self.file.index(lambda share: not self._stopping)
-            order = self._index.order(eye, k, direction)[:slots]
+            order = self._index.order(eye, k, direction)
+            self.short, order = len(order) > slots, order[:slots]
         self._tick += 1
         self._used[order] = self._tick
         missing = order[self._slot_of[order] < 0][:AT_ONCE]
@@ -475,17 +506,11 @@ class Pager:
                 column[rows] = splats.extras[name] if name in COLUMNS else splats.means[:, "xyz".index(name)]
             self._slot_of[page], self._page_in[slot] = slot, page
             pages.append((begin, splats))
-        return Update(pages, self._sizes())
-
-    def _sizes(self) -> tuple[np.ndarray, np.ndarray]:
-        """The sizes of all rows as the rule is to have them: of nodes that stand for all below them 0, their
-        parents' 0 where they are not drawn."""
-        some = np.flatnonzero(self._columns[PARENT_SIZE] > 0)
-        columns = {name: column[some] for name, column in self._columns.items()}
-        inner, reached = standing(columns)
-        sizes, parents = np.zeros((2, self.rows), np.float32)
-        sizes[some[inner]], parents[some[reached]] = columns[NODE_SIZE][inner], columns[PARENT_SIZE][reached]
-        return sizes, parents
+        begins = np.array([begin for begin, _ in pages])
+        inner, reached = self._standing.update((begins[:, None] + np.arange(SIZE)).reshape(-1))
+        # nodes that stand for all below them are leaves; what is not drawn is fine enough for nobody
+        sizes = np.where(inner, self._columns[NODE_SIZE], np.float32(0))
+        return Update(pages, (sizes, np.where(reached, self._columns[PARENT_SIZE], np.float32(0))))
 
     def start(self) -> None:
         """Begins to read in a thread: the first pages of the file, and then what is asked for."""

@@ -111,7 +111,7 @@ class Tree:
 class Apart:
     """Sizes of nodes, no two of which are the same at the same place.
 
-    By size and place children know their parent where a part of a tree is read (``paging.standing``), and
+    By size and place children know their parent where a part of a tree is read (``paging.Standing``), and
     equal splats make equal nodes. In memory are 8 bytes of each node.
     """
 

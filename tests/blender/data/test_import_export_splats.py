@@ -1,6 +1,7 @@
 """Bundles and plain files in and out of Blender, through the operators, judged by plyfile and the bytes."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import plyfile
@@ -263,3 +264,39 @@ def test_everything_shown_has_a_tooltip(bpy):
             if ours and not prop.is_hidden and "filter" not in prop.identifier:
                 assert prop.description, (kind.identifier, prop.identifier)
                 assert len(prop.name) <= 24, (kind.identifier, prop.name)
+
+
+def test_imported_piece_by_piece_and_ended_early(bpy, lodgs, bundle, tmp_path):
+    """As a window does it, which goes on between two pieces: the same scene, or nothing."""
+    path, scenes, told = tmp_path / "b.ply", lodgs("data.scenes"), []
+    lodgs("training.splats.bundle").write_bundle(path, bundle)
+    operator = lodgs("operators.import_splats").LODGS_OT_import_splats
+
+    def there():
+        return [len(kind) for kind in (bpy.data.objects, bpy.data.pointclouds, bpy.data.collections)]
+
+    def begun():
+        pressed = SimpleNamespace(
+            paths=lambda: [path], report=lambda kind, text: told.append(text), budget=0, upright=True,
+            _beside=True,
+        )  # fmt: skip
+        return operator.work(pressed, bpy.context)
+
+    nothing, most = there(), 0
+    for level in range(4):
+        work = begun()
+        while there()[1] - nothing[1] < level:
+            next(work)
+        most = max(most, there()[1] - nothing[1])
+        work.close()
+        assert there() == nothing and not scenes.roots(bpy.context.scene)
+    assert most == 3 and sum(1 for _ in begun()) > 3
+    (root,) = scenes.roots(bpy.context.scene)
+    assert root.name == "b" and [item.object.name for item in root.lodgs.levels] == [
+        f"b level {number}" for number in (1, 2, 3)
+    ]
+    whole = scenes.read_levels(scenes.import_splats(bpy.context, path))
+    for one, other in zip(scenes.read_levels(root).levels, whole.levels, strict=True):
+        np.testing.assert_array_equal(one.splats.means, other.splats.means)
+        np.testing.assert_array_equal(one.splats.extras["sigma"], other.splats.extras["sigma"])
+    assert not told

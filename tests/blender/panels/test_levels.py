@@ -204,7 +204,7 @@ def test_what_is_read_from_a_file_is_told(bpy, lodgs, draw, draw_panel, tmp_path
         return draw_panel("levels", "LODGS_PT_stream").texts
 
     views, streaming = lodgs("viewport.views"), lodgs("viewport.streaming")
-    assert texts() == ["499 of 5,999 splats here"]
+    assert texts() == ["499 of 5,999 splats in memory", "Finer ones are read when drawn"]
     monkeypatch.setattr(streaming.Stream, "_open", lambda self: None)
     stream = streaming.Stream(lodgs("data.streams").source_of(root))
     monkeypatch.setitem(views._streams, root.session_uid, stream)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.blender.fake_trainer import COUNTS, splats
+from tests.blender.fake_trainer import COUNTS, LEAVES, splats
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 TRAINER = os.environ.get("LODGS_TRAINER_PYTHON", "")
@@ -104,6 +104,33 @@ def test_numbers_are_what_was_typed(jobs, root):
     settings.image_scale, settings.parameters.footprint = 0.3, 8.3
     assert jobs.changes(settings) == {"footprint": 8.3}
     assert jobs.make_job(root, Path("/run"), {}).image_scale == 0.3
+
+
+@pytest.mark.parametrize("budget", [3 * LEAVES, 2 * LEAVES - 2, 2000])
+def test_a_tree_larger_than_the_budget_stays_in_its_file(bpy, lodgs, jobs, fake, root, tmp_path, budget):
+    """No level of it comes before; what comes is what an import brings. A smaller one comes whole."""
+    fake("tree")
+    root.lodgs.stream.budget, counts = budget, []
+    watch = jobs.start(root, str(tmp_path / "run"))
+    jobs.follow(watch, lambda watch: counts.append(sum(_levels(root).values())))
+    assert (watch.state, watch.problem) == ("done", "")
+    streams, fits = lodgs("data.streams"), budget > 2 * LEAVES
+    assert max(counts) <= (2 * LEAVES - 1 if fits else budget // 4)
+    found = lodgs("data.scenes").read_levels(root)
+    whole = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "run" / "bundle.ply", budget=budget)
+    expected = lodgs("data.scenes").read_levels(whole)
+    for one, other in zip(found.levels, expected.levels, strict=True):
+        np.testing.assert_array_equal(np.sort(one.splats.means, axis=0), np.sort(other.splats.means, axis=0))
+    assert (streams.source_of(root) is None) == (streams.source_of(whole) is None) == fits
+    if not fits:
+        source = streams.source_of(root)
+        assert source.path == tmp_path / "run" / "bundle.ply" and source.total == 2 * LEAVES - 1
+        assert root.lodgs.eye == "VIEW" and root.lodgs.stream.budget == budget
+        fake("")  # another run's levels are not that file's
+        assert bpy.ops.object.select_all(action="DESELECT") and not root.select_set(True)
+        bpy.context.view_layer.objects.active = root
+        jobs.follow(jobs.start(root, str(tmp_path / "other")))
+        assert _levels(root) == COUNTS and streams.file_of(root) is None
 
 
 @pytest.fixture

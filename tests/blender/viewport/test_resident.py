@@ -51,6 +51,18 @@ def seen(bpy, lodgs, frame, scene):
     views.clear()
 
 
+def stored(store, width):
+    """What the graphics card has at each place, (room, width)."""
+    nothing = np.zeros((store.part, width), np.float32)
+    parts = [
+        nothing
+        if texture is None
+        else np.array(texture.read(), np.float32).reshape(-1)[: nothing.size].reshape(nothing.shape)
+        for texture in store.textures
+    ]
+    return np.concatenate(parts)
+
+
 def test_a_viewed_attribute_is_the_read_one(bpy, lodgs, scene):
     attributes, cloud = lodgs("attributes"), scene.lodgs.levels[0].object.data
     kinds = set()
@@ -101,9 +113,7 @@ def test_places_change_hands(lodgs, frame):
             assert (store.places[wanted] >= 0).all() and (store.places[stay] >= 0).all()
             owned = np.flatnonzero(store.owners >= 0)
             assert np.array_equal(store.places[store.owners[owned]], owned)
-            texels = np.array(store.texture.read(), np.float32).reshape(-1)
-            there = texels[: 2500 * records.shape[1]].reshape(2500, -1)
-            assert np.array_equal(there[store.places[wanted]], records[wanted])
+            assert np.array_equal(stored(store, records.shape[1])[store.places[wanted]], records[wanted])
             last = wanted
 
     frame(8, steps)
@@ -142,7 +152,7 @@ def test_a_few_come_at_each_redraw(bpy, lodgs, seen, monkeypatch):
             pictures.append(seen(view, x, wait=False))
             assert resident.bytes_uploaded - before <= 100 * 16 * resident.record_texels(3)
             counts.append(view.count)
-            if view.pending is None and view.loading is None:
+            if view.arrangement is not None and view.pending is None and view.loading is None:
                 return counts, pictures
             time.sleep(0.01)
         raise AssertionError("it never came")
@@ -155,6 +165,40 @@ def test_a_few_come_at_each_redraw(bpy, lodgs, seen, monkeypatch):
     assert set(counts[:-1]) == {first.count} and view.arrangement is not first
     views.clear()
     np.testing.assert_array_equal(pictures[-1], seen(views.ViewState(), 3.0))
+
+
+def test_splats_are_read_an_attribute_at_a_time(bpy, lodgs, seen, scene, monkeypatch):
+    """What is drawn stays until all that choosing needs has been read; and others begin anew."""
+    views, view = lodgs("viewport.views"), lodgs("viewport.views").ViewState()
+    before, cloud = seen(view, 0.0), scene.lodgs.levels[1].object.data
+    positions = np.zeros(3 * COUNT, np.float32)
+    cloud.attributes["position"].data.foreach_get("vector", positions)
+
+    def change(by):
+        cloud.attributes["position"].data.foreach_set("vector", positions + np.float32(by))
+        cloud.update_tag()
+        bpy.context.view_layer.update()
+
+    def redraws(most=1000):
+        reads, count = views.reads, 0
+        while views.reads == reads and count < most:
+            picture, count = seen(view, 0.0, wait=False), count + 1
+            assert views.reads > reads or views.wants_redraw(view)
+            np.testing.assert_array_equal(picture, before)
+        return count
+
+    monkeypatch.setattr(views, "LOADING", (0.0, 0.0))
+    change(0.1)
+    whole = redraws()
+    assert 6 < whole < 100
+    change(0.2)
+    assert redraws(whole - 2) == whole - 2
+    change(0.3)
+    assert redraws() == whole, "it went on with what it had of others"
+    after = seen(view, 0.0)
+    views.clear()
+    np.testing.assert_array_equal(after, seen(views.ViewState(), 0.0))
+    assert not np.array_equal(after, before)
 
 
 def test_splats_that_vanish_while_they_are_loaded(bpy, lodgs, seen, scene, monkeypatch):

@@ -7,6 +7,7 @@ import time
 import numpy as np
 import pytest
 
+from tests.blender.viewport.test_resident import stored
 from tests.training.lod.test_paging import Truth
 from tests.training.lod.trees import random_leaves, tree_of, write_in_pages
 
@@ -61,11 +62,9 @@ def look(bpy, lodgs, frame):
 
 def on_the_card(view):
     """The means of the splats that a viewport draws, as the graphics card has them."""
-    texels = view.store.texture.width * view.store.texture.height
-    records = np.array(view.store.texture.read(), np.float32).reshape(texels, 4)
-    rows = np.array(view.instances.read(), np.float32).reshape(-1, 4)[: view.count]
     size = -(-(14 + 3 * view.store.higher) // 4)
-    return records[rows[:, 0].astype(int) * size, :3]
+    rows = np.array(view.instances.read(), np.float32).reshape(-1, 4)[: view.count]
+    return stored(view.store, 4 * size)[rows[:, 0].astype(int), :3]
 
 
 def test_finer_ones_come_and_what_is_drawn_is_complete_at_any_time(bpy, lodgs, tree, path, root, look):

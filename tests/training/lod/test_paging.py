@@ -1,6 +1,7 @@
 """Of a tree in a file what fits into a budget: complete cuts at any time, and the whole's where it fits."""
 
 import time
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from training.errors import LodgsError
 from training.lod import choice as by_values
 from training.lod import paging
 from training.lod.blocks import SIZE
-from training.lod.paging import Pager, TreeFile, read_within, standing, streaming_order, table_of_pages
+from training.lod.paging import Pager, Standing, TreeFile, read_within, streaming_order, table_of_pages
 from training.lod.rule import rules
 from training.lod.rules.cut import ABOVE_ROOT
 from training.lod.selection import Choice, select
@@ -152,6 +153,8 @@ def test_coarse_pages_come_first_and_those_of_no_use_for_longest_go_first(path):
         list(come_in(pager, Memory(pager), eye, pixels))
         there.append(set(np.flatnonzero(pager._slot_of >= 0)))
         assert len(there[-1]) <= 12 and pager.splats <= 12 * SIZE
+        needed = pager.file.index().detail(np.array(eye)) < max(FOCAL / pixels, 32) * (1 + paging.ROUNDING)
+        assert pager.short == (needed.sum() > 12)
     assert there[0] <= there[1]  # there was room
 
 
@@ -225,9 +228,8 @@ def test_nodes_stand_for_what_is_missing():
     columns["parent_size"][0] = ABOVE_ROOT
 
     def found(*rows):
-        return [
-            np.array(rows)[each].tolist() for each in standing({n: c[list(rows)] for n, c in columns.items()})
-        ]
+        here = Standing({name: column[list(rows)] for name, column in columns.items()})
+        return [np.array(rows)[each].tolist() for each in here.update(np.arange(len(rows)))]
 
     assert found(0, 1, 2, 3, 4, 5, 6) == [[0, 1, 3], [0, 1, 2, 3, 4, 5, 6]]
     assert found(6, 5, 4, 3, 2, 1, 0) == [[3, 1, 0], [6, 5, 4, 3, 2, 1, 0]]
@@ -238,6 +240,38 @@ def test_nodes_stand_for_what_is_missing():
     assert found(5, 6) == [[], []]
     assert found(0) == [[], [0]]
     assert found(0, 1, 2, 3, 4, 5, 6, 7) == [[0, 1], [0, 1, 2, 3, 4]]  # three children are none
+
+
+def test_what_stands_follows_whatever_comes_and_goes(truth):
+    """Against what walking up from each splat finds, whichever some places hold at a time."""
+    rng, splats = np.random.default_rng(3), truth.choice.splats
+    top = np.argsort(-splats.extras["parent_size"], kind="stable")[:600]  # of several ways few go far down
+    whole = splats.extras | dict(zip("xyz", splats.means.T, strict=True))
+    columns = {name: np.zeros(len(top), np.float32) for name in (*CUT.columns, *"xyz")}
+    holds, here, most = np.full(len(top), -1), Standing(columns), 0
+    for _ in range(60):
+        places = rng.permutation(len(top))[: rng.integers(1, 200)]
+        free = np.setdiff1d(top, np.delete(holds, places))
+        holds[places] = -1
+        come = rng.permutation(free)[: len(places) - rng.integers(min(len(places), 9))]
+        holds[places[: len(come)]] = come
+        for name, column in columns.items():
+            column[places] = 0
+            column[places[: len(come)]] = whole[name][come]
+        there = {node: place for place, node in enumerate(holds.tolist()) if node >= 0}
+        children = Counter(truth.parents[node] for node in there)
+        inner, reached = np.zeros((2, len(top)), bool)
+        for node, place in there.items():
+            inner[place] = children[node] == 2
+            above = truth.parents[node]
+            while above >= 0 and above in there and children[above] == 2:
+                above = truth.parents[above]
+            reached[place] = above < 0
+        found = here.update(places)
+        np.testing.assert_array_equal(found[0], inner)
+        np.testing.assert_array_equal(found[1], reached)
+        most = max(most, int(reached.sum()))
+    assert most > 20, "nothing was ever complete"
 
 
 def test_a_table_of_pages_is_what_reading_finds(truth, tmp_path):
