@@ -18,7 +18,7 @@ import re
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
@@ -169,8 +169,9 @@ def train(options: argparse.Namespace) -> dict:
         if drawn[-1] > largest:
             assert isinstance(method._optimizer, SeenRecords)
             largest, splats = drawn[-1], method._optimizer.gaussians
-            arrays = {name: each.detach().numpy() for name, each in vars(splats).items()}
-            np.savez(options.folder / "largest.npz", view=method.view_index(step), **arrays)
+            for name, each in vars(splats).items():  # without a copy, which would count
+                np.save(options.folder / f"largest_{name}.npy", each.detach().numpy())
+            (options.folder / "largest_view.txt").write_text(str(method.view_index(step)))
     begun = time.perf_counter()
     torch.save(method.state_dict(), options.folder / "checkpoint.pt")
     some = slice(WARM, -AFTER)
@@ -188,9 +189,9 @@ def draw(options: argparse.Namespace) -> dict:
     """Draws the largest cut of a run some times, with gradients and the loss, and knows nothing of trees."""
     keep_freed_memory(LARGE)  # as a run does
     method = method_in(options.folder, options)
-    with np.load(options.folder / "largest.npz") as file:
-        arrays = dict(file)
-    view = method.data.view(int(arrays.pop("view")))
+    names = [field.name for field in fields(Gaussians)]
+    arrays = {name: np.load(options.folder / f"largest_{name}.npy") for name in names}
+    view = method.data.view(int((options.folder / "largest_view.txt").read_text()))
     for _ in range(3):
         leaves = {name: torch.tensor(each, requires_grad=True) for name, each in arrays.items()}
         drawn = rasterize(Gaussians(**leaves), view.camera, near=town.NEAR, backend="cpu")
