@@ -32,7 +32,12 @@ class Method(method.Method[ThreedgsParameters, Drawing]):
         points, colors = sampled(points, colors, self.growth_limit(0), self.seed)
         tensors = from_points(points, colors, p.sh_degree, self.device)
         self.model = self.new_model(tensors)
-        self._densify_until = p.densify_until * p.steps
+        self._densify_until = p.densify_until * self.scheduled_steps
+
+    @property
+    def scheduled_steps(self) -> int:
+        """Over how many steps rates fall and photographs grow, of which shares are."""
+        return self.parameters.steps
 
     def new_model(self, tensors: Mapping[str, torch.Tensor]) -> Model:
         """A model of splats with what densification by the job's rule has to know of them."""
@@ -45,7 +50,7 @@ class Method(method.Method[ThreedgsParameters, Drawing]):
 
     def shrink(self, step: int) -> float:
         p = self.parameters
-        return shrink_at(step / p.steps, p.first_resolution, p.full_resolution)
+        return shrink_at(step / self.scheduled_steps, p.first_resolution, p.full_resolution)
 
     def draw(self, view: TrainingView, step: int) -> list[Drawing]:
         return [Drawing(self.rasterize_model(view.camera, step))]
@@ -56,12 +61,12 @@ class Method(method.Method[ThreedgsParameters, Drawing]):
 
     def set_learning_rates(self, step: int) -> None:
         p = self.parameters
-        rate = log_linear(p.lr_means, p.lr_means_final, step / (p.lr_means_steps or p.steps))
+        rate = log_linear(p.lr_means, p.lr_means_final, step / (p.lr_means_steps or self.scheduled_steps))
         self.model.adam.lr["means"] = rate * self.data.extent
 
     def control_density(self, step: int) -> None:
         p, model, done = self.parameters, self.model, step + 1
-        if p.least_weight and done in (round(share * p.steps) for share in WEIGHED_AT):
+        if p.least_weight and done in (round(share * self.scheduled_steps) for share in WEIGHED_AT):
             self.prune_unimportant(step)
         if done > self._densify_until:
             return

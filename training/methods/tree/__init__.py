@@ -9,8 +9,8 @@ from ..threedgs import ThreedgsParameters
 
 @dataclass(frozen=True)
 class TreeParameters(ThreedgsParameters):
-    """Those of A LoD of Gaussians; ``steps`` are those of 3DGS, which makes the leaves where there is no
-    base."""
+    """Those of A LoD of Gaussians; ``steps`` are the first ones, those of 3DGS, which makes the leaves where
+    there is no base; its schedules are of all steps."""
 
     tune_steps: int = parameter(
         600, "Steps that train the cut which each view sees of the tree; 0 leaves it as built.", unit="steps"
@@ -29,10 +29,15 @@ class TreeParameters(ThreedgsParameters):
         high=100,
     )
     node_rate: float = parameter(
-        2.0, "Learning rates of nodes above leaves, in multiples of those that 3DGS ends with.", high=100
+        2.0,
+        "Learning rates of nodes above leaves, in multiples of those that 3DGS has by then, or, with a base, "
+        "ends with.",
+        high=100,
     )
     leaf_rate: float = parameter(
-        0.3, "The same of leaves, which falls to a tenth of it; 0 leaves all leaves as they are.", high=100
+        1.0,
+        "The same of leaves, which falls to 0.03 of it, so that they come to rest; 0 leaves all as they are.",
+        high=100,
     )
     resize_interval: int = parameter(
         1000,
@@ -73,7 +78,6 @@ _STANDARD = replace(
     densify_interval=100,
     tune_steps=10_000,
     grow_interval=1000,
-    leaf_rate=1.0,  # those that grow have to learn
 )
 _PAPER = replace(
     _STANDARD,
@@ -84,6 +88,7 @@ _PAPER = replace(
     sh_degree=1,
     tune_steps=150_000,
     max_threshold=0.0075,
+    densify_until=0.083,  # 15,000 steps, as in 3DGS; all are six times as many as 3DGS makes
     unseen_epochs=2.0,
 )
 

@@ -28,6 +28,7 @@ from ..data import TrainingView
 from ..method import Drawing
 from ..schedules import due
 from ..start import from_splats
+from ..threedgs import train as threedgs_train
 from ..threedgs.refining import Refining
 from ..walk import Walk
 from . import TreeParameters
@@ -35,7 +36,7 @@ from .build import GrowingForest
 from .density import Growing
 from .store import Store, default_budget
 
-LEAF_REST = 0.1
+LEAF_REST = 0.03
 """The rate at which leaves move at the end of training, as a share of that at its beginning."""
 
 
@@ -99,10 +100,17 @@ class Method(Refining):
 
     def setup(self, base: SplatRows | None) -> None:
         super().setup(None if base is None else base.select(slice(0, 0)))
+        # leaves that are grown on need their own steps, and what continues photographs a model
+        self._densify_until = min(self._densify_until, self.finest_steps)
         self.store: Store | None = None
         self._base = base
         self._table: Columns = {}
         self._told = 0  # bytes of splat_memory that somebody was told of
+
+    @property
+    def scheduled_steps(self) -> int:
+        """Cuts go on with 3DGS where its steps for the leaves end."""
+        return self.steps
 
     @property
     def steps(self) -> int:
@@ -174,6 +182,12 @@ class Method(Refining):
         told = super().train_step(step)
         self.store.cache.after(step - self.finest_steps)
         return told
+
+    def set_learning_rates(self, step: int) -> None:
+        if self._base is None:
+            threedgs_train.Method.set_learning_rates(self, step)  # which go on falling
+        else:
+            super().set_learning_rates(step)
 
     def draw(self, view: TrainingView, step: int) -> list[Drawing]:
         if not self.refines(step):

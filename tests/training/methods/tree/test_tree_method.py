@@ -81,14 +81,31 @@ def test_leaves_come_first_and_all_nodes_last(data):
     assert weights.all()
 
 
-def test_until_the_tree_is_built_it_is_3dgs(data):
-    values = {"steps": 12, "densify_until": 0.4, "prune_interval": 6, "margin": 0.0}
+def test_until_the_tree_is_built_it_is_3dgs_of_as_many_steps_in_all(data):
+    values = {"steps": 12 + 1 + 8, "densify_until": 0.4, "prune_interval": 6, "margin": 0.0}
     plain = create("3dgs", data, override(method_info("3dgs").preset("draft"), values), 0, "cpu")
     tree = make(data)
     assert [step for step in range(12) if tree.ends_level(step)] == [11]
     for step in range(12):
         assert tree.train_step(step)[0] == pytest.approx(plain.train_step(step)[0], rel=1e-5)
     torch.testing.assert_close(tree.model["means"], plain.model["means"])
+
+
+def test_rates_go_on_falling_from_leaves_to_cuts_and_those_of_a_base_have_fallen(data, base):
+    tree, based = make(data), make(data, base)
+    p = tree.parameters
+    for step in (0, 11, 13, 20):
+        tree.set_learning_rates(step)
+        rate = p.lr_means * (p.lr_means_final / p.lr_means) ** (step / 21) * data.extent
+        assert tree.model.adam.lr["means"] == pytest.approx(rate)
+    based.set_learning_rates(1)
+    assert based.model.adam.lr["means"] == pytest.approx(p.lr_means_final * data.extent)
+
+
+def test_photographs_are_continued_while_there_are_leaves_alone(data):
+    """However many steps come after them."""
+    tree = make(data, tune_steps=40, densify_until=0.9)
+    assert [step for step in range(tree.steps) if tree.continues_margins(step)] == [11]
 
 
 def test_without_tuning_the_leaves_are_the_base_to_the_bit(data, base):
@@ -111,14 +128,14 @@ def test_leaves_of_rate_0_stay_to_the_bit_while_nodes_learn(data, base):
 
 
 def test_leaves_come_to_rest(data, base):
-    """Their rate falls to a tenth, the nodes' does not."""
+    """Their rate falls to 0.03 of what it was, the nodes' does not."""
     tree = make(data, base, leaf_rate=0.2, node_rate=3.0, tune_steps=400)
     trained(tree, until=1)
     camera = data.train[0]
     places = tree.store.take(camera, 16.0, data.near)
     above = above_leaves(tree)[tree.store.cache.rows_at(places)]
     assert above.any() and not above.all()
-    for step, share in ((1, 0.2), (201, 0.2 * 10**-0.5), (401, 0.02)):
+    for step, share in ((1, 0.2), (201, 0.2 * 0.03**0.5), (401, 0.2 * 0.03)):
         found = tree._shares(places, step).numpy()
         np.testing.assert_allclose(found, np.where(above, 3, share), rtol=0.01)
 
