@@ -100,4 +100,5 @@ METHOD = MethodInfo(
     base_in_parts=True,
     for_splats=True,
     captured={"leaf_rate": 0.0, "random_background": False},  # leaves are right, and black is nothing
+    in_cells="3dgs",
 )
