@@ -14,6 +14,8 @@ from .workers import Pending, Submit
 
 LOOKS = 0.5
 """Seconds between two looks at how blocks get on."""
+SILENT = 20.0
+"""Seconds between two words at most."""
 TRIES = 3
 """How often a block may be lost without having got any further before that ends the run."""
 
@@ -44,15 +46,18 @@ def train_blocks(blocks: Sequence[Block], path: Path, submit: Submit, tell: Tell
     try:
         for each in watched:
             each.begin(submit)
-        before = ""
+        started = told = time.monotonic()
         while not all([each.look(submit) for each in watched]):
-            if (now := _told(watched)) != before:
+            now = time.monotonic()
+            if now - told >= min(max((now - started) / 1000, LOOKS), SILENT):
                 tell("progress", **_progress(watched))
-                before = now
+                told = now
             time.sleep(LOOKS)
     except BaseException:
         for each in watched:
-            each.stop()
+            each.block.folder.request_cancel()
+        while not all(each.over for each in watched):
+            time.sleep(LOOKS)
         raise
     tell("progress", **_progress(watched))
     for each in watched:
@@ -74,15 +79,26 @@ class _Watched:
     """
 
     def __init__(self, block: Block) -> None:
-        self.block, self.code = block, None
+        self.block = block
         self._pending: Pending | None = None
+        self.code: int | None = None
+        if block.folder.bundle.exists() and block.folder.state() == "done":
+            self.code = DONE
         self._lost, self._reached = 0, -1
         self._since, self.progress = 0, {}
         self.steps = block.job.resolved_parameters().total_steps
         self._why = ""
 
     def begin(self, submit: Submit) -> None:
-        self._pending = submit(self.block.folder.path)
+        """Has it trained, unless it is finished."""
+        self.block.folder.take_cancel()  # which was meant for an earlier trainer
+        if self.code is None:
+            self._pending = submit(self.block.folder.path)
+
+    @property
+    def over(self) -> bool:
+        """Whether nobody is at work on it any more."""
+        return self._pending is None or self._pending.done()
 
     def look(self, submit: Submit) -> bool:
         """Reads how far it is, and begins it again where whoever trained it was lost; whether it is over."""
@@ -122,18 +138,6 @@ class _Watched:
             return "running" if self.progress else "waiting"
         return {DONE: "done", CANCELLED: "cancelled"}.get(self.code, "failed")
 
-    def stop(self) -> None:
-        """Asks the block to stop, and waits for it."""
-        if self._pending is None or self.code is not None:
-            return
-        cancel = getattr(self._pending, "cancel", None)
-        if cancel is not None:
-            cancel()  # where it has not begun
-        if self.block.folder.running:
-            self.block.folder.request_cancel()
-            while self.block.folder.running:
-                time.sleep(LOOKS / 5)
-
     def trouble(self) -> LodgsError:
         """Why it could not be trained."""
         error = self.block.folder.last("error") if self.code == BAD_INPUT else None
@@ -144,10 +148,6 @@ class _Watched:
             f"Block {self.block.number} was lost {TRIES} times at step {self.step}{why}.",
             f"What its trainer wrote is in {self.block.folder.log}.",
         )
-
-
-def _told(watched: Sequence[_Watched]) -> str:
-    return " ".join(f"{each.state} {each.step}" for each in watched)
 
 
 def _progress(watched: Sequence[_Watched]) -> dict:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import subprocess
 import sys
@@ -13,9 +14,12 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from ...errors import LodgsError
+from ..failures import CANCELLED
 from ..folder import RunFolder
 
 HERE = "here"
+ANSWERS = 20
+"""Seconds in which a scheduler answers."""
 _PACKAGE = (__package__ or "").partition(".")[0]
 
 
@@ -38,7 +42,8 @@ Submit = Callable[[Path], Pending]
 def train_block(folder: str, threads: int = 0) -> int:
     """Trains a run to its end, or goes on with it, in a process of its own; a worker calls it.
 
-    Where the trainer of a worker that was lost is still at work it is waited for first.
+    Where the trainer of a worker that was lost is still at work it is waited for first. A run that has been
+    asked to stop does not begin.
 
     Args:
         folder: of the run, which has its job.
@@ -50,13 +55,15 @@ def train_block(folder: str, threads: int = 0) -> int:
     run = RunFolder(folder)
     while run.running:
         time.sleep(1)
+    if run.take_cancel():
+        return CANCELLED
     package = Path(__file__).resolve().parents[2]
     environment = dict(os.environ)
     environment["PYTHONPATH"] = os.pathsep.join(
         filter(None, [str(package.parent), os.environ.get("PYTHONPATH")])
     )
     if threads:
-        environment["NUMBA_NUM_THREADS"] = str(threads)
+        environment["LODGS_THREADS"] = str(threads)
     with run.log.open("ab") as log:
         return subprocess.run(
             [sys.executable, "-m", _PACKAGE, "train", str(run.job)], env=environment, check=False,
@@ -91,11 +98,12 @@ def workers(on: str = HERE, resources: dict[str, float] | None = None) -> Iterat
         n, threads = int(count), max((os.cpu_count() or 1) // int(count), 1)
         made: Any = distributed.LocalCluster(
             n_workers=n, threads_per_worker=1, processes=True, dashboard_address=":0", resources=resources,
+            silence_logs=logging.ERROR,
         )  # fmt: skip
     else:
         made, threads = on, 0
     try:
-        client = distributed.Client(made, timeout="20s")
+        client = distributed.Client(made, timeout=ANSWERS)
     except OSError as error:
         raise LodgsError(
             f"No Dask scheduler answers at {on}.", "Start it, or correct the address."
