@@ -1,4 +1,4 @@
-"""Flamenco's job type, compiled in Node against the manager's documented interface; its commands as they are."""
+"""The job type for Flamenco, compiled in Node against the manager's interface, and the commands that it makes."""
 
 import json
 import shutil
