@@ -1,4 +1,4 @@
-"""The job type for Flamenco, compiled in Node against the manager's interface, and the commands that it makes."""
+"""The job type for Flamenco, compiled in Node against the manager's interface, and what its commands do."""
 
 import json
 import shutil
