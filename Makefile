@@ -89,7 +89,7 @@ extension: setup
 	$(VENV) tools/extension.py
 
 pins: setup
-	for name in trainer cuda develop blender-5.0; do $(LOCK) $(if $(UPGRADE),--upgrade) --python-version 3.11 \
+	for name in trainer cuda cluster develop blender-5.0; do $(LOCK) $(if $(UPGRADE),--upgrade) --python-version 3.11 \
 		requirements/$$name.in -o requirements/$$name.txt || exit 1; done
 	$(LOCK) $(if $(UPGRADE),--upgrade) --python-version 3.13 requirements/blender-5.2.in -o requirements/blender-5.2.txt
 

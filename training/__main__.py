@@ -9,13 +9,17 @@ import re
 import signal
 import sys
 import tomllib
+from collections.abc import Callable
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from . import VERSION
 from .errors import LodgsError, out_of_memory
+
+if TYPE_CHECKING:
+    from .runs.job import Job
 
 PROGRAM = "lodgs" if __package__ == "lodgs" else "python -m training"
 _INSTALL = "Install the packages of requirements/trainer.txt."
@@ -36,7 +40,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         chosen = _parser().parse_args(arguments)
         code = _COMMANDS[chosen.command](chosen)
-        if chosen.command != "train":  # whose run's folder has all that it prints
+        if chosen.command not in ("train", "blocks"):  # whose run's folder has all that it prints
             sys.stdout.flush()
         return code
     except BrokenPipeError:  # whoever read our output has seen enough
@@ -76,6 +80,21 @@ def _parser() -> argparse.ArgumentParser:
         description="Says what happens as JSON, one event a line.",
     )
     add_options(train)
+
+    blocks = commands.add_parser("blocks", help="a scene that is too large for one run, in cells")
+    whats = blocks.add_subparsers(dest="what", required=True, metavar="WHAT")
+    plan = whats.add_parser("plan", help="divide a job with --cells into blocks, each an ordinary run")
+    add_options(plan)
+    goes = whats.add_parser("run", help="train the blocks of a plan, or go on, and put them together")
+    goes.add_argument("run", type=Path, help="run folder of the plan")
+    goes.add_argument(
+        "--on", default="here", metavar="WHERE",
+        help="here, one by one (default); local:N, N at a time; or a Dask scheduler, tcp://HOST:8786",
+    )  # fmt: skip
+    goes.add_argument(
+        "--takes", action="append", default=[], metavar="NAME=NUMBER",
+        help="what each block takes of the resources that Dask workers have, such as GPU=1",
+    )  # fmt: skip
 
     methods = commands.add_parser("methods", help="say which methods there are, or what one can be told")
     methods.add_argument("name", nargs="?", metavar="NAME", help="method whose parameters to list")
@@ -187,14 +206,20 @@ def _colour(text: str) -> tuple[float, float, float] | None:
 
 
 def _train(chosen: argparse.Namespace) -> int:
+    from .runs.options import job_from
+
+    return _trained(lambda: job_from(chosen))
+
+
+def _trained(job_of: Callable[[], Job], **where: Any) -> int:
+    """Trains a job; whatever is wrong with it is told as the run's events are."""
     for name in ("SIGINT", "SIGTERM", "SIGBREAK"):  # the last is Windows' CTRL_BREAK_EVENT
         if hasattr(signal, name):  # heard also while torch loads, which takes seconds
             signal.signal(getattr(signal, name), signal.default_int_handler)
     from .runs.events import event_line
-    from .runs.options import job_from
 
     try:
-        job = job_from(chosen)
+        job = job_of()
         problems = _environment()["problems"]
         if problems:
             raise LodgsError(problems[0], _INSTALL)
@@ -205,7 +230,35 @@ def _train(chosen: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         print(event_line("cancelled", message="Stopped before training began."), flush=True)
         return 3
-    return train(job, sys.stdout)
+    return train(job, sys.stdout, **where)
+
+
+def _blocks(chosen: argparse.Namespace) -> int:
+    return (_plan_blocks if chosen.what == "plan" else _run_blocks)(chosen)
+
+
+def _plan_blocks(chosen: argparse.Namespace) -> int:
+    from .runs.blocks.plan import plan_table, write_plan
+    from .runs.folder import RunFolder
+    from .runs.job import keep_job
+    from .runs.options import job_from
+
+    job = job_from(chosen).resolved()
+    if not job.cells:
+        raise LodgsError("It is not said how many cells.", "Add --cells 2x4, for 2 columns of 4 each.")
+    folder = RunFolder(job.out)
+    folder.make()
+    keep_job(job, folder)
+    print(plan_table(write_plan(job, folder)))
+    print(f"Train them with: {PROGRAM} blocks run {folder.path}")
+    return 0
+
+
+def _run_blocks(chosen: argparse.Namespace) -> int:
+    from .runs.blocks.plan import planned_job
+    from .runs.options import amounts
+
+    return _trained(lambda: planned_job(chosen.run), on=chosen.on, resources=amounts(chosen.takes))
 
 
 def _methods(chosen: argparse.Namespace) -> int:
@@ -317,6 +370,7 @@ def _numbers(version: str) -> list[int]:
 
 _COMMANDS = {
     "train": _train,
+    "blocks": _blocks,
     "methods": _methods,
     "evaluate": _evaluate,
     "render": _render,

@@ -11,7 +11,7 @@ from tools import extension, setup
 
 ROOT = Path(__file__).resolve().parents[2]
 REQUIREMENTS = ROOT / "requirements"
-LOCKS = ["trainer", "cuda", "develop", "blender-5.0", "blender-5.2"]
+LOCKS = ["trainer", "cuda", "cluster", "develop", "blender-5.0", "blender-5.2"]
 
 PIN = r"(?P<name>[A-Za-z0-9._-]+)==(?P<version>[^\s;]+)(?P<marker> ; [^\\]+?)?"
 
@@ -52,7 +52,7 @@ def test_a_lock_has_what_was_asked_for_and_hashes(name):
     assert wanted and not wanted - locked(REQUIREMENTS / f"{name}.txt"), "run `make pins`"
 
 
-@pytest.mark.parametrize("name", ["cuda", "develop"])
+@pytest.mark.parametrize("name", ["cuda", "cluster", "develop"])
 def test_the_trainer_is_the_same_everywhere(name):
     """What artists install is what tests use, to the last dependency."""
     trainer, other = locked(REQUIREMENTS / "trainer.txt"), locked(REQUIREMENTS / f"{name}.txt")

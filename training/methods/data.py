@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -44,12 +44,17 @@ class TrainingData:
     """A scene's views, resized, and their photographs, never more than fit.
 
     Args:
+        whole: the scene that this one is a part of, whose units, and whose held-out views, count; None: it is
+            no part.
         photo_memory: bytes of photographs that are kept; None: ``targets.default_budget``. What is trained
             does not depend on it.
         splat_memory: bytes of splats that are kept by methods that have them in files; None: as they choose.
         scratch: where such methods make files, which a checkpoint tells of; None: in a temporary folder.
 
     Attributes:
+        scene: what is trained on.
+        whole: the scene that it is a part of, or the same.
+        whole_train: training cameras of the whole scene, at training size.
         train, test: cameras at training size; test views are every n-th by name (see ``Scene.split``).
         photographs: of any of these views.
     """
@@ -64,19 +69,23 @@ class TrainingData:
         photo_memory: int | None = None,
         splat_memory: int | None = None,
         scratch: Path | None = None,
+        whole: Scene | None = None,
     ) -> None:
         if len(scene.points) == 0:
             raise LodgsError(
                 f"The COLMAP model in {scene.model} has no 3D points, so there is nothing to train from.",
                 "Triangulate the model's points in COLMAP, or choose another model.",
             )
-        train, test = scene.split(test_every, validation)
+        self.whole = scene if whole is None else whole
+        all_train, all_test = self.whole.split(test_every, validation)
+        train, test = (_among(scene.cameras, each) for each in (all_train, all_test))
         if len(train) < 2:
             raise LodgsError(
                 f"The scene {scene.folder} has {len(train)} usable view(s) to train on; 2 are needed.",
                 "Check that the image folder holds the photographs that the model names.",
             )
         self.scene, self.exposure = scene, exposure
+        self.whole_train = [camera.scaled(image_scale) for camera in all_train]
         self.train = [camera.scaled(image_scale) for camera in train]
         self.test = [camera.scaled(image_scale) for camera in test]
         self.photographs = Targets(self._read, default_budget() if photo_memory is None else photo_memory)
@@ -94,22 +103,22 @@ class TrainingData:
     @cached_property
     def extent(self) -> float:
         """Scene extent in scene units: 1.1 x the largest distance of a camera from their mean."""
-        return self.scene.extent()
+        return self.whole.extent()
 
     @cached_property
     def median_depth(self) -> float:
         """Median depth of the points in the views, in scene units."""
-        return self.scene.median_depth()
+        return self.whole.median_depth()
 
     @cached_property
     def mean_camera(self) -> np.ndarray:
         """Mean position of the training cameras, (3,)."""
-        return np.mean([camera.center for camera in self.train], axis=0)
+        return np.mean([camera.center for camera in self.whole_train], axis=0)
 
     @cached_property
     def focal(self) -> float:
         """Focal length in pixels: the training views' median."""
-        return float(np.median([camera.focal for camera in self.train]))
+        return float(np.median([camera.focal for camera in self.whole_train]))
 
     @cached_property
     def support(self) -> Support:
@@ -119,7 +128,7 @@ class TrainingData:
     @cached_property
     def near(self) -> float:
         """Depth before which nothing is drawn, in scene units."""
-        return self.scene.near()
+        return self.whole.near()
 
     @cached_property
     def threshold_scale(self) -> float:
@@ -128,7 +137,7 @@ class TrainingData:
         The loss is a mean over pixels, and the gradient counts half image widths: for a splat of given
         size in pixels it grows as the image shrinks, with the inverse of the image's side.
         """
-        pixels = np.median([camera.width * camera.height for camera in self.train])
+        pixels = np.median([camera.width * camera.height for camera in self.whole_train])
         return float(np.sqrt(1e6 / pixels))
 
     def training_view(self, step: int, seed: int) -> int:
@@ -167,6 +176,12 @@ class TrainingData:
         assert camera.image is not None
         image = load_image(camera.image, camera.width, camera.height, exposure=self.exposure)
         return Target(torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))).permute(1, 2, 0))
+
+
+def _among(cameras: Sequence[Camera], others: Sequence[Camera]) -> list[Camera]:
+    """Those of some cameras that are among others, by name."""
+    names = {camera.name for camera in others}
+    return [camera for camera in cameras if camera.name in names]
 
 
 @lru_cache(8)

@@ -36,6 +36,8 @@ class MethodInfo:
         for_splats: whether it is what to offer first for splats that are there already.
         captured: values of parameters that are others where the photographs are the base's own pictures, by
             name, whatever the preset.
+        in_cells: the method that trains cells of a scene that is too large for one run: its own name, or one
+            whose splats, put together, are then its base; "" where cells cannot be put together.
         retired: names of parameters that earlier versions wrote into job files without any effect.
         package: the folder as a module, set where the method is found.
     """
@@ -51,6 +53,7 @@ class MethodInfo:
     from_base: bool = False
     base_in_parts: bool = False
     for_splats: bool = False
+    in_cells: str = ""
     captured: Mapping[str, Any] = field(default_factory=dict)
     retired: tuple[str, ...] = ()
     package: str = ""

@@ -121,13 +121,13 @@ class Method(ABC, Generic[P, D]):
     def meta(self) -> dict:
         """What a bundle records of this run. Methods add to it."""
         data = self.data
-        middle = min(data.train, key=lambda camera: np.linalg.norm(camera.center - data.mean_camera))
+        middle = min(data.whole_train, key=lambda camera: np.linalg.norm(camera.center - data.mean_camera))
         ahead = middle.center + data.median_depth * middle.world_to_camera[2, :3]
         return {
             "camera_center": data.mean_camera.tolist(),
             "view": [middle.center.tolist(), ahead.tolist()],
             "focal_px": data.focal,
-            "focal_width": data.train[0].width,
+            "focal_width": data.whole_train[0].width,
             "scene_extent": data.extent,
             "median_depth": data.median_depth,
             **({"antialias": True} if self.parameters.antialias else {}),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 from ..errors import LodgsError
@@ -11,6 +12,7 @@ from ..methods.data import TrainingData
 from ..scenes.cameras import Camera
 from ..scenes.colmap import read_scene, without
 from ..scenes.images import check_image
+from ..scenes.regions import Region
 from ..scenes.undistort import undistorted
 from .capture import capture
 from .folder import RunFolder
@@ -33,7 +35,9 @@ def training_data(
         LodgsError: if the scene cannot be read, or has too little to train on.
     """
     model, images = (Path(path) if path else None for path in (job.model, job.images))
-    scene = read_scene(_scene_folder(job, folder, tell), model=model, images=images)
+    whole = read_scene(_scene_folder(job, folder, tell), model=model, images=images)
+    region = Region.read(Path(job.region)) if job.region else None
+    scene = whole if region is None else region.views_of(whole)
     if pixels:
         scene = without(scene, _undecodable(scene.cameras))
     warnings = list(scene.warnings)
@@ -45,11 +49,15 @@ def training_data(
     for warning in warnings:
         if tell:
             tell("warning", message=warning)
+    if region is not None:
+        these = region.points_of(whole)
+        scene = replace(scene, points=whole.points[these], point_colors=whole.point_colors[these])
     return TrainingData(
         scene, job.image_scale, job.test_every, job.exposure, job.validation,
         photo_memory=job.photo_memory * 10**6 or None,
         splat_memory=job.splat_memory * 10**6 or None,
         scratch=folder.checkpoints,
+        whole=None if region is None else whole,
     )  # fmt: skip
 
 

@@ -4,7 +4,8 @@
           costs.png (what finding the distances of levels has told)
           model.npz (what a method with networks has beside its levels)
           undistorted/ (photographs without their lens's distortion, where they had some)
-          captured/ (the pictures of splats that had no photographs, as a COLMAP scene)
+          blocks/ (the runs of cells of a scene that is trained in cells, and what they are together)
+      captured/ (the pictures of splats that had no photographs, as a COLMAP scene)
           base.ply, cameras/ (the splats, and the views of them, that Blender has handed over)
           trainer.log, trainer.out (what a trainer that Blender started printed)  lock  cancel  reserve
 
@@ -55,6 +56,8 @@ class RunFolder:
         self.captured = self.path / "captured"
         self.base = self.path / "base.ply"
         self.cameras = self.path / "cameras"
+        self.blocks = self.path / "blocks"
+        self.whole = self.blocks / "whole.ply"
         self.reserve = self.path / "reserve"
         self._lock = self.path / "lock"
         self._cancel = self.path / "cancel"

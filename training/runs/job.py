@@ -23,6 +23,8 @@ DOME = "dome"
 """What ``capture`` is for views from all around."""
 VIEWS, VIEW_WIDTHS = (2, 2000), (32, 8192)
 """Bounds of how many views a dome has, and of the pixels that their pictures are wide."""
+MOST_CELLS = 256
+"""Most cells of a scene."""
 MOST_PATH = 2000
 """Most characters of a path, so that a job with all of its paths is within the bounds of a TOML file."""
 _KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
@@ -61,6 +63,9 @@ class Job:
         splat_memory: megabytes of splats, with what training keeps of each, that are in memory at a time,
             where a method can have the others in a file (tree). 0: half of the memory that is free. With less
             than all need, what is trained depends on it a little.
+        region: a file of ``scenes.regions``: what of the scene is trained on; "" for all.
+        cells: how many cells on the ground are trained one by one, "COLUMNSxROWS", and then put together; ""
+            for the scene as a whole.
         model, images: the COLMAP model's and the photographs' folder where they are not found by themselves.
         parameters: changes to the preset's parameters by name.
     """
@@ -83,6 +88,8 @@ class Job:
     splat_memory: int = 0
     model: str = ""
     images: str = ""
+    region: str = ""
+    cells: str = ""
     parameters: dict = field(default_factory=dict)
 
     @classmethod
@@ -123,7 +130,7 @@ class Job:
         for key in ("out",) if values.get("capture") else ("scene", "out"):
             if not values.get(key):
                 raise LodgsError(f"The job does not say '{key}'.", f'Add a line: {key} = "..."')
-        for key in ("scene", "out", "base", "capture", "model", "images"):
+        for key in ("scene", "out", "base", "capture", "model", "images", "region"):
             if values.get(key) and (key, values[key]) != ("capture", DOME):
                 values[key] = _path(key, values[key], folder)
         job = cls(**values)
@@ -165,6 +172,8 @@ class Job:
             )
         if self.capture:
             self._check_capture()
+        if self.cells:
+            self._check_cells()
         self.resolved_parameters()
 
     def _check_capture(self) -> None:
@@ -179,6 +188,28 @@ class Job:
                     "Leave out one of them: photographs are taken, or they are there.",
                 )
         check_views(self.views, self.view_width)
+
+    def _check_cells(self) -> None:
+        columns, rows = self.grid
+        if not 0 < columns * rows <= MOST_CELLS:
+            raise LodgsError(
+                f"cells = {self.cells!r} is not possible.",
+                f"Say columns and rows, such as 2x4, {MOST_CELLS} cells at most.",
+            )
+        for key in ("base", "capture", "region"):
+            if getattr(self, key):
+                raise LodgsError(f"The job says both 'cells' and '{key}'.", "Leave out one of them.")
+        if not method_info(self.method).in_cells:
+            raise LodgsError(
+                f"The method '{self.method}' cannot train cells one by one.",
+                "Choose another method, or leave out 'cells'.",
+            )
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Columns and rows of ``cells``; (0, 0) where it says none."""
+        columns, _, rows = self.cells.lower().partition("x")
+        return (int(columns), int(rows)) if columns.isdecimal() and rows.isdecimal() else (0, 0)
 
     def resolved_parameters(self) -> Parameters:
         """The preset's parameters with this job's changes."""
@@ -201,7 +232,7 @@ class Job:
         values = asdict(self)
         if Path(self.out) == path.parent:
             values["out"] = "."
-            for key in ("base", "capture"):
+            for key in ("base", "capture", "region"):
                 if values[key] != DOME and path.parent in Path(values[key]).parents:
                     values[key] = f"./{Path(values[key]).relative_to(path.parent).as_posix()}"
         table = values.pop("parameters")
@@ -209,6 +240,27 @@ class Job:
         lines += ["", "[parameters]"] + [_toml_line(name, value) for name, value in table.items()]
         with atomic_write(path) as temporary:
             Path(temporary).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def keep_job(job: Job, folder: RunFolder) -> None:
+    """Writes a resolved job into its run, which keeps to the one that it began with, but for CHANGEABLE.
+
+    Raises:
+        LodgsError: the folder is of another job.
+        OSError: it cannot be written.
+    """
+    if folder.job.exists():
+        before = asdict(Job.from_file(folder.job).resolved())
+        other = [key for key, value in asdict(job).items() if before[key] != value]
+        changed = [key for key in other if key not in CHANGEABLE]
+        if changed:
+            raise LodgsError(
+                f"The run folder {folder.path} belongs to another job (different: {', '.join(changed)}).",
+                "Choose another run folder, or start the run's own job.toml to resume it.",
+            )
+        if not set(other) - {"out"}:
+            return
+    job.write(folder.job)
 
 
 def check_views(views: int, width: int) -> None:

@@ -52,6 +52,11 @@ _OPTIONS: dict[str, dict] = {
         "type": _whole,
         "help": "splats in memory, where others can be in a file (tree); 0 is half of the free memory",
     },
+    "region": {"metavar": "FILE", "help": "what of the scene to train on, as the command blocks plans it"},
+    "cells": {
+        "metavar": "CxR",
+        "help": "train columns x rows of cells on the ground one by one, then put them together",
+    },
     "model": {"metavar": "DIR", "help": "folder of the COLMAP model, where it is not found by itself"},
     "images": {"metavar": "DIR", "help": "folder of the photographs, where it is not found by itself"},
 }
@@ -88,6 +93,21 @@ def job_from(chosen: argparse.Namespace) -> Job:
         raise LodgsError("It is not said what to train.", "Give a job file, or --scene DIR and --out RUN.")
     parameters = values.get("parameters", {}) | dict(map(_assignment, chosen.set))
     return Job.from_dict(values | given | {"parameters": parameters})
+
+
+def amounts(given: list[str]) -> dict[str, float] | None:
+    """What ``NAME=NUMBER`` texts say, by name; None where there are none.
+
+    Raises:
+        LodgsError: one does not say so.
+    """
+    found = {}
+    for text in given:
+        name, value = _assignment(text)
+        if not name or not isinstance(value, (int, float)) or not 0 < value < 2**31:
+            raise LodgsError(f"{printable(text[:200])} is not NAME=NUMBER.", "For example: GPU=1")
+        found[name] = float(value)
+    return found or None
 
 
 def _assignment(text: str) -> tuple[str, object]:

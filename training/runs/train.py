@@ -11,7 +11,7 @@ import time
 import traceback
 from _thread import interrupt_main
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import IO
 
 import numpy as np
@@ -34,29 +34,35 @@ from ..methods.method import Method
 from ..rasterize import cuda, device_of, resolve, warm_up
 from ..rasterize.resident import Resident
 from ..scenes.orientation import up_rotation
-from ..splats.bundle import NO_SPLATS, Bundle, Level, open_ply, write_bundle
+from ..splats.bundle import NO_SPLATS, Bundle, Level, open_ply, read_bundle, write_bundle
 from ..splats.dialects import comments_of
 from ..splats.gaussians import SplatRows
 from ..splats.ply import AT_ONCE, read_ply, write_ply
 from .base import open_base
+from .blocks.plan import write_plan
+from .blocks.train import BlocksStopped, train_blocks
+from .blocks.workers import HERE, workers
 from .checkpoints import read_newest, remove_checkpoints, write_checkpoint
 from .data import training_data
 from .events import PROTOCOL, Events, event_line
 from .failures import CANCELLED, CRASHED, DONE, in_words
 from .folder import RunFolder
-from .job import CHANGEABLE, Job
+from .job import Job, keep_job
 
 CHECKPOINT_SECONDS = float(os.environ.get("LODGS_CHECKPOINT_SECONDS", "60"))
 PROGRESS_SECONDS = 0.25, 10.0
 """Between two ``progress`` events, at first and at most: a thousandth of the time that it has taken."""
 
 
-def train(job: Job, stream: IO[str] | None = None) -> int:
+def train(
+    job: Job, stream: IO[str] | None = None, on: str = HERE, resources: dict[str, float] | None = None
+) -> int:
     """Runs a job, or goes on with it where its run folder was left.
 
     Args:
         job: what to do; a run folder that already holds another job is refused.
         stream: where the events go besides ``events.jsonl``.
+        on, resources: where a job's blocks are trained, if it has cells: see ``blocks.workers``.
 
     Returns:
         An exit code. Mistakes end in an ``error`` event, never in a traceback on the stream.
@@ -65,7 +71,7 @@ def train(job: Job, stream: IO[str] | None = None) -> int:
     try:
         folder.make()
         with folder.hold():
-            return _go_on(job.resolved(), folder, stream)
+            return _go_on(job.resolved(), folder, stream, on, resources)
     except BaseException as error:  # the run is not ours to write into
         code, event = _last_words(error)
         if stream is not None:
@@ -74,9 +80,11 @@ def train(job: Job, stream: IO[str] | None = None) -> int:
         return code
 
 
-def _go_on(job: Job, folder: RunFolder, stream: IO[str] | None) -> int:
+def _go_on(
+    job: Job, folder: RunFolder, stream: IO[str] | None, on: str, resources: dict[str, float] | None
+) -> int:
     """Begins, resumes or only repeats the end of the run in a folder that is held; returns an exit code."""
-    _keep_job(job, folder)
+    keep_job(job, folder)
     end = folder.end_event()
     if end is not None and end["event"] == "done" and folder.bundle.exists():
         remove_checkpoints(folder)  # a trainer that was killed after its last word has left them
@@ -85,7 +93,7 @@ def _go_on(job: Job, folder: RunFolder, stream: IO[str] | None) -> int:
         return DONE
     events = Events(folder.events_file, folder.reserve, stream)  # from here on the run says what happens
     try:
-        return _train(job, folder, events)
+        return _train(job, folder, events, on, resources)
     except BaseException as error:
         code, event = _last_words(error)
         events.last(**event)
@@ -96,6 +104,8 @@ def _go_on(job: Job, folder: RunFolder, stream: IO[str] | None) -> int:
 
 def _last_words(error: BaseException) -> tuple[int, dict]:
     """Exit code and last event of a training that ends with an exception."""
+    if isinstance(error, BlocksStopped):
+        return CANCELLED, {"kind": "cancelled", "message": str(error)}
     if isinstance(error, KeyboardInterrupt):
         return CANCELLED, {"kind": "cancelled", "message": "Stopped; it can be resumed."}
     what, remedy, code = in_words(error)
@@ -105,13 +115,20 @@ def _last_words(error: BaseException) -> tuple[int, dict]:
     return code, {"kind": "error", "what": what, "remedy": remedy}
 
 
-def _train(job: Job, folder: RunFolder, events: Events) -> int:
+def _train(job: Job, folder: RunFolder, events: Events, on: str, resources: dict[str, float] | None) -> int:
     started = time.monotonic()
     events(
         "hello", protocol=PROTOCOL, version=VERSION, method=job.method, preset=job.preset,
         scene=job.scene, out=str(folder.path), pid=os.getpid(),
     )  # fmt: skip
     with _interrupted_by_cancel(folder):
+        together = bool(job.cells) and METHODS[job.method].in_cells == job.method
+        if job.cells:
+            whole = folder.bundle if together else folder.whole
+            blocks = write_plan(job, folder)
+            with workers(on, resources) as submit:
+                train_blocks(blocks, whole, submit, events)
+            job = replace(job, cells="", base="" if together else str(whole))
         events("status", message="Reading the scene")
         data = training_data(job, folder, events)
         events("status", message="Preparing to train (the first time on a computer up to a minute)")
@@ -120,6 +137,8 @@ def _train(job: Job, folder: RunFolder, events: Events) -> int:
         backend = resolve(job.backend)
         warm_up(backend)
         _tell_backend(backend, events)
+        if together:
+            return _hand_over(folder, events, Evaluation(data, backend), started)
         run = _Run(job, backend, folder, events, data)
     with _stop_signals() as stopped:
         if not run.to_the_end(stopped):
@@ -131,6 +150,32 @@ def _train(job: Job, folder: RunFolder, events: Events) -> int:
     run.method.close()
     remove_checkpoints(folder)
     return DONE
+
+
+def _hand_over(folder: RunFolder, events: Events, evaluation: Evaluation, started: float) -> int:
+    """Hands over the levels that blocks were put together to, and says what they are worth."""
+    bundle = read_bundle(folder.bundle)
+    evaluation.antialias = bundle.antialias
+    alone = [level.number for level in levels_alone(bundle)]
+    for place, level in enumerate(bundle.levels, 1):
+        path = folder.levels_folder / f"level_{level.number}.ply"
+        write_ply(path, level.rows, comments_of(bundle.meta))
+        quality = evaluation.measure_level(bundle, level) if level.number in alone else {}
+        told = quality | _as_event(bundle, level, f"levels/{path.name}")
+        events("level", **told, again=False, more=place < len(bundle.levels))
+    events("status", message="Measuring the result")
+    seconds = round(time.monotonic() - started, 1)
+    events("done", bundle=folder.bundle.name, seconds=seconds, **summary(evaluation, bundle))
+    return DONE
+
+
+def _as_event(bundle: Bundle, level: Level, path: str) -> dict:
+    """What a ``level`` event says of a level and of the bundle that it belongs to."""
+    return {
+        "level": level.number, "path": path, "splats": len(level.rows), "facts": level.facts,
+        "rule": bundle.rule, "scene_facts": bundle.facts, "controls": bundle.controls,
+        "cumulative": bundle.cumulative, "meta": bundle.meta,
+    }  # fmt: skip
 
 
 class _Run:
@@ -210,7 +255,7 @@ class _Run:
         """All levels, as they were written one by one, in one file."""
         self.folder.require_held()
         levels = [self._written(record) for record in self.levels]
-        up = up_rotation(self.data.scene.cameras).round(6)
+        up = up_rotation(self.data.whole.cameras).round(6)
         meta = {**self.method.meta(), "up_rotation": up, "seed": self.job.seed}
         if self.job.test_every:
             meta["held_out"] = [self.job.test_every // 2 if self.job.validation else 0, self.job.test_every]
@@ -281,8 +326,7 @@ class _Run:
                 coarser = [other for other in levels if other.number < level.number]
                 quality = self.evaluation.measure_level(replace(bundle, levels=[*coarser, level]), level)
             self.events(
-                "level", **(quality | record), rule=bundle.rule, scene_facts=bundle.facts,
-                controls=bundle.controls, cumulative=bundle.cumulative, meta=bundle.meta,
+                "level", **(quality | _as_event(bundle, level, record["path"])),
                 again=level.number in known, more=place < len(levels),
             )  # fmt: skip
             known[level.number] = record
@@ -317,22 +361,6 @@ def _seen(base: SplatRows, data: TrainingData) -> bool:
         if any(camera.sees(means, near=data.near).any() for camera in data.train):
             return True
     return False
-
-
-def _keep_job(job: Job, folder: RunFolder) -> None:
-    """Writes the job into the run; a run folder keeps to the job that it began with, but for the backend."""
-    if folder.job.exists():
-        before = asdict(Job.from_file(folder.job).resolved())
-        other = [key for key, value in asdict(job).items() if before[key] != value]
-        changed = [key for key in other if key not in CHANGEABLE]
-        if changed:
-            raise LodgsError(
-                f"The run folder {folder.path} belongs to another job (different: {', '.join(changed)}).",
-                "Choose another run folder, or start the run's own job.toml to resume it.",
-            )
-        if not set(other) - {"out"}:
-            return
-    job.write(folder.job)
 
 
 def _tell_backend(backend: str, events: Events) -> None:

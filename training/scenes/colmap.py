@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -12,7 +12,17 @@ import numpy as np
 from ..errors import LodgsError, printable
 from .cameras import FARTHEST, Camera
 from .images import image_size
-from .model import DAMAGED, Intrinsics, Pose, model_suffix, read_cameras, read_points, read_poses, registered
+from .model import (
+    DAMAGED,
+    Intrinsics,
+    Pose,
+    model_suffix,
+    read_cameras,
+    read_observations,
+    read_points,
+    read_poses,
+    registered,
+)
 from .orientation import up_rotation
 from .photographs import Photographs, image_folder
 
@@ -38,6 +48,7 @@ class Scene:
         point_colors: (P, 3) uint8.
         distorted: names of views whose lens distorts; their cameras are the pinhole part of the lens.
         warnings: one sentence for each thing that was left out or is odd.
+        point_ids: (P,) int64, the model's own; none where the points come from elsewhere.
     """
 
     folder: Path
@@ -48,6 +59,7 @@ class Scene:
     point_colors: np.ndarray
     distorted: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    point_ids: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def split(self, test_every: int, validation: bool = False) -> tuple[list[Camera], list[Camera]]:
         """Training and held-out cameras: of every `test_every` by name the first is held out; 0: none is.
@@ -199,7 +211,7 @@ def read_scene(
             "Choose the folder that holds the images under the names that the model uses.",
         )
 
-    points, colors = read_points(model)
+    points, colors, ids = read_points(model)
     if not len(points):
         warnings.append(f"{model} has no points in points3D{model_suffix(model)}: the scene has no points.")
     possible = (np.abs(points) <= FARTHEST).all(axis=1)
@@ -220,6 +232,7 @@ def read_scene(
         cameras=views.cameras,
         points=points[possible],
         point_colors=colors[possible],
+        point_ids=ids[possible],
         distorted=views.distorted,
         warnings=[*warnings, *views.warnings(images)],
     )
@@ -248,6 +261,21 @@ def without(scene: Scene, reasons: dict[str, str]) -> Scene:
         distorted=[name for name in scene.distorted if name not in reasons],
         warnings=[*scene.warnings, *_told(list(reasons.items()))],
     )
+
+
+def observed(scene: Scene, names: Collection[str]) -> np.ndarray:
+    """Which of the scene's points some of its views, by name, observe, (P,).
+
+    Where the model does not tell, as of points that come from elsewhere, those count that a view could see.
+    """
+    seen = np.zeros(len(scene.points), bool)
+    if len(scene.point_ids):
+        seen = np.isin(scene.point_ids, read_observations(scene.model, names))
+    if not seen.any():
+        for camera in scene.cameras:
+            if camera.name in names:
+                seen |= camera.sees(scene.points)
+    return seen
 
 
 def _absolute(path: Path | str) -> Path:

@@ -8,7 +8,9 @@ at most five times as much, and for text ten times.
 from __future__ import annotations
 
 import struct
+from collections.abc import Collection
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -139,8 +141,16 @@ def read_poses(model: Path) -> list[Pose]:
     return _read(model, "images", {".bin": _images_bin, ".txt": _images_txt})
 
 
-def read_points(model: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The points of a model: positions (P, 3) float32, finite or not, and colours (P, 3) uint8.
+def read_observations(model: Path, names: Collection[str]) -> np.ndarray:
+    """The ids of the points that some images, by name, observe: (O,) int64, each once, ascending."""
+    seen = _read(
+        model, "images", {".bin": partial(_seen_bin, names=names), ".txt": partial(_seen_txt, names=names)}
+    )
+    return np.unique(np.concatenate([_NO_IDS, *seen]))
+
+
+def read_points(model: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The points of a model: positions (P, 3) float32, finite or not, colours (P, 3) uint8, ids (P,) int64.
 
     A model without a file of them has none.
     """
@@ -227,6 +237,39 @@ def _images_txt(data: bytes) -> list[Pose]:
     return poses
 
 
+def _seen_bin(data: bytes, names: Collection[str]) -> list[np.ndarray]:
+    (count,), at, seen = struct.unpack_from("<Q", data), 8, []
+    for _ in range(count):
+        end = data.index(b"\0", at + 64)
+        (points2d,) = struct.unpack_from("<Q", data, end + 1)
+        if _name(data[at + 64 : end]) in names:
+            seen.append(_observed(np.frombuffer(data, _POINT2D, points2d, end + 9)["point"]))
+        at = end + 9 + 24 * points2d
+    return seen
+
+
+def _seen_txt(data: bytes, names: Collection[str]) -> list[np.ndarray]:
+    seen, lines = [], iter(data.split(b"\n"))
+    for line in lines:
+        line = line.strip()
+        if not line or line.startswith(b"#"):
+            continue
+        points2d = next(lines, b"")
+        if _name(line.split(maxsplit=9)[9]) in names:
+            seen.append(_observed(np.array(points2d.split()[2::3], np.int64)))
+    return seen
+
+
+def _observed(ids: np.ndarray) -> np.ndarray:
+    """Without the 2D points that are no point's, of which the id is -1."""
+    return ids[ids >= 0]
+
+
+def _name(name: bytes) -> str:
+    """As `Camera.name` has it."""
+    return name.decode("utf-8", "surrogateescape").replace("\\", "/")
+
+
 def _pose(name: bytes, camera_id: int, pose: list[float]) -> Pose:
     """Rotation from a unit quaternion (w, x, y, z) and translation, both world to camera."""
     quaternion, translation = np.array(pose[:4]), np.array(pose[4:])
@@ -247,14 +290,16 @@ def _pose(name: bytes, camera_id: int, pose: list[float]) -> Pose:
 
 
 # A record of points3D.bin, packed; `track` pairs of 4-byte integers follow it.
+_POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
 _TRACK_AT = 43
 _BLOCK = 1 << 17
-_NO_POINTS = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+_NO_IDS = np.zeros(0, np.int64)
+_NO_POINTS = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), _NO_IDS
 _MARK = b"\xef\xbb\xbf"  # Windows' programs begin UTF-8 with it
 
 
-def _points_bin(data: bytes) -> tuple[np.ndarray, np.ndarray]:
+def _points_bin(data: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     (count,) = struct.unpack_from("<Q", data)
     body = np.frombuffer(data, np.uint8, offset=8)
     starts = _point_starts(body)
@@ -263,7 +308,7 @@ def _points_bin(data: bytes) -> tuple[np.ndarray, np.ndarray]:
     if not count:
         return _NO_POINTS
     records = np.lib.stride_tricks.sliding_window_view(body, _POINT.itemsize)[starts].view(_POINT)[:, 0]
-    return _float32(records["xyz"]), records["rgb"].copy()
+    return _float32(records["xyz"]), records["rgb"].copy(), records["id"].astype(np.int64)
 
 
 def _point_starts(body: np.ndarray) -> np.ndarray:
@@ -308,13 +353,14 @@ def _chain(block: np.ndarray) -> tuple[np.ndarray, int]:
     return starts[chain], int(ends[chain[-1]]) if len(chain) else 0
 
 
-def _points_txt(data: bytes) -> tuple[np.ndarray, np.ndarray]:
+def _points_txt(data: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     lines = _lines(data)
     _expect(len(lines), data, "points")
     if not lines:
         return _NO_POINTS
-    table = np.loadtxt(lines, usecols=range(1, 7), ndmin=2)
-    return _float32(table[:, :3]), np.nan_to_num(table[:, 3:]).clip(0, 255).astype(np.uint8)
+    table = np.loadtxt(lines, usecols=range(7), ndmin=2)
+    colors = np.nan_to_num(table[:, 4:]).clip(0, 255).astype(np.uint8)
+    return _float32(table[:, 1:4]), colors, np.nan_to_num(table[:, 0]).astype(np.int64)
 
 
 def _float32(positions: np.ndarray) -> np.ndarray:

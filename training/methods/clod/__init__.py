@@ -95,4 +95,5 @@ METHOD = MethodInfo(
     rule="decay",
     offered=("max_splats", "keep_share", "s_v_most"),
     from_base=True,
+    in_cells="clod",
 )

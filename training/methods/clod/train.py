@@ -259,10 +259,10 @@ class Method(threedgs_train.Method):
 
     def _far_distance(self, quantile: float) -> float:
         """A quantile of the distances between training views and the scene's points that they see."""
-        points = self.data.scene.points
+        points = self.data.whole.points
         points = points[:: max(1, len(points) // POINTS)]
         seen = [
             np.linalg.norm(points[camera.sees(points, near=self.data.near)] - camera.center, axis=1)
-            for camera in self.data.train
+            for camera in self.data.whole_train
         ]
         return float(np.quantile(np.concatenate(seen), quantile))

@@ -110,4 +110,5 @@ METHOD = MethodInfo(
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     rule="bands",
     offered=("levels", "footprint", "max_splats"),
+    in_cells="flod",
 )

@@ -126,4 +126,5 @@ METHOD = MethodInfo(
     offered=("levels", "max_splats", "drawn", "keep", "chunks"),
     from_base=True,
     for_splats=True,
+    in_cells="3dgs",
 )

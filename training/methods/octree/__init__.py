@@ -148,4 +148,5 @@ METHOD = MethodInfo(
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     rule="octree",
     offered=("levels", "max_splats"),
+    in_cells="octree",
 )

@@ -35,9 +35,10 @@ def plant(
         The schedule with its tree; points (N, 3), their colours (N, 3) uint8, and their levels (N,).
     """
     p = parameters
+    everywhere, _ = distinct(data.whole.points, data.whole.point_colors)
     points, colors = distinct(data.scene.points, data.scene.point_colors)
     octree = tree.build(
-        points, data.train, focal_px=data.focal, footprint=p.footprint,
+        everywhere, data.whole_train, focal_px=data.focal, footprint=p.footprint,
         quantiles=(p.nearest, p.farthest), levels=p.levels, coarser=p.coarser_levels,
     )  # fmt: skip
     schedule = Schedule(data, p, seed, octree)

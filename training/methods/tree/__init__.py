@@ -105,4 +105,5 @@ METHOD = MethodInfo(
     base_in_parts=True,
     for_splats=True,
     captured={"leaf_rate": 0.0, "random_background": False},  # leaves are right, and black is nothing
+    in_cells="3dgs",
 )

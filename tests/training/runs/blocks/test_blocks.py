@@ -1,0 +1,365 @@
+"""Blocks: what a plan asks of them, how they are put together, and whatever befalls them on the way."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import Future
+from contextlib import suppress
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from training.errors import LodgsError
+from training.methods import METHODS
+from training.runs import train as training_loop
+from training.runs.blocks import train as blocks_module
+from training.runs.blocks.merge import merge
+from training.runs.blocks.plan import Block, read_plan, write_plan
+from training.runs.blocks.train import BlocksStopped, train_blocks
+from training.runs.data import training_data
+from training.runs.events import event_line
+from training.runs.folder import RunFolder
+from training.runs.job import Job
+from training.scenes.regions import Region
+from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
+from training.splats.gaussians import Splats
+
+ROOT = Path(__file__).resolve().parents[4]
+FEW = {"max_splats": 200, "random_background": False}
+TINY = {"steps": 45, "densify_interval": 10, "grad_threshold": 1e-5, **FEW}
+
+
+def job_for(scene, out, method="3dgs", **further) -> Job:
+    parameters = further.pop("parameters", TINY)
+    return Job.from_dict({
+        "scene": str(scene), "out": str(out), "method": method, "image_scale": 1.0, "test_every": 4,
+        "cells": "2x1", "parameters": parameters, **further,
+    })  # fmt: skip
+
+
+def planned(job: Job) -> list[Block]:
+    folder = RunFolder(job.out)
+    folder.make()
+    return write_plan(job.resolved(), folder)
+
+
+# -- a plan ------------------------------------------------------------------------------------------------
+
+
+def test_each_view_is_seen_as_often_as_in_the_whole(tiny_scene, tmp_path):
+    job = job_for(tiny_scene, tmp_path / "run", parameters={**TINY, "steps": 600, "max_splats": 1000})
+    whole = training_data(replace(job, cells=""), RunFolder(tmp_path))
+    for block in planned(job):
+        data, p = training_data(block.job, block.folder), block.job.resolved_parameters()
+        assert p.steps / len(data.train) == pytest.approx(600 / len(whole.train), abs=0.5)
+        assert p.max_splats == pytest.approx(1000 * len(data.scene.points) / len(whole.scene.points), abs=0.5)
+        assert block.job.method == "3dgs" and block.job.cells == ""
+
+
+@pytest.mark.parametrize("method", ["flod", "octree", "clod", "3dgs", "lodge", "tree"])
+def test_all_have_the_units_of_the_whole_and_hold_out_its_views(tiny_scene, tmp_path, method):
+    job = job_for(tiny_scene, tmp_path / "run", method, parameters={})
+    whole = training_data(replace(job, cells=""), RunFolder(tmp_path))
+    blocks = planned(job)
+    seen = set()
+    for block in blocks:
+        data = training_data(block.job, block.folder)
+        for name in ("extent", "median_depth", "near", "focal", "threshold_scale"):
+            assert getattr(data, name) == getattr(whole, name)
+        np.testing.assert_array_equal(data.mean_camera, whole.mean_camera)
+        held_out = {camera.name for camera in whole.test}
+        assert {camera.name for camera in data.test} == held_out & set(block.region.views)
+        assert not {camera.name for camera in data.train} & held_out
+        seen |= {camera.name for camera in data.train}
+        assert 0 < len(data.scene.points) <= len(whole.scene.points)
+    assert seen == {camera.name for camera in whole.train}
+    assert {block.job.method for block in blocks} == {METHODS[method].in_cells}
+
+
+def test_blocks_of_a_plan_are_relative_to_it(tiny_scene, tmp_path):
+    planned(job_for(tiny_scene, tmp_path / "run"))
+    (tmp_path / "run").rename(tmp_path / "moved")
+    for block in read_plan(RunFolder(tmp_path / "moved")):
+        assert Path(block.job.region) == block.folder.path / "region.json"
+        assert Path(block.job.out) == block.folder.path
+
+
+def test_what_cannot_be_is_refused_in_a_sentence(tiny_scene, tmp_path):
+    for cells in ("0x2", "2", "axb", "1000x1000", "-1x2", "2x2x2"):
+        with pytest.raises(LodgsError, match="cells"):
+            job_for(tiny_scene, tmp_path / "run", cells=cells)
+    with pytest.raises(LodgsError, match="cells one by one"):
+        job_for(tiny_scene, tmp_path / "run", "octree_neural", parameters={})
+    with pytest.raises(LodgsError, match="both 'cells' and 'region'"):
+        job_for(tiny_scene, tmp_path / "run", region="region.json")
+    with pytest.raises(LodgsError, match="too few"):
+        planned(job_for(tiny_scene, tmp_path / "run", cells="5x1"))
+    assert not (tmp_path / "run" / "blocks").exists()
+
+
+# -- put together ------------------------------------------------------------------------------------------
+
+
+def finished(folder: Path, number: int, cell, splats: list[Splats], **further) -> Block:
+    """A block with a bundle of these levels."""
+    run = RunFolder(folder / str(number))
+    run.make()
+    levels = [Level(i, each, {"s_min": 1.0 / i}) for i, each in enumerate(splats, 1)]
+    write_bundle(run.bundle, Bundle(**({"method": "flod", "rule": "bands"} | further), levels=levels))
+    inside = np.array([cell, [-np.inf, np.inf]])
+    return Block(number, run, Region(np.eye(3), inside, inside, ("a",)))
+
+
+def random_splats(rng, count) -> Splats:
+    return Splats(
+        rng.normal(0, 1, (count, 3)).astype(np.float32), rng.normal(size=(count, 4)).astype(np.float32),
+        rng.normal(-3, 1, (count, 3)).astype(np.float32), rng.normal(size=count).astype(np.float32),
+        rng.normal(size=(count, 4, 3)).astype(np.float32), {"lod_level": np.arange(count, dtype=np.int32)},
+    )  # fmt: skip
+
+
+def test_every_splat_of_its_own_cell_is_there_once_and_no_other(tmp_path, monkeypatch):
+    from training.runs.blocks import merge as merge_module
+
+    monkeypatch.setattr(merge_module, "AT_ONCE", 7)
+    rng = np.random.default_rng(0)
+    sets = [[random_splats(rng, n) for n in (20, 50)] for _ in range(3)]
+    cells = [(-np.inf, -0.3), (-0.3, 0.4), (0.4, np.inf)]
+    blocks = [
+        finished(tmp_path, i, cell, its) for i, (cell, its) in enumerate(zip(cells, sets, strict=True), 1)
+    ]
+    kept = merge(blocks, tmp_path / "whole.ply")
+    made = read_bundle(tmp_path / "whole.ply")
+    assert [level.facts for level in made.levels] == [{"s_min": 1.0}, {"s_min": 0.5}]
+    assert sum(own for own, _ in kept) == sum(len(level.splats) for level in made.levels)
+    assert [all_ for _, all_ in kept] == [70, 70, 70]
+    for number, level in enumerate(made.levels):
+        wanted = Splats.concatenated([
+            its[number].select((its[number].means[:, 0] >= low) & (its[number].means[:, 0] < high))
+            for (low, high), its in zip(cells, sets, strict=True)
+        ])  # fmt: skip
+        for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
+            np.testing.assert_array_equal(getattr(level.splats, name), getattr(wanted, name))
+        np.testing.assert_array_equal(level.splats.extras["lod_level"], wanted.extras["lod_level"])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["1", "2", "3", "whole.ply"]
+
+
+def test_blocks_that_do_not_belong_together_are_refused(tmp_path):
+    rng = np.random.default_rng(0)
+    one = finished(tmp_path, 1, (-np.inf, 0), [random_splats(rng, 9)])
+    other = finished(tmp_path, 2, (0, np.inf), [random_splats(rng, 9)], method="3dgs", rule="")
+    with pytest.raises(LodgsError, match="another kind"):
+        merge([one, other], tmp_path / "whole.ply")
+    assert not (tmp_path / "whole.ply").exists()
+
+
+# -- whatever befalls them -----------------------------------------------------------------------------------
+
+
+class Workers:
+    """Train blocks as they are told: by block, what each attempt does, given the block's folder."""
+
+    def __init__(self, **plans) -> None:
+        self.plans = {name.removeprefix("block_"): list(plan) for name, plan in plans.items()}
+        self.attempts = dict.fromkeys(self.plans, 0)
+
+    def __call__(self, folder: Path) -> Future:
+        future: Future = Future()
+        what = self.plans[folder.name][min(self.attempts[folder.name], len(self.plans[folder.name]) - 1)]
+        self.attempts[folder.name] += 1
+
+        def work() -> None:
+            try:
+                future.set_result(what(RunFolder(folder)))
+            except Exception as error:
+                future.set_exception(error)
+
+        threading.Thread(target=work, daemon=True).start()
+        return future
+
+
+def progressing(step: int, code: int):
+    def work(folder: RunFolder) -> int:
+        line = event_line(
+            "progress", level=1, levels=1, step=step, of=45, loss=0.1, psnr=20.0, splats=9, steps_per_s=1.0,
+            eta_s=1.0,
+        )  # fmt: skip
+        with folder.events_file.open("a") as file:
+            file.write(line + "\n")
+        return code
+
+    return work
+
+
+def done(folder: RunFolder) -> int:
+    made = finished(folder.path.parent / "made", int(folder.path.name), (-np.inf, np.inf), [LEVEL])
+    made.folder.bundle.rename(folder.bundle)
+    with folder.events_file.open("a") as file:
+        file.write(event_line("done", bundle="bundle.ply") + "\n")
+    return 0
+
+
+def lost(_: RunFolder) -> int:
+    raise RuntimeError("the worker is gone")
+
+
+def refused(folder: RunFolder) -> int:
+    with folder.events_file.open("a") as file:
+        file.write(event_line("error", what="The disk is full.", remedy="Free some space.") + "\n")
+    return 2
+
+
+def cancelled(_: RunFolder) -> int:
+    return 3
+
+
+LEVEL = random_splats(np.random.default_rng(3), 5)
+
+
+@pytest.fixture
+def blocks(tiny_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(blocks_module, "LOOKS", 0.005)
+    return planned(job_for(tiny_scene, tmp_path / "run"))
+
+
+def trained(blocks, workers, tell=lambda *_, **__: None):
+    path = blocks[0].folder.path.parent / "whole.ply"
+    train_blocks(blocks, path, workers, tell)
+    return path
+
+
+def test_a_block_that_gets_on_is_begun_again_as_often_as_it_is_lost(blocks):
+    workers = Workers(block_1=[*(progressing(i, -9) for i in range(8)), lost, done], block_2=[done])
+    assert trained(blocks, workers).exists()
+    assert workers.attempts == {"1": 10, "2": 1}
+
+
+def test_one_that_does_not_get_on_ends_the_run_after_the_others_are_done(blocks):
+    workers = Workers(block_1=[lost], block_2=[progressing(3, -9), done])
+    with pytest.raises(LodgsError, match=r"Block 1 was lost 3 times at step 0 \(the worker is gone\)"):
+        trained(blocks, workers)
+    assert blocks[1].folder.bundle.exists() and workers.attempts == {"1": 3, "2": 2}
+    again = Workers(block_1=[done], block_2=[lost])
+    assert trained(blocks, again).exists()
+    assert again.attempts == {"1": 1, "2": 0}, "what is finished is not begun again"
+
+
+def test_what_is_wrong_with_a_block_is_said_in_its_words(blocks):
+    with pytest.raises(LodgsError, match="Block 2: The disk is full") as found:
+        trained(blocks, Workers(block_1=[done], block_2=[refused]))
+    assert found.value.remedy == "Free some space."
+
+
+def test_a_block_can_be_stopped_alone_and_gone_on_with(blocks):
+    with pytest.raises(BlocksStopped, match="block 2"):
+        trained(blocks, Workers(block_1=[done], block_2=[cancelled]))
+    assert trained(blocks, Workers(block_1=[lost], block_2=[done])).exists()
+
+
+def test_an_interrupt_stops_all_politely(blocks):
+    def until_cancelled(folder: RunFolder) -> int:
+        while not folder.take_cancel():
+            time.sleep(0.002)
+        return 3
+
+    def interrupt(kind, **_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        trained(blocks, Workers(block_1=[until_cancelled], block_2=[until_cancelled]), interrupt)
+
+
+def test_how_all_get_on_is_one_event(blocks):
+    told = []
+    workers = Workers(block_1=[progressing(20, -9), done], block_2=[progressing(10, -9), done])
+    trained(blocks, workers, lambda kind, **values: told.append((kind, values)))
+    *_, last = (values for kind, values in told if kind == "progress")
+    steps = [block.job.resolved_parameters().total_steps for block in blocks]
+    assert last["step"] == last["of"] == sum(steps)
+    assert last["blocks"] == [
+        {"block": number, "state": "done", "step": step, "of": step} for number, step in enumerate(steps, 1)
+    ]
+    from training.runs.events import _well_formed
+
+    event = json.loads(event_line("progress", **last))
+    assert _well_formed(event) == event, "whoever reads runs understands it"
+
+
+# -- from the outside ----------------------------------------------------------------------------------------
+
+
+def run_all(keys: dict) -> tuple[int, RunFolder]:
+    return training_loop.train(Job.from_dict(keys)), RunFolder(keys["out"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["3dgs", "flod", "octree"])
+def test_cells_give_a_bundle_like_the_whole(tiny_scene, tmp_path, method):
+    parameters = {
+        "3dgs": TINY,
+        "flod": {**TINY, "levels": 3, "steps": [15, 15, 15], "footprint": 6.0},
+        "octree": {**FEW, "levels": 3, "steps": 45, "footprint": 6.0},
+    }[method]
+    keys = asdict(job_for(tiny_scene, tmp_path / "cells", method, parameters=parameters))
+    code, folder = run_all(keys)
+    assert code == 0, folder.events()[0][-1]
+    code, whole = run_all({**keys, "cells": "", "out": str(tmp_path / "whole")})
+    assert code == 0
+    one, other = read_bundle(folder.bundle), read_bundle(whole.bundle)
+    assert (one.method, one.rule, one.facts, one.controls) == (
+        other.method,
+        other.rule,
+        other.facts,
+        other.controls,
+    )
+    assert [level.number for level in one.levels] == [level.number for level in other.levels]
+    assert [level.facts for level in one.levels] == [level.facts for level in other.levels]
+    same = {key: value for key, value in one.meta.items() if key in other.meta}
+    assert same == other.meta
+    assert [event["splats"] for event in folder.levels()] == [len(level.splats) for level in one.levels]
+    assert folder.state() == "done" and "train_psnr" in folder.last("done")
+
+
+@pytest.mark.slow
+def test_a_tree_is_built_over_what_blocks_give_together(tiny_scene, tmp_path):
+    parameters = {**TINY, "tune_steps": 5}
+    keys = asdict(job_for(tiny_scene, tmp_path / "cells", "tree", parameters=parameters))
+    code, folder = run_all(keys)
+    assert code == 0, folder.events()[0][-1]
+    leaves, made = read_bundle(folder.whole), read_bundle(folder.bundle)
+    assert made.rule == "cut" and len(made.levels[-1].splats) == len(leaves.levels[-1].splats)
+
+
+@pytest.mark.slow
+def test_trainers_killed_and_a_run_interrupted_end_in_the_same_bundle(tiny_scene, tmp_path):
+    keys = asdict(job_for(tiny_scene, tmp_path / "calm", parameters={**TINY, "steps": 300}))
+    code, calm = run_all(keys)
+    assert code == 0
+    path = tmp_path / "job.json"
+    path.write_text(json.dumps({**keys, "out": str(tmp_path / "wild")}))
+    environment = {**os.environ, "LODGS_CHECKPOINT_SECONDS": "0.2"}
+    wild, kills = RunFolder(tmp_path / "wild"), 0
+    for attempt in range(20):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "training", "train", str(path)], cwd=ROOT, env=environment,
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        until = time.monotonic() + 120
+        while process.poll() is None and time.monotonic() < until:
+            time.sleep(0.5)
+            for block in read_plan(wild) if wild.blocks.exists() else ():
+                if kills < 4 and block.folder.running and block.folder.last("progress"):
+                    with suppress(LodgsError):  # it has just ended by itself
+                        block.folder.end()
+                        kills += 1
+            if attempt == 0 and kills >= 2:
+                process.send_signal(signal.SIGKILL)
+        if process.wait() == 0:
+            break
+    assert wild.bundle.read_bytes() == calm.bundle.read_bytes() and kills >= 2

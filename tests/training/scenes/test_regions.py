@@ -1,0 +1,154 @@
+"""Cells on the ground: their borders and views against cases worked by hand, tracks against pycolmap's."""
+
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+
+from training.errors import LodgsError
+from training.scenes.cameras import Camera, look_at
+from training.scenes.colmap import Scene, observed, read_scene
+from training.scenes.regions import ENLARGED, IN_SIGHT, Region, plan_cells
+
+from .synthetic import write_scene
+
+
+def looking(name, eye, target, width=64, height=48, focal=40.0):
+    pose = look_at(np.array(eye, float), np.array(target, float), np.array([0.0, 0, 1]))
+    return Camera(name, width, height, focal, focal, width / 2, height / 2, pose)
+
+
+def scene_of(cameras, points, tmp_path):
+    points = np.array(points, np.float32)
+    return Scene(tmp_path, tmp_path, tmp_path, cameras, points, np.zeros(points.shape, np.uint8))
+
+
+@pytest.fixture
+def grid(tmp_path):
+    """4 by 2 views that stand 10 apart and look down; points all over the place, from z = 0 to 1."""
+    cameras = [
+        looking(f"{x}{y}", (10 * x, 10 * y, 3), (10 * x, 10 * y + 0.1, 0)) for x in range(4) for y in range(2)
+    ]
+    rng = np.random.default_rng(0)
+    return scene_of(cameras, rng.uniform((-50, -50, 0), (80, 60, 1), (5000, 3)), tmp_path)
+
+
+def test_borders_lie_in_the_middle_between_views_and_every_point_is_in_one_cell(grid):
+    regions = plan_cells(grid, 2, 1)
+    assert len(regions) == 2
+    of = np.array([region.contains(grid.points) for region in regions])
+    assert (of.sum(axis=0) == 1).all()
+    one = of[0] if of[0, grid.points[:, 0].argmin()] else of[1]
+    np.testing.assert_array_equal(one, grid.points[:, 0] < 15)
+
+
+def test_cells_have_equally_many_views_and_rows_stand_within_their_column(grid):
+    regions = plan_cells(grid, 2, 2)
+    eyes = np.array([camera.center for camera in grid.cameras])
+    inside = np.array([region.contains(eyes) for region in regions])
+    assert (inside.sum(axis=0) == 1).all() and (inside.sum(axis=1) == 2).all()
+    for region in regions:
+        assert np.isinf(region.cell).sum() == 2, "an outer corner has no end"
+
+
+def test_a_cell_is_enlarged_by_a_fifth_of_its_side(grid):
+    left = min(plan_cells(grid, 2, 1), key=lambda region: eyes_in(region, grid)[:, 0].max())
+    around = left.surrounds(grid.points)
+    np.testing.assert_array_equal(around, grid.points[:, 0] < 15 + ENLARGED * 15)
+
+
+def eyes_in(region, scene):
+    eyes = np.array([camera.center for camera in scene.cameras])
+    return eyes[region.contains(eyes)]
+
+
+@pytest.mark.parametrize("focal, belongs", [(40.0, False), (4000.0, True)])
+def test_a_view_belongs_to_cells_that_fill_more_than_a_quarter_of_it(tmp_path, focal, belongs):
+    """The other cell begins 15.4 ahead and is 8.4 wide, 2 high: with the short lens a 27th of the image."""
+    points = [(x, y, z) for x in np.linspace(-9, 60, 30) for y in (-2.0, 9.0) for z in (0.0, 2.0)]
+    cameras = [looking(f"{x}-{y}", (x, y, 1), (x, y + 0.1, 0)) for x in (0, 3, 6, 40, 43, 46) for y in (0, 6)]
+    far = looking("far", (3, 3, 1), (43, 3, 1), focal=focal)
+    scene = scene_of([*cameras, far], points, tmp_path)
+    right = max(plan_cells(scene, 2, 1), key=lambda region: eyes_in(region, scene)[:, 0].mean())
+    assert ("far" in right.views) == belongs
+    assert {f"{x}-{y}" for x in (40, 43, 46) for y in (0, 6)} <= set(right.views)
+    assert "0-0" not in right.views
+
+
+def test_a_share_of_an_image_is_that_of_a_box_worked_by_hand():
+    from training.scenes.regions import _share_of_image
+
+    view = looking("a", (0, 0, 0), (1, 0, 0), width=64, height=48, focal=32.0)
+    # at a distance of 10 the image is 20 wide and 15 high
+    half = np.array([[10, 11], [0, 1000], [-1000, 1000.0]])
+    assert _share_of_image(view, np.eye(3), half) == pytest.approx(0.5)
+    part = np.array([[10, 10.001], [-5, 5], [-3.75, 3.75]])
+    assert _share_of_image(view, np.eye(3), part) == pytest.approx(0.25, abs=0.01)
+    assert _share_of_image(view, np.eye(3), part * [[-1], [1], [1]]) == 0, "behind"
+    assert _share_of_image(view, np.eye(3), np.array([[-1, 1]] * 3)) == 1, "from within"
+    assert 0 < IN_SIGHT < 1
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_which_points_views_observe_is_what_pycolmap_says(tmp_path, text):
+    model = write_scene(tmp_path, names=("a.png", "b b.png", "c.png"))
+    if text:
+        folder = tmp_path / "sparse" / "0"
+        for path in folder.iterdir():
+            path.unlink()
+        model.write_text(str(folder))
+    scene = read_scene(tmp_path)
+    for names in (("b b.png",), ("a.png", "c.png"), ("none",)):
+        ids = {image.image_id for image in model.images.values() if image.name in names}
+        seen = {
+            number
+            for number, point in model.points3D.items()
+            if any(element.image_id in ids for element in point.track.elements)
+        }
+        if seen:
+            np.testing.assert_array_equal(observed(scene, names), np.isin(scene.point_ids, sorted(seen)))
+            assert 0 < len(seen) < len(scene.points)
+        else:
+            assert not observed(scene, names).any()
+    assert pycolmap.__version__
+
+
+def test_without_tracks_those_points_count_that_a_view_could_see(grid):
+    seen = observed(grid, ["00"])
+    np.testing.assert_array_equal(seen, grid.cameras[0].sees(grid.points))
+    assert 0 < seen.sum() < len(seen)
+
+
+def test_a_region_is_read_as_it_was_written(grid, tmp_path):
+    for region in plan_cells(grid, 2, 2):
+        region.write(tmp_path / "region.json")
+        again = Region.read(tmp_path / "region.json")
+        for name in ("ground", "cell", "area"):
+            np.testing.assert_array_equal(getattr(again, name), getattr(region, name))
+        assert again.views == region.views
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "", "[]", "{}", '{"ground": 1, "cell": 2, "area": 3, "views": ["a"]}',
+        '{"ground": [[1,0,0],[0,1,0],[0,0,2]], "cell": [[0,1],[0,1]], "area": [[0,1],[0,1]], "views": ["a"]}',
+        '{"ground": [[1,0,0],[0,1,0],[0,0,1]], "cell": [[1,1],[0,1]], "area": [[0,1],[0,1]], "views": ["a"]}',
+        '{"ground": [[1,0,0],[0,1,0],[0,0,1]], "cell": [[0,1],[0,1]], "area": [[0,1],[0,1]], "views": []}',
+        '{"ground": [[1,0,0],[0,1,0],[0,0,1]], "cell": [[0,1],[0,1]], "area": [[0,1],[0,""]], "views": [""]}',
+        '{"ground": [[1,0,0],[0,1,0],[0,0,1]], "cell": [[0,1],[0,1]], "area": [[0,1],[0,1]], "views": [1]}',
+    ],
+)  # fmt: skip
+def test_what_is_no_region_is_said_so(tmp_path, text):
+    (tmp_path / "region.json").write_text(text)
+    with pytest.raises(LodgsError):
+        Region.read(tmp_path / "region.json")
+
+
+def test_too_few_views_are_told(grid):
+    with pytest.raises(LodgsError, match="too few"):
+        plan_cells(grid, 5, 1)
+    same = replace(grid, cameras=[replace(grid.cameras[0], name=str(i)) for i in range(8)])
+    with pytest.raises(LodgsError, match="one place"):
+        plan_cells(same, 3, 1)

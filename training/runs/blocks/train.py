@@ -1,0 +1,171 @@
+"""Trains the blocks of a run and puts them together, wherever blocks are trained."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from ...errors import LodgsError
+from ..failures import BAD_INPUT, CANCELLED, DONE
+from .merge import merge
+from .plan import Block
+from .workers import Pending, Submit
+
+LOOKS = 0.5
+"""Seconds between two looks at how blocks get on."""
+SILENT = 20.0
+"""Seconds between two words at most."""
+TRIES = 3
+"""How often a block may be lost without having got any further before that ends the run."""
+
+Tell = Callable[..., object]
+"""Called with an event's kind and values."""
+
+
+class BlocksStopped(Exception):
+    """Some blocks were asked to stop, and the others are finished; the message says which."""
+
+
+def train_blocks(blocks: Sequence[Block], path: Path, submit: Submit, tell: Tell) -> None:
+    """Trains all blocks that are not finished and writes what they are together.
+
+    How they get on is read from their folders; an interrupt stops all of them politely first.
+
+    Args:
+        path: of the bundle of all.
+        submit: has a block trained.
+
+    Raises:
+        BlocksStopped: some were cancelled by themselves.
+        LodgsError: one could not be trained; the others have been.
+    """
+    if path.exists():
+        return
+    watched = [_Watched(block) for block in blocks]
+    try:
+        for each in watched:
+            each.begin(submit)
+        started = told = time.monotonic()
+        while not all([each.look(submit) for each in watched]):
+            now = time.monotonic()
+            if now - told >= min(max((now - started) / 1000, LOOKS), SILENT):
+                tell("progress", **_progress(watched))
+                told = now
+            time.sleep(LOOKS)
+    except BaseException:
+        for each in watched:
+            each.block.folder.request_cancel()
+        while not all(each.over for each in watched):
+            time.sleep(LOOKS)
+        raise
+    tell("progress", **_progress(watched))
+    for each in watched:
+        if each.code not in (DONE, CANCELLED):
+            raise each.trouble()
+    if stopped := [str(each.block.number) for each in watched if each.code == CANCELLED]:
+        raise BlocksStopped(f"Stopped: block {', '.join(stopped)}; the run can be resumed.")
+    tell("status", message=f"Putting {len(blocks)} blocks together")
+    kept = merge(blocks, path)
+    for block, (own, all_) in zip(blocks, kept, strict=True):
+        tell("status", message=f"Block {block.number}: {own:,} of {all_:,} splats stand in its cell")
+
+
+class _Watched:
+    """A block on its way.
+
+    Attributes:
+        code: its trainer's exit code, once it has ended for good.
+    """
+
+    def __init__(self, block: Block) -> None:
+        self.block = block
+        self._pending: Pending | None = None
+        self.code: int | None = None
+        if block.folder.bundle.exists() and block.folder.state() == "done":
+            self.code = DONE
+        self._lost, self._reached = 0, -1
+        self._since, self.progress = 0, {}
+        self.steps = block.job.resolved_parameters().total_steps
+        self._why = ""
+
+    def begin(self, submit: Submit) -> None:
+        """Has it trained, unless it is finished."""
+        self.block.folder.take_cancel()  # which was meant for an earlier trainer
+        if self.code is None:
+            self._pending = submit(self.block.folder.path)
+
+    @property
+    def over(self) -> bool:
+        """Whether nobody is at work on it any more."""
+        return self._pending is None or self._pending.done()
+
+    def look(self, submit: Submit) -> bool:
+        """Reads how far it is, and begins it again where whoever trained it was lost; whether it is over."""
+        if self.code is not None:
+            return True
+        events, self._since = self.block.folder.events(self._since)
+        for event in events:
+            if event["event"] == "progress":
+                self.progress = event
+        assert self._pending is not None
+        if not self._pending.done():
+            return False
+        try:
+            code = self._pending.result()
+        except Exception as error:  # the worker, not the block
+            code, self._why = -1, str(error)
+        if code in (DONE, BAD_INPUT, CANCELLED):
+            self.code = code
+            return True
+        self._lost = self._lost + 1 if self.step <= self._reached else 1
+        self._reached = max(self.step, self._reached)
+        if self._lost < TRIES:
+            self.begin(submit)
+            return False
+        self.code = code
+        return True
+
+    @property
+    def step(self) -> int:
+        """How many steps it has made."""
+        return self.steps if self.code == DONE else self.progress.get("step", 0)
+
+    @property
+    def state(self) -> str:
+        """``waiting``, ``running``, ``done``, ``cancelled`` or ``failed``."""
+        if self.code is None:
+            return "running" if self.progress else "waiting"
+        return {DONE: "done", CANCELLED: "cancelled"}.get(self.code, "failed")
+
+    def trouble(self) -> LodgsError:
+        """Why it could not be trained."""
+        error = self.block.folder.last("error") if self.code == BAD_INPUT else None
+        if error is not None:
+            return LodgsError(f"Block {self.block.number}: {error['what']}", error.get("remedy", ""))
+        why = f" ({self._why})" if self._why else ""
+        return LodgsError(
+            f"Block {self.block.number} was lost {TRIES} times at step {self.step}{why}.",
+            f"What its trainer wrote is in {self.block.folder.log}.",
+        )
+
+
+def _progress(watched: Sequence[_Watched]) -> dict:
+    """How all are together, as a ``progress`` event, with each beside it."""
+    there = [each.progress for each in watched if each.progress]
+    step, of = sum(each.step for each in watched), sum(each.steps for each in watched)
+    speed = sum(each.progress.get("steps_per_s", 0.0) for each in watched if each.code is None)
+    over = sum(each.code is not None for each in watched)
+
+    def mean(name: str) -> float:
+        return round(sum(each.get(name, 0.0) for each in there) / max(len(there), 1), 5)
+
+    return {
+        "stage": f"{over} of {len(watched)} blocks", "level": 1, "levels": 1, "step": step, "of": of,
+        "loss": mean("loss"), "psnr": mean("psnr"), "splats": sum(each.get("splats", 0) for each in there),
+        "steps_per_s": round(speed, 2), "eta_s": round((of - step) / speed, 1) if speed else 0.0,
+        "blocks": [
+            {"block": each.block.number, "state": each.state, "step": each.step, "of": each.steps}
+            for each in watched
+        ],
+    }  # fmt: skip

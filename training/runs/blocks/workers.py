@@ -1,0 +1,127 @@
+"""Where blocks are trained: one after the other here, or side by side by the workers of a Dask cluster."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol
+
+from ...errors import LodgsError
+from ..failures import CANCELLED
+from ..folder import RunFolder
+
+HERE = "here"
+ANSWERS = 20
+"""Seconds in which a scheduler answers."""
+_PACKAGE = (__package__ or "").partition(".")[0]
+
+
+class Pending(Protocol):
+    """A block that somebody trains, as ``concurrent.futures`` and Dask have it."""
+
+    def done(self) -> bool:
+        """Whether it has ended."""
+        ...
+
+    def result(self) -> int:
+        """The trainer's exit code; raises what went wrong with whoever ran it."""
+        ...
+
+
+Submit = Callable[[Path], Pending]
+"""Has a run's folder trained."""
+
+
+def train_block(folder: str, threads: int = 0) -> int:
+    """Trains a run to its end, or goes on with it, in a process of its own; a worker calls it.
+
+    Where the trainer of a worker that was lost is still at work it is waited for first. A run that has been
+    asked to stop does not begin.
+
+    Args:
+        folder: of the run, which has its job.
+        threads: of the kernels; 0 for as many as the computer has.
+
+    Returns:
+        The trainer's exit code, negative where it was killed.
+    """
+    run = RunFolder(folder)
+    while run.running:
+        time.sleep(1)
+    if run.take_cancel():
+        return CANCELLED
+    package = Path(__file__).resolve().parents[2]
+    environment = dict(os.environ)
+    environment["PYTHONPATH"] = os.pathsep.join(
+        filter(None, [str(package.parent), os.environ.get("PYTHONPATH")])
+    )
+    if threads:
+        environment["LODGS_THREADS"] = str(threads)
+    with run.log.open("ab") as log:
+        return subprocess.run(
+            [sys.executable, "-m", _PACKAGE, "train", str(run.job)], env=environment, check=False,
+            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=log,
+        ).returncode  # fmt: skip
+
+
+@contextmanager
+def workers(on: str = HERE, resources: dict[str, float] | None = None) -> Iterator[Submit]:
+    """Those who train blocks.
+
+    Args:
+        on: HERE, one block after the other; "local:N", N at a time on this computer; or the address of a
+            Dask scheduler, "tcp://HOST:8786", whose workers see run and scene under the same paths.
+        resources: what each block takes of a Dask worker's, such as {"GPU": 1}.
+
+    Raises:
+        LodgsError: there is no such cluster, or Dask is not installed.
+    """
+    if on == HERE:
+        with ThreadPoolExecutor(1) as pool:
+            yield lambda folder: pool.submit(train_block, str(folder))
+        return
+    kind, _, count = on.partition(":")
+    if not (kind == "local" and count.isdecimal() and int(count)) and "://" not in on:
+        raise LodgsError(
+            f"There is nothing to train on at '{on}'.",
+            "Say here, local:2 (two at a time on this computer) or tcp://HOST:8786 (a Dask scheduler).",
+        )
+    distributed = _distributed()
+    if kind == "local":
+        n, threads = int(count), max((os.cpu_count() or 1) // int(count), 1)
+        made: Any = distributed.LocalCluster(
+            n_workers=n, threads_per_worker=1, processes=True, dashboard_address=":0", resources=resources,
+            silence_logs=logging.ERROR,
+        )  # fmt: skip
+    else:
+        made, threads = on, 0
+    try:
+        client = distributed.Client(made, timeout=ANSWERS)
+    except OSError as error:
+        raise LodgsError(
+            f"No Dask scheduler answers at {on}.", "Start it, or correct the address."
+        ) from error
+    try:
+        yield lambda folder: client.submit(train_block, str(folder), threads, pure=False, resources=resources)
+    finally:
+        client.close()
+        if kind == "local":
+            made.close()
+
+
+def _distributed() -> Any:
+    try:
+        import distributed
+    except ModuleNotFoundError:
+        raise LodgsError(
+            f"Dask is not installed in {sys.executable}.",
+            'Install it there with: pip install "lodgs[cluster]", or train on: here.',
+        ) from None
+    return distributed
