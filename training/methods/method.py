@@ -63,11 +63,11 @@ class Method(ABC, Generic[P, D]):
     """
 
     model: Model
-    warn: Callable[[str], None] = staticmethod(lambda _: None)
 
     def __init__(
         self, data: TrainingData, parameters: P, seed: int, backend: str, base: Splats | None = None
     ) -> None:
+        self.warn: Callable[[str], None] = lambda message: None
         self.data, self.parameters, self.seed, self.backend = data, parameters, seed, backend
         self.device = device_of(backend)
         self.exposure = Exposure(len(data.train), parameters.lr_exposure, self.device)

@@ -23,7 +23,7 @@ class TreeParameters(ThreedgsParameters):
         unit="px",
     )
     lod_noise: float = parameter(
-        30.0,
+        10.0,
         "Each step's granularity is larger by this times r⁴, r random from 0 to 1: most cuts are fine, some "
         "are coarse.",
         high=100,
@@ -35,7 +35,7 @@ class TreeParameters(ThreedgsParameters):
         high=100,
     )
     leaf_rate: float = parameter(
-        1.0,
+        0.5,
         "The same of leaves, which falls to 0.03 of it, so that they come to rest; 0 leaves all as they are.",
         high=100,
     )
@@ -78,6 +78,7 @@ _STANDARD = replace(
     densify_interval=100,
     tune_steps=10_000,
     grow_interval=1000,
+    leaf_rate=1.0,  # those that grow have to learn
 )
 _PAPER = replace(
     _STANDARD,
