@@ -359,8 +359,8 @@ print(json.dumps(found))
 def test_the_process_stays_within_the_budget(tmp_path):
     """Ten times as many rows as there is memory for, touched at random; by the system's own count.
 
-    What comes on top: 4 bytes a row, and 16 MB for what is between file and tensors at a time (STAGING, in six
-    copies), what a step asks for, and what allocators keep.
+    What comes on top: 4 bytes a row, and 16 MB for what is between file and tensors at a time (STAGING, in
+    six copies), what a step asks for, and what allocators keep.
     """
     budget = 24 << 20
     done = subprocess.run(
