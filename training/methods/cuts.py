@@ -230,7 +230,9 @@ class CutCache:
         room = self._free[self._room : self._room + len(coming)].copy()
         for first in range(0, len(coming), self._at_once):
             some = slice(first, first + self._at_once)
-            records = self.rows.read(coming[some]).to(self._device, non_blocking=True)
+            records = self.rows.read(coming[some])
+            if self._device.type == "cuda":
+                records = records.pin_memory().to(self._device, non_blocking=True)
             self.records.index_copy_(0, torch.from_numpy(room[some]).to(self._device), records)
         self._place[coming], self._row[room] = room, coming
         places[~here] = room
