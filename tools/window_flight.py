@@ -30,6 +30,7 @@ from tools.window_hands import (
     Steps,
     module,
     press,
+    press_f12,
     region,
     say,
     scroll,
@@ -261,14 +262,9 @@ def region_and_f12(watch: Stopwatch) -> Steps:
     yield from all_there()
     watch.tell("render region on and off")
     bpy.context.preferences.view.render_display_type = "NONE"
-    done = []
-    ended = (bpy.app.handlers.render_complete, bpy.app.handlers.render_cancel)
-    for handlers, word in zip(ended, ("complete", "cancelled"), strict=True):
-        handlers.append(lambda *_, word=word: done.append(word))
-    press("render.render")
-    yield from until(lambda: bool(done), 120)
+    ended = yield from press_f12(120)
     yield from all_there()
-    watch.tell(f"F12 {done[0]}")
+    watch.tell(f"F12 {ended}")
 
 
 def all_cameras() -> list:

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 import bpy
@@ -116,6 +116,17 @@ def until(condition: Callable[[], bool], seconds: float) -> Steps:
     while not condition():
         assert time.monotonic() < end, f"Nothing came in {seconds:.0f} seconds."
         yield 0.2
+
+
+def press_f12(seconds: float) -> Generator[float, None, str]:
+    """Press F12 and wait for its picture; which returns ``complete`` or ``cancelled``."""
+    done: list[str] = []
+    ended = (bpy.app.handlers.render_complete, bpy.app.handlers.render_cancel)
+    for handlers, word in zip(ended, ("complete", "cancelled"), strict=True):
+        handlers.append(lambda *_, word=word: done.append(word))
+    press("render.render")
+    yield from until(lambda: bool(done), seconds)
+    return done[0]
 
 
 taken: list[str] = []

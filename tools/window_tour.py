@@ -31,6 +31,7 @@ from tools.window_hands import (
     open_panels,
     pixels,
     press,
+    press_f12,
     region,
     scroll,
     settle,
@@ -236,14 +237,9 @@ def render(root: bpy.types.Object) -> Steps:
     take("rendering")
     area = viewport()[0]
     bpy.context.preferences.view.render_display_type = "AREA"  # this display has no window manager
-    done = []
-    ended = (bpy.app.handlers.render_complete, bpy.app.handlers.render_cancel)
-    for handlers, word in zip(ended, ("complete", "cancelled"), strict=True):
-        handlers.append(lambda *_, word=word: done.append(word))
-    press("render.render")
-    yield from until(lambda: bool(done), 300)
+    ended = yield from press_f12(300)
     yield from settle()
-    assert done == ["complete"], "F12 was cancelled."
+    assert ended == "complete", "F12 was cancelled."
     file = OUT / "f12.png"
     bpy.data.images["Render Result"].save_render(str(file))
     photograph = Path(bpy.path.abspath(scene.camera.data.lodgs.photograph))

@@ -248,9 +248,12 @@ def _plan_blocks(chosen: argparse.Namespace) -> int:
         raise LodgsError("It is not said how many cells.", "Add --cells 2x4, for 2 columns of 4 each.")
     folder = RunFolder(job.out)
     folder.make()
-    keep_job(job, folder)
-    print(plan_table(write_plan(job, folder)))
-    print(f"Train them with: {PROGRAM} blocks run {folder.path}")
+    if folder.job.exists():
+        keep_job(job, folder)
+    blocks = write_plan(job, folder)
+    keep_job(job, folder)  # now that it can be
+    print(plan_table(blocks))
+    print(f"Train them with: {PROGRAM} blocks run {folder.path}", flush=True)
     return 0
 
 

@@ -27,6 +27,9 @@ def training_data(
 ) -> TrainingData:
     """The job's scene, read and where needed captured and undistorted (once, into the run folder).
 
+    Where it is trained in cells, units and held-out views are those of the model as it was read, whatever
+    photographs cannot be decoded: so the same in all blocks, and where they are measured together.
+
     Args:
         tell: called with an event's kind and values (status, warning) while this goes on.
         pixels: leave out views whose photograph cannot be decoded; to be saved where none is looked at.
@@ -57,7 +60,7 @@ def training_data(
         photo_memory=job.photo_memory * 10**6 or None,
         splat_memory=job.splat_memory * 10**6 or None,
         scratch=folder.checkpoints,
-        whole=None if region is None else whole,
+        whole=whole if job.region or job.cells else None,
     )  # fmt: skip
 
 

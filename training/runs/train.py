@@ -128,7 +128,7 @@ def _train(job: Job, folder: RunFolder, events: Events, on: str, resources: dict
             blocks = write_plan(job, folder)
             with workers(on, resources) as submit:
                 train_blocks(blocks, whole, submit, events)
-            job = replace(job, cells="", base="" if together else str(whole))
+            job = replace(job, base="" if together else str(whole))
         events("status", message="Reading the scene")
         data = training_data(job, folder, events)
         events("status", message="Preparing to train (the first time on a computer up to a minute)")
@@ -138,24 +138,31 @@ def _train(job: Job, folder: RunFolder, events: Events, on: str, resources: dict
         warm_up(backend)
         _tell_backend(backend, events)
         if together:
-            return _hand_over(folder, events, Evaluation(data, backend), started)
+            _hand_over(folder, events, data, backend, started)
+            return DONE
         run = _Run(job, backend, folder, events, data)
     with _stop_signals() as stopped:
         if not run.to_the_end(stopped):
             return CANCELLED
-    bundle = run.write_bundle()
-    seconds = round(time.monotonic() - started, 1)
-    events("status", message="Measuring the result")
-    events("done", bundle=folder.bundle.name, seconds=seconds, **summary(run.evaluation, bundle))
+    _tell_done(folder, events, run.evaluation, run.write_bundle(), started)
     run.method.close()
     remove_checkpoints(folder)
     return DONE
 
 
-def _hand_over(folder: RunFolder, events: Events, evaluation: Evaluation, started: float) -> int:
+def _tell_done(
+    folder: RunFolder, events: Events, evaluation: Evaluation, bundle: Bundle, started: float
+) -> None:
+    """The last word: what the run is worth."""
+    seconds = round(time.monotonic() - started, 1)
+    events("status", message="Measuring the result")
+    events("done", bundle=folder.bundle.name, seconds=seconds, **summary(evaluation, bundle))
+
+
+def _hand_over(folder: RunFolder, events: Events, data: TrainingData, backend: str, started: float) -> None:
     """Hands over the levels that blocks were put together to, and says what they are worth."""
     bundle = read_bundle(folder.bundle)
-    evaluation.antialias = bundle.antialias
+    evaluation = Evaluation(data, backend, bundle.antialias)
     alone = [level.number for level in levels_alone(bundle)]
     for place, level in enumerate(bundle.levels, 1):
         path = folder.levels_folder / f"level_{level.number}.ply"
@@ -163,10 +170,7 @@ def _hand_over(folder: RunFolder, events: Events, evaluation: Evaluation, starte
         quality = evaluation.measure_level(bundle, level) if level.number in alone else {}
         told = quality | _as_event(bundle, level, f"levels/{path.name}")
         events("level", **told, again=False, more=place < len(bundle.levels))
-    events("status", message="Measuring the result")
-    seconds = round(time.monotonic() - started, 1)
-    events("done", bundle=folder.bundle.name, seconds=seconds, **summary(evaluation, bundle))
-    return DONE
+    _tell_done(folder, events, evaluation, bundle, started)
 
 
 def _as_event(bundle: Bundle, level: Level, path: str) -> dict:

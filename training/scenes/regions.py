@@ -52,16 +52,15 @@ class Region:
         Raises:
             LodgsError: it has none of them.
         """
-        cameras = [camera for camera in scene.cameras if camera.name in self.views]
+        names = frozenset(self.views)
+        cameras = [camera for camera in scene.cameras if camera.name in names]
         if not cameras:
             raise LodgsError(f"{scene.folder} has none of the region's views.", "Write the plan again.")
-        return replace(
-            scene, cameras=cameras, distorted=[name for name in scene.distorted if name in self.views]
-        )
+        return replace(scene, cameras=cameras, distorted=[name for name in scene.distorted if name in names])
 
     def points_of(self, scene: Scene) -> np.ndarray:
         """Which of the points (P,) training begins with: those around it, and what its views observe."""
-        return self.surrounds(scene.points) | observed(scene, self.views)
+        return self.surrounds(scene.points) | observed(scene, frozenset(self.views))
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Which of points (P, 3) are the cell's, (P,); of all cells of a plan exactly one has each."""

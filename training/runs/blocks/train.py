@@ -55,7 +55,8 @@ def train_blocks(blocks: Sequence[Block], path: Path, submit: Submit, tell: Tell
             time.sleep(LOOKS)
     except BaseException:
         for each in watched:
-            each.block.folder.request_cancel()
+            if not each.over:
+                each.block.folder.request_cancel()
         while not all(each.over for each in watched):
             time.sleep(LOOKS)
         raise
@@ -80,6 +81,7 @@ class _Watched:
 
     def __init__(self, block: Block) -> None:
         self.block = block
+        block.folder.take_cancel()  # which was meant for an earlier trainer
         self._pending: Pending | None = None
         self.code: int | None = None
         if block.folder.bundle.exists() and block.folder.state() == "done":
@@ -91,7 +93,6 @@ class _Watched:
 
     def begin(self, submit: Submit) -> None:
         """Has it trained, unless it is finished."""
-        self.block.folder.take_cancel()  # which was meant for an earlier trainer
         if self.code is None:
             self._pending = submit(self.block.folder.path)
 

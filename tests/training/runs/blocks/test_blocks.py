@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from training.__main__ import main
 from training.errors import LodgsError
 from training.methods import METHODS
 from training.runs import train as training_loop
@@ -80,6 +82,33 @@ def test_all_have_the_units_of_the_whole_and_hold_out_its_views(tiny_scene, tmp_
         assert 0 < len(data.scene.points) <= len(whole.scene.points)
     assert seen == {camera.name for camera in whole.train}
     assert {block.job.method for block in blocks} == {METHODS[method].in_cells}
+
+
+def test_a_photograph_that_is_spoilt_shifts_no_held_out_views(tiny_scene, tmp_path):
+    """Left out where they are decoded, it would be counted there and not where the whole is measured."""
+    scene = tmp_path / "scene"
+    shutil.copytree(tiny_scene, scene)
+    photograph = scene / "images" / "01.jpg"
+    data = photograph.read_bytes()
+    table = data.index(b"\xff\xc4") + 5  # a Huffman table: its size and its end can be read, no pixels
+    photograph.write_bytes(data[:table] + b"\xff" * 16 + data[table + 16 :])
+    job = job_for(scene, tmp_path / "run")
+    blocks, whole = planned(job), training_data(job, RunFolder(tmp_path))
+    held_out = {camera.name for camera in whole.test}
+    assert held_out == {"00.jpg", "04.jpg", "08.jpg"}
+    trained = {camera.name for block in blocks for camera in training_data(block.job, block.folder).train}
+    assert not trained & {*held_out, "01.jpg"} and len(trained) == 5
+
+
+def test_a_plan_that_cannot_be_leaves_the_folder_free(tiny_scene, tmp_path, capsys):
+    out = tmp_path / "run"
+    command = f"blocks plan --method 3dgs --scene {tiny_scene} --out {out}".split()
+    assert main([*command, "--cells", "5x1"]) == 2
+    assert "too few" in capsys.readouterr().err
+    assert main([*command, "--cells", "2x1"]) == 0
+    assert "blocks run" in capsys.readouterr().out
+    assert main([*command, "--cells", "1x2"]) == 2, "it is another plan's now"
+    assert "belongs to another job" in capsys.readouterr().err
 
 
 def test_blocks_of_a_plan_are_relative_to_it(tiny_scene, tmp_path):
