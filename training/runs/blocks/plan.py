@@ -43,9 +43,9 @@ STILL = {
 stays in its cell, and as large as its level allows."""
 SLIMMEST = 2.5
 """No cells that are so many times longer than wide are chosen."""
-PROGRAM_BYTES = 600e6
+PROGRAM_BYTES = 650e6
 """What a trainer takes of memory without splats and photographs, about."""
-SPLAT_BYTES = 1_500
+SPLAT_BYTES = 2_300
 """What it takes for each splat that it trains, of degree 3, about."""
 
 
