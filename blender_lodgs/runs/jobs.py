@@ -20,6 +20,7 @@ from ...training.errors import LodgsError
 from ...training.lod.selection import complete
 from ...training.methods import method_info, parameters_of
 from ...training.methods.parameters import Parameters
+from ...training.runs.events import BLOCK_STATES
 from ...training.runs.folder import RunFolder
 from ...training.runs.job import CHANGEABLE, DOME, Job
 from ...training.scenes.cameras import write_camera
@@ -71,7 +72,7 @@ def _begin(root: bpy.types.Object, run: RunFolder, job: Job) -> Watch:
             f"{run.path} already holds a run.", "Choose another folder, or open it as a run and resume it."
         )
     root.lodgs.training.read = 0
-    return _launch(root, run, job, hand_over=Path(job.base) == run.base)
+    return _launch(root, run, job, write=True, hand_over=Path(job.base) == run.base)
 
 
 def resume(root: bpy.types.Object) -> Watch:
@@ -88,9 +89,14 @@ def resume(root: bpy.types.Object) -> Watch:
         raise LodgsError(f"The run in {run.path} is already at work.", "Wait for it or cancel it.")
     if state == "done":
         raise LodgsError(f"The run in {run.path} is finished.", "Press Train for a new one.")
+    return _resume(root, run)
+
+
+def _resume(root: bpy.types.Object, run: RunFolder, block: int = 0) -> Watch:
+    """Goes on with a run, or with one of its blocks alone."""
     job = replace(Job.from_file(run.job), out=str(run.path))
     backend = extension.preferences().backend  # what this computer has, and what its user wants now
-    return _launch(root, run, None if job.backend == backend else replace(job, backend=backend))
+    return _launch(root, run, replace(job, backend=backend), write=job.backend != backend, block=block)
 
 
 def start_or_resume(root: bpy.types.Object, job: Job) -> Watch:
@@ -117,7 +123,7 @@ def start_or_resume(root: bpy.types.Object, job: Job) -> Watch:
         return attach(root, job.out)
     root.lodgs.training.read = 0
     same = all(getattr(before, name) == getattr(job, name) for name in CHANGEABLE if name != "out")
-    return _launch(root, run, None if same else job)
+    return _launch(root, run, job, write=not same)
 
 
 def cancel(root: bpy.types.Object) -> None:
@@ -139,11 +145,62 @@ def cancel(root: bpy.types.Object) -> None:
                 f"{watch.folder.path} cannot be written: {error.strerror}.",
                 "Cancel again to end the trainer.",
             ) from error
-    elif watch.process is not None:
-        watch.process.kill()
     else:
-        watch.folder.end()
+        if watch.process is not None:
+            watch.process.kill()
+        else:
+            watch.folder.end()
+        for each in watch.blocks:  # with nobody to begin them again
+            with suppress(LodgsError, OSError):
+                _block(watch.folder, each["block"]).end()
     extension.redraw()
+
+
+def cancel_block(root: bpy.types.Object, number: int) -> None:
+    """Ask one block of a run to save and stop, while the others go on.
+
+    Raises:
+        LodgsError: it is not at work, nor to begin.
+    """
+    watch = watch_of(root)
+    if watch is None or not watch.running or _block_state(watch, number) not in {"waiting", "running"}:
+        raise LodgsError(f"Cell {number} of '{root.name}' is not being trained.")
+    _ask(_block(watch.folder, number).request_cancel)
+    watch.stopping.add(number)
+    extension.redraw()
+
+
+def resume_block(root: bpy.types.Object, number: int) -> Watch:
+    """Go on with one block of a run: beside the others where they are at work, else alone.
+
+    Raises:
+        LodgsError: there is no such block, or it is at work or finished.
+    """
+    watch = watch_of(root)
+    over = {"cancelled", "failed"} if watch is not None and watch.running else {*BLOCK_STATES} - {"done"}
+    if watch is None or _block_state(watch, number) not in over:
+        raise LodgsError(f"Cell {number} of '{root.name}' has nothing to go on with.")
+    if not watch.running:
+        return _resume(root, watch.folder, number)
+    _ask(_block(watch.folder, number).request_resume)
+    return watch
+
+
+def _block(run: RunFolder, number: int) -> RunFolder:
+    return RunFolder(run.blocks / str(number))
+
+
+def _block_state(watch: Watch, number: int) -> str:
+    return next((each["state"] for each in watch.blocks if each["block"] == number), "")
+
+
+def _ask(request: Callable[[], None]) -> None:
+    try:
+        request()
+    except OSError as error:
+        raise LodgsError(
+            f"{error.filename} cannot be written: {error.strerror}.", "Cancel the whole training."
+        ) from error
 
 
 def attach(root: bpy.types.Object, folder: str, *, again: bool = True) -> Watch:
@@ -228,6 +285,7 @@ def make_job(root: bpy.types.Object, out: Path, parameters: dict) -> Job:
         "test_every": hold_out(root),
         "image_scale": _as_typed(settings.image_scale),
         "backend": extension.preferences().backend,
+        "cells": "" if viewpoints.alone(root) else settings.grid,
         "parameters": changes(settings) | parameters,
     }
     return Job.from_dict(values)
@@ -241,11 +299,17 @@ def _photographed(root: bpy.types.Object, out: Path) -> dict:
             f"'{root.name}' was not imported from photographs, so there is nothing to train on.",
             "Import a COLMAP folder.",
         )
+    base = base_of(root, out)
+    if base and settings.grid:
+        raise LodgsError(
+            "Cells begin with the scene's points, not with splats.",
+            "Choose Points in Start From, or train one cell.",
+        )
     return {
         "scene": bpy.path.abspath(root.lodgs.scene_folder),
         "model": bpy.path.abspath(settings.model),
         "images": bpy.path.abspath(settings.images),
-        "base": base_of(root, out),
+        "base": base,
     }
 
 
@@ -315,6 +379,7 @@ def show(settings: TrainingSettings, job: Job) -> None:
     for name in {field.name for field in fields(Job)}.intersection(settings.bl_rna.properties.keys()):
         setattr(settings, name, getattr(job, name))
     settings.start_from = "FILE" if job.base else "POINTS"
+    settings.columns, settings.rows = job.grid if job.cells else (1, 1)
     preset, own = method_info(job.method).preset(job.preset), job.resolved_parameters()
     for f in offered(job.method):
         settings.parameters.property_unset(f.name)
@@ -355,18 +420,23 @@ def base_of(root: bpy.types.Object, out: Path) -> str:
     return str(run.path)
 
 
-def _launch(root: bpy.types.Object, run: RunFolder, job: Job | None, hand_over: bool = False) -> Watch:
-    python = environment.trainer_python()
-    environment.require(python)
-    if job is not None and hand_over:
+def _launch(
+    root: bpy.types.Object, run: RunFolder, job: Job, *, write: bool, hand_over: bool = False, block: int = 0
+) -> Watch:
+    python, at_once = environment.trainer_python(), root.lodgs.training.at_once if job.cells else 1
+    environment.require(python, at_once)
+    if hand_over:
         _hand_over(root, run, job)
     run.make()
-    if job is not None:
+    if write:
         job.resolved().write(run.job)
+    what = ["train", str(run.job), "--out", str(run.path)]
+    if job.cells:
+        what = ["blocks", "run", str(run.path), "--on", f"local:{at_once}" if at_once > 1 else "here"]
+        what += ["--block", str(block)] if block else []
     try:
         run.take_cancel()  # what was asked of an earlier trainer; from now on it is for this one
-        command = [str(python), "-m", "training", "train", str(run.job), "--out", str(run.path)]
-        process = processes.spawn(command, log=run.log, output=run.output)
+        process = processes.spawn([str(python), "-m", "training", *what], log=run.log, output=run.output)
     except OSError as error:
         raise LodgsError(
             f"The trainer's Python {python} cannot be started: {error.strerror or error}.",

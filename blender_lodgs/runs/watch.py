@@ -21,7 +21,7 @@ from ...training.runs.folder import RunFolder
 from ...training.splats.bundle import Bundle, Level, read_head, read_tables
 from ...training.splats.ply import read_ply
 from .. import extension
-from ..data import scenes
+from ..data import cells, scenes
 
 UNRESPONSIVE_AFTER = 60.0
 """Seconds without an event after which the panel says that the trainer does not answer."""
@@ -40,10 +40,12 @@ class Watch:
         share: how much of that is done, 0 to 1.
         problem: why the run failed, as a sentence with its remedy; empty when it did not.
         progress: the newest ``progress`` event.
+        blocks: how each block of a scene in cells gets on, as a ``progress`` event says.
         levels: the newest ``level`` event of each level.
         summary: of a finished run the ``done`` event, with what it is worth.
         warnings: the warnings of this run.
         cancel_requested: whether it was asked to stop.
+        stopping: numbers of blocks that were asked to stop by themselves.
         method: what it trains.
         last_event: when an event came last, in seconds since the epoch.
         offset: bytes of the run's events that have been read.
@@ -58,10 +60,12 @@ class Watch:
     share: float = 0.0
     problem: str = ""
     progress: dict = field(default_factory=dict)
+    blocks: list[dict] = field(default_factory=list)
     levels: dict[int, dict] = field(default_factory=dict)
     summary: dict = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     cancel_requested: bool = False
+    stopping: set[int] = field(default_factory=set)
     method: str = ""
     last_event: float = field(default_factory=time.time)
     offset: int = 0
@@ -137,6 +141,8 @@ class Watch:
             case "progress":
                 self.progress, self.message = event, event.get("stage", "").capitalize()
                 self.share = _share(event)
+                if "blocks" in event:
+                    self._take_blocks(root, event["blocks"])
             case "warning":
                 self.warnings.append(event["message"])
             case "level":
@@ -144,6 +150,11 @@ class Watch:
             case "done":
                 self.summary = event
                 self._finish(root)
+
+    def _take_blocks(self, root: bpy.types.Object, blocks: list[dict]) -> None:
+        self.blocks = blocks
+        self.stopping -= {each["block"] for each in blocks if each["state"] not in {"waiting", "running"}}
+        cells.require(root.lodgs.training, len(blocks))
 
     def _add_level(self, root: bpy.types.Object, event: dict) -> None:
         if self._stays_in_file(root, event):
@@ -236,7 +247,7 @@ def begin(watch: Watch) -> Watch:
     """Follows a run from now on, with what is known of it already."""
     for event in watch.folder.events()[0]:
         if event["event"] == "progress":
-            watch.progress = event
+            watch.progress, watch.blocks = event, event.get("blocks", watch.blocks)
         elif event["event"] == "level":
             watch.levels[event["level"]] = event
         elif event["event"] == "done":
