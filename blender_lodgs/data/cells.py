@@ -1,4 +1,4 @@
-"""The cells that a large scene is trained in: what their plan says, kept on its root (``training.cells``)."""
+"""The cells that a large scene is trained in: what their plan says, kept on its root (``training.planned_cells``)."""
 
 from __future__ import annotations
 
@@ -94,29 +94,29 @@ def outlines(scene: Scene, regions: list[Region]) -> list[tuple[np.ndarray, np.n
 def show(settings: TrainingSettings, job: Job, planned: list[PlannedCell]) -> None:
     """Keeps the plan of a job, for the panel and for viewports."""
     require(settings, len(planned))
-    for cell, values in zip(settings.cells, planned, strict=True):
+    for cell, values in zip(settings.planned_cells, planned, strict=True):
         for name, value in vars(values).items():
             setattr(cell, name, value)
-    settings.planned = _decides(job)
+    settings.planned_for = _decides(job)
 
 
 def require(settings: TrainingSettings, count: int) -> None:
     """Makes sure that there are so many cells; those of another plan are forgotten."""
-    if len(settings.cells) != count:
+    if len(settings.planned_cells) != count:
         forget(settings)
         for _ in range(count):
-            settings.cells.add()
+            settings.planned_cells.add()
 
 
 def forget(settings: TrainingSettings) -> None:
     """Forgets the plan."""
-    settings.cells.clear()
-    settings.active_cell, settings.planned = 0, ""
+    settings.planned_cells.clear()
+    settings.active_cell, settings.planned_for = 0, ""
 
 
 def is_planned(settings: TrainingSettings, job: Job) -> bool:
     """Whether the plan that is kept is a job's."""
-    return settings.planned == _decides(job)
+    return settings.planned_for == _decides(job)
 
 
 def _decides(job: Job) -> str:

@@ -122,7 +122,7 @@ PARAMETERS = {method: _parameters_of(info) for method, info in METHODS.items()}
 
 
 class TrainingCell(bpy.types.PropertyGroup):
-    """A cell of a scene that is trained in cells, as its plan has it (``root.lodgs.training.cells``)."""
+    """A cell of a scene that is trained in cells, as its plan has it (``root.lodgs.training.planned_cells``)."""
 
     views: bpy.props.IntProperty(name="Views", description="How many views it is trained and measured on")
     points: bpy.props.IntProperty(name="Points", description="With how many points its training begins")
@@ -301,14 +301,14 @@ class TrainingSettings(bpy.types.PropertyGroup):
         default=True,
         options=set(),
     )
-    cells: bpy.props.CollectionProperty(
+    planned_cells: bpy.props.CollectionProperty(
         type=TrainingCell, name="Cells", description="What the plan says of each cell"
     )
     active_cell: bpy.props.IntProperty(
         name="Chosen Cell", description="Line of the list of cells", options=set()
     )
-    planned: bpy.props.StringProperty(
-        name="Planned", description="What the cells were planned for, as JSON", options={"HIDDEN"}
+    planned_for: bpy.props.StringProperty(
+        name="Planned For", description="What the cells were planned for, as JSON", options={"HIDDEN"}
     )
     output: bpy.props.StringProperty(
         name="Run Folders In",

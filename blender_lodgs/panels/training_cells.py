@@ -19,7 +19,9 @@ _ICONS = {"waiting": "SORTTIME", "done": "CHECKMARK", "cancelled": "PAUSE", "fai
 class LODGS_UL_cells(bpy.types.UIList):
     """What the plan says of each cell."""
 
-    def draw_item(self, context, layout, data, item, icon, active_data, active_property, index, flt_flag):
+    def draw_item(
+        self, context, layout, data, item, icon, active_data, active_property, index: int = 0, flt_flag=0
+    ):
         row = _numbered(layout, index + 1)
         _columns(
             row, *map(_brief, (item.views, item.points, item.splats, item.steps)), _memory(item.megabytes)
@@ -29,7 +31,9 @@ class LODGS_UL_cells(bpy.types.UIList):
 class LODGS_UL_blocks(bpy.types.UIList):
     """How the training of each cell gets on."""
 
-    def draw_item(self, context, layout, data, item, icon, active_data, active_property, index, flt_flag):
+    def draw_item(
+        self, context, layout, data, item, icon, active_data, active_property, index: int = 0, flt_flag=0
+    ):
         watch = watch_of(data.id_data)
         if watch is None or index >= len(watch.blocks):
             return
@@ -61,7 +65,7 @@ class LODGS_PT_training_cells(Panel):
         layout, settings, watch = self.layout, root.lodgs.training, watch_of(root)
         if not (watch and watch.running):
             _draw_choices(layout, root)
-        if settings.planned:
+        if settings.planned_for:
             layout.prop(settings, "show_cells", toggle=True)
 
 
@@ -81,7 +85,7 @@ def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
         say(layout, str(error), "ERROR")
         return
     layout.operator("lodgs.plan_cells", icon="MESH_GRID")
-    if settings.planned:
+    if settings.planned_for:
         _draw_plan(layout.column(), settings, fits=cells.is_planned(settings, job))
 
 
@@ -92,16 +96,18 @@ def _draw_plan(layout, settings, fits):
     head = layout.row(align=True)
     head.label(text="", icon="BLANK1")
     _columns(head, "Views", "Points", "Splats", "Steps", "Memory")
-    rows = min(max(len(settings.cells), 3), 8)
-    layout.template_list("LODGS_UL_cells", "", settings, "cells", settings, "active_cell", rows=rows)
+    rows = min(max(len(settings.planned_cells), 3), 8)
+    layout.template_list("LODGS_UL_cells", "", settings, "planned_cells", settings, "active_cell", rows=rows)
 
 
 def draw_blocks(layout: bpy.types.UILayout, root: bpy.types.Object, watch: Watch) -> None:
     """How each cell of a run gets on, with a button that stops it or goes on."""
     settings = root.lodgs.training
-    if watch.blocks and len(settings.cells) == len(watch.blocks):
-        rows = min(max(len(settings.cells), 3), 8)
-        layout.template_list("LODGS_UL_blocks", "", settings, "cells", settings, "active_cell", rows=rows)
+    if watch.blocks and len(settings.planned_cells) == len(watch.blocks):
+        rows = min(max(len(settings.planned_cells), 3), 8)
+        layout.template_list(
+            "LODGS_UL_blocks", "", settings, "planned_cells", settings, "active_cell", rows=rows
+        )
 
 
 def block_facts(watch: Watch, index: int) -> tuple[float, str]:

@@ -21,12 +21,12 @@ def draw(scene: bpy.types.Scene) -> None:
     """Draws the cells that are to be shown into the active framebuffer, over everything."""
     for root in scenes.roots(scene):
         settings = root.lodgs.training
-        if not settings.show_cells or not settings.cells:
+        if not settings.show_cells or not settings.planned_cells:
             continue
         with gpu.matrix.push_pop():  # type: ignore[attr-defined]
             gpu.matrix.multiply_matrix(root.matrix_world)
             gpu.state.blend_set("ALPHA")
-            for number, cell in enumerate(settings.cells, 1):
+            for number, cell in enumerate(settings.planned_cells, 1):
                 color, chosen = level_color(number), number == settings.active_cell + 1
                 corners = np.reshape(cell.outline, (4, 3))
                 if chosen:
