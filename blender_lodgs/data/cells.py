@@ -1,4 +1,4 @@
-"""The cells that a large scene is trained in: what their plan says, kept on its root (``training.planned_cells``)."""
+"""The cells that a large scene is trained in: what their plan says, kept on its root (``training``)."""
 
 from __future__ import annotations
 

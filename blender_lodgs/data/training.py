@@ -122,7 +122,7 @@ PARAMETERS = {method: _parameters_of(info) for method, info in METHODS.items()}
 
 
 class TrainingCell(bpy.types.PropertyGroup):
-    """A cell of a scene that is trained in cells, as its plan has it (``root.lodgs.training.planned_cells``)."""
+    """A cell of a scene that is trained in cells, as its plan has it."""
 
     views: bpy.props.IntProperty(name="Views", description="How many views it is trained and measured on")
     points: bpy.props.IntProperty(name="Points", description="With how many points its training begins")
