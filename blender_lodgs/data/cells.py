@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
 
 import bpy
 import numpy as np
 
-from ...training.runs.blocks.plan import plan
+from ...training.runs.blocks.plan import Planned, cells_within, plan, read_planned_scene
 from ...training.runs.job import Job
-from ...training.scenes.colmap import Scene, read_scene
+from ...training.scenes.colmap import Scene
 from ...training.scenes.regions import ENLARGED, Region
 from . import photographs
 
@@ -35,42 +34,43 @@ _DECIDES = (
 """What of a job its plan depends on."""
 
 
-@dataclass
-class PlannedCell:
-    """What a plan says of a cell, as ``TrainingCell`` keeps it."""
+@dataclass(frozen=True)
+class CellPlan:
+    """What a plan says of the cells of a job.
 
-    views: int
-    points: int
-    splats: int
-    steps: int
-    megabytes: float
-    outline: np.ndarray
-    enlarged: np.ndarray
-    places: str
+    Attributes:
+        job: whose ``cells`` say how many there are; "" for one.
+        planned: each of them.
+        outlines: of each, see :func:`outlines`.
+        places: of each, the places by name of its views.
+    """
+
+    job: Job
+    planned: list[Planned]
+    outlines: list[tuple[np.ndarray, np.ndarray]]
+    places: list[list[int]]
 
 
-def plan_cells(job: Job) -> list[PlannedCell]:
-    """What each cell of a job will be trained on, and take. No bpy: it may take a while, in a thread.
+def plan_cells(job: Job, splats: int = 0, memory: int = 0) -> CellPlan:
+    """Plans the cells of a job. No bpy: it may take a while, in a thread.
+
+    Args:
+        splats, memory: of how many splats, or bytes, each cell has at most; the job then has as few cells as
+            do. 0: as many as the job says.
 
     Raises:
         LodgsError: the scene cannot be read, or divided so.
     """
-    model, images = (Path(path) if path else None for path in (job.model, job.images))
-    scene = read_scene(Path(job.scene), model, images)
-    places = {camera.name: place for place, camera in enumerate(scene.cameras)}
+    scene = read_planned_scene(job)
+    if splats or memory:
+        job = job.in_cells(cells_within(job.in_cells("1x1"), splats, memory, scene))
     planned = plan(job, scene)
-    found = []
-    for (region, block), (outline, enlarged) in zip(
-        planned, outlines(scene, [region for region, _ in planned]), strict=True
-    ):
-        p = block.resolved_parameters()
-        found.append(
-            PlannedCell(
-                len(region.views), int(region.points_of(scene).sum()), p.max_splats, p.total_steps, 0.0,
-                outline.ravel(), enlarged.ravel(), json.dumps([places[name] for name in region.views]),
-            )
-        )  # fmt: skip
-    return found
+    if len(planned) == 1:
+        job = replace(job, cells="")
+    regions = [each.region for each in planned]
+    place_of = {camera.name: place for place, camera in enumerate(scene.cameras)}
+    places = [[place_of[name] for name in region.views] for region in regions]
+    return CellPlan(job, planned, outlines(scene, regions), places)
 
 
 def outlines(scene: Scene, regions: list[Region]) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -91,13 +91,16 @@ def outlines(scene: Scene, regions: list[Region]) -> list[tuple[np.ndarray, np.n
     return [(corners(region.cell), corners(region.area)) for region in regions]
 
 
-def show(settings: TrainingSettings, job: Job, planned: list[PlannedCell]) -> None:
-    """Keeps the plan of a job, for the panel and for viewports."""
-    require(settings, len(planned))
-    for cell, values in zip(settings.planned_cells, planned, strict=True):
-        for name, value in vars(values).items():
-            setattr(cell, name, value)
-    settings.planned_for = _decides(job)
+def show(settings: TrainingSettings, found: CellPlan) -> None:
+    """Keeps a plan, for the panel and for viewports."""
+    settings.columns, settings.rows = found.job.grid if found.job.cells else (1, 1)
+    require(settings, len(found.planned))
+    each = zip(settings.planned_cells, found.planned, found.outlines, found.places, strict=True)
+    for cell, planned, (outline, enlarged), places in each:
+        cell.views, cell.points = planned.views, planned.points
+        cell.splats, cell.steps, cell.megabytes = planned.splats, planned.steps, planned.memory / 1e6
+        cell.outline, cell.enlarged, cell.places = outline.ravel(), enlarged.ravel(), json.dumps(places)
+    settings.planned_for = _decides(settings, found.job)
 
 
 def require(settings: TrainingSettings, count: int) -> None:
@@ -115,13 +118,13 @@ def forget(settings: TrainingSettings) -> None:
 
 
 def is_planned(settings: TrainingSettings, job: Job) -> bool:
-    """Whether the plan that is kept is a job's."""
-    return settings.planned_for == _decides(job)
+    """Whether the plan that is kept is that of a job, and of how the settings divide it."""
+    return settings.planned_for == _decides(settings, job)
 
 
-def _decides(job: Job) -> str:
+def _decides(settings: TrainingSettings, job: Job) -> str:
     values = asdict(job)
-    return json.dumps([values[name] for name in _DECIDES])
+    return json.dumps([*(values[name] for name in _DECIDES), *settings.limits])
 
 
 def eyes(root: bpy.types.Object, cell: TrainingCell) -> tuple[np.ndarray, np.ndarray]:

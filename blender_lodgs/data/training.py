@@ -265,10 +265,38 @@ class TrainingSettings(bpy.types.PropertyGroup):
     seed: bpy.props.IntProperty(
         name="Seed", description="Two runs with the same seed are equal", default=0, min=0
     )
+    divide_by: bpy.props.EnumProperty(
+        name="Divide By",
+        description="How many cells the ground is divided into, each of which is trained by itself",
+        items=[
+            ("GRID", "Columns, Rows", "So many columns of so many cells; 1 by 1 trains the scene as a whole"),
+            ("SPLATS", "Splats a Cell", "As few cells as have so many splats at most; Plan finds them"),
+            ("MEMORY", "Memory a Cell", "As few cells as take so much memory at most; Plan finds them"),
+        ],
+        options=set(),
+    )
+    cell_splats: bpy.props.IntProperty(
+        name="Splats at Most",
+        description="How many splats a cell has at most",
+        default=1_000_000,
+        min=1000,
+        soft_max=16_000_000,
+        step=10_000,
+        options=set(),
+    )
+    cell_memory: bpy.props.FloatProperty(
+        name="GB at Most",
+        description="How many gigabytes of memory the training of a cell takes at most, estimated",
+        default=8.0,
+        min=0.5,
+        soft_max=64.0,
+        precision=1,
+        step=50,
+        options=set(),
+    )
     columns: bpy.props.IntProperty(
-        name="Cells Across",
-        description="How many columns of cells the ground is divided into, across its longer side. Each cell "
-        "is trained by itself, in the memory that its part takes; 1 by 1 trains the scene as a whole",
+        name="Columns",
+        description="How many columns of cells there are, across the longer side of the ground",
         default=1,
         min=1,
         soft_max=8,
@@ -276,7 +304,7 @@ class TrainingSettings(bpy.types.PropertyGroup):
         options=set(),
     )
     rows: bpy.props.IntProperty(
-        name="Along",
+        name="Rows",
         description="How many cells each column has",
         default=1,
         min=1,
@@ -339,6 +367,14 @@ class TrainingSettings(bpy.types.PropertyGroup):
         description="Bytes of the run's events that this file has taken in",
         options={"HIDDEN"},
     )
+
+    @property
+    def limits(self) -> tuple[int, int]:
+        """Splats and bytes that a cell has at most, where these decide how many cells there are; else 0."""
+        return (
+            self.cell_splats if self.divide_by == "SPLATS" else 0,
+            round(self.cell_memory * 1e9) if self.divide_by == "MEMORY" else 0,
+        )
 
     @property
     def grid(self) -> str:

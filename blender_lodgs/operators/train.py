@@ -73,23 +73,25 @@ class LODGS_OT_plan_cells(OnScene, PieceByPiece, bpy.types.Operator):
 
     def work(self, context):
         root = scenes.active_root(context)
-        uid, job = root.session_uid, jobs.make_job(root, jobs.runs_folder(root), {})
+        uid, limits = root.session_uid, root.lodgs.training.limits
+        job = jobs.make_job(root, jobs.runs_folder(root), {})
         reader = ThreadPoolExecutor(1, "lodgs-plan")
         try:
-            reading = reader.submit(cells.plan_cells, job)
+            reading = reader.submit(cells.plan_cells, job, *limits)
             while wait([reading], 0.01).not_done:
                 yield
         finally:
             reader.shutdown(wait=False)
-        planned, root = reading.result(), root_by_uid(uid)
+        self._found, root = reading.result(), root_by_uid(uid)
         if root is not None:  # undo may have replaced it
-            cells.show(root.lodgs.training, job, planned)
+            cells.show(root.lodgs.training, self._found)
 
     def status(self, context, count):
         return "Planning cells; Esc stops"
 
     def done(self, count):
-        return "Planned"
+        views = [each.views for each in self._found.planned]
+        return f"{len(views)} cells of {min(views)} to {max(views)} views"
 
 
 class _OnBlock(OnScene):

@@ -8,7 +8,7 @@ from ...training.errors import LodgsError
 from ...training.lod.colors import level_color
 from ..data import cells, scenes, viewpoints
 from ..runs import jobs
-from ..runs.watch import Watch, watch_of
+from ..runs.watch import Part, Watch, watch_of
 from .parts import Panel, say, split_column
 
 _NUMBER = 0.16
@@ -34,20 +34,26 @@ class LODGS_UL_blocks(bpy.types.UIList):
     def draw_item(
         self, context, layout, data, item, icon, active_data, active_property, index: int = 0, flt_flag=0
     ):
-        watch = watch_of(data.id_data)
-        if watch is None or index >= len(watch.blocks):
-            return
-        number, share, state = index + 1, *block_facts(watch, index)
-        row = _numbered(layout, number).row(align=True)
-        if state == "running":
-            row.progress(text="Stopping" if number in watch.stopping else f"{share:.0%}", factor=share)
-        else:
-            began = f" at {share:.0%}" if share and state != "done" else ""
-            row.label(text=f"{state.capitalize()}{began}", icon=_ICONS[state])
-        if watch.running and state in ("waiting", "running"):
-            row.operator("lodgs.cancel_block", text="", icon="X", emboss=False).block = number
-        elif state != "done":
-            row.operator("lodgs.resume_block", text="", icon="PLAY", emboss=False).block = number
+        watch, number = watch_of(data.id_data), index + 1
+        part = watch.part(number) if watch else None
+        if watch is not None and part is not None:
+            row = _numbered(layout, number).row(align=True)
+            _draw_part(row, part, stopping=number in watch.stopping)
+            if watch.running and part.state in ("waiting", "running"):
+                row.operator("lodgs.cancel_block", text="", icon="X", emboss=False).block = number
+            elif part.state != "done":
+                row.operator("lodgs.resume_block", text="", icon="PLAY", emboss=False).block = number
+
+
+def _draw_part(layout: bpy.types.UILayout, part: Part, stopping: bool = False) -> None:
+    share, what = f"{part.share:.0%}", "Borders, " if part.kind == "seam" else ""
+    if stopping:
+        layout.label(text=f"Stopping at {share}", icon="SORTTIME")
+    elif part.state == "running":
+        layout.progress(text=f"{what}{share}", factor=part.share)
+    else:
+        at = f" at {share}" if part.share and part.state != "done" else ""
+        layout.label(text=f"{part.state.capitalize()}{at}", icon=_ICONS[part.state])
 
 
 class LODGS_PT_training_cells(Panel):
@@ -72,10 +78,14 @@ class LODGS_PT_training_cells(Panel):
 def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
     settings = root.lodgs.training
     column = split_column(layout)
-    row = column.row(align=True)
-    row.prop(settings, "columns", text="Cells")
-    row.prop(settings, "rows", text="")
-    if not settings.grid:
+    column.prop(settings, "divide_by", text="Cells")
+    if settings.divide_by == "GRID":
+        row = column.row(align=True)
+        row.prop(settings, "columns", text="Columns, Rows")
+        row.prop(settings, "rows", text="")
+    else:
+        column.prop(settings, "cell_splats" if settings.divide_by == "SPLATS" else "cell_memory")
+    if settings.divide_by == "GRID" and not settings.grid:
         say(layout, "One cell: the scene is trained as a whole.", "INFO")
         return
     column.prop(settings, "at_once")
@@ -102,21 +112,16 @@ def _draw_plan(layout, settings, fits):
 
 def draw_blocks(layout: bpy.types.UILayout, root: bpy.types.Object, watch: Watch) -> None:
     """How each cell of a run gets on, with a button that stops it or goes on."""
-    settings = root.lodgs.training
-    if watch.blocks and len(settings.planned_cells) == len(watch.blocks):
+    settings, whole = root.lodgs.training, watch.part(0)
+    if whole is not None and whole.state != "done":
+        parts = layout.split(factor=0.4)
+        parts.label(text="Coarse levels")
+        _draw_part(parts, whole)
+    if watch.part(1) is not None:
         rows = min(max(len(settings.planned_cells), 3), 8)
         layout.template_list(
             "LODGS_UL_blocks", "", settings, "planned_cells", settings, "active_cell", rows=rows
         )
-
-
-def block_facts(watch: Watch, index: int) -> tuple[float, str]:
-    """How much of a block is done, 0 to 1, and its state; what a run leaves on the way is stopped."""
-    block = watch.blocks[index]
-    state = block["state"]
-    if state == "running" and not watch.running:
-        state = "cancelled"
-    return min(block["step"] / max(block["of"], 1), 1.0), state
 
 
 def _numbered(layout: bpy.types.UILayout, number: int) -> bpy.types.UILayout:

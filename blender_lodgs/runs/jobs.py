@@ -20,7 +20,6 @@ from ...training.errors import LodgsError
 from ...training.lod.selection import complete
 from ...training.methods import method_info, parameters_of
 from ...training.methods.parameters import Parameters
-from ...training.runs.events import BLOCK_STATES
 from ...training.runs.folder import RunFolder
 from ...training.runs.job import CHANGEABLE, DOME, Job
 from ...training.scenes.cameras import write_camera
@@ -92,11 +91,11 @@ def resume(root: bpy.types.Object) -> Watch:
     return _resume(root, run)
 
 
-def _resume(root: bpy.types.Object, run: RunFolder, block: int = 0) -> Watch:
-    """Goes on with a run, or with one of its blocks alone."""
+def _resume(root: bpy.types.Object, run: RunFolder, cell: int = 0) -> Watch:
+    """Goes on with a run, or with one of its cells alone."""
     job = replace(Job.from_file(run.job), out=str(run.path))
     backend = extension.preferences().backend  # what this computer has, and what its user wants now
-    return _launch(root, run, replace(job, backend=backend), write=job.backend != backend, block=block)
+    return _launch(root, run, replace(job, backend=backend), write=job.backend != backend, cell=cell)
 
 
 def start_or_resume(root: bpy.types.Object, job: Job) -> Watch:
@@ -150,48 +149,47 @@ def cancel(root: bpy.types.Object) -> None:
             watch.process.kill()
         else:
             watch.folder.end()
-        for each in watch.blocks:  # with nobody to begin them again
+        for number in {each["block"] for each in watch.blocks}:  # with nobody to begin them again
+            part = watch.part(number)
             with suppress(LodgsError, OSError):
-                _block(watch.folder, each["block"]).end()
+                if part is not None:
+                    part.folder.end()
     extension.redraw()
 
 
 def cancel_block(root: bpy.types.Object, number: int) -> None:
-    """Ask one block of a run to save and stop, while the others go on.
+    """Ask the training of one cell to save and stop, while the others go on.
 
     Raises:
         LodgsError: it is not at work, nor to begin.
     """
     watch = watch_of(root)
-    if watch is None or not watch.running or _block_state(watch, number) not in {"waiting", "running"}:
+    part = watch.part(number) if watch is not None and watch.running else None
+    if watch is None or part is None or part.state not in {"waiting", "running"}:
         raise LodgsError(f"Cell {number} of '{root.name}' is not being trained.")
-    _ask(_block(watch.folder, number).request_cancel)
+    _ask(part.folder.request_cancel)
     watch.stopping.add(number)
     extension.redraw()
 
 
 def resume_block(root: bpy.types.Object, number: int) -> Watch:
-    """Go on with one block of a run: beside the others where they are at work, else alone.
+    """Go on with the training of one cell: beside the others where they are at work, else alone.
 
     Raises:
-        LodgsError: there is no such block, or it is at work or finished.
+        LodgsError: there is no such cell, or it is at work or finished.
     """
     watch = watch_of(root)
-    over = {"cancelled", "failed"} if watch is not None and watch.running else {*BLOCK_STATES} - {"done"}
-    if watch is None or _block_state(watch, number) not in over:
+    part = watch.part(number) if watch is not None else None
+    if (
+        watch is None
+        or part is None
+        or part.state in ({"waiting", "running", "done"} if watch.running else {"done"})
+    ):
         raise LodgsError(f"Cell {number} of '{root.name}' has nothing to go on with.")
     if not watch.running:
         return _resume(root, watch.folder, number)
-    _ask(_block(watch.folder, number).request_resume)
+    _ask(part.folder.request_resume)
     return watch
-
-
-def _block(run: RunFolder, number: int) -> RunFolder:
-    return RunFolder(run.blocks / str(number))
-
-
-def _block_state(watch: Watch, number: int) -> str:
-    return next((each["state"] for each in watch.blocks if each["block"] == number), "")
 
 
 def _ask(request: Callable[[], None]) -> None:
@@ -421,7 +419,7 @@ def base_of(root: bpy.types.Object, out: Path) -> str:
 
 
 def _launch(
-    root: bpy.types.Object, run: RunFolder, job: Job, *, write: bool, hand_over: bool = False, block: int = 0
+    root: bpy.types.Object, run: RunFolder, job: Job, *, write: bool, hand_over: bool = False, cell: int = 0
 ) -> Watch:
     python, at_once = environment.trainer_python(), root.lodgs.training.at_once if job.cells else 1
     environment.require(python, at_once)
@@ -433,7 +431,7 @@ def _launch(
     what = ["train", str(run.job), "--out", str(run.path)]
     if job.cells:
         what = ["blocks", "run", str(run.path), "--on", f"local:{at_once}" if at_once > 1 else "here"]
-        what += ["--block", str(block)] if block else []
+        what += ["--cell", str(cell)] if cell else []
     try:
         run.take_cancel()  # what was asked of an earlier trainer; from now on it is for this one
         process = processes.spawn([str(python), "-m", "training", *what], log=run.log, output=run.output)

@@ -27,6 +27,24 @@ UNRESPONSIVE_AFTER = 60.0
 """Seconds without an event after which the panel says that the trainer does not answer."""
 
 
+@dataclass(frozen=True)
+class Part:
+    """What of a scene in cells is trained now: of the whole, or of one cell.
+
+    Attributes:
+        folder: of its run.
+        number: of the cell; 0 for the whole.
+        kind, state: as ``progress`` events have them (``BLOCK_KINDS``, ``BLOCK_STATES``).
+        share: how much is done, 0 to 1, of a cell with its borders.
+    """
+
+    folder: RunFolder
+    number: int
+    kind: str
+    state: str
+    share: float
+
+
 @dataclass
 class Watch:
     """What Blender knows of one run.
@@ -40,12 +58,12 @@ class Watch:
         share: how much of that is done, 0 to 1.
         problem: why the run failed, as a sentence with its remedy; empty when it did not.
         progress: the newest ``progress`` event.
-        blocks: how each block of a scene in cells gets on, as a ``progress`` event says.
+        blocks: how each part of a scene in cells gets on, as a ``progress`` event says; see :meth:`part`.
         levels: the newest ``level`` event of each level.
         summary: of a finished run the ``done`` event, with what it is worth.
         warnings: the warnings of this run.
         cancel_requested: whether it was asked to stop.
-        stopping: numbers of blocks that were asked to stop by themselves.
+        stopping: numbers of cells that were asked to stop by themselves.
         method: what it trains.
         last_event: when an event came last, in seconds since the epoch.
         offset: bytes of the run's events that have been read.
@@ -79,6 +97,19 @@ class Watch:
     def unresponsive(self) -> bool:
         """Whether a running trainer has sent no event for :data:`UNRESPONSIVE_AFTER` seconds."""
         return self.running and time.time() - self.last_event > UNRESPONSIVE_AFTER
+
+    def part(self, number: int) -> Part | None:
+        """What is trained of a cell now, or last; or with 0 of the whole scene, before its cells. None where
+        nothing is known of such a part."""
+        mine = [each for each in self.blocks if each["block"] == number]
+        if not mine:
+            return None
+        now = next((each for each in mine if each["state"] != "done"), mine[-1])
+        state = "cancelled" if now["state"] == "running" and not self.running else now["state"]
+        share = sum(each["step"] for each in mine) / max(sum(each["of"] for each in mine), 1)
+        run = self.folder
+        places = {"coarse": run.coarse, "block": run.blocks / str(number), "seam": run.seams / str(number)}
+        return Part(RunFolder(places[now["kind"]]), number, now["kind"], state, min(share, 1.0))
 
     def step(self) -> bool:
         """Handle the events since the last step; return whether there may be more.
@@ -153,8 +184,9 @@ class Watch:
 
     def _take_blocks(self, root: bpy.types.Object, blocks: list[dict]) -> None:
         self.blocks = blocks
-        self.stopping -= {each["block"] for each in blocks if each["state"] not in {"waiting", "running"}}
-        cells.require(root.lodgs.training, len(blocks))
+        parts = map(self.part, self.stopping)
+        self.stopping = {part.number for part in parts if part and part.state in ("waiting", "running")}
+        cells.require(root.lodgs.training, sum(each["kind"] == "block" for each in blocks))
 
     def _add_level(self, root: bpy.types.Object, event: dict) -> None:
         if self._stays_in_file(root, event):

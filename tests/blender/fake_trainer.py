@@ -170,7 +170,7 @@ class Cell:
 def cells(job: Job, folder: RunFolder, say: Events, options: list[str]) -> bool:
     """Trains cells as ``train_blocks`` does; whether all are done."""
     print(*options, file=sys.stderr)  # for the log
-    only = [int(value) for name, value in pairwise(options) if name == "--block"]
+    only = [int(value) for name, value in pairwise(options) if name == "--cell"]
     columns, rows = job.grid
     blocks = [Cell(n, RunFolder(folder.blocks / str(n))) for n in range(1, columns * rows + 1)]
     for block in blocks:
@@ -183,7 +183,10 @@ def cells(job: Job, folder: RunFolder, say: Events, options: list[str]) -> bool:
             return False
         for block in blocks:
             block.look(STEPS if (folder.path / "go on").exists() else STEPS // 2)
-        told = [{"block": b.number, "state": b.state, "step": b.step, "of": STEPS} for b in blocks]
+        told = [
+            {"block": b.number, "kind": "block", "state": b.state, "step": b.step, "of": STEPS}
+            for b in blocks
+        ]
         say("progress", stage="training blocks", level=1, levels=1, step=sum(b.step for b in blocks),
             of=STEPS * len(blocks), loss=0.5, psnr=20.0, splats=5, steps_per_s=20.0, eta_s=60.0,
             blocks=told)  # fmt: skip

@@ -29,8 +29,10 @@ PROTOCOL = 1
 MOST_BYTES, MOST_LINE, MOST_EVENTS = 1 << 26, 1 << 18, 300_000
 """Bounds of the file, of a line in it and of the number of events: a month of training keeps within them."""
 
+BLOCK_KINDS = ("coarse", "block", "seam")
+"""What of a scene in cells is trained by itself: levels of the whole, a cell, the borders of one."""
 BLOCK_STATES = ("waiting", "running", "done", "cancelled", "failed")
-"""How a block of a scene in cells gets on."""
+"""How that gets on."""
 
 _MOST_TEXT, _MOST_NUMBER, _DEEPEST = 10_000, 1e30, 8
 _RESERVE = 1 << 16  # bytes
@@ -137,6 +139,7 @@ def _are_blocks(value: object) -> bool:
     """What a ``progress`` event says of each block of a scene in cells."""
     return isinstance(value, list) and all(
         isinstance(each, dict)
+        and each.get("kind") in BLOCK_KINDS
         and each.get("state") in BLOCK_STATES
         and all(_is_count(each.get(name)) for name in ("block", "step", "of"))
         for each in value
