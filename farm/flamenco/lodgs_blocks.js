@@ -33,12 +33,12 @@ function compileJob(job) {
         "blocks", "plan", "--scene", scene, "--out", output, "--cells", `${columns}x${rows}`,
         "--method", method, "--preset", preset, "--image-scale", `${image_scale}`,
     ]);
-    const blocks = [];
-    for (let number = 1; number <= columns * rows; number++) {
-        const file = path.join(output, "blocks", `${number}`, "job.toml");
-        blocks.push(task(job, `block ${number}`, lodgs, ["train", file], [plan]));
-    }
-    task(job, "put together", lodgs, ["blocks", "run", output], blocks);
+    const numbers = Array.from({ length: columns * rows }, (_, index) => index + 1);
+    const part = (kind, after) => task(job, kind, lodgs, ["blocks", "run", output, "--only", kind], after);
+    const coarse = part("coarse", [plan]);
+    const blocks = numbers.map((number) => part(`block-${number}`, [coarse]));
+    const seams = numbers.map((number) => part(`seam-${number}`, blocks));
+    task(job, "put together", lodgs, ["blocks", "run", output], seams);
 }
 
 function task(job, name, exe, args, after = []) {
