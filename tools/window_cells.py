@@ -1,7 +1,7 @@
 """The tour of a large scene, inside Blender: planned, trained in cells, put together.
 
-``tools/window.py --cells`` starts it. The plan over the scene, two cells at once, one stopped and gone on with,
-the file closed and opened meanwhile, and levels that arrive.
+``tools/window.py --cells`` starts it. The plan over the scene, two cells at once, one stopped and gone on
+with, the file closed and opened meanwhile, and levels that arrive.
 """
 # pyright: reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
 

@@ -91,11 +91,10 @@ def resume(root: bpy.types.Object) -> Watch:
     return _resume(root, run)
 
 
-def _resume(root: bpy.types.Object, run: RunFolder, cell: int = 0) -> Watch:
-    """Goes on with a run, or with one of its cells alone."""
+def _resume(root: bpy.types.Object, run: RunFolder) -> Watch:
     job = replace(Job.from_file(run.job), out=str(run.path))
     backend = extension.preferences().backend  # what this computer has, and what its user wants now
-    return _launch(root, run, replace(job, backend=backend), write=job.backend != backend, cell=cell)
+    return _launch(root, run, replace(job, backend=backend), write=job.backend != backend)
 
 
 def start_or_resume(root: bpy.types.Object, job: Job) -> Watch:
@@ -186,10 +185,8 @@ def resume_block(root: bpy.types.Object, number: int) -> Watch:
         or part.state in ({"waiting", "running", "done"} if watch.running else {"done"})
     ):
         raise LodgsError(f"Cell {number} of '{root.name}' has nothing to go on with.")
-    if not watch.running:
-        return _resume(root, watch.folder, number)
     _ask(part.folder.request_resume)
-    return watch
+    return watch if watch.running else _resume(root, watch.folder)
 
 
 def _ask(request: Callable[[], None]) -> None:
@@ -419,7 +416,7 @@ def base_of(root: bpy.types.Object, out: Path) -> str:
 
 
 def _launch(
-    root: bpy.types.Object, run: RunFolder, job: Job, *, write: bool, hand_over: bool = False, cell: int = 0
+    root: bpy.types.Object, run: RunFolder, job: Job, *, write: bool, hand_over: bool = False
 ) -> Watch:
     python, at_once = environment.trainer_python(), root.lodgs.training.at_once if job.cells else 1
     environment.require(python, at_once)
@@ -431,7 +428,6 @@ def _launch(
     what = ["train", str(run.job), "--out", str(run.path)]
     if job.cells:
         what = ["blocks", "run", str(run.path), "--on", f"local:{at_once}" if at_once > 1 else "here"]
-        what += ["--cell", str(cell)] if cell else []
     try:
         run.take_cancel()  # what was asked of an earlier trainer; from now on it is for this one
         process = processes.spawn([str(python), "-m", "training", *what], log=run.log, output=run.output)

@@ -24,7 +24,6 @@ import signal
 import sys
 import time
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 
 sys.path.insert(0, os.getcwd())
@@ -170,14 +169,14 @@ class Cell:
 def cells(job: Job, folder: RunFolder, say: Events, options: list[str]) -> bool:
     """Trains cells as ``train_blocks`` does; whether all are done."""
     print(*options, file=sys.stderr)  # for the log
-    only = [int(value) for name, value in pairwise(options) if name == "--cell"]
     columns, rows = job.grid
     blocks = [Cell(n, RunFolder(folder.blocks / str(n))) for n in range(1, columns * rows + 1)]
     for block in blocks:
         block.folder.path.mkdir(parents=True, exist_ok=True)
         block.folder.take_cancel()
-        if only and block.number not in only:
-            block.state = "cancelled"
+    if asked := [block for block in blocks if block.folder.take_resume()]:
+        for block in blocks:
+            block.state = "running" if block in asked else "cancelled"
     while any(block.state == "running" for block in blocks):
         if folder.take_cancel():
             return False
