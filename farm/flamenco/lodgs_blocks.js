@@ -22,22 +22,24 @@ const JOB_TYPE = {
           description: "How long to train" },
         { key: "image_scale", type: "float", default: 0.5, propargs: { min: 0.01, max: 1 },
           description: "Size of training images over photographs" },
+        { key: "polish", type: "int32", default: 100, propargs: { min: 0 },
+          description: "Steps that fit each cell's borders to the cells beside it; 0 for none" },
         { key: "lodgs", type: "string", default: "{lodgs}", visible: "hidden",
           description: "The command lodgs, by the manager's variable" },
     ],
 };
 
 function compileJob(job) {
-    const { scene, output, columns, rows, method, preset, image_scale, lodgs } = job.settings;
+    const { scene, output, columns, rows, method, preset, image_scale, polish, lodgs } = job.settings;
     const plan = task(job, "plan", lodgs, [
-        "blocks", "plan", "--scene", scene, "--out", output, "--cells", `${columns}x${rows}`,
-        "--method", method, "--preset", preset, "--image-scale", `${image_scale}`,
+        "blocks", "plan", scene, "--out", output, "--cells", `${columns}x${rows}`,
+        "--method", method, "--preset", preset, "--image-scale", `${image_scale}`, "--polish", `${polish}`,
     ]);
     const numbers = Array.from({ length: columns * rows }, (_, index) => index + 1);
     const part = (kind, after) => task(job, kind, lodgs, ["blocks", "run", output, "--only", kind], after);
     const coarse = part("coarse", [plan]);
     const blocks = numbers.map((number) => part(`block-${number}`, [coarse]));
-    const seams = numbers.map((number) => part(`seam-${number}`, blocks));
+    const seams = polish ? numbers.map((number) => part(`seam-${number}`, blocks)) : blocks;
     task(job, "put together", lodgs, ["blocks", "run", output], seams);
 }
 
