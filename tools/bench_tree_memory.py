@@ -176,7 +176,7 @@ def train(options: argparse.Namespace) -> dict:
     torch.save(method.state_dict(), options.folder / "checkpoint.pt")
     some = slice(WARM, -AFTER)
     share = store.cache.reused / max(store.cache.reused + store.cache.loaded, 1)
-    cache_mb = (store.cache.capacity * (4 * store.layout.width + BESIDE) + 4 * len(store)) / 1e6
+    cache_mb = (store.cache.capacity * (4 * store.layout.width + BESIDE) + store.cache.tables) / 1e6
     return {
         "splats": len(store), "cache_mb": cache_mb, "reused": share,
         "step_s": float(np.mean(times[some])), "cut_ms": float(np.mean(cuts[some])),
