@@ -281,9 +281,9 @@ def contents(run: Path) -> dict[str, bytes]:
     outside = {"trainer.log", "trainer.out"}
     files = {path.relative_to(run).as_posix(): path for path in run.rglob("*") if path.is_file()}
     return {
-        name: b"" if name in changing else path.read_bytes()
+        name: b"" if path.name in changing else path.read_bytes()
         for name, path in files.items()
-        if name not in outside
+        if path.name not in outside
     }
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 
 from ...training.methods import METHODS, PRESETS, MethodInfo, method_info
-from ...training.runs.job import VIEW_WIDTHS, VIEWS, Job
+from ...training.runs.job import MOST_CELLS, VIEW_WIDTHS, VIEWS, Job
 from ...training.splats.bundle import MOST_LEVELS
 from . import photographs, viewpoints
 
@@ -246,6 +246,25 @@ class TrainingSettings(bpy.types.PropertyGroup):
     seed: bpy.props.IntProperty(
         name="Seed", description="Two runs with the same seed are equal", default=0, min=0
     )
+    columns: bpy.props.IntProperty(
+        name="Cells Across",
+        description="How many columns of cells the ground is divided into, across its longer side. Each cell "
+        "is trained by itself, in the memory that its part takes; 1 by 1 trains the scene as a whole",
+        default=1,
+        min=1,
+        soft_max=8,
+        max=MOST_CELLS,
+        options=set(),
+    )
+    rows: bpy.props.IntProperty(
+        name="Along",
+        description="How many cells each column has",
+        default=1,
+        min=1,
+        soft_max=8,
+        max=MOST_CELLS,
+        options=set(),
+    )
     output: bpy.props.StringProperty(
         name="Run Folders In",
         description="Folder that receives the folders of the runs; empty: lodgs_runs beside the .blend file",
@@ -275,6 +294,11 @@ class TrainingSettings(bpy.types.PropertyGroup):
         description="Bytes of the run's events that this file has taken in",
         options={"HIDDEN"},
     )
+
+    @property
+    def grid(self) -> str:
+        """The cells as a job has them; "" for the scene as a whole."""
+        return f"{self.columns}x{self.rows}" if self.columns * self.rows > 1 else ""
 
     @property
     def parameters(self) -> bpy.types.PropertyGroup:

@@ -22,16 +22,19 @@ const JOB_TYPE = {
           description: "How long to train" },
         { key: "image_scale", type: "float", default: 0.5, propargs: { min: 0.01, max: 1 },
           description: "Size of training images over photographs" },
+        { key: "options", type: "string", default: "",
+          description: "Further options of lodgs train, such as --set max_splats=500000" },
         { key: "lodgs", type: "string", default: "{lodgs}", visible: "hidden",
           description: "The command lodgs, by the manager's variable" },
     ],
 };
 
 function compileJob(job) {
-    const { scene, output, columns, rows, method, preset, image_scale, lodgs } = job.settings;
+    const { scene, output, columns, rows, method, preset, image_scale, options, lodgs } = job.settings;
     const plan = task(job, "plan", lodgs, [
         "blocks", "plan", "--scene", scene, "--out", output, "--cells", `${columns}x${rows}`,
         "--method", method, "--preset", preset, "--image-scale", `${image_scale}`,
+        ...(options ? shellSplit(options) : []),
     ]);
     const blocks = [];
     for (let number = 1; number <= columns * rows; number++) {

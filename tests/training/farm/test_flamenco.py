@@ -17,6 +17,7 @@ from training.splats.bundle import read_bundle
 ROOT = Path(__file__).resolve().parents[3]
 SCRIPT = ROOT / "farm" / "flamenco" / "lodgs_blocks.js"
 MANAGER = """
+const shellSplit = text => text.split(" ");  // the manager's, but for quotation marks
 const path = { join: (...parts) => parts.join("/") };
 const author = {
     Task: (name, type) => ({

@@ -55,8 +55,7 @@ def train_blocks(blocks: Sequence[Block], path: Path, submit: Submit, tell: Tell
             time.sleep(LOOKS)
     except BaseException:
         for each in watched:
-            if not each.over:
-                each.block.folder.request_cancel()
+            each.stop()
         while not all(each.over for each in watched):
             time.sleep(LOOKS)
         raise
@@ -95,6 +94,13 @@ class _Watched:
         """Has it trained, unless it is finished."""
         if self.code is None:
             self._pending = submit(self.block.folder.path)
+
+    def stop(self) -> None:
+        """Has it stopped: who trains it saves first, and who was to train it does not begin."""
+        if self._pending is not None and not self.over:
+            self.block.folder.request_cancel()
+            if not self.block.folder.running:
+                self._pending.cancel()
 
     @property
     def over(self) -> bool:
