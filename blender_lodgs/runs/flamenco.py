@@ -31,6 +31,8 @@ JOB_TYPE = "lodgs-blocks"
 """What the manager makes of the name of our script."""
 TIMEOUT = 10.0
 """Seconds that the manager is waited for."""
+SCRIPT = extension.FOLDER / "farm" / "flamenco" / "lodgs_blocks.js"
+_INSTALL = f"Put {SCRIPT} into the folder scripts beside the manager."
 MOST_BYTES = 1 << 20
 """Most of an answer."""
 _KEYS = ("scene", "out", "method", "preset", "image_scale", "cells")
@@ -67,7 +69,7 @@ class Submission:
         if missing := sorted(self.settings.keys() - defaults.keys()):
             raise LodgsError(
                 f"The manager's job type {JOB_TYPE} is of another version: it has no {missing[0]}.",
-                "Put lodgs_blocks.js of this version of LODGS into the folder scripts beside the manager.",
+                _INSTALL,
             )
         settings = {key: value for key, value in defaults.items() if value is not None} | self.settings
         job = {
@@ -109,7 +111,7 @@ class Submission:
         if error.code == 404 and not known:
             return LodgsError(
                 f"The Flamenco manager at {self.manager} does not know the job type {JOB_TYPE}.",
-                "Put farm/flamenco/lodgs_blocks.js of LODGS into the folder scripts beside the manager.",
+                _INSTALL,
             )
         return LodgsError(
             f"The Flamenco manager refused the job: {message.rstrip('.')}.", "Its log may tell more."

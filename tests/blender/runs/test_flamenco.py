@@ -144,6 +144,15 @@ def test_what_the_farm_compiles_of_it_is_the_job_that_training_here_has(lodgs, m
     assert there.resolved() == here.resolved()
 
 
+def test_the_type_is_that_of_the_script_that_lies_here(flamenco, manager, bpy, root):
+    """Flamenco names a type like its file, with hyphens; settings it does not know would be lost."""
+    assert flamenco.SCRIPT.stem.replace("_", "-") == flamenco.JOB_TYPE
+    submit(bpy)
+    script = flamenco.SCRIPT.read_text()
+    for key in manager.asked[1][2]["settings"]:
+        assert f'key: "{key}"' in script
+
+
 def test_a_scene_without_cells_is_one_block(bpy, manager, root):
     assert submit(bpy) == {"FINISHED"}
     said = manager.asked[1][2]["settings"]
@@ -159,7 +168,7 @@ def test_a_script_gets_the_address_of_the_job(flamenco, lodgs, manager, root, tm
 REFUSALS = {
     "unknown type": (
         {"type": (404, {"code": 404, "message": "no such job type known"})},
-        "does not know the job type lodgs-blocks. Put farm/flamenco/lodgs_blocks.js",
+        "does not know the job type lodgs-blocks. Put .*lodgs_blocks.js into the folder scripts",
     ),
     "an older type": (
         {"type": (200, {**TYPE, "settings": SETTINGS[:-1]})},
