@@ -184,7 +184,7 @@ def manager_of(address: str) -> str:
     Raises:
         LodgsError: it is empty, or no address.
     """
-    address = address.strip().rstrip("/")
+    address = address.strip()
     if not address:
         raise LodgsError(
             "It is not said where the Flamenco manager is.",
@@ -200,4 +200,4 @@ def manager_of(address: str) -> str:
         raise LodgsError(
             f"'{address}' is no address of a Flamenco manager.", "Give one such as http://farm:8080."
         )
-    return given
+    return given.rstrip("/")

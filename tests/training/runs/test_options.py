@@ -56,7 +56,7 @@ def test_options_go_before_what_the_file_says(tmp_path):
     [
         Job("/a", "/b"),
         Job("/a b", "/b'c", "octree", "paper", seed=3, exposure=-1.5, test_every=0, validation=True,
-            cells="2x3", image_scale=0.65, parameters={"rho": 3, "far_share": 0.25}),
+            cells="2x3", image_scale=0.65, parameters={"levels": 3, "far_share": 0.25}),
         Job("/a", "/b", "lodge", base="/c", parameters={"distances": [8.0, 4.5, 0.0], "antialias": True}),
     ],
 )  # fmt: skip

@@ -99,13 +99,12 @@ class _Watched:
         """Has it stopped: who trains it saves first, and who was to train it does not begin."""
         if self._pending is not None and not self.over:
             self.block.folder.request_cancel()
-            if not self.block.folder.running:
-                self._pending.cancel()
+            self._pending.cancel()
 
     @property
     def over(self) -> bool:
-        """Whether nobody is at work on it any more."""
-        return self._pending is None or self._pending.done()
+        """Whether nobody is at work on it any more, not even a trainer whose worker was lost."""
+        return self._pending is None or (self._pending.done() and not self.block.folder.running)
 
     def look(self, submit: Submit) -> bool:
         """Reads how far it is, and begins it again where whoever trained it was lost; whether it is over."""

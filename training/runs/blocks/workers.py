@@ -20,6 +20,8 @@ from ..folder import RunFolder
 HERE = "here"
 ANSWERS = 20
 """Seconds in which a scheduler answers."""
+_LETS_US_STOP = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
+"""What Dask's workers here begin with: Ctrl-C in a terminal goes to all programs, and we handle it."""
 _PACKAGE = (__package__ or "").partition(".")[0]
 
 
@@ -111,7 +113,7 @@ def workers(on: str = HERE, resources: dict[str, float] | None = None) -> Iterat
         threads = max(_cores() // n, 1)
         made = distributed.LocalCluster(
             n_workers=n, threads_per_worker=1, processes=True, dashboard_address=":0", resources=resources,
-            silence_logs=logging.ERROR,
+            silence_logs=logging.ERROR, preload=[_LETS_US_STOP],
         )  # fmt: skip
     try:
         client = distributed.Client(made, timeout=ANSWERS)
