@@ -270,9 +270,9 @@ class Bench:
 
 def lost(run: RunFolder) -> Iterator[float]:
     """Seconds of work that each loss of a trainer has cost: from where the next one went on to its end."""
-    for folder in run.blocks.glob("[0-9]*"):
+    for file in run.blocks.rglob("events.jsonl"):
         last: dict = {}
-        for event in RunFolder(folder).events()[0]:
+        for event in RunFolder(file.parent).events()[0]:
             if event["event"] == "progress":
                 last = event
             elif event.get("message", "").startswith("Going on from step ") and last:

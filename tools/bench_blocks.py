@@ -25,6 +25,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from training.runs.blocks.plan import BLOCK, COARSE, read_plan  # noqa: E402
 from training.runs.folder import RunFolder  # noqa: E402
 
 ON = ("here", "local:1", "local:2")
@@ -32,8 +33,6 @@ MOST_WORKERS = 64
 JOB = (
     "--scene", str(ROOT / "examples" / "lantern_walk"), "--method", "flod", "--test-every", "8",
 )  # fmt: skip
-STAGES = ("coarse", "blocks", "seams")
-"""Folders of a run whose parts are trained, in this order; one may be missing."""
 
 
 def workers_of(on: str) -> int:
@@ -63,20 +62,16 @@ def lodgs(*arguments: str) -> float:
     return time.monotonic() - begun
 
 
-def own_seconds(folder: Path) -> float:
+def own_seconds(folder: RunFolder) -> float:
     """From a part's trainer's first word to its last."""
-    events = RunFolder(folder).events()[0]
+    events = folder.events()[0]
     return events[-1]["time"] - events[0]["time"]
 
 
 def parts_of(run: RunFolder) -> dict[str, list[float]]:
-    """The own times of a run's parts by stage, in the order of their numbers."""
-    found = {}
-    for stage in STAGES:
-        jobs = sorted((run.path / stage).rglob("job.toml"), key=lambda job: (len(str(job)), str(job)))
-        if jobs:
-            found[stage] = [round(own_seconds(job.parent), 3) for job in jobs]
-    return found
+    """The own times of a run's parts by stage, which begins when the one before it is over."""
+    stages = [stage for stage in read_plan(run).stages if stage]
+    return {stage[0].kind: [round(own_seconds(part.folder), 3) for part in stage] for stage in stages}
 
 
 def measure(work: Path, on: str, cells: str, further: Sequence[str]) -> dict:
@@ -110,10 +105,11 @@ def model(row: dict, workers: int, times: int = 1) -> float:
     """
     parts = row["parts_s"]
     each = row["overhead_s"] / sum(map(len, parts.values()))
-    alone = sum(seconds + each for seconds in parts.get("coarse", ()))
-    divided = [parts[stage] * times for stage in ("blocks", "seams") if stage in parts]
-    spread = sum(makespan([seconds + each for seconds in stage], workers) for stage in divided)
-    return row["starting_s"] + alone * times + spread + row["after_s"] * times
+    seconds = row["starting_s"] + row["after_s"] * times
+    for kind, stage in parts.items():
+        stage = [own + each for own in stage]
+        seconds += sum(stage) * times if kind == COARSE else makespan(stage * times, workers)
+    return seconds
 
 
 def plot(path: Path, rows: Sequence[dict]) -> None:
@@ -124,7 +120,7 @@ def plot(path: Path, rows: Sequence[dict]) -> None:
     from matplotlib import pyplot
 
     one = next(row for row in rows if row["on"] == "here")
-    count, counts = len(one["parts_s"]["blocks"]), range(1, MOST_WORKERS + 1)
+    count, counts = len(one["parts_s"][BLOCK]), range(1, MOST_WORKERS + 1)
     figure, axes = pyplot.subplots(figsize=(7, 4))
     for times, style in ((1, "-"), (-(-MOST_WORKERS // count), "--")):
         least = model(one, 1, times)

@@ -83,13 +83,27 @@ def _parser() -> argparse.ArgumentParser:
 
     blocks = commands.add_parser("blocks", help="a scene that is too large for one run, in cells")
     whats = blocks.add_subparsers(dest="what", required=True, metavar="WHAT")
-    plan = whats.add_parser("plan", help="divide a job with --cells into blocks, each an ordinary run")
+    plan = whats.add_parser(
+        "plan", help="divide a job into blocks, each an ordinary run, and say what each takes"
+    )
     add_options(plan)
+    plan.add_argument(
+        "--block-splats", type=_amount, default=0, metavar="N",
+        help="instead of --cells: as few cells as have N splats each, at most",
+    )  # fmt: skip
+    plan.add_argument(
+        "--block-memory", type=_amount, default=0, metavar="MB",
+        help="instead of --cells: as few as take so much memory each, by the plan's estimate",
+    )  # fmt: skip
     goes = whats.add_parser("run", help="train the blocks of a plan, or go on, and put them together")
     goes.add_argument("run", type=Path, help="run folder of the plan")
     goes.add_argument(
         "--on", default="here", metavar="WHERE",
         help="here, one by one (default); local:N, N at a time; or a Dask scheduler, tcp://HOST:8786",
+    )  # fmt: skip
+    goes.add_argument(
+        "--only", metavar="PART",
+        help="train here this part alone: coarse, block-3 or seam-3; nothing where there is none",
     )  # fmt: skip
     goes.add_argument(
         "--takes", action="append", default=[], metavar="NAME=NUMBER",
@@ -193,6 +207,12 @@ def _size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
+def _amount(text: str) -> int:
+    if text.isdecimal() and 0 < int(text) < 2**31:
+        return int(text)
+    raise argparse.ArgumentTypeError(f"{text} is no whole number above 0")
+
+
 def _colour(text: str) -> tuple[float, float, float] | None:
     if text == "transparent":
         return None
@@ -238,30 +258,46 @@ def _blocks(chosen: argparse.Namespace) -> int:
 
 
 def _plan_blocks(chosen: argparse.Namespace) -> int:
-    from .runs.blocks.plan import plan_table, write_plan
+    from .runs.blocks.plan import cells_within, plan, plan_table, read_planned_scene, write_plan
     from .runs.folder import RunFolder
     from .runs.job import keep_job
     from .runs.options import job_from
 
     job = job_from(chosen).resolved()
+    scene = read_planned_scene(job)
+    if not job.cells and (chosen.block_splats or chosen.block_memory):
+        job = job.in_cells(cells_within(job, chosen.block_splats, chosen.block_memory * 10**6, scene))
     if not job.cells:
-        raise LodgsError("It is not said how many cells.", "Add --cells 2x4, for 2 columns of 4 each.")
+        raise LodgsError(
+            "It is not said how many cells.",
+            "Add --cells 2x4, for 2 columns of 4 each, or --block-splats 1000000.",
+        )
+    planned = plan(job, scene)
     folder = RunFolder(job.out)
     folder.make()
     if folder.job.exists():
         keep_job(job, folder)
-    blocks = write_plan(job, folder)
+    write_plan(job, folder, scene, planned)
     keep_job(job, folder)  # now that it can be
-    print(plan_table(blocks))
+    print(plan_table(planned))
     print(f"Train them with: {PROGRAM} blocks run {folder.path}", flush=True)
     return 0
 
 
 def _run_blocks(chosen: argparse.Namespace) -> int:
-    from .runs.blocks.plan import planned_job
+    from .runs.blocks.plan import planned_job, read_plan
+    from .runs.blocks.train import prepare
+    from .runs.folder import RunFolder
     from .runs.options import amounts
 
-    return _trained(lambda: planned_job(chosen.run), on=chosen.on, resources=amounts(chosen.takes))
+    if not chosen.only:
+        return _trained(lambda: planned_job(chosen.run), on=chosen.on, resources=amounts(chosen.takes))
+    division = read_plan(RunFolder(chosen.run))
+    part = division.named(chosen.only)
+    if part is None:
+        return 0
+    prepare(division, part)
+    return _trained(lambda: part.job)
 
 
 def _methods(chosen: argparse.Namespace) -> int:

@@ -12,7 +12,7 @@ import platform
 import shlex
 import urllib.error
 import urllib.request
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -21,7 +21,6 @@ import bpy
 from ...training.documents import json_object
 from ...training.errors import LodgsError, printable
 from ...training.runs.folder import RunFolder
-from ...training.runs.job import Job
 from ...training.runs.options import options_of
 from .. import extension
 from ..data import viewpoints
@@ -35,7 +34,7 @@ SCRIPT = extension.FOLDER / "farm" / "flamenco" / "lodgs_blocks.js"
 _INSTALL = f"Put {SCRIPT} into the folder scripts beside the manager."
 MOST_BYTES = 1 << 20
 """Most of an answer."""
-_KEYS = ("scene", "out", "method", "preset", "image_scale", "cells")
+_KEYS = ("scene", "out", "method", "preset", "image_scale", "cells", "polish")
 """Keys of a job that the job type has settings for; the others are its options."""
 _WHERE = ("backend", "photo_memory", "splat_memory")
 """Keys that say how this computer trains: each of the farm's decides by itself."""
@@ -168,12 +167,12 @@ def prepare(root: bpy.types.Object, folder: str = "") -> Submission:
     out = Path(bpy.path.abspath(folder)).resolve() if folder else jobs.new_folder(root)
     if RunFolder(out).state() != "empty":
         raise LodgsError(f"{out} already holds a run.", "Choose another folder.")
-    values = asdict(jobs.make_job(root, out, {}))
-    job = Job.from_dict({**values, "cells": values["cells"] or "1x1"})
+    job = jobs.make_job(root, out, {})
+    job = job.in_cells(job.cells or "1x1")
     columns, rows = job.grid
     return Submission(manager, root.name, {
         "scene": job.scene, "output": job.out, "columns": columns, "rows": rows, "method": job.method,
-        "preset": job.preset, "image_scale": job.image_scale,
+        "preset": job.preset, "image_scale": job.image_scale, "polish": job.polish,
         "options": shlex.join(options_of(job, but=(*_KEYS, *_WHERE))),
     })  # fmt: skip
 

@@ -22,6 +22,8 @@ const JOB_TYPE = {
           description: "How long to train" },
         { key: "image_scale", type: "float", default: 0.5, propargs: { min: 0.01, max: 1 },
           description: "Size of training images over photographs" },
+        { key: "polish", type: "int32", default: 100, propargs: { min: 0 },
+          description: "Steps that fit each cell's borders to the cells beside it; 0 for none" },
         { key: "options", type: "string", default: "",
           description: "Further options of lodgs train, such as --set max_splats=500000" },
         { key: "lodgs", type: "string", default: "{lodgs}", visible: "hidden",
@@ -30,18 +32,18 @@ const JOB_TYPE = {
 };
 
 function compileJob(job) {
-    const { scene, output, columns, rows, method, preset, image_scale, options, lodgs } = job.settings;
+    const { scene, output, columns, rows, method, preset, image_scale, polish, options, lodgs } = job.settings;
     const plan = task(job, "plan", lodgs, [
-        "blocks", "plan", "--scene", scene, "--out", output, "--cells", `${columns}x${rows}`,
-        "--method", method, "--preset", preset, "--image-scale", `${image_scale}`,
+        "blocks", "plan", scene, "--out", output, "--cells", `${columns}x${rows}`,
+        "--method", method, "--preset", preset, "--image-scale", `${image_scale}`, "--polish", `${polish}`,
         ...(options ? shellSplit(options) : []),
     ]);
-    const blocks = [];
-    for (let number = 1; number <= columns * rows; number++) {
-        const file = path.join(output, "blocks", `${number}`, "job.toml");
-        blocks.push(task(job, `block ${number}`, lodgs, ["train", file], [plan]));
-    }
-    task(job, "put together", lodgs, ["blocks", "run", output], blocks);
+    const numbers = Array.from({ length: columns * rows }, (_, index) => index + 1);
+    const part = (kind, after) => task(job, kind, lodgs, ["blocks", "run", output, "--only", kind], after);
+    const coarse = part("coarse", [plan]);
+    const blocks = numbers.map((number) => part(`block-${number}`, [coarse]));
+    const seams = polish ? numbers.map((number) => part(`seam-${number}`, blocks)) : blocks;
+    task(job, "put together", lodgs, ["blocks", "run", output], seams);
 }
 
 function task(job, name, exe, args, after = []) {

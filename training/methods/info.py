@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -38,6 +38,8 @@ class MethodInfo:
             name, whatever the preset.
         in_cells: the method that trains cells of a scene that is too large for one run: its own name, or one
             whose splats, put together, are then its base; "" where cells cannot be put together.
+        divided: of the parameters of a scene in cells, those of a run of all of it that makes the coarser
+            levels once, and those of the cells' runs, which go on from them; None: cells make all levels.
         retired: names of parameters that earlier versions wrote into job files without any effect.
         package: the folder as a module, set where the method is found.
     """
@@ -54,6 +56,7 @@ class MethodInfo:
     base_in_parts: bool = False
     for_splats: bool = False
     in_cells: str = ""
+    divided: Callable[[Any], tuple[Parameters, Parameters] | None] = lambda parameters: None
     captured: Mapping[str, Any] = field(default_factory=dict)
     retired: tuple[str, ...] = ()
     package: str = ""

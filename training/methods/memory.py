@@ -9,6 +9,10 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+MOST_BYTES = 2 << 30
+"""Bytes of photographs that are kept, if nothing is said and the computer has four times as much free."""
+TARGET_BYTES = 36
+"""Bytes a pixel: the photograph and its two local moments, float32."""
 UNKNOWN = 4 << 30
 """Bytes that a computer is taken to have where it does not say."""
 

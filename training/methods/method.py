@@ -145,6 +145,7 @@ class Method(ABC, Generic[P, D]):
         drawings = self.draw(view, step)
         loss = self.loss(drawings, view, step)
         loss.backward()
+        self.model.hold_still()
         self.accumulate_stats(drawings, view, step)
         self.set_learning_rates(step)
         for optimizer in (*self.optimizers(), *self.exposure.optimizers(step / self.steps)):

@@ -21,6 +21,10 @@ PEAKS = ("gradient_max", "radius_max")
 """Stats that densification by maxima needs: as ``gradient_sum``, and in pixels, since the last reset."""
 
 
+HELD = "held"
+"""Column of the rows that stay as they are, 1, where there are such: what they are beside is trained."""
+
+
 class Model:
     """N splats (or anchors of splats) under optimisation.
 
@@ -100,6 +104,18 @@ class Model:
     def assign(self, name: str, values: torch.Tensor) -> None:
         """Gives a trained tensor new values and zero moments."""
         self._replace(name, values, torch.zeros_like(values), torch.zeros_like(values))
+
+    def hold(self, rows: torch.Tensor) -> None:
+        """From now on these rows, (N,) bool, stay as they are."""
+        self.columns[HELD] = rows.to(self["means"])
+
+    def hold_still(self) -> None:
+        """After ``backward``: rows that are held have no part in the step."""
+        if HELD in self.columns:
+            held = self.columns[HELD] > 0
+            for tensor in self.adam.tensors.values():
+                if tensor.grad is not None:
+                    tensor.grad[held] = 0
 
     def accumulate_stats(self, rendering: Rendering, shrink: float = 1) -> None:
         """After ``backward``: adds up image-plane gradients' norms, and how often each splat was drawn.

@@ -126,6 +126,16 @@ class Parameters:
         """Training steps of a run that begins with a base, where the method can."""
         return self.total_steps
 
+    @property
+    def goes_on(self) -> bool:
+        """Whether training goes on from coarser levels, which a base has."""
+        return False
+
+    @property
+    def most_at_once(self) -> int:
+        """Most splats that are trained at a time."""
+        return self.max_splats
+
     def margin_room(self, budget: int) -> int:
         """How many of at most so many splats may continue photographs."""
         return min(int(MARGIN_SHARE * budget), MARGIN_SPLATS) if self.margin else 0

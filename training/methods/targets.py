@@ -11,12 +11,8 @@ from pathlib import Path
 
 from ..rasterize import Target
 from ..scenes.cameras import Camera
-from .memory import free_memory
+from .memory import MOST_BYTES, TARGET_BYTES, free_memory
 
-MOST_BYTES = 2 << 30
-"""Bytes of photographs that are kept, if nothing is said and the computer has four times as much free."""
-TARGET_BYTES = 36
-"""Bytes a pixel: the photograph and its two local moments, float32."""
 READERS = 2
 """Threads that read: a step has its own."""
 AHEAD = 8

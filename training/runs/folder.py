@@ -57,6 +57,8 @@ class RunFolder:
         self.base = self.path / "base.ply"
         self.cameras = self.path / "cameras"
         self.blocks = self.path / "blocks"
+        self.coarse = self.blocks / "coarse"
+        self.seams = self.blocks / "seams"
         self.whole = self.blocks / "whole.ply"
         self.reserve = self.path / "reserve"
         self._lock = self.path / "lock"

@@ -23,6 +23,8 @@ DOME = "dome"
 """What ``capture`` is for views from all around."""
 VIEWS, VIEW_WIDTHS = (2, 2000), (32, 8192)
 """Bounds of how many views a dome has, and of the pixels that their pictures are wide."""
+POLISH = 100
+"""Steps that fit a cell's borders to the cells beside it, if nothing is said."""
 MOST_CELLS = 256
 """Most cells of a scene."""
 MOST_PATH = 2000
@@ -66,6 +68,7 @@ class Job:
         region: a file of ``scenes.regions``: what of the scene is trained on; "" for all.
         cells: how many cells on the ground are trained one by one, "COLUMNSxROWS", and then put together; ""
             for the scene as a whole.
+        polish: steps that fit each cell's borders to the cells beside it, once all are trained; 0 for none.
         model, images: the COLMAP model's and the photographs' folder where they are not found by themselves.
         parameters: changes to the preset's parameters by name.
     """
@@ -90,6 +93,7 @@ class Job:
     images: str = ""
     region: str = ""
     cells: str = ""
+    polish: int = POLISH
     parameters: dict = field(default_factory=dict)
 
     @classmethod
@@ -156,16 +160,21 @@ class Job:
                 f"exposure = {self.exposure!r} is not possible.",
                 f"Give stops from {-MOST_STOPS} to {MOST_STOPS}.",
             )
-        for key in ("photo_memory", "splat_memory"):
+        for key, what in (("photo_memory", "megabytes"), ("splat_memory", "megabytes"), ("polish", "steps")):
             if not 0 <= getattr(self, key) < 2**31:
                 raise LodgsError(
-                    f"{key} = {getattr(self, key)!r} is not possible.", "Give megabytes, or 0 to let it be."
+                    f"{key} = {getattr(self, key)!r} is not possible.", f"Give {what}, or 0 to let it be."
                 )
         if self.backend not in BACKENDS:
             raise LodgsError(
                 f"There is no backend {shown(self.backend)}.", f"Choose one of: {', '.join(BACKENDS)}."
             )
-        if self.base and not method_info(self.method).from_base:
+        goes_on = self.resolved_parameters().goes_on
+        if goes_on and not self.base:
+            raise LodgsError(
+                "The job does not say which levels to go on from.", "Say 'base', or begin with level 1."
+            )
+        if self.base and not (goes_on or method_info(self.method).from_base):
             raise LodgsError(
                 f"The method '{self.method}' cannot begin with the splats of another run.",
                 "Leave out 'base', or choose another method.",
@@ -174,7 +183,6 @@ class Job:
             self._check_capture()
         if self.cells:
             self._check_cells()
-        self.resolved_parameters()
 
     def _check_capture(self) -> None:
         if not self.base:
@@ -204,6 +212,16 @@ class Job:
                 f"The method '{self.method}' cannot train cells one by one.",
                 "Choose another method, or leave out 'cells'.",
             )
+
+    def in_cells(self, cells: str) -> Job:
+        """The same job in cells.
+
+        Raises:
+            LodgsError: it cannot be divided so.
+        """
+        job = replace(self, cells=cells)
+        job._check_cells()
+        return job
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -235,6 +253,8 @@ class Job:
             for key in ("base", "capture", "region"):
                 if values[key] != DOME and path.parent in Path(values[key]).parents:
                     values[key] = f"./{Path(values[key]).relative_to(path.parent).as_posix()}"
+            if self.region and Path(self.base).parent == path.parent.parent:  # both are parts of one run
+                values["base"] = f"../{Path(self.base).name}"
         table = values.pop("parameters")
         lines = [_toml_line(name, value) for name, value in values.items()]
         lines += ["", "[parameters]"] + [_toml_line(name, value) for name, value in table.items()]

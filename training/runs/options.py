@@ -59,6 +59,11 @@ _OPTIONS: dict[str, dict] = {
         "metavar": "CxR",
         "help": "train columns x rows of cells on the ground one by one, then put them together",
     },
+    "polish": {
+        "metavar": "N",
+        "type": _whole,
+        "help": "steps that fit each cell's borders to the cells beside it at the end; 0 for none",
+    },
     "model": {"metavar": "DIR", "help": "folder of the COLMAP model, where it is not found by itself"},
     "images": {"metavar": "DIR", "help": "folder of the photographs, where it is not found by itself"},
 }
@@ -68,8 +73,9 @@ _OPTIONS: dict[str, dict] = {
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declares a job file and, for each key of a :class:`Job`, an option that goes before the file."""
     parser.add_argument(
-        "job", nargs="?", type=Path, metavar="JOB", help="job file (TOML or JSON); a run's own resumes it"
-    )
+        "job", nargs="?", type=Path, metavar="JOB",
+        help="job file (TOML or JSON), a run's own resumes it; or the scene's folder",
+    )  # fmt: skip
     defaults = {key.name: key.default for key in fields(Job)}
     for name, option in _OPTIONS.items():
         unsaid = defaults[name] is False or defaults[name] in ("", MISSING)
@@ -89,10 +95,15 @@ def job_from(chosen: argparse.Namespace) -> Job:
         LodgsError: neither a job file nor a scene and a run folder, or an impossible value.
     """
     given = {name: value for name, value in vars(chosen).items() if name in _OPTIONS}
-    values = asdict(Job.from_file(chosen.job)) if chosen.job else {}
+    if chosen.job and chosen.job.is_dir():
+        given, values = {"scene": str(chosen.job)} | given, {}
+    else:
+        values = asdict(Job.from_file(chosen.job)) if chosen.job else {}
     said = values.keys() | given.keys()
     if "out" not in said or not said & {"scene", "capture"}:
-        raise LodgsError("It is not said what to train.", "Give a job file, or --scene DIR and --out RUN.")
+        raise LodgsError(
+            "It is not said what to train.", "Give a job file, or the scene's folder and --out RUN."
+        )
     parameters = values.get("parameters", {}) | dict(map(_assignment, chosen.set))
     return Job.from_dict(values | given | {"parameters": parameters})
 

@@ -12,6 +12,7 @@ import traceback
 from _thread import interrupt_main
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import IO
 
 import numpy as np
@@ -26,17 +27,18 @@ from ..evaluate.views import Evaluation
 from ..files import atomic_write
 from ..lod.rule import find_rule
 from ..lod.selection import levels_alone, settings
-from ..lod.sight import IN_MEMORY, in_parts
+from ..lod.sight import IN_MEMORY, in_parts, open_if_large
 from ..methods import METHODS, create
 from ..methods.data import TrainingData
 from ..methods.memory import keep_freed_memory
 from ..methods.method import Method
-from ..rasterize import cuda, device_of, resolve, warm_up
+from ..rasterize import Gaussians, contributions, cuda, device_of, resolve, warm_up
 from ..rasterize.resident import Resident
 from ..scenes.orientation import up_rotation
+from ..scenes.regions import Region
 from ..splats.bundle import NO_SPLATS, Bundle, Level, open_ply, read_bundle, write_bundle
 from ..splats.dialects import comments_of
-from ..splats.gaussians import SplatRows
+from ..splats.gaussians import SplatRows, Splats
 from ..splats.ply import AT_ONCE, read_ply, write_ply
 from .base import open_base
 from .blocks.plan import write_plan
@@ -125,9 +127,9 @@ def _train(job: Job, folder: RunFolder, events: Events, on: str, resources: dict
         together = bool(job.cells) and METHODS[job.method].in_cells == job.method
         if job.cells:
             whole = folder.bundle if together else folder.whole
-            blocks = write_plan(job, folder)
+            division = write_plan(job, folder)
             with workers(on, resources) as submit:
-                train_blocks(blocks, whole, submit, events)
+                train_blocks(division, whole, submit, events)
             job = replace(job, base="" if together else str(whole))
         events("status", message="Reading the scene")
         data = training_data(job, folder, events)
@@ -161,7 +163,7 @@ def _tell_done(
 
 def _hand_over(folder: RunFolder, events: Events, data: TrainingData, backend: str, started: float) -> None:
     """Hands over the levels that blocks were put together to, and says what they are worth."""
-    bundle = read_bundle(folder.bundle)
+    bundle = open_if_large(folder.bundle) or read_bundle(folder.bundle)
     evaluation = Evaluation(data, backend, bundle.antialias)
     alone = [level.number for level in levels_alone(bundle)]
     for place, level in enumerate(bundle.levels, 1):
@@ -202,7 +204,8 @@ class _Run:
 
     def _fresh_method(self) -> Method:
         """The job's method before its first step."""
-        job, data, base, parameters = self.job, self.data, None, self.job.resolved_parameters()
+        job, data, parameters = self.job, self.data, self.job.resolved_parameters()
+        base, region = None, None
         if job.base:
             base, antialias = open_base(job.base, self._warn)
             if not METHODS[job.method].base_in_parts:
@@ -215,9 +218,22 @@ class _Run:
                     f"No training view sees a splat of {job.base}.",
                     "Choose splats that were made from these photographs, in the same coordinates.",
                 )
+            region = Region.read(Path(job.region)) if job.region else None
+            if region is not None:
+                base = self._in_region(base.select(slice(None)), antialias, region)
         method = create(job.method, data, parameters, job.seed, self._backend, base)
         method.warn = self._warn
+        if region is not None and region.seam:
+            method.model.hold(torch.from_numpy(~region.borders(method.model["means"].detach().cpu().numpy())))
         return method
+
+    def _in_region(self, base: Splats, antialias: bool, region: Region) -> Splats:
+        """What of a base is about a region, or shows in its views."""
+        found = contributions(
+            Gaussians.of(base, device_of(self._backend)), self.data.train, near=self.data.near,
+            antialias=antialias, backend=self._backend,
+        )  # fmt: skip
+        return base.select(region.surrounds(base.means) | (found.largest > 0).cpu().numpy())
 
     def _warn(self, message: str) -> None:
         self.events("warning", message=message)

@@ -39,12 +39,15 @@ class Region:
             It includes where it begins.
         area: (2, 2), the same enlarged: where the points lie that it begins with.
         views: names of the views that it is trained and measured on.
+        seam: only what lies at the cell's borders is trained, to fit the cells beside it, and all else stays
+            as it is.
     """
 
     ground: np.ndarray
     cell: np.ndarray
     area: np.ndarray
     views: tuple[str, ...]
+    seam: bool = False
 
     def views_of(self, scene: Scene) -> Scene:
         """The scene with the region's views alone.
@@ -70,6 +73,33 @@ class Region:
         """Which of points (P, 3) lie in the enlarged cell, (P,)."""
         return _within(_on_ground(self.ground, points), self.area)
 
+    def borders(self, points: np.ndarray) -> np.ndarray:
+        """Which of points (P, 3) are the cell's and as near to another as the cell is enlarged, (P,)."""
+        return self.contains(points) & ~_within(_on_ground(self.ground, points), self._inside)
+
+    def at_seam(self, scene: Scene) -> Region:
+        """The same cell to be fitted to those beside it, by its views that stand at its borders, on either
+        side."""
+        eyes = _on_ground(self.ground, np.array([camera.center for camera in scene.cameras]))
+        near = _within(eyes, self.area) & ~_within(eyes, self._inside)
+        names = {camera.name for camera, its in zip(scene.cameras, near, strict=True) if its}
+        views = tuple(name for name in self.views if name in names)
+        return replace(self, views=views, seam=True)
+
+    def meets(self, other: Region) -> bool:
+        """Whether another cell has a part of the enlarged one."""
+        return bool(
+            (
+                np.maximum(self.area[:, 0], other.cell[:, 0]) < np.minimum(self.area[:, 1], other.cell[:, 1])
+            ).all()
+        )
+
+    @property
+    def _inside(self) -> np.ndarray:
+        """(2, 2), the cell without its borders."""
+        with np.errstate(invalid="ignore"):
+            return np.where(np.isfinite(self.cell), 2 * self.cell - self.area, self.cell)
+
     def write(self, path: Path) -> None:
         """Writes it as JSON, without limits where it has none.
 
@@ -78,7 +108,7 @@ class Region:
         """
         values = {
             "ground": self.ground.tolist(), "cell": _finite(self.cell), "area": _finite(self.area),
-            "views": self.views,
+            "views": self.views, "seam": self.seam,
         }  # fmt: skip
         with atomic_write(path) as temporary:
             Path(temporary).write_text(json.dumps(values, indent=1), encoding="utf-8")
@@ -94,13 +124,14 @@ class Region:
         try:
             ground = np.array(values["ground"], np.float64)
             cell, area = _bounds(values["cell"]), _bounds(values["area"])
-            views = tuple(values["views"])
+            views, seam = tuple(values["views"]), values.get("seam", False)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise _damaged(path) from error
         rotation = ground.shape == (3, 3) and np.allclose(ground @ ground.T, np.eye(3), atol=1e-6)
-        if not (rotation and views and all(isinstance(name, str) for name in views)):
+        named = views and all(isinstance(name, str) for name in views)
+        if not (rotation and named and isinstance(seam, bool)):
             raise _damaged(path)
-        return cls(ground, cell, area, views)
+        return cls(ground, cell, area, views, seam)
 
 
 def plan_cells(scene: Scene, columns: int, rows: int) -> list[Region]:

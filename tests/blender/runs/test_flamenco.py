@@ -14,7 +14,7 @@ import pytest
 
 SETTINGS = [
     {"key": key}
-    for key in ("scene", "output", "columns", "rows", "method", "preset", "image_scale", "options")
+    for key in ("scene", "output", "columns", "rows", "method", "preset", "image_scale", "polish", "options")
 ]
 TYPE = {"name": "lodgs-blocks", "etag": "5e", "settings": [*SETTINGS, {"key": "lodgs", "default": "{lodgs}"}]}
 
@@ -113,7 +113,8 @@ def test_the_job_is_what_the_panel_says(bpy, lodgs, manager, root, tmp_path):
     }  # fmt: skip
     assert said == {
         "scene": str(tmp_path / "scene"), "output": str(tmp_path / "runs" / "tiny"), "columns": 2, "rows": 3,
-        "method": "octree", "preset": "standard", "image_scale": 0.65, "lodgs": "{lodgs}",
+        "method": "octree", "preset": "standard", "image_scale": 0.65, "polish": 100,
+        "lodgs": "{lodgs}",
     }  # fmt: skip
     split = shlex.split(options)
     assert split[split.index("--images") + 1] == str(tmp_path / "my photographs")
@@ -137,7 +138,7 @@ def test_what_the_farm_compiles_of_it_is_the_job_that_training_here_has(lodgs, m
     command = [
         "--scene", said["scene"], "--out", said["output"], "--cells", f"{said['columns']}x{said['rows']}",
         "--method", said["method"], "--preset", said["preset"], "--image-scale", str(said["image_scale"]),
-        *shlex.split(said["options"]),
+        "--polish", str(said["polish"]), *shlex.split(said["options"]),
     ]  # fmt: skip
     there = options.job_from(parser.parse_args(command))
     here = lodgs("runs.jobs").make_job(root, tmp_path / "runs" / "tiny", {})

@@ -58,6 +58,37 @@ def test_a_cell_is_enlarged_by_a_fifth_of_its_side(grid):
     np.testing.assert_array_equal(around, grid.points[:, 0] < 15 + ENLARGED * 15)
 
 
+def test_borders_are_what_lies_within_a_fifth_of_the_side_of_another_cell(grid):
+    """The left cell ends at 15 and is 15 wide, so 3 of it; the right one is as wide as its views, too."""
+    left, right = sorted(plan_cells(grid, 2, 1), key=lambda region: eyes_in(region, grid)[:, 0].max())
+    x = grid.points[:, 0]
+    np.testing.assert_array_equal(left.borders(grid.points), (x >= 12) & (x < 15))
+    np.testing.assert_array_equal(right.borders(grid.points), (x >= 15) & (x < 18))
+    (alone,) = plan_cells(grid, 1, 1)
+    assert not alone.borders(grid.points).any() and not alone.at_seam(grid).views
+
+
+def test_a_seam_has_the_views_that_stand_at_borders_on_either_side(tmp_path):
+    cameras = [looking(f"{x:02}", (x, y, 3), (x, y + 0.1, 0)) for x in range(0, 20, 2) for y in (0,)]
+    points = np.random.default_rng(0).uniform((-9, -9, 0), (30, 9, 1), (500, 3))
+    scene = scene_of(cameras, points, tmp_path)
+    left = min(plan_cells(scene, 2, 1), key=lambda region: eyes_in(region, scene)[:, 0].max())
+    seam = left.at_seam(scene)  # the border lies at 9, and 9 wide is the cell: 1.8 on either side
+    assert seam.views == ("08", "10") and seam.seam and not left.seam
+    np.testing.assert_array_equal(seam.cell, left.cell)
+    seam.write(tmp_path / "region.json")
+    assert Region.read(tmp_path / "region.json").seam
+
+
+def test_cells_meet_those_beside_them_alone(tmp_path):
+    cameras = [looking(f"{x:02}", (x, x % 3, 3), (x, 0.1, 0)) for x in range(0, 40, 2)]
+    points = np.random.default_rng(0).uniform((-9, -9, 0), (50, 9, 1), (500, 3))
+    regions = plan_cells(scene_of(cameras, points, tmp_path), 4, 1)
+    for i, one in enumerate(regions):
+        for j, other in enumerate(regions):
+            assert one.meets(other) == (abs(i - j) <= 1)
+
+
 def eyes_in(region, scene):
     eyes = np.array([camera.center for camera in scene.cameras])
     return eyes[region.contains(eyes)]

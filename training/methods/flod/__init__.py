@@ -2,12 +2,17 @@
 
 from dataclasses import dataclass, replace
 
+from ...errors import LodgsError
 from ...splats.bundle import MOST_LEVELS
 from ..info import MethodInfo
 from ..parameters import PAPER, STANDARD, DensityParameters, parameter
 
 PAPER_FOOTPRINT = 40.0
 """Pixels that the paper's lambda, 0.2 COLMAP units, covers at the median depth of its scenes, about."""
+TOGETHER = 3
+"""So many levels are drawn together by default (``Bands.defaults``), and finished."""
+FINE = 2
+"""So many of the finest levels of a scene in cells are trained cell by cell."""
 PAPER_REACH = PAPER_FOOTPRINT / 4**3
 """How far the paper's finest level of five reaches by distance (Eq. 8, gamma 1), in median depths: 5/8."""
 
@@ -59,6 +64,10 @@ class FlodParameters(DensityParameters):
         "begin from exact positions.",
     )
 
+    first_level: int = parameter(
+        1, "Level that training begins with; above 1 from a base, which is the level before it.", low=1
+    )
+    last_level: int = parameter(0, "Level that training ends with; 0 for the finest.")
     finish_share: float = parameter(
         0.14,
         "Further steps at the end, as a share of all levels', that fit the two levels before the finest to "
@@ -72,13 +81,48 @@ class FlodParameters(DensityParameters):
     )
 
     @property
+    def end(self) -> int:
+        """The level that training ends with."""
+        return self.last_level or self.levels
+
+    @property
     def total_steps(self) -> int:
-        return sum(self.steps) + self.finish_steps
+        return sum(self.steps[self.first_level - 1 : self.end]) + self.finish_steps
+
+    @property
+    def all_steps(self) -> int:
+        """Steps of a run of all levels, which schedules are shares of."""
+        return sum(self.steps) + (round(self.finish_share * sum(self.steps)) if self.levels > 1 else 0)
 
     @property
     def finish_steps(self) -> int:
-        """Steps that train the finest levels together; none where there is but one."""
-        return round(self.finish_share * sum(self.steps)) if self.levels > 1 else 0
+        """Steps that train the finest levels together, if the finest is trained and not the only one."""
+        return self.all_steps - sum(self.steps) if self.end == self.levels else 0
+
+    @property
+    def goes_on(self) -> bool:
+        return self.first_level > 1
+
+    @property
+    def most_at_once(self) -> int:
+        shares = (self.budget_ratio**n for n in range(min(TOGETHER, self.levels)))
+        at_end = self.max_splats * self.budget_ratio ** (self.levels - self.end)
+        return round(self.max_splats * sum(shares) if self.finish_steps else at_end)
+
+    def check(self) -> None:
+        if not self.first_level <= self.end <= self.levels:
+            raise LodgsError(
+                f"Levels {self.first_level} to {self.end} of {self.levels} cannot be trained.",
+                "Correct first_level or last_level.",
+            )
+
+
+def divided(parameters: FlodParameters) -> tuple[FlodParameters, FlodParameters] | None:
+    """For a scene in cells: all but the two finest levels of the whole, and these two of each cell."""
+    coarse = parameters.levels - FINE
+    if coarse < 1:
+        return None
+    return replace(parameters, last_level=coarse), replace(parameters, first_level=coarse + 1)
 
 
 _DRAFT = FlodParameters()
@@ -111,4 +155,5 @@ METHOD = MethodInfo(
     rule="bands",
     offered=("levels", "footprint", "max_splats"),
     in_cells="flod",
+    divided=divided,
 )

@@ -22,8 +22,6 @@ from ..model import Model, splat_rates
 from ..schedules import log_linear
 from . import FlodParameters
 
-TOGETHER = 3
-"""So many levels are drawn together by default (``Bands.defaults``), and finished."""
 LEVEL = "level"
 """Column of the number of each row's level; levels follow each other, coarse to fine."""
 SPREAD = 2.0

@@ -24,7 +24,7 @@ from ..method import Drawing
 from ..model import Model, splat_rates
 from ..schedules import due, log_linear, shrink_at
 from ..start import distinct, from_points, from_splats, neighbour_distances, sampled
-from . import PAPER_REACH, FlodParameters, finish
+from . import PAPER_REACH, TOGETHER, FlodParameters, finish
 
 
 class Method(method.Method[FlodParameters, Drawing]):
@@ -40,18 +40,24 @@ class Method(method.Method[FlodParameters, Drawing]):
         p, data = self.parameters, self.data
         s_min_1 = p.s_min_1 or p.footprint * data.median_depth / data.focal
         self.s_min = s_min_of(s_min_1, p.rho, p.levels)
-        self._ends = list(accumulate(p.steps))
+        self._before = sum(p.steps[: p.first_level - 1])
+        self._ends = list(accumulate(p.steps[p.first_level - 1 : p.end]))
         points, colors = distinct(data.scene.points, data.scene.point_colors)
         self.points, self.colors = sampled(points, colors, p.max_splats, self.seed)
-        self.model = self._new_model(self._from_points(1))
         self.kept: dict[int, dict[str, torch.Tensor]] = {}
+        if base is None:
+            self.model = self._new_model(self._from_points(1))
+        else:
+            self._keep_to_finish(p.first_level - 1, base)
+            tensors = from_splats(base, p.sh_degree, self.device)
+            self.model = self._new_model(self._risen(tensors, 0.0, p.first_level))
 
     @property
     def levels(self) -> int:
         return self.parameters.levels
 
     def level_at(self, step: int) -> int:
-        return min(bisect_right(self._ends, step) + 1, self.levels)
+        return min(bisect_right(self._ends, step) + self.parameters.first_level, self.parameters.end)
 
     def ends_level(self, step: int) -> bool:
         return step + 1 in self._ends or super().ends_level(step)
@@ -69,9 +75,8 @@ class Method(method.Method[FlodParameters, Drawing]):
         number = self.level_at(step)
         s_min = self.s_min[number - 1]
         finished = Level(number, self.model.splats(s_min), {"s_min": s_min})
-        if self.parameters.finish_steps and number > self.levels - finish.TOGETHER:
-            self.kept[number] = from_splats(finished.splats, self.parameters.sh_degree, self.device)
-        if number < self.levels:
+        self._keep_to_finish(number, finished.splats)
+        if number < self.parameters.end:
             self.rise_to(number + 1)
         elif self.kept:
             self.model = finish.joined(self.kept, finish.rates(self.parameters, self.data.extent, 0.0))
@@ -99,7 +104,11 @@ class Method(method.Method[FlodParameters, Drawing]):
 
     def shrink(self, step: int) -> float:
         p = self.parameters
-        return shrink_at(step / self.steps, p.first_resolution, p.full_resolution)
+        share = (self._before + step) / p.all_steps
+        return shrink_at(share, p.first_resolution, p.full_resolution)
+
+    def sh_degree(self, step: int) -> int:
+        return super().sh_degree(self._before + step)
 
     def draw(self, view: TrainingView, step: int) -> list[Drawing]:
         if self.finishing(step):
@@ -177,8 +186,8 @@ class Method(method.Method[FlodParameters, Drawing]):
 
     def _local(self, step: int) -> int:
         """Steps that the level of a step has seen before it."""
-        level = self.level_at(step)
-        return step - (self._ends[level - 2] if level > 1 else 0)
+        place = self.level_at(step) - self.parameters.first_level
+        return step - (self._ends[place - 1] if place else 0)
 
     def _densify_until(self, step: int) -> float:
         """Steps of the level of a step in which splats are added and removed."""
@@ -199,9 +208,13 @@ class Method(method.Method[FlodParameters, Drawing]):
 
     def rise_to(self, level: int) -> None:
         """The next level starts from this one: same scales, a smaller constraint, Adam anew (Eq. 5)."""
-        before, after = self.s_min[level - 2], self.s_min[level - 1]
         tensors = {name: tensor.detach() for name, tensor in self.model.adam.tensors.items()}
-        tensors["log_scales"] = constrained_log(tensors["log_scales"].exp() + before, after)
+        self.model = self._new_model(self._risen(tensors, self.s_min[level - 2], level))
+
+    def _risen(self, tensors: dict[str, torch.Tensor], before: float, level: int) -> dict[str, torch.Tensor]:
+        """What a level begins with: the one before it, to whose scales a constraint is added, and points."""
+        after = self.s_min[level - 1]
+        tensors = {**tensors, "log_scales": constrained_log(tensors["log_scales"].exp() + before, after)}
         if self.parameters.rejoin_points:
             # What overlap pruning counts as too close is now half of a smaller size.
             distances, _ = KDTree(tensors["means"].cpu().numpy()).query(self.points)
@@ -212,7 +225,12 @@ class Method(method.Method[FlodParameters, Drawing]):
                 free = np.sort(rng.choice(free, room, replace=False))
             points = self._from_points(level)
             tensors = {name: torch.cat([tensor, points[name][free]]) for name, tensor in tensors.items()}
-        self.model = self._new_model(tensors)
+        return tensors
+
+    def _keep_to_finish(self, level: int, splats: Splats) -> None:
+        p = self.parameters
+        if p.finish_steps and level > p.levels - TOGETHER:
+            self.kept[level] = from_splats(splats, p.sh_degree, self.device)
 
     def _from_points(self, level: int) -> dict[str, torch.Tensor]:
         s_min = self.s_min[level - 1]

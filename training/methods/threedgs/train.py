@@ -16,7 +16,7 @@ from ..density import densify, peak_scores, prune, require_rows, reset_opacities
 from ..method import Drawing
 from ..model import Model, splat_rates
 from ..schedules import due, log_linear, shrink_at
-from ..start import distinct, from_points, sampled
+from ..start import distinct, from_points, from_splats, sampled
 from . import ThreedgsParameters
 
 WEIGHED_AT = (8 / 30, 16 / 30, 24 / 30)
@@ -28,9 +28,13 @@ class Method(method.Method[ThreedgsParameters, Drawing]):
 
     def setup(self, base: Splats | None) -> None:
         p, scene = self.parameters, self.data.scene
-        points, colors = distinct(scene.points, scene.point_colors)
-        points, colors = sampled(points, colors, self.growth_limit(0), self.seed)
-        tensors = from_points(points, colors, p.sh_degree, self.device)
+        self._from_base = base is not None
+        if base is not None:
+            tensors = from_splats(base, p.sh_degree, self.device)
+        else:
+            points, colors = distinct(scene.points, scene.point_colors)
+            points, colors = sampled(points, colors, self.growth_limit(0), self.seed)
+            tensors = from_points(points, colors, p.sh_degree, self.device)
         self.model = self.new_model(tensors)
         self._densify_until = p.densify_until * self.scheduled_steps
 
@@ -51,6 +55,9 @@ class Method(method.Method[ThreedgsParameters, Drawing]):
     def shrink(self, step: int) -> float:
         p = self.parameters
         return shrink_at(step / self.scheduled_steps, p.first_resolution, p.full_resolution)
+
+    def sh_degree(self, step: int) -> int:
+        return self.parameters.sh_degree if self._from_base else super().sh_degree(step)
 
     def draw(self, view: TrainingView, step: int) -> list[Drawing]:
         return [Drawing(self.rasterize_model(view.camera, step))]

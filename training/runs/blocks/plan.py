@@ -1,47 +1,160 @@
-"""From a job with cells to a block for each: an ordinary job in a folder of its own. No torch.
+"""From a job with cells to a block for each: ordinary jobs in folders of their own. No torch.
 
-run/  job.toml (with ``cells``)  blocks/1/job.toml  blocks/1/region.json  blocks/2/...  blocks/whole.ply
+run/  job.toml (with ``cells``)  blocks/
+    coarse/job.toml             levels that are trained on the whole scene, where the method divides them so
+    1/job.toml  region.json     a cell; begins with the coarse levels, where there are some
+    seams/1/job.toml  region.json   the same cell, whose borders are fitted to the cells beside it
+    whole.ply                   what all are together, where that is another method's base
 """
 
 from __future__ import annotations
 
 import shutil
 import tempfile
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+
 from ...errors import LodgsError
+from ...lod.rule import find_rule
 from ...methods import method_info
+from ...methods.memory import MOST_BYTES, TARGET_BYTES
+from ...methods.parameters import Parameters
 from ...scenes.colmap import Scene, read_scene
 from ...scenes.regions import Region, plan_cells
 from ..folder import RunFolder
-from ..job import Job
+from ..job import MOST_CELLS, Job
 
 REGION = "region.json"
+COARSE, BLOCK, SEAM = "coarse", "block", "seam"
+"""Kinds of parts: levels of the whole scene, a cell, and a cell whose borders are fitted to others."""
+POLISHED_BY = "3dgs"
+"""What fits a cell's borders to those beside it: at full detail all methods' splats are its."""
+STILL = {
+    "lr_means": 0.0, "lr_means_final": 0.0, "lr_quats": 0.0, "lr_scales": 0.0, "lr_opacities": 5e-3,
+    "lr_sh": 5e-4, "densify_until": 0.0, "prune_interval": 0, "opacity_reset_interval": 0,
+    "least_weight": 0.0, "first_resolution": 1.0, "free_depth": 0.0, "largest": 0.0, "margin": 0.0,
+}  # fmt: skip
+"""Its parameters there: colours and opacities are fitted; splats neither move nor come or go, so that each
+stays in its cell, and as large as its level allows."""
+PROGRAM_BYTES = 600e6
+"""What a trainer takes of memory without splats and photographs, about."""
+SPLAT_BYTES = 1_500
+"""What it takes for each splat that it trains, of degree 3, about."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """A cell and its run.
+    """A part of a divided run, and the ordinary run that trains it.
 
     Attributes:
-        number: from 1.
+        number: of its cell, from 1; 0 for what is trained on the whole scene.
         folder: of its run.
-        region: what it is trained on.
+        region: what it is trained on; None for the whole scene.
     """
 
     number: int
     folder: RunFolder
-    region: Region
+    region: Region | None
 
     @property
+    def kind(self) -> str:
+        """COARSE, BLOCK or SEAM."""
+        return COARSE if self.region is None else SEAM if self.region.seam else BLOCK
+
+    @property
+    def name(self) -> str:
+        """What people call it."""
+        return "coarse levels" if self.region is None else f"{self.kind} {self.number}"
+
+    @cached_property
     def job(self) -> Job:
         """Its job, as it was written."""
         return Job.from_file(self.folder.job)
 
 
-def plan(job: Job, scene: Scene | None = None) -> list[tuple[Region, Job]]:
-    """The cells of a job's scene, each with the job that trains it, whose folder is still the whole's.
+@dataclass(frozen=True)
+class Division:
+    """All parts of a divided run; each stage begins when the one before it is finished.
+
+    Attributes:
+        coarse: what is trained once on the whole scene; None where cells make all levels.
+        blocks: one for each cell, by number.
+        seams: these again, whose borders are fitted to each other; of cells without such there is none.
+    """
+
+    coarse: Block | None
+    blocks: list[Block]
+    seams: list[Block]
+
+    @property
+    def stages(self) -> list[list[Block]]:
+        """What can be trained side by side, in order."""
+        return [[self.coarse] if self.coarse else [], self.blocks, self.seams]
+
+    def named(self, name: str) -> Block | None:
+        """The part ``coarse``, ``block-3`` or ``seam-3``; None where this division needs no such part.
+
+        Raises:
+            LodgsError: no division has one called so.
+        """
+        kind, _, number = name.partition("-")
+        numbers = [str(block.number) for block in self.blocks]
+        if name != COARSE and not (kind in (BLOCK, SEAM) and number in numbers):
+            last = numbers[-1]
+            raise LodgsError(
+                f"There is no part '{name}'.",
+                f"Say coarse, block-1 to block-{last}, or seam-1 to seam-{last}.",
+            )
+        parts = [part for stage in self.stages for part in stage if part.kind == kind]
+        return next((part for part in parts if number in ("", str(part.number))), None)
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A cell before anything is trained, for whoever shows or chooses a division.
+
+    Attributes:
+        number: from 1.
+        region: the cell on the ground, and its views.
+        job: what trains it, whose folder is still the whole's.
+        views: how many it is trained on.
+        points: how many it begins with.
+        steps: how many it makes.
+        splats: the most that it has.
+        memory: bytes that its trainer takes, estimated, with photographs.
+    """
+
+    number: int
+    region: Region
+    job: Job
+    views: int
+    points: int
+    steps: int
+    splats: int
+    memory: int
+
+
+def read_planned_scene(job: Job) -> Scene:
+    """The scene of a job with cells.
+
+    Raises:
+        LodgsError: it cannot be read, or has no points.
+    """
+    model, images = (Path(path) if path else None for path in (job.model, job.images))
+    scene = read_scene(Path(job.scene), model=model, images=images)
+    if not len(scene.points):
+        raise LodgsError(
+            f"The COLMAP model in {scene.model} has no 3D points.", "Triangulate them in COLMAP."
+        )
+    return scene
+
+
+def plan(job: Job, scene: Scene | None = None) -> list[Planned]:
+    """The cells of a job's scene, each with what its training will take; nothing is written.
 
     Of the steps each block has as many as it has views, so that every view is seen as often as if the scene
     were trained as a whole; of the splats as many as it has points.
@@ -52,18 +165,10 @@ def plan(job: Job, scene: Scene | None = None) -> list[tuple[Region, Job]]:
     Raises:
         LodgsError: the scene cannot be read, or divided so.
     """
-    if scene is None:
-        model, images = (Path(path) if path else None for path in (job.model, job.images))
-        scene = read_scene(Path(job.scene), model=model, images=images)
-    if not len(scene.points):
-        raise LodgsError(
-            f"The COLMAP model in {scene.model} has no 3D points.", "Triangulate them in COLMAP."
-        )
-    method = method_info(method_info(job.method).in_cells)
-    told = asdict(job.resolved_parameters())
-    known = {field.name for field in fields(method.parameters)}
-    parameters = {name: value for name, value in told.items() if name in known}
-    training = {camera.name for camera in scene.split(job.test_every, job.validation)[0]}
+    scene = read_planned_scene(job) if scene is None else scene
+    whole, _ = _divided(job)
+    training = _training_views(job, scene)
+    pixels = float(np.mean([camera.width * camera.height for camera in scene.cameras])) * job.image_scale**2
     found = []
     for number, region in enumerate(plan_cells(scene, *job.grid), 1):
         views, points = len(training & set(region.views)), int(region.points_of(scene).sum())
@@ -71,31 +176,71 @@ def plan(job: Job, scene: Scene | None = None) -> list[tuple[Region, Job]]:
             what = f"{views} views and {points} points"
             raise LodgsError(f"Cell {number} has {what}, too little to train on.", "Ask for fewer cells.")
         share = views / len(training)
-        steps = _scaled(parameters["steps"], share)
-        splats = max(round(parameters["max_splats"] * points / len(scene.points)), 1)
-        its = {**parameters, "steps": steps, "max_splats": splats}
-        its = {name: list(value) if isinstance(value, tuple) else value for name, value in its.items()}
-        block = replace(job, method=method.name, cells="", region=REGION, parameters=its)
-        found.append((region, block))
+        splats = max(round(whole.max_splats * points / len(scene.points)), 1)
+        its = replace(whole, steps=_scaled(whole.steps, share), max_splats=splats)
+        memory = _memory(its, views, pixels, job.photo_memory)
+        found.append(
+            Planned(number, region, _part_of(job, its), views, points, its.total_steps, splats, memory)
+        )
     return found
 
 
-def write_plan(job: Job, folder: RunFolder) -> list[Block]:
-    """Writes a job and its blocks into the run's folder, ready to be trained; blocks that are there stay.
+def cells_within(job: Job, splats: int = 0, memory: int = 0, scene: Scene | None = None) -> str:
+    """The fewest cells of which none has more splats, or takes more memory: a job's ``cells``.
+
+    Args:
+        splats: the most of a block; 0: any number.
+        memory: the most bytes of a block, as ``plan`` estimates them; 0: any number.
+
+    Raises:
+        LodgsError: however many there are, one has more.
+    """
+    scene = read_planned_scene(job) if scene is None else scene
+    trouble = LodgsError("No number of cells is that small.", "Allow more splats or memory for a block.")
+    for grid in _grids(scene):
+        try:
+            found = plan(replace(job, cells=grid), scene)
+        except LodgsError as error:
+            trouble = error
+            break
+        largest, most = max(each.splats for each in found), max(each.memory for each in found)
+        if largest <= (splats or largest) and most <= (memory or most):
+            return grid
+        trouble = LodgsError(
+            f"In {grid} cells a block still has {largest:,} splats and takes {most / 1e9:.1f} GB.",
+            "Allow more for a block, or lower max_splats.",
+        )
+    raise trouble
+
+
+def write_plan(
+    job: Job, folder: RunFolder, scene: Scene | None = None, planned: list[Planned] | None = None
+) -> Division:
+    """Writes a job's parts into the run's folder, ready to be trained; parts that are there stay.
+
+    Args:
+        scene, planned: of the job, where they are known already.
 
     Raises:
         LodgsError: as :func:`plan`, or the folder cannot be written.
     """
     if not folder.blocks.exists():
-        made = plan(job)
+        scene = scene or read_planned_scene(job)
+        made, (_, coarse) = planned or plan(job, scene), _divided(job)
+        training = _training_views(job, scene)
         try:
             with tempfile.TemporaryDirectory(dir=folder.path, prefix="planning-") as work:
-                for number, (region, block) in enumerate(made, 1):
-                    there = Path(work) / "blocks" / str(number)
-                    there.mkdir(parents=True)
-                    region.write(there / REGION)
-                    replace(block, out=str(there), region=str(there / REGION)).write(there / "job.toml")
-                shutil.move(Path(work) / "blocks", folder.blocks)
+                there = RunFolder(work)
+                if coarse is not None:
+                    _write_part(_part_of(job, coarse), there.coarse)
+                for each in made:
+                    path = there.blocks / str(each.number)
+                    _write_part(each.job, path, each.region, there.coarse if coarse else None)
+                    seam = each.region.at_seam(scene)
+                    if _polishes(job) and len(training & set(seam.views)) > 1:
+                        path = there.seams / str(each.number)
+                        _write_part(_seam_job(job), path, seam, RunFolder(path).base)
+                shutil.move(there.blocks, folder.blocks)
         except OSError as error:
             raise LodgsError(
                 f"The blocks in {folder.path} cannot be written: {error.strerror or error}.",
@@ -104,19 +249,19 @@ def write_plan(job: Job, folder: RunFolder) -> list[Block]:
     return read_plan(folder)
 
 
-def read_plan(folder: RunFolder) -> list[Block]:
-    """The blocks of a run that is divided, by number.
+def read_plan(folder: RunFolder) -> Division:
+    """The parts of a run that is divided.
 
     Raises:
         LodgsError: there are none, or one is damaged.
     """
-    numbers = sorted(int(path.name) for path in folder.blocks.glob("*") if path.name.isdecimal())
-    if not numbers:
+    blocks = _read_parts(folder.blocks)
+    if not blocks:
         raise LodgsError(f"{folder.path} has no blocks.", "Plan them first.")
-    return [
-        Block(number, RunFolder(there := folder.blocks / str(number)), Region.read(there / REGION))
-        for number in numbers
-    ]
+    coarse = RunFolder(folder.coarse)
+    return Division(
+        Block(0, coarse, None) if coarse.job.exists() else None, blocks, _read_parts(folder.seams)
+    )
 
 
 def planned_job(path: Path) -> Job:
@@ -131,14 +276,89 @@ def planned_job(path: Path) -> Job:
     return job
 
 
-def plan_table(blocks: list[Block]) -> str:
+def plan_table(planned: list[Planned]) -> str:
     """What each block will take, for people."""
-    lines = ["block   views  splats at most     steps"]
-    for block in blocks:
-        p = block.job.resolved_parameters()
-        views = len(block.region.views)
-        lines.append(f"{block.number:5}{views:8,}{p.max_splats:16,}{p.total_steps:10,}")
+    lines = ["block   views    points  splats at most     steps  memory, about"]
+    for each in planned:
+        lines.append(
+            f"{each.number:5}{each.views:8,}{each.points:10,}{each.splats:16,}{each.steps:10,}"
+            f"{each.memory / 1e9:12.1f} GB"
+        )
     return "\n".join(lines)
+
+
+def _training_views(job: Job, scene: Scene) -> set[str]:
+    return {camera.name for camera in scene.split(job.test_every, job.validation)[0]}
+
+
+def _divided(job: Job) -> tuple[Parameters, Parameters | None]:
+    """Parameters of the cells, as if one had all of the scene, and of what is trained on all of it."""
+    method = method_info(method_info(job.method).in_cells)
+    told = asdict(job.resolved_parameters())
+    known = {field.name for field in fields(method.parameters)}
+    whole = method.parameters(**{name: value for name, value in told.items() if name in known})
+    coarse, fine = method.divided(whole) or (None, whole)
+    return fine, coarse
+
+
+def _part_of(job: Job, parameters: Parameters, method: str = "") -> Job:
+    values = {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(parameters).items()}
+    method = method or method_info(job.method).in_cells
+    return replace(job, method=method, cells="", polish=0, parameters=values)
+
+
+def _polishes(job: Job) -> bool:
+    """Whether borders of cells are fitted: at full detail they have to be drawn as plain splats are."""
+    rule = find_rule(method_info(method_info(job.method).in_cells).rule)
+    return job.polish > 0 and (rule is None or not rule.always)
+
+
+def _seam_job(job: Job) -> Job:
+    whole, _ = _divided(job)
+    common = {field.name: getattr(whole, field.name) for field in fields(Parameters)}
+    preset = method_info(POLISHED_BY).preset(job.preset)
+    return _part_of(job, replace(preset, **{**common, "steps": job.polish, **STILL}), POLISHED_BY)
+
+
+def _write_part(job: Job, path: Path, region: Region | None = None, base: Path | None = None) -> None:
+    path.mkdir(parents=True)
+    where = ""
+    if region is not None:
+        region.write(path / REGION)
+        where = str(path / REGION)
+    begins = "" if base is None else str(base)
+    replace(job, out=str(path), region=where, base=begins).write(path / "job.toml")
+
+
+def _read_parts(folder: Path) -> list[Block]:
+    numbers = sorted(int(path.name) for path in folder.glob("*") if path.name.isdecimal())
+    return [
+        Block(number, RunFolder(there := folder / str(number)), Region.read(there / REGION))
+        for number in numbers
+    ]
+
+
+def _grids(scene: Scene) -> Iterator[str]:
+    """Ever more cells, none much longer than wide, as ``Job.cells`` has them."""
+    ground = scene.up_rotation()
+    eyes = np.array([camera.center for camera in scene.cameras]) @ ground.T
+    longer, shorter = sorted(np.ptp(eyes[:, :2], axis=0), reverse=True)
+    aspect = min(longer / max(shorter, 1e-9), MOST_CELLS)
+    best: dict[int, tuple[float, str]] = {}
+    for rows in range(1, MOST_CELLS + 1):
+        for columns in range(1, MOST_CELLS // rows + 1):
+            slim = abs(float(np.log(aspect * rows / columns)))
+            best[columns * rows] = min(best.get(columns * rows, (slim, "")), (slim, f"{columns}x{rows}"))
+    for count in sorted(best):
+        slim, grid = best[count]
+        if slim <= np.log(2.5) or count == 1:
+            yield grid
+
+
+def _memory(parameters: Parameters, views: int, pixels: float, photo_memory: int) -> int:
+    """Bytes that a trainer takes, about."""
+    photographs = min(views * pixels * TARGET_BYTES, photo_memory * 1e6 or MOST_BYTES)
+    return round(PROGRAM_BYTES + SPLAT_BYTES * parameters.most_at_once + photographs)
 
 
 def _scaled(steps: int | tuple[int, ...], share: float) -> int | tuple[int, ...]:

@@ -1,4 +1,4 @@
-"""Trains the blocks of a run and puts them together, wherever blocks are trained."""
+"""Trains the parts of a divided run and puts them together, wherever they are trained."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pathlib import Path
 
 from ...errors import LodgsError
 from ..failures import BAD_INPUT, CANCELLED, DONE
-from .merge import merge
-from .plan import Block
+from .merge import merge, write_surroundings
+from .plan import BLOCK, Block, Division
 from .workers import Pending, Submit
 
 LOOKS = 0.5
@@ -27,14 +27,24 @@ class BlocksStopped(Exception):
     """Some blocks were asked to stop, and the others are finished; the message says which."""
 
 
-def train_blocks(blocks: Sequence[Block], path: Path, submit: Submit, tell: Tell) -> None:
-    """Trains all blocks that are not finished and writes what they are together.
+def prepare(division: Division, part: Block) -> None:
+    """Writes what a part begins with, of those that are finished before it.
+
+    Raises:
+        LodgsError: one is not finished, or the disk is full.
+    """
+    if part.region is not None and part.region.seam:
+        write_surroundings(division, part)
+
+
+def train_blocks(division: Division, path: Path, submit: Submit, tell: Tell) -> None:
+    """Trains all parts that are not finished, stage by stage, and writes what they are together.
 
     How they get on is read from their folders; an interrupt stops all of them politely first.
 
     Args:
         path: of the bundle of all.
-        submit: has a block trained.
+        submit: has a part trained.
 
     Raises:
         BlocksStopped: some were cancelled by themselves.
@@ -42,44 +52,55 @@ def train_blocks(blocks: Sequence[Block], path: Path, submit: Submit, tell: Tell
     """
     if path.exists():
         return
-    watched = [_Watched(block) for block in blocks]
-    try:
-        for each in watched:
-            each.begin(submit)
-        started = told = time.monotonic()
-        while not all([each.look(submit) for each in watched]):
-            now = time.monotonic()
-            if now - told >= min(max((now - started) / 1000, LOOKS), SILENT):
-                tell("progress", **_progress(watched))
-                told = now
-            time.sleep(LOOKS)
-    except BaseException:
-        for each in watched:
-            each.stop()
-        while not all(each.over for each in watched):
-            time.sleep(LOOKS)
-        raise
-    tell("progress", **_progress(watched))
-    for each in watched:
-        if each.code not in (DONE, CANCELLED):
-            raise each.trouble()
-    if stopped := [str(each.block.number) for each in watched if each.code == CANCELLED]:
-        raise BlocksStopped(f"Stopped: block {', '.join(stopped)}; the run can be resumed.")
-    tell("status", message=f"Putting {len(blocks)} blocks together")
-    kept = merge(blocks, path)
-    for block, (own, all_) in zip(blocks, kept, strict=True):
+    stages = [[_Watched(part, division) for part in stage] for stage in division.stages]
+    everything = [each for stage in stages for each in stage]
+    for stage in stages:
+        _train_stage(stage, everything, submit, tell)
+    tell("status", message=f"Putting {len(division.blocks)} blocks together")
+    kept = merge(division, path)
+    for seam in division.seams:
+        seam.folder.base.unlink(missing_ok=True)
+    for block, (own, all_) in zip(division.blocks, kept, strict=True):
         tell("status", message=f"Block {block.number}: {own:,} of {all_:,} splats stand in its cell")
 
 
+def _train_stage(
+    stage: Sequence[_Watched], everything: Sequence[_Watched], submit: Submit, tell: Tell
+) -> None:
+    try:
+        for each in stage:
+            each.begin(submit)
+        started = told = time.monotonic()
+        while not all([each.look(submit) for each in stage]):
+            now = time.monotonic()
+            if now - told >= min(max((now - started) / 1000, LOOKS), SILENT):
+                tell("progress", **_progress(everything))
+                told = now
+            time.sleep(LOOKS)
+    except BaseException:
+        for each in stage:
+            each.stop()
+        while not all(each.over for each in stage):
+            time.sleep(LOOKS)
+        raise
+    if stage:
+        tell("progress", **_progress(everything))
+    for each in stage:
+        if each.code not in (DONE, CANCELLED):
+            raise each.trouble()
+    if stopped := [each.block.name for each in stage if each.code == CANCELLED]:
+        raise BlocksStopped(f"Stopped: {', '.join(stopped)}; the run can be resumed.")
+
+
 class _Watched:
-    """A block on its way.
+    """A part on its way.
 
     Attributes:
         code: its trainer's exit code, once it has ended for good.
     """
 
-    def __init__(self, block: Block) -> None:
-        self.block = block
+    def __init__(self, block: Block, division: Division) -> None:
+        self.block, self._division = block, division
         block.folder.take_cancel()  # which was meant for an earlier trainer
         self._pending: Pending | None = None
         self.code: int | None = None
@@ -93,6 +114,7 @@ class _Watched:
     def begin(self, submit: Submit) -> None:
         """Has it trained, unless it is finished."""
         if self.code is None:
+            prepare(self._division, self.block)
             self._pending = submit(self.block.folder.path)
 
     def stop(self) -> None:
@@ -148,12 +170,16 @@ class _Watched:
         """Why it could not be trained."""
         error = self.block.folder.last("error") if self.code == BAD_INPUT else None
         if error is not None:
-            return LodgsError(f"Block {self.block.number}: {error['what']}", error.get("remedy", ""))
+            return LodgsError(f"{self._name}: {error['what']}", error.get("remedy", ""))
         why = f" ({self._why})" if self._why else ""
         return LodgsError(
-            f"Block {self.block.number} was lost {TRIES} times at step {self.step}{why}.",
+            f"{self._name} was lost {TRIES} times at step {self.step}{why}.",
             f"What its trainer wrote is in {self.block.folder.log}.",
         )
+
+    @property
+    def _name(self) -> str:
+        return self.block.name[0].upper() + self.block.name[1:]
 
 
 def _progress(watched: Sequence[_Watched]) -> dict:
@@ -161,17 +187,21 @@ def _progress(watched: Sequence[_Watched]) -> dict:
     there = [each.progress for each in watched if each.progress]
     step, of = sum(each.step for each in watched), sum(each.steps for each in watched)
     speed = sum(each.progress.get("steps_per_s", 0.0) for each in watched if each.code is None)
-    over = sum(each.code is not None for each in watched)
+    blocks = [each for each in watched if each.block.kind == BLOCK]
+    over = sum(each.code is not None for each in blocks)
 
     def mean(name: str) -> float:
         return round(sum(each.get(name, 0.0) for each in there) / max(len(there), 1), 5)
 
     return {
-        "stage": f"{over} of {len(watched)} blocks", "level": 1, "levels": 1, "step": step, "of": of,
+        "stage": f"{over} of {len(blocks)} blocks", "level": 1, "levels": 1, "step": step, "of": of,
         "loss": mean("loss"), "psnr": mean("psnr"), "splats": sum(each.get("splats", 0) for each in there),
         "steps_per_s": round(speed, 2), "eta_s": round((of - step) / speed, 1) if speed else 0.0,
         "blocks": [
-            {"block": each.block.number, "state": each.state, "step": each.step, "of": each.steps}
+            {
+                "block": each.block.number, "kind": each.block.kind, "state": each.state,
+                "step": each.step, "of": each.steps,
+            }
             for each in watched
         ],
     }  # fmt: skip

@@ -22,7 +22,7 @@ from training.methods import METHODS
 from training.runs import train as training_loop
 from training.runs.blocks import train as blocks_module
 from training.runs.blocks.merge import merge
-from training.runs.blocks.plan import Block, read_plan, write_plan
+from training.runs.blocks.plan import Block, Division, read_plan, write_plan
 from training.runs.blocks.train import BlocksStopped, train_blocks
 from training.runs.data import training_data
 from training.runs.events import event_line
@@ -48,7 +48,7 @@ def job_for(scene, out, method="3dgs", **further) -> Job:
 def planned(job: Job) -> list[Block]:
     folder = RunFolder(job.out)
     folder.make()
-    return write_plan(job.resolved(), folder)
+    return write_plan(job.resolved(), folder).blocks
 
 
 # -- a plan ------------------------------------------------------------------------------------------------
@@ -114,7 +114,7 @@ def test_a_plan_that_cannot_be_leaves_the_folder_free(tiny_scene, tmp_path, caps
 def test_blocks_of_a_plan_are_relative_to_it(tiny_scene, tmp_path):
     planned(job_for(tiny_scene, tmp_path / "run"))
     (tmp_path / "run").rename(tmp_path / "moved")
-    for block in read_plan(RunFolder(tmp_path / "moved")):
+    for block in read_plan(RunFolder(tmp_path / "moved")).blocks:
         assert Path(block.job.region) == block.folder.path / "region.json"
         assert Path(block.job.out) == block.folder.path
 
@@ -163,7 +163,7 @@ def test_every_splat_of_its_own_cell_is_there_once_and_no_other(tmp_path, monkey
     blocks = [
         finished(tmp_path, i, cell, its) for i, (cell, its) in enumerate(zip(cells, sets, strict=True), 1)
     ]
-    kept = merge(blocks, tmp_path / "whole.ply")
+    kept = merge(Division(None, blocks, []), tmp_path / "whole.ply")
     made = read_bundle(tmp_path / "whole.ply")
     assert [level.facts for level in made.levels] == [{"s_min": 1.0}, {"s_min": 0.5}]
     assert sum(own for own, _ in kept) == sum(len(level.splats) for level in made.levels)
@@ -184,7 +184,7 @@ def test_blocks_that_do_not_belong_together_are_refused(tmp_path):
     one = finished(tmp_path, 1, (-np.inf, 0), [random_splats(rng, 9)])
     other = finished(tmp_path, 2, (0, np.inf), [random_splats(rng, 9)], method="3dgs", rule="")
     with pytest.raises(LodgsError, match="another kind"):
-        merge([one, other], tmp_path / "whole.ply")
+        merge(Division(None, [one, other], []), tmp_path / "whole.ply")
     assert not (tmp_path / "whole.ply").exists()
 
 
@@ -259,7 +259,7 @@ def blocks(tiny_scene, tmp_path, monkeypatch):
 
 def trained(blocks, workers, tell=lambda *_, **__: None):
     path = blocks[0].folder.path.parent / "whole.ply"
-    train_blocks(blocks, path, workers, tell)
+    train_blocks(Division(None, blocks, []), path, workers, tell)
     return path
 
 
@@ -312,7 +312,8 @@ def test_how_all_get_on_is_one_event(blocks):
     steps = [block.job.resolved_parameters().total_steps for block in blocks]
     assert last["step"] == last["of"] == sum(steps)
     assert last["blocks"] == [
-        {"block": number, "state": "done", "step": step, "of": step} for number, step in enumerate(steps, 1)
+        {"block": number, "kind": "block", "state": "done", "step": step, "of": step}
+        for number, step in enumerate(steps, 1)
     ]
     from training.runs.events import _well_formed
 
@@ -382,7 +383,7 @@ def test_trainers_killed_and_a_run_interrupted_end_in_the_same_bundle(tiny_scene
         until = time.monotonic() + 120
         while process.poll() is None and time.monotonic() < until:
             time.sleep(0.5)
-            for block in read_plan(wild) if wild.blocks.exists() else ():
+            for block in read_plan(wild).blocks if wild.blocks.exists() else ():
                 if kills < 4 and block.folder.running and block.folder.last("progress"):
                     with suppress(LodgsError):  # it has just ended by itself
                         block.folder.end()

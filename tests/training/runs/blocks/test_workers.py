@@ -25,7 +25,7 @@ def block(tiny_scene, tmp_path):
     job = job_for(tiny_scene, tmp_path / "run").resolved()
     folder = RunFolder(job.out)
     folder.make()
-    return write_plan(job, folder)[0].folder
+    return write_plan(job, folder).blocks[0].folder
 
 
 @pytest.mark.parametrize(
