@@ -2,12 +2,13 @@
 
 A plan of examples/lantern_walk is trained with ``lodgs blocks run`` where ``--on`` says, each worker with one
 thread. Times are those that the run and its parts tell in their events. A part's own time is from its
-trainer's first word to its last; all else that passes while parts are trained is overhead: starting trainers
-and Dask, giving blocks out, looking how they get on, waiting. What no engine could help, a worker without
-work because blocks are not equally long, is taken out: ideally each worker takes the next block as soon as it
-is free, in the order of their numbers. The model for 1 to 64 workers is that ideal, with the overhead that
-one worker had for each block, and what comes before, between and after. Saves build/bench/blocks.json, and
-draws blocks.png beside it.
+trainer's first word to its last, and the seconds in which a trainer starts, measured by itself; whoever calls
+``lodgs train`` for one part after the other has both. All else that passes while parts are trained is the
+engine's overhead: starting Dask, giving parts out, looking how they get on, waiting. What no engine could
+help, a worker without work because parts are not equally long, is taken out: ideally each worker takes the
+next part as soon as it is free, in the order of their numbers. The model for 1 to 64 workers is that ideal,
+with the overhead that one worker had for each part, and what comes before and after. Saves
+build/bench/blocks.json, and draws blocks.png beside it.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import argparse
 import json
 import os
 import shutil
+import statistics
 import subprocess
 import sys
 import time
@@ -30,6 +32,8 @@ from training.runs.folder import RunFolder  # noqa: E402
 
 ON = ("here", "local:1", "local:2")
 MOST_WORKERS = 64
+STARTS = 3
+"""How often the start of a trainer is measured."""
 JOB = (
     "--scene", str(ROOT / "examples" / "lantern_walk"), "--method", "flod", "--test-every", "8",
 )  # fmt: skip
@@ -68,10 +72,18 @@ def own_seconds(folder: RunFolder) -> float:
     return events[-1]["time"] - events[0]["time"]
 
 
-def parts_of(run: RunFolder) -> dict[str, list[float]]:
-    """The own times of a run's parts by stage, which begins when the one before it is over."""
+def parts_of(run: RunFolder) -> tuple[dict[str, list[float]], float]:
+    """The own times of a run's parts by stage, which begins when the one before it is over; of these a start.
+
+    A trainer whose part is finished starts and ends at once.
+    """
     stages = [stage for stage in read_plan(run).stages if stage]
-    return {stage[0].kind: [round(own_seconds(part.folder), 3) for part in stage] for stage in stages}
+    finished = str(stages[0][0].folder.job)
+    start = statistics.median(lodgs("train", finished) for _ in range(STARTS))
+    parts = {
+        stage[0].kind: [round(own_seconds(part.folder) + start, 3) for part in stage] for stage in stages
+    }
+    return parts, start
 
 
 def measure(work: Path, on: str, cells: str, further: Sequence[str]) -> dict:
@@ -80,7 +92,7 @@ def measure(work: Path, on: str, cells: str, further: Sequence[str]) -> dict:
     shutil.rmtree(run.path, ignore_errors=True)
     planning = lodgs("blocks", "plan", *JOB, "--cells", cells, "--out", str(run.path), *further)
     wall = lodgs("blocks", "run", str(run.path), "--on", on)
-    parts, workers = parts_of(run), workers_of(on)
+    (parts, start), workers = parts_of(run), workers_of(on)
     events = run.events()[0]
     training = next(e["time"] for e in events if e.get("message", "").startswith("Putting "))
     training -= events[0]["time"]
@@ -91,7 +103,8 @@ def measure(work: Path, on: str, cells: str, further: Sequence[str]) -> dict:
         "on": on, "workers": workers, "cells": cells, "planning_s": round(planning, 2),
         "wall_s": round(wall, 2), "starting_s": round(wall - training - after, 2),
         "training_s": round(training, 2),
-        "after_s": round(after, 2), "parts_s": parts, "own_s": round(own, 2), "ideal_s": round(ideal, 2),
+        "after_s": round(after, 2), "start_s": round(start, 2), "parts_s": parts, "own_s": round(own, 2),
+        "ideal_s": round(ideal, 2),
         "overhead_s": round(training - ideal, 2),
         "overhead_share": round((training - ideal) * workers / own, 4),
     }  # fmt: skip
