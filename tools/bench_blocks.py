@@ -154,6 +154,23 @@ def plot(path: Path, rows: Sequence[dict]) -> None:
     pyplot.close(figure)
 
 
+def report(path: Path, rows: Sequence[dict]) -> None:
+    """Prints and saves what was measured, and the model where one worker was."""
+    for row in rows:
+        print(
+            f"{row['on']:<8} {row['wall_s']:7.1f} s, parts {row['own_s']:7.1f} s on {row['workers']} workers "
+            f"(ideally {row['ideal_s']:.1f} s): overhead {row['overhead_s']:.1f} s, "
+            f"{100 * row['overhead_share']:.1f} % of the parts' time; a trainer starts in "
+            f"{row['start_s']:.1f} s; before {row['starting_s']:.1f} s, putting together and measuring {row['after_s']:.1f} s"
+        )
+    saved: dict = {"rows": rows}
+    if one := next((row for row in rows if row["on"] == "here"), None):
+        counts = [2**power for power in range(7)]
+        saved["model_s"] = {workers: round(model(one, workers), 1) for workers in counts}
+        plot(path.with_suffix(".png"), rows)
+    path.write_text(json.dumps(saved, indent=1) + "\n", encoding="utf-8")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="measure what dividing a scene costs")
     parser.add_argument("--out", type=Path, default=Path("build/bench/blocks.json"))
@@ -161,24 +178,12 @@ def main() -> None:
     parser.add_argument("--on", nargs="+", default=ON, help="rows of others that were measured before stay")
     parser.add_argument("--cells", default="3x2")
     options, further = parser.parse_known_args()  # the others are of lodgs train
-    rows = [measure(options.work, on, options.cells, further) for on in options.on]
-    known = json.loads(options.out.read_text(encoding="utf-8"))["rows"] if options.out.exists() else []
-    rows += [row for row in known if row["on"] not in options.on]
-    rows.sort(key=lambda row: (row["workers"], row["on"]))
-    for row in rows:
-        print(
-            f"{row['on']:<8} {row['wall_s']:7.1f} s, parts {row['own_s']:7.1f} s on {row['workers']} workers "
-            f"(ideally {row['ideal_s']:.1f} s): overhead {row['overhead_s']:.1f} s, "
-            f"{100 * row['overhead_share']:.1f} % of the parts' time; starting {row['starting_s']:.1f} s, "
-            f"putting together and measuring {row['after_s']:.1f} s"
-        )
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    report: dict = {"rows": rows}
-    if one := next((row for row in rows if row["on"] == "here"), None):
-        counts = [2**power for power in range(7)]
-        report["model_s"] = {workers: round(model(one, workers), 1) for workers in counts}
-        plot(options.out.with_suffix(".png"), rows)
-    options.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    known = json.loads(options.out.read_text(encoding="utf-8"))["rows"] if options.out.exists() else []
+    rows = {row["on"]: row for row in known}
+    for on in options.on:
+        rows[on] = measure(options.work, on, options.cells, further)
+        report(options.out, sorted(rows.values(), key=lambda row: (row["workers"], row["on"])))
     print(f"{options.out} and {options.out.with_suffix('.png').name}")
 
 
