@@ -161,7 +161,7 @@ def report(path: Path, rows: Sequence[dict]) -> None:
             f"{row['on']:<8} {row['wall_s']:7.1f} s, parts {row['own_s']:7.1f} s on {row['workers']} workers "
             f"(ideally {row['ideal_s']:.1f} s): overhead {row['overhead_s']:.1f} s, "
             f"{100 * row['overhead_share']:.1f} % of the parts' time; a trainer starts in "
-            f"{row['start_s']:.1f} s; before {row['starting_s']:.1f} s, putting together and measuring {row['after_s']:.1f} s"
+            f"{row['start_s']:.1f} s; before {row['starting_s']:.1f} s, after {row['after_s']:.1f} s"
         )
     saved: dict = {"rows": rows}
     if one := next((row for row in rows if row["on"] == "here"), None):
