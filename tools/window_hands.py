@@ -61,9 +61,9 @@ def press(operator: str, way: str = "", **settings) -> None:
         getattr(getattr(bpy.ops, group), name)(way, **settings)
 
 
-def open_panels() -> None:
-    """Panels that begin closed begin open here: the pictures are to show them."""
-    for module_ in (module("panels.rendering"), module("panels.compare")):
+def open_panels(*names: str) -> None:
+    """Panels of these modules that begin closed begin open here: the pictures are to show them."""
+    for module_ in map(module, names):
         for panel in module_.CLASSES:
             if "DEFAULT_CLOSED" in getattr(panel, "bl_options", ()):
                 bpy.utils.unregister_class(panel)

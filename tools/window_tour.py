@@ -85,7 +85,7 @@ def preferences() -> Steps:
     yield 0.5
     for name in ("Cube", "Light", "Camera"):  # as the guide says: the first photograph's is the camera
         bpy.data.objects.remove(bpy.data.objects[name])
-    open_panels()
+    open_panels("panels.rendering", "panels.compare")
     space: bpy.types.SpaceView3D = viewport()[0].spaces.active  # type: ignore[assignment]
     space.show_region_ui = True
     yield 1.0

@@ -389,6 +389,8 @@ def _environment() -> dict:
             continue
         if _numbers(found[package]) < _numbers(oldest):
             problems.append(f"{package} is {found[package]}; training needs {oldest} or newer.")
+    with suppress(metadata.PackageNotFoundError):  # for several cells at once
+        found["distributed"] = metadata.version("distributed")
     return {**found, "ok": not problems, "problems": problems}
 
 

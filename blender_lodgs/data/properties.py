@@ -10,7 +10,7 @@ import bpy
 
 from ...training.lod.rule import Control, Rule, rules
 from .selection import read_json
-from .training import PARAMETERS, TrainingSettings
+from .training import PARAMETERS, TrainingCell, TrainingSettings
 
 ON_CHANGE: dict[str, Callable[[Any, bpy.types.Context], None]] = {}
 """What is done when a property has changed, with its owner, by name; ``updates`` says what."""
@@ -493,8 +493,8 @@ SplatScene.__annotations__ |= {
 }
 
 CLASSES = (
-    ViewSettings, ViewportSettings, *PARAMETERS.values(), TrainingSettings, SplatLevel, SplatTable,
-    SplatStream, *CONTROLS.values(), SplatScene, RenderSettings,
+    ViewSettings, ViewportSettings, *PARAMETERS.values(), TrainingCell, TrainingSettings, SplatLevel,
+    SplatTable, SplatStream, *CONTROLS.values(), SplatScene, RenderSettings,
 )  # fmt: skip
 
 

@@ -121,6 +121,25 @@ PARAMETERS = {method: _parameters_of(info) for method, info in METHODS.items()}
 """The groups of all methods by name; each is a property ``parameters_<name>`` of ``TrainingSettings``."""
 
 
+class TrainingCell(bpy.types.PropertyGroup):
+    """A cell of a scene that is trained in cells, as its plan has it."""
+
+    views: bpy.props.IntProperty(name="Views", description="How many views it is trained and measured on")
+    points: bpy.props.IntProperty(name="Points", description="With how many points its training begins")
+    splats: bpy.props.IntProperty(name="Splats at Most", description="How many splats it has at most")
+    steps: bpy.props.IntProperty(name="Steps", description="How many steps it is trained for")
+    megabytes: bpy.props.FloatProperty(name="Memory", description="About how much its training takes, in MB")
+    outline: bpy.props.FloatVectorProperty(
+        name="Outline", description="Its corners on the ground, in the scene's own units", size=12
+    )
+    enlarged: bpy.props.FloatVectorProperty(
+        name="Enlarged", description="The corners of what it is trained on, in the same units", size=12
+    )
+    places: bpy.props.StringProperty(
+        name="Places", description="The places by name of its views, as JSON", options={"HIDDEN"}
+    )
+
+
 class TrainingSettings(bpy.types.PropertyGroup):
     """Choices of the training panel, and the scene root's newest run (``root.lodgs.training``).
 
@@ -246,10 +265,38 @@ class TrainingSettings(bpy.types.PropertyGroup):
     seed: bpy.props.IntProperty(
         name="Seed", description="Two runs with the same seed are equal", default=0, min=0
     )
+    divide_by: bpy.props.EnumProperty(
+        name="Divide By",
+        description="How many cells the ground is divided into, each of which is trained by itself",
+        items=[
+            ("GRID", "Columns, Rows", "So many columns of so many cells; 1 by 1 trains the scene as a whole"),
+            ("SPLATS", "Splats a Cell", "As few cells as have so many splats at most; Plan finds them"),
+            ("MEMORY", "Memory a Cell", "As few cells as take so much memory at most; Plan finds them"),
+        ],
+        options=set(),
+    )
+    cell_splats: bpy.props.IntProperty(
+        name="Splats at Most",
+        description="How many splats a cell has at most",
+        default=1_000_000,
+        min=1000,
+        soft_max=16_000_000,
+        step=10_000,
+        options=set(),
+    )
+    cell_memory: bpy.props.FloatProperty(
+        name="GB at Most",
+        description="How many gigabytes of memory the training of a cell takes at most, estimated",
+        default=8.0,
+        min=0.5,
+        soft_max=64.0,
+        precision=1,
+        step=50,
+        options=set(),
+    )
     columns: bpy.props.IntProperty(
-        name="Cells Across",
-        description="How many columns of cells the ground is divided into, across its longer side. Each cell "
-        "is trained by itself, in the memory that its part takes; 1 by 1 trains the scene as a whole",
+        name="Columns",
+        description="How many columns of cells there are, across the longer side of the ground",
         default=1,
         min=1,
         soft_max=8,
@@ -257,13 +304,39 @@ class TrainingSettings(bpy.types.PropertyGroup):
         options=set(),
     )
     rows: bpy.props.IntProperty(
-        name="Along",
+        name="Rows",
         description="How many cells each column has",
         default=1,
         min=1,
         soft_max=8,
         max=MOST_CELLS,
         options=set(),
+    )
+    at_once: bpy.props.IntProperty(
+        name="Cells at Once",
+        description="How many cells are trained at a time on this computer. Each takes its own memory, and "
+        "they share the processor. Above 1 the trainer needs Dask",
+        default=1,
+        min=1,
+        soft_max=8,
+        max=MOST_CELLS,
+        options=set(),
+    )
+    show_cells: bpy.props.BoolProperty(
+        name="Show Cells",
+        description="Show the cells on the ground: what each is trained on fainter, and the cameras of the "
+        "chosen one",
+        default=True,
+        options=set(),
+    )
+    planned_cells: bpy.props.CollectionProperty(
+        type=TrainingCell, name="Cells", description="What the plan says of each cell"
+    )
+    active_cell: bpy.props.IntProperty(
+        name="Chosen Cell", description="Line of the list of cells", options=set()
+    )
+    planned_for: bpy.props.StringProperty(
+        name="Planned For", description="What the cells were planned for, as JSON", options={"HIDDEN"}
     )
     output: bpy.props.StringProperty(
         name="Run Folders In",
@@ -294,6 +367,14 @@ class TrainingSettings(bpy.types.PropertyGroup):
         description="Bytes of the run's events that this file has taken in",
         options={"HIDDEN"},
     )
+
+    @property
+    def limits(self) -> tuple[int, int]:
+        """Splats and bytes that a cell has at most, where these decide how many cells there are; else 0."""
+        return (
+            self.cell_splats if self.divide_by == "SPLATS" else 0,
+            round(self.cell_memory * 1e9) if self.divide_by == "MEMORY" else 0,
+        )
 
     @property
     def grid(self) -> str:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor, wait
+
 import bpy
 
 from ...training.errors import LodgsError
-from ..data import scenes
+from ..data import cells, scenes
 from ..runs import jobs
-from ..runs.watch import Watch
+from ..runs.watch import Watch, root_by_uid, watch_of
+from .frames import PieceByPiece
 from .parts import OnScene, report_errors, show_image
 
 
@@ -57,6 +60,65 @@ class LODGS_OT_cancel_training(OnScene, bpy.types.Operator):
     def execute(self, context):
         jobs.cancel(scenes.active_root(context))
         return {"FINISHED"}
+
+
+class LODGS_OT_plan_cells(OnScene, PieceByPiece, bpy.types.Operator):
+    bl_idname = "lodgs.plan_cells"
+    bl_label = "Plan Cells"
+    bl_description = "Say what each cell will be trained on, and what that takes, before anything runs"
+    bl_options = {"UNDO"}
+
+    def invoke(self, context, event):
+        return self.execute(context) if bpy.app.background else self.begin(context)
+
+    def work(self, context):
+        root = scenes.active_root(context)
+        uid, limits = root.session_uid, root.lodgs.training.limits
+        job = jobs.make_job(root, jobs.runs_folder(root), {})
+        reader = ThreadPoolExecutor(1, "lodgs-plan")
+        try:
+            reading = reader.submit(cells.plan_cells, job, *limits)
+            while wait([reading], 0.01).not_done:
+                yield
+        finally:
+            reader.shutdown(wait=False)
+        self._found, root = reading.result(), root_by_uid(uid)
+        if root is not None:  # undo may have replaced it
+            cells.show(root.lodgs.training, self._found)
+
+    def status(self, context, count):
+        return "Planning cells; Esc stops"
+
+    def done(self, count):
+        views = [each.views for each in self._found.planned]
+        return f"{len(views)} cells of {min(views)} to {max(views)} views"
+
+
+class _OnBlock(OnScene):
+    block: bpy.props.IntProperty(name="Cell", description="Number of the cell, from 1", min=1, default=1)
+
+
+class LODGS_OT_cancel_block(_OnBlock, bpy.types.Operator):
+    bl_idname = "lodgs.cancel_block"
+    bl_label = "Cancel Cell"
+    bl_description = "Ask this cell's training to save and stop, while the others go on"
+
+    @report_errors
+    def execute(self, context):
+        jobs.cancel_block(scenes.active_root(context), self.block)
+        return {"FINISHED"}
+
+
+class LODGS_OT_resume_block(_OnBlock, bpy.types.Operator):
+    bl_idname = "lodgs.resume_block"
+    bl_label = "Resume Cell"
+    bl_description = "Go on with this cell: beside the others where they are at work, else with it alone"
+
+    @report_errors
+    def execute(self, context):
+        root = scenes.active_root(context)
+        followed, watch = watch_of(root), jobs.resume_block(root, self.block)
+        return {"FINISHED"} if watch is followed else _follow(self, watch)
 
 
 class LODGS_OT_open_run(OnScene, bpy.types.Operator):
@@ -124,6 +186,9 @@ CLASSES = (
     LODGS_OT_train,
     LODGS_OT_resume_training,
     LODGS_OT_cancel_training,
+    LODGS_OT_plan_cells,
+    LODGS_OT_cancel_block,
+    LODGS_OT_resume_block,
     LODGS_OT_open_run,
     LODGS_OT_show_log,
     LODGS_OT_show_costs,

@@ -15,6 +15,7 @@ from ..runs import environment, jobs
 from ..runs.watch import Watch, watch_of
 from ..runs.words import measured_on, progress_facts, short_level_line
 from .parts import Panel, draw_environment, say, scene_length, split_column
+from .training_cells import draw_blocks
 
 
 class LODGS_PT_training(Panel):
@@ -30,7 +31,7 @@ class LODGS_PT_training(Panel):
         assert root is not None
         watch = watch_of(root)
         if watch is not None and watch.running:
-            _draw_running(self.layout, watch)
+            _draw_running(self.layout, watch, root)
             return
         if watch is not None:
             _draw_ended(self.layout, watch, root)
@@ -101,6 +102,7 @@ def _draw_choices(
         parameters = jobs.parameters(settings)
         levels = parameters.levels  # 0: the scene decides
         text = f" in {levels} levels" if levels > 1 else ""
+        text += f", {settings.columns * settings.rows} cells" if settings.grid and not alone else ""
         begun = alone or (info.from_base and settings.start_from != "POINTS")
         steps = parameters.base_steps if begun else parameters.total_steps
         column.label(text=f"{steps:,} steps{text}")
@@ -170,7 +172,7 @@ def _draw_distances(layout: bpy.types.UILayout, context: bpy.types.Context, root
     say(layout, f"{text}.", "INFO")
 
 
-def _draw_running(layout: bpy.types.UILayout, watch: Watch) -> None:
+def _draw_running(layout: bpy.types.UILayout, watch: Watch, root: bpy.types.Object) -> None:
     progress, share = watch.progress, watch.share
     row = layout.row(align=True)
     message, _, aside = watch.message.partition(" (")  # the bar has room for a few words
@@ -182,6 +184,7 @@ def _draw_running(layout: bpy.types.UILayout, watch: Watch) -> None:
         layout.label(text="Cancel again to end it at once", icon="INFO")
     elif watch.unresponsive:
         say(layout, "The trainer has not answered for a while. Cancel it, then resume.", "ERROR")
+    draw_blocks(layout, root, watch)
     facts = progress_facts(progress)
     if facts:
         grid = layout.grid_flow(row_major=True, columns=2, even_columns=True)
@@ -211,6 +214,7 @@ def _draw_ended(layout: bpy.types.UILayout, watch: Watch, root: bpy.types.Object
     for warning in watch.warnings[-3:]:
         say(box, warning, "INFO")
     if watch.state != "done":
+        draw_blocks(box, root, watch)
         row = box.row()
         row.operator("lodgs.resume_training", icon="PLAY")
         if watch.problem:

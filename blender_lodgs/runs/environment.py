@@ -95,8 +95,11 @@ def check(python: Path) -> Report:
     return report
 
 
-def require(python: Path) -> None:
+def require(python: Path, at_once: int = 1) -> None:
     """Make sure that a Python can train.
+
+    Args:
+        at_once: how many cells of a large scene at a time.
 
     Raises:
         LodgsError: it cannot; says what is missing.
@@ -104,6 +107,12 @@ def require(python: Path) -> None:
     report = check(python)
     if not report.ok:
         raise LodgsError(report.problems[0], _REMEDY)
+    if at_once > 1 and "distributed" not in report.versions:
+        raise LodgsError(
+            f"Training {at_once} cells at once needs Dask, which {python} does not have.",
+            "Make an environment in the preferences of LODGS, install requirements/cluster.txt there, or set "
+            "Cells at Once to 1.",
+        )
 
 
 def check_now() -> Report:

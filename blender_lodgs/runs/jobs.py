@@ -71,7 +71,7 @@ def _begin(root: bpy.types.Object, run: RunFolder, job: Job) -> Watch:
             f"{run.path} already holds a run.", "Choose another folder, or open it as a run and resume it."
         )
     root.lodgs.training.read = 0
-    return _launch(root, run, job, hand_over=Path(job.base) == run.base)
+    return _launch(root, run, job, write=True, hand_over=Path(job.base) == run.base)
 
 
 def resume(root: bpy.types.Object) -> Watch:
@@ -88,9 +88,13 @@ def resume(root: bpy.types.Object) -> Watch:
         raise LodgsError(f"The run in {run.path} is already at work.", "Wait for it or cancel it.")
     if state == "done":
         raise LodgsError(f"The run in {run.path} is finished.", "Press Train for a new one.")
+    return _resume(root, run)
+
+
+def _resume(root: bpy.types.Object, run: RunFolder) -> Watch:
     job = replace(Job.from_file(run.job), out=str(run.path))
     backend = extension.preferences().backend  # what this computer has, and what its user wants now
-    return _launch(root, run, None if job.backend == backend else replace(job, backend=backend))
+    return _launch(root, run, replace(job, backend=backend), write=job.backend != backend)
 
 
 def start_or_resume(root: bpy.types.Object, job: Job) -> Watch:
@@ -117,7 +121,7 @@ def start_or_resume(root: bpy.types.Object, job: Job) -> Watch:
         return attach(root, job.out)
     root.lodgs.training.read = 0
     same = all(getattr(before, name) == getattr(job, name) for name in CHANGEABLE if name != "out")
-    return _launch(root, run, None if same else job)
+    return _launch(root, run, job, write=not same)
 
 
 def cancel(root: bpy.types.Object) -> None:
@@ -139,11 +143,59 @@ def cancel(root: bpy.types.Object) -> None:
                 f"{watch.folder.path} cannot be written: {error.strerror}.",
                 "Cancel again to end the trainer.",
             ) from error
-    elif watch.process is not None:
-        watch.process.kill()
     else:
-        watch.folder.end()
+        if watch.process is not None:
+            watch.process.kill()
+        else:
+            watch.folder.end()
+        for number in {each["block"] for each in watch.blocks}:  # with nobody to begin them again
+            part = watch.part(number)
+            with suppress(LodgsError, OSError):
+                if part is not None:
+                    part.folder.end()
     extension.redraw()
+
+
+def cancel_block(root: bpy.types.Object, number: int) -> None:
+    """Ask the training of one cell to save and stop, while the others go on.
+
+    Raises:
+        LodgsError: it is not at work, nor to begin.
+    """
+    watch = watch_of(root)
+    part = watch.part(number) if watch is not None and watch.running else None
+    if watch is None or part is None or part.state not in {"waiting", "running"}:
+        raise LodgsError(f"Cell {number} of '{root.name}' is not being trained.")
+    _ask(part.folder.request_cancel)
+    watch.stopping.add(number)
+    extension.redraw()
+
+
+def resume_block(root: bpy.types.Object, number: int) -> Watch:
+    """Go on with the training of one cell: beside the others where they are at work, else alone.
+
+    Raises:
+        LodgsError: there is no such cell, or it is at work or finished.
+    """
+    watch = watch_of(root)
+    part = watch.part(number) if watch is not None else None
+    if (
+        watch is None
+        or part is None
+        or part.state in ({"waiting", "running", "done"} if watch.running else {"done"})
+    ):
+        raise LodgsError(f"Cell {number} of '{root.name}' has nothing to go on with.")
+    _ask(part.folder.request_resume)
+    return watch if watch.running else _resume(root, watch.folder)
+
+
+def _ask(request: Callable[[], None]) -> None:
+    try:
+        request()
+    except OSError as error:
+        raise LodgsError(
+            f"{error.filename} cannot be written: {error.strerror}.", "Cancel the whole training."
+        ) from error
 
 
 def attach(root: bpy.types.Object, folder: str, *, again: bool = True) -> Watch:
@@ -242,11 +294,17 @@ def _photographed(root: bpy.types.Object, out: Path) -> dict:
             f"'{root.name}' was not imported from photographs, so there is nothing to train on.",
             "Import a COLMAP folder.",
         )
+    base = base_of(root, out)
+    if base and settings.grid:
+        raise LodgsError(
+            "Cells begin with the scene's points, not with splats.",
+            "Choose Points in Start From, or train one cell.",
+        )
     return {
         "scene": bpy.path.abspath(root.lodgs.scene_folder),
         "model": bpy.path.abspath(settings.model),
         "images": bpy.path.abspath(settings.images),
-        "base": base_of(root, out),
+        "base": base,
     }
 
 
@@ -316,6 +374,7 @@ def show(settings: TrainingSettings, job: Job) -> None:
     for name in {field.name for field in fields(Job)}.intersection(settings.bl_rna.properties.keys()):
         setattr(settings, name, getattr(job, name))
     settings.start_from = "FILE" if job.base else "POINTS"
+    settings.columns, settings.rows = job.grid if job.cells else (1, 1)
     preset, own = method_info(job.method).preset(job.preset), job.resolved_parameters()
     for f in offered(job.method):
         settings.parameters.property_unset(f.name)
@@ -356,18 +415,22 @@ def base_of(root: bpy.types.Object, out: Path) -> str:
     return str(run.path)
 
 
-def _launch(root: bpy.types.Object, run: RunFolder, job: Job | None, hand_over: bool = False) -> Watch:
-    python = environment.trainer_python()
-    environment.require(python)
-    if job is not None and hand_over:
+def _launch(
+    root: bpy.types.Object, run: RunFolder, job: Job, *, write: bool, hand_over: bool = False
+) -> Watch:
+    python, at_once = environment.trainer_python(), root.lodgs.training.at_once if job.cells else 1
+    environment.require(python, at_once)
+    if hand_over:
         _hand_over(root, run, job)
     run.make()
-    if job is not None:
+    if write:
         job.resolved().write(run.job)
+    what = ["train", str(run.job), "--out", str(run.path)]
+    if job.cells:
+        what = ["blocks", "run", str(run.path), "--on", f"local:{at_once}" if at_once > 1 else "here"]
     try:
         run.take_cancel()  # what was asked of an earlier trainer; from now on it is for this one
-        command = [str(python), "-m", "training", "train", str(run.job), "--out", str(run.path)]
-        process = processes.spawn(command, log=run.log, output=run.output)
+        process = processes.spawn([str(python), "-m", "training", *what], log=run.log, output=run.output)
     except OSError as error:
         raise LodgsError(
             f"The trainer's Python {python} cannot be started: {error.strerror or error}.",

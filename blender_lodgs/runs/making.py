@@ -26,11 +26,12 @@ from ...training.files import atomic_write
 from .. import extension
 from . import environment, processes
 
-REQUIREMENTS = extension.FOLDER / "requirements" / "trainer.txt"
+REQUIREMENTS = extension.FOLDER / "requirements" / "cluster.txt"
+"""What training needs, and Dask for several cells of a large scene at once."""
 CUDA_REQUIREMENTS = extension.FOLDER / "requirements" / "cuda.txt"
 """The same and what an NVIDIA GPU needs: installed where there is one, and nvcc to compile with."""
 
-MODULES = ("torch", "numba", "scipy", "pycolmap", "OpenEXR", "PIL", "plyfile", "torchmetrics")
+MODULES = ("torch", "numba", "scipy", "pycolmap", "OpenEXR", "PIL", "plyfile", "torchmetrics", "distributed")
 """What a new environment must be able to import before it serves."""
 
 

@@ -21,10 +21,28 @@ from ...training.runs.folder import RunFolder
 from ...training.splats.bundle import Bundle, Level, read_head, read_tables
 from ...training.splats.ply import read_ply
 from .. import extension
-from ..data import scenes
+from ..data import cells, scenes
 
 UNRESPONSIVE_AFTER = 60.0
 """Seconds without an event after which the panel says that the trainer does not answer."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """What of a scene in cells is trained now: of the whole, or of one cell.
+
+    Attributes:
+        folder: of its run.
+        number: of the cell; 0 for the whole.
+        kind, state: as ``progress`` events have them (``BLOCK_KINDS``, ``BLOCK_STATES``).
+        share: how much is done, 0 to 1, of a cell with its borders.
+    """
+
+    folder: RunFolder
+    number: int
+    kind: str
+    state: str
+    share: float
 
 
 @dataclass
@@ -40,10 +58,12 @@ class Watch:
         share: how much of that is done, 0 to 1.
         problem: why the run failed, as a sentence with its remedy; empty when it did not.
         progress: the newest ``progress`` event.
+        blocks: how each part of a scene in cells gets on, as a ``progress`` event says; see :meth:`part`.
         levels: the newest ``level`` event of each level.
         summary: of a finished run the ``done`` event, with what it is worth.
         warnings: the warnings of this run.
         cancel_requested: whether it was asked to stop.
+        stopping: numbers of cells that were asked to stop by themselves.
         method: what it trains.
         last_event: when an event came last, in seconds since the epoch.
         offset: bytes of the run's events that have been read.
@@ -58,10 +78,12 @@ class Watch:
     share: float = 0.0
     problem: str = ""
     progress: dict = field(default_factory=dict)
+    blocks: list[dict] = field(default_factory=list)
     levels: dict[int, dict] = field(default_factory=dict)
     summary: dict = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     cancel_requested: bool = False
+    stopping: set[int] = field(default_factory=set)
     method: str = ""
     last_event: float = field(default_factory=time.time)
     offset: int = 0
@@ -75,6 +97,19 @@ class Watch:
     def unresponsive(self) -> bool:
         """Whether a running trainer has sent no event for :data:`UNRESPONSIVE_AFTER` seconds."""
         return self.running and time.time() - self.last_event > UNRESPONSIVE_AFTER
+
+    def part(self, number: int) -> Part | None:
+        """What is trained of a cell now, or last; or with 0 of the whole scene, before its cells. None where
+        nothing is known of such a part."""
+        mine = [each for each in self.blocks if each["block"] == number]
+        if not mine:
+            return None
+        now = next((each for each in mine if each["state"] != "done"), mine[-1])
+        state = "cancelled" if now["state"] == "running" and not self.running else now["state"]
+        share = sum(each["step"] for each in mine) / max(sum(each["of"] for each in mine), 1)
+        run = self.folder
+        places = {"coarse": run.coarse, "block": run.blocks / str(number), "seam": run.seams / str(number)}
+        return Part(RunFolder(places[now["kind"]]), number, now["kind"], state, min(share, 1.0))
 
     def step(self) -> bool:
         """Handle the events since the last step; return whether there may be more.
@@ -137,6 +172,8 @@ class Watch:
             case "progress":
                 self.progress, self.message = event, event.get("stage", "").capitalize()
                 self.share = _share(event)
+                if "blocks" in event:
+                    self._take_blocks(root, event["blocks"])
             case "warning":
                 self.warnings.append(event["message"])
             case "level":
@@ -144,6 +181,12 @@ class Watch:
             case "done":
                 self.summary = event
                 self._finish(root)
+
+    def _take_blocks(self, root: bpy.types.Object, blocks: list[dict]) -> None:
+        self.blocks = blocks
+        parts = map(self.part, self.stopping)
+        self.stopping = {part.number for part in parts if part and part.state in ("waiting", "running")}
+        cells.require(root.lodgs.training, sum(each["kind"] == "block" for each in blocks))
 
     def _add_level(self, root: bpy.types.Object, event: dict) -> None:
         if self._stays_in_file(root, event):
@@ -236,7 +279,7 @@ def begin(watch: Watch) -> Watch:
     """Follows a run from now on, with what is known of it already."""
     for event in watch.folder.events()[0]:
         if event["event"] == "progress":
-            watch.progress = event
+            watch.progress, watch.blocks = event, event.get("blocks", watch.blocks)
         elif event["event"] == "level":
             watch.levels[event["level"]] = event
         elif event["event"] == "done":

@@ -3,8 +3,8 @@
 Splats are drawn in all shadings but Wireframe where ``Scene.lodgs_viewport.splats`` is on; otherwise they are
 points like those of COLMAP: discs in Solid shading, Blender's own points elsewhere. Where Blender draws
 splats by itself, it is left to it. ``arranging`` decides which are drawn in which order, ``views`` keeps what
-each viewport shows, ``eye`` follows a viewport's view, and ``frusta`` shows where
-training will look from.
+each viewport shows, ``eye`` follows a viewport's view, ``frusta`` shows where training will look from, and
+``cells`` what a large scene is divided into.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import bpy
 from ...training.lod.colors import level_color
 from .. import compat, extension
 from ..data import scenes
-from . import discs, eye, frusta, splats, views
+from . import cells, discs, eye, frusta, splats, views
 
 if TYPE_CHECKING:
     from ..data.properties import SplatScene
@@ -68,6 +68,7 @@ def _draw_view(context: bpy.types.Context) -> None:
         views.draw(context)
     if space.overlay.show_overlays:
         frusta.draw(context.scene)
+        cells.draw(context.scene)
 
 
 def _points(

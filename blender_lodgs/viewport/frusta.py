@@ -40,7 +40,11 @@ def lines(views: list, length: float) -> np.ndarray:
         x, y = np.array([0, view.width]) - view.cx, np.array([0, view.height]) - view.cy
         ahead = [(x[i] / view.fx, y[j] / view.fy, 1.0) for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))]
         corners.append(view.center + length * np.array(ahead) @ view.world_to_camera[:3, :3])
-    eyes, corners = np.array([view.center for view in views])[:, None], np.array(corners)
-    edges = np.stack([np.broadcast_to(eyes, corners.shape), corners], axis=2)
+    return pyramids(np.array([view.center for view in views]), np.array(corners))
+
+
+def pyramids(eyes: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """The ends (16 * V, 3) of the lines from eyes (V, 3) to the corners (V, 4, 3) before them, and around."""
+    edges = np.stack([np.broadcast_to(eyes[:, None], corners.shape), corners], axis=2)
     frame = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2)
     return np.concatenate([edges, frame], axis=1).reshape(-1, 3).astype(np.float32)

@@ -1,9 +1,12 @@
 """Stands in for the trainer's Python: speaks the protocol of a run, and goes wrong as $LODGS_FAKE says.
 
+Cells of a job that has some make half of their steps, and wait for the file ``go on``.
+
 - ``""``        two levels and done
 - ``chunks``    two levels of LODGE, which come again with what chunks have of them
 - ``tree``      leaves, then all nodes of a tree
 - ``two halves``  two levels, and done when the file ``go on`` is there
+- ``no_dask``   the check finds Dask missing
 - ``slow``      steps until it is asked to stop
 - ``killed``    one level, then SIGKILL to itself
 - ``crash``     one level, then a traceback and exit code 1
@@ -20,7 +23,7 @@ import os
 import signal
 import sys
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 sys.path.insert(0, os.getcwd())
@@ -37,6 +40,8 @@ from training.splats.ply import write_ply
 
 COUNTS = {1: 5, 2: 20}
 """Splats by level."""
+STEPS = 20
+"""Of a cell."""
 LEAVES = 3000
 """Of a tree."""
 
@@ -56,10 +61,11 @@ def main() -> int:
     mode, command = os.environ.get("LODGS_FAKE", ""), sys.argv[3]
     if command == "check":
         problems = ["The package torch is missing in here."] if mode == "no_torch" else []
-        print(json.dumps({"torch": "2.13.0", "ok": not problems, "problems": problems}))
+        dask = {} if mode == "no_dask" else {"distributed": "2026.8.0"}
+        print(json.dumps({"torch": "2.13.0", **dask, "ok": not problems, "problems": problems}))
         return 2 if problems else 0
     METHODS["flod"] = replace(METHODS["flod"], from_base=True)  # as tests of bases have it
-    job = Job.from_file(Path(sys.argv[4]))
+    job = Job.from_file(Path(sys.argv[5], "job.toml") if command == "blocks" else Path(sys.argv[4]))
     folder = RunFolder(job.out)
     if mode == "mute":
         time.sleep(60)
@@ -92,6 +98,9 @@ def run(mode: str, job: Job, folder: RunFolder, say: Events) -> int:
             time.sleep(0.02)
     if mode == "tree":
         return tree(folder, say)
+    if job.cells and not cells(job, folder, say, sys.argv[6:]):
+        say("cancelled", message="Stopped; the run can be resumed.")
+        return 3
     levels, tables = [], {}
     for number, count in COUNTS.items():
         path = folder.levels_folder / f"level_{number}.ply"
@@ -130,6 +139,58 @@ def run(mode: str, job: Job, folder: RunFolder, say: Events) -> int:
     say("done", bundle=folder.bundle.name, seconds=1.0, train_psnr=21.5, veil={"mean": 0.01, "max": 0.25},
         oversized=0)  # fmt: skip
     return 0
+
+
+@dataclass
+class Cell:
+    """A block that is trained without a trainer: a step a look, half of them until ``go on`` is there."""
+
+    number: int
+    folder: RunFolder
+    state: str = "running"
+
+    @property
+    def step(self) -> int:
+        made = self.folder.path / "made"
+        return len(made.read_bytes()) if made.exists() else 0
+
+    def look(self, most: int) -> None:
+        if self.state == "running" and self.folder.take_cancel():
+            self.state = "cancelled"
+        if self.state == "cancelled" and self.folder.take_resume():
+            self.state = "running"
+        if self.state == "running" and self.step < most:
+            with (self.folder.path / "made").open("ab") as made:
+                made.write(b".")
+        if self.step == STEPS:
+            self.state = "done"
+
+
+def cells(job: Job, folder: RunFolder, say: Events, options: list[str]) -> bool:
+    """Trains cells as ``train_blocks`` does; whether all are done."""
+    print(*options, file=sys.stderr)  # for the log
+    columns, rows = job.grid
+    blocks = [Cell(n, RunFolder(folder.blocks / str(n))) for n in range(1, columns * rows + 1)]
+    for block in blocks:
+        block.folder.path.mkdir(parents=True, exist_ok=True)
+        block.folder.take_cancel()
+    if asked := [block for block in blocks if block.folder.take_resume()]:
+        for block in blocks:
+            block.state = "running" if block in asked else "cancelled"
+    while any(block.state == "running" for block in blocks):
+        if folder.take_cancel():
+            return False
+        for block in blocks:
+            block.look(STEPS if (folder.path / "go on").exists() else STEPS // 2)
+        told = [
+            {"block": b.number, "kind": "block", "state": b.state, "step": b.step, "of": STEPS}
+            for b in blocks
+        ]
+        say("progress", stage="training blocks", level=1, levels=1, step=sum(b.step for b in blocks),
+            of=STEPS * len(blocks), loss=0.5, psnr=20.0, splats=5, steps_per_s=20.0, eta_s=60.0,
+            blocks=told)  # fmt: skip
+        time.sleep(0.02)
+    return all(block.state == "done" for block in blocks)
 
 
 def tree(folder: RunFolder, say: Events) -> int:

@@ -29,6 +29,11 @@ PROTOCOL = 1
 MOST_BYTES, MOST_LINE, MOST_EVENTS = 1 << 26, 1 << 18, 300_000
 """Bounds of the file, of a line in it and of the number of events: a month of training keeps within them."""
 
+BLOCK_KINDS = ("coarse", "block", "seam")
+"""What of a scene in cells is trained by itself: levels of the whole, a cell, the borders of one."""
+BLOCK_STATES = ("waiting", "running", "done", "cancelled", "failed")
+"""How that gets on."""
+
 _MOST_TEXT, _MOST_NUMBER, _DEEPEST = 10_000, 1e30, 8
 _RESERVE = 1 << 16  # bytes
 
@@ -130,6 +135,17 @@ def _is_path(value: object) -> bool:
     )
 
 
+def _are_blocks(value: object) -> bool:
+    """What a ``progress`` event says of each block of a scene in cells."""
+    return isinstance(value, list) and all(
+        isinstance(each, dict)
+        and each.get("kind") in BLOCK_KINDS
+        and each.get("state") in BLOCK_STATES
+        and all(_is_count(each.get(name)) for name in ("block", "step", "of"))
+        for each in value
+    )
+
+
 def _are_numbers(value: object) -> bool:
     if not isinstance(value, dict) or len(value) > 100:
         return False
@@ -189,6 +205,7 @@ _VALUES: dict[str, Callable[[object], bool]] = {
     **dict.fromkeys(("facts", "scene_facts", "controls"), _are_numbers),
     **dict.fromkeys(("path", "bundle"), _is_path),
     "meta": _is_meta,
+    "blocks": _are_blocks,
 }
 """What values are by their names; those of other names are anything plain."""
 

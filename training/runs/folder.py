@@ -7,7 +7,8 @@
           blocks/ (the runs of cells of a scene that is trained in cells, and what they are together)
       captured/ (the pictures of splats that had no photographs, as a COLMAP scene)
           base.ply, cameras/ (the splats, and the views of them, that Blender has handed over)
-          trainer.log, trainer.out (what a trainer that Blender started printed)  lock  cancel  reserve
+          trainer.log, trainer.out (what a trainer that Blender started printed)
+          lock  cancel  resume  reserve
 
 A run is its folder, wherever that lies. ``events.jsonl`` holds one JSON object a line, the same lines that
 the trainer prints. While a trainer runs, it holds an operating-system lock on ``lock``, which vanishes with
@@ -63,6 +64,7 @@ class RunFolder:
         self.reserve = self.path / "reserve"
         self._lock = self.path / "lock"
         self._cancel = self.path / "cancel"
+        self._resume = self.path / "resume"
         self._held: IO[bytes] | None = None
 
     def make(self) -> None:
@@ -189,11 +191,15 @@ class RunFolder:
 
     def take_cancel(self) -> bool:
         """For the trainer, and for who starts one: whether it was asked to stop since the last call."""
-        try:
-            self._cancel.unlink()
-        except FileNotFoundError:
-            return False
-        return True
+        return _take(self._cancel)
+
+    def request_resume(self) -> None:
+        """Asks whoever trains the blocks of a scene to go on with this one, which was stopped."""
+        self._resume.touch()
+
+    def take_resume(self) -> bool:
+        """Whether that was asked since the last call."""
+        return _take(self._resume)
 
     def end(self) -> None:
         """Ends the trainer that is at work here by force, if it is a process of this computer.
@@ -270,6 +276,15 @@ class RunFolder:
         except (OSError, ValueError):
             return {}
         return holder if isinstance(holder, dict) else {}
+
+
+def _take(request: Path) -> bool:
+    """Whether a request was there, which it is not any more."""
+    try:
+        request.unlink()
+    except FileNotFoundError:
+        return False
+    return True
 
 
 def _try_lock(file: IO[bytes]) -> bool:

@@ -40,7 +40,9 @@ def prepare(division: Division, part: Block) -> None:
 def train_blocks(division: Division, path: Path, submit: Submit, tell: Tell) -> None:
     """Trains all parts that are not finished, stage by stage, and writes what they are together.
 
-    How they get on is read from their folders; an interrupt stops all of them politely first.
+    How they get on is read from their folders; an interrupt stops all of them politely first. One that was
+    stopped by itself goes on when its folder is asked to (``RunFolder.request_resume``): beside the others, or,
+    asked before this begins, without those that it stands beside.
 
     Args:
         path: of the bundle of all.
@@ -54,6 +56,10 @@ def train_blocks(division: Division, path: Path, submit: Submit, tell: Tell) -> 
         return
     stages = [[_Watched(part, division) for part in stage] for stage in division.stages]
     everything = [each for stage in stages for each in stage]
+    asked = [each.block for each in everything if each.block.folder.take_resume()]
+    for each in everything:
+        if each.code is None and each.block not in asked and each.block.kind in {one.kind for one in asked}:
+            each.code = CANCELLED
     for stage in stages:
         _train_stage(stage, everything, submit, tell)
     tell("status", message=f"Putting {len(division.blocks)} blocks together")
@@ -107,7 +113,8 @@ class _Watched:
         if block.folder.bundle.exists() and block.folder.state() == "done":
             self.code = DONE
         self._lost, self._reached = 0, -1
-        self._since, self.progress = 0, {}
+        self.progress = block.folder.last("progress") or {}
+        self._since, self._heard = block.folder.events()[1], False
         self.steps = block.job.resolved_parameters().total_steps
         self._why = ""
 
@@ -115,6 +122,7 @@ class _Watched:
         """Has it trained, unless it is finished."""
         if self.code is None:
             prepare(self._division, self.block)
+            self._heard = False
             self._pending = submit(self.block.folder.path)
 
     def stop(self) -> None:
@@ -129,11 +137,16 @@ class _Watched:
         return self._pending is None or (self._pending.done() and not self.block.folder.running)
 
     def look(self, submit: Submit) -> bool:
-        """Reads how far it is, and begins it again where whoever trained it was lost; whether it is over."""
+        """Reads how far it is, and begins it again where whoever trained it was lost, or where it was stopped
+        and is asked to; whether it is over."""
+        if self.code == CANCELLED and self.block.folder.take_resume():
+            self.code = None
+            self.begin(submit)
         if self.code is not None:
             return True
         events, self._since = self.block.folder.events(self._since)
         for event in events:
+            self._heard = True
             if event["event"] == "progress":
                 self.progress = event
         assert self._pending is not None
@@ -163,7 +176,7 @@ class _Watched:
     def state(self) -> str:
         """``waiting``, ``running``, ``done``, ``cancelled`` or ``failed``."""
         if self.code is None:
-            return "running" if self.progress else "waiting"
+            return "running" if self._heard else "waiting"
         return {DONE: "done", CANCELLED: "cancelled"}.get(self.code, "failed")
 
     def trouble(self) -> LodgsError:

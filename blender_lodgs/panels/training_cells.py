@@ -1,0 +1,153 @@
+"""Training a large scene in cells: their plan before it runs, and how each gets on."""
+
+from __future__ import annotations
+
+import bpy
+
+from ...training.errors import LodgsError
+from ...training.lod.colors import level_color
+from ..data import cells, scenes, viewpoints
+from ..runs import jobs
+from ..runs.watch import Part, Watch, watch_of
+from .parts import Panel, say, split_column
+
+_NUMBER = 0.16
+"""Of the width of a line, for a cell's colour and number."""
+_ICONS = {"waiting": "SORTTIME", "done": "CHECKMARK", "cancelled": "PAUSE", "failed": "ERROR"}
+
+
+class LODGS_UL_cells(bpy.types.UIList):
+    """What the plan says of each cell."""
+
+    def draw_item(
+        self, context, layout, data, item, icon, active_data, active_property, index: int = 0, flt_flag=0
+    ):
+        row = _numbered(layout, index + 1)
+        _columns(
+            row, *map(_brief, (item.views, item.points, item.splats, item.steps)), _memory(item.megabytes)
+        )
+
+
+class LODGS_UL_blocks(bpy.types.UIList):
+    """How the training of each cell gets on."""
+
+    def draw_item(
+        self, context, layout, data, item, icon, active_data, active_property, index: int = 0, flt_flag=0
+    ):
+        watch, number = watch_of(data.id_data), index + 1
+        part = watch.part(number) if watch else None
+        if watch is not None and part is not None:
+            row = _numbered(layout, number).row(align=True)
+            _draw_part(row, part, stopping=number in watch.stopping)
+            if watch.running and part.state in ("waiting", "running"):
+                row.operator("lodgs.cancel_block", text="", icon="X", emboss=False).block = number
+            elif part.state != "done":
+                row.operator("lodgs.resume_block", text="", icon="PLAY", emboss=False).block = number
+
+
+def _draw_part(layout: bpy.types.UILayout, part: Part, stopping: bool = False) -> None:
+    share, what = f"{part.share:.0%}", "Borders, " if part.kind == "seam" else ""
+    if stopping:
+        layout.label(text=f"Stopping at {share}", icon="SORTTIME")
+    elif part.state == "running":
+        layout.progress(text=f"{what}{share}", factor=part.share)
+    else:
+        at = f" at {share}" if part.share and part.state != "done" else ""
+        layout.label(text=f"{part.state.capitalize()}{at}", icon=_ICONS[part.state])
+
+
+class LODGS_PT_training_cells(Panel):
+    bl_label = "Large Scene"
+    bl_parent_id = "LODGS_PT_training"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context):
+        root = scenes.active_root(context)
+        return root is not None and bool(root.lodgs.scene_folder) and not viewpoints.alone(root)
+
+    def draw(self, context):
+        root = scenes.active_root(context)
+        layout, settings, watch = self.layout, root.lodgs.training, watch_of(root)
+        if not (watch and watch.running):
+            _draw_choices(layout, root)
+        if settings.planned_for:
+            layout.prop(settings, "show_cells", toggle=True)
+
+
+def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
+    settings = root.lodgs.training
+    column = split_column(layout)
+    column.prop(settings, "divide_by", text="Cells")
+    if settings.divide_by == "GRID":
+        row = column.row(align=True)
+        row.prop(settings, "columns", text="Columns, Rows")
+        row.prop(settings, "rows", text="")
+    else:
+        column.prop(settings, "cell_splats" if settings.divide_by == "SPLATS" else "cell_memory")
+    if settings.divide_by == "GRID" and not settings.grid:
+        say(layout, "One cell: the scene is trained as a whole.", "INFO")
+        return
+    column.prop(settings, "at_once")
+    try:
+        job = jobs.make_job(root, jobs.runs_folder(root), {})
+    except LodgsError as error:
+        say(layout, str(error), "ERROR")
+        return
+    layout.operator("lodgs.plan_cells", icon="MESH_GRID")
+    if settings.planned_for:
+        _draw_plan(layout.column(), settings, fits=cells.is_planned(settings, job))
+
+
+def _draw_plan(layout, settings, fits):
+    if not fits:
+        say(layout, "Planned for other settings: plan again.", "INFO")
+    layout.active = fits
+    head = layout.row(align=True)
+    head.label(text="", icon="BLANK1")
+    _columns(head, "Views", "Points", "Splats", "Steps", "Memory")
+    rows = min(max(len(settings.planned_cells), 3), 8)
+    layout.template_list("LODGS_UL_cells", "", settings, "planned_cells", settings, "active_cell", rows=rows)
+
+
+def draw_blocks(layout: bpy.types.UILayout, root: bpy.types.Object, watch: Watch) -> None:
+    """How each cell of a run gets on, with a button that stops it or goes on."""
+    settings, whole = root.lodgs.training, watch.part(0)
+    if whole is not None and whole.state != "done":
+        parts = layout.split(factor=0.4)
+        parts.label(text="Coarse levels")
+        _draw_part(parts, whole)
+    if watch.part(1) is not None:
+        rows = min(max(len(settings.planned_cells), 3), 8)
+        layout.template_list(
+            "LODGS_UL_blocks", "", settings, "planned_cells", settings, "active_cell", rows=rows
+        )
+
+
+def _numbered(layout: bpy.types.UILayout, number: int) -> bpy.types.UILayout:
+    """A line that begins with a cell's colour and number; the rest of it."""
+    parts = layout.split(factor=_NUMBER)
+    row = parts.row(align=True)
+    row.template_node_socket(color=(*level_color(number), 1.0))
+    row.label(text=str(number))
+    return parts
+
+
+def _columns(row: bpy.types.UILayout, *texts: str) -> None:
+    grid = row.grid_flow(row_major=True, columns=len(texts), even_columns=True, align=True)
+    for text in texts:
+        grid.label(text=text)
+
+
+def _brief(value: float) -> str:
+    """A number that fits a narrow column: 9,812; 68.3 k; 1.23 M."""
+    if value < 10_000:
+        return f"{value:,.0f}"
+    return f"{value / 1e3:.3g} k" if value < 999_500 else f"{value / 1e6:.3g} M"
+
+
+def _memory(megabytes: float) -> str:
+    return f"{megabytes / 1000:.1f} GB" if megabytes >= 100 else f"{megabytes:.0f} MB"
+
+
+CLASSES = (LODGS_UL_cells, LODGS_UL_blocks, LODGS_PT_training_cells)
