@@ -72,7 +72,7 @@ def train_block(folder: str, threads: int = 0, cards: Sequence[str] = ()) -> int
         filter(None, [str(package.parent), os.environ.get("PYTHONPATH")])
     )
     if threads:
-        environment["LODGS_THREADS"] = str(threads)
+        environment.setdefault("LODGS_THREADS", str(threads))
     if cards:
         environment["CUDA_VISIBLE_DEVICES"] = cards[int(_distributed().get_worker().name) % len(cards)]
     with run.log.open("ab") as log:
