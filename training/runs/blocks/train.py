@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ...errors import LodgsError
+from ..endings import ending
 from ..failures import BAD_INPUT, CANCELLED, DONE
 from .merge import merge, write_surroundings
 from .plan import BLOCK, Block, Division
@@ -41,8 +42,8 @@ def train_blocks(division: Division, path: Path, submit: Submit, tell: Tell) -> 
     """Trains all parts that are not finished, stage by stage, and writes what they are together.
 
     How they get on is read from their folders; an interrupt stops all of them politely first. One that was
-    stopped by itself goes on when its folder is asked to (``RunFolder.request_resume``): beside the others, or,
-    asked before this begins, without those that it stands beside.
+    stopped by itself goes on when its folder is asked to (``RunFolder.request_resume``): beside the others,
+    or, asked before this begins, without those that it stands beside.
 
     Args:
         path: of the bundle of all.
@@ -181,9 +182,11 @@ class _Watched:
 
     def trouble(self) -> LodgsError:
         """Why it could not be trained."""
-        error = self.block.folder.last("error") if self.code == BAD_INPUT else None
-        if error is not None:
-            return LodgsError(f"{self._name}: {error['what']}", error.get("remedy", ""))
+        if self.code == BAD_INPUT:
+            end = self.block.folder.end_event()
+            if end is not None and end["event"] == "error":
+                return LodgsError(f"{self._name}: {end['what']}", end.get("remedy", ""))
+            return LodgsError(f"{self._name}: {ending(self.block.folder, self.code)[1]}")
         why = f" ({self._why})" if self._why else ""
         return LodgsError(
             f"{self._name} was lost {TRIES} times at step {self.step}{why}.",
