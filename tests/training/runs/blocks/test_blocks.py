@@ -200,6 +200,7 @@ class Workers:
 
     def __call__(self, folder: Path) -> Future:
         future: Future = Future()
+        future.set_running_or_notify_cancel()
         what = self.plans[folder.name][min(self.attempts[folder.name], len(self.plans[folder.name]) - 1)]
         self.attempts[folder.name] += 1
 
