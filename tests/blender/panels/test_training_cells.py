@@ -121,8 +121,9 @@ def test_each_cell_says_how_it_gets_on(lodgs, root, draw_panel, line, watch):
     assert notes.texts == ["2", "Cancelled at 50%"] and notes.operators == ["lodgs.resume_block"]
     watch.stopping = {1}
     assert line("blocks", 0).texts == ["1", "Stopping at 25%"]
-    watch._take_blocks(root, [_part(1, "block", "done", 100), _part(2, "block", "done", 100),
-                              _part(1, "seam", "running", 10, 20), _part(2, "seam", "done", 20, 20)])  # fmt: skip
+    blocks = [_part(number, "block", "done", 100) for number in (1, 2)]
+    seams = [_part(1, "seam", "running", 10, 20), _part(2, "seam", "done", 20, 20)]
+    watch._take_blocks(root, [*blocks, *seams])
     assert line("blocks", 0).texts == ["1", "Borders, 92%"]
     assert line("blocks", 1).texts == ["2", "Done"] and not line("blocks", 1).operators
     watch.state = "cancelled"

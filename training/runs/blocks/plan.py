@@ -40,6 +40,8 @@ STILL = {
 }  # fmt: skip
 """Its parameters there: colours and opacities are fitted; splats neither move nor come or go, so that each
 stays in its cell, and as large as its level allows."""
+SLIMMEST = 2.5
+"""No cells that are so many times longer than wide are chosen."""
 PROGRAM_BYTES = 600e6
 """What a trainer takes of memory without splats and photographs, about."""
 SPLAT_BYTES = 1_500
@@ -344,15 +346,11 @@ def _grids(scene: Scene) -> Iterator[str]:
     eyes = np.array([camera.center for camera in scene.cameras]) @ ground.T
     longer, shorter = sorted(np.ptp(eyes[:, :2], axis=0), reverse=True)
     aspect = min(longer / max(shorter, 1e-9), MOST_CELLS)
-    best: dict[int, tuple[float, str]] = {}
-    for rows in range(1, MOST_CELLS + 1):
-        for columns in range(1, MOST_CELLS // rows + 1):
-            slim = abs(float(np.log(aspect * rows / columns)))
-            best[columns * rows] = min(best.get(columns * rows, (slim, "")), (slim, f"{columns}x{rows}"))
-    for count in sorted(best):
-        slim, grid = best[count]
-        if slim <= np.log(2.5) or count == 1:
-            yield grid
+    for count in range(1, MOST_CELLS + 1):
+        ways = ((count // rows, rows) for rows in range(1, count + 1) if count % rows == 0)
+        slim, columns, rows = min((abs(float(np.log(aspect * b / a))), a, b) for a, b in ways)
+        if slim <= np.log(SLIMMEST) or count == 1:
+            yield f"{columns}x{rows}"
 
 
 def _memory(parameters: Parameters, views: int, pixels: float, photo_memory: int) -> int:

@@ -42,8 +42,8 @@ def train_blocks(division: Division, path: Path, submit: Submit, tell: Tell) -> 
     """Trains all parts that are not finished, stage by stage, and writes what they are together.
 
     How they get on is read from their folders; an interrupt stops all of them politely first. One that was
-    stopped by itself goes on when its folder is asked to (``RunFolder.request_resume``): beside the others,
-    or, asked before this begins, without those that it stands beside.
+    stopped by itself goes on when its folder is asked to (``RunFolder.request_resume``): beside the others;
+    or, asked before this begins, without them.
 
     Args:
         path: of the bundle of all.

@@ -265,3 +265,74 @@ def test_one_level_has_nothing_to_meet(data):
 def test_what_is_resumed_ends_where_an_unbroken_run_ends(data, stop, check_resumed):
     """Before the last level, when it is finished, and amid the finishing steps."""
     check_resumed(lambda: make(data, finish_share=0.5), stop)
+
+
+# -- some of the levels -----------------------------------------------------
+
+
+def trained(flod) -> list[Level]:
+    finished = []
+    for step in range(flod.steps):
+        flod.train_step(step)
+        finished += flod.levels_after(step)
+    return finished
+
+
+def assert_same(one, other):
+    for name in NAMES:
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+def test_coarse_levels_alone_are_those_of_all_to_the_bit(data):
+    """The same constraint, budgets and schedules, though the finest level is trained elsewhere."""
+    values = {"levels": 4, "steps": [4, 5, 6, 7], "sh_interval": 3, "finish_share": 0.2, "max_splats": 90}
+    whole, coarse = make(data, **values), make(data, **values, last_level=2)
+    assert coarse.steps == 9 and whole.steps == 26
+    levels = trained(coarse)
+    for step in range(9):
+        whole.train_step(step)
+        for level in whole.levels_after(step):
+            alone = levels.pop(0)
+            assert (alone.number, alone.facts) == (level.number, level.facts)
+            assert_same(alone.splats, level.splats)
+    assert not levels and coarse.controls() == whole.controls()
+
+
+def test_fine_levels_go_on_from_a_coarse_one_with_the_units_of_all(data):
+    values = {
+        "levels": 4,
+        "steps": [4, 5, 6, 7],
+        "sh_interval": 3,
+        "rejoin_points": False,
+        "min_opacity": 0.0,
+    }
+    base = trained(make(data, **values, last_level=2))[-1].splats
+    parameters = override(METHOD.preset("draft"), values | {"first_level": 3, "footprint": 6.0})
+    fine = Method(data, parameters, seed=0, backend="cpu", base=base)
+    np.testing.assert_array_equal(fine.model["means"].detach(), base.means)
+    allowed = np.maximum(np.exp(base.log_scales), fine.s_min[2] * 1.05)
+    drawn = fine.model["log_scales"].detach().exp().numpy() + fine.s_min[2]
+    np.testing.assert_allclose(drawn, allowed, rtol=1e-5)
+    assert [fine.level_at(step) for step in (0, 5, 6, 12)] == [3, 3, 4, 4]
+    assert fine.sh_degree(0) == 9 // 3, "harmonics that have joined stay"
+    whole = make(data, **values, finish_share=0.14)
+    assert [fine.shrink(step) for step in range(13)] == [whole.shrink(step) for step in range(9, 22)]
+    levels = trained(fine)
+    assert [level.number for level in levels] == [3, 4, 2, 3], "the one before them is finished with them"
+    assert [level.facts["s_min"] for level in levels[:2]] == whole.s_min[2:]
+
+
+@pytest.mark.parametrize("first, last", [(3, 2), (1, 5), (5, 0)])
+def test_levels_that_there_are_not_are_refused(first, last):
+    with pytest.raises(LodgsError, match="cannot be trained"):
+        override(METHOD.preset("draft"), {"levels": 4, "first_level": first, "last_level": last})
+
+
+def test_cells_train_the_two_finest_levels():
+    coarse, fine = METHOD.divided(METHOD.preset("draft"))
+    assert (coarse.first_level, coarse.end, fine.first_level, fine.end) == (1, 3, 4, 5)
+    assert coarse.total_steps + fine.total_steps == METHOD.preset("draft").total_steps
+    assert METHOD.divided(override(METHOD.preset("draft"), {"levels": 2})) is None
+    draft = METHOD.preset("draft")
+    assert draft.most_at_once == pytest.approx(draft.max_splats * (1 + 0.6 + 0.36))
+    assert coarse.most_at_once == pytest.approx(draft.max_splats * 0.36)

@@ -22,12 +22,14 @@ from training.methods import METHODS
 from training.runs import train as training_loop
 from training.runs.blocks import train as blocks_module
 from training.runs.blocks.merge import merge
-from training.runs.blocks.plan import Block, Division, read_plan, write_plan
+from training.runs.blocks.plan import Block, Division, cells_within, plan, read_plan, write_plan
 from training.runs.blocks.train import BlocksStopped, train_blocks
 from training.runs.data import training_data
 from training.runs.events import event_line
 from training.runs.folder import RunFolder
-from training.runs.job import Job
+from training.runs.job import POLISH, Job
+from training.scenes.cameras import Camera
+from training.scenes.colmap import Scene
 from training.scenes.regions import Region
 from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
 from training.splats.gaussians import Splats
@@ -102,7 +104,9 @@ def test_a_photograph_that_is_spoilt_shifts_no_held_out_views(tiny_scene, tmp_pa
 
 def test_a_plan_that_cannot_be_leaves_the_folder_free(tiny_scene, tmp_path, capsys):
     out = tmp_path / "run"
-    command = f"blocks plan --method 3dgs --scene {tiny_scene} --out {out}".split()
+    command = f"blocks plan {tiny_scene} --method 3dgs --out {out}".split()
+    assert main(command) == 2
+    assert "how many cells" in capsys.readouterr().err
     assert main([*command, "--cells", "5x1"]) == 2
     assert "too few" in capsys.readouterr().err
     assert main([*command, "--cells", "2x1"]) == 0
@@ -112,11 +116,117 @@ def test_a_plan_that_cannot_be_leaves_the_folder_free(tiny_scene, tmp_path, caps
 
 
 def test_blocks_of_a_plan_are_relative_to_it(tiny_scene, tmp_path):
-    planned(job_for(tiny_scene, tmp_path / "run"))
+    planned(job_for(tiny_scene, tmp_path / "run", "flod", test_every=0, parameters={}))
     (tmp_path / "run").rename(tmp_path / "moved")
-    for block in read_plan(RunFolder(tmp_path / "moved")).blocks:
+    division = read_plan(RunFolder(tmp_path / "moved"))
+    assert division.seams and division.coarse
+    for block in division.blocks + division.seams:
         assert Path(block.job.region) == block.folder.path / "region.json"
         assert Path(block.job.out) == block.folder.path
+        lies = division.coarse.folder.path if block.kind == "block" else block.folder.base
+        assert Path(block.job.base) == lies
+
+
+def test_a_plan_tells_ahead_what_its_blocks_then_take(tiny_scene, tmp_path):
+    job = job_for(tiny_scene, tmp_path / "run", "flod", parameters={}).resolved()
+    told = plan(job)
+    assert not (tmp_path / "run").exists(), "nothing is written"
+    for each, block in zip(told, planned(job), strict=True):
+        data, p = training_data(block.job, block.folder), block.job.resolved_parameters()
+        assert (each.number, each.region.views) == (block.number, block.region.views)
+        assert (each.views, each.points) == (len(data.train), len(data.scene.points))
+        assert (each.steps, each.splats) == (p.total_steps, p.max_splats)
+        assert each.memory > 1000 * each.splats
+
+
+def test_coarse_levels_and_blocks_make_the_steps_and_levels_of_all(tiny_scene, tmp_path):
+    job = job_for(tiny_scene, tmp_path / "run", "flod", parameters={})
+    planned(job)
+    division = read_plan(RunFolder(job.out))
+    coarse = division.coarse.job.resolved_parameters()
+    assert (coarse.first_level, coarse.last_level) == (1, 3) and not division.coarse.job.base
+    assert coarse.steps == job.resolved_parameters().steps
+    for block in division.blocks:
+        p = block.job.resolved_parameters()
+        assert (p.first_level, p.last_level) == (4, 0)
+        assert (p.footprint, p.rho, p.levels, p.sh_degree) == (
+            coarse.footprint,
+            coarse.rho,
+            coarse.levels,
+            coarse.sh_degree,
+        )
+        assert block.job.base == str(division.coarse.folder.path)
+    few = job_for(tiny_scene, tmp_path / "few", "flod", parameters={"levels": 2})
+    planned(few)
+    division = read_plan(RunFolder(few.out))
+    assert division.coarse is None and division.blocks[0].job.base == ""
+
+
+def test_seams_are_planned_where_views_stand_at_borders_and_rules_allow_it(tiny_scene, tmp_path):
+    def seams(name, **further):
+        job = job_for(tiny_scene, tmp_path / name, test_every=0, parameters={}, **further)
+        planned(job)
+        return read_plan(RunFolder(job.out)).seams
+
+    found = seams("one")
+    assert found and all(seam.job.parameters["steps"] == POLISH for seam in found)
+    assert all(seam.region.seam and seam.job.base == str(seam.folder.base) for seam in found)
+    assert not seams("none", polish=0) and not seams("clod", method="clod")
+
+
+def test_as_few_cells_as_keep_to_what_a_block_may_have(tmp_path):
+    """Views and points in a square of 60 by 40; views look down, so that each sees what is around it."""
+    job = Job.from_dict(
+        {"scene": str(tmp_path), "out": str(tmp_path / "run"), "parameters": {"max_splats": 900}}
+    )
+    scene = street_map(tmp_path)
+    sizes = {}
+    for cells in ("1x1", "2x1", "2x2"):
+        sizes[cells] = max(each.splats for each in plan(job.in_cells(cells), scene))
+    assert sizes["1x1"] == 900 and sizes["2x2"] < sizes["2x1"] < 900
+    for cells, most in sizes.items():
+        assert cells_within(job, splats=most, scene=scene) == cells
+    more = cells_within(job, splats=sizes["2x2"] // 2, scene=scene)
+    assert max(each.splats for each in plan(job.in_cells(more), scene)) <= sizes["2x2"] // 2
+    assert Job("s", "o", cells=more).grid > (2, 2)
+    assert cells_within(job, memory=10**12, scene=scene) == "1x1"
+    with pytest.raises(LodgsError, match=r"still has|too few|too little"):
+        cells_within(job, splats=3, scene=scene)
+
+
+def street_map(folder: Path) -> Scene:
+    down = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
+    cameras = []
+    for x in range(0, 60, 4):
+        for y in range(0, 40, 4):
+            pose = np.eye(4)
+            turned = down * [[-1], [-1], [1]] if x % 8 else down  # there and back, as drones fly
+            pose[:3, :3], pose[:3, 3] = turned, -turned @ (x, y, 3)
+            cameras.append(Camera(f"{x:02}-{y:02}", 64, 48, 40.0, 40.0, 32.0, 24.0, pose))
+    points = np.random.default_rng(0).uniform((0, 0, 0), (60, 40, 1), (3000, 3)).astype(np.float32)
+    return Scene(folder, folder, folder, cameras, points, np.zeros((3000, 3), np.uint8))
+
+
+def test_parts_have_names(tiny_scene, tmp_path):
+    job = job_for(tiny_scene, tmp_path / "run", test_every=0)
+    planned(job)
+    division = read_plan(RunFolder(job.out))
+    assert division.named("block-2") == division.blocks[1] and division.named("coarse") is None
+    assert division.named("seam-1") == division.seams[0]
+    for name in ("", "block", "block-3", "block-0", "seam-", "coarse-1", "merge", "2"):
+        with pytest.raises(LodgsError, match="There is no part"):
+            division.named(name)
+    assert main(["blocks", "run", job.out, "--only", "coarse"]) == 0, "a part that is not needed is done"
+    assert main(["blocks", "run", job.out, "--only", "seam-1"]) == 2, "its blocks are not finished"
+
+
+def test_levels_to_go_on_from_have_to_be_said(tiny_scene, tmp_path):
+    keys = {"scene": str(tiny_scene), "out": str(tmp_path / "run"), "method": "flod"}
+    with pytest.raises(LodgsError, match="which levels to go on from"):
+        Job.from_dict({**keys, "parameters": {"first_level": 2}})
+    with pytest.raises(LodgsError, match="cannot begin with the splats"):
+        Job.from_dict({**keys, "base": "base.ply"})
+    assert Job.from_dict({**keys, "base": "base.ply", "parameters": {"first_level": 2}}).base
 
 
 def test_what_cannot_be_is_refused_in_a_sentence(tiny_scene, tmp_path):
