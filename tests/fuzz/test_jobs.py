@@ -1,4 +1,4 @@
-"""The doors of jobs: files in TOML and JSON, and what the command line sets."""
+"""The doors of jobs: files in TOML and JSON, regions, and what the command line sets."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 import json
 from dataclasses import asdict
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -15,6 +16,7 @@ from tests.fuzz.mutations import ODD_VALUES, spoiled, spoiled_value
 from training.methods import METHODS
 from training.runs.job import Job
 from training.runs.options import add_options, job_from
+from training.scenes.regions import Region
 
 JOBS = [
     asdict(Job.from_dict({"scene": "/scene", "out": "/run", "method": method, "seed": 3}).resolved())
@@ -70,3 +72,29 @@ def test_parameters_of_the_command_line(name, value):
     add_options(parser)
     chosen = parser.parse_args(["--scene", "s", "--out", "o", "--set", f"{name}={value}"])
     attempt("--set", lambda: job_from(chosen).resolved(), value)
+
+
+REGION = {
+    "ground": [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]], "cell": [[None, 1.5], [0, 2]], "area": [[None, 2], [-1, 3]],
+    "views": ["a.jpg", "b.jpg"], "seam": True,
+}  # fmt: skip
+
+
+def check_region(path, given: object) -> None:
+    """A region that is taken can be written, and asked for points."""
+    if region := attempt("region", lambda: Region.read(path), given):
+        region.write(path)
+        region.borders(np.zeros((3, 3), np.float32))
+
+
+@given(data=st.data())
+def test_regions(folder, data):
+    text = data.draw(spoiled([json.dumps(REGION).encode()]))
+    (folder / "region.json").write_bytes(text)
+    check_region(folder / "region.json", text)
+
+
+@given(values=spoiled_value(REGION))
+def test_regions_with_odd_values(folder, values):
+    (folder / "region.json").write_text(json.dumps(values))
+    check_region(folder / "region.json", values)

@@ -18,6 +18,11 @@ PRESETS = {
 """The presets that every method has, each with what it is for."""
 
 
+def undivided(parameters: Parameters) -> None:
+    """Of methods whose cells make all levels by themselves."""
+    return None
+
+
 @dataclass(frozen=True)
 class MethodInfo:
     """A method, as its folder declares it in ``METHOD``.
@@ -56,7 +61,7 @@ class MethodInfo:
     base_in_parts: bool = False
     for_splats: bool = False
     in_cells: str = ""
-    divided: Callable[[Any], tuple[Parameters, Parameters] | None] = lambda parameters: None
+    divided: Callable[[Any], tuple[Parameters, Parameters] | None] = undivided
     captured: Mapping[str, Any] = field(default_factory=dict)
     retired: tuple[str, ...] = ()
     package: str = ""
