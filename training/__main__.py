@@ -265,7 +265,9 @@ def _plan_blocks(chosen: argparse.Namespace) -> int:
 
     job = job_from(chosen).resolved()
     scene = read_planned_scene(job)
-    if not job.cells and (chosen.block_splats or chosen.block_memory):
+    if chosen.block_splats or chosen.block_memory:
+        if job.cells:
+            raise LodgsError("It is said how many cells, and how large they may be.", "Leave out one.")
         job = job.in_cells(cells_within(job, chosen.block_splats, chosen.block_memory * 10**6, scene))
     if not job.cells:
         raise LodgsError(

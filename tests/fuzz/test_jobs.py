@@ -75,7 +75,7 @@ def test_parameters_of_the_command_line(name, value):
 
 
 REGION = {
-    "ground": [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]], "cell": [[None, 1.5], [0, 2]], "area": [[None, 2], [-1, 3]],
+    "ground": [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]], "cell": [[None, 1], [0, 2]], "area": [[None, 2], [-1, 3]],
     "views": ["a.jpg", "b.jpg"], "seam": True,
 }  # fmt: skip
 

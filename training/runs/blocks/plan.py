@@ -14,6 +14,7 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
+from math import ceil
 from pathlib import Path
 
 import numpy as np
@@ -198,13 +199,12 @@ def cells_within(job: Job, splats: int = 0, memory: int = 0, scene: Scene | None
         LodgsError: however many there are, one has more.
     """
     scene = read_planned_scene(job) if scene is None else scene
-    trouble = LodgsError("No number of cells is that small.", "Allow more splats or memory for a block.")
-    for grid in _grids(scene):
+    whole, trouble = _divided(job)[0].max_splats, None
+    for grid in _grids(scene, whole / splats if splats else 1):
         try:
             found = plan(replace(job, cells=grid), scene)
         except LodgsError as error:
-            trouble = error
-            break
+            raise trouble or error from None
         largest, most = max(each.splats for each in found), max(each.memory for each in found)
         if largest <= (splats or largest) and most <= (memory or most):
             return grid
@@ -212,7 +212,9 @@ def cells_within(job: Job, splats: int = 0, memory: int = 0, scene: Scene | None
             f"In {grid} cells a block still has {largest:,} splats and takes {most / 1e9:.1f} GB.",
             "Allow more for a block, or lower max_splats.",
         )
-    raise trouble
+    raise trouble or LodgsError(
+        f"{MOST_CELLS} cells, the most that there can be, are too few.", "Allow more for a block."
+    )
 
 
 def write_plan(
@@ -340,13 +342,13 @@ def _read_parts(folder: Path) -> list[Block]:
     ]
 
 
-def _grids(scene: Scene) -> Iterator[str]:
+def _grids(scene: Scene, fewest: float) -> Iterator[str]:
     """Ever more cells, none much longer than wide, as ``Job.cells`` has them."""
     ground = scene.up_rotation()
     eyes = np.array([camera.center for camera in scene.cameras]) @ ground.T
     longer, shorter = sorted(np.ptp(eyes[:, :2], axis=0), reverse=True)
     aspect = min(longer / max(shorter, 1e-9), MOST_CELLS)
-    for count in range(1, MOST_CELLS + 1):
+    for count in range(ceil(fewest), MOST_CELLS + 1):
         ways = ((count // rows, rows) for rows in range(1, count + 1) if count % rows == 0)
         slim, columns, rows = min((abs(float(np.log(aspect * b / a))), a, b) for a, b in ways)
         if slim <= np.log(SLIMMEST) or count == 1:
