@@ -117,7 +117,7 @@ def draw_blocks(layout: bpy.types.UILayout, root: bpy.types.Object, watch: Watch
         parts = layout.split(factor=0.4)
         parts.label(text="Coarse levels")
         _draw_part(parts, whole)
-    if watch.part(1) is not None:
+    if len(settings.planned_cells) == watch.cells > 0:  # else another plan was made since
         rows = min(max(len(settings.planned_cells), 3), 8)
         layout.template_list(
             "LODGS_UL_blocks", "", settings, "planned_cells", settings, "active_cell", rows=rows

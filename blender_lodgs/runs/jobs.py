@@ -25,7 +25,7 @@ from ...training.runs.job import CHANGEABLE, DOME, Job
 from ...training.scenes.cameras import write_camera
 from ...training.splats.bundle import write_bundle
 from .. import extension
-from ..data import scenes, viewpoints
+from ..data import cells, scenes, viewpoints
 from ..data.training import chooses_distances, hold_out, level_distances, offered
 from . import environment, processes
 from .watch import Watch, begin, root_by_uid, watch_of, watches
@@ -215,7 +215,10 @@ def attach(root: bpy.types.Object, folder: str, *, again: bool = True) -> Watch:
     if again:
         root.lodgs.training.read = 0
     _link_run(root, run)
-    return begin(Watch(run, root.session_uid, offset=root.lodgs.training.read))
+    watch = begin(Watch(run, root.session_uid, offset=root.lodgs.training.read))
+    if watch.blocks and not root.lodgs.training.planned_for:
+        cells.require(root.lodgs.training, watch.cells)
+    return watch
 
 
 def follow(watch: Watch, show: Callable[[Watch], None] | None = None) -> None:

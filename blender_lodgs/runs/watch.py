@@ -98,6 +98,11 @@ class Watch:
         """Whether a running trainer has sent no event for :data:`UNRESPONSIVE_AFTER` seconds."""
         return self.running and time.time() - self.last_event > UNRESPONSIVE_AFTER
 
+    @property
+    def cells(self) -> int:
+        """How many cells the run has, as far as it has said so."""
+        return sum(each["kind"] == "block" for each in self.blocks)
+
     def part(self, number: int) -> Part | None:
         """What is trained of a cell now, or last; or with 0 of the whole scene, before its cells. None where
         nothing is known of such a part."""
@@ -186,7 +191,7 @@ class Watch:
         self.blocks = blocks
         parts = map(self.part, self.stopping)
         self.stopping = {part.number for part in parts if part and part.state in ("waiting", "running")}
-        cells.require(root.lodgs.training, sum(each["kind"] == "block" for each in blocks))
+        cells.require(root.lodgs.training, self.cells)
 
     def _add_level(self, root: bpy.types.Object, event: dict) -> None:
         if self._stays_in_file(root, event):

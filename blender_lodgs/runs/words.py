@@ -7,8 +7,9 @@ def progress_facts(progress: dict) -> dict[str, str]:
     """The numbers of a ``progress`` event by name; none before the first."""
     if not progress:
         return {}
+    level = {"Level": f"{progress['level']} of {progress['levels']}"}
     return {
-        "Level": f"{progress['level']} of {progress['levels']}",
+        **({} if "blocks" in progress else level),  # of which each is at its own
         "Step": f"{progress['step']:,} of {progress['of']:,}",
         "Loss": f"{progress['loss']:.4f}",
         "PSNR, training": f"{progress['psnr']:.1f} dB",

@@ -18,6 +18,7 @@ PROGRESS = {
     "event": "progress", "level": 1, "levels": 2, "step": 3, "of": 10, "loss": 0.1, "psnr": 20.0,
     "splats": 5, "steps_per_s": 2.0, "eta_s": 3.5,
 }  # fmt: skip
+BLOCK = {"block": 1, "kind": "block", "state": "running", "step": 3, "of": 10}
 
 
 def read(tmp_path, *lines) -> list[dict]:
@@ -27,7 +28,10 @@ def read(tmp_path, *lines) -> list[dict]:
     return read_events(path)[0]
 
 
-@pytest.mark.parametrize("event", [LEVEL, PROGRESS, {"event": "done", "veil": {"mean": 0.0, "max": 0.1}}])
+@pytest.mark.parametrize(
+    "event",
+    [LEVEL, PROGRESS, PROGRESS | {"blocks": [BLOCK]}, {"event": "done", "veil": {"mean": 0.0, "max": 0.1}}],
+)
 def test_what_the_trainer_says_is_read_as_it_is(tmp_path, event):
     assert read(tmp_path, event) == [event]
 
@@ -62,6 +66,14 @@ def test_a_level_that_is_none_becomes_one_warning(tmp_path, change):
 def test_a_value_of_another_kind_is_left_out(tmp_path, change):
     (event,) = read(tmp_path, LEVEL | change)
     assert event == {name: value for name, value in LEVEL.items() if name not in change}
+
+
+@pytest.mark.parametrize(
+    "blocks", [3, [3], [{}], [BLOCK | {"state": "asleep"}], [BLOCK | {"kind": []}], [BLOCK | {"step": -1}],
+               [BLOCK | {"block": "../1"}], [BLOCK, {name: 1 for name in BLOCK}]],
+)  # fmt: skip
+def test_blocks_that_are_none_are_left_out(tmp_path, blocks):
+    assert read(tmp_path, PROGRESS | {"blocks": blocks}) == [PROGRESS]
 
 
 @pytest.mark.parametrize("name", sorted(PROGRESS.keys() - {"event"}))

@@ -423,6 +423,60 @@ def test_a_block_can_be_stopped_alone_and_gone_on_with(blocks):
     assert trained(blocks, Workers(block_1=[lost], block_2=[done])).exists()
 
 
+def test_a_block_that_was_stopped_goes_on_beside_the_others_when_it_is_asked_to(blocks):
+    """While the other is at work, and no sooner; what was asked is forgotten then."""
+    told, folder = [], blocks[1].folder
+
+    def until_the_other_is_done(_: RunFolder) -> int:
+        while not folder.bundle.exists():
+            time.sleep(0.002)
+        return done(blocks[0].folder)
+
+    def tell(kind, **values):
+        states = [each["state"] for each in values.get("blocks", ())]
+        told.append(states)
+        if states == ["running", "cancelled"] and not workers.attempts["2"] > 1:
+            folder.request_resume()
+
+    def stopped(folder: RunFolder) -> int:
+        progressing(5, 3)(folder)
+        progressing(5, 3)(blocks[0].folder)  # of which something is heard so
+        return 3
+
+    workers = Workers(block_1=[until_the_other_is_done], block_2=[stopped, done])
+    assert trained(blocks, workers, tell).exists()
+    assert workers.attempts == {"1": 1, "2": 2} and not folder.take_resume()
+    assert ["running", "cancelled"] in told and told[-1] != ["running", "cancelled"]
+
+
+def test_one_that_is_asked_to_go_on_before_all_begin_does_so_alone(blocks):
+    workers = Workers(block_1=[done], block_2=[done])
+    blocks[1].folder.request_resume()
+    with pytest.raises(BlocksStopped, match="block 1"):
+        trained(blocks, workers)
+    assert workers.attempts == {"1": 0, "2": 1}
+    assert trained(blocks, workers).exists(), "then it is forgotten"
+    assert workers.attempts == {"1": 1, "2": 1}
+
+
+def test_a_block_is_at_work_once_its_trainer_has_said_so(blocks):
+    """Not because an earlier one has: blocks wait for their turn again when a run goes on."""
+    states = []
+
+    def tell(kind, **values):
+        if kind == "progress":
+            states.append([(each["state"], each["step"]) for each in values["blocks"]])
+
+    def waits(folder: RunFolder) -> int:
+        while len(states) < 5:
+            time.sleep(0.002)
+        return done(folder)
+
+    progressing(7, 3)(blocks[0].folder)
+    trained(blocks, Workers(block_1=[waits], block_2=[done]), tell)
+    assert states[0][0] == ("waiting", 7)
+
+
 def test_an_interrupt_stops_all_politely(blocks):
     def until_cancelled(folder: RunFolder) -> int:
         while not folder.take_cancel():
