@@ -23,7 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -33,7 +33,6 @@ sys.path.insert(0, str(ROOT))
 import psutil  # noqa: E402 - Dask needs it
 
 from tests.training.conftest import write_tiny_scene  # noqa: E402
-from tools.attacks import contents, disk  # noqa: E402
 from training.runs.folder import RunFolder  # noqa: E402
 
 CHECKPOINT_SECONDS = 1.0
@@ -42,15 +41,15 @@ PAUSE = 0.5, 4.0
 """Seconds between two kills."""
 PATIENCE = 600.0
 """Seconds in which anything must end."""
-JOB = {
-    "method": "flod", "image_scale": 1.0, "test_every": 4, "cells": "2x1",
-    "parameters": {"levels": 3, "steps": [1500, 2000, 2500], "footprint": 6.0, "max_splats": 300},
-}  # fmt: skip
+JOB = {"method": "flod", "image_scale": 1.0, "test_every": 4, "cells": "2x1"}
+PARAMETERS = {"levels": 3, "footprint": 6.0, "max_splats": 300}
+STEPS = (1500, 2000, 2500)
 ENVIRONMENT = {
     **os.environ, "LODGS_CHECKPOINT_SECONDS": str(CHECKPOINT_SECONDS), "LODGS_THREADS": "1",
     "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT),
 }  # fmt: skip
-KINDS = ("trainer", "worker", "computer", "shutdown")
+KINDS = ("worker", "trainer", "computer", "shutdown")
+ONCE = ("scheduler", "command")
 FULL_SAYS = ("No space left on device", "disk is full")
 
 
@@ -132,10 +131,12 @@ class Bench:
     Args:
         work: a folder for all of it.
         chance: what draws moments.
+        steps: of each level.
     """
 
-    def __init__(self, work: Path, chance: random.Random) -> None:
+    def __init__(self, work: Path, chance: random.Random, steps: Sequence[int] = STEPS) -> None:
         self.work, self.chance = work, chance
+        self.parameters = {**PARAMETERS, "steps": list(steps)}
         self.scene = write_tiny_scene(work / "scene")
         calm = self.plan(work / "undisturbed")
         code, said = self.run(calm, "here")
@@ -146,7 +147,8 @@ class Bench:
     def plan(self, out: Path) -> RunFolder:
         """A run's folder with a plan in it."""
         path = self.work / "job.json"
-        path.write_text(json.dumps({**JOB, "scene": str(self.scene), "out": str(out)}))
+        job = {**JOB, "scene": str(self.scene), "out": str(out), "parameters": self.parameters}
+        path.write_text(json.dumps(job))
         subprocess.run(
             [sys.executable, "-m", "training", "blocks", "plan", str(path)], env=ENVIRONMENT, check=True,
             stdout=subprocess.DEVNULL,
@@ -174,13 +176,12 @@ class Bench:
             time.sleep(0.1)
         return process.returncode, run.end_event() or {}
 
-    def kill_all(self, kills: int) -> dict:
-        """Kills trainers, workers and computers until that many are dead, then scheduler and command once."""
-        kinds = [KINDS[i % len(KINDS)] for i in range(kills)]
+    def kill_all(self, kills: int, once: Sequence[str] = ONCE) -> dict:
+        """Kills workers, trainers and computers until so many are dead, then of ONCE what is asked for."""
+        kinds, once = [KINDS[i % len(KINDS)] for i in range(kills)], list(once)
         found = {"killed": dict.fromkeys(kinds, 0), "runs": 0, "begun_again": 0, "wrong": [], "lost_s": []}
-        once = ["scheduler", "command"]
         while kinds or once:
-            run, due = self.plan(self.work / "killed"), [time.monotonic() + 5]
+            run, due = self.plan(self.work / "killed"), [time.monotonic() + self.chance.uniform(*PAUSE)]
 
             def attack(process: subprocess.Popen, due=due) -> None:
                 if time.monotonic() < due[0]:
@@ -280,11 +281,34 @@ def lost(run: RunFolder) -> Iterator[float]:
                 yield max(last["step"] - step, 0) / max(last["steps_per_s"], 1e-6)
 
 
+def contents(run: Path) -> dict[str, bytes]:
+    """A run's files by name; of those that tell of times and places nothing but that they are there."""
+    changing = {"events.jsonl", "lock", "job.toml"}
+    outside = {"trainer.log", "trainer.out"}
+    files = {path.relative_to(run).as_posix(): path for path in run.rglob("*") if path.is_file()}
+    return {
+        name: b"" if path.name in changing else path.read_bytes()
+        for name, path in files.items()
+        if path.name not in outside
+    }
+
+
 @contextmanager
-def bench(chance: random.Random) -> Iterator[Bench]:
+def disk(place: Path, size: int):
+    """A disk of so many bytes."""
+    place.mkdir(exist_ok=True)
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "lodgs", str(place)], check=True)
+    try:
+        yield place
+    finally:
+        subprocess.run(["umount", str(place)], check=True)
+
+
+@contextmanager
+def bench(chance: random.Random, steps: Sequence[int] = STEPS) -> Iterator[Bench]:
     """All that attacks need, in a folder of its own."""
     with tempfile.TemporaryDirectory(prefix="lodgs-attacks-") as folder:
-        made = Bench(Path(folder), chance)
+        made = Bench(Path(folder), chance, steps)
         try:
             yield made
         finally:
