@@ -8,6 +8,7 @@ from ...training.errors import LodgsError
 from ...training.evaluate.words import summary_lines
 from ...training.lod.rules.cut import RULE as CUT
 from ...training.methods import method_info
+from .. import extension
 from ..data import scenes, viewpoints
 from ..data.training import chooses_distances, hold_out, level_distances, offered
 from ..runs import environment, jobs
@@ -39,6 +40,8 @@ class LODGS_PT_training(Panel):
             row.label(text="There was a run", icon="FILE_FOLDER")
             row.operator("lodgs.open_run").directory = root.lodgs.training.run
         _draw_choices(self.layout, context, root, resumable=watch is not None and watch.state != "done")
+        if extension.preferences().flamenco and root.lodgs.scene_folder:
+            self.layout.operator("lodgs.submit_to_flamenco", icon="NETWORK_DRIVE")
 
 
 class LODGS_PT_training_advanced(Panel):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import json
+from collections.abc import Collection
 from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 
@@ -104,6 +106,24 @@ def job_from(chosen: argparse.Namespace) -> Job:
         )
     parameters = values.get("parameters", {}) | dict(map(_assignment, chosen.set))
     return Job.from_dict(values | given | {"parameters": parameters})
+
+
+def options_of(job: Job, but: Collection[str] = ()) -> list[str]:
+    """The options that :func:`job_from` makes a job of: what it says otherwise than its defaults.
+
+    Args:
+        but: keys that are left out.
+    """
+    said = {key.name: getattr(job, key.name) for key in fields(Job) if key.name in _OPTIONS}
+    known = {key.name: key.default for key in fields(Job)}
+    told: list[str] = []
+    for name, value in said.items():
+        if name not in but and value != known[name]:
+            option = f"--{name.replace('_', '-')}"
+            told += [option] if _OPTIONS[name].get("action") else [option, str(value)]
+    for name, value in job.parameters.items():
+        told += ["--set", f"{name}={json.dumps(value)}"]
+    return told
 
 
 def amounts(given: list[str]) -> dict[str, float] | None:

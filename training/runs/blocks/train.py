@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ...errors import LodgsError
+from ..endings import ending
 from ..failures import BAD_INPUT, CANCELLED, DONE
 from .merge import merge, write_surroundings
 from .plan import BLOCK, Block, Division
@@ -85,8 +86,7 @@ def _train_stage(
             time.sleep(LOOKS)
     except BaseException:
         for each in stage:
-            if not each.over:
-                each.block.folder.request_cancel()
+            each.stop()
         while not all(each.over for each in stage):
             time.sleep(LOOKS)
         raise
@@ -126,10 +126,16 @@ class _Watched:
             self._heard = False
             self._pending = submit(self.block.folder.path)
 
+    def stop(self) -> None:
+        """Has it stopped: who trains it saves first, and who was to train it does not begin."""
+        if self._pending is not None and not self.over:
+            self.block.folder.request_cancel()
+            self._pending.cancel()
+
     @property
     def over(self) -> bool:
-        """Whether nobody is at work on it any more."""
-        return self._pending is None or self._pending.done()
+        """Whether nobody is at work on it any more, not even a trainer whose worker was lost."""
+        return self._pending is None or (self._pending.done() and not self.block.folder.running)
 
     def look(self, submit: Submit) -> bool:
         """Reads how far it is, and begins it again where whoever trained it was lost, or where it was stopped
@@ -176,9 +182,11 @@ class _Watched:
 
     def trouble(self) -> LodgsError:
         """Why it could not be trained."""
-        error = self.block.folder.last("error") if self.code == BAD_INPUT else None
-        if error is not None:
-            return LodgsError(f"{self._name}: {error['what']}", error.get("remedy", ""))
+        if self.code == BAD_INPUT:
+            end = self.block.folder.end_event()
+            if end is not None and end["event"] == "error":
+                return LodgsError(f"{self._name}: {end['what']}", end.get("remedy", ""))
+            return LodgsError(f"{self._name}: {ending(self.block.folder, self.code)[1]}")
         why = f" ({self._why})" if self._why else ""
         return LodgsError(
             f"{self._name} was lost {TRIES} times at step {self.step}{why}.",
