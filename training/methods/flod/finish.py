@@ -1,9 +1,12 @@
-"""Finishing steps: coarser levels learn to stand beside the finest, as selective rendering draws them.
+"""Finishing: the levels before the finest become its most important splats, and learn to stand beside it.
 
-Not in the paper (FLoD, Sec. 5.2), which trains each level as if it were alone: no step has ever drawn two of
-them, nor the places where one takes over from the next. Here they are rows of one model, and each step draws
-what the rule chooses at a random screen size, or a coarser level alone, so that it does not come to need the
-others. The finest level stays as it is: it is drawn whole as well, and no worse than before.
+Not in the paper (FLoD, Sec. 5.2), which trains each level as if it were alone, before the finer ones: no step
+has ever drawn two of them, nor the places where one takes over from the next. Here they are rows of one
+model. Those whose smallest size hardly limits what they can show begin anew: as copies of the finest level's
+splats that have the largest share of some pixel, so many that views by distance draw no more than they may.
+Each step then draws what the rule chooses at a random screen size, or a coarser level alone, so that it does
+not come to need the others. The finest level stays as it is: it is drawn whole as well, and no worse than
+before.
 """
 
 from __future__ import annotations
@@ -13,12 +16,16 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
+from ...lod.blocks import spatial_order
 from ...lod.rule import Values, facts_of
 from ...lod.rules.bands import RULE
+from ...rasterize import contributions
 from ...rasterize.adam import LearningRate
-from ...scenes.cameras import Camera
+from ...scenes.cameras import Camera, evenly
 from ...splats.bundle import Level
+from ..data import TrainingData
 from ..model import Model, splat_rates
+from ..pruning import least_importance, room_taken_over
 from ..schedules import log_linear
 from . import FlodParameters
 
@@ -26,6 +33,13 @@ TOGETHER = 3
 """So many levels are drawn together by default (``Bands.defaults``), and finished."""
 LEVEL = "level"
 """Column of the number of each row's level; levels follow each other, coarse to fine."""
+FINE = 1.5
+"""A level begins anew where its smallest size covers at most so many pixels at the median depth. What is
+coarser was trained with fewer and larger splats than the finest level's, and keeps them."""
+VIEWS_COUNTED = 24
+"""In so many training views it is counted what they draw."""
+LEAST_SHARE = 0.25
+"""At least this share of what views draw of a level stays, whatever the others have drawn."""
 SPREAD = 2.0
 """The largest factor on the run's screen size, up or down."""
 MEANS = 3.0
@@ -45,6 +59,75 @@ def joined(levels: Mapping[int, Mapping[str, torch.Tensor]], lr: Mapping[str, Le
     tensors = {name: torch.cat([level[name] for level in levels.values()]) for name in names}
     numbers = [torch.full_like(level["opacity_logits"], n, dtype=torch.int32) for n, level in levels.items()]
     return Model(tensors, lr, {LEVEL: torch.cat(numbers)})
+
+
+@torch.no_grad()
+def begun_anew(finest: Mapping[str, torch.Tensor], s_min: float) -> dict[str, torch.Tensor]:
+    """A level to begin with: the finest one's splats in spatial order, none smaller than it allows."""
+    order = torch.from_numpy(spatial_order(finest["means"].cpu().numpy())).to(finest["means"].device)
+    tensors = {name: tensor[order] for name, tensor in finest.items()}
+    return tensors | {"log_scales": tensors["log_scales"].clamp_min(float(np.log(s_min)))}
+
+
+def views_drawing(model: Model, s_min: Sequence[float], data: TrainingData, values: Values) -> np.ndarray:
+    """In how many of VIEWS_COUNTED training views each row (N,) is drawn, by the rule."""
+    means = model["means"].detach().cpu().numpy()
+    views = np.zeros(len(means), np.int64)
+    for camera in evenly(data.train, VIEWS_COUNTED):
+        shown = weights(model, s_min, camera, values).cpu().numpy() > 0
+        views += shown & camera.sees(means, data.near)
+    return views
+
+
+@torch.no_grad()
+def thin(
+    model: Model,
+    anew: Sequence[int],
+    s_min: Sequence[float],
+    data: TrainingData,
+    parameters: FlodParameters,
+    gamma: float,
+    backend: str,
+) -> None:
+    """Leaves of levels that begin anew so many splats that by distance a share ``drawn`` is drawn.
+
+    Each keeps the ones with the largest share of a pixel, ``budget_ratio`` times as many as the next finer
+    of them. Views are as wide as photographs are continued, so that what continues them counts.
+
+    Args:
+        anew: their numbers, coarse to fine, the last one before the finest; each has all of the finest one's
+            splats, in the same order.
+        gamma: the screen size that levels are chosen with.
+    """
+    p, rows = parameters, _rows(model)
+    coarsest, *_, finest = rows
+    some = rows[anew[-1]]
+    found = contributions(
+        model.gaussians,
+        [camera.widened(p.margin) for camera in data.train],
+        near=data.near,
+        antialias=p.antialias,
+        rows=torch.arange(some.start, some.stop, dtype=torch.int32, device=model["means"].device),
+        backend=backend,
+    )
+    shares = found.largest[some].cpu().numpy()
+    rank = np.empty(len(shares))
+    rank[np.argsort(-shares, kind="stable")] = np.arange(1, len(shares) + 1)
+    first = np.zeros(len(model))  # the larger, the sooner a splat is among those that stay
+    for number in anew:
+        first[rows[number]] = p.budget_ratio ** (anew[-1] - number) / rank
+    views = views_drawing(model, s_min, data, {"gamma": gamma, "first": coarsest, "last": finest})
+    alone = views_drawing(model, s_min, data, {"gamma": gamma, "first": finest, "last": finest})
+    theirs = slice(rows[anew[0]].start, some.stop)
+    own, others = views[theirs].sum(), views.sum() - views[theirs].sum()
+    most = max(p.drawn * alone.sum() - others, LEAST_SHARE * own)
+    kept = np.ones(len(model), bool)
+    kept[theirs] = first[theirs] >= least_importance(first[theirs], views[theirs], most)
+    for number in anew:
+        level = rows[number]
+        wider = room_taken_over(model["log_scales"][level].cpu().numpy(), shares, kept[level])
+        model["log_scales"][level] += torch.from_numpy(wider).to(model["log_scales"])[:, None]
+    model.keep(torch.from_numpy(kept))
 
 
 def rates(parameters: FlodParameters, extent: float, share: float) -> dict[str, LearningRate]:

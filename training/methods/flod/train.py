@@ -74,8 +74,7 @@ class Method(method.Method[FlodParameters, Drawing]):
         if number < self.levels:
             self.rise_to(number + 1)
         elif self.kept:
-            self.model = finish.joined(self.kept, finish.rates(self.parameters, self.data.extent, 0.0))
-            self.kept = {}
+            self.begin_finishing()
         return [finished]
 
     def controls(self) -> dict[str, float]:
@@ -213,6 +212,17 @@ class Method(method.Method[FlodParameters, Drawing]):
             points = self._from_points(level)
             tensors = {name: torch.cat([tensor, points[name][free]]) for name, tensor in tensors.items()}
         self.model = self._new_model(tensors)
+
+    def begin_finishing(self) -> None:
+        """The levels that finishing steps train, as one model; those of fine detail begin anew."""
+        p, data, levels = self.parameters, self.data, self.kept
+        most = finish.FINE * data.median_depth / data.focal
+        anew = [number for number in levels if 0 < self.s_min[number - 1] <= most]
+        levels |= {number: finish.begun_anew(levels[self.levels], self.s_min[number - 1]) for number in anew}
+        self.model = finish.joined(levels, finish.rates(p, data.extent, 0.0))
+        if anew:
+            finish.thin(self.model, anew, self.s_min, data, p, self.controls()["gamma"], self.backend)
+        self.kept = {}
 
     def _from_points(self, level: int) -> dict[str, torch.Tensor]:
         s_min = self.s_min[level - 1]
