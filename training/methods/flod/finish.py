@@ -19,7 +19,7 @@ import torch
 from ...lod.blocks import spatial_order
 from ...lod.rule import Values, facts_of
 from ...lod.rules.bands import RULE
-from ...rasterize import contributions
+from ...rasterize import Gaussians, contributions
 from ...rasterize.adam import LearningRate
 from ...scenes.cameras import Camera, evenly
 from ...splats.bundle import Level
@@ -62,72 +62,60 @@ def joined(levels: Mapping[int, Mapping[str, torch.Tensor]], lr: Mapping[str, Le
 
 
 @torch.no_grad()
-def begun_anew(finest: Mapping[str, torch.Tensor], s_min: float) -> dict[str, torch.Tensor]:
-    """A level to begin with: the finest one's splats in spatial order, none smaller than it allows."""
-    order = torch.from_numpy(spatial_order(finest["means"].cpu().numpy())).to(finest["means"].device)
-    tensors = {name: tensor[order] for name, tensor in finest.items()}
-    return tensors | {"log_scales": tensors["log_scales"].clamp_min(float(np.log(s_min)))}
-
-
-def views_drawing(model: Model, s_min: Sequence[float], data: TrainingData, values: Values) -> np.ndarray:
-    """In how many of VIEWS_COUNTED training views each row (N,) is drawn, by the rule."""
-    means = model["means"].detach().cpu().numpy()
-    views = np.zeros(len(means), np.int64)
-    for camera in evenly(data.train, VIEWS_COUNTED):
-        shown = weights(model, s_min, camera, values).cpu().numpy() > 0
-        views += shown & camera.sees(means, data.near)
-    return views
-
-
-@torch.no_grad()
-def thin(
-    model: Model,
-    anew: Sequence[int],
+def begun_anew(
+    levels: Mapping[int, Mapping[str, torch.Tensor]],
+    numbers: Sequence[int],
     s_min: Sequence[float],
     data: TrainingData,
     parameters: FlodParameters,
     gamma: float,
     backend: str,
-) -> None:
-    """Leaves of levels that begin anew so many splats that by distance a share ``drawn`` is drawn.
+) -> dict[int, dict[str, torch.Tensor]]:
+    """Levels of the finest one's splats, so many that views by distance draw no more than ``drawn`` of it.
 
-    Each keeps the ones with the largest share of a pixel, ``budget_ratio`` times as many as the next finer
-    of them. Views are as wide as photographs are continued, so that what continues them counts.
+    Each has the ones with the largest share of some pixel, ``budget_ratio`` times as many as the next finer
+    one of them. Views are as wide as photographs are continued, so that what continues them counts.
 
     Args:
-        anew: their numbers, coarse to fine, the last one before the finest; each has all of the finest one's
-            splats, in the same order.
+        levels: as of :func:`joined`.
+        numbers: those that begin anew, coarse to fine, the last one before the finest.
         gamma: the screen size that levels are chosen with.
+
+    Returns:
+        Their splats, in spatial order, none smaller than its level allows.
     """
-    p, rows = parameters, _rows(model)
-    coarsest, *_, finest = rows
-    some = rows[anew[-1]]
-    found = contributions(
-        model.gaussians,
-        [camera.widened(p.margin) for camera in data.train],
-        near=data.near,
-        antialias=p.antialias,
-        rows=torch.arange(some.start, some.stop, dtype=torch.int32, device=model["means"].device),
-        backend=backend,
-    )
-    shares = found.largest[some].cpu().numpy()
+    p, (coarsest, *_, finest) = parameters, levels
+    order = torch.from_numpy(spatial_order(levels[finest]["means"].cpu().numpy()))
+    tensors = {name: tensor[order.to(tensor.device)] for name, tensor in levels[finest].items()}
+    wide = (camera.widened(p.margin) for camera in data.train)
+    found = contributions(Gaussians(**tensors), wide, near=data.near, antialias=p.antialias, backend=backend)
+    shares, log_scales = found.largest.cpu().numpy(), tensors["log_scales"].cpu().numpy()
     rank = np.empty(len(shares))
     rank[np.argsort(-shares, kind="stable")] = np.arange(1, len(shares) + 1)
-    first = np.zeros(len(model))  # the larger, the sooner a splat is among those that stay
-    for number in anew:
-        first[rows[number]] = p.budget_ratio ** (anew[-1] - number) / rank
-    views = views_drawing(model, s_min, data, {"gamma": gamma, "first": coarsest, "last": finest})
-    alone = views_drawing(model, s_min, data, {"gamma": gamma, "first": finest, "last": finest})
-    theirs = slice(rows[anew[0]].start, some.stop)
-    own, others = views[theirs].sum(), views.sum() - views[theirs].sum()
-    most = max(p.drawn * alone.sum() - others, LEAST_SHARE * own)
-    kept = np.ones(len(model), bool)
-    kept[theirs] = first[theirs] >= least_importance(first[theirs], views[theirs], most)
-    for number in anew:
-        level = rows[number]
-        wider = room_taken_over(model["log_scales"][level].cpu().numpy(), shares, kept[level])
-        model["log_scales"][level] += torch.from_numpy(wider).to(model["log_scales"])[:, None]
-    model.keep(torch.from_numpy(kept))
+    first = {number: p.budget_ratio ** (numbers[-1] - number) / rank for number in numbers}
+
+    values = {"gamma": gamma, "first": coarsest, "last": finest}
+    views = {
+        number: _views_drawing(
+            (tensors if number in numbers else level)["means"], number, s_min, data, values
+        )
+        for number, level in levels.items()
+    }
+    alone = _views_drawing(tensors["means"], finest, s_min, data, {**values, "first": finest})
+    own = np.concatenate([views[number] for number in numbers])
+    others = sum(int(each.sum()) for number, each in views.items() if number not in numbers)
+    most = max(p.drawn * alone.sum() - others, LEAST_SHARE * own.sum())
+    least = least_importance(np.concatenate(list(first.values())), own, most)
+
+    anew = {}
+    for number in numbers:
+        kept = first[number] >= least
+        wider = log_scales + room_taken_over(log_scales, shares, kept)[:, None]
+        sizes = torch.from_numpy(np.maximum(wider, np.float32(np.log(s_min[number - 1]))))
+        level = tensors | {"log_scales": sizes.to(tensors["log_scales"])}
+        rows = torch.from_numpy(kept)
+        anew[number] = {name: tensor[rows.to(tensor.device)] for name, tensor in level.items()}
+    return anew
 
 
 def rates(parameters: FlodParameters, extent: float, share: float) -> dict[str, LearningRate]:
@@ -150,18 +138,8 @@ def weights(model: Model, s_min: Sequence[float], camera: Camera, values: Values
     Args:
         s_min: of every level of the run, coarse to fine.
     """
-    means, facts = model["means"].detach().cpu().numpy(), _facts(s_min)
-    found = [
-        RULE.weights(
-            means[rows],
-            np.asarray(camera.center, np.float32),
-            camera.focal,
-            {},
-            facts_of(RULE, {}, facts, number),
-            values,
-        )
-        for number, rows in _rows(model).items()
-    ]
+    means = model["means"].detach().cpu().numpy()
+    found = [_weights(means[rows], number, s_min, camera, values) for number, rows in _rows(model).items()]
     return torch.from_numpy(np.concatenate(found)).to(model["means"].device)
 
 
@@ -185,6 +163,26 @@ def levels_of(model: Model, s_min: Sequence[float]) -> list[Level]:
     """The levels that were trained, coarse to fine: all but the finest."""
     splats, facts, (*rows, _) = model.splats(), dict(_facts(s_min)), _rows(model).items()
     return [Level(number, splats.select(some), facts[number]) for number, some in rows]
+
+
+def _weights(
+    means: np.ndarray, number: int, s_min: Sequence[float], camera: Camera, values: Values
+) -> np.ndarray:
+    """The rule's weights (N,) of a level's splats."""
+    eye, facts = np.asarray(camera.center, np.float32), facts_of(RULE, {}, _facts(s_min), number)
+    return RULE.weights(means, eye, camera.focal, {}, facts, values)
+
+
+def _views_drawing(
+    means: torch.Tensor, number: int, s_min: Sequence[float], data: TrainingData, values: Values
+) -> np.ndarray:
+    """In how many of VIEWS_COUNTED training views each of a level's splats (N,) is drawn."""
+    places = means.cpu().numpy()
+    views = np.zeros(len(places), np.int64)
+    for camera in evenly(data.train, VIEWS_COUNTED):
+        shown = _weights(places, number, s_min, camera, values) > 0
+        views += shown & camera.sees(places, data.near)
+    return views
 
 
 def _facts(s_min: Sequence[float]) -> list[tuple[int, dict[str, float]]]:

@@ -217,11 +217,11 @@ class Method(method.Method[FlodParameters, Drawing]):
         """The levels that finishing steps train, as one model; those of fine detail begin anew."""
         p, data, levels = self.parameters, self.data, self.kept
         most = finish.FINE * data.median_depth / data.focal
-        anew = [number for number in levels if 0 < self.s_min[number - 1] <= most]
-        levels |= {number: finish.begun_anew(levels[self.levels], self.s_min[number - 1]) for number in anew}
+        fine = [number for number in levels if 0 < self.s_min[number - 1] <= most]
+        if fine:
+            gamma = self.controls()["gamma"]
+            levels |= finish.begun_anew(levels, fine, self.s_min, data, p, gamma, self.backend)
         self.model = finish.joined(levels, finish.rates(p, data.extent, 0.0))
-        if anew:
-            finish.thin(self.model, anew, self.s_min, data, p, self.controls()["gamma"], self.backend)
         self.kept = {}
 
     def _from_points(self, level: int) -> dict[str, torch.Tensor]:
