@@ -38,6 +38,8 @@ FINE = 1.5
 coarser was trained with fewer and larger splats than the finest level's, and keeps them."""
 VIEWS_COUNTED = 24
 """In so many training views it is counted what they draw."""
+COARSER = 0.8
+"""Of two neighbouring levels that begin anew the coarser one has so many times the other's splats."""
 LEAST_SHARE = 0.25
 """At least this share of what views draw of a level stays, whatever the others have drawn."""
 SPREAD = 2.0
@@ -73,8 +75,8 @@ def begun_anew(
 ) -> dict[int, dict[str, torch.Tensor]]:
     """Levels of the finest one's splats, so many that views by distance draw no more than ``drawn`` of it.
 
-    Each has the ones with the largest share of some pixel, ``budget_ratio`` times as many as the next finer
-    one of them. Views are as wide as photographs are continued, so that what continues them counts.
+    Each has the ones with the largest share of some pixel. Views are as wide as photographs are continued, so
+    that what continues them counts.
 
     Args:
         levels: as of :func:`joined`.
@@ -92,7 +94,7 @@ def begun_anew(
     shares, log_scales = found.largest.cpu().numpy(), tensors["log_scales"].cpu().numpy()
     rank = np.empty(len(shares))
     rank[np.argsort(-shares, kind="stable")] = np.arange(1, len(shares) + 1)
-    first = {number: p.budget_ratio ** (numbers[-1] - number) / rank for number in numbers}
+    first = {number: COARSER ** (numbers[-1] - number) / rank for number in numbers}
 
     values = {"gamma": gamma, "first": coarsest, "last": finest}
     views = {

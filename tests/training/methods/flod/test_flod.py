@@ -241,7 +241,7 @@ def test_levels_of_fine_detail_begin_anew_as_what_shows_most_of_the_finest(data)
         assert larger.min() >= 1 - 1e-6 and 1.02 < larger.max() <= 2 + 1e-6
         assert len(np.unique(larger.round(3))) <= -(-len(finest) // SIZE)
     one, two = (len(level.splats) for level in coarser)
-    assert one == pytest.approx(flod.parameters.budget_ratio * two, abs=1)
+    assert one == pytest.approx(0.8 * two, abs=1)
 
 
 @pytest.mark.parametrize("drawn", [0.5, 0.8])
