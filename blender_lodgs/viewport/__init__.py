@@ -4,7 +4,7 @@ Splats are drawn in all shadings but Wireframe where ``Scene.lodgs_viewport.spla
 points like those of COLMAP: discs in Solid shading, Blender's own points elsewhere. Where Blender draws
 splats by itself, it is left to it. ``arranging`` decides which are drawn in which order, ``views`` keeps what
 each viewport shows, ``eye`` follows a viewport's view, and ``frusta`` shows where
-training will look from.
+training or a capture will look from.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def _draw_view(context: bpy.types.Context) -> None:
     if with_splats:
         views.draw(context)
     if space.overlay.show_overlays:
-        frusta.draw(context.scene)
+        frusta.draw(context)
 
 
 def _points(

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
+from ..errors import LodgsError
 from .cameras import Camera
 
+SHORTEST_TRACK, LONGEST_TRACK = 2, 4
+"""Views that see a point: it is left out below the first, and no more than the last are recorded."""
+_BLOCK = 1 << 24
+"""Pairs of a view and a point that are thinned at a time; each takes some 30 bytes."""
 DEPTH_TOLERANCE = 0.01  # relative: a point this much behind the surface that a view sees is hidden there
 
 
@@ -39,6 +44,34 @@ def thinned(visible: np.ndarray, longest: int) -> np.ndarray:
     """At most so many views, at random, of the views (V, N) that see each point: it keeps models small."""
     lottery = np.where(visible, np.random.default_rng(1).random(visible.shape), np.inf)
     return visible & (lottery.argsort(axis=0).argsort(axis=0) < longest)
+
+
+def write_seen(
+    scene: Path,
+    cameras: Sequence[Camera],
+    depths: Callable[[int], np.ndarray],
+    points: np.ndarray,
+    colors: np.ndarray,
+) -> int:
+    """As :func:`write_colmap`, of those points that SHORTEST_TRACK views see, by their depths.
+
+    Args:
+        depths: those of a view, by its number, as :func:`visible_in` takes them: one is in memory at a time.
+
+    Returns:
+        How many points that are.
+
+    Raises:
+        LodgsError: there are none.
+    """
+    visible = np.stack([visible_in(depths(n), view, points)[1] for n, view in enumerate(cameras)])
+    kept = visible.sum(axis=0) >= SHORTEST_TRACK
+    if not kept.any():
+        raise LodgsError("No two views see the same.", "Give more views, or nearer ones.")
+    blocks = np.array_split(visible[:, kept], -(-visible.size // _BLOCK), axis=1)
+    visible = np.concatenate([thinned(block, LONGEST_TRACK) for block in blocks], axis=1)
+    write_colmap(scene, cameras, points[kept], visible, colors[kept])
+    return int(kept.sum())
 
 
 def write_colmap(

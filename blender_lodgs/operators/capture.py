@@ -1,0 +1,45 @@
+"""Operators that capture the Blender scene, and stop that."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..runs import capturing, processes
+from .parts import report_errors
+
+
+class LODGS_OT_capture_scene(bpy.types.Operator):
+    bl_idname = "lodgs.capture_scene"
+    bl_label = "Capture This Blender Scene"
+    bl_description = (
+        "Render this Blender scene from many views with its own engine, while you work on, and make a COLMAP "
+        "scene of them to train from. What its folder holds already is not rendered again"
+    )
+
+    @report_errors
+    def execute(self, context):
+        work = capturing.start(context)
+        processes.follow(work.step)
+        if work.problem:
+            self.report({"ERROR"}, work.problem)
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class LODGS_OT_cancel_capture(bpy.types.Operator):
+    bl_idname = "lodgs.cancel_capture"
+    bl_label = "Cancel"
+    bl_description = "Stop rendering views; Capture goes on from there"
+    bl_options = {"INTERNAL"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return capturing.current is not None and capturing.current.running
+
+    def execute(self, context):
+        assert capturing.current is not None
+        capturing.current.cancel()
+        return {"FINISHED"}
+
+
+CLASSES = (LODGS_OT_capture_scene, LODGS_OT_cancel_capture)
