@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bpy
 
+from ..data import scenes
 from ..runs import capturing, processes
 from .parts import report_errors
 
@@ -42,4 +43,23 @@ class LODGS_OT_cancel_capture(bpy.types.Operator):
         return {"FINISHED"}
 
 
-CLASSES = (LODGS_OT_capture_scene, LODGS_OT_cancel_capture)
+class LODGS_OT_import_capture(bpy.types.Operator):
+    bl_idname = "lodgs.import_capture"
+    bl_label = "Import What Was Captured"
+    bl_description = (
+        "Import the captured cameras, pictures and points, to train from. They lie where this Blender scene "
+        "is: hide its meshes to see splats in their place"
+    )
+    bl_options = {"REGISTER", "UNDO"}
+
+    @report_errors
+    def execute(self, context):
+        folder = capturing.folder_of(context.scene)
+        root = scenes.import_colmap(
+            context, folder, upright=False, warn=lambda message: self.report({"WARNING"}, message)
+        )
+        self.report({"INFO"}, f"'{root.name}': {scenes.contents(root)}")
+        return {"FINISHED"}
+
+
+CLASSES = (LODGS_OT_capture_scene, LODGS_OT_cancel_capture, LODGS_OT_import_capture)

@@ -43,8 +43,7 @@ class LODGS_PT_capture(Panel):
             say(layout, str(error), "INFO")
             return
         if (folder / "sparse").is_dir():
-            done = layout.operator("lodgs.import_colmap", text="Import What Was Captured", icon="IMPORT")
-            done.directory, done.upright = str(folder), False
+            layout.operator("lodgs.import_capture", icon="IMPORT")
 
 
 def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
