@@ -39,8 +39,7 @@ from training.methods.tree.store import layout_of
 from training.methods.tree.train import Method, SeenRecords
 from training.rasterize import Gaussians, rasterize
 from training.rasterize.hspt import image_of
-from training.runs.capture import read_views
-from training.scenes.cameras import write_camera
+from training.scenes.cameras import read_views, write_camera
 from training.scenes.colmap import Scene
 from training.scenes.images import write_png
 from training.splats.gaussians import Splats

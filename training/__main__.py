@@ -68,7 +68,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from .runs.options import add_options
+    from .runs.options import add_options, size_of
 
     parser = argparse.ArgumentParser(prog=PROGRAM, description="Gaussian splats with levels of detail.")
     parser.add_argument("--version", action="version", version=f"lodgs {VERSION}")
@@ -130,7 +130,7 @@ def _parser() -> argparse.ArgumentParser:
     eye.add_argument("--view", metavar="IMAGE", help="name of a photograph that the splats were trained from")
     render.add_argument("--scene", type=Path, help="COLMAP folder of the photographs, where no run knows it")
     render.add_argument("--out", type=Path, required=True, help="picture to write: .png or .exr")
-    render.add_argument("--size", type=_size, metavar="WxH", help="pixels; otherwise the camera's own")
+    render.add_argument("--size", type=size_of, metavar="WxH", help="pixels; otherwise the camera's own")
     render.add_argument("--level", type=int, default=0, help="level to draw (otherwise the finest)")
     render.add_argument(
         "--by-distance", action="store_true", help="draw levels by distance; so does any of these:"
@@ -167,6 +167,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     capture.add_argument("--backend", default="auto", help="auto, cpu, cuda or reference")
 
+    model = commands.add_parser(
+        "model", help="views that Blender captured of its own scene, as the COLMAP model of their folder"
+    )
+    model.add_argument("folder", type=Path, help="what `blender --command lodgs capture` has filled")
+
     serve = commands.add_parser("serve", help="draw frame after frame for Blender")
     serve.add_argument("folder", type=Path, help="folder for arrays, new or empty; removed at the end")
     serve.add_argument("--backend", default="auto", help="auto, cpu, cuda or reference")
@@ -198,13 +203,6 @@ def _controls(chosen: argparse.Namespace) -> dict[str, float]:
 
     asked = {name: getattr(chosen, name) for name in every_control()}
     return {name: value for name, value in asked.items() if value is not None}
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, _, height = text.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
-        raise argparse.ArgumentTypeError(f"{text} is not WIDTHxHEIGHT, such as 640x480")
-    return int(width), int(height)
 
 
 def _amount(text: str) -> int:
@@ -356,6 +354,14 @@ def _capture(chosen: argparse.Namespace) -> int:
     return 0
 
 
+def _model(chosen: argparse.Namespace) -> int:
+    from .scenes.rendered import write_model
+
+    views, points = write_model(chosen.folder)
+    print(f"{chosen.folder}: {views} views, {points:,} points")
+    return 0
+
+
 def _warn(message: str) -> None:
     print(f"warning: {message}", file=sys.stderr)
 
@@ -418,6 +424,7 @@ _COMMANDS = {
     "evaluate": _evaluate,
     "render": _render,
     "capture": _capture,
+    "model": _model,
     "serve": _serve,
     "info": _info,
 }

@@ -96,6 +96,13 @@ def new_splats(name: str, splats: Splats) -> bpy.types.Object:
     return obj
 
 
+def root_of(obj: bpy.types.Object | None) -> bpy.types.Object | None:
+    """The root of the splat scene that an object is in: itself, or what it is a child of; None outside."""
+    while obj is not None and not obj.lodgs.is_root:
+        obj = obj.parent
+    return obj
+
+
 def read_splats(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> Splats:
     """The splats of an object, with all that artists have changed: its data, or what its modifiers leave.
 

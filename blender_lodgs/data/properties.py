@@ -11,6 +11,7 @@ import bpy
 from ...training.lod.rule import Control, Rule, rules
 from .selection import read_json
 from .training import PARAMETERS, TrainingCell, TrainingSettings
+from .viewpoints import ViewsSettings
 
 ON_CHANGE: dict[str, Callable[[Any, bpy.types.Context], None]] = {}
 """What is done when a property has changed, with its owner, by name; ``updates`` says what."""
@@ -401,6 +402,18 @@ class ViewportSettings(bpy.types.PropertyGroup):
     )
 
 
+class CaptureSettings(ViewsSettings, bpy.types.PropertyGroup):
+    """How a Blender scene becomes photographs to train from, on the scene (``Scene.lodgs_capture``)."""
+
+    folder: bpy.props.StringProperty(
+        name="Folder",
+        description="Folder that receives the pictures and becomes a COLMAP scene; empty: lodgs_capture "
+        "beside the .blend file. What is there already is not rendered again",
+        subtype="DIR_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
+    )
+
+
 class ViewSettings(bpy.types.PropertyGroup):
     """What an imported camera knows of its photograph, on its data (``Camera.lodgs``); all 0 on others."""
 
@@ -494,7 +507,7 @@ SplatScene.__annotations__ |= {
 
 CLASSES = (
     ViewSettings, ViewportSettings, *PARAMETERS.values(), TrainingCell, TrainingSettings, SplatLevel,
-    SplatTable, SplatStream, *CONTROLS.values(), SplatScene, RenderSettings,
+    SplatTable, SplatStream, *CONTROLS.values(), SplatScene, RenderSettings, CaptureSettings,
 )  # fmt: skip
 
 
@@ -504,10 +517,12 @@ def register() -> None:
     bpy.types.Camera.lodgs = bpy.props.PointerProperty(type=ViewSettings)
     bpy.types.Scene.lodgs_render = bpy.props.PointerProperty(type=RenderSettings)
     bpy.types.Scene.lodgs_viewport = bpy.props.PointerProperty(type=ViewportSettings)
+    bpy.types.Scene.lodgs_capture = bpy.props.PointerProperty(type=CaptureSettings)
 
 
 def unregister() -> None:
     """Detach them again."""
+    del bpy.types.Scene.lodgs_capture
     del bpy.types.Scene.lodgs_render
     del bpy.types.Scene.lodgs_viewport
     del bpy.types.Camera.lodgs

@@ -27,6 +27,7 @@ from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder, r
 from ...training.splats.gaussians import Splats
 from ..nodes import ellipsoids
 from . import objects, selection, streams, tables
+from .objects import root_of
 from .photographs import match_render, new_camera, views
 
 LINKED = (
@@ -45,13 +46,6 @@ def active_root(context: bpy.types.Context) -> bpy.types.Object | None:
     root = root_of(context.active_object)
     found = [root] if root is not None else roots(context.scene)
     return found[0] if len(found) == 1 else None
-
-
-def root_of(obj: bpy.types.Object | None) -> bpy.types.Object | None:
-    """The root of the splat scene that an object is in: itself, or what it is a child of; None outside."""
-    while obj is not None and not obj.lodgs.is_root:
-        obj = obj.parent
-    return obj
 
 
 def shows_splats(scene: bpy.types.Scene) -> bool:

@@ -7,6 +7,7 @@ import textwrap
 import bpy
 
 from ..data import scenes
+from ..data.viewpoints import ViewsSettings
 from ..runs import making
 
 
@@ -42,6 +43,24 @@ def say(layout: bpy.types.UILayout, text: str, icon: str) -> None:
     letters = max(int((width - 85) / 5.6), 24)  # of the default font, beside the icon and the tabs
     for number, line in enumerate(textwrap.wrap(text, letters, break_on_hyphens=False)):
         column.label(text=line, icon="BLANK1" if number else icon)  # type: ignore[arg-type]
+
+
+def draw_views(column: bpy.types.UILayout, settings: ViewsSettings, count: int) -> None:
+    """From where pictures are drawn that take the place of photographs.
+
+    Args:
+        count: how many cameras there are.
+    """
+    column.prop(settings, "views_from")
+    if settings.views_from == "CURVE":
+        column.prop(settings, "curve")
+    if settings.views_from == "CAMERAS":
+        column.label(text=f"{count} cameras")
+    else:
+        column.prop(settings, "views")
+    column.prop(settings, "view_width")
+    if settings.views_from == "DOME":
+        column.prop(settings, "show_views")
 
 
 def scene_length(context: bpy.types.Context, root: bpy.types.Object, value: float) -> str:

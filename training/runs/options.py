@@ -23,6 +23,14 @@ def _whole(text: str) -> int:
     raise argparse.ArgumentTypeError(f"{text} is no whole number from 0 to {2**31 - 1}")
 
 
+def size_of(text: str) -> tuple[int, int]:
+    """Width and height of an option such as 640x480."""
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise argparse.ArgumentTypeError(f"{text} is not WIDTHxHEIGHT, such as 640x480")
+    return int(width), int(height)
+
+
 _OPTIONS: dict[str, dict] = {
     "scene": {"metavar": "DIR", "help": "folder of the COLMAP scene"},
     "out": {"metavar": "RUN", "help": "run folder; goes on with what the same command began there"},

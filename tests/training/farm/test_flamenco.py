@@ -37,10 +37,10 @@ console.log(JSON.stringify({ type: JOB_TYPE, tasks: job.tasks }));
 needs_node = pytest.mark.skipif(shutil.which("node") is None, reason="Node.js is not installed")
 
 
-def compiled(folder: Path, **settings) -> dict:
+def compiled(folder: Path, source: Path = SCRIPT, **settings) -> dict:
     """The job type, and the tasks that it makes of these settings and the defaults of others."""
     script = folder / "job.js"
-    script.write_text(SCRIPT.read_text() + MANAGER)
+    script.write_text(source.read_text() + MANAGER)
 
     def run(values: dict) -> dict:
         told = subprocess.run(
