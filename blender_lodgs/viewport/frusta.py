@@ -9,6 +9,7 @@ from gpu_extras.batch import batch_for_shader
 
 from ...training.errors import LodgsError
 from ..data import scenes, viewpoints
+from ..data.placement import axes_of
 
 COLOR = (1.0, 0.75, 0.2, 1.0)
 LENGTH = 0.12
@@ -27,7 +28,7 @@ def draw(scene: bpy.types.Scene) -> None:
             shader = gpu.shader.from_builtin("UNIFORM_COLOR")
             batch = batch_for_shader(shader, "LINES", {"pos": lines(views, LENGTH * shells[0])})
             with gpu.matrix.push_pop():  # type: ignore[attr-defined]
-                gpu.matrix.multiply_matrix(root.matrix_world)
+                gpu.matrix.multiply_matrix(axes_of(root).matrix_world)
                 shader.bind()
                 shader.uniform_float("color", COLOR)
                 batch.draw(shader)
