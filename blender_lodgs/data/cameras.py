@@ -7,7 +7,7 @@ import numpy as np
 
 from ...training.errors import LodgsError
 from ...training.scenes.cameras import Camera
-from .placement import placement_of
+from .placement import matrix_of
 
 
 def scene_camera(scene: bpy.types.Scene) -> bpy.types.Object:
@@ -86,5 +86,5 @@ def view_from(
     """
     obj = obj or scene_camera(depsgraph.scene)
     camera, near = view_of(obj.evaluated_get(depsgraph), depsgraph, width, height)
-    inside, unit = camera.within(placement_of(root, depsgraph).matrix)
+    inside, unit = camera.within(matrix_of(root, depsgraph))
     return inside, near / unit

@@ -14,7 +14,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...training.errors import LodgsError
-from ...training.splats.placing import Placement
+from ...training.splats.placing import Placement, similarity
 
 SMALL = 1e-4
 """How large axes are drawn: nobody is to click them in place of the root."""
@@ -53,8 +53,8 @@ def in_parent(root: bpy.types.Object) -> Matrix:
     return own.copy() if axes == root else own @ axes.matrix_parent_inverse @ axes.matrix_basis
 
 
-def placement_of(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> Placement:
-    """From the coordinates of a splat scene to Blender's world.
+def matrix_of(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> np.ndarray:
+    """(4, 4) float64 from the coordinates of a splat scene to Blender's world, with the bits that Blender has.
 
     Args:
         depsgraph: as it shows them; None: as they are.
@@ -64,13 +64,22 @@ def placement_of(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None =
     """
     axes = axes_of(root)
     own = axes.evaluated_get(depsgraph) if depsgraph else axes
-    try:
-        return Placement.of(_orthogonal(np.array(own.matrix_world, np.float64)))
-    except LodgsError as error:
+    matrix = np.array(own.matrix_world, np.float64)
+    if not similarity(_orthogonal(matrix)):
         raise LodgsError(
             f"'{root.name}' is stretched, which no camera of its files can show.",
             "Give it one scale for all axes.",
-        ) from error
+        )
+    return matrix
+
+
+def placement_of(root: bpy.types.Object) -> Placement:
+    """The same as it is meant: at right angles to the last bit of float64.
+
+    Raises:
+        LodgsError: the root is stretched.
+    """
+    return Placement.of(_orthogonal(matrix_of(root)))
 
 
 def move(root: bpy.types.Object, further: Placement) -> None:

@@ -13,7 +13,7 @@ from ...training.splats.gaussians import Splats
 from .. import attributes
 from . import changes
 from .cameras import scene_camera, view_from
-from .placement import placement_of
+from .placement import matrix_of
 
 SAMPLE = 100_000
 """About so many splats say where a dome will be, before there is one."""
@@ -60,7 +60,7 @@ def placed(context: bpy.types.Context, root: bpy.types.Object, splats: Splats) -
         case "CURVE":
             if settings.curve is None:
                 raise LodgsError("No curve is chosen to walk along.", "Choose one, or other views.")
-            into = np.linalg.inv(placement_of(root).matrix)
+            into = np.linalg.inv(matrix_of(root))
             way = _way(settings.curve) @ into[:3, :3].T + into[:3, 3]
             views, near = walk(splats, way, into[:3, 2], settings.views, width, height)
             return [(view, near) for view in views]

@@ -214,6 +214,7 @@ class PlacedRows:
         return len(self.rows)
 
     def select(self, some: slice, /) -> Splats:
+        """The splats of a range of rows."""
         splats = self.placed(self.rows.select(some))
         splats.extras |= {name: column[some] for name, column in self.remade.items()}
         return splats

@@ -49,7 +49,7 @@ def bundle(tmp_path) -> Path:
 def scene(bpy, lodgs, bundle):
     """A bundle, turned and moved and scaled, and a camera before it; LODGS renders it to PNG."""
     scene = bpy.context.scene
-    root = lodgs("data.scenes").import_splats(bpy.context, bundle)
+    root = lodgs("data.scenes").import_splats(bpy.context, bundle, upright=False)
     root.location, root.scale = (1, 2, -0.5), (1.7,) * 3
     root.rotation_euler = (-1.2, 0.3, 0.4)
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
