@@ -54,7 +54,7 @@ def in_parent(root: bpy.types.Object) -> Matrix:
 
 
 def matrix_of(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> np.ndarray:
-    """(4, 4) float64 from the coordinates of a splat scene to Blender's world, with the bits that Blender has.
+    """(4, 4) float64 from a splat scene's coordinates to Blender's world, with the bits that Blender has.
 
     Args:
         depsgraph: as it shows them; None: as they are.
