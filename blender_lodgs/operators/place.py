@@ -1,10 +1,10 @@
-"""Where a splat scene stands: on which ground, how large, and in sight."""
+"""Where a splat scene stands, on which ground and how large; and where to stand, to see it."""
 
 from __future__ import annotations
 
 import bpy
 
-from ..data import ground, photographs, scenes
+from ..data import flights, ground, photographs, scenes
 from .parts import OnScene, report_errors
 
 
@@ -86,4 +86,38 @@ class LODGS_OT_set_scale(OnScene, bpy.types.Operator):
         return {"FINISHED"}
 
 
-CLASSES = (LODGS_OT_frame_scene, LODGS_OT_set_ground, LODGS_OT_set_scale)
+class LODGS_OT_camera_path(OnScene, bpy.types.Operator):
+    """Add a camera that goes along the photographs by name, smoothed, in the scene's frames"""
+
+    bl_idname = "lodgs.camera_path"
+    bl_label = "Add Camera Path"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @report_errors
+    def execute(self, context):
+        camera = flights.path(context, scenes.active_root(context))
+        self.report({"INFO"}, f"'{camera.name}' is the scene's camera")
+        return {"FINISHED"}
+
+
+class LODGS_OT_turntable(OnScene, bpy.types.Operator):
+    """Add a camera that goes once around the splat scene in the scene's frames"""
+
+    bl_idname = "lodgs.turntable"
+    bl_label = "Add Turntable"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @report_errors
+    def execute(self, context):
+        camera = flights.turntable(context, scenes.active_root(context))
+        self.report({"INFO"}, f"'{camera.name}' is the scene's camera")
+        return {"FINISHED"}
+
+
+CLASSES = (
+    LODGS_OT_frame_scene,
+    LODGS_OT_set_ground,
+    LODGS_OT_set_scale,
+    LODGS_OT_camera_path,
+    LODGS_OT_turntable,
+)

@@ -27,6 +27,11 @@ class LODGS_PT_placement(Panel):
         row.operator("lodgs.set_ground", text="From Selection", icon="SNAP_PERPENDICULAR").by = "SELECTION"
         row.operator("lodgs.set_ground", text="Find", icon="VIEWZOOM").by = "FOUND"
         column.operator("lodgs.set_scale", text="Set Scale…", icon="DRIVER_DISTANCE")
+        column = layout.column(align=True)
+        column.label(text="Moving Camera")
+        row = column.row(align=True)
+        row.operator("lodgs.camera_path", text="Along Photographs", icon="CURVE_PATH")
+        row.operator("lodgs.turntable", text="Turntable", icon="FILE_REFRESH")
 
 
 class LODGS_MT_placement(bpy.types.Menu):
@@ -37,6 +42,8 @@ class LODGS_MT_placement(bpy.types.Menu):
         layout.operator("lodgs.set_ground", text="Ground From Selection").by = "SELECTION"
         layout.operator("lodgs.set_ground", text="Find Ground").by = "FOUND"
         layout.operator("lodgs.set_scale", text="Set Scale…")
+        layout.operator("lodgs.camera_path")
+        layout.operator("lodgs.turntable")
 
 
 def _menu(self, context):
