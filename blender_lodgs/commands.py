@@ -83,6 +83,11 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("blend", type=Path, help=".blend file")
     export.add_argument("bundle", type=Path, help="bundle to write (PLY)")
     export.add_argument("--root", help="name of the scene root, where the file holds several")
+    export.add_argument(
+        "--placed",
+        action="store_true",
+        help="where the scene stands in the .blend, not in COLMAP's coordinates",
+    )
 
     capture = commands.add_parser(
         "capture",
@@ -174,7 +179,7 @@ def _export(args: argparse.Namespace) -> int:
     if len(found) != 1:
         names = ", ".join(root.name for root in bpy.data.objects if root.lodgs.is_root) or "none"
         raise LodgsError(f"{args.blend} holds {len(found)} such scenes.", f"Name one with --root: {names}.")
-    write_bundle(args.bundle, scenes.read_levels(found[0]))
+    write_bundle(args.bundle, scenes.read_levels(found[0], args.placed))
     return DONE
 
 

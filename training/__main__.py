@@ -176,6 +176,32 @@ def _parser() -> argparse.ArgumentParser:
     serve.add_argument("folder", type=Path, help="folder for arrays, new or empty; removed at the end")
     serve.add_argument("--backend", default="auto", help="auto, cpu, cuda or reference")
 
+    transform = commands.add_parser(
+        "transform",
+        help="turn, scale and move splats in a file, with all that it says of places and lengths",
+        description="Angles first, then the scale, then the shift. Numbers below 0 go behind a =, as in "
+        "--translate=-1,0,2.",
+    )
+    transform.add_argument(
+        "source", type=Path, help="bundle, folder of levels, any 3DGS PLY, or a run's folder"
+    )
+    transform.add_argument("out", type=Path, help="file or folder to write, in the form of the source")
+    transform.add_argument(
+        "--upright", action="store_true", help="first turn as the file says that its scene stands upright"
+    )
+    transform.add_argument(
+        "--rotate", type=_reals(3), default=(0, 0, 0), metavar="X,Y,Z",
+        help="degrees about x, then y, then z, as Blender's Euler angles",
+    )  # fmt: skip
+    transform.add_argument("--scale", type=float, default=1.0, metavar="N", help="times the size")
+    transform.add_argument(
+        "--translate", type=_reals(3), default=(0, 0, 0), metavar="X,Y,Z", help="shift in the new units"
+    )
+    transform.add_argument(
+        "--matrix", type=_reals(16), metavar="A,B,...",
+        help="16 numbers, row by row, instead of these three; no stretching, shearing, mirroring",
+    )  # fmt: skip
+
     info = commands.add_parser("info", help="say what a bundle or any 3DGS PLY holds")
     info.add_argument("file", type=Path)
 
@@ -209,6 +235,21 @@ def _amount(text: str) -> int:
     if text.isdecimal() and 0 < int(text) < 2**31:
         return int(text)
     raise argparse.ArgumentTypeError(f"{text} is no whole number above 0")
+
+
+def _reals(count: int) -> Callable[[str], tuple[float, ...]]:
+    """What reads so many numbers between commas."""
+
+    def read(text: str) -> tuple[float, ...]:
+        try:
+            found = tuple(map(float, text.split(",")))
+        except ValueError:
+            found = ()
+        if len(found) != count:
+            raise argparse.ArgumentTypeError(f"{text} is not {count} numbers with commas between them")
+        return found
+
+    return read
 
 
 def _colour(text: str) -> tuple[float, float, float] | None:
@@ -362,6 +403,29 @@ def _model(chosen: argparse.Namespace) -> int:
     return 0
 
 
+def _transform(chosen: argparse.Namespace) -> int:
+    import numpy as np
+
+    from .lod.placing import place_file, upright_of
+    from .runs.folder import RunFolder
+    from .splats.placing import Placement
+
+    source = chosen.source
+    if (bundle := RunFolder(source).bundle).exists():
+        source = bundle
+    if chosen.matrix is None:
+        placement = Placement.composed(chosen.rotate, chosen.scale, chosen.translate)
+    elif (chosen.rotate, chosen.scale, chosen.translate) == ((0, 0, 0), 1.0, (0, 0, 0)):
+        placement = Placement.of(np.reshape(chosen.matrix, (4, 4)))
+    else:
+        raise LodgsError("--matrix says all that --rotate, --scale and --translate say.", "Choose one.")
+    if chosen.upright:
+        placement = placement.after(upright_of(source))
+    count = place_file(source, chosen.out, placement, _warn)
+    print(f"{chosen.out}: {count:,} splats")
+    return 0
+
+
 def _warn(message: str) -> None:
     print(f"warning: {message}", file=sys.stderr)
 
@@ -426,6 +490,7 @@ _COMMANDS = {
     "capture": _capture,
     "model": _model,
     "serve": _serve,
+    "transform": _transform,
     "info": _info,
 }
 

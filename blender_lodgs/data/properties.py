@@ -240,6 +240,11 @@ class SplatScene(bpy.types.PropertyGroup):
         update=_eye_changed,
     )
 
+    axes: bpy.props.PointerProperty(
+        name="Axes",
+        description="The empty in whose space the coordinates of the scene's files are",
+        type=bpy.types.Object,
+    )
     points: bpy.props.PointerProperty(
         name="Points", description="The points of the COLMAP scene", type=bpy.types.Object
     )

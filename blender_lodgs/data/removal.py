@@ -10,6 +10,7 @@ from __future__ import annotations
 import bpy
 
 from . import photographs, tables
+from .placement import axes_of
 
 
 def remove(root: bpy.types.Object) -> None:
@@ -20,7 +21,9 @@ def remove(root: bpy.types.Object) -> None:
     """
     views = [view for view in photographs.views(root) if view.data.lodgs.width]
     known = [item.object for item in root.lodgs.levels] + [root.lodgs.points, *views]
-    parts = {obj for obj in known if obj is not None and obj.parent == root} | {root, *tables.parts(root)}
+    axes = axes_of(root)
+    parts = {obj for obj in known if obj is not None and obj.parent == axes}
+    parts |= {root, axes, *tables.parts(root)}
     others = [obj for obj in bpy.data.objects if obj not in parts and obj.is_editable]
     for obj in others:
         _let_go(obj, root)
@@ -46,7 +49,7 @@ def remove_deleted() -> None:
 
 def _let_go(obj: bpy.types.Object, root: bpy.types.Object) -> None:
     """Takes an object off the root, where it is, and away from drivers that read the root."""
-    if obj.parent == root:
+    if obj.parent in (root, axes_of(root)):
         place = obj.matrix_world.copy()
         obj.parent = None
         obj.matrix_world = place

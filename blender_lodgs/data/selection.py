@@ -22,6 +22,7 @@ from .. import compat
 from ..nodes import rules as groups
 from ..nodes.building import edited
 from ..nodes.display import NAME as DISPLAY
+from .placement import axes_of
 from .tables import read_table
 
 
@@ -102,7 +103,7 @@ def eye_place(root: bpy.types.Object, scene: bpy.types.Scene) -> tuple[float, fl
     obj = settings.eye_object if settings.eye == "OBJECT" else scene.camera
     if obj is None:
         return (0.0, 0.0, 0.0)  # as geometry nodes have it
-    return tuple(root.matrix_world.inverted_safe() @ obj.matrix_world.translation)
+    return tuple(axes_of(root).matrix_world.inverted_safe() @ obj.matrix_world.translation)
 
 
 def hold(root: bpy.types.Object, eye: tuple[float, float, float], focal_px: float) -> None:

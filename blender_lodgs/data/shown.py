@@ -14,6 +14,7 @@ import numpy as np
 
 from .. import attributes
 from . import scenes, selection, streams
+from .placement import axes_of
 
 
 @dataclass(frozen=True)
@@ -117,9 +118,9 @@ def choice_of_picture(instance: SplatInstance, depsgraph: bpy.types.Depsgraph) -
     settings = root.lodgs
     if settings.eye != "VIEW" or settings.freeze:
         return choice
-    own, place = root.evaluated_get(depsgraph), camera.evaluated_get(depsgraph).matrix_world.translation
-    eye = tuple(own.matrix_world.inverted_safe() @ place)
-    return replace(choice, eye=eye, focal_px=own.lodgs.focal_px)
+    place = camera.evaluated_get(depsgraph).matrix_world.translation
+    eye = tuple(axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe() @ place)
+    return replace(choice, eye=eye, focal_px=root.evaluated_get(depsgraph).lodgs.focal_px)
 
 
 def _with_sources(found: list[SplatInstance], depsgraph: bpy.types.Depsgraph) -> list[SplatInstance]:

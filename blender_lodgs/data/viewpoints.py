@@ -14,8 +14,9 @@ from ...training.scenes.viewpoints import DOMES, NEAR, OPAQUE, along, dome_aroun
 from ...training.splats.gaussians import Splats
 from .. import attributes
 from . import changes
-from .cameras import matrix_of, scene_camera, view_from, view_of
+from .cameras import scene_camera, view_from, view_of
 from .objects import root_of
+from .placement import matrix_of
 
 SAMPLE = 100_000
 """About so many splats say where a dome will be, before there is one."""

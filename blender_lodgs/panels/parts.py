@@ -7,6 +7,7 @@ import textwrap
 import bpy
 
 from ..data import scenes
+from ..data.placement import axes_of
 from ..data.viewpoints import ViewsSettings
 from ..runs import making
 
@@ -65,7 +66,7 @@ def draw_views(column: bpy.types.UILayout, settings: ViewsSettings, count: int) 
 
 def scene_length(context: bpy.types.Context, root: bpy.types.Object, value: float) -> str:
     """A length of a splat scene, in its own units, as Blender says it in the scene's."""
-    units, scale = context.scene.unit_settings, max(root.matrix_world.to_scale())
+    units, scale = context.scene.unit_settings, max(axes_of(root).matrix_world.to_scale())
     return bpy.utils.units.to_string(
         units.system, "LENGTH", value * scale * units.scale_length, precision=3
     ).strip()

@@ -14,6 +14,7 @@ from ...training.errors import LodgsError
 from ...training.scenes.cameras import Camera
 from ...training.scenes.viewpoints import DOMES, NEAR
 from ..data import scenes, viewpoints
+from ..data.placement import axes_of
 
 COLOR = (1.0, 0.75, 0.2, 1.0)
 LENGTH = 0.12
@@ -26,7 +27,7 @@ def draw(context: bpy.types.Context) -> None:
         if _shown(root.lodgs.training) and viewpoints.alone(root):
             with suppress(LodgsError):  # which the panel says
                 views, shells = viewpoints.dome_of(root)
-                _draw(views, shells[0], root.matrix_world)
+                _draw(views, shells[0], axes_of(root).matrix_world)
     if _shown(context.scene.lodgs_capture):
         with suppress(LodgsError):
             views, near = viewpoints.dome_of_scene(context)

@@ -44,7 +44,7 @@ def test_train_saves_and_exports(bpy, lodgs, lodgs_command, fake, tmp_path, capf
     bpy.ops.wm.open_mainfile(filepath=str(blend))
     (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
     assert {i.number: len(i.object.data.points) for i in root.lodgs.levels} == COUNTS
-    assert [obj for obj in root.children if obj.type == "CAMERA"]
+    assert [obj for obj in root.children_recursive if obj.type == "CAMERA"]
 
     other = tmp_path / "again.ply"
     assert lodgs_command("export", blend, other) == 0
