@@ -26,7 +26,7 @@ from ...training.scenes.colmap import Scene, read_scene
 from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder, read_head
 from ...training.splats.gaussians import Splats
 from ..nodes import ellipsoids
-from . import objects, selection, streams, tables
+from . import crops, objects, selection, streams, tables
 from .photographs import match_render, new_camera, views
 
 LINKED = (
@@ -637,6 +637,11 @@ def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
         for root in editable:
             if not all(item.exists for item in root.lodgs.levels):
                 _levels_changed(root)
+    if depsgraph.id_type_updated("OBJECT"):
+        for root in editable:
+            if crops.outdated(root):
+                crops.attach(root)
+                selection.update_inputs(root)
     if any(update.is_updated_geometry for update in depsgraph.updates):
         for root in editable:
             selection.update_inputs(root)
