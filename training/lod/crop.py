@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..errors import LodgsError
+
 SHAPES = ("BOX", "SPHERE")
 _NOWHERE = ((0.0, 0.0, 0.0, 2.0),) * 3
 """The way into a crop that is flat: every place is outside."""
@@ -23,7 +25,7 @@ class Crop:
     """
 
     shape: str
-    to_own: tuple[tuple[float, float, float, float], ...]
+    to_own: tuple[tuple[float, ...], ...]
     outside: bool = False
 
     @classmethod
@@ -33,13 +35,40 @@ class Crop:
         if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:3, :3])) < 1e-30:
             return cls(shape, _NOWHERE, outside)
         rows = np.linalg.inv(matrix)[:3]
-        return cls(shape, tuple((a, b, c, d) for a, b, c, d in rows.tolist()), outside)
+        return cls(shape, tuple(map(tuple, rows.tolist())), outside)
+
+    @classmethod
+    def box(cls, one: Sequence[float], other: Sequence[float], outside: bool = False) -> Crop:
+        """A box between two opposite corners (3,), along the axes.
+
+        Raises:
+            LodgsError: there is nothing between them.
+        """
+        low, high = np.minimum(one, other), np.maximum(one, other)
+        if not (high > low).all():
+            raise LodgsError(f"The box from {one} to {other} is flat.", "Give two opposite corners.")
+        matrix = np.diag([*(high - low) / 2, 1])
+        matrix[:3, 3] = (low + high) / 2
+        return cls.at("BOX", matrix, outside)
+
+    @classmethod
+    def sphere(cls, centre: Sequence[float], radius: float, outside: bool = False) -> Crop:
+        """A sphere around a centre (3,).
+
+        Raises:
+            LodgsError: it has no radius.
+        """
+        if not radius > 0:
+            raise LodgsError(f"A sphere of radius {radius:g} holds nothing.", "Give a radius above 0.")
+        matrix = np.diag([radius, radius, radius, 1.0])
+        matrix[:3, 3] = centre
+        return cls.at("SPHERE", matrix, outside)
 
     def holds(self, means: np.ndarray) -> np.ndarray:
         """(N,) bool, which means (N, 3) lie in it."""
         x, y, z = means.T
         squares = None
-        for a, b, c, d in np.float32(self.to_own):
+        for a, b, c, d in np.array(self.to_own, np.float32):
             axis = x * a
             axis += y * b
             axis += z * c
