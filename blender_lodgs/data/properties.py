@@ -81,6 +81,12 @@ class SplatLevel(bpy.types.PropertyGroup):
         name="Facts", description="What the rule needs to know of the level, as JSON", options={"HIDDEN"}
     )
 
+    lost: bpy.props.IntProperty(
+        name="No Longer Hidden",
+        description="How many splats were hidden of the level whose place this one has taken",
+        options={"HIDDEN"},
+    )
+
     @property
     def exists(self) -> bool:
         """False once an artist has deleted the level's object, which the list still remembers, or changed

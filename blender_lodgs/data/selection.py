@@ -153,6 +153,12 @@ def attach(root: bpy.types.Object) -> None:
     update_inputs(root)
 
 
+def follow_crops(root: bpy.types.Object) -> None:
+    """Has the levels' modifiers follow the crops and hidden splats that there are now."""
+    crops.attach(root)
+    update_inputs(root)
+
+
 def outdated(root: bpy.types.Object) -> bool:
     """Whether a level's modifier is not the one that this version makes: its file is an older one's."""
     rule = find_rule(root.lodgs.rule)

@@ -231,8 +231,8 @@ def test_nodes_of_a_tree_go_when_all_their_leaves_do():
         node = leaf
         while node is not None:
             alive.add(node)
-            family = ("parent_size", "parent_x", "parent_y", "parent_z")
-            key = [splats.extras[name][node].item() for name in family]
+            names = ("parent_size", "parent_x", "parent_y", "parent_z")
+            key = [splats.extras[name][node].item() for name in names]
             node = place.get(tuple(key)) if splats.extras["parent_size"][node] < 1e38 else None
     np.testing.assert_array_equal(np.flatnonzero(np.concatenate([stays[1], stays[2]])), sorted(alive))
     assert (family.leaves[2]).all() and not family.leaves[1].any()
