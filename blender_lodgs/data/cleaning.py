@@ -1,8 +1,8 @@
 """Clutter in a splat scene: found by the tests of ``training.lod.cleaning``, hidden, shown again, deleted.
 
-Hidden splats are a boolean attribute of their level's points; one modifier drops them (``crops``). They belong
-to the points: a level that is trained anew, or comes from a file, has none, and its line says how many it lost.
-Crops act on whatever comes.
+Hidden splats are a boolean attribute of their level's points; one modifier drops them (``crops``). A level
+that is trained anew has other points, of which none is hidden: the panel says how many were. Crops act on
+whatever comes.
 """
 
 from __future__ import annotations
@@ -183,7 +183,7 @@ def cameras(context: bpy.types.Context, root: bpy.types.Object) -> list[Camera]:
     if not found:
         raise LodgsError(
             f"'{root.name}' has no cameras.",
-            "Import its photographs, or add cameras where people will stand.",
+            "Import its photographs, or add cameras to the Blender scene.",
         )
     return found
 

@@ -81,7 +81,7 @@ def source_of(root: bpy.types.Object) -> Source | None:
 
 
 def changed(root: bpy.types.Object) -> bool:
-    """Whether the splats that a scene holds are no longer those that came from its file, or some are hidden."""
+    """Whether the splats that a scene holds are other ones than came from its file, or some are hidden."""
     levels = [item.object.data for item in root.lodgs.levels if item.exists]
     if any(HIDDEN in cloud.attributes for cloud in levels):
         return True

@@ -11,19 +11,14 @@ from ..data import cleaning, crops, scenes
 from .parts import OnScene, report_errors
 
 TESTS = [
-    ("LARGE", "Large", "Splats larger than a length: fog, and what stands in the way", "Size"),
-    ("FAINT", "Faint", "Splats of little opacity", "Opacity"),
-    ("FAR", "Far", "Splats far from every camera of the photographs", "Distance"),
-    (
-        "UNSEEN",
-        "Seen by Few",
-        "Splats in the frames of few cameras, whether or not something hides them",
-        "Views",
-    ),
-    ("FLOATERS", "Floaters", "Clusters of few splats with nothing near them", "Gap"),
-    ("SELECTED", "Selected", "Splats that are selected in Edit Mode", ""),
+    ("LARGE", "Large", "Splats larger than a length: fog, and what stands in the way"),
+    ("FAINT", "Faint", "Splats of little opacity"),
+    ("FAR", "Far", "Splats far from every camera of the photographs"),
+    ("UNSEEN", "Seen by Few", "Splats in the frames of few cameras, whether or not something hides them"),
+    ("FLOATERS", "Floaters", "Clusters of few splats with nothing near them"),
+    ("SELECTED", "Selected", "Splats that are selected in Edit Mode"),
 ]
-"""What can be found: identifier, name, description, and the number that it takes."""
+"""What can be found."""
 
 
 class _OnLevels(OnScene):
@@ -111,15 +106,13 @@ class LODGS_OT_remove_crop(_OnLevels, bpy.types.Operator):
 
 
 class LODGS_OT_hide_splats(_OnLevels, bpy.types.Operator):
-    """Hide splats of every level, or select them for Edit Mode: they stay in the file until they are deleted"""
+    """Hide splats of every level, or select them for Edit Mode; hidden ones can be shown again"""
 
     bl_idname = "lodgs.hide_splats"
     bl_label = "Hide Splats"
     bl_options = {"REGISTER", "UNDO"}
 
-    test: bpy.props.EnumProperty(
-        name="Which", description="Which splats are found", items=[test[:3] for test in TESTS]
-    )
+    test: bpy.props.EnumProperty(name="Which", description="Which splats are found", items=TESTS)
     action: bpy.props.EnumProperty(
         name="Do",
         description="What is done with them",
@@ -238,10 +231,10 @@ class LODGS_MT_clean_up(bpy.types.Menu):
             operator = layout.operator("lodgs.add_crop", text=f"Crop Splats to a {shape.title()}", icon=icon)
             operator.shape = shape
         layout.separator()
-        for test, name, *_ in TESTS:
+        for test, name, _ in TESTS:
             layout.operator("lodgs.hide_splats", text=f"Hide {_named(test, name)}").test = test
         layout.separator()
-        for test, name, *_ in TESTS[:-1]:
+        for test, name, _ in TESTS[:-1]:
             operator = layout.operator("lodgs.hide_splats", text=f"Select {_named(test, name)}")
             operator.test, operator.action = test, "SELECT"
         layout.separator()

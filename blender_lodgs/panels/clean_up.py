@@ -28,7 +28,7 @@ class LODGS_PT_clean_up(LevelsPanel):
 
         layout.label(text="Hide splats of all levels:")
         grid = layout.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
-        for test, name, *_ in TESTS:
+        for test, name, _ in TESTS:
             grid.operator("lodgs.hide_splats", text=name).test = test
 
         column = layout.column(align=True)
@@ -37,11 +37,7 @@ class LODGS_PT_clean_up(LevelsPanel):
         lost = {item.number: item.lost for item in cleaning.levels(root) if item.lost}
         if lost:
             counts = ", ".join(f"level {number}: {count:,}" for number, count in lost.items())
-            say(
-                column,
-                f"Hidden splats were lost when levels were renewed ({counts}). Hide them again.",
-                "INFO",
-            )
+            say(column, f"Levels were renewed, and nothing of them is hidden now ({counts} were).", "INFO")
         column = layout.column(align=True)
         column.operator("lodgs.show_hidden_splats", text="Show All Hidden")
         column.operator("lodgs.delete_left_out", text="Delete Hidden and Cropped", icon="TRASH")
