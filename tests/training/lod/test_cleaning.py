@@ -52,6 +52,8 @@ def bundle_of(name, rng):
     if name == "chunks":
         tables[BLOCKS] = table_of_blocks(rule, {level.number: level.splats for level in levels})
     facts = dict.fromkeys(rule.scene_facts, 5.0)
+    if "tau" in facts:
+        facts["tau"] = 0.004
     return Bundle("any", levels, name, facts, cumulative=rule.cumulative, tables=tables)
 
 
