@@ -24,9 +24,8 @@ DRAWN_AS = {"BOX": "CUBE", "SPHERE": "SPHERE"}
 
 def crops_of(root: bpy.types.Object) -> list[bpy.types.Object]:
     """The crops under a root, in the order of their names."""
-    there = {obj for collection in root.users_collection for obj in collection.all_objects}
-    found = [obj for obj in there if obj.lodgs_crop.is_crop and _is_under(obj, root)]
-    return sorted(found, key=lambda obj: obj.name)
+    found = [obj for obj in bpy.data.objects if obj.lodgs_crop.is_crop and _is_under(obj, root)]
+    return sorted((obj for obj in found if obj.users_collection), key=lambda obj: obj.name)
 
 
 def new_crop(root: bpy.types.Object, shape: str, matrix: Matrix) -> bpy.types.Object:

@@ -9,18 +9,19 @@ from __future__ import annotations
 
 import bpy
 
-from . import photographs, tables
+from . import crops, photographs, tables
 
 
 def remove(root: bpy.types.Object) -> None:
-    """Removes a splat scene: levels, tables, points, cameras, the root, and collections that are empty then.
+    """Removes a splat scene: levels, crops, tables, points, cameras, the root, and collections empty then.
 
     What else hangs on the root stays where it is: copies of levels show what they show, without following.
     What the root knows and does not carry, another does: a copy of a root alone knows the same levels.
     """
     views = [view for view in photographs.views(root) if view.data.lodgs.width]
     known = [item.object for item in root.lodgs.levels] + [root.lodgs.points, *views]
-    parts = {obj for obj in known if obj is not None and obj.parent == root} | {root, *tables.parts(root)}
+    parts = {obj for obj in known if obj is not None and obj.parent == root}
+    parts |= {root, *tables.parts(root), *crops.crops_of(root)}
     others = [obj for obj in bpy.data.objects if obj not in parts and obj.is_editable]
     for obj in others:
         _let_go(obj, root)
