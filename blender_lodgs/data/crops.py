@@ -83,14 +83,14 @@ def attach(root: bpy.types.Object) -> None:
         if item.exists:
             if crops or HIDDEN in item.object.data.attributes:
                 _attach(item.object, crops)
-            elif (modifier := modifier_of(item.object)) is not None:
-                take_away(item.object, modifier)
+            else:
+                detach(item.object)
 
 
 def outdated(root: bpy.types.Object) -> bool:
     """Whether crops have come or gone since modifiers were last given them."""
     crops = crops_of(root)
-    return any(_crops_in(item.object) != crops for item in root.lodgs.levels if item.exists)
+    return any(followed_by(item.object) != crops for item in root.lodgs.levels if item.exists)
 
 
 def modifier_of(obj: bpy.types.Object) -> bpy.types.NodesModifier | None:
@@ -101,6 +101,23 @@ def modifier_of(obj: bpy.types.Object) -> bpy.types.NodesModifier | None:
         ):
             return modifier
     return None
+
+
+def followed_by(obj: bpy.types.Object) -> list[bpy.types.Object | None]:
+    """The objects that a level's modifier follows."""
+    modifier = modifier_of(obj)
+    if modifier is None or modifier.node_group is None:
+        return []
+    count = range(1, modifier.node_group[groups.COUNT] + 1)
+    names = [groups.OBJECT.format(number) for number in count]
+    return [compat.get_input(modifier, name) for name in names if compat.has_input(modifier, name)]
+
+
+def detach(obj: bpy.types.Object) -> None:
+    """Takes the modifier that follows crops off a level, or a copy of one."""
+    modifier = modifier_of(obj)
+    if modifier is not None:
+        take_away(obj, modifier)
 
 
 def _is_under(obj: bpy.types.Object | None, root: bpy.types.Object) -> bool:
@@ -119,22 +136,11 @@ def _crop(
     return Crop.at("SPHERE" if sphere else "BOX", matrix, outside)
 
 
-def _crops_in(obj: bpy.types.Object) -> list[bpy.types.Object | None]:
-    """The objects that a level's modifier follows."""
-    modifier = modifier_of(obj)
-    if modifier is None or modifier.node_group is None:
-        return []
-    count = range(1, modifier.node_group[groups.COUNT] + 1)
-    names = [groups.OBJECT.format(number) for number in count]
-    return [compat.get_input(modifier, name) for name in names if compat.has_input(modifier, name)]
-
-
 def _attach(obj: bpy.types.Object, crops: list[bpy.types.Object]) -> None:
     modifier = modifier_of(obj)
-    if modifier is not None:
-        if groups.serves(modifier.node_group, len(crops)) and _crops_in(obj) == crops:
-            return
-        take_away(obj, modifier)
+    if modifier is not None and groups.serves(modifier.node_group, len(crops)) and followed_by(obj) == crops:
+        return
+    detach(obj)
     modifier = obj.modifiers.new(groups.NAME, "NODES")
     assert isinstance(modifier, bpy.types.NodesModifier)
     modifier.node_group, modifier.show_expanded = groups.crops_group(len(crops)), False
