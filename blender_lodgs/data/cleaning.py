@@ -214,12 +214,14 @@ def suggestions(context: bpy.types.Context, root: bpy.types.Object) -> dict[str,
 
 
 def bounds(root: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
-    """Corners, along the world's axes, of a box around nine tenths of the finest level on each: (3,) each."""
+    """Corners (3,), along the world's axes, of a box with some room around nine tenths of the finest level on
+    each: flat ground often lies in its outermost layer."""
     means = _view(levels(root)[-1].object.data, "position")
     matrix = np.array(root.matrix_world, np.float64)
     placed = means[:: max(len(means) // 100_000, 1)] @ matrix[:3, :3].T + matrix[:3, 3]
     low, high = np.quantile(placed, (0.05, 0.95), axis=0)
-    return low, np.maximum(high, low + 1e-3 * max((high - low).max(), 1e-6))
+    room = 0.05 * np.maximum(high - low, 0.1 * max((high - low).max(), 1e-6))
+    return low - room, high + room
 
 
 def levels(root: bpy.types.Object) -> list[SplatLevel]:
