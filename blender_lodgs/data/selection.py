@@ -150,13 +150,29 @@ def attach(root: bpy.types.Object) -> None:
                 _detach(item.object)
                 continue
             _drive_level(root, item.object, rule, facts)
+    _order(root)
     update_inputs(root)
 
 
 def follow_crops(root: bpy.types.Object) -> None:
     """Has the levels' modifiers follow the crops and hidden splats that there are now."""
     crops.attach(root)
+    _order(root)
     update_inputs(root)
+
+
+def _order(root: bpy.types.Object) -> None:
+    """Crops come before a rule that asks how many splats there are; else after it, where fewer are left."""
+    rule = find_rule(root.lodgs.rule)
+    for item in root.lodgs.levels if rule else ():
+        cropping, own = (
+            (crops.modifier_of(item.object), _modifier(item.object)) if item.exists else (None, None)
+        )
+        if cropping and own and rule:
+            modifiers = item.object.modifiers
+            place, there = modifiers.find(cropping.name), modifiers.find(own.name)
+            if (place < there) == rule.apart:
+                modifiers.move(place, there)
 
 
 def outdated(root: bpy.types.Object) -> bool:
