@@ -27,6 +27,16 @@ from .properties import SplatLevel
 SELECTION = ".selection"
 """Blender's own attribute of the points that are selected in Edit Mode."""
 
+TESTS = [
+    ("LARGE", "Large", "Splats larger than a length: fog, and what stands in the way"),
+    ("FAINT", "Faint", "Splats of little opacity"),
+    ("FAR", "Far", "Splats far from every camera of the photographs"),
+    ("UNSEEN", "Seen by Few", "Splats in the frames of few cameras, whether or not something hides them"),
+    ("FLOATERS", "Floaters", "Clusters of few splats with nothing near them"),
+    ("SELECTED", "Selected", "Splats that are selected in Edit Mode"),
+]
+"""What can be found, as Blender lists it."""
+
 Test = Callable[[bpy.types.PointCloud], np.ndarray]
 """Which splats of a level it finds, (N,) bool."""
 

@@ -10,16 +10,6 @@ from ...training.lod.cleaning import SHARE
 from ..data import cleaning, crops, scenes
 from .parts import OnScene, report_errors
 
-TESTS = [
-    ("LARGE", "Large", "Splats larger than a length: fog, and what stands in the way"),
-    ("FAINT", "Faint", "Splats of little opacity"),
-    ("FAR", "Far", "Splats far from every camera of the photographs"),
-    ("UNSEEN", "Seen by Few", "Splats in the frames of few cameras, whether or not something hides them"),
-    ("FLOATERS", "Floaters", "Clusters of few splats with nothing near them"),
-    ("SELECTED", "Selected", "Splats that are selected in Edit Mode"),
-]
-"""What can be found."""
-
 
 class _OnLevels(OnScene):
     """An operator that changes the levels of the active splat scene."""
@@ -112,7 +102,7 @@ class LODGS_OT_hide_splats(_OnLevels, bpy.types.Operator):
     bl_label = "Hide Splats"
     bl_options = {"REGISTER", "UNDO"}
 
-    test: bpy.props.EnumProperty(name="Which", description="Which splats are found", items=TESTS)
+    test: bpy.props.EnumProperty(name="Which", description="Which splats are found", items=cleaning.TESTS)
     action: bpy.props.EnumProperty(
         name="Do",
         description="What is done with them",
@@ -231,10 +221,10 @@ class LODGS_MT_clean_up(bpy.types.Menu):
             operator = layout.operator("lodgs.add_crop", text=f"Crop Splats to a {shape.title()}", icon=icon)
             operator.shape = shape
         layout.separator()
-        for test, name, _ in TESTS:
+        for test, name, _ in cleaning.TESTS:
             layout.operator("lodgs.hide_splats", text=f"Hide {_named(test, name)}").test = test
         layout.separator()
-        for test, name, _ in TESTS[:-1]:
+        for test, name, _ in cleaning.TESTS[:-1]:
             operator = layout.operator("lodgs.hide_splats", text=f"Select {_named(test, name)}")
             operator.test, operator.action = test, "SELECT"
         layout.separator()

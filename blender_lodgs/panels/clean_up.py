@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from ..data import cleaning, crops, scenes
-from ..operators.clean_up import TESTS
 from .parts import LevelsPanel, say
 
 
@@ -28,7 +27,7 @@ class LODGS_PT_clean_up(LevelsPanel):
 
         layout.label(text="Hide splats of all levels:")
         grid = layout.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
-        for test, name, _ in TESTS:
+        for test, name, _ in cleaning.TESTS:
             grid.operator("lodgs.hide_splats", text=name).test = test
 
         column = layout.column(align=True)
