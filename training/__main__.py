@@ -201,6 +201,50 @@ def _parser() -> argparse.ArgumentParser:
         "--matrix", type=_reals(16), metavar="A,B,...",
         help="16 numbers, row by row, instead of these three; no stretching, shearing, mirroring",
     )  # fmt: skip
+    edit = commands.add_parser(
+        "edit",
+        help="a copy without clutter: what lies outside of crops, floaters, splats that are too large",
+        description="Every level is edited alike, and stays what its rule chooses from. Places and lengths "
+        "are in the splats' own units; lodgs info tells their bounds.",
+    )
+    edit.add_argument("source", type=Path, help="bundle, folder of levels or any 3DGS PLY")
+    edit.add_argument("--out", type=Path, required=True, help="file, or folder, to write")
+    edit.add_argument(
+        "--crop-box", type=float, nargs=6, action="append", default=[], metavar="N",
+        help="two opposite corners of a box, X Y Z X Y Z; of several boxes and spheres any one counts",
+    )  # fmt: skip
+    edit.add_argument(
+        "--crop-sphere", type=float, nargs=4, action="append", default=[], metavar="N",
+        help="centre and radius of a sphere, X Y Z R",
+    )  # fmt: skip
+    edit.add_argument(
+        "--keep", choices=("inside", "outside"), default="inside",
+        help="what stays of boxes and spheres (default inside)",
+    )  # fmt: skip
+    edit.add_argument(
+        "--max-size", type=float, metavar="N", help="drop splats with a larger standard deviation"
+    )
+    edit.add_argument("--min-opacity", type=float, metavar="N", help="drop fainter splats; from 0 to 1")
+    edit.add_argument(
+        "--drop-floaters", action="store_true", help="drop clusters of few splats with nothing near them"
+    )
+    edit.add_argument(
+        "--gap", type=float, metavar="N",
+        help="how far off floaters are at least (otherwise by how far most splats reach)",
+    )  # fmt: skip
+    edit.add_argument(
+        "--share", type=float, metavar="N",
+        help="how large clusters of floaters are at most, as a share of all splats (default 0.001)",
+    )  # fmt: skip
+    edit.add_argument(
+        "--scene", type=Path, metavar="DIR", help="COLMAP folder of the photographs, for the next two"
+    )
+    edit.add_argument(
+        "--max-distance", type=float, metavar="N", help="drop splats farther from every photograph's eye"
+    )
+    edit.add_argument(
+        "--min-views", type=int, metavar="N", help="drop splats in the frames of fewer photographs"
+    )
 
     info = commands.add_parser("info", help="say what a bundle or any 3DGS PLY holds")
     info.add_argument("file", type=Path)
@@ -436,6 +480,34 @@ def _serve(chosen: argparse.Namespace) -> int:
     return serve(chosen.folder, chosen.backend, sys.stdin.buffer, sys.stdout)
 
 
+def _edit(chosen: argparse.Namespace) -> int:
+    from .lod.cleaning import Cleaning
+    from .lod.crop import Crop
+    from .lod.edit import edit
+
+    names = "max_size", "min_opacity", "max_distance", "min_views", "gap", "share"
+    given = {name: value for name in names if (value := getattr(chosen, name)) is not None}
+    for name, value in given.items():
+        if not 0 <= value < float("inf"):
+            raise LodgsError(f"--{name.replace('_', '-')} cannot be {value:g}.", "Give a number from 0 on.")
+    outside = chosen.keep == "outside"
+    crops = [Crop.box(box[:3], box[3:], outside) for box in chosen.crop_box]
+    crops += [Crop.sphere(sphere[:3], sphere[3], outside) for sphere in chosen.crop_sphere]
+    if given.keys() & {"max_distance", "min_views"}:
+        if chosen.scene is None:
+            raise LodgsError("Photographs' views are in their scene.", "Name its folder with --scene.")
+        from .scenes.colmap import read_scene
+
+        given["cameras"] = tuple(read_scene(chosen.scene).cameras)
+    print(
+        edit(
+            chosen.source, chosen.out,
+            Cleaning(tuple(crops), drop_floaters=chosen.drop_floaters, **given), _warn,
+        )
+    )  # fmt: skip
+    return 0
+
+
 def _info(chosen: argparse.Namespace) -> int:
     from .lod.describe import describe
 
@@ -491,6 +563,7 @@ _COMMANDS = {
     "model": _model,
     "serve": _serve,
     "transform": _transform,
+    "edit": _edit,
     "info": _info,
 }
 

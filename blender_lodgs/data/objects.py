@@ -22,6 +22,7 @@ from ..attributes import (
     BASE,
     COLOR,
     COLUMN,
+    HIDDEN,
     LAYOUTS,
     LOG_SCALE,
     OPACITY_LOGIT,
@@ -36,7 +37,9 @@ from ..attributes import (
 )
 from ..nodes import display
 
-_OWN = {"position", BASE, SCALE, ROTATION, LOG_SCALE, OPACITY_LOGIT, QUATERNION, COLOR, RADIUS, WEIGHT}
+_OWN = {
+    "position", BASE, SCALE, ROTATION, LOG_SCALE, OPACITY_LOGIT, QUATERNION, COLOR, RADIUS, WEIGHT, HIDDEN,
+}  # fmt: skip
 _TYPE = "lodgs_type:"  # custom property that remembers a column's type
 _EXTRA = COLUMN.format("")
 _MADE = ("scenes", "objects", "collections", "pointclouds", "meshes", "cameras", "images")

@@ -82,6 +82,12 @@ class SplatLevel(bpy.types.PropertyGroup):
         name="Facts", description="What the rule needs to know of the level, as JSON", options={"HIDDEN"}
     )
 
+    lost: bpy.props.IntProperty(
+        name="No Longer Hidden",
+        description="How many splats were hidden of the level whose place this one has taken",
+        options={"HIDDEN"},
+    )
+
     @property
     def exists(self) -> bool:
         """False once an artist has deleted the level's object, which the list still remembers, or changed
@@ -441,6 +447,26 @@ class ViewSettings(bpy.types.PropertyGroup):
     )
 
 
+class CropSettings(bpy.types.PropertyGroup):
+    """What an empty under a scene root crops (``Object.lodgs_crop``); see ``crops``."""
+
+    is_crop: bpy.props.BoolProperty(
+        name="Crop", description="Whether the empty crops the splats of its scene", options={"HIDDEN"}
+    )
+    keep: bpy.props.EnumProperty(
+        name="Keep",
+        description="What is left of the splats, at every level",
+        items=[
+            ("INSIDE", "Keep Inside", "Splats in this crop stay, and those in others that keep theirs"),
+            ("OUTSIDE", "Cut Out", "Splats in this crop go"),
+        ],
+        update=_changed,
+    )
+    use: bpy.props.BoolProperty(
+        name="Use", description="Whether the crop has an effect", default=True, update=_changed
+    )
+
+
 class RenderSettings(bpy.types.PropertyGroup):
     """How the engine LODGS renders a Blender scene (``Scene.lodgs_render``)."""
 
@@ -512,13 +538,14 @@ SplatScene.__annotations__ |= {
 
 CLASSES = (
     ViewSettings, ViewportSettings, *PARAMETERS.values(), TrainingCell, TrainingSettings, SplatLevel,
-    SplatTable, SplatStream, *CONTROLS.values(), SplatScene, RenderSettings, CaptureSettings,
+    SplatTable, SplatStream, *CONTROLS.values(), SplatScene, CropSettings, RenderSettings, CaptureSettings,
 )  # fmt: skip
 
 
 def register() -> None:
     """Attach the groups to Blender's objects, cameras and scenes."""
     bpy.types.Object.lodgs = bpy.props.PointerProperty(type=SplatScene)
+    bpy.types.Object.lodgs_crop = bpy.props.PointerProperty(type=CropSettings)
     bpy.types.Camera.lodgs = bpy.props.PointerProperty(type=ViewSettings)
     bpy.types.Scene.lodgs_render = bpy.props.PointerProperty(type=RenderSettings)
     bpy.types.Scene.lodgs_viewport = bpy.props.PointerProperty(type=ViewportSettings)
@@ -531,4 +558,5 @@ def unregister() -> None:
     del bpy.types.Scene.lodgs_render
     del bpy.types.Scene.lodgs_viewport
     del bpy.types.Camera.lodgs
+    del bpy.types.Object.lodgs_crop
     del bpy.types.Object.lodgs

@@ -27,7 +27,7 @@ from ...training.scenes.colmap import Scene, read_scene
 from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder, read_head
 from ...training.splats.gaussians import Splats
 from ..nodes import ellipsoids
-from . import objects, selection, streams, tables
+from . import cleaning, crops, objects, selection, streams, tables
 from .objects import root_of
 from .photographs import match_render, new_camera, views
 from .placement import axes_of, new_axes, placement_of
@@ -362,12 +362,15 @@ def make_room(root: bpy.types.Object, number: int) -> None:
 def read_levels(root: bpy.types.Object, placed: bool = False) -> Bundle:
     """The levels of a splat scene with all that artists have changed in them, modifiers not applied.
 
+    What is hidden, and what crops leave out, is not among them.
+
     Args:
         placed: where the scene stands in Blender, upright there; otherwise in the splats' own world. What of
             its objects has been moved by itself counts in neither.
 
     Raises:
-        LodgsError: there are none; or of a placed one, its root is stretched or its rule unknown.
+        LodgsError: there are none, or crops leave nothing; or of a placed one, its root is stretched or its
+            rule unknown.
     """
     levels = [
         Level(item.number, objects.read_splats(item.object), selection.read_facts(item.facts))
@@ -382,10 +385,34 @@ def read_levels(root: bpy.types.Object, placed: bool = False) -> Bundle:
         settings.method, levels, settings.rule, facts, _set_controls(root), settings.cumulative, meta,
         tables.read_tables(root),
     )  # fmt: skip
+    bundle = cleaning.left(root, bundle, bpy.context.evaluated_depsgraph_get())
     if placed:
         bundle = placing.placed(bundle, placement_of(root))
         bundle.meta["up_rotation"] = np.eye(3)
     return bundle
+
+
+def delete_left_out(root: bpy.types.Object) -> int:
+    """Deletes what is hidden and what crops leave out, of every level, and the crops; how many splats.
+
+    Raises:
+        LodgsError: as :func:`read_levels`, or the levels are only the top of a tree in a file.
+    """
+    file = streams.file_of(root)
+    if file is not None:
+        raise LodgsError(
+            f"Most of these splats are in {file.name}, which stays as it is.",
+            "Keep the crops; or edit the file with the command lodgs edit, and import what that writes.",
+        )
+    before = sum(len(item.object.data.points) for item in root.lodgs.levels if item.exists)
+    bundle = read_levels(root)
+    for level in bundle.levels:
+        _put_level(root, level)
+    for item in root.lodgs.levels:
+        item.lost = 0
+    bpy.data.batch_remove(crops.crops_of(root))
+    _levels_changed(root)
+    return before - sum(len(level.splats) for level in bundle.levels)
 
 
 def read_level(root: bpy.types.Object, number: int, placed: bool = False) -> Splats:
@@ -603,6 +630,7 @@ def _put_level(
     elif item.exists:
         # The object stays, with all that artists have hung on it; only its splats change.
         old, obj = item.object.data, item.object
+        item.lost = int(cleaning.hidden(old).sum())
         obj.data, obj.color = fresh.data, fresh.color
         bpy.data.objects.remove(fresh)
         name = old.name
@@ -650,6 +678,10 @@ def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
         for root in editable:
             if not all(item.exists for item in root.lodgs.levels):
                 _levels_changed(root)
+    if depsgraph.id_type_updated("OBJECT"):
+        for root in editable:
+            if crops.outdated(root):
+                selection.follow_crops(root)
     if any(update.is_updated_geometry for update in depsgraph.updates):
         for root in editable:
             selection.update_inputs(root)

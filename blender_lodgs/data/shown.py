@@ -113,7 +113,7 @@ def choice_of_picture(instance: SplatInstance, depsgraph: bpy.types.Depsgraph) -
     """
     choice = selection.choice(instance.evaluated, depsgraph)
     root, camera = scenes.root_of(instance.object), depsgraph.scene.camera
-    if choice is None or instance.source is None or root is None or camera is None:
+    if choice is None or not choice.rule or instance.source is None or root is None or camera is None:
         return choice
     settings = root.lodgs
     if settings.eye != "VIEW" or settings.freeze:

@@ -346,6 +346,11 @@ class Standing:
             reached, up = further, higher
         return inner, reached
 
+    @property
+    def parents(self) -> np.ndarray:
+        """(N,) int32, at which place each splat's parent is; -1 where it is not there, or it has none."""
+        return self._parents
+
     def _family(self, places: np.ndarray, size: str, axes: Sequence[str]) -> np.ndarray:
         """(M, 4) by which children and parents know each other."""
         columns = [self._columns[name][places] for name in (size, *axes)]

@@ -28,6 +28,9 @@ NO_FINER = 1 << 30
 OPACITY = "opacity"
 """The column that every splat has: its own opacity, in [0, 1]."""
 
+HIDDEN = "hidden"
+"""The column of splats that somebody has hidden: not 0 where they are."""
+
 Values = Mapping[str, float]
 """A number for each control of a rule, by name."""
 
@@ -272,6 +275,18 @@ def rules() -> dict[str, Rule]:
     return {module.RULE.name: module.RULE for module in modules}
 
 
+class Everything(Rule):
+    """What stands for a rule where there is none: all splats are drawn."""
+
+    name = ""
+
+    def weights(self, means, eye, focal_px, columns, facts, values, tables=NO_TABLES) -> np.ndarray:
+        return np.ones(len(means), np.float32)
+
+
+EVERYTHING = Everything()
+
+
 def find_rule(name: str) -> Rule | None:
     """The rule of that name; None where there is none, or this version does not know it."""
     return rules().get(name)
@@ -283,8 +298,8 @@ def every_control() -> dict[str, Control]:
 
 
 def every_column() -> set[str]:
-    """The columns of all rules, but the opacity."""
-    return {name for rule in rules().values() for name in rule.columns} - {OPACITY}
+    """The columns of all rules, but the opacity; and HIDDEN, which choices ask for beside them."""
+    return {name for rule in rules().values() for name in rule.columns} - {OPACITY} | {HIDDEN}
 
 
 def fact_names(rule: Rule) -> list[str]:

@@ -301,8 +301,8 @@ class DrawableRows:
     def __len__(self) -> int:
         return len(self._rows) if self._kept is None else len(self._kept)
 
-    def select(self, some: slice, /) -> Splats:
-        """The splats of a range of rows."""
+    def select(self, some: slice | np.ndarray, /) -> Splats:
+        """The splats of a range of rows, or of some rows (M,) ascending."""
         return drawable(self._meant(some if self._kept is None else self._kept[some]), self._rows.path)
 
     def _meant(self, some: slice | np.ndarray, warn: Warn = silent) -> Splats:
