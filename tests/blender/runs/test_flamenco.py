@@ -113,7 +113,8 @@ def test_the_job_is_what_the_panel_says(bpy, lodgs, manager, root, tmp_path):
     }  # fmt: skip
     assert said == {
         "scene": str(tmp_path / "scene"), "output": str(tmp_path / "runs" / "tiny"), "columns": 2, "rows": 3,
-        "method": "octree", "preset": "standard", "image_scale": 0.65, "polish": 100,
+        "method": "octree", "preset": "standard", "image_scale": 0.65,
+        "polish": lodgs("training.runs.job").Job.polish,
         "lodgs": "{lodgs}",
     }  # fmt: skip
     split = shlex.split(options)
