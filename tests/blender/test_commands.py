@@ -215,3 +215,18 @@ def test_the_trainer_outlives_blender(bpy, lodgs, fake, tmp_path):
     while run.state() != "cancelled":
         assert time.monotonic() < end
         time.sleep(0.05)
+
+
+def test_cells_are_trained_in_one_command(bpy, lodgs, lodgs_command, fake, tmp_path, capfd):
+    fake()
+    run, blend = tmp_path / "run", tmp_path / "out.blend"
+    run.mkdir()
+    (run / "go on").touch()
+    command = ["train", "--scene", SCENE, "--cells", "2x1", "--out", run, "--blend", blend]
+    assert lodgs_command(*command) == 0
+    assert "Training blocks" in capfd.readouterr().err.splitlines()
+    assert lodgs("training.runs.job").Job.from_file(run / "job.toml").cells == "2x1"
+    bpy.ops.wm.open_mainfile(filepath=str(blend))
+    (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
+    assert (root.lodgs.training.columns, root.lodgs.training.rows) == (2, 1), "which the panel then shows"
+    assert lodgs_command(*command) == 0, "it is finished"
