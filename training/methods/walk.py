@@ -11,7 +11,7 @@ NEIGHBOURS = 100
 """How many of its nearest views may follow a view, at most; the authors have so many, of thousands."""
 SHARE = 1 / 12
 """Of all views those that may follow one, where there are fewer: all would be near otherwise."""
-FEWEST = 8
+FEWEST = 4
 """But so many may always."""
 BLOCK = 128
 """Of so many steps the first one's view is random."""

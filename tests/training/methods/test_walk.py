@@ -49,6 +49,13 @@ def test_it_stays_nearer_than_a_shuffle():
     assert away[within].max() < 7 < np.mean(away[~within])
 
 
+@pytest.mark.parametrize(("count", "most"), [(1, 0), (3, 2), (30, 4), (48, 4), (240, 20), (3000, 100)])
+def test_near_views_are_a_share_of_all(count, most):
+    """A twelfth, at least 4 and at most 100, as far as there are others."""
+    centers = np.random.default_rng(3).random((count, 3))
+    assert Walk(centers, 0).neighbours.shape == (count, most)
+
+
 def test_every_view_is_seen_and_begins_a_block_as_often_as_any_other():
     walk = Walk(CENTERS, 1, neighbours=3)
     first = [walk(block * BLOCK) for block in range(3 * len(CENTERS))]
