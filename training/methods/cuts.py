@@ -20,7 +20,7 @@ FLUSH_INTERVAL = 1000
 REDUCED = 0.8
 """Share of the room that is taken after the least recently used has gone."""
 BESIDE = 17
-"""Bytes kept of each row here beside its numbers: which it is, where, of which group, whether changed."""
+"""Bytes that are kept of each row here beside its numbers: which row, its group, whether changed, places."""
 PLACE = 4
 """Bytes that are kept of each row there is: where it is here."""
 

@@ -34,8 +34,8 @@ BLOCK = 16
 """Rows of a block. Of rows that a step brings half as many bytes are written as with 64: blocks are whole."""
 TABLES = 21
 """Bytes in memory for each block, at most: where it is, its checksum, and where checkpoints have it."""
-NEAR = 2
-"""What is read skips no more blocks than this: reading them takes less time than another call."""
+NEAR = 4
+"""Blocks between two that are wanted, at most, which are read with them: it takes less time than a call."""
 STAGING = 3 << 18
 """Bytes of blocks that are between file and tensors at a time; in up to six copies, all told."""
 KEPT = 2

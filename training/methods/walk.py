@@ -8,11 +8,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 NEIGHBOURS = 100
-"""How many of its nearest views may follow a view, at most; the authors have so many, of thousands."""
-SHARE = 1 / 12
-"""Of all views those that may follow one, where there are fewer: all would be near otherwise."""
-FEWEST = 8
-"""But so many may always."""
+"""How many of its nearest views may follow a view, as the authors have it."""
 BLOCK = 128
 """Of so many steps the first one's view is random."""
 SPREAD = 1.0
@@ -31,7 +27,7 @@ class Walk:
 
     Args:
         centers: (V, 3) of the cameras, V >= 1.
-        neighbours: k, no more than there are others; 0: as NEIGHBOURS, SHARE and FEWEST say.
+        neighbours: k; no more than there are others.
         spread: W over the median distance; the larger, the less the distance counts.
         block: steps from one random view to the next.
 
@@ -44,13 +40,13 @@ class Walk:
         self,
         centers: np.ndarray,
         seed: int,
-        neighbours: int = 0,
+        neighbours: int = NEIGHBOURS,
         spread: float = SPREAD,
         block: int = BLOCK,
     ) -> None:
         count = len(centers)
         self._seed, self._block = seed, block
-        k = min(neighbours or min(max(FEWEST, round(SHARE * count)), NEIGHBOURS), count - 1)
+        k = min(neighbours, count - 1)
         distances, found = KDTree(centers).query(centers, k + 1)
         found, distances = found.reshape(count, k + 1), distances.reshape(count, k + 1)
         # itself is among them: not always first where cameras stand in one place, nor at all where many do
