@@ -22,7 +22,7 @@ const JOB_TYPE = {
           description: "How long to train" },
         { key: "image_scale", type: "float", default: 0.5, propargs: { min: 0.01, max: 1 },
           description: "Size of training images over photographs" },
-        { key: "polish", type: "int32", default: 100, propargs: { min: 0 },
+        { key: "polish", type: "int32", default: 300, propargs: { min: 0 },
           description: "Steps that fit each cell's borders to the cells beside it; 0 for none" },
         { key: "options", type: "string", default: "",
           description: "Further options of lodgs train, such as --set max_splats=500000" },

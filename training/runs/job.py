@@ -23,7 +23,7 @@ DOME = "dome"
 """What ``capture`` is for views from all around."""
 VIEWS, VIEW_WIDTHS = (2, 2000), (32, 8192)
 """Bounds of how many views a dome has, and of the pixels that their pictures are wide."""
-POLISH = 100
+POLISH = 300
 """Steps that fit a cell's borders to the cells beside it, if nothing is said."""
 MOST_CELLS = 256
 """Most cells of a scene."""

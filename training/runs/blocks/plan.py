@@ -35,17 +35,17 @@ COARSE, BLOCK, SEAM = "coarse", "block", "seam"
 POLISHED_BY = "3dgs"
 """What fits a cell's borders to those beside it: at full detail all methods' splats are its."""
 STILL = {
-    "lr_means": 0.0, "lr_means_final": 0.0, "lr_quats": 0.0, "lr_scales": 0.0, "lr_opacities": 5e-3,
-    "lr_sh": 5e-4, "densify_until": 0.0, "prune_interval": 0, "opacity_reset_interval": 0,
+    "lr_means": 0.0, "lr_means_final": 0.0, "lr_quats": 0.0, "lr_scales": 0.0, "lr_opacities": 1e-2,
+    "lr_sh": 1e-3, "densify_until": 0.0, "prune_interval": 0, "opacity_reset_interval": 0,
     "least_weight": 0.0, "first_resolution": 1.0, "free_depth": 0.0, "largest": 0.0, "margin": 0.0,
 }  # fmt: skip
 """Its parameters there: colours and opacities are fitted; splats neither move nor come or go, so that each
 stays in its cell, and as large as its level allows."""
 SLIMMEST = 2.5
 """No cells that are so many times longer than wide are chosen."""
-PROGRAM_BYTES = 600e6
+PROGRAM_BYTES = 650e6
 """What a trainer takes of memory without splats and photographs, about."""
-SPLAT_BYTES = 1_500
+SPLAT_BYTES = 2_300
 """What it takes for each splat that it trains, of degree 3, about."""
 
 

@@ -12,12 +12,13 @@ import pytest
 
 from training.errors import LodgsError
 from training.runs.blocks import workers as workers_module
-from training.runs.blocks.plan import write_plan
+from training.runs.blocks.plan import read_plan, write_plan
 from training.runs.blocks.workers import train_block, workers
 from training.runs.events import event_line
 from training.runs.folder import RunFolder
+from training.runs.train import train
 
-from .test_blocks import job_for
+from .test_blocks import TINY, job_for
 
 
 @pytest.fixture
@@ -78,13 +79,21 @@ def test_a_block_that_was_asked_to_stop_does_not_begin(block):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_a_worker_of_dask_trains_a_block(block):
+@pytest.mark.timeout(900)
+def test_workers_of_dask_make_the_bundle_that_is_made_here(tiny_scene, tmp_path):
+    """Coarse levels, blocks and seams, two at a time."""
     pytest.importorskip("distributed")
-    with workers("local:1", {"GPU": 1}) as submit:
-        assert submit(block.path).result() == 0
-    assert block.state() == "done" and block.bundle.exists()
-    assert Path(block.log).exists()
+    steps = {"levels": 3, "steps": [15, 15, 15], "footprint": 6.0}
+    here, there = (
+        job_for(tiny_scene, tmp_path / name, "flod", test_every=0, polish=4, parameters={**TINY, **steps})
+        for name in ("here", "there")
+    )
+    assert train(here) == 0 and train(there, on="local:2", resources={"GPU": 1}) == 0
+    division = read_plan(RunFolder(there.out))
+    parts = [part for stage in division.stages for part in stage]
+    assert [part.kind for part in parts] == ["coarse", "block", "block", "seam", "seam"]
+    assert all(part.folder.state() == "done" and part.folder.log.exists() for part in parts)
+    assert RunFolder(there.out).bundle.read_bytes() == RunFolder(here.out).bundle.read_bytes()
 
 
 PRINTS_ITS_CARD = """
