@@ -38,7 +38,7 @@ class LODGS_UL_blocks(bpy.types.UIList):
         part = watch.part(number) if watch else None
         if watch is not None and part is not None:
             row = _numbered(layout, number).row(align=True)
-            _draw_part(row, part, stopping=number in watch.stopping)
+            _draw_part(row, part, stopping=(part.kind, number) in watch.stopping)
             if watch.running and part.state in ("waiting", "running"):
                 row.operator("lodgs.cancel_block", text="", icon="X", emboss=False).block = number
             elif part.state != "done":

@@ -167,7 +167,7 @@ def cancel_block(root: bpy.types.Object, number: int) -> None:
     if watch is None or part is None or part.state not in {"waiting", "running"}:
         raise LodgsError(f"Cell {number} of '{root.name}' is not being trained.")
     _ask(part.folder.request_cancel)
-    watch.stopping.add(number)
+    watch.stopping.add((part.kind, number))
     extension.redraw()
 
 

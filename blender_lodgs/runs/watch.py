@@ -63,7 +63,7 @@ class Watch:
         summary: of a finished run the ``done`` event, with what it is worth.
         warnings: the warnings of this run.
         cancel_requested: whether it was asked to stop.
-        stopping: numbers of cells that were asked to stop by themselves.
+        stopping: kinds and cells' numbers of parts that were asked to stop by themselves.
         method: what it trains.
         last_event: when an event came last, in seconds since the epoch.
         offset: bytes of the run's events that have been read.
@@ -83,7 +83,7 @@ class Watch:
     summary: dict = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     cancel_requested: bool = False
-    stopping: set[int] = field(default_factory=set)
+    stopping: set[tuple[str, int]] = field(default_factory=set)
     method: str = ""
     last_event: float = field(default_factory=time.time)
     offset: int = 0
@@ -189,8 +189,9 @@ class Watch:
 
     def _take_blocks(self, root: bpy.types.Object, blocks: list[dict]) -> None:
         self.blocks = blocks
-        parts = map(self.part, self.stopping)
-        self.stopping = {part.number for part in parts if part and part.state in ("waiting", "running")}
+        self.stopping &= {
+            (each["kind"], each["block"]) for each in blocks if each["state"] in ("waiting", "running")
+        }
         cells.require(root.lodgs.training, self.cells)
 
     def _add_level(self, root: bpy.types.Object, event: dict) -> None:

@@ -1,6 +1,5 @@
 """What the training panel says and offers, drawn into a layout that takes notes."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -125,10 +124,8 @@ def test_distances_can_be_given_by_hand(bpy, lodgs, root, draw, fake):
     assert not any("Give falling numbers" in text for text in draw().texts)
 
 
-def test_what_training_starts_from_is_asked_where_a_method_can_choose(lodgs, root, draw, fake, monkeypatch):
+def test_what_training_starts_from_is_asked_where_a_method_can_choose(root, draw, fake):
     assert "start_from" not in draw().properties
-    methods = lodgs("training.methods").METHODS
-    monkeypatch.setitem(methods, "3dgs", replace(methods["3dgs"], from_base=True))
     root.lodgs.training.method = "3dgs"
     assert "start_from" in draw().properties and "base" not in draw().properties
     root.lodgs.training.start_from = "FILE"

@@ -70,28 +70,30 @@ def test_the_plan_is_offered_for_more_than_one_cell(bpy, root, draw, line):
     assert line("cells", 1).colors == [(*level_color(2), 1.0)]
 
 
-def test_cells_are_found_by_what_one_may_have(bpy, root, draw, fake):
-    settings = root.lodgs.training
-    settings.divide_by = "SPLATS"
-    most = settings.parameters.preset_max_splats
-    settings.cell_splats = most
+def test_cells_are_found_by_what_one_may_have(bpy, lodgs, root, draw, monkeypatch):
+    cells, settings, asked = lodgs("data.cells"), root.lodgs.training, []
+    real = cells.cells_within
+
+    def found(job, splats, memory, scene):
+        asked.append((job.cells, splats, memory))
+        return grid or real(job, splats, memory, scene)
+
+    monkeypatch.setattr(cells, "cells_within", found)
+    settings.divide_by, settings.cell_splats, grid = "SPLATS", settings.parameters.preset_max_splats, ""
     assert draw().properties == ["divide_by", "cell_splats", "at_once"]
     bpy.ops.lodgs.plan_cells()
     assert (settings.columns, settings.rows) == (1, 1), "it fits as it is"
     assert not any("plan again" in text for text in draw().texts)
-    settings.cell_splats = most * 9 // 10
+    settings.cell_splats, grid = 5000, "2x1"
     assert "Planned for other settings: plan again." in draw().texts
     bpy.ops.lodgs.plan_cells()
-    assert settings.columns * settings.rows == len(settings.planned_cells) > 1
-    assert max(cell.splats for cell in settings.planned_cells) <= settings.cell_splats
-    settings.divide_by = "MEMORY"
-    settings.cell_memory = 64.0
+    assert asked[-1] == ("1x1", 5000, 0)
+    assert (settings.columns, settings.rows, len(settings.planned_cells)) == (2, 1, 2)
+    settings.divide_by, settings.cell_memory, grid = "MEMORY", 0.5, ""
     assert draw().properties[:2] == ["divide_by", "cell_memory"]
-    bpy.ops.lodgs.plan_cells()
-    assert (settings.columns, settings.rows) == (1, 1)
-    settings.cell_memory = 0.5
-    with pytest.raises(RuntimeError, match="a block"):
+    with pytest.raises(RuntimeError, match="cells"):
         bpy.ops.lodgs.plan_cells()
+    assert asked[-1] == ("1x1", 0, 500_000_000)
 
 
 def test_what_cannot_be_divided_is_said_before_it_is_tried(root, draw):
@@ -119,7 +121,7 @@ def test_each_cell_says_how_it_gets_on(lodgs, root, draw_panel, line, watch):
     assert line("blocks", 0).texts == ["1", "25%"] and line("blocks", 0).operators == ["lodgs.cancel_block"]
     notes = line("blocks", 1)
     assert notes.texts == ["2", "Cancelled at 50%"] and notes.operators == ["lodgs.resume_block"]
-    watch.stopping = {1}
+    watch.stopping = {("block", 1)}
     assert line("blocks", 0).texts == ["1", "Stopping at 25%"]
     blocks = [_part(number, "block", "done", 100) for number in (1, 2)]
     seams = [_part(1, "seam", "running", 10, 20), _part(2, "seam", "done", 20, 20)]

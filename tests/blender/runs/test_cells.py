@@ -52,10 +52,14 @@ def test_a_plan_says_what_the_trainer_will_do(bpy, lodgs, jobs, root):
     names = [camera.name for camera in scene.cameras]
     truth = plan(job, scene)
     assert len(settings.planned_cells) == len(truth) == 4
-    for cell, (region, block) in zip(settings.planned_cells, truth, strict=True):
-        p = block.resolved_parameters()
-        assert (cell.views, cell.splats, cell.steps) == (len(region.views), p.max_splats, p.total_steps)
+    for cell, planned in zip(settings.planned_cells, truth, strict=True):
+        region, p = planned.region, planned.job.resolved_parameters()
+        trained = {camera.name for camera in scene.split(4)[0]}
+        assert (cell.views, cell.splats, cell.steps) == (
+            len(trained & set(region.views)), p.max_splats, p.total_steps,
+        )  # fmt: skip
         assert cell.points == region.points_of(scene).sum()
+        assert cell.megabytes == pytest.approx(planned.memory / 1e6)
         assert [names[place] for place in json.loads(cell.places)] == list(region.views)
         eyes, frames = lodgs("data.cells").eyes(root, cell)
         centers = [camera.center for camera in scene.cameras if camera.name in region.views]
@@ -158,7 +162,7 @@ def test_one_cell_is_stopped_and_goes_on_beside_the_others(bpy, jobs, fake, root
     with pytest.raises(RuntimeError, match="Cell 2 of 'lantern_garden' has nothing to go on with"):
         bpy.ops.lodgs.resume_block(block=2)
     assert bpy.ops.lodgs.cancel_block(block=2) == {"FINISHED"}
-    assert watch.stopping == {2}
+    assert watch.stopping == {("block", 2)}
     _wait(watch, lambda: _states(watch) == ["running", "cancelled"])
     assert not watch.stopping
     for number in (2, 3):

@@ -175,7 +175,7 @@ def test_training_starts_from_points_this_run_or_a_file(
     settings.base = "//splats.ply"
     root = bpy.data.objects["tiny"]
     assert jobs.make_job(root, Path("/run"), {}).base == str(tmp_path / "splats.ply")
-    settings.method = "3dgs"  # which cannot
+    settings.method = "octree"  # which cannot
     assert jobs.make_job(root, Path("/run"), {}).base == ""
 
 
