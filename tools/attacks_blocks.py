@@ -87,12 +87,12 @@ class Cluster:
         return psutil.Process(made.pid)
 
     def trainers(self) -> list[tuple[int, psutil.Process, psutil.Process]]:
-        """Of each worker that trains its place, its process below the nanny, and the trainer."""
+        """Of each worker whose trainer makes steps its place, its process below the nanny, and the trainer."""
         found = []
         for place, nanny in enumerate(self.workers):
             with suppress(psutil.Error):
                 for worker in nanny.children():
-                    found += [(place, worker, trainer) for trainer in worker.children()]
+                    found += [(place, worker, each) for each in worker.children() if makes_steps(each)]
         return found
 
     def kill(self, kind: str, chance: random.Random) -> bool:
@@ -267,6 +267,13 @@ class Bench:
         if code or odd:
             found["wrong"].append(f"code {code} {said.get('what', '')}, otherwise: {sorted(odd)}")
         shutil.rmtree(run.path)
+
+
+def makes_steps(trainer: psutil.Process) -> bool:
+    """Whether a trainer is past its start."""
+    job = Path(trainer.cmdline()[-1])
+    told = RunFolder(job.parent).last("hello", "progress") if job.name == "job.toml" else None
+    return told is not None and told["event"] == "progress" and trainer.create_time() < told["time"]
 
 
 def lost(run: RunFolder) -> Iterator[float]:

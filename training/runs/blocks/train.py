@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import CancelledError
 from pathlib import Path
 
 from ...errors import LodgsError
@@ -17,6 +18,8 @@ LOOKS = 0.5
 """Seconds between two looks at how blocks get on."""
 SILENT = 20.0
 """Seconds between two words at most."""
+GRACE = 10.0
+"""Seconds in which who was given a part begins it, and so hears that it is to stop."""
 TRIES = 3
 """How often a block may be lost without having got any further before that ends the run."""
 
@@ -85,10 +88,7 @@ def _train_stage(
                 told = now
             time.sleep(LOOKS)
     except BaseException:
-        for each in stage:
-            each.stop()
-        while not all(each.over for each in stage):
-            time.sleep(LOOKS)
+        _stop_stage(stage)
         raise
     if stage:
         tell("progress", **_progress(everything))
@@ -97,6 +97,21 @@ def _train_stage(
             raise each.trouble()
     if stopped := [each.block.name for each in stage if each.code == CANCELLED]:
         raise BlocksStopped(f"Stopped: {', '.join(stopped)}; the run can be resumed.")
+
+
+def _stop_stage(stage: Sequence[_Watched]) -> None:
+    """Has all parts stopped: who trains one saves first, and who was given one does not begin."""
+    asked = [each for each in stage if not each.over]
+    for each in asked:
+        each.block.folder.request_cancel()
+    given_up = time.monotonic() + GRACE
+    while not all(each.over for each in asked):
+        time.sleep(LOOKS)
+        if time.monotonic() > given_up:
+            for each in asked:
+                each.give_up()
+    for each in asked:
+        each.block.folder.take_cancel()  # which nobody has heard
 
 
 class _Watched:
@@ -126,10 +141,9 @@ class _Watched:
             self._heard = False
             self._pending = submit(self.block.folder.path)
 
-    def stop(self) -> None:
-        """Has it stopped: who trains it saves first, and who was to train it does not begin."""
-        if self._pending is not None and not self.over:
-            self.block.folder.request_cancel()
+    def give_up(self) -> None:
+        """Waits no longer for those who were given it and have not begun: there may be nobody."""
+        if self._pending is not None:
             self._pending.cancel()
 
     @property
@@ -155,6 +169,9 @@ class _Watched:
             return False
         try:
             code = self._pending.result()
+        except CancelledError:  # the scheduler was lost, and with it who has the part, which may be well
+            self.begin(submit)
+            return False
         except Exception as error:  # the worker, not the block
             code, self._why = -1, str(error)
         if code in (DONE, BAD_INPUT, CANCELLED):

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import Future
+from concurrent.futures import CancelledError, Future
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -401,8 +401,9 @@ def test_one_that_could_not_even_write_what_is_wrong_says_so(blocks):
         trained(blocks, Workers(block_1=[done], block_2=[lambda _: 2]))
 
 
-def test_whom_nobody_has_begun_is_given_up_at_an_interrupt(blocks):
-    """A cluster without workers, on which nothing will ever be begun."""
+def test_whom_nobody_has_begun_is_given_up_at_an_interrupt(blocks, monkeypatch):
+    """A cluster without workers, on which nothing will ever be begun; it may be later, by itself."""
+    monkeypatch.setattr(blocks_module, "GRACE", 0.05)
     asked = []
 
     def submit(folder: Path) -> Future:
@@ -415,6 +416,17 @@ def test_whom_nobody_has_begun_is_given_up_at_an_interrupt(blocks):
     with pytest.raises(KeyboardInterrupt):
         trained(blocks, submit, interrupt)
     assert [future.cancelled() for future in asked] == [True, True]
+    assert not any(block.folder.take_cancel() for block in blocks)
+
+
+def test_a_lost_scheduler_is_no_loss_of_a_block(blocks):
+    """Its blocks are given out again as often as it comes back; that it does not is said by who gives out."""
+
+    def scheduler_lost(_: RunFolder) -> int:
+        raise CancelledError
+
+    workers = Workers(block_1=[scheduler_lost] * 5 + [done], block_2=[done])
+    assert trained(blocks, workers).exists() and workers.attempts == {"1": 6, "2": 1}
 
 
 def test_a_block_can_be_stopped_alone_and_gone_on_with(blocks):
