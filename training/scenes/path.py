@@ -32,8 +32,10 @@ def smoothed(positions: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.n
     turns = np.where(np.einsum("ij,ij->i", quats[1:], quats[:-1]) < 0, -1.0, 1.0)
     quats = quats * np.cumprod(np.append(1.0, turns))[:, None]
     places = np.arange(len(positions))
-    spread = np.minimum(SPREAD, np.minimum(places, places[::-1]) / 2)
-    weights = np.exp(-np.square((places[:, None] - places) / np.maximum(spread, 1e-3)[:, None]) / 2)
+    within = np.minimum(places, places[::-1])[:, None]  # as many on either side: straight ways stay straight
+    apart = np.abs(places[:, None] - places)
+    spread = np.clip(within / 2, 1e-3, SPREAD)
+    weights = np.exp(-np.square(apart / spread) / 2) * (apart <= within)
     weights /= weights.sum(axis=1, keepdims=True)
     positions, quats = weights @ positions, weights @ quats
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
