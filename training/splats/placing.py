@@ -213,8 +213,8 @@ class PlacedRows:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def select(self, some: slice, /) -> Splats:
-        """The splats of a range of rows."""
+    def select(self, some: slice | np.ndarray, /) -> Splats:
+        """The splats of a range of rows, or of some rows (M,) ascending."""
         splats = self.placed(self.rows.select(some))
         splats.extras |= {name: column[some] for name, column in self.remade.items()}
         return splats
