@@ -87,7 +87,7 @@ class Cluster:
         return psutil.Process(made.pid)
 
     def trainers(self) -> list[tuple[int, psutil.Process, psutil.Process]]:
-        """Of each worker whose trainer makes steps its place, its process below the nanny, and the trainer."""
+        """Of each worker whose trainer makes steps: its place, its process below the nanny, the trainer."""
         found = []
         for place, nanny in enumerate(self.workers):
             with suppress(psutil.Error):
