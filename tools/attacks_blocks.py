@@ -271,8 +271,10 @@ class Bench:
 
 def makes_steps(trainer: psutil.Process) -> bool:
     """Whether a trainer is past its start."""
-    job = Path(trainer.cmdline()[-1])
-    told = RunFolder(job.parent).last("hello", "progress") if job.name == "job.toml" else None
+    jobs = [
+        Path(each) for each in trainer.cmdline() if each.endswith("job.toml")
+    ]  # none of one that has ended
+    told = RunFolder(jobs[0].parent).last("hello", "progress") if jobs else None
     return told is not None and told["event"] == "progress" and trainer.create_time() < told["time"]
 
 
