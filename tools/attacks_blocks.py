@@ -87,7 +87,7 @@ class Cluster:
         return psutil.Process(made.pid)
 
     def trainers(self) -> list[tuple[int, psutil.Process, psutil.Process]]:
-        """Of each worker whose trainer makes steps: place, process below the nanny, and the trainer."""
+        """Of each worker whose trainer makes steps: its place, its process below the nanny, the trainer."""
         found = []
         for place, nanny in enumerate(self.workers):
             with suppress(psutil.Error):
@@ -271,8 +271,10 @@ class Bench:
 
 def makes_steps(trainer: psutil.Process) -> bool:
     """Whether a trainer is past its start."""
-    job = Path(trainer.cmdline()[-1])
-    told = RunFolder(job.parent).last("hello", "progress") if job.name == "job.toml" else None
+    jobs = [
+        Path(each) for each in trainer.cmdline() if each.endswith("job.toml")
+    ]  # none of one that has ended
+    told = RunFolder(jobs[0].parent).last("hello", "progress") if jobs else None
     return told is not None and told["event"] == "progress" and trainer.create_time() < told["time"]
 
 
