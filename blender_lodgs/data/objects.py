@@ -165,7 +165,8 @@ def splats_of(cloud: bpy.types.PointCloud, weights: np.ndarray | None = None) ->
 
 def megabytes(cloud: bpy.types.PointCloud) -> float:
     """Size of the splats as a 3DGS file, in 10^6 bytes."""
-    names = [a.name for a in cloud.attributes if a.data_type in LAYOUTS and a.domain == "POINT"]
+    columns = LAYOUTS.keys() - {"BOOLEAN"}  # which no file has: Blender's own
+    names = [a.name for a in cloud.attributes if a.data_type in columns and a.domain == "POINT"]
     own = _OWN - {"position", BASE, SCALE, ROTATION}
     widths = [LAYOUTS[cloud.attributes[name].data_type].width for name in names if name not in own]
     normals = 3

@@ -129,7 +129,7 @@ def test_train_has_the_trainers_options(lodgs, lodgs_command, capfd):
     [
         (["train", "--scene", "nowhere", "--out", "run"], "nowhere"),
         (["train", "--scene", SCENE, "--out", "run", "--set", "levels"], "--set levels is not NAME=VALUE"),
-        (["train", "--out", "run"], "--scene DIR"),
+        (["train", "--out", "run"], "the scene's folder"),
         (["train", "--scene", SCENE, "--out", "run", "--set", "wings=2"], "unknown parameter 'wings'"),
         (["train", "--scene", SCENE, "--out", "run", "--method", "magic"], "magic"),
         (["train", "--scene", SCENE, "--out", "run", "--image-scale", "7"], "image_scale = 7"),
