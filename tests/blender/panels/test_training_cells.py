@@ -131,3 +131,13 @@ def test_each_cell_says_how_it_gets_on(lodgs, root, draw_panel, line, watch):
     watch.state = "cancelled"
     assert line("blocks", 0).texts == ["1", "Cancelled at 92%"]
     assert line("blocks", 0).operators == ["lodgs.resume_block"]
+
+
+def test_no_time_is_told_before_there_is_a_speed(lodgs):
+    facts = lodgs("runs.words").progress_facts
+    progress = {
+        "level": 1, "levels": 1, "step": 0, "of": 90, "loss": 0.0, "psnr": 0.0, "splats": 0,
+        "steps_per_s": 0.0, "eta_s": 0.0, "blocks": [],
+    }  # fmt: skip
+    assert set(facts(progress)) == {"Step", "Loss", "PSNR, training", "Splats"}
+    assert facts(progress | {"steps_per_s": 2.0, "eta_s": 45.0})["Time left"] == "45 s"
