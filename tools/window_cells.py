@@ -24,6 +24,7 @@ from tools.window_hands import (
     open_panels,
     press,
     region,
+    scroll,
     settle,
     start,
     take,
@@ -32,8 +33,8 @@ from tools.window_hands import (
 )
 
 TINY = {
-    "levels": 3, "steps": (120, 160, 320), "densify_until": (0.5,) * 3, "densify_interval": (20,) * 3,
-    "max_splats": 40_000,
+    "levels": 3, "steps": (60, 100, 160), "densify_until": (0.5,) * 3, "densify_interval": (20,) * 3,
+    "max_splats": 20_000,
 }  # fmt: skip
 
 
@@ -61,22 +62,24 @@ def plan(root: bpy.types.Object) -> Steps:
     press("lodgs.plan_cells", "INVOKE_DEFAULT")
     yield from until(lambda: len(settings.planned_cells) == 4, 120)
     settings.active_cell = 1
+    scroll(9)
     yield from settle()
     take("plan", ", ".join(f"{cell.views} views" for cell in settings.planned_cells))
 
 
 def train(root: bpy.types.Object) -> Steps:
+    root.lodgs.training.image_scale = 0.25
     jobs = module("runs.jobs")
     watch = jobs.start(root, PLAN["run"], TINY)
     jobs.follow(watch)
 
     def states() -> list[str]:
-        return [block["state"] for block in watch.blocks]
+        return [part.state for number in range(1, watch.cells + 1) if (part := watch.part(number))]
 
-    yield from until(lambda: not watch.running or states().count("running") == 2, 300)
+    yield from until(lambda: not watch.running or states().count("running") == 2, 400)
     assert watch.running, watch.problem
     number = states().index("running") + 1
-    yield from until(lambda: watch.blocks[number - 1]["step"] > 20, 300)
+    scroll(4)
     yield from settle()
     take("cells", f"{states()}")
     press("lodgs.cancel_block", block=number)
@@ -93,7 +96,7 @@ def train(root: bpy.types.Object) -> Steps:
     root = module("data.scenes").active_root(bpy.context)
     watch = module("runs.watch").watch_of(root)
     assert watch is not None and watch.running and watch.process is None, "The run is not found again."
-    yield from until(lambda: states()[number - 1] == "cancelled", 60)
+    assert states()[number - 1] == "cancelled", f"{states()}"
     press("lodgs.resume_block", block=number)
     yield from until(lambda: states()[number - 1] in ("waiting", "running"), 60)
     yield from settle()
@@ -112,9 +115,10 @@ def _look_down(root: bpy.types.Object) -> None:
     middle = sum(places, Vector()) / len(places)
     looks = viewport()[1]
     looks.view_perspective = "PERSP"
-    looks.view_rotation = Euler((math.radians(38), 0, math.radians(20))).to_quaternion()
-    looks.view_location = middle
-    looks.view_distance = 3.2 * max((place - middle).length for place in places)
+    looks.view_rotation = Euler((math.radians(30), 0, math.radians(20))).to_quaternion()
+    reach = max((place - middle).length for place in places)
+    looks.view_location = middle + looks.view_rotation @ Vector((0.35 * reach, 0, 0))  # left of the sidebar
+    looks.view_distance = 2.9 * reach
 
 
 start(tour())

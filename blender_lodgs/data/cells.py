@@ -12,7 +12,7 @@ import numpy as np
 from ...training.runs.blocks.plan import Planned, cells_within, plan, read_planned_scene
 from ...training.runs.job import Job
 from ...training.scenes.colmap import Scene
-from ...training.scenes.regions import ENLARGED, Region
+from ...training.scenes.regions import Region
 from . import photographs
 
 if TYPE_CHECKING:
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 GROUND = 0.01
 """The quantile of the points' heights at which cells are shown."""
+BEYOND = 0.05
+"""Share of the cameras' longer side by which cells without end are shown to reach beyond them."""
 _DECIDES = (
     "scene",
     "model",
@@ -81,7 +83,7 @@ def outlines(scene: Scene, regions: list[Region]) -> list[tuple[np.ndarray, np.n
     ground = regions[0].ground
     stand = np.array([camera.center for camera in scene.cameras]) @ ground.T
     low, high = stand[:, :2].min(axis=0), stand[:, :2].max(axis=0)
-    reach = ENLARGED * (high - low).max()
+    reach = BEYOND * (high - low).max()
     height = np.quantile(scene.points.astype(np.float64) @ ground[2], GROUND)
 
     def corners(bounds: np.ndarray) -> np.ndarray:

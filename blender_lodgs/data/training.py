@@ -228,9 +228,9 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
         name="Divide By",
         description="How many cells the ground is divided into, each of which is trained by itself",
         items=[
-            ("GRID", "Columns, Rows", "So many columns of so many cells; 1 by 1 trains the scene as a whole"),
-            ("SPLATS", "Splats a Cell", "As few cells as have so many splats at most; Plan finds them"),
-            ("MEMORY", "Memory a Cell", "As few cells as take so much memory at most; Plan finds them"),
+            ("GRID", "By Number", "So many columns of so many cells; 1 by 1 trains the scene as a whole"),
+            ("SPLATS", "By Splats", "As few cells as have so many splats at most; Plan finds them"),
+            ("MEMORY", "By Memory", "As few cells as take so much memory at most; Plan finds them"),
         ],
         options=set(),
     )

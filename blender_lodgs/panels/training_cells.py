@@ -23,9 +23,7 @@ class LODGS_UL_cells(bpy.types.UIList):
         self, context, layout, data, item, icon, active_data, active_property, index: int = 0, flt_flag=0
     ):
         row = _numbered(layout, index + 1)
-        _columns(
-            row, *map(_brief, (item.views, item.points, item.splats, item.steps)), _memory(item.megabytes)
-        )
+        _columns(row, str(item.views), _brief(item.splats), _memory(item.megabytes))
 
 
 class LODGS_UL_blocks(bpy.types.UIList):
@@ -103,11 +101,12 @@ def _draw_plan(layout, settings, fits):
     if not fits:
         say(layout, "Planned for other settings: plan again.", "INFO")
     layout.active = fits
-    head = layout.row(align=True)
-    head.label(text="", icon="BLANK1")
-    _columns(head, "Views", "Points", "Splats", "Steps", "Memory")
+    head = layout.row()
+    _columns(_numbered(head, None), "Views", "Splats", "Memory")
     rows = min(max(len(settings.planned_cells), 3), 8)
     layout.template_list("LODGS_UL_cells", "", settings, "planned_cells", settings, "active_cell", rows=rows)
+    chosen = settings.planned_cells[settings.active_cell]
+    layout.label(text=f"From {chosen.points:,} points, {chosen.steps:,} steps")
 
 
 def draw_blocks(layout: bpy.types.UILayout, root: bpy.types.Object, watch: Watch) -> None:
@@ -124,12 +123,13 @@ def draw_blocks(layout: bpy.types.UILayout, root: bpy.types.Object, watch: Watch
         )
 
 
-def _numbered(layout: bpy.types.UILayout, number: int) -> bpy.types.UILayout:
-    """A line that begins with a cell's colour and number; the rest of it."""
+def _numbered(layout: bpy.types.UILayout, number: int | None) -> bpy.types.UILayout:
+    """A line that begins with a cell's colour and number, or the space that they take; the rest of it."""
     parts = layout.split(factor=_NUMBER)
     row = parts.row(align=True)
-    row.template_node_socket(color=(*level_color(number), 1.0))
-    row.label(text=str(number))
+    if number is not None:
+        row.template_node_socket(color=(*level_color(number), 1.0))
+    row.label(text=str(number or ""))
     return parts
 
 

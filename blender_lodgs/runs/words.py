@@ -8,14 +8,17 @@ def progress_facts(progress: dict) -> dict[str, str]:
     if not progress:
         return {}
     level = {"Level": f"{progress['level']} of {progress['levels']}"}
+    speed = {
+        "Speed": f"{progress['steps_per_s']:.1f} steps/s",
+        "Time left": duration(progress["eta_s"]),
+    }
     return {
         **({} if "blocks" in progress else level),  # of which each is at its own
         "Step": f"{progress['step']:,} of {progress['of']:,}",
         "Loss": f"{progress['loss']:.4f}",
         "PSNR, training": f"{progress['psnr']:.1f} dB",
         "Splats": f"{progress['splats']:,}",
-        "Speed": f"{progress['steps_per_s']:.1f} steps/s",
-        "Time left": duration(progress["eta_s"]),
+        **(speed if progress["steps_per_s"] else {}),  # else nobody knows yet
     }
 
 

@@ -12,9 +12,9 @@ from ..data import cells, scenes
 from ..data.placement import axes_of
 from . import frusta
 
-WIDTH = 3.0
-"""Pixels of an outline; of the chosen cell's it is twice that."""
-FAINT, FILLED = 0.5, 0.12
+WIDTH = 2.5
+"""Pixels of an outline; a half more of the chosen cell's."""
+FAINT, FILLED = 0.5, 0.08
 """Opacities of what a cell is trained on beyond its own, and of the ground of the chosen one."""
 
 
@@ -34,7 +34,7 @@ def draw(scene: bpy.types.Scene) -> None:
                     _draw("TRIS", corners[[0, 1, 2, 0, 2, 3]], (*color, FILLED))
                     _draw("LINES", frusta.pyramids(*cells.eyes(root, cell)), (*color, 1.0))
                 _draw_lines(_around(np.reshape(cell.enlarged, (4, 3))), (*color, FAINT), 1.5)
-                _draw_lines(_around(corners), (*color, 1.0), WIDTH * (1 + chosen))
+                _draw_lines(_around(corners), (*color, 1.0), WIDTH * (1 + chosen / 2))
             gpu.state.blend_set("NONE")
 
 

@@ -59,14 +59,14 @@ def test_the_plan_is_offered_for_more_than_one_cell(bpy, root, draw, line):
     assert notes.operators == ["lodgs.plan_cells"] and notes.properties[-1] == "at_once"
     bpy.ops.lodgs.plan_cells()
     notes = draw()
-    assert {"Views", "Points", "Splats", "Steps", "Memory"} <= set(notes.texts)
+    assert {"Views", "Splats", "Memory"} <= set(notes.texts)
     assert notes.properties[-1] == "show_cells" and not any("plan again" in text for text in notes.texts)
     settings.preset = "standard"
     assert "Planned for other settings: plan again." in draw().texts
     settings.planned_cells[0].points, settings.planned_cells[0].splats = 68_349, 1_234_567
     settings.planned_cells[0].steps, settings.planned_cells[0].megabytes = 9812, 2345.6
-    texts = line("cells", 0).texts
-    assert texts == ["1", str(settings.planned_cells[0].views), "68.3 k", "1.23 M", "9,812", "2.3 GB"]
+    assert line("cells", 0).texts == ["1", str(settings.planned_cells[0].views), "1.23 M", "2.3 GB"]
+    assert "From 68,349 points, 9,812 steps" in draw().texts
     assert line("cells", 1).colors == [(*level_color(2), 1.0)]
 
 
@@ -131,3 +131,13 @@ def test_each_cell_says_how_it_gets_on(lodgs, root, draw_panel, line, watch):
     watch.state = "cancelled"
     assert line("blocks", 0).texts == ["1", "Cancelled at 92%"]
     assert line("blocks", 0).operators == ["lodgs.resume_block"]
+
+
+def test_no_time_is_told_before_there_is_a_speed(lodgs):
+    facts = lodgs("runs.words").progress_facts
+    progress = {
+        "level": 1, "levels": 1, "step": 0, "of": 90, "loss": 0.0, "psnr": 0.0, "splats": 0,
+        "steps_per_s": 0.0, "eta_s": 0.0, "blocks": [],
+    }  # fmt: skip
+    assert set(facts(progress)) == {"Step", "Loss", "PSNR, training", "Splats"}
+    assert facts(progress | {"steps_per_s": 2.0, "eta_s": 45.0})["Time left"] == "45 s"

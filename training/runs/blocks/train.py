@@ -221,7 +221,7 @@ def _progress(watched: Sequence[_Watched]) -> dict:
     step, of = sum(each.step for each in watched), sum(each.steps for each in watched)
     speed = sum(each.progress.get("steps_per_s", 0.0) for each in watched if each.code is None)
     blocks = [each for each in watched if each.block.kind == BLOCK]
-    over = sum(each.code is not None for each in blocks)
+    over = sum(each.code == DONE for each in blocks)
 
     def mean(name: str) -> float:
         return round(sum(each.get(name, 0.0) for each in there) / max(len(there), 1), 5)
