@@ -12,7 +12,7 @@ PYTEST := -m pytest -n auto
 quick test test-5.0 fuzz: export OMP_NUM_THREADS := 1  # torch's threads would come on top of the workers
 export LODGS_TRAINER_PYTHON := $(CURDIR)/$(VENV)
 
-.PHONY: help setup demo check quick test test-5.0 fuzz attacks lint docs tables bench bench-quality bench-lod bench-tree extension pins \
+.PHONY: help setup demo check quick test test-5.0 fuzz attacks lint docs tables bench bench-quality bench-lod bench-tree bench-blocks extension pins \
 	window interop clean
 
 help:
@@ -28,11 +28,12 @@ help:
 	@echo "make bench-quality  PSNR and veil against seconds, all methods (SCENES=\"DIR ...\", BASE=another checkout)"
 	@echo "make bench-lod  levels and chunks on a town of 3 million splats (over an hour the first time; STAGES=\"town lodge others table\")"
 	@echo "make bench-tree cuts of trees of up to 10 million nodes, and training them in 400 MB (an hour and 10 GB the first time)"
+	@echo "make bench-blocks  what giving blocks out costs, and the plot for 1 to 64 workers (half an hour alone)"
 	@echo "make extension  dist/lodgs-VERSION.zip, checked by Blender"
 	@echo "make pins       requirements/*.txt anew from requirements/*.in (UPGRADE=1 takes the newest of what these leave open)"
 	@echo "make window     a tour in a real Blender window, with pictures (METHOD=flod; needs Blender, Xvfb, ImageMagick)"
 	@echo "make interop    other programs read our files (needs Node)"
-	@echo "make attacks    trainers killed at random moments, disks that fill up: about a quarter of an hour"
+	@echo "make attacks    trainers, workers and a scheduler killed at random moments, disks that fill up: half an hour"
 
 setup:
 	@command -v $(PYTHON) >/dev/null || { echo "setup: Python is missing; install Python 3.11 with pip." >&2; exit 1; }
@@ -85,6 +86,9 @@ bench-tree: setup
 	$(VENV) tools/bench_tree.py
 	$(VENV) tools/bench_tree_memory.py
 
+bench-blocks: setup
+	$(VENV) tools/bench_blocks.py
+
 extension: setup
 	$(VENV) tools/extension.py
 
@@ -101,6 +105,7 @@ interop: setup
 
 attacks: setup
 	$(VENV) tools/attacks.py
+	$(VENV) tools/attacks_blocks.py
 
 clean:
 	rm -rf build dist .venv .venv-blender-5.2 .venv-blender-5.0

@@ -11,7 +11,7 @@ from . import commands, operators, panels, viewport
 from .data import changes, loaded, older_files, properties, removal, scenes, updates
 from .nodes import building
 from .render import compare, engine, renderer
-from .runs import jobs
+from .runs import capturing, jobs
 from .viewport import wipe
 
 MODULES = (
@@ -31,6 +31,7 @@ MODULES = (
     wipe,
     compare,
     jobs,
+    capturing,
     commands,
 )
 

@@ -15,7 +15,7 @@ import numpy as np
 
 BASE, SH, SCALE, ROTATION = "radiance:base", "radiance:sh_{}", "scale", "rotation"
 LOG_SCALE, OPACITY_LOGIT, QUATERNION = "log_scale", "opacity_logit", "quaternion"
-COLOR, RADIUS, WEIGHT = "display_color", "radius", "lod_weight"
+COLOR, RADIUS, WEIGHT, HIDDEN = "display_color", "radius", "lod_weight", "hidden"
 COLUMN = "column:{}"
 """A file's column whose own name may mean something else to Blender; every column of a table."""
 
@@ -34,6 +34,7 @@ LAYOUTS = {
     "FLOAT_COLOR": Layout("color", np.float32, 4),
     "FLOAT4": Layout("vector", np.float32, 4),
     "QUATERNION": Layout("value", np.float32, 4),
+    "BOOLEAN": Layout("value", np.bool_, 1),
     "INT": Layout("value", np.int32, 1),
     "INT32_2D": Layout("value", np.int32, 2),
 }

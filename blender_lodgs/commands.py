@@ -17,11 +17,12 @@ from ..training.evaluate.words import summary_lines
 from ..training.lod.describe import describe
 from ..training.methods.describe import describe_method, describe_methods
 from ..training.runs.folder import RunFolder
-from ..training.runs.job import Job
-from ..training.runs.options import add_options, job_from
+from ..training.runs.job import Job, check_views
+from ..training.runs.options import add_options, job_from, size_of
 from ..training.splats.bundle import write_bundle
 from . import extension
-from .data import scenes
+from .data import scenes, viewpoints
+from .render.capture import render_views, write_model
 from .runs import environment, jobs
 from .runs.watch import Watch
 from .runs.words import duration, level_line
@@ -82,6 +83,32 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("blend", type=Path, help=".blend file")
     export.add_argument("bundle", type=Path, help="bundle to write (PLY)")
     export.add_argument("--root", help="name of the scene root, where the file holds several")
+    export.add_argument(
+        "--placed",
+        action="store_true",
+        help="where the scene stands in the .blend, not in COLMAP's coordinates",
+    )
+
+    capture = commands.add_parser(
+        "capture",
+        help="any Blender scene to a COLMAP scene of its renders, to train from",
+        description="Renders views with the scene's own engine, writes their exact cameras and a model of "
+        "them. What is not said is as the file's LODGS tab has it. Given again, it goes on where it stopped.",
+    )
+    capture.set_defaults(command=_capture)
+    capture.add_argument("blend", type=Path, help=".blend file")
+    capture.add_argument("--out", type=Path, required=True, help="folder that becomes the COLMAP scene")
+    where = capture.add_mutually_exclusive_group()
+    where.add_argument("--around", action="store_true", help="views around what is selected, or all")
+    where.add_argument("--cameras", action="store_true", help="every camera of the scene")
+    where.add_argument("--animation", action="store_true", help="frames of the scene's camera")
+    where.add_argument("--curve", metavar="NAME", help="a walk along a curve")
+    capture.add_argument("--views", type=int, metavar="N", help="how many, but of cameras")
+    capture.add_argument("--size", type=size_of, metavar="WxH", help="pixels of the pictures")
+    capture.add_argument(
+        "--range", type=_range, metavar="A-B", help="render only these views, from 1 on, and make no model: "
+        "for several computers, before one does the same without it",
+    )  # fmt: skip
 
     info = commands.add_parser("info", help="say what a bundle or any 3DGS PLY holds")
     info.set_defaults(command=_info)
@@ -147,15 +174,59 @@ def _import(args: argparse.Namespace) -> int:
 
 
 def _export(args: argparse.Namespace) -> int:
-    if not args.blend.is_file():
-        raise LodgsError(f"There is no file {args.blend}.")
-    bpy.ops.wm.open_mainfile(filepath=str(args.blend.resolve()))
+    _open(args.blend)
     found = [root for root in bpy.data.objects if root.lodgs.is_root and args.root in {None, root.name}]
     if len(found) != 1:
         names = ", ".join(root.name for root in bpy.data.objects if root.lodgs.is_root) or "none"
         raise LodgsError(f"{args.blend} holds {len(found)} such scenes.", f"Name one with --root: {names}.")
-    write_bundle(args.bundle, scenes.read_levels(found[0]))
+    write_bundle(args.bundle, scenes.read_levels(found[0], args.placed))
     return DONE
+
+
+def _capture(args: argparse.Namespace) -> int:
+    _open(args.blend)
+    scene = bpy.context.scene
+    settings = scene.lodgs_capture
+    for name in ("around", "cameras", "animation", "curve"):
+        if getattr(args, name):
+            settings.views_from = {"around": "DOME"}.get(name, name.upper())
+    if args.curve:
+        settings.curve = bpy.data.objects.get(args.curve)
+        if settings.curve is None or settings.curve.type != "CURVE":
+            raise LodgsError(f"{args.blend} has no curve '{args.curve}'.", "Name another one.")
+    width, height = args.size or viewpoints.size(scene, settings)
+    views = settings.views if args.views is None else args.views
+    check_views(views, width)
+    settings.views = views
+    if not args.range:
+        environment.require(environment.trainer_python())
+
+    def tell(number: int, count: int) -> None:
+        _print(f"View {number} of {count}")
+
+    folder = args.out.resolve()
+    try:
+        with _interrupts():
+            count = render_views(bpy.context, folder, width, height, args.range, tell)
+            rendered = f"{folder}: {min(args.range[1], count)} of {count}" if args.range else ""
+            _print(rendered or write_model(folder))
+    except KeyboardInterrupt:
+        _print("Cancelled. The same command goes on from here.")
+        return CANCELLED
+    return DONE
+
+
+def _range(text: str) -> tuple[int, int]:
+    first, _, last = text.partition("-")
+    if not (first.isdecimal() and last.isdecimal() and 1 <= int(first) <= int(last)):
+        raise argparse.ArgumentTypeError(f"{text} is not FIRST-LAST, such as 1-16")
+    return int(first), int(last)
+
+
+def _open(blend: Path) -> None:
+    if not blend.is_file():
+        raise LodgsError(f"There is no file {blend}.")
+    bpy.ops.wm.open_mainfile(filepath=str(blend.resolve()))
 
 
 def _info(args: argparse.Namespace) -> int:

@@ -99,6 +99,14 @@ def set_input(modifier: bpy.types.NodesModifier, name: str, value) -> None:
     modifier.id_data.update_tag()
 
 
+def png(settings: bpy.types.ImageFormatSettings, alpha: bool) -> None:
+    """Has pictures saved as PNGs of 8 bits."""
+    if hasattr(settings, "media_type"):
+        settings.media_type = "IMAGE"
+    settings.file_format, settings.color_mode = "PNG", "RGBA" if alpha else "RGB"
+    settings.color_depth = "8"
+
+
 def multilayer_exr(settings: bpy.types.ImageFormatSettings) -> None:
     """Has pictures saved as multilayer EXRs, in whole floats."""
     if hasattr(settings, "media_type"):

@@ -21,10 +21,12 @@ class Settings(Protocol):
     Attributes:
         python: path of the trainer's Python; empty for the environment that the extension makes.
         backend: name of the rasterizer's backend, or "auto".
+        flamenco: address of the manager of a render farm; empty for none.
     """
 
     python: str
     backend: str
+    flamenco: str
 
 
 def user_folder(name: str = "") -> Path:

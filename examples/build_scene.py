@@ -1165,6 +1165,18 @@ def render(out: Path, cameras: str, views: list[int] | None):
         bpy.ops.render.render(write_still=True)
 
 
+def animate(cameras: str):
+    """Lets the scene's camera go the way of a set, a frame a view."""
+    scene = bpy.context.scene
+    poses = np.linalg.inv(rig.world_to_cameras(cameras)) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    scene.camera.rotation_mode = "QUATERNION"
+    for view, pose in enumerate(poses):
+        scene.camera.matrix_world = Matrix(pose.tolist())
+        for channel in ("location", "rotation_quaternion"):
+            scene.camera.keyframe_insert(channel, frame=view)
+    scene.frame_start, scene.frame_end = 0, len(poses) - 1
+
+
 def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -1183,6 +1195,8 @@ def main():
         if cameras == "walk":
             path_side()
         render(out, cameras, options.views)
+    animate("view")
+    out.mkdir(parents=True, exist_ok=True)
     bpy.ops.wm.save_as_mainfile(filepath=str(out / "garden.blend"), compress=True)
 
 

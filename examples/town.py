@@ -18,11 +18,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from training.rasterize.sh import basis, coefficients
 from training.runs.capture import write_scene
 from training.scenes.cameras import Camera, look_at, write_camera
 from training.splats.gaussians import SH_C0, Splats
 from training.splats.ply import write_ply
+from training.splats.sh import basis, coefficients
 
 from . import town_shapes as shapes
 from .town_shapes import Plan

@@ -21,7 +21,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from contextlib import contextmanager
 from multiprocessing import get_context
 from multiprocessing.context import ForkProcess as Process
 from pathlib import Path
@@ -35,6 +34,7 @@ import numpy as np  # noqa: E402
 
 import training.runs.train  # noqa: E402, F401 - loaded once for all that are killed
 from tests.training.conftest import FOCAL, HEIGHT, WIDTH, write_tiny_scene  # noqa: E402
+from tools.attacks_blocks import FULL_SAYS, contents, disk  # noqa: E402
 from training import __main__, files  # noqa: E402
 from training.errors import LodgsError  # noqa: E402
 from training.methods import rows  # noqa: E402
@@ -57,7 +57,6 @@ KINDS = ("undistort", "checkpoint", "level", "bundle", "event", "step", "rows")
 """What a trainer is busy with when it is killed."""
 KILLS_A_RUN = 3
 FORK = get_context("fork")
-FULL_SAYS = ("No space left on device", "disk is full")
 
 
 # -- the victim ------------------------------------------------------------------------------------------
@@ -275,18 +274,6 @@ def base() -> Splats:
     return Splats(means, quats, log_scales, logits, sh)
 
 
-def contents(run: Path) -> dict[str, bytes]:
-    """A run's files by name; of those that tell of times and places nothing but that they are there."""
-    changing = {"events.jsonl", "lock", "job.toml"}
-    outside = {"trainer.log", "trainer.out"}
-    files = {path.relative_to(run).as_posix(): path for path in run.rglob("*") if path.is_file()}
-    return {
-        name: b"" if name in changing else path.read_bytes()
-        for name, path in files.items()
-        if name not in outside
-    }
-
-
 def ended(process: Process) -> int | None:
     """The exit code of a process, when it has ended."""
     process.join()
@@ -299,17 +286,6 @@ def alive(pid: str) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except OSError:
         return False
-
-
-@contextmanager
-def disk(place: Path, size: int):
-    """A disk of so many bytes."""
-    place.mkdir(exist_ok=True)
-    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "lodgs", str(place)], check=True)
-    try:
-        yield place
-    finally:
-        subprocess.run(["umount", str(place)], check=True)
 
 
 def main() -> int:

@@ -9,6 +9,7 @@ Viewport, where this Blender has graphics in background: what the main thread do
 Blender's own evaluation (the rules, the list of splats onto the graphics card), what the thread beside it
 does (choosing and sorting), how long the first picture's splats take onto the card, from their attributes,
 and what comes there later.
+Clean Up, of five levels: how long a moved crop, and a search for floaters, hold the main thread.
 Streaming, there as well: a tree is flown through of which a part fits into the budget. How long each redraw
 holds up the main thread, all that LODGS does there but drawing itself, and how soon all has come at the end.
 ``--tree FILE --budget N`` takes a bundle of your own, of ten million splats say.
@@ -182,6 +183,41 @@ def viewport(bpy, count: int) -> None:
     )
 
 
+def clean_up(bpy, count: int) -> None:
+    """Prints what editing five levels of so many splats together costs the main thread."""
+    scenes, cleaning = load("blender_lodgs.data.scenes"), load("blender_lodgs.data.cleaning")
+    bundle = load("training.splats.bundle")
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    with scenes._new_scene(bpy.context, "bench") as root:
+        scenes.set_bundle_facts(root, bundle.Bundle("flod", [], "bands"))
+        for number in range(1, 6):
+            scenes.set_level(
+                root, bundle.Level(number, random_splats(count // 5), {"s_min": 0.1 / 2**number})
+            )
+    root.lodgs.mode, root.lodgs.bands.first = "SELECTIVE", 1
+    crop = load("blender_lodgs.operators.clean_up").add_crop(bpy.context, root, "BOX")
+    bpy.context.view_layer.update()
+    moves = []
+    for _ in range(11):
+        crop.location.x += 0.1
+        moves.append(least(bpy.context.view_layer.update, 1))
+    counts = least(
+        lambda: (cleaning._counts.clear(), cleaning.count_left(root, bpy.context.view_layer.depsgraph))
+    )
+    floaters = least(lambda: cleaning.find_floaters(bpy.context, root, 0.0, 0.001))
+    crop.lodgs_crop.use = False
+    bpy.context.view_layer.update()
+    everywhere = least(lambda: cleaning.find_floaters(bpy.context, root, 0.0, 0.001))
+    found = cleaning.find_floaters(bpy.context, root, 0.0, 0.001)
+    hide = least(lambda: cleaning.hide(root, found), 1)
+    print(
+        f"clean up, {count:,} splats in five levels, ms of the main thread: a moved crop"
+        f" {1e3 * np.median(moves):.0f} (median of 11; its counts {1e3 * counts:.0f} more), floaters"
+        f" {1e3 * everywhere:.0f}, within the crop {1e3 * floaters:.0f}; hiding"
+        f" {sum(map(np.count_nonzero, found.values())):,} {1e3 * hide:.0f}"
+    )
+
+
 def streaming(bpy, path: Path, budget: int, frames: int = 100) -> None:
     """Prints what a flight through a tree in a file costs the main thread."""
     import gpu
@@ -281,6 +317,7 @@ def main() -> None:
         )
     else:
         print("F12: not measured, set LODGS_TRAINER_PYTHON")
+    clean_up(bpy, COUNTS[-1])
     viewport(bpy, 500_000)
     with tempfile.TemporaryDirectory() as folder:
         write_in_pages(

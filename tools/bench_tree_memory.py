@@ -39,8 +39,7 @@ from training.methods.tree.store import layout_of
 from training.methods.tree.train import Method, SeenRecords
 from training.rasterize import Gaussians, rasterize
 from training.rasterize.hspt import image_of
-from training.runs.capture import read_views
-from training.scenes.cameras import write_camera
+from training.scenes.cameras import read_views, write_camera
 from training.scenes.colmap import Scene
 from training.scenes.images import write_png
 from training.splats.gaussians import Splats
@@ -176,7 +175,7 @@ def train(options: argparse.Namespace) -> dict:
     torch.save(method.state_dict(), options.folder / "checkpoint.pt")
     some = slice(WARM, -AFTER)
     share = store.cache.reused / max(store.cache.reused + store.cache.loaded, 1)
-    cache_mb = (store.cache.capacity * (4 * store.layout.width + BESIDE) + 4 * len(store)) / 1e6
+    cache_mb = (store.cache.capacity * (4 * store.layout.width + BESIDE) + store.cache.tables) / 1e6
     return {
         "splats": len(store), "cache_mb": cache_mb, "reused": share,
         "step_s": float(np.mean(times[some])), "cut_ms": float(np.mean(cuts[some])),

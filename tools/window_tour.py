@@ -206,7 +206,7 @@ def orbit(root: bpy.types.Object) -> Steps:
         yield from settle()
         yield from settle()
         eye = viewport()[1].view_matrix.inverted().translation
-        away = (root.matrix_world @ Vector(root.lodgs.held_eye) - eye).length
+        away = (root.lodgs.axes.matrix_world @ Vector(root.lodgs.held_eye) - eye).length
         assert away < 1e-3, f"The viewport's eye is {away:.3f} from the view's."
         shown, _ = module("data.scenes").count_shown(bpy.context, root)
         take("orbit", f"{shown:,} splats")

@@ -68,7 +68,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from .runs.options import add_options
+    from .runs.options import add_options, size_of
 
     parser = argparse.ArgumentParser(prog=PROGRAM, description="Gaussian splats with levels of detail.")
     parser.add_argument("--version", action="version", version=f"lodgs {VERSION}")
@@ -130,7 +130,7 @@ def _parser() -> argparse.ArgumentParser:
     eye.add_argument("--view", metavar="IMAGE", help="name of a photograph that the splats were trained from")
     render.add_argument("--scene", type=Path, help="COLMAP folder of the photographs, where no run knows it")
     render.add_argument("--out", type=Path, required=True, help="picture to write: .png or .exr")
-    render.add_argument("--size", type=_size, metavar="WxH", help="pixels; otherwise the camera's own")
+    render.add_argument("--size", type=size_of, metavar="WxH", help="pixels; otherwise the camera's own")
     render.add_argument("--level", type=int, default=0, help="level to draw (otherwise the finest)")
     render.add_argument(
         "--by-distance", action="store_true", help="draw levels by distance; so does any of these:"
@@ -167,9 +167,84 @@ def _parser() -> argparse.ArgumentParser:
     )
     capture.add_argument("--backend", default="auto", help="auto, cpu, cuda or reference")
 
+    model = commands.add_parser(
+        "model", help="views that Blender captured of its own scene, as the COLMAP model of their folder"
+    )
+    model.add_argument("folder", type=Path, help="what `blender --command lodgs capture` has filled")
+
     serve = commands.add_parser("serve", help="draw frame after frame for Blender")
     serve.add_argument("folder", type=Path, help="folder for arrays, new or empty; removed at the end")
     serve.add_argument("--backend", default="auto", help="auto, cpu, cuda or reference")
+
+    transform = commands.add_parser(
+        "transform",
+        help="turn, scale and move splats in a file, with all that it says of places and lengths",
+        description="Angles first, then the scale, then the shift. Numbers below 0 go behind a =, as in "
+        "--translate=-1,0,2.",
+    )
+    transform.add_argument(
+        "source", type=Path, help="bundle, folder of levels, any 3DGS PLY, or a run's folder"
+    )
+    transform.add_argument("out", type=Path, help="file or folder to write, in the form of the source")
+    transform.add_argument(
+        "--upright", action="store_true", help="first turn as the file says that its scene stands upright"
+    )
+    transform.add_argument(
+        "--rotate", type=_reals(3), default=(0, 0, 0), metavar="X,Y,Z",
+        help="degrees about x, then y, then z, as Blender's Euler angles",
+    )  # fmt: skip
+    transform.add_argument("--scale", type=float, default=1.0, metavar="N", help="times the size")
+    transform.add_argument(
+        "--translate", type=_reals(3), default=(0, 0, 0), metavar="X,Y,Z", help="shift in the new units"
+    )
+    transform.add_argument(
+        "--matrix", type=_reals(16), metavar="A,B,...",
+        help="16 numbers, row by row, instead of these three; no stretching, shearing, mirroring",
+    )  # fmt: skip
+    edit = commands.add_parser(
+        "edit",
+        help="a copy without clutter: what lies outside of crops, floaters, splats that are too large",
+        description="Every level is edited alike, and stays what its rule chooses from. Places and lengths "
+        "are in the splats' own units; lodgs info tells their bounds.",
+    )
+    edit.add_argument("source", type=Path, help="bundle, folder of levels or any 3DGS PLY")
+    edit.add_argument("--out", type=Path, required=True, help="file, or folder, to write")
+    edit.add_argument(
+        "--crop-box", type=float, nargs=6, action="append", default=[], metavar="N",
+        help="two opposite corners of a box, X Y Z X Y Z; of several boxes and spheres any one counts",
+    )  # fmt: skip
+    edit.add_argument(
+        "--crop-sphere", type=float, nargs=4, action="append", default=[], metavar="N",
+        help="centre and radius of a sphere, X Y Z R",
+    )  # fmt: skip
+    edit.add_argument(
+        "--keep", choices=("inside", "outside"), default="inside",
+        help="what stays of boxes and spheres (default inside)",
+    )  # fmt: skip
+    edit.add_argument(
+        "--max-size", type=float, metavar="N", help="drop splats with a larger standard deviation"
+    )
+    edit.add_argument("--min-opacity", type=float, metavar="N", help="drop fainter splats; from 0 to 1")
+    edit.add_argument(
+        "--drop-floaters", action="store_true", help="drop clusters of few splats with nothing near them"
+    )
+    edit.add_argument(
+        "--gap", type=float, metavar="N",
+        help="how far off floaters are at least (otherwise by how far most splats reach)",
+    )  # fmt: skip
+    edit.add_argument(
+        "--share", type=float, metavar="N",
+        help="how large clusters of floaters are at most, as a share of all splats (default 0.001)",
+    )  # fmt: skip
+    edit.add_argument(
+        "--scene", type=Path, metavar="DIR", help="COLMAP folder of the photographs, for the next two"
+    )
+    edit.add_argument(
+        "--max-distance", type=float, metavar="N", help="drop splats farther from every photograph's eye"
+    )
+    edit.add_argument(
+        "--min-views", type=int, metavar="N", help="drop splats in the frames of fewer photographs"
+    )
 
     info = commands.add_parser("info", help="say what a bundle or any 3DGS PLY holds")
     info.add_argument("file", type=Path)
@@ -200,17 +275,25 @@ def _controls(chosen: argparse.Namespace) -> dict[str, float]:
     return {name: value for name, value in asked.items() if value is not None}
 
 
-def _size(text: str) -> tuple[int, int]:
-    width, _, height = text.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
-        raise argparse.ArgumentTypeError(f"{text} is not WIDTHxHEIGHT, such as 640x480")
-    return int(width), int(height)
-
-
 def _amount(text: str) -> int:
     if text.isdecimal() and 0 < int(text) < 2**31:
         return int(text)
     raise argparse.ArgumentTypeError(f"{text} is no whole number above 0")
+
+
+def _reals(count: int) -> Callable[[str], tuple[float, ...]]:
+    """What reads so many numbers between commas."""
+
+    def read(text: str) -> tuple[float, ...]:
+        try:
+            found = tuple(map(float, text.split(",")))
+        except ValueError:
+            found = ()
+        if len(found) != count:
+            raise argparse.ArgumentTypeError(f"{text} is not {count} numbers with commas between them")
+        return found
+
+    return read
 
 
 def _colour(text: str) -> tuple[float, float, float] | None:
@@ -356,6 +439,37 @@ def _capture(chosen: argparse.Namespace) -> int:
     return 0
 
 
+def _model(chosen: argparse.Namespace) -> int:
+    from .scenes.rendered import write_model
+
+    views, points = write_model(chosen.folder)
+    print(f"{chosen.folder}: {views} views, {points:,} points")
+    return 0
+
+
+def _transform(chosen: argparse.Namespace) -> int:
+    import numpy as np
+
+    from .lod.placing import place_file, upright_of
+    from .runs.folder import RunFolder
+    from .splats.placing import Placement
+
+    source = chosen.source
+    if (bundle := RunFolder(source).bundle).exists():
+        source = bundle
+    if chosen.matrix is None:
+        placement = Placement.composed(chosen.rotate, chosen.scale, chosen.translate)
+    elif (chosen.rotate, chosen.scale, chosen.translate) == ((0, 0, 0), 1.0, (0, 0, 0)):
+        placement = Placement.of(np.reshape(chosen.matrix, (4, 4)))
+    else:
+        raise LodgsError("--matrix says all that --rotate, --scale and --translate say.", "Choose one.")
+    if chosen.upright:
+        placement = placement.after(upright_of(source))
+    count = place_file(source, chosen.out, placement, _warn)
+    print(f"{chosen.out}: {count:,} splats")
+    return 0
+
+
 def _warn(message: str) -> None:
     print(f"warning: {message}", file=sys.stderr)
 
@@ -364,6 +478,34 @@ def _serve(chosen: argparse.Namespace) -> int:
     from .render.serve import serve
 
     return serve(chosen.folder, chosen.backend, sys.stdin.buffer, sys.stdout)
+
+
+def _edit(chosen: argparse.Namespace) -> int:
+    from .lod.cleaning import Cleaning
+    from .lod.crop import Crop
+    from .lod.edit import edit
+
+    names = "max_size", "min_opacity", "max_distance", "min_views", "gap", "share"
+    given = {name: value for name in names if (value := getattr(chosen, name)) is not None}
+    for name, value in given.items():
+        if not 0 <= value < float("inf"):
+            raise LodgsError(f"--{name.replace('_', '-')} cannot be {value:g}.", "Give a number from 0 on.")
+    outside = chosen.keep == "outside"
+    crops = [Crop.box(box[:3], box[3:], outside) for box in chosen.crop_box]
+    crops += [Crop.sphere(sphere[:3], sphere[3], outside) for sphere in chosen.crop_sphere]
+    if given.keys() & {"max_distance", "min_views"}:
+        if chosen.scene is None:
+            raise LodgsError("Photographs' views are in their scene.", "Name its folder with --scene.")
+        from .scenes.colmap import read_scene
+
+        given["cameras"] = tuple(read_scene(chosen.scene).cameras)
+    print(
+        edit(
+            chosen.source, chosen.out,
+            Cleaning(tuple(crops), drop_floaters=chosen.drop_floaters, **given), _warn,
+        )
+    )  # fmt: skip
+    return 0
 
 
 def _info(chosen: argparse.Namespace) -> int:
@@ -418,7 +560,10 @@ _COMMANDS = {
     "evaluate": _evaluate,
     "render": _render,
     "capture": _capture,
+    "model": _model,
     "serve": _serve,
+    "transform": _transform,
+    "edit": _edit,
     "info": _info,
 }
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from ...training.errors import LodgsError
 from ...training.scenes.cameras import Camera
+from .placement import matrix_of
 
 
 def scene_camera(scene: bpy.types.Scene) -> bpy.types.Object:
@@ -85,22 +86,5 @@ def view_from(
     """
     obj = obj or scene_camera(depsgraph.scene)
     camera, near = view_of(obj.evaluated_get(depsgraph), depsgraph, width, height)
-    matrix = matrix_of(root.evaluated_get(depsgraph))
-    inside, unit = camera.within(matrix)
+    inside, unit = camera.within(matrix_of(root, depsgraph))
     return inside, near / unit
-
-
-def matrix_of(root: bpy.types.Object) -> np.ndarray:
-    """(4, 4) float64 from the coordinates of a splat scene to Blender's world.
-
-    Raises:
-        LodgsError: the root is stretched.
-    """
-    matrix = np.array(root.matrix_world, np.float64)
-    scales = np.linalg.norm(matrix[:3, :3], axis=0)
-    if scales.min() <= 0 or scales.max() > 1.0001 * scales.min() or np.linalg.det(matrix[:3, :3]) <= 0:
-        raise LodgsError(
-            f"'{root.name}' is stretched, which no camera of its files can show.",
-            "Give it one scale for all axes.",
-        )
-    return matrix

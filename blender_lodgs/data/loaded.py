@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
-from ...training.lod.rule import Region, rules
+from ...training.lod.rule import Region
 from ..attributes import read_attribute
 from . import objects, selection
 
@@ -18,7 +18,8 @@ def chosen(context: bpy.types.Context, root: bpy.types.Object) -> selection.Choi
     depsgraph = context.view_layer.depsgraph
     for item in root.lodgs.levels if depsgraph is not None else ():
         if item.exists and item.object.visible_get(view_layer=context.view_layer):
-            return selection.choice(item.object.evaluated_get(depsgraph), depsgraph)
+            choice = selection.choice(item.object.evaluated_get(depsgraph), depsgraph)
+            return choice if choice is not None and choice.rule else None
     return None
 
 
@@ -41,7 +42,7 @@ def _count(cloud: bpy.types.PointCloud, choice: selection.Choice, region: Region
     key = cloud.session_uid, region
     if key not in _counts:
         nothing = np.broadcast_to(np.float32(0), len(cloud.points))
-        found = {name: read_attribute(cloud, name) for name in rules()[choice.rule].columns}
+        found = {name: read_attribute(cloud, name) for name in choice.columns}
         columns = {name: nothing if values is None else values for name, values in found.items()}
         _counts[key] = int(np.count_nonzero(choice.loaded(columns)))
     return _counts[key]

@@ -22,6 +22,7 @@ from ..attributes import (
     BASE,
     COLOR,
     COLUMN,
+    HIDDEN,
     LAYOUTS,
     LOG_SCALE,
     OPACITY_LOGIT,
@@ -36,7 +37,9 @@ from ..attributes import (
 )
 from ..nodes import display
 
-_OWN = {"position", BASE, SCALE, ROTATION, LOG_SCALE, OPACITY_LOGIT, QUATERNION, COLOR, RADIUS, WEIGHT}
+_OWN = {
+    "position", BASE, SCALE, ROTATION, LOG_SCALE, OPACITY_LOGIT, QUATERNION, COLOR, RADIUS, WEIGHT, HIDDEN,
+}  # fmt: skip
 _TYPE = "lodgs_type:"  # custom property that remembers a column's type
 _EXTRA = COLUMN.format("")
 _MADE = ("scenes", "objects", "collections", "pointclouds", "meshes", "cameras", "images")
@@ -93,6 +96,13 @@ def new_splats(name: str, splats: Splats) -> bpy.types.Object:
     write_attribute(cloud, RADIUS, "FLOAT", radius)
     obj = _in_colors(name, cloud, to_bytes(SH_C0 * splats.sh[:, 0] + np.float32(0.5)))
     display.attach(obj)
+    return obj
+
+
+def root_of(obj: bpy.types.Object | None) -> bpy.types.Object | None:
+    """The root of the splat scene that an object is in: itself, or what it is a child of; None outside."""
+    while obj is not None and not obj.lodgs.is_root:
+        obj = obj.parent
     return obj
 
 
@@ -155,7 +165,8 @@ def splats_of(cloud: bpy.types.PointCloud, weights: np.ndarray | None = None) ->
 
 def megabytes(cloud: bpy.types.PointCloud) -> float:
     """Size of the splats as a 3DGS file, in 10^6 bytes."""
-    names = [a.name for a in cloud.attributes if a.data_type in LAYOUTS and a.domain == "POINT"]
+    columns = LAYOUTS.keys() - {"BOOLEAN"}  # which no file has: Blender's own
+    names = [a.name for a in cloud.attributes if a.data_type in columns and a.domain == "POINT"]
     own = _OWN - {"position", BASE, SCALE, ROTATION}
     widths = [LAYOUTS[cloud.attributes[name].data_type].width for name in names if name not in own]
     normals = 3

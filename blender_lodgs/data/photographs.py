@@ -13,6 +13,8 @@ from ...training.scenes.cameras import Camera
 from ...training.splats.dialects import Warn, silent
 from ..attributes import read_attribute
 from . import selection
+from .objects import root_of
+from .placement import in_parent
 
 SENSOR = 36.0
 """Longer side of every imported camera's sensor in millimetres: lenses read as on a full-frame camera."""
@@ -124,21 +126,34 @@ def look_at_scene(context: bpy.types.Context, root: bpy.types.Object, warn: Warn
     for obj in _in_the_way(context, *photographed) if photographed is not None else ():
         obj.hide_set(True)
         warn(f"'{obj.name}' stands before the cameras and is hidden; Alt+H shows it.")
-    if context.screen is None:
+    if photographed is None:
+        frame(context, root)
         return
-    reach = _reach(root)
-    for area in context.screen.areas:
+    eye, target = photographed
+    for looks in _viewports(context, root):
+        looks.view_rotation = (eye - target).to_track_quat("Z", "Y")
+        looks.view_location, looks.view_distance = target, (eye - target).length
+
+
+def frame(context: bpy.types.Context, root: bpy.types.Object) -> None:
+    """Has most of a splat scene in sight of the window's viewports, from the side that they look from: far
+    outliers do not count."""
+    if (bounds := bounds_of_most(root)) is not None:
+        for looks in _viewports(context, root):
+            looks.view_location, size = bounds
+            looks.view_distance = 1.5 * size
+
+
+def _viewports(context: bpy.types.Context, root: bpy.types.Object) -> list[bpy.types.RegionView3D]:
+    """The window's viewports, out of cameras, and with all of a splat scene before their far end."""
+    found, reach = [], _reach(root)
+    for area in context.screen.areas if context.screen is not None else ():
         if area.type == "VIEW_3D":
-            area.spaces.active.clip_end = max(area.spaces.active.clip_end, reach)
-            looks = area.spaces.active.region_3d
-            looks.view_perspective = "PERSP"
-            if photographed is not None:
-                eye, target = photographed
-                looks.view_rotation = (eye - target).to_track_quat("Z", "Y")
-                looks.view_location, looks.view_distance = target, (eye - target).length
-            elif (bounds := bounds_of_most(root)) is not None:
-                looks.view_location, size = bounds
-                looks.view_distance = 1.5 * size
+            space = area.spaces.active
+            space.clip_end = max(space.clip_end, reach)
+            space.region_3d.view_perspective = "PERSP"
+            found.append(space.region_3d)
+    return found
 
 
 def _in_the_way(context: bpy.types.Context, eye: Vector, target: Vector) -> list[bpy.types.Object]:
@@ -161,7 +176,7 @@ def photographed_from(root: bpy.types.Object) -> tuple[Vector, Vector] | None:
     middle of all views, at the median depth of the points. None where neither is there."""
     meta = selection.read_json(root.lodgs.meta)
     if "view" in meta:
-        eye, target = (root.matrix_basis @ Vector(place) for place in meta["view"])
+        eye, target = (in_parent(root) @ Vector(place) for place in meta["view"])
         return eye, target
     poses, places = np.array([view.matrix_basis for view in views(root)]), _positions(root.lodgs.points)
     if not len(poses) or not len(places):
@@ -171,19 +186,19 @@ def photographed_from(root: bpy.types.Object) -> tuple[Vector, Vector] | None:
     eye, ahead = pose[:3, 3], -pose[:3, 2]
     depths = (places - eye) @ ahead
     depth = np.median(depths[depths > 0]) if (depths > 0).any() else 1.0
-    return root.matrix_basis @ Vector(eye), root.matrix_basis @ Vector(eye + depth * ahead)
+    return in_parent(root) @ Vector(eye), in_parent(root) @ Vector(eye + depth * ahead)
 
 
 def bounds_of_most(root: bpy.types.Object) -> tuple[Vector, float] | None:
     """Middle and diagonal, in the root's parent, of a box around nine tenths of the finest level along each
-    axis: far outliers, which splats always have, are left out. None without splats."""
-    levels = [item.object for item in root.lodgs.levels if item.exists]
-    places = _positions(levels[-1] if levels else None)
+    axis, or of the points without splats: far outliers, which both always have, are left out. None without
+    either."""
+    places = _most_places(root)
     if not len(places):
         return None
     low, high = np.percentile(places, (5, 95), axis=0)
-    size = float(np.linalg.norm(high - low)) * max(root.matrix_basis.to_scale())
-    return root.matrix_basis @ Vector((low + high) / 2), size
+    size = float(np.linalg.norm(high - low)) * max(in_parent(root).to_scale())
+    return in_parent(root) @ Vector((low + high) / 2), size
 
 
 def _reach(root: bpy.types.Object) -> float:
@@ -192,9 +207,14 @@ def _reach(root: bpy.types.Object) -> float:
     bounds = bounds_of_most(root)
     if bounds is None:
         return 0.0
-    places = _positions([item.object for item in root.lodgs.levels if item.exists][-1])
-    across = float(np.linalg.norm(np.ptp(places, axis=0))) * max(root.matrix_basis.to_scale())
+    across = float(np.linalg.norm(np.ptp(_most_places(root), axis=0))) * max(in_parent(root).to_scale())
     return min(across, 100 * bounds[1])
+
+
+def _most_places(root: bpy.types.Object) -> np.ndarray:
+    """(N, 3) places of the finest level, or without levels of the points, in the scene's own space."""
+    levels = [item.object for item in root.lodgs.levels if item.exists]
+    return _positions(levels[-1] if levels else root.lodgs.points)
 
 
 def _positions(obj: bpy.types.Object | None) -> np.ndarray:
@@ -208,7 +228,7 @@ def through(context: bpy.types.Context, view: bpy.types.Object) -> bpy.types.Obj
     context.scene.camera = view
     if view.data.lodgs.width:
         match_render(context.scene, view.data.lodgs, context.scene.render.resolution_percentage)
-    root = view.parent
+    root = root_of(view)
     if root is not None and root.lodgs.cameras is not None:
         line = root.lodgs.cameras.objects.find(view.name)
         if line >= 0 and line != root.lodgs.active_view:  # the list of views goes along

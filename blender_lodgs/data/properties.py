@@ -11,6 +11,7 @@ import bpy
 from ...training.lod.rule import Control, Rule, rules
 from .selection import read_json
 from .training import PARAMETERS, TrainingCell, TrainingSettings
+from .viewpoints import ViewsSettings
 
 ON_CHANGE: dict[str, Callable[[Any, bpy.types.Context], None]] = {}
 """What is done when a property has changed, with its owner, by name; ``updates`` says what."""
@@ -79,6 +80,12 @@ class SplatLevel(bpy.types.PropertyGroup):
     )
     facts: bpy.props.StringProperty(
         name="Facts", description="What the rule needs to know of the level, as JSON", options={"HIDDEN"}
+    )
+
+    lost: bpy.props.IntProperty(
+        name="No Longer Hidden",
+        description="How many splats were hidden of the level whose place this one has taken",
+        options={"HIDDEN"},
     )
 
     @property
@@ -239,6 +246,11 @@ class SplatScene(bpy.types.PropertyGroup):
         update=_eye_changed,
     )
 
+    axes: bpy.props.PointerProperty(
+        name="Axes",
+        description="The empty in whose space the coordinates of the scene's files are",
+        type=bpy.types.Object,
+    )
     points: bpy.props.PointerProperty(
         name="Points", description="The points of the COLMAP scene", type=bpy.types.Object
     )
@@ -401,6 +413,18 @@ class ViewportSettings(bpy.types.PropertyGroup):
     )
 
 
+class CaptureSettings(ViewsSettings, bpy.types.PropertyGroup):
+    """How a Blender scene becomes photographs to train from, on the scene (``Scene.lodgs_capture``)."""
+
+    folder: bpy.props.StringProperty(
+        name="Folder",
+        description="Folder that receives the pictures and becomes a COLMAP scene; empty: lodgs_capture "
+        "beside the .blend file. What is there already is not rendered again",
+        subtype="DIR_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
+    )
+
+
 class ViewSettings(bpy.types.PropertyGroup):
     """What an imported camera knows of its photograph, on its data (``Camera.lodgs``); all 0 on others."""
 
@@ -420,6 +444,26 @@ class ViewSettings(bpy.types.PropertyGroup):
     psnr: bpy.props.FloatProperty(
         name="PSNR",
         description="How alike the splats and the photograph were when last measured, in dB; 0 before",
+    )
+
+
+class CropSettings(bpy.types.PropertyGroup):
+    """What an empty under a scene root crops (``Object.lodgs_crop``); see ``crops``."""
+
+    is_crop: bpy.props.BoolProperty(
+        name="Crop", description="Whether the empty crops the splats of its scene", options={"HIDDEN"}
+    )
+    keep: bpy.props.EnumProperty(
+        name="Keep",
+        description="What is left of the splats, at every level",
+        items=[
+            ("INSIDE", "Keep Inside", "Splats in this crop stay, and those in others that keep theirs"),
+            ("OUTSIDE", "Cut Out", "Splats in this crop go"),
+        ],
+        update=_changed,
+    )
+    use: bpy.props.BoolProperty(
+        name="Use", description="Whether the crop has an effect", default=True, update=_changed
     )
 
 
@@ -494,21 +538,25 @@ SplatScene.__annotations__ |= {
 
 CLASSES = (
     ViewSettings, ViewportSettings, *PARAMETERS.values(), TrainingCell, TrainingSettings, SplatLevel,
-    SplatTable, SplatStream, *CONTROLS.values(), SplatScene, RenderSettings,
+    SplatTable, SplatStream, *CONTROLS.values(), SplatScene, CropSettings, RenderSettings, CaptureSettings,
 )  # fmt: skip
 
 
 def register() -> None:
     """Attach the groups to Blender's objects, cameras and scenes."""
     bpy.types.Object.lodgs = bpy.props.PointerProperty(type=SplatScene)
+    bpy.types.Object.lodgs_crop = bpy.props.PointerProperty(type=CropSettings)
     bpy.types.Camera.lodgs = bpy.props.PointerProperty(type=ViewSettings)
     bpy.types.Scene.lodgs_render = bpy.props.PointerProperty(type=RenderSettings)
     bpy.types.Scene.lodgs_viewport = bpy.props.PointerProperty(type=ViewportSettings)
+    bpy.types.Scene.lodgs_capture = bpy.props.PointerProperty(type=CaptureSettings)
 
 
 def unregister() -> None:
     """Detach them again."""
+    del bpy.types.Scene.lodgs_capture
     del bpy.types.Scene.lodgs_render
     del bpy.types.Scene.lodgs_viewport
     del bpy.types.Camera.lodgs
+    del bpy.types.Object.lodgs_crop
     del bpy.types.Object.lodgs

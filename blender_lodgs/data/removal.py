@@ -9,21 +9,25 @@ from __future__ import annotations
 
 import bpy
 
-from . import photographs, tables
+from . import crops, photographs, tables
+from .placement import axes_of
 
 
 def remove(root: bpy.types.Object) -> None:
-    """Removes a splat scene: levels, tables, points, cameras, the root, and collections that are empty then.
+    """Removes a splat scene: levels, crops, tables, points, cameras, the root, and collections empty then.
 
-    What else hangs on the root stays where it is: copies of levels show what they show, without following.
+    What else hangs on the root stays where it is: copies of levels show what they show, without following,
+    and uncropped.
     What the root knows and does not carry, another does: a copy of a root alone knows the same levels.
     """
     views = [view for view in photographs.views(root) if view.data.lodgs.width]
     known = [item.object for item in root.lodgs.levels] + [root.lodgs.points, *views]
-    parts = {obj for obj in known if obj is not None and obj.parent == root} | {root, *tables.parts(root)}
+    axes, cropping = axes_of(root), crops.crops_of(root)
+    parts = {obj for obj in known if obj is not None and obj.parent == axes}
+    parts |= {root, axes, *tables.parts(root), *cropping}
     others = [obj for obj in bpy.data.objects if obj not in parts and obj.is_editable]
     for obj in others:
-        _let_go(obj, root)
+        _let_go(obj, root, cropping)
     pictures = {picture.image for view in views for picture in view.data.background_images} - {None}
     data = {obj.data for obj in parts} - {None}
     collections = {part for obj in parts for part in obj.users_collection if part in bpy.data.collections[:]}
@@ -44,12 +48,14 @@ def remove_deleted() -> None:
             remove(root)
 
 
-def _let_go(obj: bpy.types.Object, root: bpy.types.Object) -> None:
-    """Takes an object off the root, where it is, and away from drivers that read the root."""
-    if obj.parent == root:
+def _let_go(obj: bpy.types.Object, root: bpy.types.Object, cropping: list[bpy.types.Object]) -> None:
+    """Takes an object off the root, where it is, and away from drivers that read the root, and its crops."""
+    if obj.parent in (root, axes_of(root)):
         place = obj.matrix_world.copy()
         obj.parent = None
         obj.matrix_world = place
+    if any(crop in crops.followed_by(obj) for crop in cropping):
+        crops.detach(obj)
     for curve in list(obj.animation_data.drivers if obj.animation_data else ()):
         if any(target.id == root for variable in curve.driver.variables for target in variable.targets):
             obj.animation_data.drivers.remove(curve)

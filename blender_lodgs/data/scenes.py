@@ -1,8 +1,8 @@
 """Splat scenes in Blender: a root, a collection, and in it cameras, points and levels.
 
 The scene root is an empty; ``root.lodgs`` holds what belongs to the scene (see ``properties.SplatScene``).
-Everything else is its child in COLMAP coordinates. These functions are what operators call and what scripts
-may call.
+Everything else hangs on its axes in COLMAP coordinates (see ``placement``). These functions are what
+operators call and what scripts may call.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...training.errors import LodgsError
+from ...training.lod import placing
 from ...training.lod.paging import TreeFile, is_tree, read_within
 from ...training.lod.rule import Control, Tables, find_rule
 from ...training.lod.selection import complete, known_rule, not_alone, unknown_rule
@@ -26,8 +27,10 @@ from ...training.scenes.colmap import Scene, read_scene
 from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder, read_head
 from ...training.splats.gaussians import Splats
 from ..nodes import ellipsoids
-from . import objects, selection, streams, tables
+from . import cleaning, crops, objects, selection, streams, tables
+from .objects import root_of
 from .photographs import match_render, new_camera, views
+from .placement import axes_of, new_axes, placement_of
 
 LINKED = (
     "This splat scene is linked from another file, where its settings are. To change them here, append it "
@@ -45,13 +48,6 @@ def active_root(context: bpy.types.Context) -> bpy.types.Object | None:
     root = root_of(context.active_object)
     found = [root] if root is not None else roots(context.scene)
     return found[0] if len(found) == 1 else None
-
-
-def root_of(obj: bpy.types.Object | None) -> bpy.types.Object | None:
-    """The root of the splat scene that an object is in: itself, or what it is a child of; None outside."""
-    while obj is not None and not obj.lodgs.is_root:
-        obj = obj.parent
-    return obj
 
 
 def shows_splats(scene: bpy.types.Scene) -> bool:
@@ -122,9 +118,9 @@ def import_colmap(
         )
     extent, near = _extent(scene), _near(scene)
     with _new_scene(context, scene.folder.name) as root:
+        axes = axes_of(root)
         if upright:
-            root.rotation_mode = "QUATERNION"
-            root.rotation_quaternion = Matrix(scene.up_rotation().tolist()).to_quaternion()
+            axes.rotation_quaternion = Matrix(scene.up_rotation().tolist()).to_quaternion()
         root.empty_display_size = extent / 4
         root.lodgs.scene_folder = str(scene.folder)
         root.lodgs.camera_center = scene.center
@@ -137,13 +133,13 @@ def import_colmap(
         for place, camera in enumerate(scene.cameras):
             distorted = camera.name in scene.distorted
             view = new_camera(camera, extent, near, photograph=photographs, distorted=distorted)
-            view.parent, view.data.lodgs.place = root, place
+            view.parent, view.data.lodgs.place = axes, place
             root.lodgs.cameras.objects.link(view)
         if len(scene.points):
             points = objects.new_points(
                 f"{root.name} points", scene.points, scene.point_colors, radius=extent / 400
             )
-            points.parent = root
+            points.parent = axes
             _collection(root).objects.link(points)
             root.lodgs.points = points
         if context.scene.camera is None and scene.cameras:
@@ -164,7 +160,7 @@ def import_splats(
 
     Args:
         budget: see :func:`read_splats_file`.
-        upright: turn the root as the bundle says, or without that so that -y, which is up in most splat
+        upright: turn the scene as the bundle says, or without that so that -y, which is up in most splat
             files, is up; otherwise leave the axes.
         warn: receives a sentence for each thing that is shown otherwise than the file's maker shows it.
 
@@ -243,8 +239,7 @@ def place_splats(
             yield
         with _new_scene(context, file.path.stem) as root:
             if upright:
-                rows = bundle.meta.get("up_rotation", ((1, 0, 0), (0, 0, 1), (0, -1, 0)))
-                root.rotation_euler = Matrix(rows).to_euler()
+                axes_of(root).rotation_quaternion = Matrix(bundle.upright.tolist()).to_quaternion()
             _fill(root, file, made)
             root.lodgs.training.method = next(info.name for info in METHODS.values() if info.for_splats)
     except BaseException:
@@ -364,13 +359,18 @@ def make_room(root: bpy.types.Object, number: int) -> None:
     _levels_changed(root)
 
 
-def read_levels(root: bpy.types.Object) -> Bundle:
-    """The levels of a splat scene with all that artists have changed in them, in the splats' own world.
+def read_levels(root: bpy.types.Object, placed: bool = False) -> Bundle:
+    """The levels of a splat scene with all that artists have changed in them, modifiers not applied.
 
-    The objects' transforms and modifiers are not applied.
+    What is hidden, and what crops leave out, is not among them.
+
+    Args:
+        placed: where the scene stands in Blender, upright there; otherwise in the splats' own world. What of
+            its objects has been moved by itself counts in neither.
 
     Raises:
-        LodgsError: there are none.
+        LodgsError: there are none, or crops leave nothing; or of a placed one, its root is stretched or its
+            rule unknown.
     """
     levels = [
         Level(item.number, objects.read_splats(item.object), selection.read_facts(item.facts))
@@ -381,19 +381,50 @@ def read_levels(root: bpy.types.Object) -> Bundle:
         raise LodgsError(f"{root.name} has no levels yet.", "Train it or import splats first.")
     settings = root.lodgs
     facts, meta = selection.read_facts(settings.facts), selection.read_json(settings.meta)
-    return Bundle(
+    bundle = Bundle(
         settings.method, levels, settings.rule, facts, _set_controls(root), settings.cumulative, meta,
         tables.read_tables(root),
     )  # fmt: skip
+    bundle = cleaning.left(root, bundle, bpy.context.evaluated_depsgraph_get())
+    if placed:
+        bundle = placing.placed(bundle, placement_of(root))
+        bundle.meta["up_rotation"] = np.eye(3)
+    return bundle
 
 
-def read_level(root: bpy.types.Object, number: int) -> Splats:
-    """One level with all that artists have changed in it; where levels add up, with all coarser ones.
+def delete_left_out(root: bpy.types.Object) -> int:
+    """Deletes what is hidden and what crops leave out, of every level, and the crops; how many splats.
 
     Raises:
-        LodgsError: there is no such level, or it is no scene by itself.
+        LodgsError: as :func:`read_levels`, or the levels are only the top of a tree in a file.
     """
+    file = streams.file_of(root)
+    if file is not None:
+        raise LodgsError(
+            f"Most of these splats are in {file.name}, which stays as it is.",
+            "Keep the crops; or edit the file with the command lodgs edit, and import what that writes.",
+        )
+    before = sum(len(item.object.data.points) for item in root.lodgs.levels if item.exists)
     bundle = read_levels(root)
+    for level in bundle.levels:
+        _put_level(root, level)
+    for item in root.lodgs.levels:
+        item.lost = 0
+    bpy.data.batch_remove(crops.crops_of(root))
+    _levels_changed(root)
+    return before - sum(len(level.splats) for level in bundle.levels)
+
+
+def read_level(root: bpy.types.Object, number: int, placed: bool = False) -> Splats:
+    """One level with all that artists have changed in it; where levels add up, with all coarser ones.
+
+    Args:
+        placed: see :func:`read_levels`.
+
+    Raises:
+        LodgsError: there is no such level, or it is no scene by itself; or as :func:`read_levels`.
+    """
+    bundle = read_levels(root, placed)
     for level in bundle.levels:
         if level.number == number:
             _require_alone(root, number)
@@ -401,13 +432,17 @@ def read_level(root: bpy.types.Object, number: int) -> Splats:
     raise LodgsError(f"{root.name} has no level {number}.", "Choose one from the list of levels.")
 
 
-def shown_splats(context: bpy.types.Context, root: bpy.types.Object) -> Splats:
+def shown_splats(context: bpy.types.Context, root: bpy.types.Object, placed: bool = False) -> Splats:
     """The splats that the detail settings, and artists' own modifiers, leave visible in the view layer.
 
     Columns that not every visible level has are left out.
 
+    Args:
+        placed: see :func:`read_levels`.
+
     Raises:
-        LodgsError: nothing is visible, or the levels have spherical harmonics of different degrees.
+        LodgsError: nothing is visible, or the levels have spherical harmonics of different degrees; or of
+            placed ones, the root is stretched.
     """
     depsgraph = context.evaluated_depsgraph_get()
     parts = [
@@ -421,10 +456,14 @@ def shown_splats(context: bpy.types.Context, root: bpy.types.Object) -> Splats:
         )
     shared = [name for name in parts[0].extras if all(name in part.extras for part in parts)]
     arrays = ("means", "quats", "log_scales", "opacity_logits", "sh")
-    return Splats(
+    splats = Splats(
         **{name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays},
         extras={name: np.concatenate([part.extras[name] for part in parts]) for name in shared},
     )
+    rule = find_rule(root.lodgs.rule)
+    if not placed:
+        return splats
+    return placement_of(root).splats(splats, *((rule.lengths, rule.places) if rule else ()))
 
 
 def count_shown(context: bpy.types.Context, root: bpy.types.Object) -> tuple[int, int]:
@@ -473,6 +512,7 @@ def _new_scene(context: bpy.types.Context, name: str) -> Iterator[bpy.types.Obje
         root.lodgs.is_root = True
         collection.objects.link(root)
         context.scene.collection.children.link(collection)
+        new_axes(root)
         yield root
     for obj in context.selected_objects:
         obj.select_set(False)
@@ -590,6 +630,7 @@ def _put_level(
     elif item.exists:
         # The object stays, with all that artists have hung on it; only its splats change.
         old, obj = item.object.data, item.object
+        item.lost = int(cleaning.hidden(old).sum())
         obj.data, obj.color = fresh.data, fresh.color
         bpy.data.objects.remove(fresh)
         name = old.name
@@ -597,7 +638,7 @@ def _put_level(
         obj.data.name = name
         fresh = obj
     if fresh.parent is None:
-        fresh.parent = root
+        fresh.parent = axes_of(root)
         _collection(root).objects.link(fresh)
     item.object = fresh
     item.facts = json.dumps(level.facts)
@@ -637,6 +678,10 @@ def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
         for root in editable:
             if not all(item.exists for item in root.lodgs.levels):
                 _levels_changed(root)
+    if depsgraph.id_type_updated("OBJECT"):
+        for root in editable:
+            if crops.outdated(root):
+                selection.follow_crops(root)
     if any(update.is_updated_geometry for update in depsgraph.updates):
         for root in editable:
             selection.update_inputs(root)

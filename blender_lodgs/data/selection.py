@@ -19,23 +19,25 @@ from ...training.errors import LodgsError
 from ...training.lod.choice import Choice
 from ...training.lod.rule import Rule, fact_names, facts_of, find_rule
 from .. import compat
+from ..nodes import crops as crop_groups
 from ..nodes import rules as groups
-from ..nodes.building import edited
+from ..nodes.building import fresh_driver, take_away
 from ..nodes.display import NAME as DISPLAY
+from . import crops
+from .placement import axes_of
 from .tables import read_table
 
 
 def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Choice | None:
-    """What the modifier of an evaluated level chooses by, as of the depsgraph.
+    """What the modifiers of an evaluated level choose by, as of the depsgraph: its crops, then its rule.
 
-    None where all is shown, or where somebody has changed its group: then it shows what the nodes leave.
+    None where all is shown. A modifier whose group somebody has changed counts as none (:func:`only_chosen`).
     """
+    cropped = crops.of_modifier(evaluated, depsgraph, lambda modifier: _is_on(modifier, depsgraph))
     modifier = _modifier(evaluated)
-    if modifier is None or not _is_on(modifier, depsgraph):
-        return None
-    rule = groups.rule_of_group(modifier.node_group)
-    if rule is None:
-        return None
+    rule = None if modifier is None else groups.rule_of_group(modifier.node_group)
+    if modifier is None or rule is None or not _is_on(modifier, depsgraph):
+        return None if cropped is None else Choice.by_crops(cropped)
 
     def value(name: str):
         return compat.get_input(modifier, name)
@@ -57,6 +59,7 @@ def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Choic
         tuple((name, value(name)) for name in fact_names(rule)),
         tuple((control.name, value(control.name)) for control in rule.controls),
         tuple((name, _frozen(value(groups.table_socket(name)))) for name in rule.tables),
+        cropped,
     )
 
 
@@ -69,10 +72,15 @@ def _frozen(obj: bpy.types.Object | None) -> tuple[tuple[str, str, bytes], ...]:
 def only_chosen(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
     """Whether an evaluated object shows its own splats as they are, chosen by nothing but :func:`choice`."""
     return all(
-        modifier.type == "NODES" and (modifier.name == DISPLAY or groups.rule_of_group(modifier.node_group))
+        modifier.type == "NODES" and (modifier.name == DISPLAY or _chooses(modifier.node_group))
         for modifier in evaluated.modifiers
         if _is_on(modifier, depsgraph)
     )
+
+
+def _chooses(group: bpy.types.NodeTree | None) -> bool:
+    """Whether a modifier's group is a rule's or the crops', and what they made it."""
+    return groups.rule_of_group(group) is not None or crop_groups.crops_of_group(group) is not None
 
 
 def _is_on(modifier: bpy.types.Modifier, depsgraph: bpy.types.Depsgraph) -> bool:
@@ -102,7 +110,7 @@ def eye_place(root: bpy.types.Object, scene: bpy.types.Scene) -> tuple[float, fl
     obj = settings.eye_object if settings.eye == "OBJECT" else scene.camera
     if obj is None:
         return (0.0, 0.0, 0.0)  # as geometry nodes have it
-    return tuple(root.matrix_world.inverted_safe() @ obj.matrix_world.translation)
+    return tuple(axes_of(root).matrix_world.inverted_safe() @ obj.matrix_world.translation)
 
 
 def hold(root: bpy.types.Object, eye: tuple[float, float, float], focal_px: float) -> None:
@@ -124,6 +132,7 @@ def attach(root: bpy.types.Object) -> None:
     which have none, are shown one at a time.
     """
     settings = root.lodgs
+    crops.attach(root)
     _drive_focal_length(root)
     rule = find_rule(settings.rule)
     levels = [(item.number, read_facts(item.facts)) for item in settings.levels if item.exists]
@@ -142,7 +151,29 @@ def attach(root: bpy.types.Object) -> None:
                 _detach(item.object)
                 continue
             _drive_level(root, item.object, rule, facts)
+    _order(root)
     update_inputs(root)
+
+
+def follow_crops(root: bpy.types.Object) -> None:
+    """Has the levels' modifiers follow the crops and hidden splats that there are now."""
+    crops.attach(root)
+    _order(root)
+    update_inputs(root)
+
+
+def _order(root: bpy.types.Object) -> None:
+    """Crops come before a rule that asks how many splats there are; else after it, where fewer are left."""
+    rule = find_rule(root.lodgs.rule)
+    for item in root.lodgs.levels if rule else ():
+        cropping, own = (
+            (crops.modifier_of(item.object), _modifier(item.object)) if item.exists else (None, None)
+        )
+        if cropping and own and rule:
+            modifiers = item.object.modifiers
+            place, there = modifiers.find(cropping.name), modifiers.find(own.name)
+            if (place < there) == rule.apart:
+                modifiers.move(place, there)
 
 
 def outdated(root: bpy.types.Object) -> bool:
@@ -161,12 +192,13 @@ def update_inputs(root: bpy.types.Object) -> None:
     }
     for item in root.lodgs.levels:
         modifier = item.exists and _modifier(item.object)
-        if modifier:
-            slots = item.object.material_slots
-            given = {groups.EYE_OBJECT: root.lodgs.eye_object} | tables
-            given[groups.MATERIAL] = slots[0].material if slots else None
-            for name, value in given.items():
-                _set(modifier, name, value, lambda there, value: there == value)
+        slots = item.object.material_slots if item.exists else ()
+        material = {groups.MATERIAL: slots[0].material if slots else None}
+        cropping = item.exists and crops.modifier_of(item.object)
+        eye = {groups.EYE_OBJECT: root.lodgs.eye_object}
+        for each, given in ((modifier, eye | tables | material), (cropping, material)):
+            for name, value in given.items() if each else ():
+                _set(each, name, value, lambda there, value: there == value)
 
 
 def _set(modifier: bpy.types.NodesModifier, name: str, value, same: Callable[[Any, Any], bool]) -> None:
@@ -194,7 +226,7 @@ def _drive_focal_length(root: bpy.types.Object) -> None:
         "ay": ("render.pixel_aspect_y", None),
     }
     width, height = "floor(rx * p / 100)", "floor(ry * p / 100)"
-    driver = _driver(
+    driver = fresh_driver(
         root,
         "lodgs.focal_px",
         f"lens * min(1, ax / ay) * ({width} / sw if fit == 1 or (fit == 0 and ax * {width} >= ay * {height})"
@@ -224,7 +256,7 @@ def _drive(
         index: of a vector's component.
         without: values of names where this extension, and with it the properties, are missing; others are 0.
     """
-    driver = _driver(obj, path, expression, index)
+    driver = fresh_driver(obj, path, expression, index)
     for name, source in sources.items():
         variable = driver.variables.new()
         variable.name, variable.type = name, "SINGLE_PROP"
@@ -291,22 +323,10 @@ def _modifier_of(obj: bpy.types.Object, rule: Rule) -> bpy.types.NodesModifier:
 
 
 def _detach(obj: bpy.types.Object) -> None:
-    """Takes away the modifier that chooses by distance, its drivers, and its group if it was the last.
-
-    A group that somebody has changed is kept, for whoever wants it back.
-    """
+    """Takes away the modifier that chooses by distance."""
     modifier = _modifier(obj)
-    if modifier is None:
-        return
-    for driver in list(obj.animation_data.drivers if obj.animation_data else ()):
-        if driver.data_path.startswith(f'modifiers["{modifier.name}"]'):
-            obj.animation_data.drivers.remove(driver)
-    group = modifier.node_group
-    obj.modifiers.remove(modifier)
-    if group is not None and edited(group):
-        group.use_fake_user = True
-    elif group is not None and not group.users:
-        bpy.data.node_groups.remove(group)
+    if modifier is not None:
+        take_away(obj, modifier)
 
 
 _BEFORE_RULES = ("LODGS Distance Band", "LODGS Octree Level")
@@ -321,12 +341,3 @@ def _modifier(obj: bpy.types.Object) -> bpy.types.NodesModifier | None:
         ):
             return modifier
     return None
-
-
-def _driver(obj: bpy.types.Object, path: str, expression: str, index: int = -1) -> bpy.types.Driver:
-    """A fresh driver of the property at ``path``, or of a vector's component, without variables."""
-    obj.driver_remove(path, index)
-    driver = obj.driver_add(path, index).driver
-    assert driver is not None
-    driver.type, driver.expression = "SCRIPTED", expression
-    return driver

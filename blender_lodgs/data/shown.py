@@ -14,6 +14,7 @@ import numpy as np
 
 from .. import attributes
 from . import scenes, selection, streams
+from .placement import axes_of
 
 
 @dataclass(frozen=True)
@@ -112,14 +113,14 @@ def choice_of_picture(instance: SplatInstance, depsgraph: bpy.types.Depsgraph) -
     """
     choice = selection.choice(instance.evaluated, depsgraph)
     root, camera = scenes.root_of(instance.object), depsgraph.scene.camera
-    if choice is None or instance.source is None or root is None or camera is None:
+    if choice is None or not choice.rule or instance.source is None or root is None or camera is None:
         return choice
     settings = root.lodgs
     if settings.eye != "VIEW" or settings.freeze:
         return choice
-    own, place = root.evaluated_get(depsgraph), camera.evaluated_get(depsgraph).matrix_world.translation
-    eye = tuple(own.matrix_world.inverted_safe() @ place)
-    return replace(choice, eye=eye, focal_px=own.lodgs.focal_px)
+    place = camera.evaluated_get(depsgraph).matrix_world.translation
+    eye = tuple(axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe() @ place)
+    return replace(choice, eye=eye, focal_px=root.evaluated_get(depsgraph).lodgs.focal_px)
 
 
 def _with_sources(found: list[SplatInstance], depsgraph: bpy.types.Depsgraph) -> list[SplatInstance]:

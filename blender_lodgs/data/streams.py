@@ -12,6 +12,8 @@ from pathlib import Path
 
 import bpy
 
+from ..attributes import HIDDEN
+
 HELD, MOST_HELD = 0.25, 250_000
 """Share of the budget that the scene's objects hold, and how many splats at most: Blender evaluates them anew
 whenever an eye rests, and all that is done with them holds its main thread."""
@@ -79,8 +81,11 @@ def source_of(root: bpy.types.Object) -> Source | None:
 
 
 def changed(root: bpy.types.Object) -> bool:
-    """Whether the splats that a scene holds are no longer those that came from its file."""
-    return not any(item.exists for item in root.lodgs.levels) or _held(root) != root.lodgs.stream.here
+    """Whether the splats that a scene holds are other ones than came from its file, or some are hidden."""
+    levels = [item.object.data for item in root.lodgs.levels if item.exists]
+    if any(HIDDEN in cloud.attributes for cloud in levels):
+        return True
+    return not levels or _held(root) != root.lodgs.stream.here
 
 
 def _held(root: bpy.types.Object) -> int:

@@ -16,6 +16,7 @@ from ...training.lod.rules.chunks import COLUMNS as SPHERE
 from ...training.lod.streaming import BLOCKS
 from ..attributes import COLUMN
 from .objects import read_column, write_column
+from .placement import axes_of
 
 _COLUMNS = "lodgs_columns"
 """Custom property of a table's mesh: its columns in their order, as JSON."""
@@ -38,7 +39,7 @@ def set_tables(root: bpy.types.Object, tables: Tables) -> None:
         if rule is not None and name in rule.tables and all(column in columns for column in SPHERE):
             objects += _new_spheres(f"{root.name} {name.removesuffix('s')}", columns)
         for obj in objects:
-            obj.parent = root
+            obj.parent = axes_of(root)
             collection.objects.link(obj)
 
 
@@ -57,7 +58,7 @@ def parts(root: bpy.types.Object) -> list[bpy.types.Object]:
     """The objects of a splat scene's tables: their meshes, and the spheres. A copy of a root has none."""
     collections = [item.collection for item in root.lodgs.tables if item.collection]
     known = {item.object for item in root.lodgs.tables} | {obj for one in collections for obj in one.objects}
-    return [obj for obj in known if obj is not None and obj.parent == root]
+    return [obj for obj in known if obj is not None and obj.parent == axes_of(root)]
 
 
 def read_tables(root: bpy.types.Object) -> dict[str, dict[str, np.ndarray]]:

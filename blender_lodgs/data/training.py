@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 
 from ...training.methods import METHODS, PRESETS, MethodInfo, method_info
-from ...training.runs.job import MOST_CELLS, VIEW_WIDTHS, VIEWS, Job
+from ...training.runs.job import MOST_CELLS, Job
 from ...training.splats.bundle import MOST_LEVELS
 from . import photographs, viewpoints
 
@@ -50,10 +50,6 @@ def level_distances(settings: bpy.types.PropertyGroup) -> list[tuple[int, int]]:
     group = settings.parameters
     levels = group.levels if group.is_property_set("levels") else group.preset_levels
     return [(number, levels - 1 - number) for number in range(1, levels)]
-
-
-def _is_curve(settings: bpy.types.PropertyGroup, obj: bpy.types.Object) -> bool:
-    return obj.type == "CURVE"
 
 
 def _preset_value(f: Field, method: str):
@@ -140,7 +136,7 @@ class TrainingCell(bpy.types.PropertyGroup):
     )
 
 
-class TrainingSettings(bpy.types.PropertyGroup):
+class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
     """Choices of the training panel, and the scene root's newest run (``root.lodgs.training``).
 
     ``run`` is the folder of that run, relative to the .blend where possible; all else about it is read from
@@ -170,43 +166,6 @@ class TrainingSettings(bpy.types.PropertyGroup):
             ),
             ("SCENE", "These Splats", "The finest level of this scene, with all that was changed in it"),
         ],
-    )
-    views_from: bpy.props.EnumProperty(
-        name="Views From",
-        description="From where pictures of these splats are drawn, which take the place of photographs",
-        items=[
-            (
-                "DOME",
-                "All Around",
-                "A dome of views around the splats: for a thing that is seen from outside",
-            ),
-            ("CAMERAS", "Cameras", "Every camera of the Blender scene"),
-            ("ANIMATION", "Animation", "The scene's camera in frames that are evenly chosen from its range"),
-            ("CURVE", "Along Curve", "A walk along a curve that looks ahead, to both sides and back in turn"),
-        ],
-    )
-    views: bpy.props.IntProperty(
-        name="Views", description="How many views there are", default=Job.views, min=VIEWS[0], max=VIEWS[1]
-    )
-    show_views: bpy.props.BoolProperty(
-        name="Show Views",
-        description="Show in the viewport from where the splats will be looked at",
-        default=False,
-        options=set(),
-    )
-    view_width: bpy.props.IntProperty(
-        name="View Width",
-        description="How wide their pictures are; training makes them smaller by Image Scale",
-        default=Job.view_width,
-        min=VIEW_WIDTHS[0],
-        max=VIEW_WIDTHS[1],
-        subtype="PIXEL",
-    )
-    curve: bpy.props.PointerProperty(
-        name="Curve",
-        description="What to walk along, at the height of the eyes",
-        type=bpy.types.Object,
-        poll=_is_curve,
     )
     find_distances: bpy.props.BoolProperty(
         name="Find Distances",

@@ -1,24 +1,86 @@
-"""From where splats without photographs are looked at, so that their own pictures can be the photographs."""
+"""From where splats without photographs, or a Blender scene, are looked at, so that there are photographs."""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 
 import bpy
 import numpy as np
 
 from ...training.errors import LodgsError
-from ...training.runs.job import VIEWS
+from ...training.runs.job import VIEW_WIDTHS, VIEWS, Job
 from ...training.scenes.cameras import Camera
-from ...training.scenes.viewpoints import DOMES, NEAR, OPAQUE, dome_around, walk
+from ...training.scenes.viewpoints import DOMES, NEAR, OPAQUE, along, dome_around, walk
 from ...training.splats.gaussians import Splats
 from .. import attributes
 from . import changes
-from .cameras import matrix_of, scene_camera, view_from
+from .cameras import scene_camera, view_from, view_of
+from .objects import root_of
+from .placement import matrix_of
 
 SAMPLE = 100_000
 """About so many splats say where a dome will be, before there is one."""
 
+UP, LOWEST = (0.0, 0.0, 1.0), 0.0
+"""What is up in a Blender scene, and the sine of the elevation at which a dome begins there: things stand on
+the ground."""
+CLIP_START = 0.1
+"""Of cameras along a curve in a Blender scene, in its units: what Blender gives to every new camera."""
+_SOLID = {"MESH", "CURVE", "SURFACE", "FONT", "META", "VOLUME", "POINTCLOUD", "CURVES"}
+
+Shot = bpy.types.Object | int | tuple[Camera, float]
+"""From where a picture of a Blender scene is rendered: a camera of it, the frame in which its camera looks,
+or a view that is placed in its world, with its near depth."""
+
 _domes: dict[tuple, tuple[list[Camera], tuple[float, float]]] = {}
 """The last one, by what it depends on."""
+
+
+def _is_curve(settings: bpy.types.PropertyGroup, obj: bpy.types.Object) -> bool:
+    return obj.type == "CURVE"
+
+
+class ViewsSettings:
+    """Choices of views, of splats without photographs and of a Blender scene."""
+
+    views_from: bpy.props.EnumProperty(
+        name="Views From",
+        description="From where pictures are drawn that take the place of photographs",
+        items=[
+            (
+                "DOME",
+                "All Around",
+                "A dome of views around the splats, or around what is selected of a Blender scene: for a "
+                "thing that is seen from outside",
+            ),
+            ("CAMERAS", "Cameras", "Every camera of the Blender scene"),
+            ("ANIMATION", "Animation", "The scene's camera in frames that are evenly chosen from its range"),
+            ("CURVE", "Along Curve", "A walk along a curve that looks ahead, to both sides and back in turn"),
+        ],
+    )
+    views: bpy.props.IntProperty(
+        name="Views", description="How many views there are", default=Job.views, min=VIEWS[0], max=VIEWS[1]
+    )
+    show_views: bpy.props.BoolProperty(
+        name="Show Views",
+        description="Show in the viewport from where the pictures will be drawn",
+        default=False,
+        options=set(),
+    )
+    view_width: bpy.props.IntProperty(
+        name="View Width",
+        description="How wide their pictures are; training makes them smaller by Image Scale",
+        default=Job.view_width,
+        min=VIEW_WIDTHS[0],
+        max=VIEW_WIDTHS[1],
+        subtype="PIXEL",
+    )
+    curve: bpy.props.PointerProperty(
+        name="Curve",
+        description="What to walk along, at the height of the eyes",
+        type=bpy.types.Object,
+        poll=_is_curve,
+    )
 
 
 def alone(root: bpy.types.Object) -> bool:
@@ -46,24 +108,79 @@ def placed(context: bpy.types.Context, root: bpy.types.Object, splats: Splats) -
     width, height = size(context.scene, settings)
     match settings.views_from:
         case "CAMERAS":
-            cameras = _cameras(context.scene)
-            if len(cameras) < VIEWS[0]:
-                raise LodgsError(
-                    f"The Blender scene has {len(cameras)} camera(s), and training takes two views or more.",
-                    "Add cameras, or choose other views.",
-                )
+            cameras = _enough(_cameras(context.scene))
             depsgraph = context.evaluated_depsgraph_get()
             return [view_from(root, depsgraph, width, height, camera) for camera in cameras]
         case "ANIMATION":
-            return _animated(context, root, width, height)
+            frames = _frames(context.scene, settings.views)
+            return _animated(context, frames, lambda depsgraph: view_from(root, depsgraph, width, height))
         case "CURVE":
-            if settings.curve is None:
-                raise LodgsError("No curve is chosen to walk along.", "Choose one, or other views.")
             into = np.linalg.inv(matrix_of(root))
             way = _way(settings.curve) @ into[:3, :3].T + into[:3, 3]
             views, near = walk(splats, way, into[:3, 2], settings.views, width, height)
             return [(view, near) for view in views]
     return []
+
+
+def of_scene(context: bpy.types.Context, width: int, height: int) -> list[Shot]:
+    """From where the settings of a Blender scene (``Scene.lodgs_capture``) have it captured.
+
+    Raises:
+        LodgsError: there are no two cameras, no curve, or one that leads nowhere; the camera stands still; a
+            camera is no perspective one; or nothing is there to look at.
+    """
+    scene, settings = context.scene, context.scene.lodgs_capture
+    match settings.views_from:
+        case "CAMERAS":
+            cameras = _enough([obj for obj in _cameras(scene) if root_of(obj) is None])
+            depsgraph = context.evaluated_depsgraph_get()
+            for camera in cameras:
+                view_of(camera.evaluated_get(depsgraph), depsgraph, width, height)
+            return list(cameras)
+        case "ANIMATION":
+            frames = _frames(scene, settings.views)
+            some = frames[0], frames[len(frames) // 2], frames[-1]
+
+            def see(depsgraph: bpy.types.Depsgraph) -> tuple[Camera, float]:
+                return view_of(scene_camera(scene).evaluated_get(depsgraph), depsgraph, width, height)
+
+            _animated(context, some, see)
+            return list(frames)
+        case "CURVE":
+            views = along(_way(settings.curve), np.array(UP), settings.views, width, height)
+            return [(view, CLIP_START) for view in views]
+    views, near = dome_of_scene(context, width, height)
+    return [(view, near) for view in views]
+
+
+def count_of_scene(scene: bpy.types.Scene) -> int:
+    """How many views the settings of a Blender scene ask for."""
+    match scene.lodgs_capture.views_from:
+        case "CAMERAS":
+            return sum(root_of(obj) is None for obj in _cameras(scene))
+        case "ANIMATION":
+            return len(_frames(scene, scene.lodgs_capture.views))
+    return scene.lodgs_capture.views
+
+
+def dome_of_scene(context: bpy.types.Context, width: int = 3, height: int = 2) -> tuple[list[Camera], float]:
+    """The dome around what is selected of a Blender scene, or around all of it, and its near depth.
+
+    Raises:
+        LodgsError: there is nothing.
+    """
+    depsgraph, corners = context.evaluated_depsgraph_get(), []
+    solid = [obj for obj in context.view_layer.objects if obj.type in _SOLID and not obj.hide_render]
+    solid = [obj for obj in solid if root_of(obj) is None]
+    for obj in [obj for obj in solid if obj.select_get()] or solid:
+        matrix = np.array(obj.evaluated_get(depsgraph).matrix_world)
+        box = np.array(obj.evaluated_get(depsgraph).bound_box, np.float64)
+        corners.append(box @ matrix[:3, :3].T + matrix[:3, 3])
+    if not corners:
+        raise LodgsError(
+            "The Blender scene holds nothing to look at.", "Add something, or choose other views."
+        )
+    return dome_around(np.concatenate(corners), context.scene.lodgs_capture.views, width, height, UP, LOWEST)
 
 
 def dome_of(root: bpy.types.Object) -> tuple[list[Camera], tuple[float, float]]:
@@ -96,17 +213,33 @@ def _cameras(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     return sorted((obj for obj in scene.objects if obj.type == "CAMERA"), key=lambda obj: obj.name)
 
 
+def _enough(cameras: list[bpy.types.Object]) -> list[bpy.types.Object]:
+    if len(cameras) < VIEWS[0]:
+        raise LodgsError(
+            f"The Blender scene has {len(cameras)} camera(s), and training takes two views or more.",
+            "Add cameras, or choose other views.",
+        )
+    return cameras
+
+
+def _frames(scene: bpy.types.Scene, count: int) -> list[int]:
+    """So many frames, evenly chosen from the scene's range, or all that it has."""
+    frames = np.linspace(scene.frame_start, scene.frame_end, count).round().astype(int)
+    return np.unique(frames).tolist()
+
+
 def _animated(
-    context: bpy.types.Context, root: bpy.types.Object, width: int, height: int
+    context: bpy.types.Context,
+    frames: Sequence[int],
+    see: Callable[[bpy.types.Depsgraph], tuple[Camera, float]],
 ) -> list[tuple[Camera, float]]:
-    """What the scene's camera sees in frames that are evenly chosen from the scene's range."""
+    """What the scene's camera sees in some frames, as ``see`` has it in each."""
     scene, frame, part = context.scene, context.scene.frame_current, context.scene.frame_subframe
-    frames = np.linspace(scene.frame_start, scene.frame_end, root.lodgs.training.views).round().astype(int)
     found = []
     try:
-        for each in np.unique(frames).tolist():
+        for each in frames:
             scene.frame_set(each)
-            found.append(view_from(root, context.evaluated_depsgraph_get(), width, height))
+            found.append(see(context.evaluated_depsgraph_get()))
     finally:
         scene.frame_set(frame, subframe=part)
     if not np.ptp([view.world_to_camera for view, _ in found], axis=0).any():
@@ -117,12 +250,14 @@ def _animated(
     return found
 
 
-def _way(curve: bpy.types.Object) -> np.ndarray:
+def _way(curve: bpy.types.Object | None) -> np.ndarray:
     """The corners (P, 3) of a curve in Blender's world, as fine as it is drawn.
 
     Raises:
-        LodgsError: it has not one spline.
+        LodgsError: there is none, or it has not one spline.
     """
+    if curve is None:
+        raise LodgsError("No curve is chosen to walk along.", "Choose one, or other views.")
     if len(curve.data.splines) != 1:
         raise LodgsError(
             f"The curve '{curve.name}' has {len(curve.data.splines)} splines, and a walk takes one.",

@@ -278,6 +278,31 @@ def unregister() -> None:
         handlers.remove(_on_load)
 
 
+def fresh_driver(obj: bpy.types.Object, path: str, expression: str, index: int = -1) -> bpy.types.Driver:
+    """A fresh driver of the property at ``path``, or of a vector's component, without variables."""
+    obj.driver_remove(path, index)
+    driver = obj.driver_add(path, index).driver
+    assert driver is not None
+    driver.type, driver.expression = "SCRIPTED", expression
+    return driver
+
+
+def take_away(obj: bpy.types.Object, modifier: bpy.types.NodesModifier) -> None:
+    """Removes a modifier, its drivers, and its group if it was the last that has it.
+
+    A group that somebody has changed is kept, for whoever wants it back.
+    """
+    for driver in list(obj.animation_data.drivers if obj.animation_data else ()):
+        if driver.data_path.startswith(f'modifiers["{modifier.name}"]'):
+            obj.animation_data.drivers.remove(driver)
+    group = modifier.node_group
+    obj.modifiers.remove(modifier)
+    if group is not None and edited(group):
+        group.use_fake_user = True
+    elif group is not None and not group.users:
+        bpy.data.node_groups.remove(group)
+
+
 def switched(obj: bpy.types.Object, group: bpy.types.GeometryNodeTree, where: str, by: str) -> None:
     """A new modifier with a group, which is on only in one place and where the active scene says so.
 

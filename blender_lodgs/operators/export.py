@@ -17,7 +17,19 @@ from ..data import scenes, selection
 from .parts import OnLevels, report_errors
 
 
-class _Export(OnLevels, ExportHelper):
+class _AsPlaced(OnLevels):
+    """What all exports can be told."""
+
+    placed: bpy.props.BoolProperty(
+        name="As Placed",
+        description="Write the splats where the scene stands in Blender: moved, turned and scaled with its "
+        "root, ground and size. Otherwise in the scene's own (COLMAP's) coordinates. Copies, and what of the "
+        "scene is moved by itself, count in neither",
+        default=False,
+    )
+
+
+class _Export(_AsPlaced, ExportHelper):
     """What exports to one PLY have in common: a name after the scene, and the browser's overwrite check."""
 
     filename_ext = ".ply"
@@ -61,7 +73,7 @@ class LODGS_OT_export_bundle(_Export, bpy.types.Operator):
                 "The coarser level of these splats is no scene by itself, which other viewers would show.",
                 "Put the finest level first.",
             )
-        bundle = scenes.read_levels(root)
+        bundle = scenes.read_levels(root, self.placed)
         write_bundle(self._path(), bundle, self.order)
         self.report({"INFO"}, f"{len(bundle.levels)} levels written to {self._path()}")
         return {"FINISHED"}
@@ -81,8 +93,8 @@ class LODGS_OT_export_plain(_Export, bpy.types.Operator):
             (
                 "SHOWN",
                 "As Shown",
-                "The splats of the levels that the viewport shows now, modifiers applied. In the scene's own "
-                "coordinates: where objects stand, copies, and the viewport's limit do not count",
+                "The splats of the levels that the viewport shows now, modifiers applied. Copies and the "
+                "viewport's limit do not count",
             ),
             ("LEVEL", "One Level", "All splats of one level, modifiers not applied"),
         ],
@@ -94,22 +106,21 @@ class LODGS_OT_export_plain(_Export, bpy.types.Operator):
         self.layout.prop(self, "source")
         if self.source == "LEVEL":
             self.layout.prop(self, "level")
-        self.layout.label(text="In the scene's own coordinates,", icon="INFO")
-        self.layout.label(text="wherever its objects stand; no copies", icon="BLANK1")
+        self.layout.prop(self, "placed")
 
     @report_errors
     def execute(self, context):
         root = scenes.active_root(context)
         if self.source == "LEVEL":
-            splats = scenes.read_level(root, self.level)
+            splats = scenes.read_level(root, self.level, self.placed)
         else:
-            splats = scenes.shown_splats(context, root)
+            splats = scenes.shown_splats(context, root, self.placed)
         write_ply(self._path(), splats, comments_of(selection.read_json(root.lodgs.meta)))
         self.report({"INFO"}, f"{len(splats):,} splats written to {self._path()}")
         return {"FINISHED"}
 
 
-class LODGS_OT_export_folder(OnLevels, bpy.types.Operator):
+class LODGS_OT_export_folder(_AsPlaced, bpy.types.Operator):
     """Export levels as files of their own, whole scenes each; splat-transform streams them for the web"""
 
     bl_idname = "lodgs.export_folder"
@@ -135,7 +146,7 @@ class LODGS_OT_export_folder(OnLevels, bpy.types.Operator):
         if not self.replace and any(folder.glob("lod*.ply")):
             raise LodgsError(f"{folder} already holds levels.", "Choose another folder, or tick Replace.")
         root = scenes.active_root(context)
-        bundle = scenes.read_levels(root)
+        bundle = scenes.read_levels(root, self.placed)
         if is_tree(bundle):
             bundle = complete_levels(bundle)
         command = write_folder(folder, bundle)

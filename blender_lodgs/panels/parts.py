@@ -7,6 +7,8 @@ import textwrap
 import bpy
 
 from ..data import scenes
+from ..data.placement import axes_of
+from ..data.viewpoints import ViewsSettings
 from ..runs import making
 
 
@@ -44,9 +46,27 @@ def say(layout: bpy.types.UILayout, text: str, icon: str) -> None:
         column.label(text=line, icon="BLANK1" if number else icon)  # type: ignore[arg-type]
 
 
+def draw_views(column: bpy.types.UILayout, settings: ViewsSettings, count: int) -> None:
+    """From where pictures are drawn that take the place of photographs.
+
+    Args:
+        count: how many cameras there are.
+    """
+    column.prop(settings, "views_from")
+    if settings.views_from == "CURVE":
+        column.prop(settings, "curve")
+    if settings.views_from == "CAMERAS":
+        column.label(text=f"{count} cameras")
+    else:
+        column.prop(settings, "views")
+    column.prop(settings, "view_width")
+    if settings.views_from == "DOME":
+        column.prop(settings, "show_views")
+
+
 def scene_length(context: bpy.types.Context, root: bpy.types.Object, value: float) -> str:
     """A length of a splat scene, in its own units, as Blender says it in the scene's."""
-    units, scale = context.scene.unit_settings, max(root.matrix_world.to_scale())
+    units, scale = context.scene.unit_settings, max(axes_of(root).matrix_world.to_scale())
     return bpy.utils.units.to_string(
         units.system, "LENGTH", value * scale * units.scale_length, precision=3
     ).strip()

@@ -1,4 +1,4 @@
-"""The extension's preferences: which Python trains, and on what."""
+"""The extension's preferences: which Python trains, on what, and which farm."""
 
 from __future__ import annotations
 
@@ -31,12 +31,18 @@ class LodgsPreferences(bpy.types.AddonPreferences):
         description="What draws the splats while training; a run may go on with another one",
         items=_BACKENDS,
     )
+    flamenco: bpy.props.StringProperty(
+        name="Flamenco Manager",
+        description="Address of the manager of a render farm that is to train cells, such as "
+        "http://farm:8080; empty: no farm",
+    )
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         layout.use_property_split = True
         layout.prop(self, "python")
         layout.prop(self, "backend")
+        layout.prop(self, "flamenco")
         draw_environment(layout)
         layout.operator("lodgs.check_environment", icon="CHECKMARK")
         report = environment.report

@@ -8,12 +8,13 @@ from ...training.errors import LodgsError
 from ...training.evaluate.words import summary_lines
 from ...training.lod.rules.cut import RULE as CUT
 from ...training.methods import method_info
+from .. import extension
 from ..data import scenes, viewpoints
 from ..data.training import chooses_distances, hold_out, level_distances, offered
 from ..runs import environment, jobs
 from ..runs.watch import Watch, watch_of
 from ..runs.words import measured_on, progress_facts, short_level_line
-from .parts import Panel, draw_environment, say, scene_length, split_column
+from .parts import Panel, draw_environment, draw_views, say, scene_length, split_column
 from .training_cells import draw_blocks
 
 
@@ -39,6 +40,8 @@ class LODGS_PT_training(Panel):
             row.label(text="There was a run", icon="FILE_FOLDER")
             row.operator("lodgs.open_run").directory = root.lodgs.training.run
         _draw_choices(self.layout, context, root, resumable=watch is not None and watch.state != "done")
+        if extension.preferences().flamenco and root.lodgs.scene_folder:
+            self.layout.operator("lodgs.submit_to_flamenco", icon="NETWORK_DRIVE")
 
 
 class LODGS_PT_training_advanced(Panel):
@@ -126,16 +129,8 @@ def _draw_views(column: bpy.types.UILayout, context: bpy.types.Context, root: bp
     """From where splats without photographs are looked at."""
     settings = root.lodgs.training
     column.separator()
-    column.prop(settings, "views_from")
-    if settings.views_from == "CURVE":
-        column.prop(settings, "curve")
-    if settings.views_from == "CAMERAS":
-        column.label(text=f"{viewpoints.count(settings)} cameras")
-    else:
-        column.prop(settings, "views")
-    column.prop(settings, "view_width")
+    draw_views(column, settings, viewpoints.count(settings))
     if settings.views_from == "DOME":
-        column.prop(settings, "show_views")
         try:
             _, shells = viewpoints.dome_of(root)
         except LodgsError as error:

@@ -55,7 +55,7 @@ def start(root: bpy.types.Object, folder: str = "", parameters: dict | None = No
     Raises:
         LodgsError: no trainer, no scene, an impossible setting, or a folder that is taken.
     """
-    run = RunFolder(Path(bpy.path.abspath(folder)).resolve()) if folder else RunFolder(_new_folder(root))
+    run = RunFolder(Path(bpy.path.abspath(folder)).resolve()) if folder else RunFolder(new_folder(root))
     return _begin(root, run, make_job(root, run.path, parameters or {}))
 
 
@@ -469,7 +469,7 @@ def runs_folder(root: bpy.types.Object) -> Path:
     return Path.home() / "lodgs_runs"
 
 
-def _new_folder(root: bpy.types.Object) -> Path:
+def new_folder(root: bpy.types.Object) -> Path:
     """A folder for a run, not there yet."""
     parent = runs_folder(root)
     name = bpy.path.clean_name(root.name)

@@ -3,8 +3,8 @@
 Splats are drawn in all shadings but Wireframe where ``Scene.lodgs_viewport.splats`` is on; otherwise they are
 points like those of COLMAP: discs in Solid shading, Blender's own points elsewhere. Where Blender draws
 splats by itself, it is left to it. ``arranging`` decides which are drawn in which order, ``views`` keeps what
-each viewport shows, ``eye`` follows a viewport's view, ``frusta`` shows where training will look from, and
-``cells`` what a large scene is divided into.
+each viewport shows, ``eye`` follows a viewport's view, ``frusta`` shows where training or a capture will look
+from, and ``cells`` what a large scene is divided into.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def _draw_view(context: bpy.types.Context) -> None:
     if with_splats:
         views.draw(context)
     if space.overlay.show_overlays:
-        frusta.draw(context.scene)
+        frusta.draw(context)
         cells.draw(context.scene)
 
 

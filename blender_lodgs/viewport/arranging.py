@@ -16,7 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from ...training.lod.choice import Choice, Chooser
-from ...training.lod.rule import OPACITY, rules
+from ...training.lod.rule import OPACITY
 
 SAMPLE, LEAST_SAMPLE = 16, 10_000
 """Of so many splats one is asked where a budget looks for a choice, and how many are asked at least."""
@@ -78,7 +78,7 @@ class Pool:
     def about(self, placement: Placement) -> int:
         """About how many splats of a placement have a weight: of many splats a few are asked."""
         few = placement.count // SAMPLE
-        if placement.choice is None or not rules()[placement.choice.rule].apart or few < LEAST_SAMPLE:
+        if placement.choice is None or not placement.choice.how.apart or few < LEAST_SAMPLE:
             return len(_choose(self, placement)[0])
         key = placement.first, -few
         if key not in self._choosers:
@@ -337,11 +337,13 @@ def _color_levels(
     pool: Pool, placement: Placement, index: np.ndarray, means: np.ndarray
 ) -> np.ndarray | float:
     """Which level's colour a placement's splats (M,) at means (M, 3) get."""
-    if placement.tell == "LEVELS" and placement.choice is not None:
-        own, place = rules()[placement.choice.rule].columns, index + placement.first
-        return placement.choice.told_level({n: pool.columns[n][place] for n in own if n in pool.columns})
-    if placement.tell == "BANDS" and placement.choice is not None:
-        return placement.choice.wanted_level(means)
-    if placement.tell == "CHUNKS" and placement.choice is not None:
-        return placement.choice.parts(means)
+    choice = placement.choice
+    if choice is not None and choice.rule:
+        if placement.tell == "LEVELS":
+            own, place = choice.how.columns, index + placement.first
+            return choice.told_level({n: pool.columns[n][place] for n in own if n in pool.columns})
+        if placement.tell == "BANDS":
+            return choice.wanted_level(means)
+        if placement.tell == "CHUNKS":
+            return choice.parts(means)
     return placement.level if placement.tell in ("LEVELS", "BANDS") else 0

@@ -9,6 +9,7 @@ from gpu_extras.batch import batch_for_shader
 
 from ...training.lod.colors import level_color
 from ..data import cells, scenes
+from ..data.placement import axes_of
 from . import frusta
 
 WIDTH = 2.5
@@ -24,7 +25,7 @@ def draw(scene: bpy.types.Scene) -> None:
         if not settings.show_cells or not settings.planned_cells:
             continue
         with gpu.matrix.push_pop():  # type: ignore[attr-defined]
-            gpu.matrix.multiply_matrix(root.matrix_world)
+            gpu.matrix.multiply_matrix(axes_of(root).matrix_world)
             gpu.state.blend_set("ALPHA")
             for number, cell in enumerate(settings.planned_cells, 1):
                 color, chosen = level_color(number), number == settings.active_cell + 1

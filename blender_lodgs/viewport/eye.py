@@ -15,6 +15,7 @@ import numpy as np
 from mathutils import Matrix, Vector
 
 from ..data import scenes, selection
+from ..data.placement import axes_of
 
 Place = tuple[float, float, float]
 
@@ -84,7 +85,7 @@ def moved(scene: bpy.types.Scene, root: bpy.types.Object) -> tuple[Place, float]
     if _newest is None or _newest[0] != scene.name or not _follows(root):
         return None
     _, eye, focal_px = _newest
-    local = root.matrix_world.inverted_safe() @ Vector(eye)
+    local = axes_of(root).matrix_world.inverted_safe() @ Vector(eye)
     return tuple(np.float32(local).tolist()), float(np.float32(focal_px))  # as properties will have them
 
 
@@ -92,7 +93,7 @@ def follow(scene: bpy.types.Scene, eye: Place, focal_px: float) -> None:
     """Has all splat scenes whose eye is the viewport measure distances from a place in the world."""
     for root in scenes.roots(scene):
         if _follows(root):
-            selection.hold(root, tuple(root.matrix_world.inverted_safe() @ Vector(eye)), focal_px)
+            selection.hold(root, tuple(axes_of(root).matrix_world.inverted_safe() @ Vector(eye)), focal_px)
 
 
 def _follows(root: bpy.types.Object) -> bool:

@@ -1,36 +1,51 @@
-"""The views that training will place around splats, as small pyramids in the viewport."""
+"""The views that will be placed around splats or in a Blender scene, as small pyramids in the viewport."""
 
 from __future__ import annotations
+
+from contextlib import suppress
 
 import bpy
 import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
+from mathutils import Matrix
 
 from ...training.errors import LodgsError
+from ...training.scenes.cameras import Camera
+from ...training.scenes.viewpoints import DOMES, NEAR
 from ..data import scenes, viewpoints
+from ..data.placement import axes_of
 
 COLOR = (1.0, 0.75, 0.2, 1.0)
 LENGTH = 0.12
 """Of a pyramid, as a share of how far the nearer views are from the middle."""
 
 
-def draw(scene: bpy.types.Scene) -> None:
+def draw(context: bpy.types.Context) -> None:
     """Draws the domes that are to be shown into the active framebuffer, over everything."""
-    for root in scenes.roots(scene):
-        settings = root.lodgs.training
-        if settings.show_views and settings.views_from == "DOME" and viewpoints.alone(root):
-            try:
+    for root in scenes.roots(context.scene):
+        if _shown(root.lodgs.training) and viewpoints.alone(root):
+            with suppress(LodgsError):  # which the panel says
                 views, shells = viewpoints.dome_of(root)
-            except LodgsError:  # which the panel says
-                continue
-            shader = gpu.shader.from_builtin("UNIFORM_COLOR")
-            batch = batch_for_shader(shader, "LINES", {"pos": lines(views, LENGTH * shells[0])})
-            with gpu.matrix.push_pop():  # type: ignore[attr-defined]
-                gpu.matrix.multiply_matrix(root.matrix_world)
-                shader.bind()
-                shader.uniform_float("color", COLOR)
-                batch.draw(shader)
+                _draw(views, shells[0], axes_of(root).matrix_world)
+    if _shown(context.scene.lodgs_capture):
+        with suppress(LodgsError):
+            views, near = viewpoints.dome_of_scene(context)
+            _draw(views, DOMES[0] * near / NEAR, Matrix())
+
+
+def _shown(settings: viewpoints.ViewsSettings) -> bool:
+    return settings.show_views and settings.views_from == "DOME"
+
+
+def _draw(views: list[Camera], away: float, matrix: Matrix) -> None:
+    shader = gpu.shader.from_builtin("UNIFORM_COLOR")
+    batch = batch_for_shader(shader, "LINES", {"pos": lines(views, LENGTH * away)})
+    with gpu.matrix.push_pop():  # type: ignore[attr-defined]
+        gpu.matrix.multiply_matrix(matrix)
+        shader.bind()
+        shader.uniform_float("color", COLOR)
+        batch.draw(shader)
 
 
 def lines(views: list, length: float) -> np.ndarray:

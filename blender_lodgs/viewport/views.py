@@ -403,7 +403,11 @@ def _choice(
         return shown.choice_of_picture(instance, depsgraph)
     choice, root = selection.choice(instance.evaluated, depsgraph), scenes.root_of(instance.object)
     seen = eye.moved(depsgraph.scene, root) if root is not None else None
-    return choice if choice is None or seen is None else replace(choice, eye=seen[0], focal_px=seen[1])
+    return (
+        choice
+        if choice is None or not choice.rule or seen is None
+        else replace(choice, eye=seen[0], focal_px=seen[1])
+    )
 
 
 def _arrange(view: ViewState, of: Resident, request: Request, wait: bool, take_over: bool) -> bool:

@@ -24,16 +24,19 @@ const JOB_TYPE = {
           description: "Size of training images over photographs" },
         { key: "polish", type: "int32", default: 300, propargs: { min: 0 },
           description: "Steps that fit each cell's borders to the cells beside it; 0 for none" },
+        { key: "options", type: "string", default: "",
+          description: "Further options of lodgs train, such as --set max_splats=500000" },
         { key: "lodgs", type: "string", default: "{lodgs}", visible: "hidden",
           description: "The command lodgs, by the manager's variable" },
     ],
 };
 
 function compileJob(job) {
-    const { scene, output, columns, rows, method, preset, image_scale, polish, lodgs } = job.settings;
+    const { scene, output, columns, rows, method, preset, image_scale, polish, options, lodgs } = job.settings;
     const plan = task(job, "plan", lodgs, [
         "blocks", "plan", scene, "--out", output, "--cells", `${columns}x${rows}`,
         "--method", method, "--preset", preset, "--image-scale", `${image_scale}`, "--polish", `${polish}`,
+        ...(options ? shellSplit(options) : []),
     ]);
     const numbers = Array.from({ length: columns * rows }, (_, index) => index + 1);
     const part = (kind, after) => task(job, kind, lodgs, ["blocks", "run", output, "--only", kind], after);

@@ -44,7 +44,7 @@ def test_train_saves_and_exports(bpy, lodgs, lodgs_command, fake, tmp_path, capf
     bpy.ops.wm.open_mainfile(filepath=str(blend))
     (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
     assert {i.number: len(i.object.data.points) for i in root.lodgs.levels} == COUNTS
-    assert [obj for obj in root.children if obj.type == "CAMERA"]
+    assert [obj for obj in root.children_recursive if obj.type == "CAMERA"]
 
     other = tmp_path / "again.ply"
     assert lodgs_command("export", blend, other) == 0
@@ -129,7 +129,7 @@ def test_train_has_the_trainers_options(lodgs, lodgs_command, capfd):
     [
         (["train", "--scene", "nowhere", "--out", "run"], "nowhere"),
         (["train", "--scene", SCENE, "--out", "run", "--set", "levels"], "--set levels is not NAME=VALUE"),
-        (["train", "--out", "run"], "--scene DIR"),
+        (["train", "--out", "run"], "the scene's folder"),
         (["train", "--scene", SCENE, "--out", "run", "--set", "wings=2"], "unknown parameter 'wings'"),
         (["train", "--scene", SCENE, "--out", "run", "--method", "magic"], "magic"),
         (["train", "--scene", SCENE, "--out", "run", "--image-scale", "7"], "image_scale = 7"),

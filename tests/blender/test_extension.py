@@ -53,6 +53,7 @@ def test_zip_holds_what_it_needs_and_nothing_else(archive):
     }
     others = {"__init__.py", "blender_manifest.toml", "LICENSE"}
     others |= {"pyproject.toml", *(f"requirements/{name}.txt" for name in ("trainer", "cluster", "cuda"))}
+    others |= {p.relative_to(REPOSITORY).as_posix() for p in (REPOSITORY / "farm").rglob("*.js")}
     wheels = set(tomllib.loads((REPOSITORY / "blender_manifest.toml").read_text())["wheels"])
     assert {n for n in names if not n.endswith("/")} == code | others | {w.removeprefix("./") for w in wheels}
 

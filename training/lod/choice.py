@@ -9,7 +9,8 @@ import numpy as np
 
 from ..scenes.cameras import Camera
 from .blocks import Blocks
-from .rule import OPACITY, Region, Rule, Tables, every_column, rules
+from .crop import Crop, kept
+from .rule import EVERYTHING, HIDDEN, OPACITY, Region, Rule, Tables, every_column, rules
 
 Column = tuple[str, str, bytes]
 """A column of a table: its name, its type, its rows."""
@@ -25,6 +26,8 @@ class Choice:
         focal_px: the eye's focal length in pixels.
         facts, values: see ``rule.Rule.weights``, as pairs.
         tables: those that the rule reads: name, columns by name, each as its type and its bytes.
+        crops: what is left of the splats before the rule chooses: those that are not HIDDEN, and that these
+            keep; None: all of them, hidden or not.
     """
 
     rule: str
@@ -33,51 +36,81 @@ class Choice:
     facts: tuple[tuple[str, float], ...]
     values: tuple[tuple[str, float], ...]
     tables: tuple[tuple[str, tuple[Column, ...]], ...] = ()
+    crops: tuple[Crop, ...] | None = None
+
+    @classmethod
+    def by_crops(cls, crops: tuple[Crop, ...]) -> Choice:
+        """All that crops leave, without a rule."""
+        return cls(EVERYTHING.name, (0.0, 0.0, 0.0), 1.0, (), (), crops=crops)
+
+    @property
+    def how(self) -> Rule:
+        """The rule itself."""
+        return rules()[self.rule] if self.rule else EVERYTHING
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns that :meth:`weights` asks for."""
+        return self.how.columns if self.crops is None else (*self.how.columns, HIDDEN)
 
     def weights(self, means: np.ndarray, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-        """(N,) weights of splats at means (N, 3) with the rule's columns (N,) by name."""
-        rule = rules()[self.rule]
+        """(N,) weights of splats at means (N, 3) with columns (N,) by name; those that crops leave out, and
+        hidden ones, have none, and are not there for the rule."""
         eye, facts, values = np.array(self.eye, np.float32), dict(self.facts), dict(self.values)
-        return rule.weights(means, eye, self.focal_px, columns, facts, values, self._tables())
+
+        def weigh(means: np.ndarray, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+            return self.how.weights(means, eye, self.focal_px, columns, facts, values, self._tables())
+
+        if self.crops is None:
+            return weigh(means, columns)
+        there = kept(self.crops, means)
+        if HIDDEN in columns:
+            there &= columns[HIDDEN] == 0
+        if there.all():
+            return weigh(means, columns)
+        weights, some = np.zeros(len(means), np.float32), np.flatnonzero(there)
+        own = {name: columns[name][some] for name in self.how.columns}
+        weights[some] = weigh(means[some], own)
+        return weights
 
     def band(self, highest: Mapping[str, np.ndarray]) -> tuple[float, float | np.ndarray]:
         """See ``Rule.band``."""
-        return rules()[self.rule].band(self.focal_px, dict(self.facts), dict(self.values), highest)
+        return self.how.band(self.focal_px, dict(self.facts), dict(self.values), highest)
 
     def region(self) -> Region | None:
         """See ``Rule.region``."""
-        return rules()[self.rule].region(np.array(self.eye, np.float32), dict(self.values), self._tables())
+        return self.how.region(np.array(self.eye, np.float32), dict(self.values), self._tables())
 
     def loaded(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
         """(N,) bool: see ``Rule.loaded``, of the region that there must be."""
         region = self.region()
         assert region is not None
-        return rules()[self.rule].loaded(columns, region)
+        return self.how.loaded(columns, region)
 
     def where(self) -> str:
         """See ``Rule.where``."""
-        return rules()[self.rule].where(np.array(self.eye, np.float32), dict(self.values), self._tables())
+        return self.how.where(np.array(self.eye, np.float32), dict(self.values), self._tables())
 
     def idle(self) -> Mapping[str, str]:
         """See ``Rule.idle``."""
-        return rules()[self.rule].idle(np.array(self.eye, np.float32), dict(self.values), self._tables())
+        return self.how.idle(np.array(self.eye, np.float32), dict(self.values), self._tables())
 
     def parts(self, means: np.ndarray) -> np.ndarray:
         """(N,) numbers of the parts of space where places are: see ``Rule.parts``."""
-        return rules()[self.rule].parts(means, self._tables())
+        return self.how.parts(means, self._tables())
 
     def told_level(self, columns: Mapping[str, np.ndarray]) -> np.ndarray | float:
         """(N,) the level of splats with the rule's columns (N,): see ``Rule.told_level``."""
-        return rules()[self.rule].told_level(columns, dict(self.facts))
+        return self.how.told_level(columns, dict(self.facts))
 
     def wanted_level(self, means: np.ndarray) -> np.ndarray:
         """(N,) the level that is wanted at each place."""
         eye, facts, values = np.array(self.eye, np.float32), dict(self.facts), dict(self.values)
-        return rules()[self.rule].wanted_level(means, eye, self.focal_px, facts, values)
+        return self.how.wanted_level(means, eye, self.focal_px, facts, values)
 
     def coarser(self, levels: Sequence[int]) -> Choice | None:
         """The next coarser choice, where there is one."""
-        values = rules()[self.rule].coarser(dict(self.values), levels)
+        values = self.how.coarser(dict(self.values), levels)
         return None if values is None else replace(self, values=tuple(values.items()))
 
     def _tables(self) -> Tables:
@@ -95,6 +128,7 @@ class Choice:
         return {
             "rule": self.rule, "eye": list(self.eye), "focal_px": self.focal_px,
             "facts": dict(self.facts), "values": dict(self.values), "tables": tables,
+            "crops": None if self.crops is None else [crop.as_dict() for crop in self.crops],
         }  # fmt: skip
 
 
@@ -146,7 +180,7 @@ class Chooser:
         if self._near is None or self._near[:2] != (choice.rule, region):
             rows = np.flatnonzero(choice.loaded(every.columns)).astype(np.int32)
             if len(rows) < len(every.means):
-                columns = {name: every.columns[name][rows] for name in rules()[choice.rule].columns}
+                columns = {name: every.columns[name][rows] for name in choice.columns}
                 log_scales = None if self._log_scales is None else self._log_scales[rows]
                 every = _Part.of(rows, every.means[rows], columns, log_scales)
             self._near = choice.rule, region, every
@@ -157,8 +191,8 @@ class Chooser:
     ) -> tuple[np.ndarray, np.ndarray]:
         part, in_region = (self._all, False) if choice is None else self._part(choice)
         blocks, means, rows = part.blocks, part.means, part.rows
-        rule = None if choice is None else rules()[choice.rule]
-        columns = {} if rule is None else {name: part.columns[name] for name in rule.columns}
+        rule = None if choice is None else choice.how
+        columns = {} if choice is None else {name: part.columns[name] for name in choice.columns}
 
         def weigh(means: np.ndarray, columns: Mapping[str, np.ndarray]) -> np.ndarray:
             return np.ones(len(means), np.float32) if choice is None else choice.weights(means, columns)

@@ -268,7 +268,7 @@ class _Ordered:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def select(self, some: slice, /) -> Splats:
+    def select(self, some: slice | np.ndarray, /) -> Splats:
         return self.file.select(self.rows[some])
 
 

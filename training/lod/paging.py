@@ -28,7 +28,7 @@ from ..splats.gaussians import Splats
 from .blocks import SIZE, Blocks, places_on_curve
 from .choice import Choice
 from .rule import distances_by_axes
-from .rules.cut import ABOVE_ROOT, K_LEAST, NODE_SIZE, PARENT, PARENT_SIZE, RULE, detail_of
+from .rules.cut import ABOVE_ROOT, K_LEAST, NODE_SIZE, PARENT, PARENT_SIZE, RULE, detail_of, hashed
 from .streaming import BLOCKS
 
 BOUNDS = tuple(f"{end}_{axis}" for end in ("low", "high") for axis in "xyz")
@@ -346,20 +346,15 @@ class Standing:
             reached, up = further, higher
         return inner, reached
 
+    @property
+    def parents(self) -> np.ndarray:
+        """(N,) int32, at which place each splat's parent is; -1 where it is not there, or it has none."""
+        return self._parents
+
     def _family(self, places: np.ndarray, size: str, axes: Sequence[str]) -> np.ndarray:
         """(M, 4) by which children and parents know each other."""
         columns = [self._columns[name][places] for name in (size, *axes)]
         return np.stack(columns, axis=1) + np.float32(0)  # no zero below zero
-
-
-def hashed(rows: np.ndarray) -> np.ndarray:
-    """(N,) uint64 of rows (N, 4) float32: equal ones have equal numbers, and hardly any others."""
-    words = np.ascontiguousarray(rows).view(np.uint32).astype(np.uint64)
-    found = np.zeros(len(rows), np.uint64)
-    for word in words.T:
-        found = (found ^ word) * np.uint64(0x9E3779B97F4A7C15)
-        found ^= found >> np.uint64(29)
-    return found
 
 
 def read_within(

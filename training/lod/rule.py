@@ -19,12 +19,17 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ..errors import LodgsError
+from ..splats.placing import Place
+from ..splats.ply import Columns
 
 NO_FINER = 1 << 30
 """What the fact ``finer`` of the finest level is."""
 
 OPACITY = "opacity"
 """The column that every splat has: its own opacity, in [0, 1]."""
+
+HIDDEN = "hidden"
+"""The column of splats that somebody has hidden: not 0 where they are."""
 
 Values = Mapping[str, float]
 """A number for each control of a rule, by name."""
@@ -100,6 +105,9 @@ class Rule(ABC):
         columns: names of per-splat columns, (N,) float32; zeros where splats lack one. OPACITY is each
             splat's own.
         tables: names of tables of the bundle; where one is missing, the rule does without it.
+        lengths: which of its facts, its columns and the columns of its tables are lengths in scene units.
+        places: names, as x, y and z, of those of its columns, or of its tables', that are places.
+        related: whether columns of one splat have to agree with those of others: see :meth:`agreed`.
         always: whether its weights belong to the picture at full detail, too: without them a level is not
             what was trained.
         apart: whether the weight of a splat does not depend on other splats, so that a few can be asked for.
@@ -115,6 +123,9 @@ class Rule(ABC):
     level_facts: ClassVar[tuple[str, ...]] = ()
     columns: ClassVar[tuple[str, ...]] = ()
     tables: ClassVar[tuple[str, ...]] = ()
+    lengths: ClassVar[tuple[str, ...]] = ()
+    places: ClassVar[tuple[Place, ...]] = ()
+    related: ClassVar[bool] = False
     always: ClassVar[bool] = False
     apart: ClassVar[bool] = True
     complete: ClassVar[bool] = True
@@ -164,6 +175,15 @@ class Rule(ABC):
     def check(self, tables: Tables) -> None:
         """Raises ValueError, with half a sentence, where tables are there but not what the rule reads."""
         return
+
+    def agreed(self, before: Columns, after: Columns) -> Columns:
+        """Where the rule is ``related``: those columns (N,) that rounding has put out of step, made anew.
+
+        Args:
+            before: the rule's columns and x, y and z of the means, of the splats of all levels.
+            after: the same where these splats have been placed elsewhere.
+        """
+        return {}
 
     def region(self, eye: np.ndarray, values: Values, tables: Tables) -> Region | None:
         """Where an eye is, for rules whose splats can be told beforehand for a whole region; else None.
@@ -255,6 +275,18 @@ def rules() -> dict[str, Rule]:
     return {module.RULE.name: module.RULE for module in modules}
 
 
+class Everything(Rule):
+    """What stands for a rule where there is none: all splats are drawn."""
+
+    name = ""
+
+    def weights(self, means, eye, focal_px, columns, facts, values, tables=NO_TABLES) -> np.ndarray:
+        return np.ones(len(means), np.float32)
+
+
+EVERYTHING = Everything()
+
+
 def find_rule(name: str) -> Rule | None:
     """The rule of that name; None where there is none, or this version does not know it."""
     return rules().get(name)
@@ -266,8 +298,8 @@ def every_control() -> dict[str, Control]:
 
 
 def every_column() -> set[str]:
-    """The columns of all rules, but the opacity."""
-    return {name for rule in rules().values() for name in rule.columns} - {OPACITY}
+    """The columns of all rules, but the opacity; and HIDDEN, which choices ask for beside them."""
+    return {name for rule in rules().values() for name in rule.columns} - {OPACITY} | {HIDDEN}
 
 
 def fact_names(rule: Rule) -> list[str]:

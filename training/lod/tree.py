@@ -10,9 +10,18 @@ import numpy as np
 
 from ..splats.bundle import MOST_LEVELS, Bundle, Level
 from ..splats.gaussians import Splats
-from .paging import hashed, streaming_order
+from .paging import streaming_order
 from .rules.bands import RULE as BANDS
-from .rules.cut import ABOVE_ROOT, NODE_SIZE, PARENT, PARENT_SIZE, RULE, least_size
+from .rules.cut import (
+    ABOVE_ROOT,
+    NODE_SIZE,
+    PARENT,
+    PARENT_SIZE,
+    RULE,
+    hashed,
+    least_size,
+    rounded_up,
+)
 
 NODES, LEAVES = 1, 2
 """Numbers of the levels: the nodes above, and the leaves, which are the full scene."""
@@ -86,7 +95,7 @@ class Tree:
             below = self.children[layer - self.leaves]
             apart = means[below].astype(np.float64) - means[layer, None].astype(np.float64)
             least = least_size(sizes[below], np.sqrt(np.square(apart).sum(axis=2))).max(axis=1)
-            sizes[layer] = larger(_rounded_up(np.maximum(least, size_of(log_scales[layer]))), means[layer])
+            sizes[layer] = larger(rounded_up(np.maximum(least, size_of(log_scales[layer]))), means[layer])
         return sizes
 
     def columns(self, means: np.ndarray, sizes: np.ndarray) -> dict[str, np.ndarray]:
@@ -208,9 +217,3 @@ def complete_levels(bundle: Bundle) -> Bundle:
     ]
     controls = {"gamma": bundle.controls.get("pixels", RULE.controls[0].default), "first": 1}
     return replace(bundle, levels=levels, rule=BANDS.name, controls=controls, tables={})
-
-
-def _rounded_up(values: np.ndarray) -> np.ndarray:
-    """The next float32 (N,) that are not below float64 values."""
-    rounded = values.astype(np.float32)
-    return np.where(rounded < values, np.nextafter(rounded, np.float32(np.inf)), rounded)

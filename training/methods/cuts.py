@@ -19,8 +19,13 @@ FLUSH_INTERVAL = 1000
 """Steps after which everything goes back, so that no cut stays for good."""
 REDUCED = 0.8
 """Share of the room that is taken after the least recently used has gone."""
-BESIDE = 25
-"""Bytes that are kept of each row beside its numbers."""
+BESIDE = 17
+"""Bytes that are kept of each row here beside its numbers: which row, its group, whether changed, places."""
+PLACE = 4
+"""Bytes that are kept of each row there is: where it is here."""
+
+AT_ONCE = 1 << 15
+"""Rows that are read or written together."""
 
 LARGE = 1 << 20
 """Bytes from which on an array's memory is the system's again when it is freed, where not all rows have room:
@@ -57,7 +62,7 @@ class CutCache:
 
     Rows that leave a cut stay here, and their changes with them, as long as there is room: what has been in
     no cut for longest goes first, and where cuts themselves have no room, those least recently used. Memory
-    is the budget, in which is a table of 4 bytes of every row there is. A group's rows are no other group's.
+    is the budget, in which are the tables of all rows there are. A group's rows are no other group's.
 
     What a step sees depends on which cuts are here, so ``state_dict`` tells that, too; it does not depend on
     which other rows are.
@@ -92,13 +97,14 @@ class CutCache:
         self._least, self._most = reuse
         self._flush_interval, self._reduced = flush_interval, reduced
         self._record, self.budget = 4 * self.layout.width, budget
-        self._at_once = max(STAGING // self._record, 1)
+        # on a device what is between it and the file has memory of its own
+        self._at_once = AT_ONCE if self._device.type == "cpu" else max(STAGING // self._record, 1)
         self.records = torch.zeros(0, self.layout.width, device=self._device)
         self.loaded = self.reused = 0
         self._forget(groups)
 
     def _forget(self, groups: int) -> None:
-        most = max(self.budget - 4 * len(self.rows), 0) // (self._record + BESIDE)
+        most = max(self.budget - self.tables, 0) // (self._record + BESIDE)
         self.capacity = min(most, len(self.rows))
         if self.capacity < len(self.rows):
             keep_freed_memory(LARGE)
@@ -106,11 +112,12 @@ class CutCache:
             self.records = self.records[:0].clone()
             self.records = torch.zeros(self.capacity, self.layout.width, device=self._device)
         self._place = np.full(len(self.rows), -1, np.int32)  # of each row, where its record is; -1: not here
-        self._row = np.zeros(self.capacity, np.int64)  # of each record, which row it is
-        self._group = np.full(self.capacity, FREE, np.int64)  # or FREE - 1 - the clock when it left one
+        self._row = np.zeros(self.capacity, np.int32)  # of each record, which row it is
+        self._group = np.full(self.capacity, FREE, np.int32)  # or FREE - 1 - the clock when it left one
         self._dirty = np.zeros(self.capacity, bool)
-        self._free, self._room = np.arange(self.capacity)[::-1].copy(), self.capacity  # a stack of places
-        self._places: dict[int, np.ndarray] = {}  # of each group whose cut is here
+        self._free = np.arange(self.capacity, dtype=np.int32)[::-1].copy()  # a stack of places
+        self._room = self.capacity  # of these so many are left
+        self._places: dict[int, np.ndarray] = {}  # of each group whose cut is here, int32
         self._held = 0  # rows of all these
         self._distance = np.full(groups, np.nan)
         self._used = np.full(groups, -1)
@@ -119,6 +126,11 @@ class CutCache:
     def __len__(self) -> int:
         """Rows that are here."""
         return self.capacity - self._room
+
+    @property
+    def tables(self) -> int:
+        """Bytes of what is kept of all rows there are."""
+        return PLACE * len(self.rows) + self.rows.tables
 
     # -- a step ----------------------------------------------------------------------------------------
 
@@ -152,7 +164,7 @@ class CutCache:
                 break  # otherwise cuts that are finer than they need be have no room
         if there + len(rows) > self.capacity:
             needed = there + len(rows)
-            budget = needed * (self._record + BESIDE) + 4 * len(self.rows)
+            budget = needed * (self._record + BESIDE) + self.tables
             raise NoRoom(needed, self.capacity, budget)
         self._clock += 1
         self._used[groups] = self._clock
@@ -161,7 +173,7 @@ class CutCache:
             self._bring(groups[anew], np.asarray(rows, np.int64), np.asarray(counts, np.int64))
         self._distance[groups[anew]] = distances[anew]
         places = [self._places[group] for group in groups.tolist()]
-        return np.concatenate(places) if places else np.zeros(0, np.int64)
+        return np.concatenate(places, dtype=np.int64) if places else np.zeros(0, np.int64)
 
     def rows_at(self, places: np.ndarray) -> np.ndarray:
         """Which rows (M,) are at places (M,)."""
@@ -227,18 +239,20 @@ class CutCache:
             self._drop(self._longest_left(short))
         self._held += len(rows)
         self._room -= len(coming)
-        room = self._free[self._room : self._room + len(coming)].copy()
+        room = self._free[self._room : self._room + len(coming)].astype(np.int64)
         for first in range(0, len(coming), self._at_once):
             some = slice(first, first + self._at_once)
-            records = self.rows.read(coming[some])
-            if self._device.type == "cuda":
-                records = records.pin_memory().to(self._device, non_blocking=True)
+            if self._device.type == "cpu":
+                self.rows.read(coming[some], self.records, room[some])
+                continue
+            records = self.rows.read(coming[some]).pin_memory().to(self._device, non_blocking=True)
             self.records.index_copy_(0, torch.from_numpy(room[some]).to(self._device), records)
         self._place[coming], self._row[room] = room, coming
         places[~here] = room
         self._group[places] = owners
         ends = np.cumsum(counts)
-        self._places |= zip(groups.tolist(), np.split(places.astype(np.int64), ends[:-1]), strict=True)
+        parts = (part.copy() for part in np.split(places, ends[:-1]))  # each leaves by itself
+        self._places |= zip(groups.tolist(), parts, strict=True)
         self.loaded += len(coming)
         self.reused += len(stays)
 
@@ -282,7 +296,8 @@ class CutCache:
         places = places[np.argsort(self._row[places])]
         for first in range(0, len(places), self._at_once):
             some = places[first : first + self._at_once]
-            self.rows.write(self._row[some], self.get(some).cpu())
+            here = (self.records, some) if self._device.type == "cpu" else (self.get(some).cpu(), None)
+            self.rows.write(self._row[some], *here)
             self._dirty[some] = False
 
     # -- what lasts ------------------------------------------------------------------------------------
@@ -296,7 +311,7 @@ class CutCache:
             "rows": self.rows.state_dict(),
             "groups": torch.tensor(groups, dtype=torch.int64),
             "counts": torch.tensor([len(each) for each in places], dtype=torch.int64),
-            "here": torch.from_numpy(self._row[np.concatenate(places)] if places else np.zeros(0, np.int64)),
+            "here": torch.from_numpy(self._row[np.concatenate(places)] if places else self._row[:0].copy()),
             "distance": torch.from_numpy(self._distance.copy()),
             "used": torch.from_numpy(self._used.copy()),
             "clock": self._clock,

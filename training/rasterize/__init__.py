@@ -20,11 +20,11 @@ import torch
 from ..errors import LodgsError
 from ..scenes.cameras import Camera
 from ..splats.gaussians import SH_C0
+from ..splats.sh import degree_of
 from .adam import Adam
 from .features import depths, normals
 from .gaussians import Gaussians
 from .rendering import OUTPUTS, Contributions, Rendering, Settings, Target, View
-from .sh import degree_of
 
 __all__ = [
     "BACKENDS", "OUTPUTS", "Adam", "Contributions", "Gaussians", "Rendering", "Target",

@@ -8,16 +8,9 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from ..splats.placing import similarity
 from .features import rotation_matrices
 from .gaussians import Gaussians
-
-
-def similarity(matrix: np.ndarray) -> bool:
-    """Whether a transform (4, 4) is a rotation, one scale for all axes, and a translation."""
-    linear = matrix[:3, :3]
-    square = linear.T @ linear
-    scale = np.trace(square) / 3
-    return np.linalg.det(linear) > 0 and bool(np.abs(square / scale - np.eye(3)).max() < 1e-5)
 
 
 def transformed(own: Gaussians, matrix: np.ndarray) -> Gaussians:

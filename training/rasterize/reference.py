@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch.nn.functional import conv2d, normalize
 
-from . import sh as harmonics
+from ..splats import sh as harmonics
 from .features import rotation_matrices
 from .gaussians import Gaussians
 from .rendering import (

@@ -12,7 +12,8 @@ import numpy as np
 from ..documents import json_object
 from ..errors import LodgsError
 from ..lod.choice import Choice
-from ..lod.rule import Rule, fact_names, find_rule
+from ..lod.crop import SHAPES, Crop
+from ..lod.rule import EVERYTHING, Rule, fact_names, find_rule
 from ..lod.rules.cut import RULE as CUT
 from ..scenes.cameras import FARTHEST, Camera, camera_from_dict, check_size
 
@@ -25,6 +26,7 @@ LARGEST = 1e30
 """Of numbers that a rule is told: single precision holds them."""
 MOST_COLUMNS, MOST_ROWS = 32, 4096
 """Of a table, and columns of a set."""
+MOST_CROPS = 256
 
 _NAME = re.compile(r"[\w-][\w.-]{0,99}", re.ASCII)
 
@@ -166,19 +168,38 @@ def _columns(values: dict) -> tuple[str, ...]:
 
 
 def _choice(values: dict) -> Choice:
-    rule = find_rule(_of_kind(values, "rule", str))
+    name = _of_kind(values, "rule", str)
+    rule = find_rule(name) if name else EVERYTHING
     if rule is None:
-        raise _refused("rule", values["rule"])
+        raise _refused("rule", name)
     x, y, z = _numbers(values, "eye", 3, FARTHEST)
     (focal_px,) = _numbers({"focal_px": [values.get("focal_px")]}, "focal_px", 1, LARGEST)
     controls = _by_name(values, "values", [control.name for control in rule.controls])
     for control in rule.controls:  # the ends of a slider, as single precision has them, are possible
         if not np.float32(control.low) <= np.float32(controls[control.name]) <= np.float32(control.high):
             raise _refused(control.name, controls[control.name])
-    facts = _by_name(values, "facts", fact_names(rule))
+    facts = _by_name(values, "facts", fact_names(rule) if name else [])
     return Choice(
-        rule.name, (x, y, z), focal_px, tuple(facts.items()), tuple(controls.items()), _tables(values, rule)
-    )
+        rule.name, (x, y, z), focal_px, tuple(facts.items()), tuple(controls.items()), _tables(values, rule),
+        _crops(values),
+    )  # fmt: skip
+
+
+def _crops(values: dict) -> tuple[Crop, ...] | None:
+    if values.get("crops") is None:
+        return None
+    given, found = _of_kind(values, "crops", list), []
+    if len(given) > MOST_CROPS:
+        raise _refused("crops", f"{len(given)} of them")
+    for crop in given:
+        if not isinstance(crop, dict) or crop.get("shape") not in SHAPES:
+            raise _refused("crops", crop)
+        rows = _of_kind(crop, "to_own", list)
+        if len(rows) != 3:
+            raise _refused("to_own", rows)
+        a, b, c = (_numbers({"to_own": row}, "to_own", 4, LARGEST) for row in rows)
+        found.append(Crop(crop["shape"], tuple(map(tuple, (a, b, c))), bool(crop.get("outside"))))
+    return tuple(found)
 
 
 def _tables(values: dict, rule: Rule) -> tuple:

@@ -12,10 +12,10 @@ from torch.nn.functional import normalize
 from ..errors import LodgsError, out_of_memory
 from ..lod.choice import Choice
 from ..rasterize import Gaussians, strips
-from ..rasterize.placing import similarity
 from ..rasterize.resident import Chosen, SplatSet, looked_at
-from ..rasterize.sh import basis, degree_of
 from ..scenes.cameras import Camera, check_size
+from ..splats.placing import similarity
+from ..splats.sh import basis, degree_of
 from .picture import NOTHING, Picture
 
 STRIP = 1 << 20

@@ -46,11 +46,11 @@ from ..errors import LodgsError, out_of_memory
 from ..evaluate.metrics import psnr
 from ..lod.paging import TreeFile
 from ..rasterize import resolve
-from ..rasterize.placing import similarity
 from ..runs.events import event_line
 from ..scenes.cameras import camera_as_dict
 from ..scenes.images import load_image
 from ..splats.dialects import drawable
+from ..splats.placing import similarity
 from . import wire
 from .picture import read_depth
 from .requests import Cancel, FrameRequest, NamedSet, frame_of, read_line, read_request

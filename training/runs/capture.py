@@ -12,18 +12,16 @@ from PIL import Image
 
 from ..errors import LodgsError
 from ..rasterize import Gaussians, rasterize
-from ..scenes.cameras import Camera, read_camera
+from ..scenes.cameras import Camera, read_views
 from ..scenes.viewpoints import dome
-from ..scenes.write_colmap import thinned, visible_in, write_colmap
+from ..scenes.write_colmap import write_seen
 from ..splats.dialects import Warn, silent
 from ..splats.gaussians import Splats
 from .base import read_base
-from .job import DOME, VIEWS
+from .job import DOME
 
 POINTS = 60_000
 """About so many points a scene gets, those that only one view sees among them."""
-SHORTEST_TRACK, LONGEST_TRACK = 2, 4
-"""Views that see a point: it is left out below the first, and no more than the last are recorded."""
 
 Tell = Callable[[int, int], object]
 """Is told before each view which one it is, from 1 on, and of how many."""
@@ -63,20 +61,6 @@ def capture(
     return len(cameras), write_scene(
         scene, splats, cameras, near, backend=backend, antialias=antialias, tell=tell
     )
-
-
-def read_views(folder: Path) -> tuple[list[Camera], float]:
-    """The views of a folder of camera files, by name, and the depth at which drawing begins in all of them.
-
-    Raises:
-        LodgsError: there are not two, or one cannot be read.
-    """
-    files = sorted(folder.glob("*.json"))
-    if len(files) < VIEWS[0]:
-        raise LodgsError(f"{folder} holds no two camera files (*.json).", "Choose another folder.")
-    cameras, nears = zip(*map(read_camera, files), strict=True)
-    named = [replace(camera, name=file.stem) for camera, file in zip(cameras, files, strict=True)]
-    return named, min(nears)
 
 
 def write_scene(
@@ -154,25 +138,9 @@ def _write(
         np.save(scene / "depths" / f"{number}.npy", depth)
         x, y = rng.integers([view.width, view.height], size=(points // len(views) + 1, 2)).T
         x, y = x[depth[y, x] > 0], y[depth[y, x] > 0]
-        found.append(_behind(view, x, y, depth[y, x]))
+        found.append(view.unproject(np.column_stack([x, y]) + 0.5, depth[y, x]))
         colors.append(picture[y, x])
-    candidates = np.concatenate(found)
-    visible = np.stack(
-        [
-            visible_in(np.load(scene / "depths" / f"{number}.npy"), view, candidates)[1]
-            for number, view in enumerate(views)
-        ]
-    )
-    kept = visible.sum(axis=0) >= SHORTEST_TRACK
-    if not kept.any():
-        raise LodgsError("No two views see the same splats.", "Give more views, or nearer ones.")
-    visible = thinned(visible[:, kept], LONGEST_TRACK)
-    write_colmap(scene, views, candidates[kept], visible, np.concatenate(colors)[kept])
-    return int(kept.sum())
-
-
-def _behind(camera: Camera, x: np.ndarray, y: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """World points (M, 3) at depths (M,) above 0 behind pixels."""
-    rays = np.stack([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy], axis=1)
-    local = np.column_stack([rays, np.ones(len(rays))]) * depth[:, None]
-    return (local - camera.world_to_camera[:3, 3]) @ camera.world_to_camera[:3, :3]
+    return write_seen(
+        scene, views, lambda number: np.load(scene / "depths" / f"{number}.npy"),
+        np.concatenate(found), np.concatenate(colors),
+    )  # fmt: skip

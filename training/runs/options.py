@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import json
+from collections.abc import Collection
 from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 
@@ -19,6 +21,14 @@ def _whole(text: str) -> int:
     except ValueError:
         pass
     raise argparse.ArgumentTypeError(f"{text} is no whole number from 0 to {2**31 - 1}")
+
+
+def size_of(text: str) -> tuple[int, int]:
+    """Width and height of an option such as 640x480."""
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise argparse.ArgumentTypeError(f"{text} is not WIDTHxHEIGHT, such as 640x480")
+    return int(width), int(height)
 
 
 _OPTIONS: dict[str, dict] = {
@@ -104,6 +114,24 @@ def job_from(chosen: argparse.Namespace) -> Job:
         )
     parameters = values.get("parameters", {}) | dict(map(_assignment, chosen.set))
     return Job.from_dict(values | given | {"parameters": parameters})
+
+
+def options_of(job: Job, but: Collection[str] = ()) -> list[str]:
+    """The options that :func:`job_from` makes a job of: what it says otherwise than its defaults.
+
+    Args:
+        but: keys that are left out.
+    """
+    said = {key.name: getattr(job, key.name) for key in fields(Job) if key.name in _OPTIONS}
+    known = {key.name: key.default for key in fields(Job)}
+    told: list[str] = []
+    for name, value in said.items():
+        if name not in but and value != known[name]:
+            option = f"--{name.replace('_', '-')}"
+            told += [option] if _OPTIONS[name].get("action") else [option, str(value)]
+    for name, value in job.parameters.items():
+        told += ["--set", f"{name}={json.dumps(value)}"]
+    return told
 
 
 def amounts(given: list[str]) -> dict[str, float] | None:

@@ -89,6 +89,12 @@ class Camera:
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=1), z
 
+    def unproject(self, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
+        """World points (P, 3) at pixels (P, 2) and depths (P,) above 0: the inverse of :meth:`project`."""
+        rays = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
+        local = np.column_stack([rays, np.ones(len(rays))]) * depths[:, None]
+        return (local - self.world_to_camera[:3, 3]) @ self.world_to_camera[:3, :3]
+
     def sees(self, points: np.ndarray, near: float = 0.0, margin: float = 0.0) -> np.ndarray:
         """Which world points (P, 3) are in the image, (P,) bool.
 
@@ -190,6 +196,20 @@ def read_camera(path: Path) -> tuple[Camera, float]:
         return camera_from_dict(values)
     except LodgsError as error:
         raise LodgsError(f"{path}: {error.what}", error.remedy) from error
+
+
+def read_views(folder: Path) -> tuple[list[Camera], float]:
+    """The views of a folder of camera files, by name, and the depth at which drawing begins in all of them.
+
+    Raises:
+        LodgsError: there are not two, or one cannot be read.
+    """
+    files = sorted(folder.glob("*.json"))
+    if len(files) < 2:
+        raise LodgsError(f"{folder} holds no two camera files (*.json).", "Choose another folder.")
+    cameras, nears = zip(*map(read_camera, files), strict=True)
+    named = [replace(camera, name=file.stem) for camera, file in zip(cameras, files, strict=True)]
+    return named, min(nears)
 
 
 def camera_from_dict(values: dict) -> tuple[Camera, float]:

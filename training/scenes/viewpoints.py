@@ -36,25 +36,35 @@ def dome(splats: Splats, count: int, width: int = 960, height: int = 640) -> tup
 
 
 def dome_around(
-    opaque: np.ndarray, count: int, width: int = 960, height: int = 640
+    places: np.ndarray,
+    count: int,
+    width: int = 960,
+    height: int = 640,
+    up: tuple[float, float, float] = UP,
+    lowest: float = -1.0,
 ) -> tuple[list[Camera], float]:
-    """As :func:`dome`, of the places (N, 3) float64 of opaque splats, or some of them.
+    """As :func:`dome`, of places (N, 3) float64: of opaque splats or some of them, or of a thing's corners.
+
+    Args:
+        up: what is up in the pictures, along an axis.
+        lowest: sine of the elevation at which the dome begins: 0 on the level, -1 straight below.
 
     Raises:
         LodgsError: there are none.
     """
-    if not len(opaque):
+    if not len(places):
         raise _nothing()
-    middle = np.median(opaque, axis=0)
-    radius = max(float(np.quantile(np.linalg.norm(opaque - middle, axis=1), INSIDE)), 1e-6)
+    middle = np.median(places, axis=0)
+    radius = max(float(np.quantile(np.linalg.norm(places - middle, axis=1), INSIDE)), 1e-6)
     fills = radius * np.hypot(1, 2 * FOCAL)  # a ball of that radius meets the upper and lower edge
     number = np.arange(count)
-    z, turn = 1 - (2 * number + 1) / count, number * 2.399963  # evenly, along a spiral
-    ring = np.sqrt(1 - z**2)
-    away = np.stack([ring * np.cos(turn), z, ring * np.sin(turn)], axis=1)
+    sine, turn = lowest + (1 - lowest) * (number + 0.5) / count, number * 2.399963  # evenly, along a spiral
+    ring = np.sqrt(1 - sine**2)
+    away = sine[:, None] * np.array(up)
+    away[:, np.flatnonzero(np.array(up) == 0)] = np.stack([ring * np.cos(turn), ring * np.sin(turn)], axis=1)
     eyes = middle + fills * np.where(number % 2, *DOMES)[:, None] * away
     lens = _lens(width, height)
-    views = [Camera(f"dome_{n:04d}", *lens, look_at(eye, middle, UP)) for n, eye in enumerate(eyes)]
+    views = [Camera(f"dome_{n:04d}", *lens, look_at(eye, middle, up)) for n, eye in enumerate(eyes)]
     return views, NEAR * fills
 
 
@@ -71,16 +81,28 @@ def walk(
         The views and, as for a dome, the depth at which drawing begins.
 
     Raises:
-        LodgsError: the way has no length or leads straight up, or there is no opaque splat to look at.
+        LodgsError: as :func:`along`, or there is no opaque splat to look at.
+    """
+    views = along(way, up, count, width, height)
+    eyes = np.array([view.center for view in views])
+    away = np.linalg.norm(_opaque(splats) - np.median(eyes, axis=0), axis=1)
+    return views, NEAR * float(np.median(away))
+
+
+def along(way: np.ndarray, up: np.ndarray, count: int, width: int = 960, height: int = 640) -> list[Camera]:
+    """The views of :func:`walk`, whatever there is to see.
+
+    Raises:
+        LodgsError: the way has no length or leads straight up.
     """
     lengths = np.linalg.norm(np.diff(way, axis=0), axis=1)
-    along = np.concatenate([[0], np.cumsum(lengths)])
-    places = (np.arange(count) + 0.5) / count * along[-1]
+    reached = np.concatenate([[0], np.cumsum(lengths)])
+    places = (np.arange(count) + 0.5) / count * reached[-1]
 
     def at(places: np.ndarray) -> np.ndarray:
-        return np.stack([np.interp(places, along, coordinate) for coordinate in way.T], axis=1)
+        return np.stack([np.interp(places, reached, coordinate) for coordinate in way.T], axis=1)
 
-    pause = along[-1] / count / 2
+    pause = reached[-1] / count / 2
     eyes, ahead = at(places), at(places + pause) - at(places - pause)
     up = up / np.linalg.norm(up)
     level = ahead - (ahead @ up)[:, None] * up
@@ -90,12 +112,10 @@ def walk(
     turn = np.radians(np.resize(TURNS, count))[:, None]
     looks = np.cos(turn) * level + np.sin(turn) * np.cross(up, level)
     lens = _lens(width, height)
-    views = [
+    return [
         Camera(f"walk_{n:04d}", *lens, look_at(eye, eye + look, up))
         for n, (eye, look) in enumerate(zip(eyes, looks, strict=True))
     ]
-    away = np.linalg.norm(_opaque(splats) - np.median(eyes, axis=0), axis=1)
-    return views, NEAR * float(np.median(away))
 
 
 def _opaque(splats: Splats) -> np.ndarray:

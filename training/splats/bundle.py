@@ -56,6 +56,8 @@ _MAX_COMMENTS = 2560
 _LARGEST_FACT = 1e30
 META_SHAPES = {"camera_center": (3,), "up_rotation": (3, 3), "view": (2, 3)}
 """What readers rely on of meta, where it is there; none of its numbers is beyond FARTHEST."""
+META_LENGTHS = ("scene_extent", "median_depth", "voxel", "distances")
+"""What of meta, at any depth, are lengths in scene units."""
 # What reading others' descriptions raises where something in them is missing, or of another kind.
 _CONTRADICTIONS = (ValueError, KeyError, TypeError, AttributeError)
 
@@ -124,6 +126,12 @@ class Bundle:
     def antialias(self) -> bool:
         """Whether the splats are drawn through Mip-Splatting's 2D filter, as they were trained."""
         return bool(self.meta.get("antialias"))
+
+    @property
+    def upright(self) -> np.ndarray:
+        """(3, 3) float64, the rotation that turns the scene upright, z up: as ``meta`` says, or else from -y,
+        which is up in most files of splats."""
+        return np.array(self.meta.get("up_rotation", ((1, 0, 0), (0, 0, 1), (0, -1, 0))), np.float64)
 
     @property
     def elsewhere(self) -> bool:
@@ -293,8 +301,8 @@ class DrawableRows:
     def __len__(self) -> int:
         return len(self._rows) if self._kept is None else len(self._kept)
 
-    def select(self, some: slice, /) -> Splats:
-        """The splats of a range of rows."""
+    def select(self, some: slice | np.ndarray, /) -> Splats:
+        """The splats of a range of rows, or of some rows (M,) ascending."""
         return drawable(self._meant(some if self._kept is None else self._kept[some]), self._rows.path)
 
     def _meant(self, some: slice | np.ndarray, warn: Warn = silent) -> Splats:

@@ -16,8 +16,8 @@ class SplatRows(Protocol):
 
     def __len__(self) -> int: ...
 
-    def select(self, index: slice, /) -> Splats:
-        """The splats of a range of rows."""
+    def select(self, index: slice | np.ndarray, /) -> Splats:
+        """The splats of a range of rows, or of some rows (M,) ascending."""
         ...
 
 

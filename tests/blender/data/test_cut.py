@@ -57,12 +57,12 @@ def test_it_is_shown_by_distance_from_the_scenes_own_space(bpy, lodgs, tree, roo
         ((0, 0, 20), 25, 30),
         ((60, 3, 9), 50, 20),
     ):
-        camera.location = root.matrix_world @ camera.location.__class__(eye)
+        camera.location = root.lodgs.axes.matrix_world @ camera.location.__class__(eye)
         camera.data.lens, root.lodgs.controls.pixels = lens, pixels
         bpy.context.view_layer.update()
         found = shown_rows(bpy, lodgs, root)
         focal = lens * bpy.context.scene.render.resolution_x / 36
-        own = root.matrix_world.inverted() @ camera.matrix_world.translation
+        own = root.lodgs.axes.matrix_world.inverted() @ camera.matrix_world.translation
         wanted = wanted_rows(lodgs, tree, own, focal, pixels)
         # a splat on a border may fall on its other side, where numbers are rounded elsewhere
         assert sum(len(np.setxor1d(a, b)) for a, b in zip(found, wanted, strict=True)) <= 4

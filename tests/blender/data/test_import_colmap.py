@@ -35,7 +35,7 @@ def test_cameras_see_points_where_colmap_does(bpy, lodgs, mini):
         for point in scene.points[::197].astype(np.float64):
             x, y, z = camera.world_to_camera[:3, :3] @ point + camera.world_to_camera[:3, 3]
             u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-            seen = world_to_camera_view(bpy.context.scene, obj, root.matrix_world @ Vector(point))
+            seen = world_to_camera_view(bpy.context.scene, obj, root.lodgs.axes.matrix_world @ Vector(point))
             if z > 0 and 0 < u < camera.width and 0 < v < camera.height:
                 inside += 1
                 assert seen.x * camera.width == pytest.approx(u, abs=0.01)
@@ -73,14 +73,14 @@ def test_operator_imports_everything_upright(bpy, mini):
     (root,) = [o for o in bpy.data.objects if o.lodgs.is_root]
     bpy.context.view_layer.update()
 
-    cameras = [o for o in root.children if o.type == "CAMERA"]
+    cameras = [o for o in root.children_recursive if o.type == "CAMERA"]
     assert sorted(o.name for o in cameras) == [c.name for c in scene.cameras]
     pictures = [o.data.background_images[0].image for o in cameras]
     assert all(Path(p.filepath).is_file() for p in pictures)
     up = np.mean([np.array(o.matrix_world)[:3, 1] for o in cameras], axis=0)
     assert up[2] > 0.9 * np.linalg.norm(up)
 
-    (cloud,) = [o for o in root.children if o.type == "POINTCLOUD"]
+    (cloud,) = [o for o in root.children_recursive if o.type == "POINTCLOUD"]
     positions = np.empty(len(cloud.data.points) * 3, np.float32)
     cloud.data.attributes["position"].data.foreach_get("vector", positions)
     assert np.array_equal(positions.reshape(-1, 3), scene.points)
@@ -170,8 +170,8 @@ def test_odd_scenes_import(bpy, lodgs, shared_scenes, name):
     folder = shared_scenes / "variants" / name
     scene, told = read_scene(folder), []
     root = lodgs("data.scenes").import_colmap(bpy.context, folder, warn=told.append)
-    assert len([o for o in root.children if o.type == "CAMERA"]) == len(scene.cameras) > 0
-    assert bool([o for o in root.children if o.type == "POINTCLOUD"]) == bool(len(scene.points))
+    assert len([o for o in root.children_recursive if o.type == "CAMERA"]) == len(scene.cameras) > 0
+    assert bool([o for o in root.children_recursive if o.type == "POINTCLOUD"]) == bool(len(scene.points))
     assert all(message in told for message in scene.warnings)
     assert bool(scene.distorted) == any("distortion" in message for message in told)
 

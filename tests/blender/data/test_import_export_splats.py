@@ -123,7 +123,7 @@ def test_a_foreign_2d_filter_is_known_and_named_again_on_export(bpy, lodgs, bund
 def test_upright_turns_minus_y_up(bpy, lodgs, file):
     root = lodgs("data.scenes").import_splats(bpy.context, file)
     bpy.context.view_layer.update()
-    assert np.array(root.matrix_world)[:3, :3] @ [0, -1, 0] == pytest.approx([0, 0, 1], abs=1e-6)
+    assert np.array(root.lodgs.axes.matrix_world)[:3, :3] @ [0, -1, 0] == pytest.approx([0, 0, 1], abs=1e-6)
 
 
 def test_upright_is_as_the_bundle_says(bpy, lodgs, bundle, tmp_path):
@@ -132,7 +132,7 @@ def test_upright_is_as_the_bundle_says(bpy, lodgs, bundle, tmp_path):
     lodgs("training.splats.bundle").write_bundle(tmp_path / "b.ply", bundle)
     root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "b.ply")
     bpy.context.view_layer.update()
-    assert np.array(root.matrix_world)[:3, :3] == pytest.approx(turned, abs=1e-6)
+    assert np.array(root.lodgs.axes.matrix_world)[:3, :3] == pytest.approx(turned, abs=1e-6)
 
 
 def test_one_level_and_what_is_shown(bpy, lodgs, bundle, file, tmp_path):
@@ -183,8 +183,8 @@ def test_as_shown_is_of_the_scene_itself_and_says_so(bpy, lodgs, file, tmp_path)
     bpy.context.view_layer.update()
     bpy.ops.lodgs.export_plain(filepath=str(out[1]))
     assert out[0].read_bytes() == out[1].read_bytes()
-    shown = bpy.ops.lodgs.export_plain.get_rna_type().properties["source"].enum_items["SHOWN"]
-    assert "scene's own coordinates" in shown.description and "copies" in shown.description
+    placed = bpy.ops.lodgs.export_plain.get_rna_type().properties["placed"]
+    assert "scene's own (COLMAP's) coordinates. Copies" in placed.description and not placed.default
 
 
 def test_only_this_one(bpy, file):

@@ -72,7 +72,7 @@ def test_levels_fade_in_as_the_rule_says(bpy, root, offset):
     bpy.context.scene.camera.location = (3, -2, 1)
     bpy.context.scene.camera.data.lens = 35
     bpy.context.view_layer.update()
-    eye = root.matrix_world.inverted() @ bpy.context.scene.camera.matrix_world.translation
+    eye = root.lodgs.axes.matrix_world.inverted() @ bpy.context.scene.camera.matrix_world.translation
     rule = expected(root, eye, settings.focal_px, offset)
     counts = []
     for item, wanted, (weights, radii) in zip(settings.levels, rule, shown(bpy, root), strict=True):
@@ -143,7 +143,7 @@ def test_what_is_shown_is_exported_as_it_fades(bpy, lodgs, root):
     bpy.context.scene.camera.location = (3, -2, 1)
     bpy.context.view_layer.update()
     splats = lodgs("data.scenes").shown_splats(bpy.context, root)
-    eye = root.matrix_world.inverted() @ bpy.context.scene.camera.matrix_world.translation
+    eye = root.lodgs.axes.matrix_world.inverted() @ bpy.context.scene.camera.matrix_world.translation
     opacities = []
     for item, weights in zip(root.lodgs.levels, expected(root, eye, root.lodgs.focal_px), strict=True):
         logits = np.empty(COUNT, np.float32)

@@ -28,6 +28,9 @@ def root(bpy, lodgs):
     scenes.set_tables(root, {"any": {"x": np.float32([1, 2])}})
     root.location = (1, 2, 3)
     bpy.context.view_layer.update()
+    lodgs("operators.clean_up").add_crop(bpy.context, root, "BOX")
+    bpy.context.view_layer.objects.active = root
+    bpy.context.view_layer.update()
     return root
 
 

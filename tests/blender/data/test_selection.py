@@ -83,7 +83,7 @@ def check(bpy, root, eye=None, f=None) -> list[int]:
     assert settings.focal_px == pytest.approx(f, rel=1e-6)
     if eye is None:
         world = np.array(bpy.context.scene.camera.matrix_world, np.float64)[:, 3]
-        eye = np.linalg.solve(np.array(root.matrix_world, np.float64), world)[:3]
+        eye = np.linalg.solve(np.array(root.lodgs.axes.matrix_world, np.float64), world)[:3]
     bands = flod_bands(S_MIN, f, settings.bands.gamma, settings.bands.first, settings.bands.last)
     counts = []
     for item, shown, (near, far) in zip(settings.levels, kept(bpy, root), bands, strict=True):
@@ -242,7 +242,12 @@ def test_unused_levels_are_not_evaluated(bpy, root):
 
 def test_drivers_need_no_scripts(bpy, root):
     """Simple expressions are what Blender evaluates with Auto Run Python Scripts off."""
-    drivers = [c.driver for t in [root, *root.children] if t.animation_data for c in t.animation_data.drivers]
+    drivers = [
+        c.driver
+        for t in [root, *root.children_recursive]
+        if t.animation_data
+        for c in t.animation_data.drivers
+    ]
     assert len(drivers) == 1 + 15 * len(S_MIN)
     assert all(driver.is_simple_expression and driver.is_valid for driver in drivers)
 

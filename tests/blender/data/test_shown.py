@@ -49,7 +49,7 @@ def test_arrays_are_activated_and_in_the_splats_own_space(bpy, lodgs, two_levels
     [(shown, arrays)] = sets(bpy, lodgs)
     truth = splats[1]
     assert shown.level == 2 and shown.object == root.lodgs.levels[1].object
-    assert np.allclose(shown.matrix_world, np.array(root.matrix_world), atol=1e-6)
+    assert np.allclose(shown.matrix_world, np.array(root.lodgs.axes.matrix_world), atol=1e-6)
     assert np.array_equal(arrays.means, truth.means)
     assert np.allclose(arrays.scales, np.exp(truth.log_scales.astype(float)), rtol=1e-6)
     assert np.allclose(arrays.opacities, 1 / (1 + np.exp(-truth.opacity_logits.astype(float))), atol=1e-6)
@@ -69,7 +69,7 @@ def test_distance_bands_count(bpy, lodgs, two_levels):
     bpy.context.view_layer.update()
     border = s_min / settings.bands.gamma * settings.focal_px
     world = np.append(bpy.context.scene.camera.location, 1)
-    eye = np.linalg.solve(np.array(root.matrix_world, float), world)[:3]
+    eye = np.linalg.solve(np.array(root.lodgs.axes.matrix_world, float), world)[:3]
     found = sets(bpy, lodgs)
     assert [shown.level for shown, _ in found] == [1, 2]
     for (shown, arrays), truth in zip(found, splats, strict=True):

@@ -87,7 +87,7 @@ def test_chunks_are_spheres_that_nobody_trips_over(bpy, root):
     spheres = [obj for obj in item.collection.objects if obj.type == "EMPTY"]
     assert [obj.name for obj in spheres] == [f"town chunk {number:02}" for number in range(3)]
     for number, sphere in enumerate(spheres):
-        assert sphere.parent == root
+        assert sphere.parent == root.lodgs.axes
         assert sphere.location[:] == tuple(CHUNKS[axis][number] for axis in "xyz")
         assert (sphere.empty_display_type, sphere.hide_select) == ("SPHERE", True)
         assert sphere.empty_display_size == CHUNKS["radius"][number]
@@ -96,7 +96,8 @@ def test_chunks_are_spheres_that_nobody_trips_over(bpy, root):
     bpy.context.view_layer.update()
     assert [obj.visible_get() for obj in item.collection.objects] == [False, True, True, True]
     assert all(
-        (root.matrix_world @ obj.location - obj.matrix_world.translation).length < 1e-6 for obj in spheres
+        (root.lodgs.axes.matrix_world @ obj.location - obj.matrix_world.translation).length < 1e-6
+        for obj in spheres
     )
     assert [obj.type for obj in root.lodgs.tables["other"].collection.objects] == ["MESH"]
 

@@ -106,7 +106,7 @@ def test_every_eye_chooses_its_chunks(bpy, weights, eye):
     obj = bpy.data.objects.new("eye", bpy.data.cameras.new("eye") if eye == "CAMERA" else None)
     bpy.context.scene.collection.objects.link(obj)
     bpy.context.view_layer.update()
-    obj.location = root.matrix_world @ obj.location.__class__(place)
+    obj.location = root.lodgs.axes.matrix_world @ obj.location.__class__(place)
     if eye == "CAMERA":
         bpy.context.scene.camera = obj
     root.lodgs.eye_object, root.lodgs.held_eye = obj, place
@@ -128,7 +128,7 @@ def test_it_follows_an_animated_camera_and_files_without_handlers(bpy, lodgs, we
     bpy.context.scene.camera = camera
     bpy.context.view_layer.update()
     for frame, x in ((1, 0.0), (11, 10.0)):
-        camera.location = root.matrix_world @ camera.location.__class__((x, 0, 0))
+        camera.location = root.lodgs.axes.matrix_world @ camera.location.__class__((x, 0, 0))
         camera.keyframe_insert("location", frame=frame)
     root.lodgs.eye = "CAMERA"
     path, name = str(tmp_path / "a.blend"), root.lodgs.levels[1].object.name
@@ -164,9 +164,9 @@ def test_a_render_evaluates_them_although_they_are_hidden(bpy, lodgs, weights):
     camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
     bpy.context.scene.collection.objects.link(camera)
     bpy.context.scene.camera = camera
-    camera.location = weights.root.matrix_world @ camera.location.__class__((2.5, 3, 0))
+    camera.location = weights.root.lodgs.axes.matrix_world @ camera.location.__class__((2.5, 3, 0))
     bpy.context.view_layer.update()
-    camera.location = weights.root.matrix_world @ camera.location.__class__((2.5, 3, 0))
+    camera.location = weights.root.lodgs.axes.matrix_world @ camera.location.__class__((2.5, 3, 0))
     weights.root.lodgs.eye = "CAMERA"
     bpy.utils.register_class(Recorder)
     try:

@@ -45,6 +45,17 @@ def test_before_training(root, draw, fake):
     assert "3,000 steps" in draw().texts
 
 
+def test_a_farm_is_offered_where_there_is_one(lodgs, root, draw, fake):
+    preferences = lodgs("extension").preferences()
+    preferences.flamenco = "http://farm:8080"
+    try:
+        assert draw().operators == ["lodgs.train", "lodgs.submit_to_flamenco"]
+        root.lodgs.scene_folder = ""
+        assert "lodgs.submit_to_flamenco" not in draw().operators
+    finally:
+        preferences.flamenco = ""
+
+
 def test_splats_alone_ask_for_views_of_them(bpy, lodgs, root, draw, fake):
     root.lodgs.scene_folder = ""
     assert draw().operators == [] and "Not imported from photographs: nothing to train on." in draw().texts

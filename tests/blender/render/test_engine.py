@@ -49,7 +49,7 @@ def bundle(tmp_path) -> Path:
 def scene(bpy, lodgs, bundle):
     """A bundle, turned and moved and scaled, and a camera before it; LODGS renders it to PNG."""
     scene = bpy.context.scene
-    root = lodgs("data.scenes").import_splats(bpy.context, bundle)
+    root = lodgs("data.scenes").import_splats(bpy.context, bundle, upright=False)
     root.location, root.scale = (1, 2, -0.5), (1.7,) * 3
     root.rotation_euler = (-1.2, 0.3, 0.4)
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
@@ -156,7 +156,7 @@ def test_an_imported_view_is_the_photographs_camera(bpy, lodgs, bundle, tmp_path
     photographed.lodgs.points.hide_render = True
     root = lodgs("data.scenes").import_splats(bpy.context, bundle, upright=False)
     bpy.context.view_layer.update()
-    root.matrix_world = photographed.matrix_world
+    root.lodgs.axes.matrix_world = photographed.lodgs.axes.matrix_world
     bpy.context.scene.render.dither_intensity = 0
     lodgs("render.engine").use(bpy.context.scene)
     shown = f12(bpy, tmp_path)
@@ -275,7 +275,7 @@ def by_distance(bpy, lodgs, scene, tmp_path):
         scene.render.resolution_percentage = 25
         bpy.context.view_layer.update()
         before = lodgs("data.scenes").roots(scene)[0]
-        middle = (before.matrix_world.inverted() @ scene.camera.matrix_world.translation).length
+        middle = (before.lodgs.axes.matrix_world.inverted() @ scene.camera.matrix_world.translation).length
         focal = before.lodgs.focal_px
         of_scene, coarse, fine = {
             "bands": ({}, {"s_min": middle / focal}, {"s_min": 0.0}),
@@ -299,7 +299,7 @@ def by_distance(bpy, lodgs, scene, tmp_path):
         write_bundle(tmp_path / "levels.ply", bundle)
         bpy.data.batch_remove([obj for obj in bpy.data.objects if obj.type == "POINTCLOUD"])
         root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "levels.ply")
-        root.matrix_world = before.matrix_world
+        root.lodgs.axes.matrix_world = before.lodgs.axes.matrix_world
         root.lodgs.mode = "SELECTIVE"
         bpy.context.view_layer.update()
         return root

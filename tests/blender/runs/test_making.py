@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-ASKED = Path(__file__).resolve().parents[3] / "requirements" / "trainer.in"
+ASKED = [
+    Path(__file__).resolve().parents[3] / "requirements" / f"{name}.in" for name in ("trainer", "cluster")
+]
 
 
 @pytest.fixture
@@ -63,7 +65,8 @@ def test_nothing_is_downloaded_without_leave(bpy, lodgs, making, monkeypatch):
 
 
 def test_what_is_tried_is_what_was_asked_for(making):
-    names = {line.split("==")[0] for line in ASKED.read_text().splitlines() if "==" in line}
+    lines = [line for path in ASKED for line in path.read_text().splitlines()]
+    names = {line.split("==")[0] for line in lines if "==" in line}
     assert {"pillow" if name == "PIL" else name for name in making.MODULES} == names - {"numpy"}
 
 
@@ -187,7 +190,7 @@ def test_what_a_gpu_needs_is_installed_where_it_can_be_compiled(bpy, making, fak
     fake(pip=f'echo "$@" > {tmp_path}/said')
     programs = {"nvidia-smi": "/nvidia-smi"}
     monkeypatch.setattr(making.shutil, "which", programs.get)
-    for lock in ("trainer.txt", "cuda.txt"):
+    for lock in ("cluster.txt", "cuda.txt"):
         assert bpy.ops.lodgs.make_environment() == {"FINISHED"}
         said = (tmp_path / "said").read_text()
         assert said.strip().endswith(lock) and "--require-hashes --only-binary=:all:" in said

@@ -61,7 +61,7 @@ def assert_sees_as_blender(bpy, root, camera, view, near):
     points = ball(20).means.astype(float)
     pixels, depths = view.project(points)
     for point, pixel, depth in zip(points, pixels, depths, strict=True):
-        place = root.matrix_world @ Vector(point)
+        place = root.lodgs.axes.matrix_world @ Vector(point)
         x, y, away = world_to_camera_view(bpy.context.scene, camera, place)
         assert pixel == pytest.approx((x * view.width, (1 - y) * view.height), abs=0.02)
         assert depth * 2 == pytest.approx(away, rel=1e-4)  # the root is twice as large
@@ -137,7 +137,7 @@ def test_a_walk_along_a_curve(bpy, fake, root, tmp_path):
     curves = len(bpy.data.curves), len(bpy.data.objects)
     _, views = train(bpy, tmp_path)
     assert (len(bpy.data.curves), len(bpy.data.objects)) == (curves[0], curves[1] + 1), "but for a level"
-    matrix = np.array(root.matrix_world)
+    matrix = np.array(root.lodgs.axes.matrix_world)
     eyes = np.array([view.center for view, _ in views]) @ matrix[:3, :3].T + matrix[:3, 3]
     np.testing.assert_allclose(np.linalg.norm(eyes[:, :2] - [1, 2], axis=1), 6, atol=0.1)
     np.testing.assert_allclose(eyes[:, 2], 1.7, atol=1e-5)

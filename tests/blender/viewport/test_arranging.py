@@ -381,7 +381,7 @@ def test_the_viewports_eye(bpy, lodgs, scene_of):
 
     def check(eye, focal):
         bpy.context.view_layer.update()
-        local = np.linalg.solve(np.array(root.matrix_world, float), np.append(eye, 1))[:3]
+        local = np.linalg.solve(np.array(root.lodgs.axes.matrix_world, float), np.append(eye, 1))[:3]
         borders = [1e30, *(s / settings.bands.gamma * focal for s in S_MIN[:2]), 0]
         for (_, arrays), far, near in zip(shown(bpy, lodgs), borders, borders[1:], strict=False):
             own = lodgs("data.shown").read(root.lodgs.levels[borders.index(far)].object.data).means

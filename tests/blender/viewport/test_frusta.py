@@ -71,7 +71,7 @@ def test_they_are_drawn(bpy, lodgs, root, frame):
         with gpu.matrix.push_pop(), gpu.matrix.push_pop_projection():
             gpu.matrix.load_identity()
             gpu.matrix.load_projection_matrix(Matrix.Diagonal((0.1, 0.1, 0.01, 1)))
-            lodgs("viewport.frusta").draw(bpy.context.scene)
+            lodgs("viewport.frusta").draw(bpy.context)
 
     assert (frame(64, draw)[..., 0] > 0).sum() > 50
     root.lodgs.training.show_views = False

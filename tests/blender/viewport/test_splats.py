@@ -1,6 +1,5 @@
 """Splats in 3D viewports, drawn offscreen, against the trainer's rasterizer and by hand."""
 
-import importlib.util
 import os
 import subprocess
 from itertools import pairwise
@@ -9,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-REPOSITORY = Path(__file__).resolve().parents[3]
+from training.splats import sh as harmonics
+
 SIZE = 512
 
 
@@ -156,10 +156,6 @@ def _in_world(splats, matrix, world_to_camera):
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
     eye = np.linalg.inv(world_to_camera)[:3, 3]
     local = splats.means - (np.linalg.inv(matrix) @ np.append(eye, 1))[:3]
-    path = REPOSITORY / "training/rasterize/sh.py"
-    specification = importlib.util.spec_from_file_location("training.rasterize.sh", path)
-    harmonics = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(harmonics)  # by itself, for Blender's Python lacks torch
     values = np.empty((splats.sh.shape[1], count))
     harmonics.basis(*(local / np.linalg.norm(local, axis=1, keepdims=True)).T, splats.sh_degree, values)
     return {

@@ -19,6 +19,7 @@ from training.splats.bundle import read_bundle
 ROOT = Path(__file__).resolve().parents[3]
 SCRIPT = ROOT / "farm" / "flamenco" / "lodgs_blocks.js"
 MANAGER = """
+const shellSplit = text => text.split(" ");  // the manager's, but for quotation marks
 const path = { join: (...parts) => parts.join("/") };
 const author = {
     Task: (name, type) => ({
@@ -36,10 +37,10 @@ console.log(JSON.stringify({ type: JOB_TYPE, tasks: job.tasks }));
 needs_node = pytest.mark.skipif(shutil.which("node") is None, reason="Node.js is not installed")
 
 
-def compiled(folder: Path, **settings) -> dict:
+def compiled(folder: Path, source: Path = SCRIPT, **settings) -> dict:
     """The job type, and the tasks that it makes of these settings and the defaults of others."""
     script = folder / "job.js"
-    script.write_text(SCRIPT.read_text() + MANAGER)
+    script.write_text(source.read_text() + MANAGER)
 
     def run(values: dict) -> dict:
         told = subprocess.run(
@@ -73,6 +74,13 @@ def test_without_polishing_there_are_no_seams(tmp_path):
     tasks = compiled(tmp_path, scene="/scene", output="/run", columns=2, rows=1, polish=0)["tasks"]
     assert [task["name"] for task in tasks] == ["plan", "coarse", "block-1", "block-2", "put together"]
     assert tasks[-1]["after"] == ["block-1", "block-2"]
+
+
+@needs_node
+def test_options_are_the_plans(tmp_path):
+    plan, *others = compiled(tmp_path, columns=1, rows=2, options="--seed 3 --set max_splats=500000")["tasks"]
+    assert plan["commands"][0]["args"][-4:] == ["--seed", "3", "--set", "max_splats=500000"]
+    assert not any("--seed" in command["args"] for task in others for command in task["commands"])
 
 
 @needs_node

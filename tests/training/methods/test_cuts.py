@@ -5,13 +5,14 @@ import pytest
 import torch
 
 from training.errors import LodgsError
-from training.methods.cuts import BESIDE, CutCache
-from training.methods.rows import FileRows, Layout
+from training.methods.cuts import BESIDE, PLACE, CutCache
+from training.methods.rows import TABLES, FileRows, Layout
 
 LAYOUT = Layout({"values": (4,)})
 GROUPS, SIZE = 20, 30
 """Group g is the rows from SIZE * g; those of a cut are the first few, more for nearer ones."""
-ROW, TABLE = 4 * LAYOUT.width + BESIDE, 4 * GROUPS * SIZE
+BLOCK = 7
+ROW, TABLE = 4 * LAYOUT.width + BESIDE, PLACE * GROUPS * SIZE + TABLES * -(-GROUPS * SIZE // BLOCK)
 
 
 def filled(rows):
@@ -35,7 +36,7 @@ def cut_for(groups: np.ndarray, distances: np.ndarray):
 
 @pytest.fixture
 def made(tmp_path):
-    return filled(FileRows(tmp_path, LAYOUT, block=7))
+    return filled(FileRows(tmp_path, LAYOUT, block=BLOCK))
 
 
 @pytest.mark.parametrize("room", [140, 200, 1000])
@@ -166,7 +167,7 @@ def test_a_resumed_run_has_the_same_bits(tmp_path):
 
     def fresh(name: str) -> CutCache:
         (tmp_path / name).mkdir(exist_ok=True)
-        rows, _ = filled(FileRows(tmp_path / name, LAYOUT, block=7))
+        rows, _ = filled(FileRows(tmp_path / name, LAYOUT, block=BLOCK))
         return CutCache(rows, GROUPS, 130 * ROW + TABLE, flush_interval=40)
 
     truth = steps(fresh("whole"), 0, 60)
@@ -179,7 +180,7 @@ def test_a_resumed_run_has_the_same_bits(tmp_path):
     cache.load_state_dict(state)
     seen += steps(cache, 23, 60)
     assert all(np.array_equal(a, b) for a, b in zip(truth, seen, strict=True))
-    small = CutCache(filled(FileRows(tmp_path, LAYOUT, block=7))[0], GROUPS, 5 * ROW)
+    small = CutCache(filled(FileRows(tmp_path, LAYOUT, block=BLOCK))[0], GROUPS, 5 * ROW)
     state["rows"] = small.rows.state_dict()
     small.load_state_dict(state)  # in which there is no room for what was here
     assert not len(small)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from training.rasterize import sh
+from training.splats import sh
 
 CHANNELS = 513
 

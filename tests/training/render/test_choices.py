@@ -1,5 +1,6 @@
 """What a frame shows of splats that stay: the picture of those that a rule chooses, to the bit."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 import torch
 
 from training.lod.choice import Choice
+from training.lod.crop import Crop
 from training.lod.rule import NO_FINER, fact_names, rules
 from training.lod.rules.chunks import TABLE, member_columns
 from training.render.requests import read_request
@@ -142,6 +144,14 @@ def test_a_choice_travels_as_json(camera):
         found = read_request(asked).sets[0].choice
         assert found.as_dict() == choice.as_dict()
         assert found.region() == choice.region()
+    crops = (Crop.sphere((1, 2, 3), 4), Crop.box((0, 0, 0), (1, 2, 3), True))
+    for choice in (choice_of("bands", (0.1, -2, 3)), Choice.by_crops(())):
+        choice = replace(choice, crops=crops)
+        one = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "choice": choice.as_dict()}
+        asked = json.loads(
+            json.dumps({"frame": 1, "out": "o", "camera": camera_as_dict(camera, 0.1), "sets": [one]})
+        )
+        assert read_request(asked).sets[0].choice == choice
 
 
 def low(values: dict) -> dict:
@@ -157,6 +167,11 @@ def low(values: dict) -> dict:
         {"tables": {"chunks": {"x": [1], "y": []}}}, {"tables": {"chunks": {"x": 1}}},
         {"tables": {"chunks": {"x": ["1"]}}}, {"tables": {"chunks": {"x": [0.0] * 5000}}},
         {"tables": {"chunks": {f"x{i}": [] for i in range(40)}}}, low,
+        {"crops": 1}, {"crops": [1]}, {"crops": [{"shape": "CUBE", "to_own": [[0.0] * 4] * 3}]},
+        {"crops": [{"shape": "BOX"}]}, {"crops": [{"shape": "BOX", "to_own": [[0.0] * 4] * 2}]},
+        {"crops": [{"shape": "BOX", "to_own": [[0.0] * 3] * 3}]},
+        {"crops": [{"shape": "BOX", "to_own": [[0.0, 0.0, 0.0, 1e40]] * 3}]},
+        {"crops": [Crop.sphere((0, 0, 0), 1).as_dict()] * 300},
     ],
 )  # fmt: skip
 def test_impossible_choices_are_a_sentence(camera, change):

@@ -12,9 +12,9 @@ from training.errors import LodgsError
 from training.evaluate.costs import cost_curves
 from training.rasterize import Gaussians, rasterize
 from training.runs import capture
-from training.runs.capture import read_views, write_scene
+from training.runs.capture import write_scene
 from training.runs.folder import RunFolder
-from training.scenes.cameras import write_camera
+from training.scenes.cameras import read_views, write_camera
 from training.scenes.colmap import read_scene
 from training.scenes.images import load_image
 from training.scenes.viewpoints import dome, walk

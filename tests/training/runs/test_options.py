@@ -1,14 +1,14 @@
 """Options of ``train``: they say what a job file says."""
 
 import argparse
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import pytest
 
 from training.__main__ import main
 from training.errors import LodgsError
 from training.runs.job import Job
-from training.runs.options import add_options, job_from
+from training.runs.options import add_options, job_from, options_of
 
 
 def job(*words) -> Job:
@@ -49,6 +49,20 @@ def test_options_go_before_what_the_file_says(tmp_path):
     Job("/a", "/b", seed=1, parameters={"rho": 3, "footprint": 9}).write(tmp_path / "job.toml")
     changed = job(tmp_path / "job.toml", "--seed", 2, "--out", "/c", "--set", "rho=2")
     assert changed == Job("/a", "/c", seed=2, parameters={"rho": 2, "footprint": 9})
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        Job("/a", "/b"),
+        Job("/a b", "/b'c", "octree", "paper", seed=3, exposure=-1.5, test_every=0, validation=True,
+            cells="2x3", image_scale=0.65, parameters={"levels": 3, "far_share": 0.25}),
+        Job("/a", "/b", "lodge", base="/c", parameters={"distances": [8.0, 4.5, 0.0], "antialias": True}),
+    ],
+)  # fmt: skip
+def test_a_job_is_what_its_options_say(given):
+    assert job(*options_of(given)) == given
+    assert job("--scene", "/x", *options_of(given, but=("scene",))) == replace(given, scene="/x")
 
 
 @pytest.mark.parametrize(

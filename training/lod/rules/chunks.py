@@ -40,6 +40,8 @@ class Chunks(Rule):
     level_facts = ("d_l",)
     columns = MEMBERS
     tables = (TABLE,)
+    lengths = ("d_l", "radius")
+    places = (("x", "y", "z"),)
     controls = (
         Control(
             "distance_scale", 1.0, 0.01, 100.0, "Distance Scale",

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ...splats.ply import Columns
 from ..colors import LEVEL_COLORS
 from ..rule import NO_COLUMNS, NO_TABLES, Control, Rule, Values, distances, distances_by_axes
 
@@ -62,6 +63,22 @@ def least_size(child_sizes: np.ndarray, away: np.ndarray) -> np.ndarray:
     return (child_sizes + np.asarray(away, np.float64) / K_LEAST) * (1 + ROUNDING)
 
 
+def rounded_up(values: np.ndarray) -> np.ndarray:
+    """The next float32 (N,) that are not below float64 values."""
+    rounded = values.astype(np.float32)
+    return np.where(rounded < values, np.nextafter(rounded, np.float32(np.inf)), rounded)
+
+
+def hashed(rows: np.ndarray) -> np.ndarray:
+    """(N,) uint64 of rows (N, 4) float32: equal ones have equal numbers, and hardly any others."""
+    words = np.ascontiguousarray(rows).view(np.uint32).astype(np.uint64)
+    found = np.zeros(len(rows), np.uint64)
+    for word in words.T:
+        found = (found ^ word) * np.uint64(0x9E3779B97F4A7C15)
+        found ^= found >> np.uint64(29)
+    return found
+
+
 class Cut(Rule):
     """1 where a node is fine enough and its parent is not, 0 elsewhere (Eq. 5).
 
@@ -78,6 +95,9 @@ class Cut(Rule):
     name = "cut"
     complete = False
     columns = (NODE_SIZE, PARENT_SIZE, *PARENT)
+    lengths = (NODE_SIZE, PARENT_SIZE)
+    places = (PARENT,)
+    related = True
     controls = (
         Control(
             "pixels", 1.0, 0.1, 100.0, "Granularity",
@@ -107,6 +127,38 @@ class Cut(Rule):
         k = detail_of(focal_px, values["pixels"])
         return 0.0, (k + K_LEAST) * (1 + 4 * ROUNDING) * highest[PARENT_SIZE].astype(np.float64)
 
+    def agreed(self, before: Columns, after: Columns) -> Columns:
+        """Sizes with which cuts are proper still, and no two nodes are the same at the same place.
+
+        They are what scaling makes of them, or larger in the last places.
+        """
+        inside = (before[PARENT_SIZE] > 0) & (before[PARENT_SIZE] < ABOVE_ROOT)
+        above = hashed(_identities(before, PARENT_SIZE, PARENT)[inside])
+        keys, first, family = np.unique(above, return_index=True, return_inverse=True)
+        own = hashed(_identities(before, NODE_SIZE, "xyz"))
+        heads = np.searchsorted(keys, own).clip(max=max(len(keys) - 1, 0))
+        is_head = before[NODE_SIZE] > 0
+        if len(keys):
+            is_head &= keys[heads] == own
+        sizes, places = after[NODE_SIZE].copy(), np.stack([after[axis][inside] for axis in PARENT], axis=1)
+        means = np.stack([after[axis][inside] for axis in "xyz"], axis=1)
+        away = np.sqrt(np.square(means.astype(np.float64) - places).sum(axis=1))
+        of_keys, places = after[PARENT_SIZE][inside][first], places[first] + np.float32(0)
+        while len(keys):
+            sizes[is_head] = of_keys[heads[is_head]]
+            least = np.zeros(len(keys))
+            np.maximum.at(least, family, least_size(sizes[inside], away))
+            larger = np.maximum(of_keys, rounded_up(least))
+            alike = np.ones(len(keys), bool)
+            alike[np.unique(hashed(np.column_stack([larger, places])), return_index=True)[1]] = False
+            larger[alike] = np.nextafter(larger[alike], np.float32(np.inf))
+            if np.array_equal(larger, of_keys):
+                break
+            of_keys = larger
+        parent_sizes = before[PARENT_SIZE].copy()
+        parent_sizes[inside] = of_keys[family]
+        return {NODE_SIZE: sizes, PARENT_SIZE: parent_sizes}
+
     def told_level(self, columns, facts) -> np.ndarray:
         """The number of a colour: the octave of a node's size, OCTAVES + 1 for leaves."""
         return _octave(columns[NODE_SIZE])
@@ -118,6 +170,11 @@ class Cut(Rule):
     def coarser(self, values: Values, levels: Sequence[int]) -> Values | None:
         pixels = values["pixels"] * STEP
         return {**values, "pixels": pixels} if pixels <= self.controls[0].high else None
+
+
+def _identities(columns: Columns, size: str, axes: Sequence[str]) -> np.ndarray:
+    """(N, 4) by which children and parents know each other."""
+    return np.stack([columns[name] for name in (size, *axes)], axis=1) + np.float32(0)  # no zero below zero
 
 
 def _octave(sizes: np.ndarray) -> np.ndarray:

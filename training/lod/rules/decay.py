@@ -42,7 +42,7 @@ def last_seen_at(normalized: np.ndarray, sigma: np.ndarray, opacity: np.ndarray,
     ratio = opacity / np.float32(tau)
     product = 2 * normalized**2 / (2 * sigma.clip(0) ** 2 + np.float32(EPSILON)) * ratio**2
     product = product.clip(np.float32(1e-12), np.float32(1e30))
-    w = np.log(1 + product)
+    w = np.log1p(product)
     for _ in range(NEWTON_STEPS):
         w = w / (1 + w) * (1 + np.log(product / w))
     return ratio * np.exp(-w / 2)
@@ -60,6 +60,7 @@ class Decay(Rule):
 
     name = "decay"
     scene_facts = ("reference", "tau")
+    lengths = ("reference",)  # σ_d is a share of it
     columns = (SIGMA, OPACITY)
     controls = (
         Control(

@@ -53,6 +53,7 @@ class Octree(Rule):
     name = "octree"
     cumulative = True
     scene_facts = ("d_max", "d_max_focal")
+    lengths = ("d_max",)
     columns = (BIAS,)
     controls = (
         Control(

@@ -22,7 +22,6 @@ from ..density import require_rows
 from ..method import Drawing
 from ..model import Model, splat_rates
 from ..schedules import due
-from ..start import from_splats
 from ..threedgs import train as threedgs_train
 from . import ClodParameters
 
@@ -67,12 +66,10 @@ class Method(threedgs_train.Method):
 
     def setup(self, base: Splats | None) -> None:
         p = self.parameters
-        if base is None:
-            super().setup(None)
-            tensors = {name: tensor.detach() for name, tensor in self.model.adam.tensors.items()}
-            self.begins = round(p.begin * p.steps)
-        else:
-            tensors = from_splats(base, p.sh_degree, self.device)
+        super().setup(base)
+        tensors = {name: tensor.detach() for name, tensor in self.model.adam.tensors.items()}
+        self.begins = round(p.begin * p.steps)
+        if base is not None:
             self.begins = self._densify_until = 0
         sigma = torch.full((len(tensors["means"]),), p.sigma_init, device=self.device)
         rates = splat_rates(p, self.data.extent) | {SIGMA: p.lr_sigma}

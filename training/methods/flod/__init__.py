@@ -71,7 +71,15 @@ class FlodParameters(DensityParameters):
     finish_share: float = parameter(
         0.14,
         "Further steps at the end, as a share of all levels', that fit the two levels before the finest to "
-        "how the three are drawn together by distance. Not in the paper.",
+        "how the three are drawn together by distance; those of fine detail begin anew with the finest "
+        "level's most important splats. Not in the paper.",
+        high=1,
+    )
+    drawn: float = parameter(
+        0.53,
+        "By distance the training views draw at most this share of the splats that they draw of the finest "
+        "level alone: so many splats do the levels have that finishing steps begin anew. Not in the paper.",
+        above=0,
         high=1,
     )
     finish_alone: float = parameter(

@@ -1,9 +1,12 @@
-"""Finishing steps: coarser levels learn to stand beside the finest, as selective rendering draws them.
+"""Finishing: the levels before the finest become its most important splats, and learn to stand beside it.
 
-Not in the paper (FLoD, Sec. 5.2), which trains each level as if it were alone: no step has ever drawn two of
-them, nor the places where one takes over from the next. Here they are rows of one model, and each step draws
-what the rule chooses at a random screen size, or a coarser level alone, so that it does not come to need the
-others. The finest level stays as it is: it is drawn whole as well, and no worse than before.
+Not in the paper (FLoD, Sec. 5.2), which trains each level as if it were alone, before the finer ones: no step
+has ever drawn two of them, nor the places where one takes over from the next. Here they are rows of one
+model. Those whose smallest size hardly limits what they can show begin anew: as copies of the finest level's
+splats that have the largest share of some pixel, so many that views by distance draw no more than they may.
+Each step then draws what the rule chooses at a random screen size, or a coarser level alone, so that it does
+not come to need the others. The finest level stays as it is: it is drawn whole as well, and no worse than
+before.
 """
 
 from __future__ import annotations
@@ -13,17 +16,30 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
+from ...lod.blocks import spatial_order
 from ...lod.rule import Values, facts_of
 from ...lod.rules.bands import RULE
+from ...rasterize import Gaussians, contributions
 from ...rasterize.adam import LearningRate
-from ...scenes.cameras import Camera
+from ...scenes.cameras import Camera, evenly
 from ...splats.bundle import Level
+from ..data import TrainingData
 from ..model import Model, splat_rates
+from ..pruning import least_importance, room_taken_over
 from ..schedules import log_linear
 from . import FlodParameters
 
 LEVEL = "level"
 """Column of the number of each row's level; levels follow each other, coarse to fine."""
+FINE = 1.5
+"""A level begins anew where its smallest size covers at most so many pixels at the median depth. What is
+coarser was trained with fewer and larger splats than the finest level's, and keeps them."""
+VIEWS_COUNTED = 24
+"""In so many training views it is counted what they draw."""
+COARSER = 0.8
+"""Of two neighbouring levels that begin anew the coarser one has so many times the other's splats."""
+LEAST_SHARE = 0.25
+"""At least this share of what views draw of a level stays, whatever the others have drawn."""
 SPREAD = 2.0
 """The largest factor on the run's screen size, up or down."""
 MEANS = 3.0
@@ -43,6 +59,63 @@ def joined(levels: Mapping[int, Mapping[str, torch.Tensor]], lr: Mapping[str, Le
     tensors = {name: torch.cat([level[name] for level in levels.values()]) for name in names}
     numbers = [torch.full_like(level["opacity_logits"], n, dtype=torch.int32) for n, level in levels.items()]
     return Model(tensors, lr, {LEVEL: torch.cat(numbers)})
+
+
+@torch.no_grad()
+def begun_anew(
+    levels: Mapping[int, Mapping[str, torch.Tensor]],
+    numbers: Sequence[int],
+    s_min: Sequence[float],
+    data: TrainingData,
+    parameters: FlodParameters,
+    gamma: float,
+    backend: str,
+) -> dict[int, dict[str, torch.Tensor]]:
+    """Levels of the finest one's splats, so many that views by distance draw no more than ``drawn`` of it.
+
+    Each has the ones with the largest share of some pixel. Views are as wide as photographs are continued, so
+    that what continues them counts.
+
+    Args:
+        levels: as of :func:`joined`.
+        numbers: those that begin anew, coarse to fine, the last one before the finest.
+        gamma: the screen size that levels are chosen with.
+
+    Returns:
+        Their splats, in spatial order, none smaller than its level allows.
+    """
+    p, (coarsest, *_, finest) = parameters, levels
+    order = torch.from_numpy(spatial_order(levels[finest]["means"].cpu().numpy()))
+    tensors = {name: tensor[order.to(tensor.device)] for name, tensor in levels[finest].items()}
+    wide = (camera.widened(p.margin) for camera in data.train)
+    found = contributions(Gaussians(**tensors), wide, near=data.near, antialias=p.antialias, backend=backend)
+    shares, log_scales = found.largest.cpu().numpy(), tensors["log_scales"].cpu().numpy()
+    rank = np.empty(len(shares))
+    rank[np.argsort(-shares, kind="stable")] = np.arange(1, len(shares) + 1)
+    first = {number: COARSER ** (numbers[-1] - number) / rank for number in numbers}
+
+    values = {"gamma": gamma, "first": coarsest, "last": finest}
+    views = {
+        number: _views_drawing(
+            (tensors if number in numbers else level)["means"], number, s_min, data, values
+        )
+        for number, level in levels.items()
+    }
+    alone = _views_drawing(tensors["means"], finest, s_min, data, {**values, "first": finest})
+    own = np.concatenate([views[number] for number in numbers])
+    others = sum(int(each.sum()) for number, each in views.items() if number not in numbers)
+    most = max(p.drawn * alone.sum() - others, LEAST_SHARE * own.sum())
+    least = least_importance(np.concatenate(list(first.values())), own, most)
+
+    anew = {}
+    for number in numbers:
+        kept = first[number] >= least
+        wider = log_scales + room_taken_over(log_scales, shares, kept)[:, None]
+        sizes = torch.from_numpy(np.maximum(wider, np.float32(np.log(s_min[number - 1]))))
+        level = tensors | {"log_scales": sizes.to(tensors["log_scales"])}
+        rows = torch.from_numpy(kept)
+        anew[number] = {name: tensor[rows.to(tensor.device)] for name, tensor in level.items()}
+    return anew
 
 
 def rates(parameters: FlodParameters, extent: float, share: float) -> dict[str, LearningRate]:
@@ -65,18 +138,8 @@ def weights(model: Model, s_min: Sequence[float], camera: Camera, values: Values
     Args:
         s_min: of every level of the run, coarse to fine.
     """
-    means, facts = model["means"].detach().cpu().numpy(), _facts(s_min)
-    found = [
-        RULE.weights(
-            means[rows],
-            np.asarray(camera.center, np.float32),
-            camera.focal,
-            {},
-            facts_of(RULE, {}, facts, number),
-            values,
-        )
-        for number, rows in _rows(model).items()
-    ]
+    means = model["means"].detach().cpu().numpy()
+    found = [_weights(means[rows], number, s_min, camera, values) for number, rows in _rows(model).items()]
     return torch.from_numpy(np.concatenate(found)).to(model["means"].device)
 
 
@@ -100,6 +163,26 @@ def levels_of(model: Model, s_min: Sequence[float]) -> list[Level]:
     """The levels that were trained, coarse to fine: all but the finest."""
     splats, facts, (*rows, _) = model.splats(), dict(_facts(s_min)), _rows(model).items()
     return [Level(number, splats.select(some), facts[number]) for number, some in rows]
+
+
+def _weights(
+    means: np.ndarray, number: int, s_min: Sequence[float], camera: Camera, values: Values
+) -> np.ndarray:
+    """The rule's weights (N,) of a level's splats."""
+    eye, facts = np.asarray(camera.center, np.float32), facts_of(RULE, {}, _facts(s_min), number)
+    return RULE.weights(means, eye, camera.focal, {}, facts, values)
+
+
+def _views_drawing(
+    means: torch.Tensor, number: int, s_min: Sequence[float], data: TrainingData, values: Values
+) -> np.ndarray:
+    """In how many of VIEWS_COUNTED training views each of a level's splats (N,) is drawn."""
+    places = means.cpu().numpy()
+    views = np.zeros(len(places), np.int64)
+    for camera in evenly(data.train, VIEWS_COUNTED):
+        shown = _weights(places, number, s_min, camera, values) > 0
+        views += shown & camera.sees(places, data.near)
+    return views
 
 
 def _facts(s_min: Sequence[float]) -> list[tuple[int, dict[str, float]]]:

@@ -79,8 +79,7 @@ class Method(method.Method[FlodParameters, Drawing]):
         if number < self.parameters.end:
             self.rise_to(number + 1)
         elif self.kept:
-            self.model = finish.joined(self.kept, finish.rates(self.parameters, self.data.extent, 0.0))
-            self.kept = {}
+            self.begin_finishing()
         return [finished]
 
     def controls(self) -> dict[str, float]:
@@ -231,6 +230,17 @@ class Method(method.Method[FlodParameters, Drawing]):
         p = self.parameters
         if p.finish_steps and level > p.levels - TOGETHER:
             self.kept[level] = from_splats(splats, p.sh_degree, self.device)
+
+    def begin_finishing(self) -> None:
+        """The levels that finishing steps train, as one model; those of fine detail begin anew."""
+        p, data, levels = self.parameters, self.data, self.kept
+        most = finish.FINE * data.median_depth / data.focal
+        fine = [number for number in levels if 0 < self.s_min[number - 1] <= most]
+        if fine:
+            gamma = self.controls()["gamma"]
+            levels |= finish.begun_anew(levels, fine, self.s_min, data, p, gamma, self.backend)
+        self.model = finish.joined(levels, finish.rates(p, data.extent, 0.0))
+        self.kept = {}
 
     def _from_points(self, level: int) -> dict[str, torch.Tensor]:
         s_min = self.s_min[level - 1]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from ...lod.blocks import SIZE, Blocks
+from ...lod.blocks import Blocks
 from ...lod.rule import facts_of
 from ...lod.rules.chunks import RULE
 from ...rasterize import Gaussians, contributions
@@ -134,22 +134,6 @@ class Stack:
             )
             largest = torch.maximum(largest, found.largest.to(largest))
         return largest
-
-
-def room_taken_over(log_scales: np.ndarray, shares: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """What is to be added to log-scales (N, 3), (N,), so that those that are kept cover what all did.
-
-    In each block, areas weighted by the splats' shares of a pixel add up to what they were. At most doubles
-    a splat's size: a block of which nearly nothing is kept is not one surface.
-    """
-    if not len(kept):
-        return np.zeros(0, np.float32)
-    begins = np.arange(0, len(kept), SIZE)
-    ordered = np.sort(log_scales, axis=1)
-    covered = shares * np.exp(ordered[:, 1] + ordered[:, 2]).astype(np.float64)
-    before, after = (np.add.reduceat(each, begins) for each in (covered, covered * kept))
-    wider = np.log(np.clip(before / np.maximum(after, 1e-30), 1, 4)) / 2
-    return np.repeat(wider, SIZE)[: len(kept)].astype(np.float32)
 
 
 def seen_from_afar(

@@ -23,13 +23,13 @@ from ..data import TrainingView
 from ..density import require_rows
 from ..method import Drawing
 from ..model import NAMES
+from ..pruning import least_importance, room_taken_over
 from ..threedgs.refining import Refining
 from . import ROUNDS, LodgeParameters, chunks
 from .composite import (
     IndexedLevel,
     Stack,
     filtered,
-    room_taken_over,
     rows_seen,
     seen_from_afar,
     together,
@@ -208,10 +208,7 @@ class Method(Refining):
                 else:
                     others += seen.sum()
         most = max(share * finest - others, views.sum() / 4)
-        values = importance.numpy()
-        descending = np.argsort(-values, kind="stable")
-        within = int(np.searchsorted(views[descending].cumsum(), most, side="right"))
-        return float(values[descending[within - 1]]) if 0 < within < len(values) else 0.0
+        return least_importance(importance.numpy(), views, most)
 
     def _begin_level(self, number: int) -> None:
         p, data = self.parameters, self.data

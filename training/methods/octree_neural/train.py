@@ -18,10 +18,10 @@ from torch.nn.functional import normalize
 
 from ...lod.rules.octree import BIAS, faded
 from ...rasterize import Adam, Contributions, Gaussians, Rendering, contributions, rasterize
-from ...rasterize import sh as harmonics
 from ...rasterize.adam import LearningRate
 from ...rasterize.rendering import ALPHA_MIN
 from ...scenes.cameras import Camera
+from ...splats import sh as harmonics
 from ...splats.bundle import Level
 from ...splats.gaussians import SH_C0, Splats
 from .. import method

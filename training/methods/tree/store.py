@@ -34,6 +34,8 @@ AT_ONCE = 1 << 14
 """Nodes that are looked at together where all are."""
 MARK = 32
 """Of every so many entries of a list the size of the first is in memory."""
+LIST_BLOCK = 64
+"""Entries that are read and written together: of a list always the first ones."""
 ENTRY = Layout({"node": (), "pair": (2,), "ranks": (2,), "ball": (4,)})
 """Of a list: a node and its children, by their numbers in the subtree, and these by their ranks in the list;
 the node's mean and size."""
@@ -84,7 +86,7 @@ class Store:
         self.budget, self._device = budget, device
         self.coarsened, self.wanted = 1.0, 0
         self.rows = FileRows(folder, self.layout)
-        self._lists = FileRows(folder, ENTRY, name="lists")
+        self._lists = FileRows(folder, ENTRY, block=LIST_BLOCK, name="lists")
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from .. import sh as harmonics
+from ...splats import sh as harmonics
 from ..rendering import ALPHA_MIN, DILATION, MIP_VARIANCE, View
 from .compile import FAST, f32, inlined, kernel
 from .fastmath import fetch_ahead

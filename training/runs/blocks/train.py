@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import CancelledError
 from pathlib import Path
 
 from ...errors import LodgsError
+from ..endings import ending
 from ..failures import BAD_INPUT, CANCELLED, DONE
 from .merge import merge, write_surroundings
 from .plan import BLOCK, Block, Division
@@ -16,6 +18,8 @@ LOOKS = 0.5
 """Seconds between two looks at how blocks get on."""
 SILENT = 20.0
 """Seconds between two words at most."""
+GRACE = 10.0
+"""Seconds in which who was given a part begins it, and so hears that it is to stop."""
 TRIES = 3
 """How often a block may be lost without having got any further before that ends the run."""
 
@@ -84,11 +88,7 @@ def _train_stage(
                 told = now
             time.sleep(LOOKS)
     except BaseException:
-        for each in stage:
-            if not each.over:
-                each.block.folder.request_cancel()
-        while not all(each.over for each in stage):
-            time.sleep(LOOKS)
+        _stop_stage(stage)
         raise
     if stage:
         tell("progress", **_progress(everything))
@@ -97,6 +97,21 @@ def _train_stage(
             raise each.trouble()
     if stopped := [each.block.name for each in stage if each.code == CANCELLED]:
         raise BlocksStopped(f"Stopped: {', '.join(stopped)}; the run can be resumed.")
+
+
+def _stop_stage(stage: Sequence[_Watched]) -> None:
+    """Has all parts stopped: who trains one saves first, and who was given one does not begin."""
+    asked = [each for each in stage if not each.over]
+    for each in asked:
+        each.block.folder.request_cancel()
+    given_up = time.monotonic() + GRACE
+    while not all(each.over for each in asked):
+        time.sleep(LOOKS)
+        if time.monotonic() > given_up:
+            for each in asked:
+                each.give_up()
+    for each in asked:
+        each.block.folder.take_cancel()  # which nobody has heard
 
 
 class _Watched:
@@ -126,10 +141,15 @@ class _Watched:
             self._heard = False
             self._pending = submit(self.block.folder.path)
 
+    def give_up(self) -> None:
+        """Waits no longer for those who were given it and have not begun: there may be nobody."""
+        if self._pending is not None:
+            self._pending.cancel()
+
     @property
     def over(self) -> bool:
-        """Whether nobody is at work on it any more."""
-        return self._pending is None or self._pending.done()
+        """Whether nobody is at work on it any more, not even a trainer whose worker was lost."""
+        return self._pending is None or (self._pending.done() and not self.block.folder.running)
 
     def look(self, submit: Submit) -> bool:
         """Reads how far it is, and begins it again where whoever trained it was lost, or where it was stopped
@@ -149,6 +169,9 @@ class _Watched:
             return False
         try:
             code = self._pending.result()
+        except CancelledError:  # the scheduler was lost, and with it who has the part, which may be well
+            self.begin(submit)
+            return False
         except Exception as error:  # the worker, not the block
             code, self._why = -1, str(error)
         if code in (DONE, BAD_INPUT, CANCELLED):
@@ -176,9 +199,11 @@ class _Watched:
 
     def trouble(self) -> LodgsError:
         """Why it could not be trained."""
-        error = self.block.folder.last("error") if self.code == BAD_INPUT else None
-        if error is not None:
-            return LodgsError(f"{self._name}: {error['what']}", error.get("remedy", ""))
+        if self.code == BAD_INPUT:
+            end = self.block.folder.end_event()
+            if end is not None and end["event"] == "error":
+                return LodgsError(f"{self._name}: {end['what']}", end.get("remedy", ""))
+            return LodgsError(f"{self._name}: {ending(self.block.folder, self.code)[1]}")
         why = f" ({self._why})" if self._why else ""
         return LodgsError(
             f"{self._name} was lost {TRIES} times at step {self.step}{why}.",

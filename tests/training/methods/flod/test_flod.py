@@ -5,14 +5,15 @@ import pytest
 import torch
 
 from training.errors import LodgsError
+from training.lod.blocks import SIZE
 from training.lod.rule import every_control
-from training.lod.selection import select
+from training.lod.selection import select, settings
 from training.methods.data import TrainingData
 from training.methods.flod import METHOD, finish
 from training.methods.flod.train import Method, apart
 from training.methods.model import NAMES
 from training.methods.parameters import override
-from training.rasterize import Gaussians, rasterize
+from training.rasterize import Gaussians, contributions, rasterize
 from training.scenes.colmap import read_scene
 from training.splats.bundle import Bundle, Level
 
@@ -199,7 +200,8 @@ def test_points_that_repeat_are_no_trouble_and_too_few_are_said(data, tiny_scene
 
 def finishing(data, **values) -> tuple[Method, list[Level]]:
     """A run just before its first finishing step, and what it has handed over."""
-    flod, handed = make(data, finish_share=0.5, footprint=40.0, random_background=False, **values), []
+    values = {"finish_share": 0.5, "footprint": 40.0, "random_background": False, **values}
+    flod, handed = make(data, **values), []
     for step in range(18):
         flod.train_step(step)
         handed += flod.levels_after(step)
@@ -215,6 +217,44 @@ def test_finishing_begins_with_the_levels_as_they_were_handed_over(data):
         assert before.facts == after.facts
         for name in NAMES:
             np.testing.assert_array_equal(getattr(before.splats, name), getattr(after.splats, name))
+
+
+def test_levels_of_fine_detail_begin_anew_as_what_shows_most_of_the_finest(data):
+    """Blending weights by the reference; in views as wide as photographs are continued."""
+    flod, handed = finishing(data, footprint=1.0, drawn=0.6, margin=0.25)
+    finest, coarser = handed[-1].splats, finish.levels_of(flod.model, flod.s_min)
+    wide = [camera.widened(0.25) for camera in data.train]
+    shares = contributions(Gaussians.of(finest), wide, near=data.near, backend="reference").largest.numpy()
+    assert [level.number for level in coarser] == [1, 2]
+    for level in coarser:
+        places = {tuple(mean): row for row, mean in enumerate(finest.means.tolist())}
+        rows = [places[tuple(mean)] for mean in level.splats.means.tolist()]  # each is one of the finest's
+        assert len(set(rows)) == len(rows)
+        assert shares[rows].min() >= np.delete(shares, rows).max() - 1e-4
+        np.testing.assert_array_equal(level.splats.sh, finest.sh[rows])
+        scales = np.exp(level.splats.log_scales)
+        assert scales.min() >= level.facts["s_min"] * (1 - 1e-6)
+        free = scales > level.facts["s_min"] * (1 + 1e-6)
+        larger = (scales / np.exp(finest.log_scales[rows]))[
+            free
+        ]  # a block takes over the room of what it lost
+        assert larger.min() >= 1 - 1e-6 and 1.02 < larger.max() <= 2 + 1e-6
+        assert len(np.unique(larger.round(3))) <= -(-len(finest) // SIZE)
+    one, two = (len(level.splats) for level in coarser)
+    assert one == pytest.approx(0.8 * two, abs=1)
+
+
+@pytest.mark.parametrize("drawn", [0.5, 0.8])
+def test_views_by_distance_draw_at_most_a_share_of_the_finest_level(data, drawn):
+    flod, handed = finishing(data, footprint=1.0, drawn=drawn)
+    levels = [*finish.levels_of(flod.model, flod.s_min), handed[-1]]
+    bundle, by_distance, finest = Bundle("flod", levels, "bands"), 0, 0
+    for camera in data.train:
+        values = settings(bundle, flod.controls())
+        shown, _ = select(bundle, camera.center, camera.focal, values)
+        by_distance += camera.sees(shown.means, data.near).sum()
+        finest += camera.sees(handed[-1].splats.means, data.near).sum()
+    assert 0.9 * drawn < by_distance / finest <= drawn
 
 
 @pytest.mark.parametrize("alone", [0.0, 1.0])
@@ -264,7 +304,7 @@ def test_one_level_has_nothing_to_meet(data):
 @pytest.mark.parametrize("stop", [8, 18, 21])
 def test_what_is_resumed_ends_where_an_unbroken_run_ends(data, stop, check_resumed):
     """Before the last level, when it is finished, and amid the finishing steps."""
-    check_resumed(lambda: make(data, finish_share=0.5), stop)
+    check_resumed(lambda: make(data, finish_share=0.5, footprint=1.0), stop)
 
 
 # -- some of the levels -----------------------------------------------------

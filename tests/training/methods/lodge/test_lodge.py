@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from training.errors import LodgsError
-from training.lod.blocks import SIZE, spatial_order
+from training.lod.blocks import spatial_order
 from training.lod.selection import select, settings
 from training.methods import create, method_info
 from training.methods.lodge import LodgeParameters
-from training.methods.lodge.composite import IndexedLevel, Stack, room_taken_over, rows_seen, together
+from training.methods.lodge.composite import IndexedLevel, Stack, rows_seen, together
 from training.methods.lodge.thresholds import MOST_CURVES, TRIED, Thresholds
 from training.methods.parameters import override
 from training.methods.threedgs.train import WEIGHED_AT
@@ -212,18 +212,6 @@ def test_levels_keep_their_share_at_most(data, base):
     levels = trained(make(data, base, prune_weight=0.0, drawn=1.0, keep=0.4, distances=[1.2, 0.8, 0.0]))
     shares = {level.number: len(level.splats) / len(base) for level in levels}
     assert shares[2] == pytest.approx(0.4, abs=0.06) and shares[1] == pytest.approx(0.16, abs=0.06)
-
-
-def test_what_stays_takes_over_the_room_of_what_goes():
-    """Discs of the area e^-3 in two blocks: of the first a quarter stays, of the second all."""
-    log_scales = np.tile(np.float32([-9, -1, -2]), (2 * SIZE, 1))
-    kept, shares = np.ones(2 * SIZE, bool), np.ones(2 * SIZE, np.float32)
-    kept[: 3 * SIZE // 4] = False
-    wider = room_taken_over(log_scales, shares, kept)
-    np.testing.assert_allclose(wider[:SIZE], np.log(2), rtol=1e-5)  # four times the area is twice the size
-    np.testing.assert_allclose(wider[SIZE:], 0, atol=1e-7)
-    shares[: 3 * SIZE // 4] = 0  # what nobody saw leaves no room
-    np.testing.assert_allclose(room_taken_over(log_scales, shares, kept), 0, atol=1e-7)
 
 
 def test_the_cost_of_distances_by_hand():

@@ -10,7 +10,8 @@ from tests.training.lod.trees import surfaces
 from tests.training.rasterize.test_hspt import cameras
 from training.errors import LodgsError
 from training.lod.forest import divided, joined, longest_of, shape_of
-from training.methods.cuts import BESIDE
+from training.methods.cuts import BESIDE, PLACE
+from training.methods.rows import BLOCK, TABLES
 from training.methods.tree import store as store_module
 from training.methods.tree.build import build
 from training.methods.tree.store import Store, layout_of
@@ -18,6 +19,7 @@ from training.rasterize.hspt import Hspt
 
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
 RECORD = 4 * layout_of(1).width + BESIDE
+TABLE = PLACE * 16_000 + TABLES * 16_000 // BLOCK
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +155,7 @@ def test_with_little_room_the_bits_are_the_same(town, tmp_path):
     most = stored(tmp_path / "all", town)
     views = cameras(np.random.default_rng(1), 40)
     needed = max(len(most.take(view, 1.0, 0.3)) for view in views) + len(most.shape.counts)
-    little = exactly(stored(tmp_path / "some", town, budget=needed * RECORD + 4 * len(most)))
+    little = exactly(stored(tmp_path / "some", town, budget=needed * RECORD + most.cache.tables))
     assert little.cache.capacity == needed < len(most) / 3
     truth, found = steps(exactly(stored(tmp_path / "more", town)), 0, 40), steps(little, 0, 40)
     torch.testing.assert_close(found, truth, rtol=0, atol=0)
@@ -163,7 +165,7 @@ def test_with_little_room_the_bits_are_the_same(town, tmp_path):
 @pytest.mark.parametrize("stop", [3, 14, 29])
 def test_a_store_goes_on_to_the_bit(town, tmp_path, stop):
     """With cuts that serve from near by and little room, so that which are there matters."""
-    budget = 3500 * RECORD + 4 * 16_000
+    budget = 3500 * RECORD + TABLE
     truth = steps(stored(tmp_path / "whole", town, budget), 0, 40)
     first = stored(tmp_path / "parts", town, budget)
     steps(first, 0, stop)
@@ -179,7 +181,7 @@ def test_a_store_goes_on_to_the_bit(town, tmp_path, stop):
 
 def test_a_view_without_room_is_coarsened_until_it_has(town, tmp_path):
     """And what it is shown then is the cut for that granularity; a budget as told has room."""
-    made, whole = stored(tmp_path / "some", town, budget=700 * RECORD + 4 * 16_000), stored(tmp_path, town)
+    made, whole = stored(tmp_path / "some", town, budget=700 * RECORD + TABLE), stored(tmp_path, town)
     coarser = 0
     for camera in cameras(np.random.default_rng(0)):
         made.cache.forget()
@@ -202,7 +204,7 @@ def test_a_view_without_room_is_coarsened_until_it_has(town, tmp_path):
 
 
 def test_too_little_room_for_the_coarsest_is_told(town, tmp_path):
-    made = stored(tmp_path, town, budget=3 * RECORD + 4 * 16_000)
+    made = stored(tmp_path, town, budget=3 * RECORD + TABLE)
     camera = next(cameras(np.random.default_rng(0)))
     with pytest.raises(LodgsError, match=r"at once; .* room for .* splat_memory"):
         made.take(camera, 0.1, 0.3)

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import Future
+from concurrent.futures import CancelledError, Future
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -310,6 +310,7 @@ class Workers:
 
     def __call__(self, folder: Path) -> Future:
         future: Future = Future()
+        future.set_running_or_notify_cancel()
         what = self.plans[folder.name][min(self.attempts[folder.name], len(self.plans[folder.name]) - 1)]
         self.attempts[folder.name] += 1
 
@@ -393,6 +394,39 @@ def test_what_is_wrong_with_a_block_is_said_in_its_words(blocks):
     with pytest.raises(LodgsError, match="Block 2: The disk is full") as found:
         trained(blocks, Workers(block_1=[done], block_2=[refused]))
     assert found.value.remedy == "Free some space."
+
+
+def test_one_that_could_not_even_write_what_is_wrong_says_so(blocks):
+    with pytest.raises(LodgsError, match=r"Block 2: The trainer could write nothing more .* disk is full"):
+        trained(blocks, Workers(block_1=[done], block_2=[lambda _: 2]))
+
+
+def test_whom_nobody_has_begun_is_given_up_at_an_interrupt(blocks, monkeypatch):
+    """A cluster without workers, on which nothing will ever be begun; it may be later, by itself."""
+    monkeypatch.setattr(blocks_module, "GRACE", 0.05)
+    asked = []
+
+    def submit(folder: Path) -> Future:
+        asked.append(Future())
+        return asked[-1]
+
+    def interrupt(kind, **_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        trained(blocks, submit, interrupt)
+    assert [future.cancelled() for future in asked] == [True, True]
+    assert not any(block.folder.take_cancel() for block in blocks)
+
+
+def test_a_lost_scheduler_is_no_loss_of_a_block(blocks):
+    """Its blocks are given out again as often as it comes back; that it does not is said by who gives out."""
+
+    def scheduler_lost(_: RunFolder) -> int:
+        raise CancelledError
+
+    workers = Workers(block_1=[scheduler_lost] * 5 + [done], block_2=[done])
+    assert trained(blocks, workers).exists() and workers.attempts == {"1": 6, "2": 1}
 
 
 def test_a_block_can_be_stopped_alone_and_gone_on_with(blocks):

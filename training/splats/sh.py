@@ -4,7 +4,7 @@ The same functions serve torch (``out`` is a list that receives tensors) and Num
 receives numbers), so that every backend has one basis.
 """
 
-from ..splats.gaussians import SH_C0
+from .gaussians import SH_C0
 
 MAX_DEGREE = 4
 

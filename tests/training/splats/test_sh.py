@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from training.rasterize.sh import basis, basis_gradient, coefficients, degree_of
+from training.splats.sh import basis, basis_gradient, coefficients, degree_of
 
 
 def directions(count: int) -> np.ndarray:

@@ -1,0 +1,65 @@
+"""Operators that capture the Blender scene, and stop that."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..data import scenes
+from ..runs import capturing, processes
+from .parts import report_errors
+
+
+class LODGS_OT_capture_scene(bpy.types.Operator):
+    bl_idname = "lodgs.capture_scene"
+    bl_label = "Capture This Blender Scene"
+    bl_description = (
+        "Render this Blender scene from many views with its own engine, while you work on, and make a COLMAP "
+        "scene of them to train from. What its folder holds already is not rendered again"
+    )
+
+    @report_errors
+    def execute(self, context):
+        work = capturing.start(context)
+        processes.follow(work.step)
+        if work.problem:
+            self.report({"ERROR"}, work.problem)
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class LODGS_OT_cancel_capture(bpy.types.Operator):
+    bl_idname = "lodgs.cancel_capture"
+    bl_label = "Cancel"
+    bl_description = "Stop rendering views; Capture goes on from there"
+    bl_options = {"INTERNAL"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return capturing.current is not None and capturing.current.running
+
+    def execute(self, context):
+        assert capturing.current is not None
+        capturing.current.cancel()
+        return {"FINISHED"}
+
+
+class LODGS_OT_import_capture(bpy.types.Operator):
+    bl_idname = "lodgs.import_capture"
+    bl_label = "Import What Was Captured"
+    bl_description = (
+        "Import the captured cameras, pictures and points, to train from. They lie where this Blender scene "
+        "is: hide its meshes to see splats in their place"
+    )
+    bl_options = {"REGISTER", "UNDO"}
+
+    @report_errors
+    def execute(self, context):
+        folder = capturing.folder_of(context.scene)
+        root = scenes.import_colmap(
+            context, folder, upright=False, warn=lambda message: self.report({"WARNING"}, message)
+        )
+        self.report({"INFO"}, f"'{root.name}': {scenes.contents(root)}")
+        return {"FINISHED"}
+
+
+CLASSES = (LODGS_OT_capture_scene, LODGS_OT_cancel_capture, LODGS_OT_import_capture)

@@ -1,0 +1,260 @@
+"""Cut a splat scene free: crops, and hiding and deleting of clutter, at every level alike."""
+
+from __future__ import annotations
+
+import bpy
+from mathutils import Matrix
+
+from ...training.errors import LodgsError
+from ...training.lod.cleaning import SHARE
+from ..data import cleaning, crops, scenes
+from .parts import OnScene, report_errors
+
+
+class _OnLevels(OnScene):
+    """An operator that changes the levels of the active splat scene."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if not super().poll(context):
+            return False
+        if scenes.root_with_levels(context) is None:
+            cls.poll_message_set("Select a splat scene that has levels")  # type: ignore[attr-defined]
+            return False
+        return True
+
+
+class LODGS_OT_add_crop(_OnLevels, bpy.types.Operator):
+    """Add an object that crops every level of the splat scene: move, turn and scale it like any other"""
+
+    bl_idname = "lodgs.add_crop"
+    bl_label = "Crop Splats"
+    bl_options = {"REGISTER", "UNDO"}
+
+    shape: bpy.props.EnumProperty(
+        name="Shape",
+        description="What it looks like",
+        items=[("BOX", "Box", "A box"), ("SPHERE", "Sphere", "A sphere, or with other scales an ellipsoid")],
+    )
+    keep: bpy.props.EnumProperty(
+        name="Keep",
+        description="What is left of the splats",
+        items=[
+            ("INSIDE", "Inside", "What lies in the crop stays"),
+            ("OUTSIDE", "Outside", "What lies in the crop goes"),
+        ],
+    )
+
+    @report_errors
+    def execute(self, context):
+        add_crop(context, scenes.active_root(context), self.shape, self.keep)
+        return {"FINISHED"}
+
+
+def add_crop(
+    context: bpy.types.Context, root: bpy.types.Object, shape: str, keep: str = "INSIDE"
+) -> bpy.types.Object:
+    """A crop around most of a scene's splats, selected; one that cuts out is a third as large."""
+    if context.mode != "OBJECT":
+        bpy.ops.object.mode_set(mode="OBJECT")
+    context.view_layer.update()
+    low, high = cleaning.bounds(root)
+    half = (high - low) / (2 if keep == "INSIDE" else 6)
+    if shape == "SPHERE":
+        half[:] = half.max()
+    obj = crops.new_crop(root, shape, Matrix.LocRotScale((low + high) / 2, None, half))
+    obj.lodgs_crop.keep = keep
+    for other in context.selected_objects:
+        other.select_set(False)
+    obj.select_set(True)
+    context.view_layer.objects.active = obj
+    return obj
+
+
+class LODGS_OT_remove_crop(_OnLevels, bpy.types.Operator):
+    """Remove this crop; what it left out is there again"""
+
+    bl_idname = "lodgs.remove_crop"
+    bl_label = "Remove Crop"
+    bl_options = {"REGISTER", "UNDO"}
+
+    name: bpy.props.StringProperty(name="Crop", description="Name of the crop's object")
+
+    @report_errors
+    def execute(self, context):
+        root = scenes.active_root(context)
+        for crop in crops.crops_of(root):
+            if crop.name == self.name:
+                active = context.active_object == crop
+                bpy.data.objects.remove(crop)
+                if active:
+                    context.view_layer.objects.active = root
+                return {"FINISHED"}
+        raise LodgsError(
+            f"'{root.name}' has no crop of the name '{self.name}'.", "Choose one of the panel's."
+        )
+
+
+class LODGS_OT_hide_splats(_OnLevels, bpy.types.Operator):
+    """Hide splats of every level, or select them for Edit Mode; hidden ones can be shown again"""
+
+    bl_idname = "lodgs.hide_splats"
+    bl_label = "Hide Splats"
+    bl_options = {"REGISTER", "UNDO"}
+
+    test: bpy.props.EnumProperty(name="Which", description="Which splats are found", items=cleaning.TESTS)
+    action: bpy.props.EnumProperty(
+        name="Do",
+        description="What is done with them",
+        items=[
+            ("HIDE", "Hide", "Hide them everywhere: in viewports, renders and exports"),
+            ("SELECT", "Select", "Select them, to be looked at and changed in Edit Mode"),
+        ],
+        options={"SKIP_SAVE"},
+    )
+    size: bpy.props.FloatProperty(
+        name="Size", description="Find splats with a larger standard deviation, along their longest axis",
+        default=1.0, min=0.0, subtype="DISTANCE", options={"SKIP_SAVE"},
+    )  # fmt: skip
+    opacity: bpy.props.FloatProperty(
+        name="Opacity", description="Find splats of less opacity", default=0.05, min=0.0, max=1.0,
+        subtype="FACTOR",
+    )  # fmt: skip
+    distance: bpy.props.FloatProperty(
+        name="Distance", description="Find splats farther than this from every camera", default=10.0,
+        min=0.0, subtype="DISTANCE", options={"SKIP_SAVE"},
+    )  # fmt: skip
+    views: bpy.props.IntProperty(
+        name="Views", description="Find splats in the frames of fewer cameras than this", default=3, min=1
+    )
+    gap: bpy.props.FloatProperty(
+        name="Gap", description="Nothing nearer than this is apart, nothing farther than twice this together",
+        default=0.0, min=0.0, subtype="DISTANCE", options={"SKIP_SAVE"},
+    )  # fmt: skip
+    share: bpy.props.FloatProperty(
+        name="Largest Cluster", description="Clusters with more of all splats than this are no floaters",
+        default=100 * SHARE, min=0.0, max=100.0, precision=2, subtype="PERCENTAGE",
+    )  # fmt: skip
+
+    def draw(self, context):
+        layout = self.layout
+        layout.use_property_split = True
+        layout.prop(self, "test")
+        for name in {"FLOATERS": ("gap", "share"), "UNSEEN": ("views",), "FAR": ("distance",),
+                     "LARGE": ("size",), "FAINT": ("opacity",)}.get(self.test, ()):  # fmt: skip
+            layout.prop(self, name)
+        layout.prop(self, "action")
+
+    def invoke(self, context, event):
+        for name, value in cleaning.suggestions(context, scenes.active_root(context)).items():
+            if not self.properties.is_property_set(name):
+                setattr(self, name, value)
+        return self.execute(context)
+
+    @report_errors
+    def execute(self, context):
+        root = scenes.active_root(context)
+        found = self._found(context, root)
+        count = sum(int(mask.sum()) for mask in found.values())
+        by_level = ", ".join(f"level {number} {mask.sum():,}" for number, mask in found.items())
+        if self.action == "SELECT":
+            cleaning.select(root, found)
+            self.report({"INFO"}, f"{count:,} splats selected: {by_level}")
+            return {"FINISHED"}
+        if count:
+            cleaning.hide(root, found)
+        self.report({"INFO"}, f"{count:,} splats hidden: {by_level}")
+        return {"FINISHED"}
+
+    def _found(self, context, root):
+        if self.test == "FLOATERS":
+            return cleaning.find_floaters(context, root, self.gap, self.share / 100)
+        if self.test == "FAR":
+            test = cleaning.far(context, root, self.distance)
+        elif self.test == "UNSEEN":
+            test = cleaning.unseen(context, root, self.views)
+        elif self.test == "LARGE":
+            test = cleaning.large(root, self.size)
+        else:
+            test = cleaning.faint(self.opacity) if self.test == "FAINT" else cleaning.selected
+        return cleaning.find(root, test)
+
+
+class LODGS_OT_show_hidden_splats(_OnLevels, bpy.types.Operator):
+    """Show all hidden splats of the scene again"""
+
+    bl_idname = "lodgs.show_hidden_splats"
+    bl_label = "Show Hidden Splats"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @report_errors
+    def execute(self, context):
+        self.report({"INFO"}, f"{cleaning.show_all(scenes.active_root(context)):,} splats shown again")
+        return {"FINISHED"}
+
+
+class LODGS_OT_delete_left_out(_OnLevels, bpy.types.Operator):
+    """Delete the splats that are hidden or cropped, of every level, and the crops with them"""
+
+    bl_idname = "lodgs.delete_left_out"
+    bl_label = "Delete What Is Left Out"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @report_errors
+    def execute(self, context):
+        root = scenes.active_root(context)
+        if context.mode != "OBJECT":
+            bpy.ops.object.mode_set(mode="OBJECT")
+        if context.active_object in crops.crops_of(root):
+            context.view_layer.objects.active = root
+        self.report({"INFO"}, f"{scenes.delete_left_out(root):,} splats deleted")
+        return {"FINISHED"}
+
+
+class LODGS_MT_clean_up(bpy.types.Menu):
+    bl_idname = "LODGS_MT_clean_up"
+    bl_label = "Clean Up Splats"
+
+    def draw(self, context):
+        layout = self.layout
+        for shape, icon in (("BOX", "MESH_CUBE"), ("SPHERE", "MESH_UVSPHERE")):
+            operator = layout.operator("lodgs.add_crop", text=f"Crop Splats to a {shape.title()}", icon=icon)
+            operator.shape = shape
+        layout.separator()
+        for test, name, _ in cleaning.TESTS:
+            layout.operator("lodgs.hide_splats", text=f"Hide {_named(test, name)}").test = test
+        layout.separator()
+        for test, name, _ in cleaning.TESTS[:-1]:
+            operator = layout.operator("lodgs.hide_splats", text=f"Select {_named(test, name)}")
+            operator.test, operator.action = test, "SELECT"
+        layout.separator()
+        layout.operator("lodgs.show_hidden_splats")
+        layout.operator("lodgs.delete_left_out", text="Delete Hidden and Cropped Splats")
+
+
+def _named(test: str, name: str) -> str:
+    return {"UNSEEN": "Splats Seen by Few", "FLOATERS": "Floating Splats"}.get(test, f"{name} Splats")
+
+
+def _menu(self, context):
+    if scenes.root_with_levels(context) is not None:
+        self.layout.separator()
+        self.layout.menu(LODGS_MT_clean_up.bl_idname)
+
+
+CLASSES = (
+    LODGS_OT_add_crop, LODGS_OT_remove_crop, LODGS_OT_hide_splats, LODGS_OT_show_hidden_splats,
+    LODGS_OT_delete_left_out, LODGS_MT_clean_up,
+)  # fmt: skip
+
+_MENUS = (bpy.types.VIEW3D_MT_object, bpy.types.VIEW3D_MT_edit_pointcloud)
+
+
+def register() -> None:
+    for menu in _MENUS:
+        menu.append(_menu)
+
+
+def unregister() -> None:
+    for menu in _MENUS:
+        menu.remove(_menu)

@@ -1,0 +1,45 @@
+"""The Clean Up panel: crops, what is hidden, and how much of each level is left."""
+
+from __future__ import annotations
+
+from ..data import cleaning, crops, scenes
+from .parts import LevelsPanel, say
+
+
+class LODGS_PT_clean_up(LevelsPanel):
+    bl_label = "Clean Up"
+    bl_order = 4
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context):
+        layout, root = self.layout, scenes.active_root(context)
+        row = layout.row(align=True)
+        for shape, icon in (("BOX", "MESH_CUBE"), ("SPHERE", "MESH_UVSPHERE")):
+            row.operator("lodgs.add_crop", text=f"Crop {shape.title()}", icon=icon).shape = shape
+        column = layout.column(align=True)
+        for crop in crops.crops_of(root):
+            row = column.row(align=True)
+            used = "CHECKBOX_HLT" if crop.lodgs_crop.use else "CHECKBOX_DEHLT"
+            row.prop(crop.lodgs_crop, "use", text="", icon=used)
+            row.prop(crop, "name", text="")
+            row.prop(crop.lodgs_crop, "keep", text="")
+            row.operator("lodgs.remove_crop", text="", icon="X").name = crop.name
+
+        layout.label(text="Hide splats of all levels:")
+        grid = layout.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
+        for test, name, _ in cleaning.TESTS:
+            grid.operator("lodgs.hide_splats", text=name).test = test
+
+        column = layout.column(align=True)
+        for number, (left, there) in cleaning.count_left(root, context.view_layer.depsgraph).items():
+            column.label(text=f"Level {number}: {left:,} of {there:,} left")
+        lost = {item.number: item.lost for item in cleaning.levels(root) if item.lost}
+        if lost:
+            counts = ", ".join(f"level {number}: {count:,}" for number, count in lost.items())
+            say(column, f"Levels were renewed, and nothing of them is hidden now ({counts} were).", "INFO")
+        column = layout.column(align=True)
+        column.operator("lodgs.show_hidden_splats", text="Show All Hidden")
+        column.operator("lodgs.delete_left_out", text="Delete Hidden and Cropped", icon="TRASH")
+
+
+CLASSES = (LODGS_PT_clean_up,)

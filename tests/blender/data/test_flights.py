@@ -1,0 +1,58 @@
+"""Cameras that move: along the example's photographs, and around it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
+
+
+@pytest.fixture
+def root(bpy, lodgs):
+    bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, 48
+    return lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+
+
+def seen_from(bpy, camera, frames):
+    found = []
+    for frame in frames:
+        bpy.context.scene.frame_set(frame)
+        found.append(np.array(camera.evaluated_get(bpy.context.evaluated_depsgraph_get()).matrix_world))
+    return np.array(found)
+
+
+def test_a_path_goes_from_the_first_photograph_to_the_last_beside_the_others(bpy, lodgs, root):
+    assert bpy.ops.lodgs.camera_path() == {"FINISHED"}
+    camera, views = bpy.context.scene.camera, lodgs("data.photographs").views(root)
+    poses = seen_from(bpy, camera, range(1, 49))
+    np.testing.assert_allclose(poses[0], views[0].matrix_world, atol=1e-4)
+    np.testing.assert_allclose(poses[-1], views[-1].matrix_world, atol=1e-4)
+    places = np.array([view.matrix_world.translation for view in views])
+    across = np.linalg.norm(np.ptp(places, axis=0))
+    apart = np.linalg.norm(poses[:, None, :3, 3] - places, axis=2).min(axis=1)
+    assert apart.max() < 0.2 * across
+    assert camera.data.lens == pytest.approx(views[0].data.lens) and not camera.data.background_images
+    assert camera not in views and camera.parent == root.lodgs.axes
+
+
+def test_a_turntable_looks_at_the_middle_all_around_evenly(bpy, lodgs, root):
+    middle, size = lodgs("data.photographs").bounds_of_most(root)
+    assert bpy.ops.lodgs.turntable() == {"FINISHED"}
+    poses = seen_from(bpy, bpy.context.scene.camera, range(1, 50))
+    to = np.array(middle) - poses[:, :3, 3]
+    away = np.linalg.norm(to, axis=1)
+    np.testing.assert_allclose(np.einsum("ij,ij->i", to / away[:, None], -poses[:, :3, 2]), 1, atol=1e-5)
+    np.testing.assert_allclose(away, away[0], rtol=1e-4)
+    assert away[0] > size / 2 and (poses[:, 1 + 1, 1] > 0.9).all()  # upright
+    angles = np.unwrap(np.arctan2(-to[:, 1], -to[:, 0]))
+    np.testing.assert_allclose(np.diff(angles), 2 * np.pi / 48, atol=1e-3)
+
+
+@pytest.mark.parametrize("verb", ["camera_path", "turntable"])
+def test_a_scene_of_nothing_is_refused_and_nothing_is_left(bpy, lodgs, root, verb):
+    bpy.data.batch_remove([*root.lodgs.cameras.objects, root.lodgs.points])
+    before = len(bpy.data.objects), len(bpy.data.cameras)
+    with pytest.raises(RuntimeError, match=r"0 camera|nothing to turn"):
+        getattr(bpy.ops.lodgs, verb)()
+    assert (len(bpy.data.objects), len(bpy.data.cameras)) == before

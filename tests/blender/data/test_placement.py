@@ -1,0 +1,286 @@
+"""Where scenes stand: the root is the artist's, the axes carry what turns, grounds and scales the scene."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from training.lod.placing import placed
+from training.lod.rules.chunks import member_columns
+from training.splats.bundle import Bundle, Level, read_bundle, read_folder, write_bundle
+from training.splats.gaussians import Splats
+from training.splats.placing import Placement
+
+GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
+
+
+def some_splats(count: int, seed: int) -> Splats:
+    rng = np.random.default_rng(seed)
+    return Splats(
+        means=rng.normal(0, 2, (count, 3)).astype(np.float32),
+        quats=rng.normal(size=(count, 4)).astype(np.float32),
+        log_scales=rng.normal(-2, 0.5, (count, 3)).astype(np.float32),
+        opacity_logits=rng.normal(0, 2, count).astype(np.float32),
+        sh=rng.normal(0, 0.5, (count, 16, 3)).astype(np.float32),
+    )
+
+
+def lodge() -> Bundle:
+    """Two levels by chunks: facts, columns and a table with lengths and places."""
+    rng = np.random.default_rng(5)
+    levels = [Level(1, some_splats(40, 1), {"d_l": 4.0}), Level(2, some_splats(90, 2), {"d_l": 0.0})]
+    for level in levels:
+        level.splats.extras |= member_columns(rng.random((3, len(level.splats))) < 0.5)
+    table = {name: rng.uniform(1, 3, 3).astype(np.float32) for name in ("x", "y", "z", "radius")}
+    meta = {"camera_center": [0.0, 0.5, -4.0], "view": [[0.0, 0, -4], [0.0, 0, 0]], "median_depth": 4.0}
+    return Bundle("lodge", levels, "chunks", meta=meta, tables={"chunks": table})
+
+
+@pytest.fixture
+def root(bpy, lodgs, tmp_path):
+    write_bundle(tmp_path / "in.ply", lodge())
+    found = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "in.ply")
+    bpy.context.view_layer.update()
+    return found
+
+
+def world(root) -> np.ndarray:
+    return np.array(root.lodgs.levels[-1].object.matrix_world, np.float64)
+
+
+def select(bpy, *objects):
+    for obj in bpy.context.view_layer.objects:
+        obj.select_set(obj in objects)
+    bpy.context.view_layer.objects.active = objects[-1]
+
+
+def empties(bpy, root, places):
+    """Empties at places in the world, selected, with the root active."""
+    made = [bpy.data.objects.new("mark", None) for _ in places]
+    for obj, place in zip(made, places, strict=True):
+        obj.location = place
+        bpy.context.scene.collection.objects.link(obj)
+    bpy.context.view_layer.update()
+    select(bpy, *made, root)
+    return made
+
+
+@pytest.mark.parametrize("what", ["splats", "colmap"])
+def test_a_roots_transform_is_clean_and_clearing_it_takes_nothing_else(bpy, lodgs, root, what):
+    if what == "colmap":
+        root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+    assert root.rotation_mode == "XYZ" and np.array_equal(np.array(root.matrix_basis), np.eye(4))
+    bpy.context.view_layer.update()
+    part = root.lodgs.points or root.lodgs.levels[-1].object
+    upright = np.array(part.matrix_world)
+    assert abs(upright[:3, :3] - np.eye(3)).max() > 0.1
+    root.location, root.rotation_euler, root.scale = (1, 2, 3), (0, 0, 0.5), (2, 2, 2)
+    bpy.context.view_layer.update()
+    np.testing.assert_allclose(part.matrix_world, np.array(root.matrix_world) @ upright, atol=1e-6)
+    select(bpy, root.lodgs.axes, root)
+    for operator in (
+        bpy.ops.object.rotation_clear,
+        bpy.ops.object.location_clear,
+        bpy.ops.object.scale_clear,
+    ):
+        operator()
+    bpy.context.view_layer.update()
+    np.testing.assert_allclose(part.matrix_world, upright, atol=1e-6)
+
+
+def test_applying_the_roots_transform_leaves_everything_where_it_is(bpy, lodgs, root):
+    root.location, root.rotation_euler, root.scale = (1, 2, 3), (0.1, 0.2, 0.5), (2, 2, 2)
+    bpy.context.view_layer.update()
+    before = world(root)
+    select(bpy, root)
+    bpy.ops.object.transform_apply(location=True, rotation=True, scale=True)
+    bpy.context.view_layer.update()
+    np.testing.assert_allclose(world(root), before, atol=1e-6)
+    np.testing.assert_allclose(lodgs("data.placement").placement_of(root).matrix, before, atol=1e-5)
+
+
+def test_a_copied_hierarchy_has_axes_of_its_own(bpy, lodgs, root):
+    levels = [item.object for item in root.lodgs.levels]
+    root.lodgs.mode = "SELECTIVE"  # both are there
+    bpy.context.view_layer.update()
+    select(bpy, *levels, root.lodgs.axes, root)
+    bpy.ops.object.duplicate()
+    copy = bpy.context.view_layer.objects.active
+    assert copy != root and copy.lodgs.axes.parent == copy and copy.lodgs.axes != root.lodgs.axes
+    assert copy.lodgs.levels[0].object.parent == copy.lodgs.axes
+    copy.location = (9, 0, 0)
+    bpy.context.view_layer.update()
+    placement_of = lodgs("data.placement").placement_of
+    np.testing.assert_allclose(placement_of(copy).translation - placement_of(root).translation, (9, 0, 0))
+
+
+def test_the_ground_through_three_empties_is_at_zero(bpy, root):
+    root.location, root.rotation_euler = (1, 1, 1), (0, 0, 0.7)
+    places = np.array([[0, 0, 1.0], [2, 0, 1.5], [0, 2, 0.8]])
+    marks = empties(bpy, root, places)
+    before, clean = world(root), np.array(root.matrix_basis)
+    on_it = (np.linalg.inv(before) @ np.column_stack([places, np.ones(3)]).T)[:3].T
+    bpy.ops.ed.undo_push(message="before")
+    assert bpy.ops.lodgs.set_ground() == {"FINISHED"}
+    bpy.context.view_layer.update()
+    after = world(root)
+    there = on_it @ after[:3, :3].T + after[:3, 3]
+    np.testing.assert_allclose(there[:, 2], 0, atol=1e-5)
+    np.testing.assert_allclose(there.mean(axis=0)[:2], places.mean(axis=0)[:2], atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(np.diff(there, axis=0), axis=1),
+                               np.linalg.norm(np.diff(places, axis=0), axis=1), atol=1e-5)  # fmt: skip
+    np.testing.assert_array_equal(np.array(root.matrix_basis), clean)
+    assert [tuple(mark.location) for mark in marks] == [tuple(np.float32(place)) for place in places]
+    up = after[:3, :3] @ np.linalg.inv(before[:3, :3]) @ [0, 0, 1]
+    assert up[2] > 0.9
+    bpy.ops.lodgs.set_ground(flip=True)
+    bpy.context.view_layer.update()
+    flipped = world(root)[:3, :3] @ np.linalg.inv(after[:3, :3]) @ [0, 0, 1]
+    assert flipped[2] < -0.9
+
+
+def test_the_ground_through_points_that_are_selected_in_edit_mode(bpy, lodgs):
+    root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+    bpy.context.view_layer.update()
+    cloud = root.lodgs.points
+    select(bpy, cloud)
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.ops.pointcloud.select_all(action="DESELECT")
+    with pytest.raises(RuntimeError, match="0 places are selected"):
+        bpy.ops.lodgs.set_ground()
+    places = np.empty((len(cloud.data.points), 3), np.float32)
+    cloud.data.attributes["position"].data.foreach_get("vector", places.reshape(-1))
+    some = np.zeros(len(places), bool)
+    some[[10, 200, 500, 900]] = True
+    cloud.data.attributes[".selection"].data.foreach_set("value", some)
+    assert bpy.context.mode == "EDIT_POINTCLOUD"  # no refusal leaves it
+    assert bpy.ops.lodgs.set_ground() == {"FINISHED"}
+    assert bpy.context.mode == "OBJECT"
+    bpy.context.view_layer.update()
+    matrix = np.array(cloud.matrix_world)
+    there = places @ matrix[:3, :3].T + matrix[:3, 3]
+    apart = there[some][:, 2]
+    assert abs(apart.mean()) < 1e-5
+    assert np.square(apart).sum() < np.square(np.linalg.svd(there[some] - there[some].mean(0))[1][2]) + 1e-6
+
+
+def test_the_ground_is_found(bpy, lodgs):
+    """The example's, which is z = 0 in its own coordinates; the root has been turned and moved away."""
+    root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+    root.rotation_euler, root.location = (0.2, -0.1, 1.0), (0, 0, 5)
+    bpy.context.view_layer.update()
+    bpy.ops.lodgs.set_ground(by="FOUND")
+    bpy.context.view_layer.update()
+    placement = lodgs("data.placement").placement_of(root)
+    np.testing.assert_allclose(placement.rotation[2], (0, 0, 1), atol=0.01)  # in which z is up already
+    assert abs(placement.translation[2]) < 0.05
+
+
+def test_the_scale_by_a_length_between_two_empties(bpy, lodgs):
+    root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+    bpy.ops.lodgs.set_ground(by="FOUND")
+    bpy.context.view_layer.update()
+    view = root.lodgs.cameras.objects[0]
+    before, near = np.array(root.lodgs.points.matrix_world), view.data.clip_start
+    empties(bpy, root, [(1, 0, 0), (1, 2, 0)])
+    assert bpy.ops.lodgs.set_scale(length=5.0) == {"FINISHED"}
+    bpy.context.view_layer.update()
+    after = np.array(root.lodgs.points.matrix_world)
+    np.testing.assert_allclose(after, np.diag([2.5, 2.5, 2.5, 1]) @ before, atol=1e-5)
+    assert view.data.clip_start == pytest.approx(2.5 * near)
+    assert tuple(root.scale) == (1, 1, 1)
+
+
+@pytest.mark.parametrize(
+    "places,words", [([(0, 0, 0)], "1 places"), ([(1, 1, 1)] * 2, "are one"), ([(0, 0, 0)] * 3, "3 places")]
+)
+def test_a_selection_that_is_no_length_is_refused(bpy, root, places, words):
+    empties(bpy, root, places)
+    with pytest.raises(RuntimeError, match=words):
+        bpy.ops.lodgs.set_scale(length=1.0)
+
+
+def test_a_stretched_root_is_refused(bpy, lodgs, root, tmp_path):
+    root.scale = (1, 1, 2)
+    bpy.context.view_layer.update()
+    for verb in (
+        lambda: bpy.ops.lodgs.set_ground(by="FOUND"),
+        lambda: bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "no.ply"), placed=True),
+    ):
+        with pytest.raises(RuntimeError, match="stretched"):
+            verb()
+    assert not (tmp_path / "no.ply").exists()
+
+
+@pytest.mark.parametrize("undone", [False, True])
+def test_each_step_is_undone(bpy, root, undone):
+    name = root.name
+    empties(bpy, root, [(0, 0, 0), (2, 0, 1), (0, 2, 0)])
+    bpy.ops.ed.undo_push(message="start")
+    before = world(root)
+    bpy.ops.lodgs.set_ground()
+    bpy.ops.ed.undo_push(message="ground")
+    bpy.context.view_layer.update()
+    assert not np.allclose(world(root), before)
+    bpy.ops.ed.undo()
+    bpy.context.view_layer.update()
+    np.testing.assert_allclose(world(bpy.data.objects[name]), before, atol=1e-6)
+
+
+def stand_somewhere(bpy, root):
+    root.location, root.rotation_euler, root.scale = (1, -2, 3), (0.4, -0.2, 0.9), (2.5, 2.5, 2.5)
+    bpy.context.view_layer.update()
+
+
+def test_a_bundle_as_placed_stands_there_when_it_is_imported(bpy, lodgs, root, tmp_path):
+    stand_somewhere(bpy, root)
+    there = world(root)
+    bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"), placed=True)
+    found, wanted = read_bundle(tmp_path / "out.ply"), placed(lodge(), Placement.of(
+        lodgs("data.placement").placement_of(root).matrix))  # fmt: skip
+    assert found.meta["up_rotation"] == np.eye(3).tolist()
+    np.testing.assert_allclose(found.meta["camera_center"], wanted.meta["camera_center"])
+    assert [level.facts for level in found.levels] == [level.facts for level in wanted.levels]
+    for column in ("x", "radius"):
+        np.testing.assert_array_equal(found.tables["chunks"][column], wanted.tables["chunks"][column])
+    again = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "out.ply")
+    bpy.context.view_layer.update()
+    np.testing.assert_allclose(world(again), np.eye(4), atol=1e-6)
+    for one, before in zip(found.levels, lodge().levels, strict=True):
+        np.testing.assert_allclose(
+            one.splats.means, before.splats.means @ there[:3, :3].T + there[:3, 3], atol=1e-5
+        )
+    bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "plain.ply"))
+    as_is = read_bundle(tmp_path / "plain.ply")
+    np.testing.assert_allclose(as_is.levels[1].splats.means, found.levels[1].splats.means)
+
+
+def test_plain_plys_and_folders_as_placed(bpy, lodgs, root, tmp_path):
+    stand_somewhere(bpy, root)
+    placement = lodgs("data.placement").placement_of(root)
+    wanted = placed(lodge(), Placement.of(placement.matrix)).levels[1].splats
+    bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "p.ply"), source="LEVEL", level=2, placed=True)
+    bpy.ops.lodgs.export_folder(directory=str(tmp_path / "f"), placed=True)
+    root.lodgs.mode, root.lodgs.single_level = "SINGLE", 2
+    bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "s.ply"), source="SHOWN", placed=True)
+    for found in (
+        read_bundle(tmp_path / "p.ply").levels[0].splats,
+        read_bundle(tmp_path / "s.ply").levels[0].splats,
+        read_folder(tmp_path / "f").levels[1].splats,
+    ):
+        for name in ("means", "quats", "log_scales", "sh"):
+            np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), atol=1e-5)
+
+
+def test_the_command_exports_as_placed(bpy, lodgs, root, tmp_path):
+    stand_somewhere(bpy, root)
+    there = world(root)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"), check_existing=False)
+    out = tmp_path / "out.ply"
+    assert lodgs("commands").main(["export", str(tmp_path / "scene.blend"), str(out), "--placed"]) == 0
+    means = lodge().levels[1].splats.means @ there[:3, :3].T + there[:3, 3]
+    np.testing.assert_allclose(read_bundle(out).levels[1].splats.means, means, atol=1e-5)
+
+
+def test_frame_needs_no_window(bpy, root):
+    assert bpy.ops.lodgs.frame_scene() == {"FINISHED"}

@@ -1,0 +1,51 @@
+"""What the panel that captures a Blender scene says and offers."""
+
+from types import SimpleNamespace
+
+import pytest
+
+
+@pytest.fixture
+def drawn(bpy, lodgs, draw_panel, monkeypatch, tmp_path):
+    """What the panel draws, with a trainer, of a scene that is to be captured to tmp_path/out."""
+    monkeypatch.setenv("LODGS_TRAINER_PYTHON", "python")
+    monkeypatch.setattr(lodgs("runs.capturing"), "current", None)
+    bpy.context.scene.lodgs_capture.folder = str(tmp_path / "out")
+    return lambda: draw_panel("capture", "LODGS_PT_capture")
+
+
+def test_it_asks_for_views_and_offers_import_once_there_is_a_model(bpy, drawn, tmp_path):
+    settings = bpy.context.scene.lodgs_capture
+    notes = drawn()
+    assert notes.operators == ["lodgs.capture_scene"]
+    assert {"views_from", "views", "view_width", "show_views", "folder"} == set(notes.properties)
+    settings.views_from = "CURVE"
+    assert "curve" in drawn().properties and "show_views" not in drawn().properties
+    settings.views_from = "CAMERAS"
+    bpy.context.scene.collection.objects.link(bpy.data.objects.new("C", bpy.data.cameras.new("C")))
+    assert "1 cameras" in drawn().texts
+    (tmp_path / "out" / "sparse").mkdir(parents=True)
+    assert drawn().operators == ["lodgs.capture_scene", "lodgs.import_capture"]
+    settings.folder = ""
+    assert any("not saved yet" in text for text in drawn().texts)
+
+
+def test_it_tells_how_far_a_capture_is_and_how_it_ended(bpy, lodgs, drawn, monkeypatch):
+    work = SimpleNamespace(running=True, message="View 3 of 9", fraction=0.2, problem="")
+    monkeypatch.setattr(lodgs("runs.capturing"), "current", work)
+    assert (drawn().texts, drawn().operators) == (["View 3 of 9"], ["lodgs.cancel_capture"])
+    work.running, work.message, work.problem = False, "Stopped", "The disk is full."
+    assert "The disk is full." in drawn().texts and "lodgs.capture_scene" in drawn().operators
+
+
+def test_it_is_there_where_no_splat_scene_is(bpy, lodgs, drawn):
+    panel = lodgs("panels.capture").LODGS_PT_capture
+    assert panel.poll(bpy.context)
+    with lodgs("data.scenes")._new_scene(bpy.context, "scene"):
+        pass
+    assert not panel.poll(bpy.context)
+
+
+def test_without_a_trainer_it_offers_to_make_one(bpy, drawn, monkeypatch, tmp_path):
+    monkeypatch.delenv("LODGS_TRAINER_PYTHON")
+    assert "lodgs.capture_scene" not in drawn().operators

@@ -1,0 +1,343 @@
+"""A Blender scene becomes a COLMAP scene: cameras are Blender's, depths and points lie on its surfaces."""
+
+import os
+import subprocess
+import sys
+import time
+from math import radians
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from training.scenes.cameras import read_views
+from training.scenes.images import image_size
+
+TRAINER = os.environ.get("LODGS_TRAINER_PYTHON", "")
+AS_BLENDER = Path(__file__).resolve().parents[1] / "as_blender.py"
+SIZE = "64x48"
+
+needs_trainer = pytest.mark.skipif(not TRAINER, reason="no trainer; set LODGS_TRAINER_PYTHON")
+
+
+@pytest.fixture
+def scene(bpy):
+    """Two cubes on a ground of 12 m, under a sun: a sample a pixel, through its centre."""
+    scene = bpy.context.scene
+    bpy.ops.mesh.primitive_plane_add(size=12)
+    bpy.ops.mesh.primitive_cube_add(location=(2.5, 1.5, 1))
+    bpy.ops.mesh.primitive_cube_add(location=(0, 0, 1))
+    bpy.ops.object.light_add(type="SUN", rotation=(0.5, 0.3, 0))
+    scene.world = bpy.data.worlds.new("World")
+    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 1, False
+    scene.cycles.pixel_filter_type, scene.cycles.filter_width = "BOX", 0.01
+    select(bpy, "Cube.001")
+    return scene
+
+
+def select(bpy, *names):
+    for obj in bpy.context.scene.objects:
+        obj.select_set(obj.name in names)
+
+
+def new_camera(bpy, location, turn, **data):
+    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    camera.location, camera.rotation_euler = location, [radians(angle) for angle in turn]
+    for name, value in data.items():
+        setattr(camera.data, name, value)
+    bpy.context.scene.collection.objects.link(camera)
+    return camera
+
+
+def odd_cameras(bpy):
+    """Cameras of which each has something that an exact pose or lens trips over."""
+    carrier = bpy.data.objects.new("Carrier", None)
+    carrier.location, carrier.scale, carrier.rotation_euler = (0, 0, 1), (2, 2, 2), (0, 0, 0.4)
+    bpy.context.scene.collection.objects.link(carrier)
+    cameras = [
+        new_camera(bpy, (0, -9, 3), (75, 0, 0), shift_x=0.13, shift_y=-0.08),
+        new_camera(bpy, (7, -6, 4), (68, 10, 48), lens=35, sensor_fit="VERTICAL", sensor_height=30),
+        new_camera(bpy, (-5, -6, 5), (60, 0, -40), lens=28, sensor_fit="HORIZONTAL", sensor_width=40),
+        new_camera(bpy, (0, -4, 1), (80, 0, 0), lens=24),
+    ]
+    cameras[-1].parent = carrier
+    cameras[0].data.dof.use_dof = True
+    return cameras
+
+
+@pytest.fixture
+def capture(bpy, lodgs, tmp_path):
+    """``capture("--around", ...)``: the exit code of capturing the file as it is now to tmp_path/out."""
+
+    def run(*arguments, out="out"):
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
+        command = ["capture", tmp_path / "scene.blend", "--out", tmp_path / out, "--size", SIZE, *arguments]
+        return lodgs("commands").main([str(word) for word in command])
+
+    return run
+
+
+def depth_of(folder: Path, name: str) -> np.ndarray:
+    """Depths by the trainer's reader in a Python that has OpenEXR."""
+    code = (
+        "import sys, numpy, pathlib; from training.scenes.rendered import read_depth;"
+        "numpy.save(sys.argv[2], read_depth(pathlib.Path(sys.argv[1])))"
+    )
+    saved = folder / "depth.npy"
+    command = [TRAINER, "-c", code, str(folder / "depths" / f"{name}.exr"), str(saved)]
+    subprocess.run(command, check=True, cwd=AS_BLENDER.parents[2])
+    return np.load(saved)
+
+
+def test_views_are_blenders_own_to_a_fraction_of_a_pixel(bpy, scene, capture, tmp_path):
+    from bpy_extras.object_utils import world_to_camera_view
+    from mathutils import Vector
+
+    scene.render.pixel_aspect_x, scene.render.pixel_aspect_y = 1.0, 1.4
+    cameras = odd_cameras(bpy)
+    assert capture("--cameras", "--range", "1-4") == 0
+    views, _ = read_views(tmp_path / "out" / "cameras")
+    rng, scene = np.random.default_rng(0), bpy.context.scene
+    scene.render.resolution_x, scene.render.resolution_y = (int(side) for side in SIZE.split("x"))
+    by_name = sorted((obj for obj in scene.objects if obj.type == "CAMERA"), key=lambda obj: obj.name)
+    assert len(views) == len(by_name) == len(cameras)
+    for camera, view in zip(by_name, views, strict=True):
+        points = rng.uniform((-3, -3, 0), (3, 3, 2), (50, 3))
+        pixels, depths = view.project(points)
+        for point, pixel, depth in zip(points, pixels, depths, strict=True):
+            x, y, away = world_to_camera_view(scene, camera, Vector(point))
+            assert away > 0 and depth == pytest.approx(away, rel=1e-5)
+            assert pixel == pytest.approx((x * view.width, (1 - y) * view.height), abs=2e-3)
+
+
+@needs_trainer
+def test_depths_are_where_rays_through_pixels_meet_surfaces(bpy, scene, capture, tmp_path):
+    odd_cameras(bpy)
+    assert capture("--cameras", "--range", "1-4") == 0
+    scene, depsgraph = bpy.context.scene, bpy.context.evaluated_depsgraph_get()
+    views, _ = read_views(tmp_path / "out" / "cameras")
+    for view in views:
+        depths, met, sky = depth_of(tmp_path / "out", view.name), 0, 0
+        for y in range(1, view.height, 5):
+            for x in range(2, view.width, 5):
+                far = view.unproject(np.array([[x + 0.5, y + 0.5]]), np.ones(1))[0]
+                hit, place, *_ = scene.ray_cast(depsgraph, view.center, far - view.center)
+                around = depths[y - 1 : y + 2, x - 1 : x + 2]
+                if hit and np.ptp(around) < 1:  # not at an outline, which float32 may put a hair beside
+                    assert depths[y, x] == pytest.approx(view.view_space(np.array([place]))[0, 2], rel=2e-4)
+                    met += 1
+                elif not hit and around.min() > 100:
+                    assert depths[y, x] > 1e6
+                    sky += 1
+        assert met > 40 and (sky or view is not views[0])
+
+
+@needs_trainer
+def test_the_model_imports_with_points_on_the_scenes_surfaces(bpy, scene, capture, tmp_path):
+    assert capture("--around", "--views", "8") == 0
+    assert not (tmp_path / "out" / ".model.tmp").exists()
+    bpy.context.scene.lodgs_capture.folder = str(tmp_path / "out")
+    assert bpy.ops.lodgs.import_capture() == {"FINISHED"}
+    assert not any(obj.hide_get() for obj in bpy.context.view_layer.objects)
+    (root,) = [obj for obj in bpy.context.scene.objects if obj.lodgs.is_root]
+    assert np.allclose(root.matrix_world, np.eye(4)), "it lies where the Blender scene is"
+    assert len(root.lodgs.cameras.objects) == 8
+    cloud = root.lodgs.points.data
+    points = np.empty(3 * len(cloud.points), np.float32)
+    cloud.attributes["position"].data.foreach_get("vector", points)
+    points = points.reshape(-1, 3).astype(float)
+    assert len(points) > 1000
+    boxes = [
+        np.abs(points - middle) - half
+        for middle, half in (((0, 0, 1), 1.0), ((2.5, 1.5, 1), 1.0), ((0, 0, 0), (6, 6, 0)))
+    ]
+    away = [np.linalg.norm(np.maximum(box, 0), axis=1) + np.abs(box.max(axis=1).clip(max=0)) for box in boxes]
+    assert np.min(away, axis=0).max() < 0.01
+    assert all((distance < 0.01).sum() > 20 for distance in away), "on each of them"
+
+
+def test_a_dome_begins_on_the_level_and_shows_what_is_selected(bpy, scene, capture, tmp_path):
+    assert capture("--around", "--views", "9", "--range", "1-9") == 0
+    views, _ = read_views(tmp_path / "out" / "cameras")
+    corners = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (0, 2)], float)
+    for view in views:
+        assert view.center[2] >= 1 and view.sees(corners).all()
+        assert view.world_to_camera[1, 2] <= 1e-6, "up is up"
+    lows, highs = views[0].center[2], views[-1].center[2]
+    assert lows < 2 < highs
+
+
+def test_frames_of_a_camera_that_moves(bpy, scene, capture, tmp_path):
+    camera = scene.camera = new_camera(bpy, (0, -9, 3), (75, 0, 0))
+    for frame, x in ((1, -4), (21, 4)):
+        camera.location.x = x
+        camera.keyframe_insert("location", frame=frame)
+    scene.frame_end = 21
+    scene.timeline_markers.new("first", frame=1).camera = camera
+    scene.timeline_markers.new("other", frame=15).camera = new_camera(bpy, (9, 0, 3), (75, 0, 90))
+    assert capture("--animation", "--views", "5", "--range", "1-5") == 0
+    views, _ = read_views(tmp_path / "out" / "cameras")
+    scene = bpy.context.scene
+    for frame, view in zip((1, 6, 11, 16, 21), views, strict=True):
+        scene.frame_set(frame)
+        np.testing.assert_allclose(view.center, scene.camera.matrix_world.translation, atol=1e-5)
+    assert views[-1].center[0] == pytest.approx(9), "the marker's camera"
+
+
+def test_a_walk_along_a_curve(bpy, scene, capture, tmp_path, capfd):
+    bpy.ops.curve.primitive_bezier_circle_add(radius=5, location=(0, 0, 1.7))
+    bpy.context.object.name = "Way"
+    assert capture("--curve", "Way", "--views", "6", "--range", "1-6") == 0
+    views, _ = read_views(tmp_path / "out" / "cameras")
+    eyes = np.array([view.center for view in views])
+    np.testing.assert_allclose(np.hypot(*eyes[:, :2].T), 5, atol=0.1)
+    np.testing.assert_allclose(eyes[:, 2], 1.7, atol=1e-5)
+    assert capture("--curve", "Why", "--views", "6", "--range", "1-6") == 2
+    assert "has no curve 'Why'" in capfd.readouterr().err
+
+
+def test_what_is_there_is_not_rendered_again(bpy, scene, capture, tmp_path, capfd):
+    assert capture("--around", "--views", "4", "--range", "2-3") == 0
+    out = tmp_path / "out"
+    assert {file.stem for file in (out / "images").iterdir()} == {"view_0002", "view_0003"}
+    dates = {file: file.stat().st_mtime_ns for file in out.rglob("*.*")}
+    (out / "cameras" / "view_0003.json").unlink()  # as where Blender was killed before it
+    capfd.readouterr()
+    assert capture("--around", "--views", "4", "--range", "1-9") == 0
+    said = [line for line in capfd.readouterr().err.splitlines() if line.startswith("View")]
+    assert said == ["View 1 of 4", "View 3 of 4", "View 4 of 4"]
+    for file, date in dates.items():
+        if "0002" in file.name:
+            assert file.stat().st_mtime_ns == date
+    assert sorted(file.name for file in out.rglob("*") if file.is_file()) == sorted(
+        f"view_000{number}.{ending}" for number in (1, 2, 3, 4) for ending in ("exr", "json", "png")
+    )
+    for other in (["--views", "5"], ["--views", "3"]):
+        assert capture("--around", *other, "--range", "1-5") == 2
+        assert "holds other views" in capfd.readouterr().err
+
+
+def test_nothing_but_the_views_is_written_and_nothing_is_blurred_or_cut(bpy, lodgs, scene, capture, tmp_path):
+    compat = lodgs("compat")
+    tree = compat.compositor_tree(scene)
+    layers, store = tree.nodes.new("CompositorNodeRLayers"), tree.nodes.new("CompositorNodeOutputFile")
+    if hasattr(store, "base_path"):
+        store.base_path = str(tmp_path / "stored")
+        tree.links.new(layers.outputs["Image"], store.inputs[0])
+    else:
+        store.directory = str(tmp_path / "stored")
+        store.file_output_items.new("RGBA", "Image")
+        tree.links.new(layers.outputs["Image"], store.inputs["Image"])
+    tree.links.new(layers.outputs["Image"], compat.compositor_output(tree))
+    scene.render.use_border = scene.render.use_crop_to_border = True
+    scene.render.border_max_x = 0.5
+    scene.render.resolution_percentage = 37
+    assert capture("--around", "--views", "2", "--range", "1-2") == 0
+    assert not (tmp_path / "stored").exists()
+    for file in (tmp_path / "out" / "images").iterdir():
+        assert image_size(file) == (64, 48)
+
+
+def test_transparent_films_give_pictures_with_alpha(bpy, scene, capture, tmp_path):
+    scene.render.film_transparent = True
+    bpy.data.objects.remove(bpy.data.objects["Plane"])
+    assert capture("--around", "--views", "2", "--range", "1-2") == 0
+    picture = bpy.data.images.load(str(tmp_path / "out" / "images" / "view_0001.png"))
+    assert picture.depth == 32 and {0, 1} <= set(np.array(picture.pixels[:])[3::4])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "arguments", "says"),
+    [
+        (lambda bpy: None, ["--cameras"], "has 0 camera(s)"),
+        (lambda bpy: None, ["--animation"], "has no camera"),
+        (lambda bpy: setattr(bpy.context.scene, "camera", new_camera(bpy, (0, -9, 3), (75, 0, 0))),
+         ["--animation"], "does not move"),
+        (lambda bpy: [new_camera(bpy, (0, -9, 3), (75, 0, 0), type=kind) for kind in ("ORTHO", "PERSP")],
+         ["--cameras"], "is ortho"),
+        (lambda bpy: [new_camera(bpy, (0, -9, 3), (75, 0, 0), type=kind) for kind in ("PANO", "PERSP")],
+         ["--cameras"], "is pano"),
+        (lambda bpy: [bpy.data.objects.remove(obj) for obj in list(bpy.data.objects)], ["--around"],
+         "nothing to look at"),
+        (lambda bpy: None, ["--around", "--views", "1"], "views = 1 is not possible"),
+        (lambda bpy: None, ["--around", "--range", "0-3"], "not FIRST-LAST"),
+        (lambda bpy: None, ["--around", "--range", "5-3"], "not FIRST-LAST"),
+        (lambda bpy: None, ["--around", "--cameras"], "not allowed with"),
+        (lambda bpy: None, ["--around", "--size", "0x5"], "not WIDTHxHEIGHT"),
+    ],
+)  # fmt: skip
+def test_mistakes_end_with_a_sentence(bpy, scene, capture, tmp_path, capfd, spoil, arguments, says):
+    spoil(bpy)
+    bpy.context.view_layer.update()
+    assert capture("--range", "1-2", *arguments) == 2
+    said = capfd.readouterr().err
+    assert says in said and "Traceback" not in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_cannot_be_written(bpy, scene, capture, tmp_path, capfd):
+    (tmp_path / "out").write_text("a file")
+    assert capture("--around", "--views", "2", "--range", "1-2") == 2
+    assert "could not be written" in capfd.readouterr().err
+
+
+def test_without_a_trainer_nothing_is_rendered(bpy, scene, capture, tmp_path, capfd, monkeypatch):
+    monkeypatch.delenv("LODGS_TRAINER_PYTHON", raising=False)
+    assert capture("--around", "--views", "2") == 2
+    assert "none is set up" in capfd.readouterr().err and not (tmp_path / "out").exists()
+
+
+@pytest.fixture
+def blender(bpy, tmp_path, monkeypatch):
+    """The program that the panel starts."""
+    program = tmp_path / "blender"
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{AS_BLENDER}" "$@"\n')
+    program.chmod(0o755)
+    monkeypatch.setattr(bpy.app, "binary_path", str(program))
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    return program
+
+
+@needs_trainer
+def test_the_panel_captures_the_scene_as_it_is_now(bpy, lodgs, scene, blender, tmp_path):
+    settings, capturing = scene.lodgs_capture, lodgs("runs.capturing")
+    with pytest.raises(RuntimeError, match="not saved yet"):
+        bpy.ops.lodgs.capture_scene()
+    settings.folder, settings.views, settings.view_width = str(tmp_path / "out"), 4, 64
+    scene.render.resolution_x, scene.render.resolution_y = 400, 300
+    objects = len(bpy.data.objects)
+    assert bpy.ops.lodgs.capture_scene() == {"FINISHED"}
+    work = capturing.current
+    assert (work.message, work.fraction, work.problem) == ("Captured", 1.0, "")
+    assert len(bpy.data.objects) == objects and not bpy.data.filepath, "the artist's file is as it was"
+    assert bpy.ops.lodgs.import_capture() == {"FINISHED"}
+    (root,) = [obj for obj in scene.objects if obj.lodgs.is_root]
+    assert len(root.lodgs.cameras.objects) == 4
+    assert [tuple(cam.data.lodgs.width for cam in root.lodgs.cameras.objects)] == [(64,) * 4]
+
+
+def test_a_capture_that_is_stopped_says_so(bpy, lodgs, fake, scene, blender, tmp_path):
+    fake()
+    capturing = lodgs("runs.capturing")
+    settings = scene.lodgs_capture
+    settings.folder, settings.views, settings.view_width = str(tmp_path / "out"), 30, 64
+    work = capturing.start(bpy.context)
+    with pytest.raises(RuntimeError, match="at work already"):
+        bpy.ops.lodgs.capture_scene()
+    end = time.monotonic() + 60
+    while work.step() and not work.message.startswith("View"):
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    assert bpy.ops.lodgs.cancel_capture() == {"FINISHED"}
+    while work.step():
+        time.sleep(0.02)
+    there = len(list((tmp_path / "out" / "cameras").iterdir()))
+    assert 0 < there < 30 and work.message == f"Stopped after {there} of 30 views" and not work.problem
+    for kind in ("images", "depths"):
+        assert len([f for f in (tmp_path / "out" / kind).iterdir() if f.suffix in (".png", ".exr")]) >= there
+    settings.views = 20  # other views
+    with pytest.raises(RuntimeError, match="holds other views"):
+        bpy.ops.lodgs.capture_scene()
+    settings.views_from = "CAMERAS"
+    with pytest.raises(RuntimeError, match="has 0 camera"):
+        bpy.ops.lodgs.capture_scene()

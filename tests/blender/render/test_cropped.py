@@ -1,0 +1,91 @@
+"""F12 and pictures in viewport quality of what crops and hiding leave: those of the same splats alone."""
+
+import numpy as np
+import pytest
+
+from tests.training.lod.test_cleaning import bundle_of
+from tests.training.lod.trees import random_leaves, tree_of, write_in_pages
+from training.lod.crop import Crop
+from training.splats.bundle import write_bundle
+
+
+@pytest.fixture
+def camera(bpy):
+    scene = bpy.context.scene
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    camera.location, camera.rotation_euler = (2, -20.0, 1.0), (1.5, 0, 0.1)
+    scene.render.resolution_x, scene.render.resolution_y = 96, 64
+    scene.render.resolution_percentage = 100
+    return camera
+
+
+@pytest.mark.usefixtures("renderer")
+@pytest.mark.parametrize("name", ["bands", "octree", "chunks", "decay"])
+@pytest.mark.parametrize("mode", ["SINGLE", "SELECTIVE"])
+def test_frames_show_what_is_left(bpy, lodgs, camera, tmp_path, name, mode):
+    bundle = bundle_of(name, np.random.default_rng(0))
+    for level in bundle.levels:
+        level.splats.sh[:] *= 0.2
+    write_bundle(tmp_path / "in.ply", bundle)
+    scenes, engine = lodgs("data.scenes"), lodgs("render.engine")
+
+    def frame(root):
+        root.lodgs.mode, root.lodgs.single_level = mode, 3
+        root.location, root.rotation_euler = (1, 2, 0), (0.1, 0.2, 0.7)
+        bpy.context.view_layer.update()
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        planes = engine.frame(depsgraph, 96, 64, (0, 0, 96, 64)).planes
+        return np.stack([planes[f"Combined.{channel}"] for channel in "RGB"], axis=2)
+
+    root = scenes.import_splats(bpy.context, tmp_path / "in.ply", upright=False)
+    whole = frame(root)
+    bpy.ops.lodgs.add_crop(shape="SPHERE")
+    crop = bpy.context.active_object
+    crop.location, crop.scale = (1, -1, 0.5), (4, 5, 3)
+    bpy.ops.lodgs.hide_splats(test="LARGE", size=0.3)
+    cropped = frame(root)
+    crop.location.x += 2
+    moved = frame(root)
+    crop.location.x -= 2
+    np.testing.assert_array_equal(frame(root), cropped)
+    bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"))
+    lodgs("data.removal").remove(root)
+    alone = frame(scenes.import_splats(bpy.context, tmp_path / "out.ply", upright=False))
+    np.testing.assert_allclose(cropped, alone, atol=1e-5)
+    assert np.abs(whole - cropped).max() > 0.05 and np.abs(moved - cropped).max() > 0.05
+
+
+@pytest.mark.usefixtures("renderer")
+def test_a_tree_that_is_read_from_its_file_is_cropped(bpy, lodgs, camera, tmp_path):
+    write_in_pages(tmp_path / "tree.ply", tree_of(random_leaves(6000, np.random.default_rng(3), degree=1)))
+    scenes, engine = lodgs("data.scenes"), lodgs("render.engine")
+
+    def frame(root):
+        root.lodgs.controls.pixels = 0.1  # leaves
+        bpy.context.view_layer.update()
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        planes = engine.frame(depsgraph, 96, 64, (0, 0, 96, 64)).planes
+        return np.stack([planes[f"Combined.{channel}"] for channel in "RGB"], axis=2)
+
+    pictures = []
+    for budget in (3000, 0):
+        root = scenes.import_splats(bpy.context, tmp_path / "tree.ply", budget=budget, upright=False)
+        assert bool(lodgs("data.streams").file_of(root)) == bool(budget)
+        whole = frame(root)
+        bpy.ops.lodgs.add_crop(shape="BOX")
+        box = bpy.context.active_object
+        box.location, box.scale = (0.5, -1, 0), (3, 2, 2)
+        pictures.append(frame(root))
+        if budget:
+            placed = engine.placed_splats(bpy.context.evaluated_depsgraph_get())
+            (crop,) = placed[0].choice.crops
+            assert isinstance(placed[0], lodgs("render.renderer").PlacedTree)
+            assert (crop.shape, crop.outside) == ("BOX", False)
+            wanted = Crop.at("BOX", np.array(box.matrix_world))
+            np.testing.assert_allclose(crop.to_own, wanted.to_own, rtol=1e-5)
+        lodgs("data.removal").remove(root)
+        assert "Crop Box" not in bpy.data.objects
+    np.testing.assert_allclose(*pictures, atol=1e-4)
+    assert np.abs(whole - pictures[0]).max() > 0.05

@@ -1,0 +1,228 @@
+"""Levels that stand elsewhere: every rule chooses there as it did, and files hold them."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.training.lod.test_rule import RULES, any_values, bundle_of
+from tests.training.lod.trees import random_tree, surfaces
+from training.__main__ import main
+from training.errors import LodgsError
+from training.lod.paging import TreeFile, streaming_order, table_of_pages
+from training.lod.placing import placed
+from training.lod.rule import rules
+from training.lod.rules.chunks import member_columns
+from training.lod.selection import Choice, settings
+from training.lod.streaming import BLOCKS
+from training.lod.tree import Tree
+from training.splats.bundle import (
+    Bundle,
+    Level,
+    open_bundle,
+    read_bundle,
+    read_folder,
+    write_bundle,
+    write_folder,
+)
+from training.splats.gaussians import Splats
+from training.splats.placing import Placement
+from training.splats.ply import write_ply
+
+QUARTER = np.array([[0, -2.0, 0, 0], [2, 0, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]])
+"""A quarter turn to twice the size: of float32 numbers it makes float32 numbers, without rounding."""
+
+
+def tree_bundle(seed: int, leaves: int = 400) -> tuple[Bundle, Tree]:
+    """A tree of deep and shallow branches; ``node`` says which node a splat is."""
+    rng = np.random.default_rng(seed)
+    tree, splats = random_tree(rng, leaves), surfaces(2 * leaves - 1)
+    splats.extras["node"] = np.arange(len(splats), dtype=np.int32)
+    levels = tree.levels(splats)
+    table = table_of_pages({level.number: level.splats.extras for level in levels})
+    return Bundle("tree", levels, "cut", tables={BLOCKS: table}), tree
+
+
+def choosable(name: str, seed: int = 0) -> Bundle:
+    """A bundle of a rule, with the tables that it knows."""
+    if name == "cut":
+        return tree_bundle(seed)[0]
+    bundle, rng = bundle_of(name), np.random.default_rng(seed)
+    if name == "decay":
+        bundle.facts["tau"] = 0.05
+    if name == "chunks":
+        centres = {axis: rng.normal(0, 4, 5).astype(np.float32) for axis in "xyz"}
+        bundle.tables = {"chunks": centres | {"radius": rng.uniform(1, 5, 5).astype(np.float32)}}
+        for level in bundle.levels:
+            level.splats.extras |= member_columns(rng.random((5, len(level.splats))) < 0.5)
+    return bundle
+
+
+def general(scale: float, away: float) -> Placement:
+    matrix = np.eye(4)
+    matrix[:3, :3] = scale * Rotation.random(random_state=3).as_matrix()
+    matrix[:3, 3] = away, -away, 2 * away
+    return Placement.of(matrix)
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_every_rule_chooses_as_before_bit_for_bit(name):
+    """Where nothing is rounded. A length or a place that a rule does not declare would show."""
+    bundle, placement, rng = choosable(name), Placement.of(QUARTER), np.random.default_rng(1)
+    there, shown = placed(bundle, placement), 0
+    before, after = Choice(bundle), Choice(there)
+    for _ in range(40):
+        eye, focal = np.float32(rng.normal(0, 4, 3)), rng.uniform(1, 90)
+        values = settings(bundle, any_values(rules()[name], rng))
+        weights = before.weights(eye, focal, values)
+        shown += np.count_nonzero(weights)
+        np.testing.assert_array_equal(after.weights(placement.points(eye), focal, values), weights)
+    assert 0 < shown < 40 * len(before.splats)
+
+
+@pytest.mark.parametrize("name", RULES)
+@pytest.mark.parametrize("scale", [0.013, 7.7])
+def test_every_rule_chooses_as_before_anywhere(name, scale):
+    """But for what meets a border in the last bits of single precision."""
+    bundle, placement, rng = choosable(name), general(scale, 3 * scale), np.random.default_rng(1)
+    there = placed(bundle, placement)
+    before, after = Choice(bundle), Choice(there)
+    for _ in range(20):
+        eye, focal = np.float32(rng.normal(0, 4, 3)), rng.uniform(1, 90)
+        values = settings(bundle, any_values(rules()[name], rng))
+        weights = before.weights(eye, focal, values)
+        same = np.isclose(after.weights(placement.points(eye), focal, values), weights, atol=2e-4)
+        assert np.count_nonzero(~same) <= 1 + len(same) // 200
+
+
+@pytest.mark.parametrize("scale,away", [(1.0, 0.0), (0.3, 5000.0), (7.7, 100.0)])
+def test_cuts_of_a_placed_tree_are_proper(scale, away):
+    """Of each leaf and the nodes above it exactly one is shown, however much is rounded."""
+    bundle, tree = tree_bundle(1)
+    there, rng = placed(bundle, general(scale, away)), np.random.default_rng(2)
+    choice = Choice(there)
+    nodes, means = choice.splats.extras["node"], choice.splats.means
+    for _ in range(200):
+        eye = means[rng.integers(len(means))] + scale * rng.normal(0, rng.choice([0.1, 3, 30]), 3)
+        focal = 10 ** rng.uniform(0, 4)
+        shown = np.zeros(len(tree))
+        shown[nodes] = choice.weights(eye, focal, settings(there, {}))
+        above = shown.copy()
+        for layer in tree.layers:
+            above[tree.children[layer - tree.leaves]] += above[layer][:, None]
+        np.testing.assert_array_equal(above[: tree.leaves], 1)
+
+
+def test_nodes_of_a_placed_tree_know_their_parents():
+    """Those alike in all but the last places of their size, too, which rounding makes one."""
+    leaves = surfaces(64)
+    leaves = leaves.select(np.zeros(64, int))  # all the same
+    tree = random_tree(np.random.default_rng(0), 64)
+    splats = Splats.concatenated([leaves, leaves.select(slice(63))])
+    bundle = Bundle("tree", tree.levels(splats), "cut")
+    for scale in (0.61, 1.3, 2.9):
+        nodes = placed(bundle, general(scale, 1.0)).levels[0].splats
+        sizes = nodes.extras["node_size"]
+        assert len(np.unique(sizes)) == len(sizes) == 63
+        for level in placed(bundle, general(scale, 1.0)).levels:
+            above = level.splats.extras["parent_size"]
+            assert np.isin(above[above < 3e38], sizes).all()
+
+
+def test_what_a_bundle_says_goes_along():
+    bundle = choosable("chunks")
+    bundle.meta = {
+        "camera_center": [1, 0, 0], "view": [[0, 0, 0], [0, 1, 0]], "up_rotation": np.eye(3),
+        "median_depth": 4, "focal_px": 100.0, "costs": [{"level": 1, "distances": [1.5, 2]}], "seed": 3,
+    }  # fmt: skip
+    there = placed(bundle, Placement.of(QUARTER))
+    assert there.meta == {
+        "camera_center": [0, 2, 0], "view": [[0, 0, 0], [-2, 0, 0]], "median_depth": 8.0,
+        "up_rotation": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], "focal_px": 100.0,
+        "costs": [{"level": 1, "distances": [3.0, 4.0]}], "seed": 3,
+    }  # fmt: skip
+    np.testing.assert_array_equal(there.tables["chunks"]["radius"], 2 * bundle.tables["chunks"]["radius"])
+    np.testing.assert_array_equal(there.tables["chunks"]["y"], 2 * bundle.tables["chunks"]["x"])
+    assert [level.facts["d_l"] for level in there.levels] == [2 * x.facts["d_l"] for x in bundle.levels]
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_what_stays_in_a_file_is_placed_as_what_is_in_memory(name, tmp_path):
+    bundle = choosable(name)
+    write_bundle(tmp_path / "in.ply", bundle)
+    head, rows = open_bundle(tmp_path / "in.ply")
+    for level in head.levels:
+        level.elsewhere = rows[level.number]
+    placement = general(1.7, 2.0)
+    write_bundle(tmp_path / "out.ply", placed(head, placement))
+    wanted, found = placed(bundle, placement), read_bundle(tmp_path / "out.ply")
+    assert (found.rule, found.facts) == (wanted.rule, wanted.facts)
+    for one, other in zip(found.levels, wanted.levels, strict=True):
+        assert one.facts == other.facts and one.splats.extras.keys() == other.splats.extras.keys()
+        for attribute in ("means", "quats", "log_scales", "sh"):
+            np.testing.assert_array_equal(getattr(one.splats, attribute), getattr(other.splats, attribute))
+        for column in one.splats.extras:
+            np.testing.assert_array_equal(one.splats.extras[column], other.splats.extras[column])
+
+
+def test_a_placed_tree_is_read_by_pages(tmp_path):
+    bundle, _ = tree_bundle(1, 3000)
+    write_bundle(tmp_path / "t.ply", placed(bundle, general(2.3, 9.0)))
+    file = TreeFile(tmp_path / "t.ply")
+    table = file.bundle.tables[BLOCKS]
+    del file.bundle.tables[BLOCKS]
+    index, anew = type(file.index()).of(table), file.index()
+    np.testing.assert_array_equal(index.low, anew.low)
+    np.testing.assert_array_equal(index.parent_size, anew.parent_size)
+    assert (streaming_order(bundle.levels[0].splats.extras)[:5] == np.arange(5)).all()
+
+
+def test_an_unknown_rule_is_refused():
+    bundle = Bundle("new", [Level(1, surfaces(5))], "of tomorrow")
+    with pytest.raises(LodgsError, match="of tomorrow"):
+        placed(bundle, Placement.of(QUARTER))
+    bundle.rule = ""
+    assert len(placed(bundle, Placement.of(QUARTER)).levels[0].splats) == 5
+
+
+def test_the_command_writes_the_same_form(tmp_path, capsys):
+    """A bundle, a plain PLY with columns of its own, and a folder."""
+    bundle, folder = choosable("bands"), tmp_path / "levels"
+    bundle.meta["up_rotation"] = Rotation.from_euler("x", -90, degrees=True).as_matrix().round(6)
+    write_bundle(tmp_path / "b.ply", bundle)
+    write_folder(folder, bundle)
+    plain = bundle.levels[-1].splats
+    plain.extras["mine"] = np.arange(len(plain), dtype=np.float32)
+    write_ply(tmp_path / "p.ply", plain, ["SplatRenderMode: mip"])
+    placement = Placement.composed((10, 20, 30), 2.0, (-1, 0, 3))
+    options = ["--rotate", "10,20,30", "--scale", "2", "--translate=-1,0,3"]
+    for name in ("b.ply", "levels", "p.ply"):
+        out = tmp_path / f"out_{name}"
+        assert main(["transform", str(tmp_path / name), str(out), *options]) == 0
+        assert f"{out}:" in capsys.readouterr().out
+        read = read_folder if out.is_dir() else read_bundle
+        found, wanted = read(out), placed(read(tmp_path / name), placement)
+        assert (found.rule, found.facts, found.meta.keys()) == (wanted.rule, wanted.facts, wanted.meta.keys())
+        for one, other in zip(found.levels, wanted.levels, strict=True):
+            np.testing.assert_array_equal(one.splats.means, other.splats.means)
+            np.testing.assert_array_equal(one.splats.sh, other.splats.sh)
+    text = (tmp_path / "out_p.ply").read_bytes()[:4000]
+    assert b"lodsplat" not in text and b"property float mine" in text and b"SplatRenderMode: mip" in text
+    assert main(["transform", str(tmp_path / "b.ply"), str(tmp_path / "u.ply"), "--upright"]) == 0
+    up = read_bundle(tmp_path / "u.ply")
+    np.testing.assert_allclose(up.upright, np.eye(3), atol=1e-6)
+    x, y, z = bundle.levels[0].splats.means.T
+    np.testing.assert_allclose(up.levels[0].splats.means, np.stack([x, z, -y], axis=1), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "options,words",
+    [
+        (["--scale", "0"], "scale of 0"),
+        (["--matrix", "1,0,0,0,0,2,0,0,0,0,1,0,0,0,0,1"], "stretches"),
+        (["--matrix", "1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1", "--scale", "2"], "Choose one"),
+    ],
+)
+def test_the_command_refuses_in_a_sentence(tmp_path, capsys, options, words):
+    write_bundle(tmp_path / "b.ply", choosable("bands"))
+    assert main(["transform", str(tmp_path / "b.ply"), str(tmp_path / "o.ply"), *options]) == 2
+    assert words in capsys.readouterr().err and not (tmp_path / "o.ply").exists()

@@ -1,0 +1,161 @@
+"""Splats that stand elsewhere: drawn from the other side, and against what covariances and colours are."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from tests.training.conftest import look_at
+from training.errors import LodgsError
+from training.rasterize import Gaussians, rasterize
+from training.scenes.cameras import Camera
+from training.splats.gaussians import Splats
+from training.splats.placing import PlacedRows, Placement
+from training.splats.sh import basis, coefficients
+
+
+def some_splats(count: int, degree: int, seed: int = 0) -> Splats:
+    rng = np.random.default_rng(seed)
+    return Splats(
+        means=rng.uniform(-1, 1, (count, 3)).astype(np.float32),
+        quats=rng.normal(size=(count, 4)).astype(np.float32),
+        log_scales=rng.normal(-2.5, 0.6, (count, 3)).astype(np.float32),
+        opacity_logits=rng.normal(0.5, 2, count).astype(np.float32),
+        sh=rng.normal(0, 0.4, (count, coefficients(degree), 3)).astype(np.float32),
+    )
+
+
+def matrix_of(seed: int, scale: float = 1.0, away: float = 3.0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    found = np.eye(4)
+    found[:3, :3] = scale * Rotation.random(random_state=seed).as_matrix()
+    found[:3, 3] = rng.uniform(-away, away, 3)
+    return found
+
+
+def covariances(splats: Splats) -> np.ndarray:
+    turns = Rotation.from_quat(splats.quats[:, [1, 2, 3, 0]].astype(float)).as_matrix()
+    half = turns * np.exp(splats.log_scales.astype(float))[:, None, :]
+    return half @ half.transpose(0, 2, 1)
+
+
+def drawn(splats: Splats, camera: Camera, near: float) -> np.ndarray:
+    return rasterize(Gaussians.of(splats), camera, backend="reference", near=near).image.numpy()
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3, 4])
+@pytest.mark.parametrize("scale", [1.0, 0.37, 12.5])
+def test_the_turned_scene_is_what_the_turned_camera_sees(degree, scale):
+    """At least 50 dB, where harmonics that stay behind have less than 30."""
+    splats, placement = some_splats(300, degree), Placement.of(matrix_of(degree, scale))
+    camera = Camera("", 96, 72, 90.0, 80.0, 50.0, 33.0, look_at((2.5, 0.4, 1.5)))
+    there, unit = camera.within(np.linalg.inv(placement.matrix))
+    assert unit == pytest.approx(1 / scale)
+    before = drawn(splats, camera, 0.01)
+    after = drawn(placement.splats(splats), there, 0.01 * scale)
+    assert before.std() > 0.1
+    assert -10 * np.log10(np.square(after - before).mean()) > 50
+    left = drawn(replace(placement.splats(splats), sh=splats.sh), there, 0.01 * scale)
+    assert -10 * np.log10(np.square(left - before).mean()) < 30
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_colours_covariances_and_places_go_along(seed):
+    splats, matrix = some_splats(50, 4, seed), matrix_of(seed, 2.5)
+    placed, linear = Placement.of(matrix).splats(splats), matrix[:3, :3]
+    np.testing.assert_allclose(placed.means, splats.means @ linear.T + matrix[:3, 3], atol=1e-6)
+    np.testing.assert_allclose(
+        covariances(placed), linear @ covariances(splats) @ linear.T, rtol=1e-4, atol=1e-6
+    )
+    np.testing.assert_allclose(
+        np.linalg.norm(placed.quats, axis=1), np.linalg.norm(splats.quats, axis=1), rtol=1e-6
+    )
+    directions = np.random.default_rng(seed).normal(size=(3, 50))
+    directions /= np.linalg.norm(directions, axis=0)
+    before, after = np.empty((2, 25, 50))
+    basis(*directions, 4, before)
+    basis(*(linear / 2.5 @ directions), 4, after)
+    np.testing.assert_allclose(
+        np.einsum("kn,nkc->nc", after, placed.sh), np.einsum("kn,nkc->nc", before, splats.sh), atol=1e-5
+    )
+
+
+def test_the_identity_changes_nothing():
+    splats = some_splats(20, 3)
+    placed = Placement.of(np.eye(4)).splats(splats)
+    for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
+        np.testing.assert_array_equal(getattr(placed, name), getattr(splats, name))
+
+
+def test_back_again_is_where_it_was():
+    splats, matrix = some_splats(50, 3), matrix_of(4, 0.2)
+    again = Placement.of(np.linalg.inv(matrix)).splats(Placement.of(matrix).splats(splats))
+    for name in ("means", "log_scales", "sh"):
+        np.testing.assert_allclose(getattr(again, name), getattr(splats, name), atol=2e-5)
+    sign = np.sign((again.quats * splats.quats).sum(axis=1, keepdims=True))  # q and -q are one rotation
+    np.testing.assert_allclose(sign * again.quats, splats.quats, atol=2e-5)
+
+
+def test_further_columns_go_along_as_what_they_are():
+    splats = some_splats(3, 0)
+    columns = {name: np.float32([1, 2, 3]) for name in ("size", "weight", "px", "py", "pz")}
+    splats.extras = columns | {"nx": np.float32([1, 0, 0]), "ny": np.float32([0, 1, 0])}
+    splats.extras |= {"nz": np.float32([0, 0, 1]), "far": np.float32([3e38, 0, 1])}
+    quarter = np.array([[0, -2, 0, 10], [2, 0, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1.0]])
+    placed = Placement.of(quarter).splats(splats, ("size",), (("px", "py", "pz"),)).extras
+    assert placed["size"].tolist() == [2, 4, 6] and placed["weight"].tolist() == [1, 2, 3]
+    assert [placed[name].tolist() for name in ("px", "py", "pz")] == [[8, 6, 4], [2, 4, 6], [2, 4, 6]]
+    normals = np.stack([placed[name] for name in ("nx", "ny", "nz")], axis=1)
+    np.testing.assert_allclose(normals, [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], atol=1e-7)
+    assert splats.extras["size"].tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_rotation_as_a_quaternion(seed):
+    turn = Rotation.random(random_state=seed)
+    if seed < 3:  # half turns, about each axis, have no w
+        turn = Rotation.from_rotvec(np.pi * np.eye(3)[seed])
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn.as_matrix()
+    quat, wanted = Placement.of(matrix).quat, turn.as_quat()[[3, 0, 1, 2]]
+    assert abs(quat @ wanted) == pytest.approx(1, abs=1e-12)
+
+
+def test_angles_are_those_of_scipy_about_fixed_axes():
+    placement = Placement.composed((20, -50, 130), 2.5, (1, 2, 3))
+    wanted = Rotation.from_euler("xyz", (20, -50, 130), degrees=True).as_matrix()
+    np.testing.assert_allclose(placement.matrix[:3, :3], 2.5 * wanted, atol=1e-12)
+    assert placement.matrix[:3, 3].tolist() == [1, 2, 3]
+    with pytest.raises(LodgsError, match="scale of 0"):
+        Placement.composed(scale=0.0)
+    first, points = Placement.of(matrix_of(1, 3.0)), np.eye(3)
+    np.testing.assert_allclose(
+        placement.after(first).points(points), placement.points(first.points(points)), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    "linear",
+    [
+        np.diag([1.0, 1.0, 1.01]),
+        np.diag([1.0, 1.0, -1.0]),
+        np.array([[1.0, 0.1, 0], [0, 1, 0], [0, 0, 1]]),
+        np.zeros((3, 3)),
+        np.diag([np.nan, 1, 1]),
+    ],
+)
+def test_what_is_no_placement_is_refused(linear):
+    matrix = np.eye(4)
+    matrix[:3, :3] = linear
+    with pytest.raises(LodgsError, match=r"stretches|no transform"):
+        Placement.of(matrix)
+
+
+def test_rows_in_a_file_are_placed_as_they_are_read():
+    splats, placement = some_splats(30, 1), Placement.of(matrix_of(1, 3.0))
+    rows = PlacedRows(splats, placement.splats, {"mine": np.arange(30, dtype=np.float32)})
+    some, whole = rows.select(slice(10, 20)), placement.splats(splats)
+    assert len(rows) == 30 and torch.equal(torch.from_numpy(some.means), torch.from_numpy(whole.means[10:20]))
+    np.testing.assert_array_equal(some.extras["mine"], np.arange(10, 20))

@@ -1,0 +1,81 @@
+"""A copy of a scene whose photographs differ in exposure, to see what ``lr_exposure`` is worth.
+
+    python tools/jitter.py SCENE COPY [--stops 0.7]
+    python tools/bench_quality.py COPY SCENE --report --methods 3dgs --shares 1 --set lr_exposure=0.01
+
+Every photograph is as if it had been exposed by a random number of stops more or less; those that ``train``
+holds out stay as they are, so that pictures are compared with the same truth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+HERE = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(HERE))
+
+from training.errors import LodgsError  # noqa: E402
+from training.scenes.colmap import read_scene  # noqa: E402
+from training.scenes.color import linear_from_srgb, srgb_from_linear  # noqa: E402
+
+
+def exposed(pixels: np.ndarray, stops: float) -> np.ndarray:
+    """A photograph (H, W, 3) uint8 with 2^stops as much light; what is over white is lost."""
+    linear = linear_from_srgb(pixels / 255.0) * 2.0**stops
+    return np.round(255 * srgb_from_linear(np.clip(linear, 0, 1))).astype(np.uint8)
+
+
+def jittered(scene: Path, copy: Path, stops: float, seed: int, test_every: int) -> dict[str, float]:
+    """Writes the copy.
+
+    Args:
+        stops: the most that a photograph's light is changed, up or down.
+        test_every: every so many-th photograph by name stays as it is, as ``Scene.split`` has it.
+
+    Returns:
+        The stops of each photograph that was changed, by name.
+
+    Raises:
+        LodgsError: the scene cannot be read, or the copy exists.
+    """
+    if copy.exists():
+        raise LodgsError(f"{copy} exists.", "Choose another folder.")
+    train, _ = read_scene(scene).split(test_every)
+    drawn = np.random.default_rng(seed).uniform(-stops, stops, len(train))
+    shutil.copytree(scene, copy)
+    for camera, change in zip(train, drawn, strict=True):
+        if camera.image is None:
+            continue
+        path = copy / camera.image.relative_to(scene)
+        changed = exposed(np.asarray(Image.open(path).convert("RGB")), change)
+        Image.fromarray(changed).save(path, quality=97)
+    return {camera.name: float(change) for camera, change in zip(train, drawn, strict=True)}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scene", type=Path, metavar="SCENE")
+    parser.add_argument("copy", type=Path, metavar="COPY")
+    parser.add_argument("--stops", type=float, default=0.7)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--test-every", type=int, default=8)
+    args = parser.parse_args()
+    try:
+        found = jittered(args.scene, args.copy, args.stops, args.seed, args.test_every)
+    except LodgsError as error:
+        print(error.what, error.remedy, file=sys.stderr)
+        return 2
+    print(f"{len(found)} photographs by {min(found.values()):+.2f} to {max(found.values()):+.2f} stops")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,149 @@
+"""Levels of detail that stand elsewhere: they look the same there, and are chosen alike. numpy only."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import LodgsError
+from ..splats.bundle import (
+    META_LENGTHS,
+    NO_SPLATS,
+    Bundle,
+    DrawableRows,
+    Level,
+    open_bundle,
+    read_folder,
+    read_head,
+    write_bundle,
+    write_folder,
+)
+from ..splats.dialects import Warn, comments_of, meta_of, silent
+from ..splats.gaussians import Splats
+from ..splats.placing import PlacedRows, Placement
+from ..splats.ply import AT_ONCE, Columns, write_ply
+from .paging import BOUNDS, table_of_pages
+from .rule import Rule, find_rule
+from .selection import columns_of, unknown_rule
+from .streaming import BLOCKS
+
+
+def placed(bundle: Bundle, placement: Placement) -> Bundle:
+    """A bundle whose splats, and all that it says of places and lengths, stand elsewhere.
+
+    Levels that are in files stay there until they are written. Of a rule whose columns are ``related`` these
+    are in memory, some 150 bytes a splat.
+
+    Raises:
+        LodgsError: this version does not know the rule, and so not what it says of lengths.
+    """
+    rule = find_rule(bundle.rule)
+    if rule is None and bundle.rule:
+        raise LodgsError(unknown_rule(bundle.rule)[0], "Update LODGS, or export one level as a plain PLY.")
+    lengths, places = (rule.lengths, rule.places) if rule else ((), ())
+
+    def of(splats: Splats) -> Splats:
+        return placement.splats(splats, lengths, places)
+
+    def facts(known: dict[str, float]) -> dict[str, float]:
+        return {n: value * placement.scale if n in lengths else value for n, value in known.items()}
+
+    remade = _agreed(bundle, rule, placement) if rule and rule.related else [{} for _ in bundle.levels]
+    levels = []
+    for level, columns in zip(bundle.levels, remade, strict=True):
+        if level.elsewhere is None:
+            splats = of(level.splats)
+            splats.extras |= columns
+            levels.append(Level(level.number, splats, facts(level.facts)))
+        else:
+            rows = PlacedRows(level.elsewhere, of, columns)
+            levels.append(Level(level.number, NO_SPLATS, facts(level.facts), rows))
+    tables = dict(bundle.tables)
+    for name in rule.tables if rule else ():
+        if name in tables:
+            tables[name] = placement.columns(tables[name], lengths, places)
+    if BOUNDS[0] in tables.get(BLOCKS, {}):
+        tables[BLOCKS] = table_of_pages({x.number: c for x, c in zip(bundle.levels, remade, strict=True)})
+    meta = _meta(bundle.meta, placement)
+    return replace(bundle, levels=levels, facts=facts(bundle.facts), tables=tables, meta=meta)
+
+
+def place_file(source: Path, out: Path, placement: Placement, warn: Warn = silent) -> int:
+    """Writes a bundle, a folder of levels or any 3DGS PLY as it stands elsewhere, in the same form.
+
+    Splats of a PLY are read and written a few at a time.
+
+    Returns:
+        How many splats there are.
+
+    Raises:
+        LodgsError: as :func:`placed`, ``open_bundle``, ``read_folder``, or the file cannot be written.
+    """
+    if source.is_dir():
+        there = placed(read_folder(source, warn), placement)
+        write_folder(out, there)
+        return sum(len(level.splats) for level in there.levels)
+    bundle, rows = open_bundle(source)
+    for level in bundle.levels:
+        level.elsewhere = DrawableRows(rows[level.number], warn)
+    if any(len(level.rows) < len(rows[level.number]) for level in bundle.levels):
+        bundle.tables.pop(BLOCKS, None)  # which tells of rows
+    there = placed(bundle, placement)
+    if bundle == Bundle("", bundle.levels, meta=meta_of(comments_of(bundle.meta))):
+        write_ply(out, there.levels[0].rows, comments_of(bundle.meta))
+    else:
+        write_bundle(out, there)
+    return sum(len(level.rows) for level in there.levels)
+
+
+def upright_of(source: Path) -> Placement:
+    """What stands a file's scene upright, z up.
+
+    Raises:
+        LodgsError: as ``read_head`` and ``read_folder``.
+    """
+    bundle = (read_folder if source.is_dir() else read_head)(source)
+    left, _, right = np.linalg.svd(bundle.upright)  # of numbers that have been rounded
+    return Placement(left @ right, 1.0, np.zeros(3))
+
+
+def _meta(meta: dict, placement: Placement) -> dict:
+    """What a bundle says of places, directions and lengths beside its splats."""
+    found = dict(meta) if placement.scale == 1 else _scaled(meta, placement.scale)
+    for name in ("camera_center", "view"):
+        if name in meta:
+            points = placement.points(np.asarray(meta[name], np.float64).reshape(-1, 3))
+            found[name] = points.reshape(np.shape(meta[name])).tolist()
+    if "up_rotation" in meta:
+        found["up_rotation"] = (np.asarray(meta["up_rotation"]) @ placement.rotation.T).round(9).tolist()
+    return found
+
+
+def _scaled(value: Any, scale: float, length: bool = False) -> Any:
+    """What JSON holds, its lengths scaled, to six digits: headers have little room."""
+    match value:
+        case dict():
+            return {name: _scaled(each, scale, name in META_LENGTHS) for name, each in value.items()}
+        case list():
+            return [_scaled(each, scale, length) for each in value]
+        case int() | float() if length:
+            return float(f"{value * scale:.6g}")
+    return value
+
+
+def _agreed(bundle: Bundle, rule: Rule, placement: Placement) -> list[Columns]:
+    """The rule's columns of each level where they stand then, as they agree with each other."""
+    parts, ends = [], []
+    for level in bundle.levels:
+        for begin in range(0, max(len(level.rows), 1), AT_ONCE):
+            splats = level.rows.select(slice(begin, begin + AT_ONCE))
+            parts.append(columns_of(rule, splats) | dict(zip("xyz", splats.means.T.copy(), strict=True)))
+        ends.append(len(level.rows))
+    before = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    after = placement.columns(before, rule.lengths, (*rule.places, ("x", "y", "z")))
+    after |= rule.agreed(before, after)
+    parts = [np.split(after[name], np.cumsum(ends)[:-1]) for name in rule.columns]
+    return [dict(zip(rule.columns, columns, strict=True)) for columns in zip(*parts, strict=True)]

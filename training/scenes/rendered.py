@@ -1,0 +1,130 @@
+"""Views that a renderer drew with exact cameras and depths become a COLMAP scene.
+
+folder/  images/view_0001.png   the picture, as photographs are
+         depths/view_0001.exr   depth along the camera's z axis, in a channel Depth.Z, as Blender writes it
+         cameras/view_0001.json the camera, as ``write_camera`` writes it
+         sparse/0/*.bin         the model: what is made here
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import LodgsError
+from .cameras import FARTHEST, read_views
+from .exr import read_parts
+from .images import load_image
+
+IMAGES, DEPTHS, CAMERAS = "images", "depths", "cameras"
+"""The folders of what was drawn."""
+POINTS = 100_000
+"""At most so many points a model gets."""
+SKY = 1e9
+"""Depths from here on are of nothing: renderers put 1e10 there."""
+_LOOKS = 10
+"""Pixels that are looked at for each point, about."""
+_PRIMES = np.array([73856093, 19349663, 83492791, 15485863])
+
+Tell = Callable[[int, int], object]
+"""Is told before each view which one it is, from 1 on, and of how many."""
+
+
+def write_model(folder: Path, most: int = POINTS, tell: Tell = lambda number, count: None) -> tuple[int, int]:
+    """Writes folder/sparse/0/*.bin: the cameras, and points where random pixels meet surfaces.
+
+    Points are even in space up to the median depth, and from there on apart by what doubles as depth does;
+    of the sky there are none. Each has its pixel's colour, and a track of views that see it. Depths are read
+    again for the tracks: one view is in memory at a time.
+
+    Returns:
+        How many views and points there are.
+
+    Raises:
+        LodgsError: a view lacks a file or a depth, or no two views see the same.
+    """
+    from .write_colmap import write_seen  # pycolmap, which reading lacks
+
+    drawn, _ = read_views(folder / CAMERAS)
+    views = [replace(view, name=f"{view.name}.png") for view in drawn]
+    files = [folder / DEPTHS / f"{view.name}.exr" for view in drawn]
+    rng, found, depths, colors = np.random.default_rng(0), [], [], []
+    for number, (view, file) in enumerate(zip(views, files, strict=True)):
+        tell(number + 1, len(views))
+        picture = load_image(folder / IMAGES / view.name, view.width, view.height)
+        depth = read_depth(file)
+        if depth.shape != picture.shape[:2]:
+            raise LodgsError(
+                f"{file} is not of its camera's size of {view.width}x{view.height}.", "Render the view again."
+            )
+        y, x = np.nonzero(depth < SKY)
+        some = rng.permutation(len(x))[: most * _LOOKS // len(views) + 1]
+        y, x = y[some], x[some]
+        found.append(view.unproject(np.column_stack([x, y]) + 0.5, depth[y, x]))
+        depths.append(depth[y, x])
+        colors.append(picture[y, x])
+    points, depth, color = map(np.concatenate, (found, depths, colors))
+    kept = spread(points, depth, most, rng)
+    beside = folder / ".model.tmp"
+    try:
+        shutil.rmtree(beside, ignore_errors=True)
+        count = write_seen(beside, views, lambda n: read_depth(files[n]), points[kept], 255 * color[kept])
+        shutil.rmtree(folder / "sparse", ignore_errors=True)
+        (beside / "sparse").rename(folder / "sparse")
+    except OSError as error:
+        raise LodgsError(
+            f"The model in {folder} could not be written: {error.strerror or error}.",
+            "Free some space there.",
+        ) from error
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+    return len(views), count
+
+
+def read_depth(file: Path) -> np.ndarray:
+    """Depths (H, W) float64 of a multilayer EXR, the nearest of its layers; FARTHEST where there is nothing.
+
+    Raises:
+        LodgsError: it cannot be read, or holds none.
+    """
+    try:
+        layers = [
+            pixels
+            for _, _, channels in read_parts(file)
+            for name, pixels in channels.items()
+            if name.endswith("Depth.Z")
+        ]
+    except (RuntimeError, OSError, ValueError) as error:
+        raise LodgsError(f"{file} cannot be read: {error}.", "Render the view again.") from error
+    if not layers:
+        raise LodgsError(f"{file} holds no depth.", "Render with an engine that has the pass Depth.")
+    nearest = np.min(layers, axis=0).astype(np.float64)
+    return np.where((nearest > 0) & (nearest < SKY), nearest, FARTHEST)
+
+
+def spread(points: np.ndarray, depths: np.ndarray, most: int, rng: np.random.Generator) -> np.ndarray:
+    """Which of some points (N, 3) to keep, at most so many: one in each cube of a grid, at random.
+
+    The cubes are the smallest that are few enough. Their size doubles wherever depths (N,) reach twice the
+    median, four times and so on: there pixels are as much larger.
+    """
+    order = rng.permutation(len(points))
+    if len(points) <= most:
+        return order
+    middle = float(np.median(depths))
+    octave = np.floor(np.log2(np.maximum(depths / middle, 1))).astype(np.int64)[order]
+    places = points[order] / 2.0 ** octave[:, None]
+
+    def firsts(side: float) -> np.ndarray:
+        cubes = np.column_stack([np.floor(places / side).astype(np.int64), octave])
+        return np.unique(cubes @ _PRIMES, return_index=True)[1]
+
+    low, high = np.log2([1e-6 * middle, 1e3 * middle])
+    while high - low > 0.05:
+        half = (low + high) / 2
+        low, high = (low, half) if len(firsts(2.0**half)) <= most else (half, high)
+    return order[firsts(2.0**high)[:most]]
