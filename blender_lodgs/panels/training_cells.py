@@ -13,7 +13,13 @@ from .parts import Panel, say, split_column
 
 _NUMBER = 0.16
 """Of the width of a line, for a cell's colour and number."""
-_ICONS = {"waiting": "SORTTIME", "done": "CHECKMARK", "cancelled": "PAUSE", "failed": "ERROR"}
+_ICONS = {
+    "waiting": "SORTTIME",
+    "done": "CHECKMARK",
+    "cancelled": "PAUSE",
+    "stopped": "PAUSE",
+    "failed": "ERROR",
+}
 
 
 class LODGS_UL_cells(bpy.types.UIList):
@@ -94,13 +100,15 @@ def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
         return
     layout.operator("lodgs.plan_cells", icon="MESH_GRID")
     if settings.planned_for:
-        _draw_plan(layout.column(), settings, fits=cells.is_planned(settings, job))
+        fits = cells.is_planned(settings, job)
+        if not fits:
+            say(layout, "Planned for other settings: plan again.", "INFO")
+        column = layout.column()
+        column.active = fits
+        _draw_plan(column, settings)
 
 
-def _draw_plan(layout, settings, fits):
-    if not fits:
-        say(layout, "Planned for other settings: plan again.", "INFO")
-    layout.active = fits
+def _draw_plan(layout, settings):
     head = layout.row()
     _columns(_numbered(head, None), "Views", "Splats", "Memory")
     rows = min(max(len(settings.planned_cells), 3), 8)

@@ -34,7 +34,8 @@ class Part:
     Attributes:
         folder: of its run.
         number: of the cell; 0 for the whole.
-        kind, state: as ``progress`` events have them (``BLOCK_KINDS``, ``BLOCK_STATES``).
+        kind, state: as ``progress`` events have them (``BLOCK_KINDS``, ``BLOCK_STATES``); ``stopped`` with the
+            run that it was trained by.
         share: how much is done, 0 to 1, of a cell with its borders.
     """
 
@@ -110,7 +111,7 @@ class Watch:
         if not mine:
             return None
         now = next((each for each in mine if each["state"] != "done"), mine[-1])
-        state = "cancelled" if now["state"] == "running" and not self.running else now["state"]
+        state = "stopped" if now["state"] == "running" and not self.running else now["state"]
         share = sum(each["step"] for each in mine) / max(sum(each["of"] for each in mine), 1)
         run = self.folder
         places = {"coarse": run.coarse, "block": run.blocks / str(number), "seam": run.seams / str(number)}

@@ -129,7 +129,7 @@ def test_each_cell_says_how_it_gets_on(lodgs, root, draw_panel, line, watch):
     assert line("blocks", 0).texts == ["1", "Borders, 92%"]
     assert line("blocks", 1).texts == ["2", "Done"] and not line("blocks", 1).operators
     watch.state = "cancelled"
-    assert line("blocks", 0).texts == ["1", "Cancelled at 92%"]
+    assert line("blocks", 0).texts == ["1", "Stopped at 92%"]
     assert line("blocks", 0).operators == ["lodgs.resume_block"]
 
 
