@@ -34,8 +34,8 @@ class Part:
     Attributes:
         folder: of its run.
         number: of the cell; 0 for the whole.
-        kind, state: as ``progress`` events have them (``BLOCK_KINDS``, ``BLOCK_STATES``); ``stopped`` with the
-            run that it was trained by.
+        kind, state: as ``progress`` events have them (``BLOCK_KINDS``, ``BLOCK_STATES``); ``stopped`` with
+            the run that it was trained by.
         share: how much is done, 0 to 1, of a cell with its borders.
     """
 
