@@ -20,6 +20,17 @@ def psnr(image: torch.Tensor, target: torch.Tensor) -> float:
     return min(float(peak_signal_noise_ratio(to_8_bit(image), to_8_bit(target), data_range=1.0)), MOST_PSNR)
 
 
+def exposed_as(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """An image (H, W, 3) with the gain and offset of each channel that bring it closest to a target.
+
+    Least squares; what ``methods.exposure`` learns of a training view, found for one that was held out.
+    """
+    mean, goal = image.mean((0, 1)), target.mean((0, 1))
+    around = image - mean
+    gain = (around * (target - goal)).sum((0, 1)) / (around**2).sum((0, 1)).clamp_min(1e-12)
+    return around * gain + goal
+
+
 def ssim(image: torch.Tensor, target: torch.Tensor) -> float:
     """Structural similarity of (H, W, 3) images, 11x11 Gaussian window of sigma 1.5 (Wang et al. 2004)."""
     from torchmetrics.functional.image import structural_similarity_index_measure

@@ -114,12 +114,17 @@ class Evaluation:
     def _options(self) -> dict:
         return {"near": self.data.near, "antialias": self.antialias}
 
-    def psnrs(self, cameras: Sequence[Camera], shown_to: ShownTo) -> np.ndarray:
-        """The PSNR of each of some views with a photograph, in dB, (V,)."""
+    def psnrs(
+        self,
+        cameras: Sequence[Camera],
+        shown_to: ShownTo,
+        measure: Callable[[torch.Tensor, torch.Tensor], float | tuple[float, ...]] = psnr,
+    ) -> np.ndarray:
+        """The PSNR of each of some views with a photograph, in dB, (V,); or what else ``measure`` finds."""
         found = []
         for camera in cameras:
             splats, weights = shown_to(camera)
-            found.append(psnr(self.draw(splats, camera, weights), self.target(camera)))
+            found.append(measure(self.draw(splats, camera, weights), self.target(camera)))
         return np.array(found)
 
     def measure(self, render: Callable[[Camera], Rendering], count: Callable[[Camera], int]) -> dict:
