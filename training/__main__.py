@@ -167,6 +167,19 @@ def _parser() -> argparse.ArgumentParser:
     )
     capture.add_argument("--backend", default="auto", help="auto, cpu, cuda or reference")
 
+    scene = commands.add_parser(
+        "scene", help="what another program has exported of photographs and cameras, as a COLMAP scene"
+    )
+    scene.add_argument(
+        "--from", dest="source", type=Path, required=True, metavar="DIR",
+        help="folder of the export, told by what is in it: transforms.json (nerfstudio, instant-ngp, "
+        "NeRF-synthetic), Polycam, Record3D, Metashape XML, OpenMVG, Bundler",
+    )  # fmt: skip
+    scene.add_argument(
+        "--out", type=Path, metavar="DIR",
+        help="folder that becomes the scene; otherwise the model is put beside the photographs",
+    )  # fmt: skip
+
     model = commands.add_parser(
         "model", help="views that Blender captured of its own scene, as the COLMAP model of their folder"
     )
@@ -439,6 +452,16 @@ def _capture(chosen: argparse.Namespace) -> int:
     return 0
 
 
+def _scene(chosen: argparse.Namespace) -> int:
+    from .scenes.formats import convert
+
+    made = convert(chosen.source, chosen.out)
+    for message in made.warnings:
+        _warn(message)
+    print(f"{made.folder}: {made.views} views, {made.points:,} points, from {made.what}")
+    return 0
+
+
 def _model(chosen: argparse.Namespace) -> int:
     from .scenes.rendered import write_model
 
@@ -560,6 +583,7 @@ _COMMANDS = {
     "evaluate": _evaluate,
     "render": _render,
     "capture": _capture,
+    "scene": _scene,
     "model": _model,
     "serve": _serve,
     "transform": _transform,

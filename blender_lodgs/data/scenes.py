@@ -24,6 +24,7 @@ from ...training.lod.rule import Control, Tables, find_rule
 from ...training.lod.selection import complete, known_rule, not_alone, unknown_rule
 from ...training.methods import METHODS
 from ...training.scenes.colmap import Scene, read_scene
+from ...training.scenes.formats import colmap_scene
 from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder, read_head
 from ...training.splats.gaussians import Splats
 from ..nodes import ellipsoids
@@ -89,7 +90,8 @@ def import_colmap(
     Where the Blender scene has no camera, the first view becomes its camera and gives the render its size.
 
     Args:
-        folder: the scene's folder, or that of a model in it.
+        folder: the scene's folder, or that of a model in it; or another program's export, which is then made
+            a COLMAP scene (``formats.colmap_scene``).
         model: folder of the model; by default the largest one. Training takes the same one.
         images: folder of the photographs; by default found beside the model. Training takes the same one.
         upright: turn the root so that the cameras' mean up direction is +z; otherwise leave COLMAP's axes.
@@ -106,7 +108,8 @@ def import_colmap(
     manager.progress_begin(0, 1)  # at the mouse pointer
     try:
         model, images = (Path(path) if path else None for path in (model, images))
-        scene = read_scene(Path(folder), model, images, manager.progress_update)
+        folder = Path(folder) if model else colmap_scene(Path(folder), warn)
+        scene = read_scene(folder, model, images, manager.progress_update)
     finally:
         manager.progress_end()
     for message in scene.warnings:

@@ -19,7 +19,8 @@ class LODGS_OT_import_colmap(bpy.types.Operator):
 
     directory: bpy.props.StringProperty(
         name="Folder",
-        description="Folder of the COLMAP scene: photographs and sparse model",
+        description="Folder of the COLMAP scene, with photographs and sparse model; or of what nerfstudio, "
+        "Polycam, Record3D, Metashape, OpenMVG or Bundler have exported",
         subtype="DIR_PATH",
     )
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})

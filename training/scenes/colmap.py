@@ -259,7 +259,7 @@ def without(scene: Scene, reasons: dict[str, str]) -> Scene:
         scene,
         cameras=kept,
         distorted=[name for name in scene.distorted if name not in reasons],
-        warnings=[*scene.warnings, *_told(list(reasons.items()))],
+        warnings=[*scene.warnings, *told(list(reasons.items()))],
     )
 
 
@@ -296,7 +296,8 @@ def _largest_model(folder: Path, warnings: list[str]) -> Path:
     if not models:
         raise LodgsError(
             f"{folder} holds no COLMAP model.",
-            "Choose a folder with sparse/0/cameras.bin, images.bin and points3D.bin (or .txt).",
+            "Choose a folder with sparse/0/cameras.bin, images.bin and points3D.bin (or .txt), or make one "
+            "of another program's export: lodgs scene --from DIR --out DIR.",
         )
     views = [registered(model) for model in models]
     for model, count in zip(models, views, strict=True):
@@ -363,7 +364,7 @@ class _Views:
 
     def warnings(self, folder: Path) -> list[str]:
         """What is odd, in few sentences however many views there are."""
-        found = _told(self.left_out)
+        found = told(self.left_out)
         match self._missing:
             case []:
                 pass
@@ -381,7 +382,7 @@ class _Views:
         return found
 
 
-def _told(left_out: Sequence[tuple[str, str]]) -> list[str]:
+def told(left_out: Sequence[tuple[str, str]]) -> list[str]:
     """Names and reasons as sentences; many are summed up."""
     found = [f"{_shown(name)} is left out: {why}" for name, why in left_out[:NAMED]]
     if len(left_out) > NAMED:

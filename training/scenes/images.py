@@ -30,9 +30,10 @@ _START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height in pixels of a JPEG, PNG or EXR file, from its header; EXIF rotation is ignored.
+    """Width and height in pixels of a photograph, from its header; EXIF rotation is ignored.
 
-    The kind is told by the file's content, not by its name. The size of an EXR is its display window.
+    The kind, JPEG, PNG, TIFF, WebP or EXR, is told by the file's content, not by its name. The size of an EXR
+    is its display window, that of a TIFF its first picture's.
 
     Raises:
         LodgsError: the file is missing, no regular file, empty, of another kind, cut short, or of no size
@@ -59,7 +60,11 @@ def _size(path: Path, file: IO[bytes]) -> tuple[int, int]:
         return _png_size(file)
     if head[:4] == MAGIC:
         return exr_size(file)
-    raise LodgsError(f"{path} is not a JPEG, PNG or EXR image.", "Convert it to one of these.")
+    if head[:4] in (b"II*\0", b"MM\0*"):
+        return _tiff_size(file, "<" if head[:2] == b"II" else ">")
+    if head[:4] == b"RIFF":
+        return _webp_size(file)
+    raise LodgsError(f"{path} is not a JPEG, PNG, TIFF, WebP or EXR image.", "Convert it to one of these.")
 
 
 def _checked(path: Path, size: tuple[int, int]) -> tuple[int, int]:
@@ -109,6 +114,40 @@ def _png_size(file) -> tuple[int, int]:
     return width, height
 
 
+def _tiff_size(file, order: str) -> tuple[int, int]:
+    """From the first directory; 16-bit tags 256 and 257, whose values are of 16 or 32 bits (TIFF 6.0)."""
+    file.seek(4)
+    (directory,) = struct.unpack(order + "I", file.read(4))
+    file.seek(directory)
+    (count,) = struct.unpack(order + "H", file.read(2))
+    found = {}
+    for _ in range(count):
+        tag, kind, _, value = struct.unpack(order + "HHI4s", file.read(12))
+        if tag in (256, 257):
+            found[tag] = struct.unpack(order + ("H2x" if kind == 3 else "I"), value)[0]
+    return found[256], found[257]
+
+
+def _webp_size(file) -> tuple[int, int]:
+    """From the first chunk, whose kind says where it stands (RFC 9649); the file is as long as it says."""
+    file.seek(4)
+    length, kind, chunk = struct.unpack("<I4s4s", file.read(12))
+    if kind != b"WEBP":
+        raise ValueError
+    body = file.read(14)[4:]
+    file.seek(0, 2)
+    if file.tell() < length + 8:
+        raise Truncated
+    if chunk == b"VP8 ":
+        width, height = struct.unpack("<6xHH", body)
+        return width & 0x3FFF, height & 0x3FFF
+    if chunk == b"VP8L":
+        (packed,) = struct.unpack("<xI5x", body)
+        return (packed & 0x3FFF) + 1, (packed >> 14 & 0x3FFF) + 1
+    across, down = body[4:7], body[7:10]
+    return int.from_bytes(across, "little") + 1, int.from_bytes(down, "little") + 1
+
+
 def _expect_end(file, marker: bytes) -> None:
     """The marker ends the file or, before what some cameras append, stands somewhere after this place."""
     here = file.tell()
@@ -140,7 +179,7 @@ def load_image(path: Path, width: int, height: int, exposure: float = 0.0) -> np
     """An image at the given size, (height, width, 3) float32 in [0, 1], display (sRGB) coded.
 
     Sizes below the file's are area averages (each pixel the mean of the rectangle that it covers: an exact
-    2x2 box at half size). JPEG and PNG are averaged as they are coded; an EXR is taken as linear, averaged
+    2x2 box at half size). All but EXR are averaged as they are coded; an EXR is taken as linear, averaged
     so, multiplied by 2**exposure and coded by the sRGB transfer function (IEC 61966-2-1). Alpha is ignored
     and grey becomes RGB.
 
@@ -188,7 +227,7 @@ def _opened(path: Path, width: int, height: int, large: int) -> Iterator[_Source
             from PIL import Image
 
             file.seek(0)
-            with Image.open(file, formats=("JPEG", "PNG")) as image:
+            with Image.open(file, formats=("JPEG", "PNG", "TIFF", "WEBP")) as image:
                 if image.width * image.height > large:
                     image.draft(None, (2 * width, 2 * height))
                     times = min(image.width // (2 * width), image.height // (2 * height))
