@@ -20,6 +20,9 @@ from .exr import MAGIC, Truncated, exr_size, read_parts
 MOST_PIXELS = 178_956_970
 """Pixels of an image that is read: Pillow opens no larger ones, which take it 4 bytes a pixel."""
 
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
+"""How names of photographs end, in lower case; beside ``.exr``, which only renderers write."""
+
 _LARGE = 1 << 25
 """Pixels from which on a JPEG is not decoded larger than twice the size that is needed."""
 _STRIP = 1 << 20

@@ -1,30 +1,21 @@
-"""Distorted photographs made pinhole, by COLMAP through pycolmap: for the trainer's environment only.
-
-pycolmap runs in a process of its own, because Pillow, which the trainer uses, corrupts memory beside it.
-"""
+"""Distorted photographs made pinhole, by COLMAP through pycolmap: for the trainer's environment only."""
 
 from __future__ import annotations
 
 import hashlib
-import json
 import os
-import subprocess
 import sys
 import tempfile
-import threading
-import time
 from collections import defaultdict
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 from ..errors import LodgsError
+from . import apart
 from .colmap import Scene, read_scene
 
 _VERSION = b"1"  # of what is kept in the cache
-_ROOM = 1 << 18  # bytes that are still free on a disk that is not full
-LOOKS = 2.0
-"""Seconds between two looks at whether the disk is full."""
 
 
 def undistorted(scene: Scene, cache: Path) -> Scene:
@@ -79,27 +70,10 @@ def _undistort_into(target: Path, scene: Scene) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix="undistorting-") as work:
         request["work"] = work
-        package = Path(__file__).resolve().parents[1]  # training, or lodgs where pip has installed it
-        with subprocess.Popen(
-            [sys.executable, "-m", f"{package.name}.scenes.undistort"],
-            cwd=package.parent,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            encoding="utf-8",
-            errors="replace",
-        ) as child:
-            threading.Thread(target=_end_without_room, args=(child, Path(work)), daemon=True).start()
-            try:
-                problems = _converse(child, json.dumps(request))
-            except BaseException:
-                child.kill()
-                raise
-        _require_room(Path(work))
-        if child.returncode:
-            lines = problems.strip().splitlines() or [f"exit code {child.returncode}"]
+        problem = apart.run_apart("undistort", request, Path(work))
+        if problem:
             raise LodgsError(
-                f"The lens distortion of {scene.folder} could not be undone: {lines[-1]}",
+                f"The lens distortion of {scene.folder} could not be undone: {problem}",
                 "Check the trainer's environment and the free space, or give an undistorted scene "
                 "(colmap image_undistorter).",
             )
@@ -110,55 +84,8 @@ def _undistort_into(target: Path, scene: Scene) -> None:
                 raise
 
 
-def _end_without_room(child: subprocess.Popen[str], folder: Path) -> None:
-    """Ends a program when the disk that it writes to is full: COLMAP's threads may wait for good then."""
-    while child.poll() is None:
-        try:
-            _require_room(folder)
-        except OSError:
-            child.kill()
-        time.sleep(LOOKS)
-
-
-def _require_room(folder: Path) -> None:
-    """Raises OSError where a disk is full: COLMAP crashes then, or hangs, or writes half a photograph."""
-    with tempfile.TemporaryFile(dir=folder) as file:
-        file.write(os.urandom(_ROOM))
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def _converse(child: subprocess.Popen[str], request: str) -> str:
-    """Sends a program its request in a line and returns what it said on standard error when it has ended.
-
-    Its standard input stays open until then: the program ends when that is closed, as it is however this
-    process ends.
-    """
-    assert child.stdin is not None and child.stderr is not None
-    with suppress(OSError):  # it has ended already, and said why
-        child.stdin.write(request + "\n")
-        child.stdin.flush()
-    problems = child.stderr.read()
-    child.wait()
-    with suppress(OSError):
-        child.stdin.close()
-    return problems
-
-
-def _end_with_parent() -> None:
-    """Ends this process as soon as its standard input is closed."""
-
-    def wait() -> None:
-        while os.read(0, 4096):
-            pass
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
-
-
 def _main() -> None:
-    request = json.loads(sys.stdin.readline())
-    _end_with_parent()
+    request = apart.request()
     try:
         import pycolmap
     except ImportError as error:

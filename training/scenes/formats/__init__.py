@@ -7,7 +7,6 @@ Each format is a file here with ``NAME``, ``find`` and ``read``; nothing else kn
 from __future__ import annotations
 
 import os
-import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from types import ModuleType
 import numpy as np
 
 from ...errors import LodgsError
+from ...files import link_or_copy
 from ..cameras import Camera
 from ..colmap import find_models, told
 from ..images import image_size
@@ -175,7 +175,7 @@ def _write(scene: Path, views: list[View], points: np.ndarray, colors: np.ndarra
     images, sparse = Path(os.path.commonpath([view.image.parent for view in views])), scene / "sparse"
     if not images.is_relative_to(scene):
         for view in views:
-            _link(view.image, scene / "images" / view.image.relative_to(images))
+            link_or_copy(view.image, scene / "images" / view.image.relative_to(images))
     elif image_folder(scene, sparse / "0", [view.image.name for view in views]) != images:
         images = scene
     sparse.mkdir(parents=True, exist_ok=True)
@@ -185,14 +185,3 @@ def _write(scene: Path, views: list[View], points: np.ndarray, colors: np.ndarra
         poses = [(view.image.relative_to(images).as_posix(), view.world_to_camera) for view in views]
         write_model(model, lenses, poses, points, colors)
         os.replace(model, sparse / "0")
-
-
-def _link(source: Path, target: Path) -> None:
-    """The same file where the disk can have it twice, else a copy."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if target.exists():
-        return
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copyfile(source, target)

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import LodgsError
-from .views import IMAGES, Exported, View, lens_of, number, numbers, read_document, world_to_camera
+from ..images import SUFFIXES
+from .views import Exported, View, lens_of, number, numbers, read_document, world_to_camera
 
 NAME = "Record3D"
 
@@ -34,7 +35,7 @@ def read(path: Path) -> Exported:
         lens = lens_of(number(told, "w"), number(told, "h"), (focal_x, focal_y), (center[0], center[1]))
     except LodgsError as error:
         raise LodgsError(f"{path} is damaged: {error.what}", "Export it again.") from error
-    files = [file for file in (path.parent / "rgb").iterdir() if file.suffix in IMAGES]
+    files = [file for file in (path.parent / "rgb").iterdir() if file.suffix.lower() in SUFFIXES]
     files.sort(key=lambda file: (len(file.stem), file.stem))
     views, left_out = [], []
     for place, pose in enumerate(poses):

@@ -12,13 +12,14 @@ import numpy as np
 from ...documents import read_json
 from ...errors import LodgsError
 from ..cameras import Camera
+from ..images import SUFFIXES
 from ..model import Intrinsics, intrinsics
 
 MOST_JSON = 1 << 26
 """Bytes of a JSON file that is read: of 5,000 views it has some 4 million."""
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """From OpenCV's camera axes to OpenGL's (x right, y up, looking along -z), or back."""
-IMAGES = ".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".exr"
+_ENDINGS = *SUFFIXES, ".exr", *(suffix.upper() for suffix in SUFFIXES)
 _NO_POINTS = np.zeros((0, 3))
 
 
@@ -160,7 +161,7 @@ def find_image(folder: Path, name: str) -> Path:
     parts = [part for part in name.replace("\\", "/").split("/") if part not in ("", ".", "..")]
     there = [folder.joinpath(*parts[start:]) for start in range(len(parts))] or [folder]
     for place in there:
-        for each in (place, *(place.with_name(place.name + ending) for ending in IMAGES)):
+        for each in (place, *(place.with_name(place.name + ending) for ending in _ENDINGS)):
             if each.is_file():
                 return each
     return there[0]
