@@ -1,6 +1,6 @@
 """From photographs alone to a COLMAP scene: where each was taken, by COLMAP through pycolmap.
 
-out/  images/    the photographs, links or copies
+out/  images/    the photographs, links or copies; WebP, which pycolmap does not read, as PNG
       sparse/0/  the model
       colmap/    what COLMAP knows of them, from which it goes on; pairs.png, which photographs show the same
 """
@@ -24,7 +24,7 @@ from ..errors import LodgsError
 from ..files import atomic_write, link_or_copy
 from . import apart
 from .colmap import find_models, told
-from .images import SUFFIXES, image_size, write_png
+from .images import SUFFIXES, image_size, load_image, write_png
 
 PRESETS = {"draft": (1000, 2048), "standard": (1600, 4096)}
 """Pixels of the longer side in which features are looked for, and at most so many of a photograph."""
@@ -39,6 +39,7 @@ STAGES = {
     "cameras": "Photographs placed:",
 }
 
+_WEBP = ".webp"
 _TABLES = {"features": "descriptors", "pairs": "two_view_geometries"}
 """Of COLMAP's database, which have a row for each that is done."""
 _LOOKS = 0.5
@@ -122,8 +123,13 @@ def reconstruct(
 
     try:
         _begin(work, settings)
+        images = out / "images"
+        if photos.is_relative_to(out):
+            images = photos
+        else:
+            names = [_taken_over(photos, name, images) for name in names]
         asked = settings | {
-            "photos": str(photos), "names": names, "ordered": ordered, "work": str(work),
+            "photos": str(images), "names": names, "ordered": ordered, "work": str(work),
             "masks": str(_masks(masks, names, work)) if masks else "",
         }  # fmt: skip
         with progress:
@@ -136,10 +142,6 @@ def reconstruct(
             write_png(temporary, pairs_picture(names, found["pairs"], found["placed"]))
         if len(found["placed"]) < FEWEST:
             raise LodgsError(*_nothing(names, found, work))
-        images = out / "images"
-        if not photos.resolve().is_relative_to(out.resolve()):
-            for name in names:
-                link_or_copy(photos / name, images / name)
         (out / "sparse").mkdir(exist_ok=True)
         shutil.rmtree(out / "sparse" / "0", ignore_errors=True)
         os.replace(work / "model", out / "sparse" / "0")
@@ -235,6 +237,20 @@ def _photographs(
         else:
             names.append(name)
     return names, left_out, sizes
+
+
+def _taken_over(photos: Path, name: str, images: Path) -> str:
+    """Puts a photograph into the scene's folder; its name there."""
+    if not name.lower().endswith(_WEBP):
+        link_or_copy(photos / name, images / name)
+        return name
+    name_there = f"{name}.png"
+    if not (images / name_there).exists():
+        width, height = image_size(photos / name)
+        codes = np.rint(255 * load_image(photos / name, width, height)).astype(np.uint8)
+        with atomic_write(images / name_there) as temporary:
+            write_png(temporary, codes)
+    return name_there
 
 
 def _begin(work: Path, settings: Mapping[str, object]) -> None:
