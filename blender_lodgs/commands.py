@@ -23,6 +23,7 @@ from ..training.splats.bundle import write_bundle
 from . import extension
 from .data import scenes, viewpoints
 from .render.capture import render_views, write_model
+from .render.video import MOST_FRAMES, extract_frames
 from .runs import environment, jobs
 from .runs.watch import Watch
 from .runs.words import duration, level_line
@@ -109,6 +110,16 @@ def _parser() -> argparse.ArgumentParser:
         "--range", type=_range, metavar="A-B", help="render only these views, from 1 on, and make no model: "
         "for several computers, before one does the same without it",
     )  # fmt: skip
+
+    frames = commands.add_parser(
+        "frames", help="sharp frames of a video, from which lodgs scene --photos --ordered finds cameras"
+    )
+    frames.set_defaults(command=_frames)
+    frames.add_argument("video", type=Path, help="any video that Blender reads")
+    frames.add_argument("--out", type=Path, required=True, help="folder of the frames")
+    frames.add_argument(
+        "--most", type=int, default=MOST_FRAMES, metavar="N", help=f"at most so many ({MOST_FRAMES})"
+    )
 
     info = commands.add_parser("info", help="say what a bundle or any 3DGS PLY holds")
     info.set_defaults(command=_info)
@@ -213,6 +224,21 @@ def _capture(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         _print("Cancelled. The same command goes on from here.")
         return CANCELLED
+    return DONE
+
+
+def _frames(args: argparse.Namespace) -> int:
+    if args.most < 2:
+        raise LodgsError(f"{args.most} frames make no scene.", "Ask for some dozens with --most.")
+    if not args.video.is_file():
+        raise LodgsError(f"There is no file {args.video}.", "Choose a video.")
+
+    def tell(number: int, count: int) -> None:
+        _print(f"Frames of the video: {number} of {count}")
+
+    folder = args.out.resolve()
+    count = extract_frames(args.video.resolve(), folder, args.most, tell)
+    _print(f"{folder}: {count} frames")
     return DONE
 
 

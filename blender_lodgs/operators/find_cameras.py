@@ -22,16 +22,20 @@ class LODGS_OT_find_cameras(bpy.types.Operator):
     bl_idname = "lodgs.find_cameras"
     bl_label = "Import Photographs"
     bl_description = (
-        "Find from where a folder of photographs was taken, while you work on, and import them as a scene. "
-        "It takes minutes; stopped, it goes on from there"
+        "Find from where a folder of photographs, or a video, was taken, while you work on, and import them "
+        "as a scene. It takes minutes; stopped, it goes on from there"
     )
     bl_options = {"REGISTER", "PRESET"}
 
+    filepath: bpy.props.StringProperty(
+        name="Video", description="A video, instead of a folder of photographs", subtype="FILE_PATH"
+    )
     directory: bpy.props.StringProperty(
         name="Folder", description="Folder of the photographs, and of folders of them", subtype="DIR_PATH"
     )
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
     filter_image: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
+    filter_movie: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
     out: bpy.props.StringProperty(
         name="Scene",
         description="Folder that becomes the COLMAP scene; empty for one beside the photographs' folder",
@@ -59,7 +63,10 @@ class LODGS_OT_find_cameras(bpy.types.Operator):
     @report_errors
     def execute(self, context):
         photos = Path(bpy.path.abspath(self.directory)).resolve()
-        beside = photos.with_name(f"{photos.name}_scene")
+        video = Path(bpy.path.abspath(self.filepath)).resolve() if self.filepath else photos
+        if video.is_file() and video.suffix.lower() in bpy.path.extensions_movie:
+            photos = video
+        beside = photos.with_name(f"{photos.stem if photos.is_file() else photos.name}_scene")
         out = Path(bpy.path.abspath(self.out)).resolve() if self.out else beside
         lens = "" if self.lens == "AUTO" else self.lens
         work = reconstructing.start(photos, out, self.preset, self.ordered, lens)

@@ -29,10 +29,12 @@ class Reconstructing:
         warnings: a sentence for each thing that is odd in it.
     """
 
-    def __init__(self, folder: Path, process: subprocess.Popen, log: Path) -> None:
+    def __init__(self, folder: Path, commands: list[list[str]]) -> None:
         self.folder, self.message, self.fraction, self.problem = folder, "Looking at the photographs", 0.0, ""
         self.running, self.root, self.warnings = True, None, list[str]()
-        self._process, self._log, self._cancelled = process, log, False
+        self._commands, self._log, self._cancelled = commands, folder / "colmap.log", False
+        self._log.unlink(missing_ok=True)
+        self._process = self._next()
 
     def cancel(self) -> None:
         """Stops it; the same again goes on from there."""
@@ -42,6 +44,8 @@ class Reconstructing:
     def step(self) -> bool:
         """For ``processes.follow``: show what is new, import at the end; return whether it goes on."""
         code, last = self._process.poll(), processes.last_lines(self._log)[-1:]
+        if code == 0 and self._commands and not self._cancelled:
+            self._process, code = self._next(), None
         self.running = code is None
         if code is None and last and (told := _TOLD.match(last[0])):
             self.message, self.fraction = last[0], int(told[2]) / max(int(told[3]), 1)
@@ -52,6 +56,9 @@ class Reconstructing:
             self.problem = "" if self._cancelled else processes.problem_of(self._log, code)
         extension.redraw()
         return self.running
+
+    def _next(self) -> subprocess.Popen:
+        return processes.spawn(self._commands.pop(0), self._log, self._log.with_suffix(".out"))
 
     def _import(self) -> None:
         words = processes.last_lines(self._log.with_suffix(".out"))
@@ -77,7 +84,7 @@ def start(
     """Begin to find the cameras of photographs, or go on with it.
 
     Args:
-        photos: their folder.
+        photos: their folder, or a video, of which frames are taken first.
         folder: that becomes the COLMAP scene.
         preset, ordered, lens: see ``reconstruct``.
 
@@ -89,18 +96,20 @@ def start(
         raise LodgsError("Cameras of photographs are being found already.", "Wait for that or cancel it.")
     python = environment.trainer_python()
     environment.require(python)
-    log = folder / "colmap.log"
+    commands = []
+    if photos.is_file():
+        video, photos, ordered, lens = photos, folder / "images", True, "one"
+        command = [bpy.app.binary_path, "--command", "lodgs", "frames", str(video), "--out", str(photos)]
+        commands.append(command)
     command = [str(python), "-m", "training", "scene", "--photos", str(photos), "--out", str(folder)]
     command += ["--preset", preset, *(["--ordered"] if ordered else []), *(["--lens", lens] if lens else [])]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        log.unlink(missing_ok=True)
-        process = processes.spawn(command, log=log, output=log.with_suffix(".out"))
+        current = Reconstructing(folder, [*commands, command])
     except OSError as error:
         raise LodgsError(
             f"{folder} cannot be written: {error.strerror or error}.", "Choose another folder."
         ) from error
-    current = Reconstructing(folder, process, log)
     return current
 
 
