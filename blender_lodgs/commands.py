@@ -20,11 +20,12 @@ from ..training.runs.folder import RunFolder
 from ..training.runs.job import Job, check_views
 from ..training.runs.options import add_options, job_from, size_of
 from ..training.splats.bundle import write_bundle
+from ..training.splats.dialects import Warn
 from . import extension
 from .data import scenes, viewpoints
 from .render.capture import render_views, write_model
 from .render.video import MOST_FRAMES, extract_frames
-from .runs import environment, jobs
+from .runs import environment, jobs, preparing
 from .runs.watch import Watch
 from .runs.words import duration, level_line
 
@@ -164,9 +165,16 @@ def _imported(job: Job) -> bpy.types.Object:
         _print(f"warning: {message}")
 
     if not job.capture:
-        return scenes.import_colmap(bpy.context, Path(job.scene), warn=warn)
+        return _photographed(Path(job.scene), warn)
     run = RunFolder(job.base)
     return scenes.import_splats(bpy.context, run.bundle if run.bundle.exists() else run.path, warn=warn)
+
+
+def _photographed(folder: Path, warn: Warn) -> bpy.types.Object:
+    """A COLMAP scene, its photographs straightened where their lens bends lines."""
+    root = scenes.import_colmap(bpy.context, folder, warn=warn)
+    preparing.straighten(root, warn)
+    return root
 
 
 def _methods(args: argparse.Namespace) -> int:
@@ -177,7 +185,7 @@ def _methods(args: argparse.Namespace) -> int:
 def _import(args: argparse.Namespace) -> int:
     _empty_file()
     if args.source.is_dir():
-        scenes.import_colmap(bpy.context, args.source.resolve(), warn=lambda m: _print(f"warning: {m}"))
+        _photographed(args.source.resolve(), lambda m: _print(f"warning: {m}"))
     else:
         scenes.import_splats(bpy.context, args.source.resolve(), warn=lambda m: _print(f"warning: {m}"))
     _save(args.blend)

@@ -202,6 +202,13 @@ def _parser() -> argparse.ArgumentParser:
         help="pictures that are black where nothing is to be recognised: of a.jpg a.jpg.png, or a.png",
     )  # fmt: skip
 
+    undistort = commands.add_parser(
+        "undistort", help="undo a scene's lens distortion once, for all runs and for Blender"
+    )
+    undistort.add_argument("scene", type=Path, help="COLMAP folder")
+    undistort.add_argument("--model", type=Path, metavar="DIR", help="folder of its model")
+    undistort.add_argument("--images", type=Path, metavar="DIR", help="folder of its photographs")
+
     model = commands.add_parser(
         "model", help="views that Blender captured of its own scene, as the COLMAP model of their folder"
     )
@@ -505,6 +512,18 @@ def _reconstruct(chosen: argparse.Namespace) -> int:
     return 0
 
 
+def _undistort(chosen: argparse.Namespace) -> int:
+    from .scenes.colmap import read_scene
+    from .scenes.undistort import CACHE, undistorted
+
+    scene = read_scene(chosen.scene, chosen.model, chosen.images)
+    found = undistorted(scene, scene.folder / CACHE)
+    for message in found.warnings:
+        _warn(message)
+    print(f"{found.images_folder}: {len(found.cameras)} photographs, {len(scene.distorted)} straightened")
+    return 0
+
+
 def _model(chosen: argparse.Namespace) -> int:
     from .scenes.rendered import write_model
 
@@ -627,6 +646,7 @@ _COMMANDS = {
     "render": _render,
     "capture": _capture,
     "scene": _scene,
+    "undistort": _undistort,
     "model": _model,
     "serve": _serve,
     "transform": _transform,

@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 
 from ...training.scenes.reconstruct import PRESETS
-from ..runs import processes, reconstructing
+from ..runs import preparing, processes
 from .parts import report_errors
 
 _LENSES = (
@@ -69,7 +69,7 @@ class LODGS_OT_find_cameras(bpy.types.Operator):
         beside = photos.with_name(f"{photos.stem if photos.is_file() else photos.name}_scene")
         out = Path(bpy.path.abspath(self.out)).resolve() if self.out else beside
         lens = "" if self.lens == "AUTO" else self.lens
-        work = reconstructing.start(photos, out, self.preset, self.ordered, lens)
+        work = preparing.find_cameras(photos, out, self.preset, self.ordered, lens)
         processes.follow(work.step)
         for message in work.warnings:
             self.report({"WARNING"}, message)
@@ -88,11 +88,11 @@ class LODGS_OT_cancel_find_cameras(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return reconstructing.current is not None and reconstructing.current.running
+        return preparing.current is not None and preparing.current.running
 
     def execute(self, context):
-        assert reconstructing.current is not None
-        reconstructing.current.cancel()
+        assert preparing.current is not None
+        preparing.current.cancel()
         return {"FINISHED"}
 
 

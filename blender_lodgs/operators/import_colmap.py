@@ -7,6 +7,7 @@ from pathlib import Path
 import bpy
 
 from ..data import photographs, scenes
+from ..runs import preparing
 from .parts import report_errors
 
 
@@ -50,6 +51,7 @@ class LODGS_OT_import_colmap(bpy.types.Operator):
             photographs=self.photographs,
             warn=warn,
         )
+        preparing.straighten(root, warn)
         if first:  # otherwise the artist is looking at something
             photographs.look_at_scene(context, root, warn)
         self.report({"INFO"}, f"'{root.name}': {scenes.contents(root)}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..data import photographs, scenes
-from ..runs import reconstructing
+from ..runs import preparing
 from .parts import Panel, say, split_column
 
 
@@ -51,7 +51,7 @@ class LODGS_PT_scene(Panel):
 
 def _draw_finding(column: bpy.types.UILayout) -> None:
     """How far the cameras of photographs are found, or how it went."""
-    work = reconstructing.current
+    work = preparing.current
     if work is None:
         return
     if work.running:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 import sys
 import tempfile
+import time
 from collections import defaultdict
 from contextlib import suppress
 from dataclasses import replace
@@ -15,15 +17,19 @@ from ..errors import LodgsError
 from . import apart
 from .colmap import Scene, read_scene
 
-_VERSION = b"1"  # of what is kept in the cache
+CACHE = ".undistorted"
+"""Folder in a scene's of what is made of it once, for all runs and for Blender."""
+_VERSION = b"2"  # of what is kept in the cache
+_LEFT = 86_400.0
+"""Seconds after which what is half done in a cache is nobody's."""
 
 
 def undistorted(scene: Scene, cache: Path) -> Scene:
     """The scene with every lens undone: all views pinhole, `distorted` empty, the world unchanged.
 
-    Photographs and model are written into a folder of `cache` that is named after their content, and taken
-    from there the next time; it appears whole or not at all. A scene without distorted views is returned as
-    it is. Undistorted images are cropped so that no pixel is empty (COLMAP's blank_pixels = 0).
+    Photographs and model are written into a folder of `cache` that is named after them, and taken from there
+    the next time; it appears whole or not at all. A scene without distorted views is returned as it is.
+    Undistorted images are cropped so that no pixel is empty (COLMAP's blank_pixels = 0).
 
     Raises:
         LodgsError: pycolmap is missing or fails, one camera's photographs have several sizes, or the cache
@@ -32,32 +38,69 @@ def undistorted(scene: Scene, cache: Path) -> Scene:
     if not scene.distorted:
         return scene
     try:
-        target = Path(cache) / _content_key(scene)
+        target = cache / _key(scene)
         if not target.is_dir():
+            _remove_left(cache)
             _undistort_into(target, scene)
     except OSError as error:
         raise LodgsError(
             f"The lens distortion of {scene.folder} could not be undone: {error.strerror or error}.",
             "Check the images and the free space.",
         ) from error
+    return _read(target, scene)
+
+
+def cache_of(scene: Scene, otherwise: Path) -> Path:
+    """The cache beside a scene's photographs; another folder, where that may not be written to."""
+    cache = scene.folder / CACHE
+    try:
+        cache.mkdir(exist_ok=True)
+        with tempfile.TemporaryFile(dir=cache):
+            return cache
+    except OSError:
+        return otherwise
+
+
+def already_undistorted(scene: Scene) -> Scene | None:
+    """As :func:`undistorted`, where that was done before and is kept with the scene; else None.
+
+    Raises:
+        LodgsError: what is kept is damaged.
+    """
+    if not scene.distorted:
+        return scene
+    try:
+        target = scene.folder / CACHE / _key(scene)
+        return _read(target, scene) if target.is_dir() else None
+    except OSError:
+        return None
+
+
+def _read(target: Path, scene: Scene) -> Scene:
     result = read_scene(target, model=target / "sparse", images=target / "images")
     missing = {camera.name for camera in scene.cameras} - {camera.name for camera in result.cameras}
     lost = [f"{name} is left out: its lens distortion could not be undone." for name in sorted(missing)]
     return replace(result, warnings=[*scene.warnings, *lost])
 
 
-def _content_key(scene: Scene) -> str:
-    """A digest of the model's files and of every photograph with its name."""
+def _key(scene: Scene) -> str:
+    """A digest of names, sizes and times of the model's files and of every photograph."""
     digest = hashlib.blake2b(_VERSION, digest_size=16)
     model = sorted(path for path in scene.model.iterdir() if path.suffix in (".bin", ".txt"))
     files = [(path.name, path) for path in model]
     files += [(camera.name, camera.image) for camera in scene.cameras if camera.image is not None]
     for name, path in files:
-        digest.update(f"{name}\0{path.stat().st_size}\0".encode("utf-8", "surrogateescape"))
-        with path.open("rb") as file:
-            while block := file.read(1 << 20):
-                digest.update(block)
+        status = path.stat()
+        text = f"{name}\0{status.st_size}\0{status.st_mtime_ns}\0"
+        digest.update(text.encode("utf-8", "surrogateescape"))
     return digest.hexdigest()
+
+
+def _remove_left(cache: Path) -> None:
+    """Removes what killed programs have left half done."""
+    for left in cache.glob("undistorting-*"):
+        if time.time() - left.stat().st_mtime > _LEFT:
+            shutil.rmtree(left, ignore_errors=True)
 
 
 def _undistort_into(target: Path, scene: Scene) -> None:

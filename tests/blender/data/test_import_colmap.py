@@ -175,7 +175,8 @@ def test_odd_scenes_import(bpy, lodgs, shared_scenes, name):
     assert len([o for o in root.children_recursive if o.type == "CAMERA"]) == len(scene.cameras) > 0
     assert bool([o for o in root.children_recursive if o.type == "POINTCLOUD"]) == bool(len(scene.points))
     assert all(message in told for message in scene.warnings)
-    assert bool(scene.distorted) == any("distortion" in message for message in told)
+    views = lodgs("data.photographs").views(root)
+    assert bool(scene.distorted) == any(view.data.lodgs.distorted for view in views)
 
 
 def test_failures_are_said_and_leave_nothing(bpy, lodgs, tmp_path, mini, monkeypatch):

@@ -96,5 +96,6 @@ def test_what_is_no_video(lodgs, tmp_path, content, capfd):
 
 def test_a_video_becomes_a_scene(bpy, lodgs, video, blender, tmp_path):
     assert bpy.ops.lodgs.find_cameras(filepath=str(video)) == {"FINISHED"}
-    work = lodgs("runs.reconstructing").current
-    assert work.folder == tmp_path / "walk_scene" and len(work.root.lodgs.cameras.objects) >= 4
+    work = lodgs("runs.preparing").current
+    assert work.root.lodgs.scene_folder == str(tmp_path / "walk_scene")
+    assert len(work.root.lodgs.cameras.objects) >= 4
