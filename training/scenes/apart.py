@@ -88,6 +88,18 @@ def request() -> dict:
     return found
 
 
+def load_pycolmap():
+    """pycolmap, which says what goes wrong on standard error and writes no log files; ends the program where
+    there is none."""
+    try:
+        import pycolmap
+    except ImportError as error:
+        sys.exit(f"pycolmap cannot be loaded: {error}.")
+    pycolmap.logging.logtostderr = True
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR.value)
+    return pycolmap
+
+
 def say(**values: object) -> None:
     """An object for whoever started this program."""
     print(json.dumps(values), flush=True)

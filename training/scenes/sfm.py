@@ -7,7 +7,6 @@ downloaded: without the path of a vocabulary COLMAP fetches one, and ends the pr
 from __future__ import annotations
 
 import shutil
-import sys
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,12 +35,7 @@ _SAMPLED = 60_000
 
 def _main() -> None:
     asked = apart.request()
-    try:
-        import pycolmap
-    except ImportError as error:
-        sys.exit(f"pycolmap cannot be loaded: {error}.")
-    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR.value)
-    pycolmap.set_random_seed(0)
+    apart.load_pycolmap().set_random_seed(0)
     work = Path(asked["work"])
     database = work / "database.db"
     say(stage="features", done=0, of=len(asked["names"]))

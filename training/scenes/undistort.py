@@ -129,10 +129,7 @@ def _undistort_into(target: Path, scene: Scene) -> None:
 
 def _main() -> None:
     request = apart.request()
-    try:
-        import pycolmap
-    except ImportError as error:
-        sys.exit(f"pycolmap cannot be loaded: {error}.")
+    pycolmap = apart.load_pycolmap()
     model = pycolmap.Reconstruction(request["model"])
     sizes = defaultdict(set)
     for image in model.images.values():
