@@ -24,10 +24,12 @@ from .model import (
     registered,
 )
 from .orientation import up_rotation
-from .photographs import Photographs, image_folder
+from .photographs import Masks, Photographs, image_folder
 
 ASTRAY = 1000
 """What lies so many times as far from the middle of the cameras as most cameras or points is an error."""
+MASKS = "masks"
+"""Folder beside that of the photographs."""
 NAMED = 5
 """Of so many views that are odd in one way each is named; more are summed up."""
 MOST_FOLDERS = 20_000
@@ -199,7 +201,7 @@ def read_scene(
     images = _absolute(images)
     if not images.is_dir():
         raise LodgsError(f"There is no image folder {images}.", "Choose the folder of the photographs.")
-    views = _Views(Photographs(images, folder))
+    views = _Views(Photographs(images, folder), Masks(images.parent / MASKS))
     for number, pose in enumerate(poses):
         if progress and number % 50 == 0:
             progress(0.5 * number / len(poses))
@@ -313,8 +315,8 @@ class _Views:
         left_out: names, and a sentence each.
     """
 
-    def __init__(self, files: Photographs) -> None:
-        self._files = files
+    def __init__(self, files: Photographs, masks: Masks) -> None:
+        self._files, self._masks = files, masks
         self._missing: list[str] = []
         self._reshaped: list[str] = []
         self.cameras: list[Camera] = []
@@ -334,7 +336,8 @@ class _Views:
                 self._missing.append(name)
                 return
             width, height = image_size(image)
-            camera = Camera(name, lens.width, lens.height, *lens.pinhole, pose.world_to_camera, image)
+            mask = self._masks.find(name)
+            camera = Camera(name, lens.width, lens.height, *lens.pinhole, pose.world_to_camera, image, mask)
             if (width, height) != (lens.width, lens.height):
                 camera = camera.resized(width, height)
             if flaw := camera.flaw:

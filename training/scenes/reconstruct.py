@@ -2,6 +2,7 @@
 
 out/  images/    the photographs, links or copies; WebP, which pycolmap does not read, as PNG
       sparse/0/  the model
+      masks/     of the photographs, where there are some: the same in training
       colmap/    what COLMAP knows of them, from which it goes on; pairs.png, which photographs show the same
 """
 
@@ -23,8 +24,9 @@ import numpy as np
 from ..errors import LodgsError
 from ..files import atomic_write, link_or_copy
 from . import apart
-from .colmap import find_models, told
+from .colmap import MASKS, find_models, told
 from .images import SUFFIXES, image_size, load_image, write_png
+from .photographs import Masks
 
 PRESETS = {"draft": (1000, 2048), "standard": (1600, 4096)}
 """Pixels of the longer side in which features are looked for, and at most so many of a photograph."""
@@ -130,7 +132,7 @@ def reconstruct(
             names = [_taken_over(photos, name, images) for name in names]
         asked = settings | {
             "photos": str(images), "names": names, "ordered": ordered, "work": str(work),
-            "masks": str(_masks(masks, names, work)) if masks else "",
+            "masks": str(_masks(masks, names, out)) if masks else "",
         }  # fmt: skip
         with progress:
             problem = apart.run_apart("sfm", asked, work, hear)
@@ -263,12 +265,11 @@ def _begin(work: Path, settings: Mapping[str, object]) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def _masks(masks: Path, names: Sequence[str], work: Path) -> Path:
+def _masks(masks: Path, names: Sequence[str], out: Path) -> Path:
     """A folder of masks as COLMAP names them."""
-    there = work / "masks"
+    there = out / MASKS
     for name in names:
-        given = (masks / f"{name}.png", (masks / name).with_suffix(".png"))
-        found = next((path for path in given if path.is_file()), None)
+        found = Masks(masks).find(name)
         if found is not None:
             link_or_copy(found, there / f"{name}.png")
     if not there.is_dir():

@@ -13,9 +13,12 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ..errors import LodgsError
 from . import apart
-from .colmap import Scene, read_scene
+from .colmap import MASKS, Scene, read_scene
+from .images import load_image, write_png
 
 CACHE = ".undistorted"
 """Folder in a scene's of what is made of it once, for all runs and for Blender."""
@@ -89,6 +92,7 @@ def _key(scene: Scene) -> str:
     model = sorted(path for path in scene.model.iterdir() if path.suffix in (".bin", ".txt"))
     files = [(path.name, path) for path in model]
     files += [(camera.name, camera.image) for camera in scene.cameras if camera.image is not None]
+    files += [(camera.name, camera.mask) for camera in scene.cameras if camera.mask is not None]
     for name, path in files:
         status = path.stat()
         text = f"{name}\0{status.st_size}\0{status.st_mtime_ns}\0"
@@ -113,6 +117,13 @@ def _undistort_into(target: Path, scene: Scene) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix="undistorting-") as work:
         request["work"] = work
+        masks = Path(work) / MASKS
+        for camera in scene.cameras:
+            if camera.mask is not None:
+                light = load_image(camera.mask, camera.width, camera.height)
+                path = masks / f"{camera.name}.png"
+                path.parent.mkdir(parents=True, exist_ok=True)
+                write_png(path, np.rint(255 * light).astype(np.uint8))
         problem = apart.run_apart("undistort", request, Path(work))
         if problem:
             raise LodgsError(
@@ -157,6 +168,17 @@ def _main() -> None:
         image_names=list(request["sizes"]),
         jpeg_quality=98,
     )
+    masks = work / MASKS
+    if masks.is_dir():  # bent like their photographs, whose names theirs begin with
+        for image in model.images.values():
+            image.name = f"{image.name}.png"
+        (work / "masked").mkdir()
+        model.write(str(work / "masked"))
+        names = [path.relative_to(masks).as_posix() for path in masks.rglob("*.png")]
+        pycolmap.undistort_images(
+            output_path=work / "straight", input_path=work / "masked", image_path=masks, image_names=names
+        )
+        (work / "straight" / "images").rename(work / "undistorted" / MASKS)
 
 
 if __name__ == "__main__":
