@@ -29,7 +29,7 @@ from .photographs import Masks, Photographs, image_folder
 ASTRAY = 1000
 """What lies so many times as far from the middle of the cameras as most cameras or points is an error."""
 MASKS = "masks"
-"""Folder beside that of the photographs."""
+"""Folder beside that of the photographs, or in the scene's where they are that."""
 NAMED = 5
 """Of so many views that are odd in one way each is named; more are summed up."""
 MOST_FOLDERS = 20_000
@@ -201,7 +201,9 @@ def read_scene(
     images = _absolute(images)
     if not images.is_dir():
         raise LodgsError(f"There is no image folder {images}.", "Choose the folder of the photographs.")
-    views = _Views(Photographs(images, folder), Masks(images.parent / MASKS))
+    views = _Views(
+        Photographs(images, folder), Masks((folder if images == folder else images.parent) / MASKS)
+    )
     for number, pose in enumerate(poses):
         if progress and number % 50 == 0:
             progress(0.5 * number / len(poses))

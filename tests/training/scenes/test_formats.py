@@ -305,6 +305,17 @@ def test_another_folder_gets_the_photographs_and_the_source_stays(tmp_path):
         convert(source, out)
 
 
+def test_masks_come_along(tmp_path):
+    def change(document):
+        document["frames"][1]["mask_path"] = "black/b.png"
+
+    write_transforms(tmp_path, change)
+    photographs(tmp_path / "black", ["b.png"])
+    convert(tmp_path)
+    masks = [camera.mask for camera in read_scene(tmp_path).cameras]
+    assert masks == [None, tmp_path / "masks" / "second photo.png.png", None]
+
+
 def test_random_points_are_seen_by_two_views(tmp_path):
     write_transforms(tmp_path)
     convert(tmp_path)

@@ -18,7 +18,7 @@ import numpy as np
 from ...errors import LodgsError
 from ...files import link_or_copy
 from ..cameras import Camera
-from ..colmap import find_models, told
+from ..colmap import MASKS, find_models, told
 from ..images import image_size
 from ..model import write_model
 from ..photographs import image_folder
@@ -179,6 +179,10 @@ def _write(scene: Path, views: list[View], points: np.ndarray, colors: np.ndarra
     elif image_folder(scene, sparse / "0", [view.image.name for view in views]) != images:
         images = scene
     sparse.mkdir(parents=True, exist_ok=True)
+    for view in views:
+        if view.mask is not None and view.mask.is_file():
+            name = view.image.relative_to(images).as_posix()
+            link_or_copy(view.mask, scene / MASKS / f"{name}.png")
     with tempfile.TemporaryDirectory(dir=sparse, prefix=".model-") as work:
         model = Path(work) / "0"
         lenses = [view.lens for view in views]

@@ -75,7 +75,8 @@ def _view(folder: Path, told: Mapping[str, Any]) -> View:
     tangential = number(told, "p1", 0), number(told, "p2", 0)
     lens = lens_of(width, height, (fx, fy), center, radial, tangential, fisheye)
     pose = numbers(told.get("transform_matrix"), -1, 4)
-    return View(image, lens, world_to_camera(pose, opengl=True))
+    mask = find_image(folder, told["mask_path"]) if isinstance(told.get("mask_path"), str) else None
+    return View(image, lens, world_to_camera(pose, opengl=True), mask)
 
 
 def _focal(angle: float, size: float) -> float:

@@ -31,11 +31,13 @@ class View:
         image: the file.
         lens: as COLMAP has it, for photographs of its size; of no size (0) where the program does not tell.
         world_to_camera: (4, 4), OpenCV axes.
+        mask: black where the photograph does not count; None: there is none.
     """
 
     image: Path
     lens: Intrinsics
     world_to_camera: np.ndarray
+    mask: Path | None = None
 
     def sized(self, width: int, height: int) -> View:
         """The same with the lens for photographs of that size; focal lengths scale with it."""
