@@ -78,7 +78,8 @@ def _light(path: Path) -> np.ndarray:
     """The green of a picture, (H, W) float32."""
     image = bpy.data.images.load(str(path))
     try:
-        (width, height), pixels = image.size, np.empty(len(image.pixels), np.float32)
+        width, height = tuple(image.size)
+        pixels = np.empty(len(image.pixels), np.float32)
         image.pixels.foreach_get(pixels)
         return pixels.reshape(height, width, -1)[..., 1]
     finally:
