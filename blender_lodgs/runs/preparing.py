@@ -109,7 +109,7 @@ def find_cameras(
     def finish(work: Preparing) -> None:
         work.root = scenes.import_colmap(bpy.context, folder, warn=work.warnings.append)
         work.message = work.told[-2]
-        bpy.ops.ed.undo_push(message="Import Photographs")
+        extension.undo_step("Import Photographs")
 
     environment.require(environment.trainer_python())
     return _start(folder / "colmap.log", commands, finish, "Looking at the photographs")
