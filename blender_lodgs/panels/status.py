@@ -1,4 +1,4 @@
-"""The status bar: how far programs beside Blender are, in every workspace, and a notice when one has ended."""
+"""The status bar: how far programs beside Blender are, in every workspace, and a notice at their end."""
 
 from __future__ import annotations
 
