@@ -66,7 +66,7 @@ def _draw(self, context: bpy.types.Context) -> None:
     for work in shown(time.monotonic()):
         row = self.layout.row(align=True)
         if work.running:
-            row.scale_x = 1.6
+            row.ui_units_x = 16
             row.progress(text=work.text, factor=work.share)
         else:
             row.label(text=work.text, icon="ERROR" if work.failed else "CHECKMARK")

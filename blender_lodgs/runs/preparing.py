@@ -107,7 +107,10 @@ def find_cameras(
     commands.append(["undistort", str(folder)])
 
     def finish(work: Preparing) -> None:
+        first = not scenes.roots(bpy.context.scene)
         work.root = scenes.import_colmap(bpy.context, folder, warn=work.warnings.append)
+        if first:  # otherwise the artist is looking at something
+            photographs.look_at_scene(bpy.context, work.root, work.warnings.append)
         work.message = work.told[-2]
         extension.undo_step("Import Photographs")
 
