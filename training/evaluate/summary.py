@@ -34,6 +34,8 @@ def summary(evaluation: Evaluation, bundle: Bundle) -> dict:
     return found
 
 
-def _as_it_is_and_exposed(image: torch.Tensor, target: torch.Tensor) -> tuple[float, float]:
+def _as_it_is_and_exposed(
+    image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None
+) -> tuple[float, float]:
     """The PSNR of a picture, and of the same with its photograph's exposure."""
-    return psnr(image, target), psnr(exposed_as(image, target), target)
+    return psnr(image, target, mask), psnr(exposed_as(image, target, mask), target, mask)
