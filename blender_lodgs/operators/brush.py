@@ -13,6 +13,7 @@ from gpu_extras.batch import batch_for_shader
 from gpu_extras.presets import draw_circle_2d
 
 from ...training.errors import LodgsError
+from .. import extension
 from ..data import cleaning, scenes
 from ..viewport.strokes import Picture
 from .parts import OnOwnLevels, report_errors
@@ -139,7 +140,7 @@ class LODGS_OT_select_splats(OnOwnLevels, bpy.types.Operator):
         return {"FINISHED"}
 
     def _stop(self, context):
-        context.region.tag_redraw()
+        extension.redraw()
         if self._line is not None:
             context.space_data.draw_handler_remove(self._line, "WINDOW")
             self._line = None
