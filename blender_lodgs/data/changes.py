@@ -29,7 +29,7 @@ def version(datablock: bpy.types.ID) -> Version:
 def selecting() -> Iterator[None]:
     """In the block only selections change. To Blender that is a change of points, to :func:`version` none:
     what was made of them stays."""
-    global _selections, _selecting
+    global _selecting
     bpy.context.view_layer.update()  # what has changed before is one
     _selecting = True
     try:
@@ -37,11 +37,17 @@ def selecting() -> Iterator[None]:
         bpy.context.view_layer.update()
     finally:
         _selecting = False
-        _selections += 1
+        others_selected()
+
+
+def others_selected() -> None:
+    """Says that viewports are to show other points as selected."""
+    global _selections
+    _selections += 1
 
 
 def selection() -> Version:
-    """Another one after :func:`selecting`."""
+    """Another one after other points are to be shown as selected."""
     return _files, _selections
 
 

@@ -149,8 +149,8 @@ def select_also(root: bpy.types.Object, found: Mapping[int, np.ndarray], remove:
 
 def show_selected(root: bpy.types.Object, found: Mapping[int, np.ndarray]) -> None:
     """Has viewports show splats as selected until :func:`select` says which are: while a stroke lasts."""
-    with changes.selecting():
-        _in_stroke.update({item.object.data.session_uid: found[item.number] for item in levels(root)})
+    _in_stroke.update({item.object.data.session_uid: found[item.number] for item in levels(root)})
+    changes.others_selected()
 
 
 def shown_selected(cloud: bpy.types.PointCloud) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from ..data import cleaning, crops, scenes
-from ..operators.brush import TOOLS
 from .parts import LevelsPanel, say
 
 
@@ -30,8 +29,8 @@ class LODGS_PT_clean_up(LevelsPanel):
         column, brush = layout.column(align=True), context.scene.lodgs_brush
         row = column.row(align=True)
         row.enabled = context.mode == "OBJECT"
-        for tool in TOOLS:
-            row.operator("wm.tool_set_by_id", text=tool.bl_label.split()[0]).name = tool.bl_idname
+        for name, tool in (("Brush", "lodgs.brush"), ("Lasso", "lodgs.lasso")):
+            row.operator("wm.tool_set_by_id", text=name).name = tool
         row = column.row(align=True)
         row.prop(brush, "radius")
         row.prop(brush, "through", toggle=True)

@@ -139,7 +139,7 @@ class Front:
             shown = np.flatnonzero((splats.x > -SIDES[-1]) & (splats.y > -SIDES[-1]) & (opacities > 0))
             pixel, (a, b, c) = splats.pixel[shown], scales[shown].T
             sigma = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c)) / pixel
-            kind = np.searchsorted(np.float32(SIDES[:-1]), 3 * sigma)
+            kind = np.searchsorted(np.array(SIDES[:-1], np.float32), 3 * sigma)
             for number, side in enumerate(SIDES):
                 some = np.flatnonzero(kind == number)
                 rows = shown[some]
