@@ -123,7 +123,6 @@ def hide(root: bpy.types.Object, found: Mapping[int, np.ndarray]) -> int:
 
 def select(root: bpy.types.Object, found: Mapping[int, np.ndarray]) -> int:
     """Selects splats, in place of those that are, as Edit Mode does; how many."""
-    _in_stroke.clear()
     with changes.selecting():
         for item in levels(root):
             write_attribute(item.object.data, SELECTION, "BOOLEAN", found[item.number])
@@ -148,8 +147,10 @@ def select_also(root: bpy.types.Object, found: Mapping[int, np.ndarray], remove:
 
 
 def show_selected(root: bpy.types.Object, found: Mapping[int, np.ndarray]) -> None:
-    """Has viewports show splats as selected until :func:`select` says which are: while a stroke lasts."""
-    _in_stroke.update({item.object.data.session_uid: found[item.number] for item in levels(root)})
+    """Has viewports show splats as selected while a stroke lasts; without any level those that are."""
+    _in_stroke.clear()
+    clouds = {item.number: item.object.data.session_uid for item in levels(root)}
+    _in_stroke.update({clouds[number]: mask for number, mask in found.items()})
     changes.others_selected()
 
 

@@ -77,7 +77,6 @@ class LODGS_OT_select_splats(OnOwnLevels, bpy.types.Operator):
 
     def cancel(self, context):
         self._stop(context)
-        cleaning.select(scenes.active_root(context), self._before)
 
     @report_errors
     def _begin(self, context, event):
@@ -102,14 +101,13 @@ class LODGS_OT_select_splats(OnOwnLevels, bpy.types.Operator):
         if event.type in {"MOUSEMOVE", "INBETWEEN_MOUSEMOVE"}:
             self._go_to(context, event)
         elif event.type == "LEFTMOUSE" and event.value == "RELEASE":
-            root = scenes.active_root(context)
+            root = self._same_root(context)
             if self.shape == "LASSO":
                 self._select(root, self._picture, np.array([point.loc for point in self.path]))
             else:
                 cleaning.select_also(root, self._found, self.action == "REMOVE")
             return self._finish(root)
         elif event.type in {"ESC", "RIGHTMOUSE"} and event.value == "PRESS":
-            cleaning.select(scenes.active_root(context), self._before)
             return {"CANCELLED"}
         return {"RUNNING_MODAL"}
 
@@ -122,13 +120,21 @@ class LODGS_OT_select_splats(OnOwnLevels, bpy.types.Operator):
         self.path.add().loc = here
         context.region.tag_redraw()
         if self.shape == "BRUSH":
-            root, remove = scenes.active_root(context), self.action == "REMOVE"
+            root, remove = self._same_root(context), self.action == "REMOVE"
             for number, mask in self._picture.brush([last, here], self.radius, self.through).items():
                 self._found[number] |= mask
             cleaning.show_selected(root, {
                 number: mask & ~self._found[number] if remove else mask | self._found[number]
                 for number, mask in self._before.items()
             })  # fmt: skip
+
+    def _same_root(self, context):
+        """The splat scene, as long as it has the levels with which the stroke began: training may go on."""
+        root = scenes.active_root(context)
+        there = {item.number: len(item.object.data.points) for item in cleaning.levels(root)}
+        if there != {number: len(mask) for number, mask in self._before.items()}:
+            raise LodgsError("The levels have been renewed during the stroke.", "Draw it again.")
+        return root
 
     def _select(self, root, picture, path):
         select_by_stroke(root, picture, path, self.shape, self.radius, self.through, self.action == "REMOVE")
@@ -140,6 +146,7 @@ class LODGS_OT_select_splats(OnOwnLevels, bpy.types.Operator):
         return {"FINISHED"}
 
     def _stop(self, context):
+        cleaning.show_selected(scenes.active_root(context), {})
         extension.redraw()
         if self._line is not None:
             context.space_data.draw_handler_remove(self._line, "WINDOW")
