@@ -146,11 +146,11 @@ def select_also(root: bpy.types.Object, found: Mapping[int, np.ndarray], remove:
     return select(root, _with_nodes(root, both))
 
 
-def show_selected(root: bpy.types.Object, found: Mapping[int, np.ndarray]) -> None:
+def show_selected(root: bpy.types.Object | None, found: Mapping[int, np.ndarray]) -> None:
     """Has viewports show splats as selected while a stroke lasts; without any level those that are."""
     _in_stroke.clear()
-    clouds = {item.number: item.object.data.session_uid for item in levels(root)}
-    _in_stroke.update({clouds[number]: mask for number, mask in found.items()})
+    for item in levels(root) if root is not None and found else ():
+        _in_stroke[item.object.data.session_uid] = found[item.number]
     changes.others_selected()
 
 

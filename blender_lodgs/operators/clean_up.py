@@ -215,7 +215,7 @@ class LODGS_MT_clean_up(bpy.types.Menu):
         for test, name, _ in cleaning.TESTS[:-1]:
             operator = layout.operator("lodgs.hide_splats", text=f"Select {_named(test, name)}")
             operator.test, operator.action = test, "SELECT"
-        for tool in TOOLS:
+        for tool in TOOLS if context.mode == "OBJECT" else ():
             layout.operator("wm.tool_set_by_id", text=tool.bl_label).name = tool.bl_idname
         for action, name in (("DESELECT", "Deselect Splats"), ("INVERT", "Invert Selected Splats")):
             layout.operator("lodgs.select_all_splats", text=name).action = action

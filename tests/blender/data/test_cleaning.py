@@ -405,3 +405,18 @@ def test_what_lies_on_a_crops_face_is_in_it_for_nodes_and_for_numpy(bpy, lodgs, 
         on_face = np.arange(1, len(level.splats), 2)
         np.testing.assert_array_equal(shown_rows(bpy, lodgs, item.object), on_face)
         np.testing.assert_array_equal(np.flatnonzero(crops[0].holds(level.splats.means)), on_face)
+
+
+def test_an_older_files_crops_are_given_this_versions_group(bpy, lodgs, scene_of):
+    root, _ = scene_of(bundle_of("bands", np.random.default_rng(7)))
+    bpy.ops.lodgs.add_crop(shape="BOX")
+    crop, crops, version = bpy.context.active_object, lodgs("data.crops"), lodgs("nodes.building").VERSION
+    levels = [item.object for item in root.lodgs.levels]
+    bpy.context.view_layer.update()
+    older = crops.modifier_of(levels[0]).node_group
+    now, older[version] = older[version], older[version] - 1
+    assert crops.outdated(root)
+    crop.location.x += 0.1
+    bpy.context.view_layer.update()
+    assert not crops.outdated(root)
+    assert {crops.modifier_of(obj).node_group[version] for obj in levels} == {now}
