@@ -89,9 +89,13 @@ def attach(root: bpy.types.Object) -> None:
 
 
 def outdated(root: bpy.types.Object) -> bool:
-    """Whether crops have come or gone since modifiers were last given them."""
+    """Whether crops have come or gone since modifiers were last given them, or an older version gave them."""
     crops = crops_of(root)
-    return any(followed_by(item.object) != crops for item in root.lodgs.levels if item.exists)
+    levels = [item.object for item in root.lodgs.levels if item.exists]
+    given = [modifier.node_group for obj in levels if (modifier := modifier_of(obj))]
+    return any(followed_by(obj) != crops for obj in levels) or not all(
+        groups.serves(group, len(crops)) for group in given
+    )
 
 
 def modifier_of(obj: bpy.types.Object) -> bpy.types.NodesModifier | None:

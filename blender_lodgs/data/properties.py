@@ -467,6 +467,26 @@ class CropSettings(bpy.types.PropertyGroup):
     )
 
 
+class BrushSettings(bpy.types.PropertyGroup):
+    """How strokes select splats, on the Blender scene (``Scene.lodgs_brush``)."""
+
+    radius: bpy.props.IntProperty(
+        name="Radius",
+        description="Of the brush, in pixels of the viewport; press F over it to change it there",
+        default=40,
+        min=1,
+        max=2000,
+        soft_max=400,
+        subtype="PIXEL",
+        options=set(),
+    )
+    through: bpy.props.BoolProperty(
+        name="Through",
+        description="Select what other splats hide from the view as well, to any depth",
+        options=set(),
+    )
+
+
 class RenderSettings(bpy.types.PropertyGroup):
     """How the engine LODGS renders a Blender scene (``Scene.lodgs_render``)."""
 
@@ -538,7 +558,8 @@ SplatScene.__annotations__ |= {
 
 CLASSES = (
     ViewSettings, ViewportSettings, *PARAMETERS.values(), TrainingCell, TrainingSettings, SplatLevel,
-    SplatTable, SplatStream, *CONTROLS.values(), SplatScene, CropSettings, RenderSettings, CaptureSettings,
+    SplatTable, SplatStream, *CONTROLS.values(), SplatScene, CropSettings, BrushSettings, RenderSettings,
+    CaptureSettings,
 )  # fmt: skip
 
 
@@ -549,12 +570,14 @@ def register() -> None:
     bpy.types.Camera.lodgs = bpy.props.PointerProperty(type=ViewSettings)
     bpy.types.Scene.lodgs_render = bpy.props.PointerProperty(type=RenderSettings)
     bpy.types.Scene.lodgs_viewport = bpy.props.PointerProperty(type=ViewportSettings)
+    bpy.types.Scene.lodgs_brush = bpy.props.PointerProperty(type=BrushSettings)
     bpy.types.Scene.lodgs_capture = bpy.props.PointerProperty(type=CaptureSettings)
 
 
 def unregister() -> None:
     """Detach them again."""
     del bpy.types.Scene.lodgs_capture
+    del bpy.types.Scene.lodgs_brush
     del bpy.types.Scene.lodgs_render
     del bpy.types.Scene.lodgs_viewport
     del bpy.types.Camera.lodgs

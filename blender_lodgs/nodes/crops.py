@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import bpy
 
+from ...training.lod.crop import FACE
 from ..attributes import HIDDEN
 from .building import VERSION, Field, Nodes, edited, group
 
@@ -21,7 +22,7 @@ _SOCKETS = {
     OBJECT: "NodeSocketObject", SIZE: "NodeSocketFloat", SPHERE: "NodeSocketFloat",
     OUTSIDE: "NodeSocketFloat", USE: "NodeSocketFloat",
 }  # fmt: skip
-_VERSION = 1
+_VERSION = 2
 MATERIAL = "material"
 
 
@@ -88,4 +89,4 @@ def _holds(nodes: Nodes, sockets, number: int, position: bpy.types.NodeSocket) -
     x, y, z = (nodes.field(apart.outputs[axis]) for axis in "XYZ")
     size, sphere = (nodes.field(sockets[name.format(number)]) for name in (SIZE, SPHERE))
     away = (sphere > 0.5).where(x + y + z, x.maximum(y).maximum(z))
-    return nodes.field(inverse.outputs["Invertible"]) & (away <= size * size)
+    return nodes.field(inverse.outputs["Invertible"]) & (away <= size * size * FACE)

@@ -21,6 +21,9 @@ from .arranging import WIDTH, Arrangement
 MOST_COEFFICIENTS = 24
 """Coefficients beyond the first: degree 4."""
 
+SELECTED = (1.0, 0.45, 0.05)
+"""The colour of what is selected, sRGB."""
+
 PARTS = 8
 """Textures that splats' records are in at most: a driver may take long for one that holds them all."""
 
@@ -100,7 +103,8 @@ void main()
   place = vec2(0.0);
   color_opacity = vec4(0.0);
 
-  vec4 instance = texel(instances, gl_InstanceID);  // splat, weight, placement, level whose colour it gets
+  // splat, weight, placement, level whose colour it gets; -1: that of what is selected
+  vec4 instance = texel(instances, gl_InstanceID);
   int slot = int(instance.x), row = int(instance.z) * 5;
   ivec2 record = ivec2(slot / part_size, slot % part_size * texels);
   vec4 mean = stored(record, 0);
@@ -156,9 +160,10 @@ void main()
 
   vec3 base = vec3(s.w, stored(record, 3).xy);
   vec3 color = seen_color(record, base, normalize(mean.xyz * eye.w - eye.xyz));
-  if (instance.w > 0.0) {  // in the lightness of its own colour, so that the scene stays readable
-    float lightness = min(dot(color, vec3(1.0 / 3.0)), 1.0);
-    color = (0.35 + 0.65 * lightness) * texelFetch(palette, ivec2(int(instance.w - 1.0) % PALETTE, 0), 0).rgb;
+  if (instance.w != 0.0) {  // in the lightness of its own colour, so that the scene stays readable
+    float lightness = 0.35 + 0.65 * min(dot(color, vec3(1.0 / 3.0)), 1.0);
+    color = lightness * (instance.w < 0.0
+      ? SELECTED : texelFetch(palette, ivec2(int(instance.w - 1.0) % PALETTE, 0), 0).rgb);
   }
   color_opacity = vec4(color, opacity);
 }
@@ -247,11 +252,14 @@ void main()
 """
 
 
-def instances_texture(arrangement: Arrangement, places: np.ndarray) -> tuple[gpu.types.GPUTexture, int]:
+def instances_texture(
+    arrangement: Arrangement, places: np.ndarray, selected: np.ndarray | None = None
+) -> tuple[gpu.types.GPUTexture, int]:
     """An arrangement's list on the graphics card, and how many splats it has: those that have a place there.
 
     Args:
         places: see ``resident.Store``.
+        selected: see ``resident.Resident``; these get the colour of what is selected.
     """
     there = places[arrangement.splats]
     some = there >= 0
@@ -260,6 +268,8 @@ def instances_texture(arrangement: Arrangement, places: np.ndarray) -> tuple[gpu
     data = gpu.types.Buffer("FLOAT", height * WIDTH * 4)
     listed = np.frombuffer(data, np.float32).reshape(-1, 4)[: len(rows)]  # type: ignore[arg-type]
     listed[:], listed[:, 0] = rows, there[some]
+    if selected is not None:
+        listed[selected[arrangement.splats[some]], 3] = -1
     return gpu.types.GPUTexture((WIDTH, height), format="RGBA32F", data=data), len(rows)
 
 
@@ -487,6 +497,7 @@ def _splat_shader() -> gpu.types.GPUShader:
         info.sampler(slot, "FLOAT_2D", name)
     info.define("WIDTH", str(WIDTH))
     info.define("PALETTE", str(len(LEVEL_COLORS)))
+    info.define("SELECTED", f"vec3{SELECTED}")
     info.push_constant("MAT4", "projection")
     info.push_constant("VEC2", "size")
     info.push_constant("INT", "degree")
