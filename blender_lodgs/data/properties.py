@@ -391,6 +391,11 @@ class ViewportSettings(bpy.types.PropertyGroup):
         update=_changed,
         options=set(),
     )
+    points: bpy.props.BoolProperty(
+        description="Whether Blender draws splats, as points",
+        get=lambda self: not self.splats,
+        options={"HIDDEN"},
+    )
     budget: bpy.props.IntProperty(
         name="Splats at Most",
         description="How many splats a viewport draws at most. Where there are more, coarser levels stand "
@@ -459,6 +464,7 @@ class CropSettings(bpy.types.PropertyGroup):
         items=[
             ("INSIDE", "Keep Inside", "Splats in this crop stay, and those in others that keep theirs"),
             ("OUTSIDE", "Cut Out", "Splats in this crop go"),
+            ("ALL", "Keep All", "None go: only the look of the splats in it is its own"),
         ],
         update=_changed,
     )

@@ -13,7 +13,7 @@ import bpy
 import numpy as np
 
 from .. import attributes
-from . import scenes, selection, streams
+from . import looks, scenes, selection, streams
 from .placement import axes_of
 
 
@@ -29,6 +29,7 @@ class SplatInstance:
         antialias: see ``SplatScene.antialias``.
         source: from where finer splats are to be read than the levels of its scene hold. All of them are
             instances beside it then, and what is read stands for them all, in the place of the finest.
+        looks: see ``looks.looks_of``.
     """
 
     object: bpy.types.Object
@@ -37,6 +38,7 @@ class SplatInstance:
     level: int
     antialias: bool
     source: streams.Source | None = None
+    looks: tuple[looks.PlacedLook, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,10 @@ def splat_instances(
         evaluated = original.evaluated_get(depsgraph)
         level, root = levels.get(original) or (0, scenes.root_of(original))
         antialias = root is not None and root.lodgs.antialias
-        found.append(SplatInstance(original, evaluated, matrix, level, antialias))
+        own = ()
+        if root is not None:
+            own = looks.looks_of(root, depsgraph, evaluated.matrix_world.inverted_safe())
+        found.append(SplatInstance(original, evaluated, matrix, level, antialias, looks=own))
     found.sort(key=lambda instance: (instance.level, instance.object.name))
     return _with_sources(found, depsgraph)
 

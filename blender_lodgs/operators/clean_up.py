@@ -42,6 +42,7 @@ class LODGS_OT_add_crop(_OnLevels, bpy.types.Operator):
         items=[
             ("INSIDE", "Inside", "What lies in the crop stays"),
             ("OUTSIDE", "Outside", "What lies in the crop goes"),
+            ("ALL", "All", "Nothing goes: what lies in the crop can be given a look of its own"),
         ],
     )
 
