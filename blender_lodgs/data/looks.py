@@ -134,6 +134,11 @@ def attach(root: bpy.types.Object) -> None:
             _detach(item.object)
 
 
+def modifier_of(obj: bpy.types.Object) -> bpy.types.NodesModifier | None:
+    """The modifier of a level that shows looks, of any version."""
+    return modifier_with(obj, groups.COUNT)
+
+
 def outdated(root: bpy.types.Object) -> bool:
     """Whether regions have come or gone since modifiers were last given them."""
     regions = regions_of(root)
@@ -155,7 +160,7 @@ def _as_set(settings: LookSettings) -> Look:
 
 
 def _attach(obj: bpy.types.Object, root: bpy.types.Object, regions: list[bpy.types.Object]) -> None:
-    modifier = modifier_with(obj, groups.COUNT)
+    modifier = modifier_of(obj)
     if (
         modifier is not None
         and groups.serves(modifier.node_group, len(regions))
@@ -183,7 +188,7 @@ def _attach(obj: bpy.types.Object, root: bpy.types.Object, regions: list[bpy.typ
 
 
 def _detach(obj: bpy.types.Object) -> None:
-    modifier = modifier_with(obj, groups.COUNT)
+    modifier = modifier_of(obj)
     if modifier is not None:
         take_away(obj, modifier)
 

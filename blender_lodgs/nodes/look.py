@@ -10,7 +10,6 @@ from __future__ import annotations
 import bpy
 
 from ...training.splats.gaussians import SH_C0
-from .. import compat
 from ..attributes import BASE, COLOR, LOOK_OPACITY
 from .building import VERSION, Field, Nodes, edited, group
 from .crops import OBJECT, SIZE, SPHERE, USE, holds
@@ -19,8 +18,8 @@ COUNT = "lodgs_looks"
 """Custom property of these groups: how many regions with looks of their own they have."""
 NAME = "LODGS Look"
 ROWS, OPACITY = ("red_{}", "green_{}", "blue_{}"), "opacity_{}"
-"""Sockets of each look: the rows of its matrix, and its opacity. 0 is the look everywhere; regions follow, with
-the sockets of crops."""
+"""Sockets of each look: the rows of its matrix, and its opacity. 0 is the look everywhere; regions follow,
+with the sockets of crops."""
 _VERSION = 1
 
 
@@ -78,7 +77,7 @@ def _add_sockets(tree: bpy.types.GeometryNodeTree, number: int) -> None:
 
 def _own_color(nodes: Nodes) -> list[Field]:
     """Red, green and blue of the splats without view dependence, display-coded."""
-    base = nodes.add("GeometryNodeInputNamedAttribute", data_type=compat.WIDE_TYPE)
+    base = nodes.add("GeometryNodeInputNamedAttribute", data_type="FLOAT_COLOR")
     base.inputs["Name"].default_value = BASE
     apart = nodes.add("ShaderNodeSeparateXYZ")
     nodes.link(next(s for s in base.outputs if s.name == "Attribute" and s.enabled), apart, "Vector")

@@ -107,7 +107,7 @@ void main()
   vec4 mean = stored(record, 0);
   float opacity = mean.w * instance.y;
   mean.w = 1.0;
-  vec4 filtered = texel(placements, row + 4);  // added variance; whether opacity pays for it; first look, last
+  vec4 filtered = texel(placements, row + 4);  // added variance, whether opacity pays for it, looks
   mat3 look = mat3(1.0);
   for (int i = int(filtered.z); i < int(filtered.w); i++) {  // see ``_looks``
     int at = 6 * i;

@@ -2,8 +2,8 @@
 
 Splats have display-coded (sRGB) colours, in which they are blended, as the photographs are. There a look is a
 3x3 matrix on colours: what it makes of each splat's colour, it makes of the blended picture. Linear light
-times k is a code times k^(1/2.2), as nearly as a factor can have it. Colours are linear in their harmonics, so
-that the matrix acts on the coefficients of every degree, and nothing of a view has to be known.
+times k is a code times k^(1/2.2), as nearly as a factor can have it. Colours are linear in their harmonics:
+the matrix acts on the coefficients of every degree, and nothing of a view has to be known.
 """
 
 from __future__ import annotations
