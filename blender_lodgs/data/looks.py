@@ -8,6 +8,7 @@ level has a modifier (``nodes.look``) as soon as somebody has set something.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import bpy
@@ -28,7 +29,8 @@ PARTS = tuple(RANGES)
 
 
 class PlacedLook(NamedTuple):
-    """A look, and the crop in which it counts, in the splats' own space; None: everywhere."""
+    """A look, and the crop in which it counts, or outside of which, in the splats' own space; None:
+    everywhere."""
 
     crop: Crop | None
     look: Look
@@ -79,6 +81,11 @@ class LookSettings(bpy.types.PropertyGroup):
         default=NEUTRAL.opacity, min=RANGES["opacity"][0], max=RANGES["opacity"][1], precision=3,
         subtype="FACTOR", update=_changed,
     )  # fmt: skip
+    outside: bpy.props.BoolProperty(
+        name="Outside",
+        description="Have the look of the region count outside of it, to leave what lies in it as it is",
+        update=_changed,
+    )
     matrix: bpy.props.FloatVectorProperty(
         name="Matrix",
         description="What the look makes of display-coded colours, row by row, for node groups",
@@ -98,9 +105,11 @@ def looks_of(
     if everywhere != NEUTRAL:
         found.append(PlacedLook(None, everywhere))
     for obj in regions_of(root):
-        look = _as_set(obj.evaluated_get(depsgraph).lodgs_look)
+        settings = obj.evaluated_get(depsgraph).lodgs_look
+        look = _as_set(settings)
         if obj.lodgs_crop.use and look != NEUTRAL:
-            found.append(PlacedLook(crops.as_it_stands(obj, to_own, depsgraph), look))
+            crop = crops.as_it_stands(obj, to_own, depsgraph)
+            found.append(PlacedLook(replace(crop, outside=settings.outside), look))
     return tuple(found)
 
 
@@ -116,7 +125,7 @@ def is_set(obj: bpy.types.Object) -> bool:
 
 def reset(root: bpy.types.Object, obj: bpy.types.Object) -> None:
     """Gives the root, or one of its crops, the look that changes nothing; it may still be animated."""
-    for name in PARTS:
+    for name in (*PARTS, "outside"):
         obj.lodgs_look.property_unset(name)
     attach(root)
     obj.update_tag()
@@ -178,6 +187,8 @@ def _attach(obj: bpy.types.Object, root: bpy.types.Object, regions: list[bpy.typ
     for number, source in enumerate((root, *regions)):
         if number:
             crops.follow(obj, modifier, number, source)
+            driver = fresh_driver(obj, compat.input_path(modifier, groups.BEYOND.format(number)), "value")
+            crops.read_from(driver, source, "lodgs_look.outside", 0.0)
         for row, name in enumerate(groups.ROWS):
             path = compat.input_path(modifier, name.format(number))
             for column in range(3):

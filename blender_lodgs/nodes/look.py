@@ -17,9 +17,9 @@ from .crops import OBJECT, SIZE, SPHERE, USE, holds
 COUNT = "lodgs_looks"
 """Custom property of these groups: how many regions with looks of their own they have."""
 NAME = "LODGS Look"
-ROWS, OPACITY = ("red_{}", "green_{}", "blue_{}"), "opacity_{}"
+ROWS, OPACITY, BEYOND = ("red_{}", "green_{}", "blue_{}"), "opacity_{}", "beyond_{}"
 """Sockets of each look: the rows of its matrix, and its opacity. 0 is the look everywhere; regions follow,
-with the sockets of crops."""
+with the sockets of crops, and what is 1 where a look counts outside of one."""
 _VERSION = 1
 
 
@@ -35,7 +35,9 @@ def look_group(count: int) -> bpy.types.GeometryNodeTree:
         color, opacity = _own_color(nodes), nodes.field(sockets[OPACITY.format(0)])
         color = _mapped(nodes, sockets, 0, color)
         for number in range(1, count + 1):
-            held = holds(nodes, sockets, number, position) & nodes.field(sockets[USE.format(number)])
+            used, beyond = (nodes.field(sockets[name.format(number)]) for name in (USE, BEYOND))
+            held = holds(nodes, sockets, number, position)
+            held = used & (beyond > 0.5).where(1.0 - held, held)
             there = _mapped(nodes, sockets, number, color)
             color = [held.where(new, old) for new, old in zip(there, color, strict=True)]
             opacity = opacity * held.where(nodes.field(sockets[OPACITY.format(number)]), 1.0)
@@ -70,7 +72,7 @@ def serves(tree: bpy.types.NodeTree | None, count: int) -> bool:
 def _add_sockets(tree: bpy.types.GeometryNodeTree, number: int) -> None:
     kinds = dict.fromkeys(ROWS, "NodeSocketVector") | {OPACITY: "NodeSocketFloat"}
     if number:
-        kinds |= {OBJECT: "NodeSocketObject"} | dict.fromkeys((SIZE, SPHERE, USE), "NodeSocketFloat")
+        kinds |= {OBJECT: "NodeSocketObject"} | dict.fromkeys((SIZE, SPHERE, USE, BEYOND), "NodeSocketFloat")
     for name, kind in kinds.items():
         tree.interface.new_socket(name.format(number), in_out="INPUT", socket_type=kind)
 

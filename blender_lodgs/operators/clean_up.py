@@ -65,6 +65,8 @@ def add_crop(
         half[:] = half.max()
     obj = crops.new_crop(root, shape, Matrix.LocRotScale((low + high) / 2, None, half))
     obj.lodgs_crop.keep = keep
+    if keep == "ALL":
+        obj.name = f"Region {shape.title()}"
     for other in context.selected_objects:
         other.select_set(False)
     obj.select_set(True)

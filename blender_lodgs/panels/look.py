@@ -44,6 +44,7 @@ class LODGS_PT_look_regions(LevelsPanel):
                 row.operator("lodgs.reset_look", text="", icon="LOOP_BACK").name = crop.name
                 row.operator("lodgs.remove_crop", text="", icon="X").name = crop.name
                 _draw_look(box, crop)
+                split_column(box).prop(crop.lodgs_look, "outside")
 
 
 def _draw_look(layout: bpy.types.UILayout, obj: bpy.types.Object) -> None:

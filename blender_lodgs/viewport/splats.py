@@ -115,7 +115,8 @@ void main()
     vec3 own = vec3(dot(texel(looks, at), mean), dot(texel(looks, at + 1), mean),
                     dot(texel(looks, at + 2), mean));
     own *= own;
-    if ((green.w > 0.0 ? own.x + own.y + own.z : max(own.x, max(own.y, own.z))) <= 1.0) {
+    float away = green.w > 0.0 ? own.x + own.y + own.z : max(own.x, max(own.y, own.z));
+    if ((away <= 1.0) != (blue.w > 0.0)) {
       look = transpose(mat3(red.xyz, green.xyz, blue.xyz)) * look;
       opacity *= red.w;
     }
@@ -464,15 +465,14 @@ def _placements(
 
 def _looks(of_placements: Sequence[Looks]) -> gpu.types.GPUTexture:
     """Six texels a look: three rows to the space of its crop, zeros where it counts everywhere, and three
-    rows of its matrix; beside these its opacity, and whether the crop is a sphere."""
+    rows of its matrix; beside these its opacity, whether the crop is a sphere, whether it counts outside."""
     every = [each for looks in of_placements for each in looks]
     data = np.zeros((max(-(-6 * len(every) // WIDTH), 1) * WIDTH, 4), np.float32)
     for number, (crop, look) in enumerate(every):
         rows = data[6 * number : 6 * number + 6]
         if crop is not None:
-            rows[:3] = crop.to_own
-        rows[3:, :3] = look.matrix
-        rows[3:5, 3] = look.opacity, crop is not None and crop.shape == "SPHERE"
+            rows[:3], rows[4:, 3] = crop.to_own, (crop.shape == "SPHERE", crop.outside)
+        rows[3:, :3], rows[3, 3] = look.matrix, look.opacity
     buffer = gpu.types.Buffer("FLOAT", data.size, data.reshape(-1))
     return gpu.types.GPUTexture((WIDTH, len(data) // WIDTH), format="RGBA32F", data=buffer)
 

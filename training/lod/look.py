@@ -82,7 +82,8 @@ class Look:
 NEUTRAL = Look()
 
 Looks = Sequence[tuple[Crop | None, Look]]
-"""Looks, one upon the other, and in which box or sphere each counts; None: everywhere."""
+"""Looks, one upon the other, and in which box or sphere each counts, or if so said outside of which; None:
+everywhere."""
 
 
 def looks_as_dicts(looks: Looks) -> list[dict[str, Any]]:
@@ -121,7 +122,7 @@ def changed(
     Colours that stay above black are what the matrices make of them, from everywhere.
     """
     for crop, look in looks:
-        some: Any = slice(None) if crop is None else np.flatnonzero(crop.holds(means))
+        some: Any = slice(None) if crop is None else np.flatnonzero(crop.holds(means) != crop.outside)
         if crop is not None and not len(some):
             continue
         matrix = look.matrix

@@ -29,6 +29,7 @@ def wanted(means, sh):
     color = color @ EVERYWHERE.matrix.T
     for matrix, shape, look in REGIONS:
         held, clear = inside(matrix, means, shape == "SPHERE")
+        held ^= shape == "SPHERE"  # outside of it
         assert clear.all() and 0 < held.sum() < len(held)
         color[held] = color[held] @ look.matrix.T
         factor[held] *= look.opacity
@@ -45,6 +46,7 @@ def looking(bpy, lodgs, scene_of):  # noqa: F811
         for matrix, shape, look in REGIONS:
             obj = lodgs("data.crops").new_crop(root, shape, blender(matrix))
             obj.lodgs_crop.keep = "ALL"
+            obj.lodgs_look.outside = shape == "SPHERE"
             give(obj.lodgs_look, look)
         bpy.context.view_layer.update()
         return root, bundle

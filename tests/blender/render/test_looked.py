@@ -100,8 +100,10 @@ def test_viewports_draw_what_is_exported(bpy, lodgs, seen, tmp_path):
     ball.lodgs_look.exposure -= 1
     ball.empty_display_type = "CUBE"
     box = seen(quick)
-    for shape, picture in (("SPHERE", looked), ("CUBE", box)):
-        ball.empty_display_type = shape
+    ball.lodgs_look.outside = True
+    around = seen(quick)
+    for shape, outside, picture in (("SPHERE", False, looked), ("CUBE", False, box), ("CUBE", True, around)):
+        ball.empty_display_type, ball.lodgs_look.outside = shape, outside
         bpy.context.view_layer.objects.active = root
         bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"))
         root.hide_viewport = True
@@ -114,7 +116,7 @@ def test_viewports_draw_what_is_exported(bpy, lodgs, seen, tmp_path):
         root.hide_viewport = False
         for item in root.lodgs.levels:
             item.show = True
-    assert np.abs(box - looked).max() > 0.02
+    assert np.abs(box - looked).max() > 0.02 and np.abs(box - around).max() > 0.05
 
 
 @pytest.mark.usefixtures("renderer", "camera")

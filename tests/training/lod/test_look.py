@@ -109,7 +109,7 @@ def test_opacities_of_any_logit():
 
 def test_regions_come_upon_the_look_everywhere():
     splats, ball = some_splats(500, 1), Crop.sphere((0.2, 0, 0), 0.8)
-    box, there = Crop.box((-2, -2, 0), (2, 2, 2)), Look(tint=(0.2, 1, 1))
+    box, there = Crop.box((-2, -2, -2), (2, 2, 0), outside=True), Look(tint=(0.2, 1, 1))
     found = looked(splats, [(None, LOOK), (ball, there), (box, Look(opacity=0.5))])
     held = np.linalg.norm(splats.means - np.float32([0.2, 0, 0]), axis=1) <= 0.8
     above = splats.means[:, 2] >= 0
