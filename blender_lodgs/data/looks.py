@@ -179,7 +179,7 @@ def _attach(obj: bpy.types.Object, root: bpy.types.Object, regions: list[bpy.typ
     _detach(obj)
     modifier = switched(
         obj, groups.look_group(len(regions)),
-        show_viewport="lodgs_viewport.points", show_render="lodgs_render.draws_ellipsoids",
+        show_viewport="lodgs_viewport.points", show_render="lodgs_render.draws_points",
     )  # fmt: skip
     last = obj.modifiers.find(ellipsoids.NAME)
     if last >= 0:

@@ -495,9 +495,14 @@ class RenderSettings(bpy.types.PropertyGroup):
         "reflections. Fine up to some hundred thousand splats",
         update=_ellipsoids_changed,
     )
+    draws_points: bpy.props.BoolProperty(
+        description="Whether renders of this scene are Blender's, which show points or ellipsoids",
+        get=lambda self: self.id_data.render.engine != "LODGS",
+        options={"HIDDEN"},
+    )
     draws_ellipsoids: bpy.props.BoolProperty(
         description="Whether renders of this scene show ellipsoids: LODGS draws true splats instead",
-        get=lambda self: self.ellipsoids and self.id_data.render.engine != "LODGS",
+        get=lambda self: self.ellipsoids and self.draws_points,
         options={"HIDDEN"},
     )
     holdout: bpy.props.StringProperty(

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import LodgsError
+from ..splats.bundle import Bundle
 from ..splats.gaussians import SH_C0, SplatRows, Splats
 from .crop import Crop
 
@@ -156,6 +157,18 @@ class LookedRows:
     def select(self, some: slice | np.ndarray, /) -> Splats:
         """The splats of a range of rows, or of some rows (M,) ascending."""
         return looked(self.of.select(some), self.looks)
+
+
+def looked_levels(bundle: Bundle, looks: Looks) -> Bundle:
+    """A bundle whose levels are as looks have them; those that are in files stay there until they are
+    written."""
+    levels = [
+        replace(level, splats=looked(level.splats, looks))
+        if level.elsewhere is None
+        else replace(level, elsewhere=LookedRows(level.elsewhere, looks))
+        for level in bundle.levels
+    ]
+    return replace(bundle, levels=levels)
 
 
 def _faded(logits: np.ndarray, factor: float) -> np.ndarray:

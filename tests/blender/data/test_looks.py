@@ -87,7 +87,12 @@ def test_node_groups_show_of_every_level_what_numpy_does(bpy, lodgs, looking, na
         assert lodgs("data.selection").only_chosen(item.object.evaluated_get(depsgraph), depsgraph)
     bpy.context.scene.lodgs_viewport.splats = True  # what LODGS draws has its look without them
     bpy.context.view_layer.update()
-    assert shown(bpy, lodgs, root.lodgs.levels[2].object)[2] is None
+    obj = root.lodgs.levels[2].object
+    assert shown(bpy, lodgs, obj)[2] is None
+    for engine in ("CYCLES", "LODGS"):
+        bpy.context.scene.render.engine = engine
+        bpy.context.view_layer.update()
+        assert lodgs("data.looks").modifier_of(obj).show_render == (engine == "CYCLES")
 
 
 def test_a_look_is_animated_and_levels_that_come_have_it(bpy, lodgs, looking):
