@@ -521,7 +521,7 @@ def _edit(chosen: argparse.Namespace) -> int:
         edit(
             chosen.source, chosen.out,
             Cleaning(tuple(crops), drop_floaters=chosen.drop_floaters, **given), _warn,
-            [(place, look) for place in places] if parts else (),
+            looks=[(place, look) for place in places] if parts else (),
         )
     )  # fmt: skip
     return 0

@@ -388,8 +388,7 @@ def read_levels(root: bpy.types.Object, placed: bool = False, looked: bool = Fal
     )  # fmt: skip
     bundle = cleaning.left(root, bundle, bpy.context.evaluated_depsgraph_get())
     if looked:
-        for level in bundle.levels:
-            level.splats = _looked(root, level.splats)
+        bundle = look.looked_levels(bundle, _looks(root))
     if placed:
         bundle = placing.placed(bundle, placement_of(root))
         bundle.meta["up_rotation"] = np.eye(3)
@@ -472,7 +471,7 @@ def shown_splats(
         extras={name: np.concatenate([part.extras[name] for part in parts]) for name in shared},
     )
     if looked:
-        splats = _looked(root, splats)
+        splats = look.looked(splats, _looks(root))
     rule = find_rule(root.lodgs.rule)
     if not placed:
         return splats
@@ -533,11 +532,11 @@ def _new_scene(context: bpy.types.Context, name: str) -> Iterator[bpy.types.Obje
     root.select_set(True)
 
 
-def _looked(root: bpy.types.Object, splats: Splats) -> Splats:
-    """Splats as the scene's look has them now."""
+def _looks(root: bpy.types.Object) -> look.Looks:
+    """The looks of a scene as it stands now."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
     to_own = axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe()
-    return look.looked(splats, looks.looks_of(root, depsgraph, to_own))
+    return looks.looks_of(root, depsgraph, to_own)
 
 
 def _require_alone(root: bpy.types.Object, number: int) -> None:

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from tests.fuzz.doors import attempt
 from tests.fuzz.mutations import spoiled, spoiled_value
-from training.render import wire
 from training.lod.crop import Crop
 from training.lod.look import Look, looks_as_dicts
+from training.render import wire
 from training.render.requests import FrameRequest, read_line, read_request
 from training.render.scene import Instance, SplatSet, draw
 from training.scenes.cameras import MOST_PIXELS, Camera, camera_as_dict

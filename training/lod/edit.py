@@ -9,11 +9,11 @@ from ..splats.bundle import DrawableRows, open_bundle, read_folder, write_bundle
 from ..splats.dialects import Warn, comments_of, silent
 from ..splats.ply import write_ply
 from .cleaning import Cleaning, cleaned
-from .look import LookedRows, Looks, looked
+from .look import Looks, looked_levels
 from .selection import known_rule
 
 
-def edit(source: Path, out: Path, cleaning: Cleaning, warn: Warn = silent, looks: Looks = ()) -> str:
+def edit(source: Path, out: Path, cleaning: Cleaning, warn: Warn = silent, *, looks: Looks = ()) -> str:
     """Writes what a cleaning leaves of a bundle, a folder of levels or any 3DGS PLY, as such a file.
 
     Of a binary PLY only some rows at a time are in memory.
@@ -37,12 +37,7 @@ def edit(source: Path, out: Path, cleaning: Cleaning, warn: Warn = silent, looks
         for level in bundle.levels:
             level.elsewhere = DrawableRows(rows[level.number], warn)
     known_rule(bundle)
-    found = cleaned(bundle, cleaning)
-    for level in found.levels if looks else ():
-        if level.elsewhere is None:
-            level.splats = looked(level.splats, looks)
-        else:
-            level.elsewhere = LookedRows(level.elsewhere, looks)
+    found = looked_levels(cleaned(bundle, cleaning), looks)
     if source.is_dir():
         write_folder(out, found)
     elif bundle.method or bundle.rule or len(bundle.levels) > 1:

@@ -77,7 +77,7 @@ class Look:
 
     def as_dict(self) -> dict[str, Any]:
         """The same as JSON has it."""
-        return asdict(self)
+        return asdict(self) | {"tint": list(self.tint)}
 
 
 NEUTRAL = Look()
