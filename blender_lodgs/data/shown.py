@@ -84,7 +84,7 @@ def splat_instances(
         for item in root.lodgs.levels
         if item.object is not None
     }
-    found = []
+    found, own_looks = [], {}
     for instance in depsgraph.object_instances:  # visible ones only
         obj = instance.object
         if obj.type != "POINTCLOUD" or not is_splats(obj.original.data):
@@ -97,10 +97,11 @@ def splat_instances(
         evaluated = original.evaluated_get(depsgraph)
         level, root = levels.get(original) or (0, scenes.root_of(original))
         antialias = root is not None and root.lodgs.antialias
-        own = ()
-        if root is not None:
-            own = looks.looks_of(root, depsgraph, evaluated.matrix_world.inverted_safe())
-        found.append(SplatInstance(original, evaluated, matrix, level, antialias, looks=own))
+        together = root, evaluated.matrix_world.copy().freeze()  # levels mostly are, and have one look
+        if root is not None and together not in own_looks:
+            own_looks[together] = looks.looks_of(root, depsgraph, evaluated.matrix_world.inverted_safe())
+        look = own_looks.get(together, ())
+        found.append(SplatInstance(original, evaluated, matrix, level, antialias, looks=look))
     found.sort(key=lambda instance: (instance.level, instance.object.name))
     return _with_sources(found, depsgraph)
 
