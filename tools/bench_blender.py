@@ -11,6 +11,7 @@ does (choosing and sorting), how long the first picture's splats take onto the c
 and what comes there later.
 Clean Up, of five levels: how long a moved crop, a search for floaters, and a stroke of the brush hold the
 main thread.
+Look, of the same: how long each step of a slider does, where LODGS draws the splats and where Blender does.
 Streaming, there as well: a tree is flown through of which a part fits into the budget. How long each redraw
 holds up the main thread, all that LODGS does there but drawing itself, and how soon all has come at the end.
 ``--tree FILE --budget N`` takes a bundle of your own, of ten million splats say.
@@ -205,6 +206,18 @@ def clean_up(bpy, count: int) -> None:
         bpy.context.view_layer.update()
         moves.append((time.perf_counter() - begun, time.process_time() - own))
     wall, own = 1e3 * np.median(moves, axis=0)
+    steps = []
+    for splats in (True, False):
+        bpy.context.scene.lodgs_viewport.splats = splats
+        root.lodgs_look.exposure = 0.0  # makes what shows it
+        bpy.context.view_layer.update()
+        for _ in range(11):
+            root.lodgs_look.exposure += 0.1
+            steps.append(least(bpy.context.view_layer.update, 1))
+    print(
+        f"look, {count:,} splats in five levels, ms of the main thread: a slider's step"
+        f" {1e3 * np.median(steps[:11]):.0f}, as points {1e3 * np.median(steps[11:]):.0f} (medians of 11)"
+    )
     counts = least(
         lambda: (cleaning._counts.clear(), cleaning.count_left(root, bpy.context.view_layer.depsgraph))
     )

@@ -391,6 +391,11 @@ class ViewportSettings(bpy.types.PropertyGroup):
         update=_changed,
         options=set(),
     )
+    points: bpy.props.BoolProperty(
+        description="Whether Blender draws splats, as points",
+        get=lambda self: not self.splats,
+        options={"HIDDEN"},
+    )
     budget: bpy.props.IntProperty(
         name="Splats at Most",
         description="How many splats a viewport draws at most. Where there are more, coarser levels stand "
@@ -459,6 +464,7 @@ class CropSettings(bpy.types.PropertyGroup):
         items=[
             ("INSIDE", "Keep Inside", "Splats in this crop stay, and those in others that keep theirs"),
             ("OUTSIDE", "Cut Out", "Splats in this crop go"),
+            ("ALL", "Keep All", "None go: only the look of the splats in it is its own"),
         ],
         update=_changed,
     )
@@ -509,9 +515,14 @@ class RenderSettings(bpy.types.PropertyGroup):
         "reflections. Fine up to some hundred thousand splats",
         update=_ellipsoids_changed,
     )
+    draws_points: bpy.props.BoolProperty(
+        description="Whether renders of this scene are Blender's, which show points or ellipsoids",
+        get=lambda self: self.id_data.render.engine != "LODGS",
+        options={"HIDDEN"},
+    )
     draws_ellipsoids: bpy.props.BoolProperty(
         description="Whether renders of this scene show ellipsoids: LODGS draws true splats instead",
-        get=lambda self: self.ellipsoids and self.id_data.render.engine != "LODGS",
+        get=lambda self: self.ellipsoids and self.draws_points,
         options={"HIDDEN"},
     )
     holdout: bpy.props.StringProperty(

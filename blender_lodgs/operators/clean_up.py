@@ -30,6 +30,7 @@ class LODGS_OT_add_crop(OnOwnLevels, bpy.types.Operator):
         items=[
             ("INSIDE", "Inside", "What lies in the crop stays"),
             ("OUTSIDE", "Outside", "What lies in the crop goes"),
+            ("ALL", "All", "Nothing goes: what lies in the crop can be given a look of its own"),
         ],
     )
 
@@ -52,6 +53,8 @@ def add_crop(
         half[:] = half.max()
     obj = crops.new_crop(root, shape, Matrix.LocRotScale((low + high) / 2, None, half))
     obj.lodgs_crop.keep = keep
+    if keep == "ALL":
+        obj.name = f"Region {shape.title()}"
     for other in context.selected_objects:
         other.select_set(False)
     obj.select_set(True)

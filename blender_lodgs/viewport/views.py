@@ -190,7 +190,8 @@ def draw_splats(
     splats.draw(
         view.store.textures, view.store.part, view.store.higher, view.instances, view.count,
         [placement.world for placement in placements], view_matrix, projection, view.canvas,
-        antialias=[placement.antialias for placement in placements], resolution=view.resolution,
+        antialias=[placement.antialias for placement in placements],
+        looks=[placement.looks for placement in placements], resolution=view.resolution,
         under_overlays=under_overlays,
     )  # fmt: skip
 
@@ -396,6 +397,7 @@ def _placements(
                 tell=root.lodgs.tell if root else "OWN",
                 antialias=instance.antialias,
                 arrived=(paged.arrived if take_over else paged.taken) if paged else 0,
+                looks=instance.looks,
             )
         )
     return tuple(found)
