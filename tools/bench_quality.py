@@ -26,7 +26,7 @@ from training.errors import LodgsError  # noqa: E402
 from training.methods import METHODS  # noqa: E402
 from training.runs.measure import evaluate_run  # noqa: E402
 
-COLUMNS = ("psnr", "worst", "train_psnr", "veil", "veil_max", "oversized", "splats", "seconds")
+COLUMNS = ("psnr", "fitted_psnr", "worst", "train_psnr", "veil", "veil_max", "oversized", "splats", "seconds")
 
 
 @dataclass
@@ -39,6 +39,7 @@ class Point:
     share: float
     seed: int
     psnr: float
+    fitted_psnr: float
     worst: float
     train_psnr: float
     veil: float
@@ -78,9 +79,9 @@ def measured(out: Path, **run) -> Point:
     report = evaluate_run(out)
     finest = report["levels"][-1]
     return Point(
-        **run, psnr=finest["psnr"], worst=report["worst"]["psnr"], train_psnr=report["train_psnr"],
-        veil=report["veil"]["mean"], veil_max=report["veil"]["max"], oversized=report["oversized"],
-        splats=finest["splats"], seconds=events[-1]["seconds"],
+        **run, psnr=finest["psnr"], fitted_psnr=report["fitted_psnr"], worst=report["worst"]["psnr"],
+        train_psnr=report["train_psnr"], veil=report["veil"]["mean"], veil_max=report["veil"]["max"],
+        oversized=report["oversized"], splats=finest["splats"], seconds=events[-1]["seconds"],
     )  # fmt: skip
 
 

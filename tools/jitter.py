@@ -3,6 +3,8 @@
     python tools/jitter.py SCENE COPY [--stops 0.7]
     python tools/bench_quality.py COPY SCENE --report --methods 3dgs --shares 1 --set lr_exposure=0.01
 
+``psnr`` counts what exposure is missed as well, ``fitted_psnr`` only what is left without it.
+
 Every photograph is as if it had been exposed by a random number of stops more or less; those that ``train``
 holds out stay as they are, so that pictures are compared with the same truth.
 """

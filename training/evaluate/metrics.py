@@ -25,9 +25,23 @@ def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = 
     """
     from torchmetrics.functional.image import peak_signal_noise_ratio
 
-    if mask is not None and bool((mask > COUNTS).any()):
-        image, target = image[mask > COUNTS], target[mask > COUNTS]
-    return min(float(peak_signal_noise_ratio(to_8_bit(image), to_8_bit(target), data_range=1.0)), MOST_PSNR)
+    image, target = map(to_8_bit, _counted(image, target, mask))
+    return min(float(peak_signal_noise_ratio(image, target, data_range=1.0)), MOST_PSNR)
+
+
+def exposed_as(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
+    """An image (H, W, 3) with the gain and offset of each channel that bring it closest to a target.
+
+    Least squares; what ``methods.exposure`` learns of a training view, found for one that was held out.
+
+    Args:
+        mask: as of :func:`psnr`.
+    """
+    pixels, wanted = _counted(image, target, mask)
+    mean, goal = pixels.mean(0), wanted.mean(0)
+    around = pixels - mean
+    gain = (around * (wanted - goal)).sum(0) / (around**2).sum(0).clamp_min(1e-12)
+    return (image - mean) * gain + goal
 
 
 def ssim(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float:
@@ -42,3 +56,12 @@ def ssim(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = 
         image = torch.where((mask > COUNTS)[..., None], image, target)
     pair = [to_8_bit(each).permute(2, 0, 1)[None] for each in (image, target)]
     return float(structural_similarity_index_measure(*pair, data_range=1.0))  # type: ignore[arg-type]
+
+
+def _counted(
+    image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Of two images (H, W, 3) the pixels that count, (P, 3)."""
+    if mask is not None and bool((mask > COUNTS).any()):
+        return image[mask > COUNTS], target[mask > COUNTS]
+    return image.reshape(-1, 3), target.reshape(-1, 3)

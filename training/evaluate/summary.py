@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import torch
+
 from ..scenes.cameras import evenly
 from ..splats.bundle import Bundle
 from .aside import oversized, veil
+from .metrics import exposed_as, psnr
 from .views import MOST_TRAINING_VIEWS, Evaluation, shown_at
 
 
@@ -14,7 +17,7 @@ def summary(evaluation: Evaluation, bundle: Bundle) -> dict:
     Returns:
         ``train_psnr``: dB, mean over training views, ``MOST_TRAINING_VIEWS`` at most; ``veil`` and
         ``oversized``, see ``evaluate.aside``; where views are held out ``worst``, the ``view`` of the lowest
-        ``psnr``.
+        ``psnr``, and ``fitted_psnr``, the mean over them where each picture has its photograph's exposure.
     """
     data, shown = evaluation.data, shown_at(bundle, bundle.levels[-1])
     train = evaluation.psnrs(evenly(data.train, MOST_TRAINING_VIEWS), shown)
@@ -24,7 +27,15 @@ def summary(evaluation: Evaluation, bundle: Bundle) -> dict:
         "oversized": oversized(data, shown),
     }
     if data.test:
-        quality = evaluation.psnrs(data.test, shown)
+        quality, fitted = evaluation.psnrs(data.test, shown, _as_it_is_and_exposed).T
+        found["fitted_psnr"] = round(float(fitted.mean()), 3)
         worst = int(quality.argmin())
         found["worst"] = {"view": data.test[worst].name, "psnr": round(float(quality[worst]), 3)}
     return found
+
+
+def _as_it_is_and_exposed(
+    image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None
+) -> tuple[float, float]:
+    """The PSNR of a picture, and of the same with its photograph's exposure."""
+    return psnr(image, target, mask), psnr(exposed_as(image, target, mask), target, mask)

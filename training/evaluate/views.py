@@ -25,6 +25,8 @@ MOST_TRAINING_VIEWS = 24
 REPEATS = 3
 """How often a view is drawn to time it."""
 
+Measure = Callable[[torch.Tensor, torch.Tensor, torch.Tensor | None], float | tuple[float, ...]]
+"""What is found of a picture and its photograph, (H, W, 3) both, and of the mask of what counts of it."""
 ShownTo = Callable[[Camera], tuple[Splats, np.ndarray | None]]
 """What a camera is shown: splats, all that there are or those in its sight, and weights (N,) in [0, 1] on
 opacities; None: all 1."""
@@ -114,13 +116,20 @@ class Evaluation:
     def _options(self) -> dict:
         return {"near": self.data.near, "antialias": self.antialias}
 
-    def psnrs(self, cameras: Sequence[Camera], shown_to: ShownTo) -> np.ndarray:
-        """The PSNR of each of some views with a photograph, in dB, (V,)."""
+    def psnrs(
+        self,
+        cameras: Sequence[Camera],
+        shown_to: ShownTo,
+        measure: Callable[
+            [torch.Tensor, torch.Tensor, torch.Tensor | None], float | tuple[float, ...]
+        ] = psnr,
+    ) -> np.ndarray:
+        """The PSNR of each of some views with a photograph, in dB, (V,); or what else ``measure`` finds."""
         found = []
         for camera in cameras:
             splats, weights = shown_to(camera)
             target = self.target(camera)
-            found.append(psnr(self.draw(splats, camera, weights), target.image, target.mask))
+            found.append(measure(self.draw(splats, camera, weights), target.image, target.mask))
         return np.array(found)
 
     def measure(self, render: Callable[[Camera], Rendering], count: Callable[[Camera], int]) -> dict:

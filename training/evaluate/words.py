@@ -14,6 +14,9 @@ def summary_lines(measures: dict) -> list[str]:
     match measures.get("worst"):
         case {"view": str(view), "psnr": int() | float() as quality}:
             lines.append(f"Worst held-out view: {quality:.1f} dB ({view})")
+    match measures.get("fitted_psnr"):
+        case int() | float() as quality:
+            lines.append(f"Held-out views, exposure fitted: {quality:.1f} dB")
     match measures.get("aside"):
         case {"psnr": int() | float() as quality, "views": list(views)}:
             lines.append(f"Off the path: {quality:.1f} dB ({len(views)} views)")

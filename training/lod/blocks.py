@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -61,8 +62,7 @@ class Blocks:
         Args:
             near: depth at which drawing begins, in world units.
         """
-        low, high = self.low.astype(np.float64), self.high.astype(np.float64)
-        middle, radius = (low + high) / 2, np.linalg.norm(high - low, axis=1) / 2
+        middle, radius = self._spheres
         x, y, z = camera.view_space(middle).T
         seen = z + radius > near
         far = np.maximum(z + radius, 0)
@@ -75,6 +75,12 @@ class Blocks:
                 room = radius * np.hypot(1, border) + spread + PIXELS / focal * far
                 seen &= side - z * border <= room
         return seen
+
+    @cached_property
+    def _spheres(self) -> tuple[np.ndarray, np.ndarray]:
+        """Middles (B, 3) and radii (B,), float64, of spheres about the bounds."""
+        low, high = self.low.astype(np.float64), self.high.astype(np.float64)
+        return (low + high) / 2, np.linalg.norm(high - low, axis=1) / 2
 
     def distances(self, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The least and the greatest distance, (B,) float64 each, of a block's means from an eye (3,)."""

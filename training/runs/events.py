@@ -200,7 +200,9 @@ _VALUES: dict[str, Callable[[object], bool]] = {
     **dict.fromkeys(("event", "message", "what", "remedy", "method", "rule", "stage", "version"), _is_text),
     **dict.fromkeys(("level", "levels"), _is_level),
     **dict.fromkeys(("step", "of", "splats", "protocol", "pid", "drawn"), _is_count),
-    **dict.fromkeys(("time", "loss", "psnr", "steps_per_s", "eta_s", "train_psnr"), _is_number),
+    **dict.fromkeys(
+        ("time", "loss", "psnr", "steps_per_s", "eta_s", "train_psnr", "fitted_psnr"), _is_number
+    ),
     **dict.fromkeys(("cumulative", "again", "more"), _is_bool),
     **dict.fromkeys(("facts", "scene_facts", "controls"), _are_numbers),
     **dict.fromkeys(("path", "bundle"), _is_path),

@@ -41,9 +41,9 @@ def evaluate_run(
     Returns:
         Of all levels, but those that are no scene by themselves, ``levels``: coarse to fine, ``level``, its
         facts, ``splats``, ``drawn``, ``psnr``, ``ssim``, ``frame_s``, ``veil``; where levels add up, of each
-        with all coarser ones. Of the finest,
-        ``train_psnr``, ``veil``, ``oversized``, ``worst`` (``evaluate.summary``), and ``aside`` where the
-        scene has views off its path (``scenes.aside``): their mean ``psnr`` and the names of the ``views``.
+        with all coarser ones. Of the finest, ``train_psnr``, ``veil``, ``oversized``, ``worst`` and
+        ``fitted_psnr`` (``evaluate.summary``), and ``aside`` where the scene has views off its path
+        (``scenes.aside``): their mean ``psnr`` and the names of the ``views``.
         By the rule, ``selective``: per view and predetermined (chosen from the mean training camera; not of a
         file that is too large for memory), with the values of the rule's controls; none where the levels have
         no rule. ``frame_s``: seconds a frame

@@ -70,9 +70,9 @@ class FlodParameters(DensityParameters):
     last_level: int = parameter(0, "Level that training ends with; 0 for the finest.")
     finish_share: float = parameter(
         0.14,
-        "Further steps at the end, as a share of all levels', that fit the two levels before the finest to "
-        "how the three are drawn together by distance; those of fine detail begin anew with the finest "
-        "level's most important splats. Not in the paper.",
+        "Further steps at the end, as a share of all levels', that fit the three finest levels to how they "
+        "are drawn together by distance; of the two coarser ones those of fine detail begin anew with the "
+        "finest level's most important splats. Not in the paper.",
         high=1,
     )
     drawn: float = parameter(
@@ -83,8 +83,8 @@ class FlodParameters(DensityParameters):
         high=1,
     )
     finish_alone: float = parameter(
-        0.25,
-        "Share of these steps that draw one of these two alone, so that it does not need the others.",
+        0.5,
+        "Share of these steps that draw one of the three alone, so that it does not need the others.",
         high=1,
     )
 

@@ -1,12 +1,12 @@
-"""Finishing: the levels before the finest become its most important splats, and learn to stand beside it.
+"""Finishing: the levels before the finest become its most important splats, and all learn to stand together.
 
 Not in the paper (FLoD, Sec. 5.2), which trains each level as if it were alone, before the finer ones: no step
 has ever drawn two of them, nor the places where one takes over from the next. Here they are rows of one
 model. Those whose smallest size hardly limits what they can show begin anew: as copies of the finest level's
 splats that have the largest share of some pixel, so many that views by distance draw no more than they may.
-Each step then draws what the rule chooses at a random screen size, or a coarser level alone, so that it does
-not come to need the others. The finest level stays as it is: it is drawn whole as well, and no worse than
-before.
+Each step then draws what the rule chooses at a random screen size, or a level alone, so that it does not come
+to need the others. Rates fall meanwhile, for the finest level as well: without that the one before it, which
+has fewer splats and more steps, comes to be the better one.
 """
 
 from __future__ import annotations
@@ -125,9 +125,9 @@ def rates(parameters: FlodParameters, extent: float, share: float) -> dict[str, 
 
 
 def random_values(rng: np.random.Generator, gamma: float, model: Model, alone: float) -> Values:
-    """Controls of the rule for a step: a coarser level alone with a chance of ``alone``, else all levels."""
+    """Controls of the rule for a step: a level alone with a chance of ``alone``, else all levels."""
     numbers = list(_rows(model))
-    factor, level = SPREAD ** rng.uniform(-1, 1), int(rng.choice(numbers[:-1]))
+    factor, level = SPREAD ** rng.uniform(-1, 1), int(rng.choice(numbers))
     first, last = (level, level) if rng.uniform() < alone else (numbers[0], numbers[-1])
     return {"gamma": gamma * factor, "first": first, "last": last}
 
@@ -143,14 +143,6 @@ def weights(model: Model, s_min: Sequence[float], camera: Camera, values: Values
     return torch.from_numpy(np.concatenate(found)).to(model["means"].device)
 
 
-def hold_finest(model: Model) -> None:
-    """After ``backward``: the finest level has no part in the step; without moments it stays as it is."""
-    *_, finest = _rows(model).values()
-    for tensor in model.adam.tensors.values():
-        if tensor.grad is not None:
-            tensor.grad[finest] = 0
-
-
 @torch.no_grad()
 def keep_sizes(model: Model, s_min: Sequence[float]) -> None:
     """No splat becomes smaller than its level allows."""
@@ -160,9 +152,9 @@ def keep_sizes(model: Model, s_min: Sequence[float]) -> None:
 
 
 def levels_of(model: Model, s_min: Sequence[float]) -> list[Level]:
-    """The levels that were trained, coarse to fine: all but the finest."""
-    splats, facts, (*rows, _) = model.splats(), dict(_facts(s_min)), _rows(model).items()
-    return [Level(number, splats.select(some), facts[number]) for number, some in rows]
+    """The levels that were trained, coarse to fine."""
+    splats, facts = model.splats(), dict(_facts(s_min))
+    return [Level(number, splats.select(some), facts[number]) for number, some in _rows(model).items()]
 
 
 def _weights(

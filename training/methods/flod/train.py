@@ -117,9 +117,7 @@ class Method(method.Method[FlodParameters, Drawing]):
         return [Drawing(self.rasterize_model(view.camera, step, min_scale=min_scale))]
 
     def accumulate_stats(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> None:
-        if self.finishing(step):
-            finish.hold_finest(self.model)
-        elif self._local(step) < self._densify_until(step):
+        if not self.finishing(step) and self._local(step) < self._densify_until(step):
             self.model.accumulate_stats(drawings[0].rendering, view.shrink)
 
     def set_learning_rates(self, step: int) -> None:
