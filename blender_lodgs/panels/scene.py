@@ -11,11 +11,15 @@ class LODGS_PT_scene(Panel):
     bl_order = 0
 
     def draw(self, context):
-        layout = self.layout
-        column = layout.column(align=True)
-        column.operator("lodgs.import_colmap", text="Import Photographs (COLMAP)…", icon="CAMERA_DATA")
-        column.operator("lodgs.import_splats", text="Import Splats…", icon="POINTCLOUD_DATA")
-        root = scenes.active_root(context)
+        layout, root = self.layout, scenes.active_root(context)
+        if scenes.shows_splats(context.scene):  # a further one is seldom wanted
+            row = layout.row(align=True)
+            row.operator("lodgs.import_colmap", text="Photographs…", icon="CAMERA_DATA")
+            row.operator("lodgs.import_splats", text="Splats…", icon="POINTCLOUD_DATA")
+        else:
+            column = layout.column(align=True)
+            column.operator("lodgs.import_colmap", text="Import Photographs (COLMAP)…", icon="CAMERA_DATA")
+            column.operator("lodgs.import_splats", text="Import Splats…", icon="POINTCLOUD_DATA")
         if scenes.linked(context):
             say(layout, scenes.LINKED, "LINKED")
         if root is None:

@@ -478,7 +478,7 @@ def new_folder(root: bpy.types.Object) -> Path:
     return next(parent / n for n in names if not (parent / n).exists())
 
 
-def _far(folder: str) -> bool:
+def is_far(folder: str) -> bool:
     """Whether a folder is on another computer than the .blend: it is looked for there on request only.
 
     Opening somebody's file must not make Windows introduce itself to a computer of their choice.
@@ -490,7 +490,7 @@ def _far(folder: str) -> bool:
 def reattach() -> None:
     """Attach to the run of every scene root that has one and is not watched: after loading, undo and redo."""
     for root in [obj for obj in bpy.data.objects if obj.lodgs.training.run]:
-        if watch_of(root) is None and not _far(bpy.path.abspath(root.lodgs.training.run)):
+        if watch_of(root) is None and not is_far(bpy.path.abspath(root.lodgs.training.run)):
             with suppress(LodgsError):  # the folder is gone: the panel says so
                 watch = attach(root, root.lodgs.training.run, again=False)
                 if bpy.app.background:

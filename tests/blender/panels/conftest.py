@@ -21,6 +21,12 @@ class Notes:
 
     column = box = grid_flow = split = row
 
+    def panel(self, *_, **__):
+        return self, self
+
+    def menu(self, *_, **__):
+        pass
+
     def label(self, text="", **_):
         self.texts.append(text)
 
