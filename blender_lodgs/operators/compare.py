@@ -44,7 +44,6 @@ class LODGS_OT_cancel_measuring(bpy.types.Operator):
 
     bl_idname = "lodgs.cancel_measuring"
     bl_label = "Cancel"
-    bl_options = {"INTERNAL"}
 
     @classmethod
     def poll(cls, context):

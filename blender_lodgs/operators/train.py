@@ -9,7 +9,7 @@ import bpy
 from ...training.errors import LodgsError
 from ..data import cells, scenes
 from ..runs import jobs
-from ..runs.watch import Watch, dismiss_notices, root_by_uid, watch_of
+from ..runs.watch import Watch, root_by_uid, watch_of
 from .frames import PieceByPiece
 from .parts import OnScene, report_errors, show_image
 
@@ -146,17 +146,6 @@ class LODGS_OT_open_run(OnScene, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LODGS_OT_dismiss_notice(bpy.types.Operator):
-    bl_idname = "lodgs.dismiss_notice"
-    bl_label = "Dismiss"
-    bl_description = "The Training panel goes on saying how it ended"
-    bl_options = {"INTERNAL"}
-
-    def execute(self, context):
-        dismiss_notices()
-        return {"FINISHED"}
-
-
 class LODGS_OT_show_log(OnScene, bpy.types.Operator):
     bl_idname = "lodgs.show_log"
     bl_label = "Show Log"
@@ -203,7 +192,6 @@ CLASSES = (
     LODGS_OT_cancel_block,
     LODGS_OT_resume_block,
     LODGS_OT_open_run,
-    LODGS_OT_dismiss_notice,
     LODGS_OT_show_log,
     LODGS_OT_show_costs,
 )

@@ -1,6 +1,8 @@
-"""The Placement panel."""
+"""The Placement panel, and the same verbs in the viewport's menus, where F3 finds them."""
 
 from __future__ import annotations
+
+import bpy
 
 from ..data import scenes
 from .parts import Panel
@@ -32,4 +34,38 @@ class LODGS_PT_placement(Panel):
         row.operator("lodgs.turntable", text="Turntable", icon="FILE_REFRESH")
 
 
-CLASSES = (LODGS_PT_placement,)
+class LODGS_MT_placement(bpy.types.Menu):
+    bl_label = "Splat Scene"
+
+    def draw(self, context):
+        layout = self.layout
+        layout.operator("lodgs.set_ground", text="Ground From Selection").by = "SELECTION"
+        layout.operator("lodgs.set_ground", text="Find Ground").by = "FOUND"
+        layout.operator("lodgs.set_scale", text="Set Scale…")
+        layout.operator("lodgs.camera_path")
+        layout.operator("lodgs.turntable")
+
+
+def _menu(self, context):
+    self.layout.menu("LODGS_MT_placement")
+
+
+def _view_menu(self, context):
+    self.layout.operator("lodgs.frame_scene")
+
+
+_MENUS = ("VIEW3D_MT_object", "VIEW3D_MT_edit_pointcloud")
+
+CLASSES = (LODGS_PT_placement, LODGS_MT_placement)
+
+
+def register() -> None:
+    for name in _MENUS:
+        getattr(bpy.types, name).append(_menu)
+    bpy.types.VIEW3D_MT_view.append(_view_menu)
+
+
+def unregister() -> None:
+    bpy.types.VIEW3D_MT_view.remove(_view_menu)
+    for name in _MENUS:
+        getattr(bpy.types, name).remove(_menu)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import bpy
+
 from ..data import photographs, scenes
+from ..runs import preparing
 from .parts import Panel, say, split_column
 
 
@@ -12,14 +15,7 @@ class LODGS_PT_scene(Panel):
 
     def draw(self, context):
         layout, root = self.layout, scenes.active_root(context)
-        if scenes.shows_splats(context.scene):  # a further one is seldom wanted
-            row = layout.row(align=True)
-            row.operator("lodgs.import_colmap", text="Photographs…", icon="CAMERA_DATA")
-            row.operator("lodgs.import_splats", text="Splats…", icon="POINTCLOUD_DATA")
-        else:
-            column = layout.column(align=True)
-            column.operator("lodgs.import_colmap", text="Import Photographs (COLMAP)…", icon="CAMERA_DATA")
-            column.operator("lodgs.import_splats", text="Import Splats…", icon="POINTCLOUD_DATA")
+        _draw_import(layout, another=scenes.shows_splats(context.scene))
         if scenes.linked(context):
             say(layout, scenes.LINKED, "LINKED")
         if root is None:
@@ -46,6 +42,32 @@ class LODGS_PT_scene(Panel):
             name = camera.name if camera in views else "Look Through"
             row.operator("lodgs.look_through", text=name, icon="OUTLINER_DATA_CAMERA").step = 0
             row.operator("lodgs.look_through", text="", icon="TRIA_RIGHT").step = 1
+
+
+def _draw_import(layout: bpy.types.UILayout, another: bool) -> None:
+    """The ways in; folded away where there is a scene."""
+    column: bpy.types.UILayout | None = layout.column(align=True)
+    _draw_finding(column)
+    if another:
+        header, column = layout.panel("LODGS_import_another", default_closed=True)
+        header.label(text="Import Another")
+    if column is not None:
+        column.operator("lodgs.find_cameras", text="Import Photographs…", icon="IMAGE_DATA")
+        column.operator("lodgs.import_colmap", text="Import COLMAP or Export…", icon="CAMERA_DATA")
+        column.operator("lodgs.import_splats", text="Import Splats…", icon="POINTCLOUD_DATA")
+
+
+def _draw_finding(column: bpy.types.UILayout) -> None:
+    """How far the cameras of photographs are found, or how it went."""
+    work = preparing.current
+    if work is None:
+        return
+    if work.running:
+        row = column.row(align=True)
+        row.progress(text=work.message, factor=work.fraction)
+        row.operator("lodgs.cancel_find_cameras", text="", icon="X")
+    else:
+        say(column, work.problem or work.message, "ERROR" if work.problem else "INFO")
 
 
 CLASSES = (LODGS_PT_scene,)

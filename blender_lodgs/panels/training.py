@@ -11,14 +11,11 @@ from ...training.methods import method_info
 from .. import extension
 from ..data import scenes, viewpoints
 from ..data.training import chooses_distances, hold_out, level_distances, offered
-from ..runs import environment, found, jobs
+from ..runs import environment, jobs
 from ..runs.watch import Watch, watch_of
 from ..runs.words import measured_on, progress_facts, short_level_line
 from .parts import Panel, draw_environment, draw_views, say, scene_length, split_column
 from .training_cells import draw_blocks
-
-MOST_RUNS = 8
-"""So many of the newest are listed."""
 
 
 class LODGS_PT_training(Panel):
@@ -36,6 +33,8 @@ class LODGS_PT_training(Panel):
         if watch is not None and watch.running:
             _draw_running(self.layout, watch, root)
             return
+        if root.lodgs.training.run:
+            self.layout.menu("LODGS_MT_runs", icon="FILE_FOLDER")
         if watch is not None:
             _draw_ended(self.layout, watch, root)
         elif root.lodgs.training.run:
@@ -43,41 +42,14 @@ class LODGS_PT_training(Panel):
             row.label(text="There was a run", icon="FILE_FOLDER")
             row.operator("lodgs.open_run").directory = root.lodgs.training.run
         resumable = watch is not None and watch.state != "done"
-        header, choices = self.layout.panel("LODGS_train_anew", default_closed=bool(root.lodgs.levels))
-        header.label(text="Train Anew" if watch is not None else "New Training")
+        choices: bpy.types.UILayout | None = self.layout
+        if scenes.root_with_levels(context) is not None and root.lodgs.training.run:  # next are the levels
+            header, choices = self.layout.panel("LODGS_train_anew", default_closed=True)
+            header.label(text="Train Anew")
         if choices is not None:
             _draw_choices(choices, context, root, resumable)
             if extension.preferences().flamenco and root.lodgs.scene_folder:
                 choices.operator("lodgs.submit_to_flamenco", icon="NETWORK_DRIVE")
-
-
-class LODGS_PT_training_runs(Panel):
-    bl_label = "Runs"
-    bl_parent_id = "LODGS_PT_training"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        root = scenes.active_root(context)
-        return root is not None and root.is_editable and len(found.runs_of(root)) > 1
-
-    def draw(self, context: bpy.types.Context) -> None:
-        root = scenes.active_root(context)
-        assert root is not None
-        column, shown, runs = self.layout.column(align=True), jobs.run_folder(root), found.runs_of(root)
-        for run in runs[:MOST_RUNS]:
-            row = column.row(align=True)
-            row.alignment = "LEFT"
-            here = shown is not None and shown.path.resolve() == run.path.resolve()
-            levels = f"{run.levels} level{'s' * (run.levels != 1)}"
-            text = f"{run.path.name}: {run.method}, {levels}"
-            button = row.operator(
-                "lodgs.open_run", text=text, icon="RADIOBUT_ON" if here else "RADIOBUT_OFF", emboss=False
-            )
-            button.directory = str(run.path)
-            if run.state != "done":
-                row.label(text="", icon="PLAY" if run.state == "running" else "PAUSE")
-        if len(runs) > MOST_RUNS:
-            column.label(text=f"{len(runs) - MOST_RUNS} older ones: Advanced, Open Run")
 
 
 class LODGS_PT_training_advanced(Panel):
@@ -249,4 +221,4 @@ def _draw_ended(layout: bpy.types.UILayout, watch: Watch, root: bpy.types.Object
             row.operator("lodgs.show_log", icon="TEXT")
 
 
-CLASSES = (LODGS_PT_training, LODGS_PT_training_runs, LODGS_PT_training_advanced)
+CLASSES = (LODGS_PT_training, LODGS_PT_training_advanced)

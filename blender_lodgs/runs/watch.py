@@ -68,7 +68,6 @@ class Watch:
         method: what it trains.
         last_event: when an event came last, in seconds since the epoch.
         offset: bytes of the run's events that have been read.
-        unread: whether it has ended since it was seen at work, and nobody has dismissed that notice.
         reading: a finished tree that is larger than it may be in memory, while its top is read.
     """
 
@@ -89,7 +88,6 @@ class Watch:
     method: str = ""
     last_event: float = field(default_factory=time.time)
     offset: int = 0
-    unread: bool = False
     reading: Future[scenes.SplatsFile] | None = None
 
     @property
@@ -165,9 +163,9 @@ class Watch:
         return f"What the trainer sent could not be shown: {error}."
 
     def _alive(self) -> bool:
-        alive = (self.process is not None and self.process.poll() is None) or self.folder.running
-        self.unread |= alive
-        return alive
+        if self.process is not None and self.process.poll() is None:
+            return True
+        return self.folder.running
 
     def _apply(self, root: bpy.types.Object, event: dict) -> None:
         match event["event"]:
@@ -273,13 +271,6 @@ class Watch:
 
 def _share(event: dict) -> float:
     return min(event.get("step", 0) / max(event.get("of", 0), 1), 1.0)
-
-
-def dismiss_notices() -> None:
-    """Says no more that runs have ended."""
-    for watch in watches.values():
-        watch.unread = watch.running and watch.unread
-    extension.redraw()
 
 
 watches: dict[int, Watch] = {}

@@ -24,9 +24,6 @@ class Notes:
     def panel(self, *_, **__):
         return self, self
 
-    def menu(self, *_, **__):
-        pass
-
     def label(self, text="", **_):
         self.texts.append(text)
 
@@ -38,6 +35,9 @@ class Notes:
         self.operators.append(name)
         self.buttons.append(text)
         return SimpleNamespace()
+
+    def menu(self, name, **_):
+        self.texts.append(name)
 
     def separator(self, **_):
         pass
