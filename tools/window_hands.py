@@ -71,16 +71,6 @@ def open_panels(*names: str) -> None:
                 bpy.utils.register_class(panel)
 
 
-def open_panel(name: str) -> None:
-    """Have the panel of this module open, and at the top of the sidebar."""
-    open_panels(name)
-    for panel in module(name).CLASSES:
-        if getattr(panel, "bl_region_type", "") == "UI":
-            bpy.utils.unregister_class(panel)
-            panel.bl_order = -1 - len(taken)
-            bpy.utils.register_class(panel)
-
-
 def scroll(times: int) -> None:
     """Turn the mouse wheel over the sidebar, from its top on downwards."""
     with bpy.context.temp_override(

@@ -2,7 +2,7 @@
 
 ``tools/window.py`` starts it with ``--walk``; see ``window_tour``.
 """
-# pyright: reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
+# pyright: reportAttributeAccessIssue=false, reportGeneralTypeIssues=false, reportOptionalMemberAccess=false
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from tools.window_hands import (
     PLAN,
     Steps,
     changed,
-    look_at,
     module,
-    open_panel,
+    open_panels,
     press,
     press_f12,
     region,
+    scroll,
     settle,
     start,
     take,
@@ -72,18 +72,21 @@ def train(root: bpy.types.Object) -> Steps:
 
 
 def place(root: bpy.types.Object) -> Steps:
-    open_panel("panels.placement")
+    open_panels("panels.placement", "panels.clean_up", "panels.rendering")
     press("lodgs.set_ground", by="FOUND")
-    press("lodgs.frame_scene")
+    module("data.photographs").look_at_scene(bpy.context, root, print)
+    scroll(16)
     yield from settle()
     take("placed")
 
 
 def clean(root: bpy.types.Object) -> Steps:
     before = take("uncropped")
-    open_panel("panels.clean_up")
     press("lodgs.add_crop", shape="SPHERE")
-    bpy.context.active_object.scale *= 0.6
+    eye, target = module("data.photographs").photographed_from(root)
+    crop = bpy.context.active_object
+    crop.location, crop.scale = target, [(eye - target).length * 0.4] * 3
+    scroll(26)
     press("lodgs.hide_splats", test="FLOATERS")
     yield from settle()
     shown, everything = module("data.scenes").count_shown(bpy.context, root)
@@ -93,7 +96,7 @@ def clean(root: bpy.types.Object) -> Steps:
 def click(root: bpy.types.Object) -> Steps:
     """A click on nothing deselects, and one on the splats selects their scene."""
     part, window = region(), bpy.context.window_manager.windows[0]
-    middle = part.x + part.width // 2 - 120, part.y + part.height // 2
+    middle = part.x + part.width // 2 + 30, part.y + part.height // 2 - 40  # beside the crop's lines
     for place, chosen in (((part.x + 90, part.y + 15), None), (middle, root)):
         window.event_simulate(type="MOUSEMOVE", value="NOTHING", x=place[0], y=place[1])
         yield 0.3
@@ -107,15 +110,15 @@ def click(root: bpy.types.Object) -> Steps:
 
 def shoot(root: bpy.types.Object) -> Steps:
     """A mesh among the splats, and the picture of both."""
-    scene, (middle, size) = bpy.context.scene, module("data.photographs").bounds_of_most(root)
-    press("mesh.primitive_uv_sphere_add", way="EXEC_DEFAULT", radius=size / 14, location=middle)
-    look_at(middle, back=size)
+    scene, (eye, target) = bpy.context.scene, module("data.photographs").photographed_from(root)
+    away = (eye - target).length
+    press("mesh.primitive_uv_sphere_add", way="EXEC_DEFAULT", radius=away / 12, location=target)
     press("lodgs.use_engine")
     press("lodgs.combine_with_meshes")
     scene.lodgs_render.meshes.cycles.samples = 16
     press("lodgs.look_through", step=1)
     viewport()[1].view_perspective = "CAMERA"
-    open_panel("panels.rendering")
+    scroll(60)
     yield from settle()
     take("shot")
     bpy.context.preferences.view.render_display_type = "AREA"  # this display has no window manager
