@@ -41,6 +41,7 @@ def walk() -> Steps:
     """Everything in order. An assertion that fails ends the walk with its sentence."""
     for name in ("Cube", "Light", "Camera"):
         bpy.data.objects.remove(bpy.data.objects[name])
+    open_panels("panels.placement", "panels.clean_up", "panels.rendering")
     viewport()[0].spaces.active.show_region_ui = True
     yield 1.0
     region("UI").active_panel_category = "LODGS"
@@ -72,7 +73,6 @@ def train(root: bpy.types.Object) -> Steps:
 
 
 def place(root: bpy.types.Object) -> Steps:
-    open_panels("panels.placement", "panels.clean_up", "panels.rendering")
     press("lodgs.set_ground", by="FOUND")
     module("data.photographs").look_at_scene(bpy.context, root, print)
     scroll(16)
