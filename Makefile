@@ -98,7 +98,7 @@ pins: setup
 	$(LOCK) $(if $(UPGRADE),--upgrade) --python-version 3.13 requirements/blender-5.2.in -o requirements/blender-5.2.txt
 
 window: setup
-	$(VENV) tools/window.py --method $(METHOD) $(if $(LONG),--long)
+	$(VENV) tools/window.py --method $(METHOD) $(if $(LONG),--long) $(if $(WALK),--walk)
 
 interop: setup
 	$(VENV) tools/interop.py

@@ -7,7 +7,8 @@ has ``window_tour.py`` import the example scene, train it, look at it and render
 ``--flight BUNDLE --cameras DIR`` has ``window_flight.py`` open a tree of splats instead and fly through it,
 along the cameras of a folder's files, and prints how long each piece of our work holds Blender's main thread.
 
-``--cells`` has ``window_cells.py`` train the scene in cells, two at a time.
+``--cells`` has ``window_cells.py`` train the scene in cells, two at a time. ``--walk`` has ``window_walk.py``
+go from photographs to a rendered shot, as the artists' page tells it.
 
 Always on a virtual display (Xvfb), photographed from outside by ImageMagick: the same pictures on every
 computer, nothing of the desktop in them, and nobody's screen is taken. Blender's own screenshots are black
@@ -51,6 +52,7 @@ def main() -> int:
     )
     parser.add_argument("--budget", type=int, default=1_000_000, help="splats of that tree in memory")
     parser.add_argument("--cells", action="store_true", help="train the scene in cells, instead of the tour")
+    parser.add_argument("--walk", action="store_true", help="from photographs to a shot, instead of the tour")
     chosen = parser.parse_args()
     if chosen.flight and not chosen.cameras:
         parser.error("--flight needs --cameras")
@@ -71,6 +73,7 @@ def main() -> int:
         "method": chosen.method,
         "long": chosen.long,
         "cells": chosen.cells,
+        "walk": chosen.walk,
         "camera": [camera, "-window", "root"],
     }
     if chosen.flight:
@@ -129,9 +132,12 @@ def display(x_server: str) -> Iterator[str]:
 
 def tour(blender: str, plan: dict, log: Path) -> str:
     """Have Blender take the tour, or fly; return why it failed, or nothing."""
-    script = ROOT / "tools" / f"window_{next((k for k in ('flight', 'cells') if plan.get(k)), 'tour')}.py"
+    script = (
+        ROOT / "tools" / f"window_{next((k for k in ('flight', 'cells', 'walk') if plan.get(k)), 'tour')}.py"
+    )
     command = [
         blender, "--gpu-backend", "opengl", "--window-geometry", "0", "0", *map(str, SIZE),
+        *(["--enable-event-simulate"] if plan.get("walk") else []),
         "--python-exit-code", "1", "--python", str(script), "--", json.dumps(plan),
     ]  # fmt: skip
     with open(log, "wb") as said:

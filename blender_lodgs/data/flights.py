@@ -43,6 +43,7 @@ def path(context: bpy.types.Context, root: bpy.types.Object) -> bpy.types.Object
     camera = bpy.data.objects.new(f"{root.name} path", data)
     root.users_collection[0].objects.link(camera)
     camera.parent, camera.rotation_mode = axes_of(root), "QUATERNION"
+    camera.lodgs.flight_of = root
     begin, end = context.scene.frame_start, context.scene.frame_end
     for place, turn, time in zip(*smoothed(np.array(places), np.array(turns)), strict=True):
         camera.location, camera.rotation_quaternion = place, turn
@@ -69,6 +70,7 @@ def turntable(context: bpy.types.Context, root: bpy.types.Object) -> bpy.types.O
     camera = bpy.data.objects.new(data.name, data)
     for obj in (pivot, camera):
         scene.collection.objects.link(obj)
+        obj.lodgs.flight_of = root
     wide, high = (getattr(scene.render, f"resolution_{axis}") for axis in "xy")
     tangent = data.sensor_width / 2 / data.lens * min(1.0, wide / high, high / wide)
     away = size / 2 / math.sin(math.atan(tangent))

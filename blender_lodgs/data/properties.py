@@ -197,6 +197,13 @@ class SplatScene(bpy.types.PropertyGroup):
         type=bpy.types.Object,
         options={"HIDDEN"},
     )
+    flight_of: bpy.props.PointerProperty(
+        name="Flight of",
+        description="The root of the scene that this object carries a moving camera along or around, and "
+        "with which it is removed",
+        type=bpy.types.Object,
+        options={"HIDDEN"},
+    )
     scene_folder: bpy.props.StringProperty(
         name="Scene", description="Folder of the COLMAP scene", subtype="DIR_PATH"
     )

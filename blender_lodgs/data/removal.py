@@ -14,7 +14,8 @@ from .placement import axes_of
 
 
 def remove(root: bpy.types.Object) -> None:
-    """Removes a splat scene: levels, crops, tables, points, cameras, the root, and collections empty then.
+    """Removes a splat scene: levels, crops, tables, points, cameras with those that move,
+    the root, and collections empty then.
 
     What else hangs on the root stays where it is: copies of levels show what they show, without following,
     and uncropped.
@@ -25,6 +26,7 @@ def remove(root: bpy.types.Object) -> None:
     axes, cropping = axes_of(root), crops.crops_of(root)
     parts = {obj for obj in known if obj is not None and obj.parent == axes}
     parts |= {root, axes, *tables.parts(root), *cropping}
+    parts |= {obj for obj in bpy.data.objects if obj.lodgs.flight_of == root and obj.is_editable}
     others = [obj for obj in bpy.data.objects if obj not in parts and obj.is_editable]
     for obj in others:
         _let_go(obj, root, cropping)

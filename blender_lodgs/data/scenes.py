@@ -57,6 +57,12 @@ def shows_splats(scene: bpy.types.Scene) -> bool:
     return bool(roots(scene)) or any(map(_instanced, scene.objects))
 
 
+def shows_levels(scene: bpy.types.Scene) -> bool:
+    """Whether a Blender scene has levels of splats, its own or in instances of collections."""
+    own = any(item.exists for root in roots(scene) for item in root.lodgs.levels)
+    return own or any(map(_instanced, scene.objects))
+
+
 def linked(context: bpy.types.Context) -> bool:
     """Whether the splat scene that is meant is another file's, or the selected instance shows such a one."""
     root, obj = active_root(context), context.active_object

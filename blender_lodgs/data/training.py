@@ -271,6 +271,15 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
         max=MOST_CELLS,
         options=set(),
     )
+    polish: bpy.props.IntProperty(
+        name="Border Steps",
+        description="Steps that fit each cell's borders to the cells beside it, once all are trained; "
+        "0 leaves them as they are",
+        default=Job.polish,
+        min=0,
+        soft_max=2000,
+        options=set(),
+    )
     at_once: bpy.props.IntProperty(
         name="Cells at Once",
         description="How many cells are trained at a time on this computer. Each takes its own memory, and "

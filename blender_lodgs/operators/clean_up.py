@@ -67,7 +67,7 @@ class LODGS_OT_remove_crop(OnOwnLevels, bpy.types.Operator):
 
     bl_idname = "lodgs.remove_crop"
     bl_label = "Remove Crop"
-    bl_options = {"REGISTER", "UNDO"}
+    bl_options = {"REGISTER", "UNDO", "INTERNAL"}
 
     name: bpy.props.StringProperty(name="Crop", description="Name of the crop's object")
 

@@ -13,7 +13,7 @@ class LODGS_OT_show_only_level(OnScene, bpy.types.Operator):
 
     bl_idname = "lodgs.show_only_level"
     bl_label = "Only This One"
-    bl_options = {"REGISTER", "UNDO"}
+    bl_options = {"REGISTER", "UNDO", "INTERNAL"}
 
     level: bpy.props.IntProperty(name="Level", description="1 is the coarsest", default=1, min=1)
 

@@ -102,6 +102,7 @@ class LODGS_OT_cancel_block(_OnBlock, bpy.types.Operator):
     bl_idname = "lodgs.cancel_block"
     bl_label = "Cancel Cell"
     bl_description = "Ask this cell's training to save and stop, while the others go on"
+    bl_options = {"INTERNAL"}
 
     @report_errors
     def execute(self, context):
@@ -113,6 +114,7 @@ class LODGS_OT_resume_block(_OnBlock, bpy.types.Operator):
     bl_idname = "lodgs.resume_block"
     bl_label = "Resume Cell"
     bl_description = "Go on with this cell: beside the others where they are at work, else with it alone"
+    bl_options = {"INTERNAL"}
 
     @report_errors
     def execute(self, context):

@@ -18,7 +18,7 @@ class LODGS_PT_rendering(Panel):
 
     @classmethod
     def poll(cls, context):
-        return scenes.shows_splats(context.scene)
+        return scenes.shows_levels(context.scene)
 
     def draw(self, context):
         layout, scene = self.layout, context.scene

@@ -14,13 +14,8 @@ class LODGS_PT_scene(Panel):
     bl_order = 0
 
     def draw(self, context):
-        layout = self.layout
-        column = layout.column(align=True)
-        _draw_finding(column)
-        column.operator("lodgs.find_cameras", text="Import Photographs…", icon="IMAGE_DATA")
-        column.operator("lodgs.import_colmap", text="Import COLMAP or Export…", icon="CAMERA_DATA")
-        column.operator("lodgs.import_splats", text="Import Splats…", icon="POINTCLOUD_DATA")
-        root = scenes.active_root(context)
+        layout, root = self.layout, scenes.active_root(context)
+        _draw_import(layout, another=scenes.shows_splats(context.scene))
         if scenes.linked(context):
             say(layout, scenes.LINKED, "LINKED")
         if root is None:
@@ -47,6 +42,19 @@ class LODGS_PT_scene(Panel):
             name = camera.name if camera in views else "Look Through"
             row.operator("lodgs.look_through", text=name, icon="OUTLINER_DATA_CAMERA").step = 0
             row.operator("lodgs.look_through", text="", icon="TRIA_RIGHT").step = 1
+
+
+def _draw_import(layout: bpy.types.UILayout, another: bool) -> None:
+    """The ways in; folded away where there is a scene."""
+    column: bpy.types.UILayout | None = layout.column(align=True)
+    _draw_finding(column)
+    if another:
+        header, column = layout.panel("LODGS_import_another", default_closed=True)
+        header.label(text="Import Another")
+    if column is not None:
+        column.operator("lodgs.find_cameras", text="Import Photographs…", icon="IMAGE_DATA")
+        column.operator("lodgs.import_colmap", text="Import COLMAP or Export…", icon="CAMERA_DATA")
+        column.operator("lodgs.import_splats", text="Import Splats…", icon="POINTCLOUD_DATA")
 
 
 def _draw_finding(column: bpy.types.UILayout) -> None:

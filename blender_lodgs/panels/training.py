@@ -41,9 +41,15 @@ class LODGS_PT_training(Panel):
             row = self.layout.row()
             row.label(text="There was a run", icon="FILE_FOLDER")
             row.operator("lodgs.open_run").directory = root.lodgs.training.run
-        _draw_choices(self.layout, context, root, resumable=watch is not None and watch.state != "done")
-        if extension.preferences().flamenco and root.lodgs.scene_folder:
-            self.layout.operator("lodgs.submit_to_flamenco", icon="NETWORK_DRIVE")
+        resumable = watch is not None and watch.state != "done"
+        choices: bpy.types.UILayout | None = self.layout
+        if scenes.root_with_levels(context) is not None and root.lodgs.training.run:  # next are the levels
+            header, choices = self.layout.panel("LODGS_train_anew", default_closed=True)
+            header.label(text="Train Anew")
+        if choices is not None:
+            _draw_choices(choices, context, root, resumable)
+            if extension.preferences().flamenco and root.lodgs.scene_folder:
+                choices.operator("lodgs.submit_to_flamenco", icon="NETWORK_DRIVE")
 
 
 class LODGS_PT_training_advanced(Panel):

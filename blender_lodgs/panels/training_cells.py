@@ -41,9 +41,11 @@ class LODGS_UL_blocks(bpy.types.UIList):
         watch, number = watch_of(data.id_data), index + 1
         part = watch.part(number) if watch else None
         if watch is not None and part is not None:
-            row = _numbered(layout, number).row(align=True)
-            _draw_part(row, part, stopping=(part.kind, number) in watch.stopping)
-            if watch.running and part.state in ("waiting", "running"):
+            row, stopping = _numbered(layout, number).row(align=True), (part.kind, number) in watch.stopping
+            _draw_part(row, part, stopping)
+            if watch.running and part.state == "waiting" and stopping:
+                row.label(icon="BLANK1")
+            elif watch.running and part.state in ("waiting", "running"):
                 row.operator("lodgs.cancel_block", text="", icon="X", emboss=False).block = number
             elif part.state != "done":
                 row.operator("lodgs.resume_block", text="", icon="PLAY", emboss=False).block = number
@@ -51,7 +53,9 @@ class LODGS_UL_blocks(bpy.types.UIList):
 
 def _draw_part(layout: bpy.types.UILayout, part: Part, stopping: bool = False) -> None:
     share, what = f"{part.share:.0%}", "Borders, " if part.kind == "seam" else ""
-    if stopping:
+    if stopping and part.state == "waiting":  # the run says so when it next comes to it
+        layout.label(text="Cancelled", icon=_ICONS["cancelled"])
+    elif stopping:
         layout.label(text=f"Stopping at {share}", icon="SORTTIME")
     elif part.state == "running":
         layout.progress(text=f"{what}{share}", factor=part.share)
@@ -93,6 +97,7 @@ def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
         say(layout, "One cell: the scene is trained as a whole.", "INFO")
         return
     column.prop(settings, "at_once")
+    column.prop(settings, "polish")
     try:
         job = jobs.make_job(root, jobs.runs_folder(root), {})
     except LodgsError as error:

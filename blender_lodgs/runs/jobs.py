@@ -293,6 +293,7 @@ def make_job(root: bpy.types.Object, out: Path, parameters: dict) -> Job:
         "image_scale": _as_typed(settings.image_scale),
         "backend": extension.preferences().backend,
         "cells": "" if viewpoints.alone(root) else settings.grid,
+        "polish": settings.polish,
         "parameters": changes(settings) | parameters,
     }
     return Job.from_dict(values)

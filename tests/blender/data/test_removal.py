@@ -137,3 +137,13 @@ def test_a_root_of_an_older_file_holds_on_to_itself(lodgs, root):
     root.lodgs.itself = None
     lodgs("data.older_files").bring_up_to_date(root)
     assert root.lodgs.itself == root
+
+
+def test_cameras_that_move_go_with_their_scene(bpy, lodgs, root):
+    """The artist's own things stay, and so does what moves about another scene."""
+    there = everything(bpy)["objects"]
+    assert bpy.ops.lodgs.camera_path() == {"FINISHED"} and bpy.ops.lodgs.turntable() == {"FINISHED"}
+    added = set(everything(bpy)["objects"]) - set(there)
+    assert len(added) == 3
+    lodgs("data.removal").remove(root)
+    assert everything(bpy)["objects"] == ["the artist's"] and bpy.context.scene.camera is None

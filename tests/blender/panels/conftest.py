@@ -21,6 +21,9 @@ class Notes:
 
     column = box = grid_flow = split = row
 
+    def panel(self, *_, **__):
+        return self, self
+
     def label(self, text="", **_):
         self.texts.append(text)
 

@@ -113,3 +113,12 @@ def test_what_came_is_said(bpy, lodgs, capfd, tmp_path):
     scene = lodgs("training.scenes.colmap").read_scene(GARDEN)
     truth = f"{len(scene.cameras)} photographs, {len(scene.points):,} points"
     assert f"'lantern_garden': {truth}" in capfd.readouterr().out
+
+
+def test_what_is_about_splats_waits_for_them(bpy, lodgs):
+    scenes = lodgs("data.scenes")
+    found = [getattr(lodgs(f"panels.{name}"), f"LODGS_PT_{name}") for name in ("viewport", "rendering")]
+    root = scenes.import_colmap(bpy.context, GARDEN, photographs=False)
+    assert not any(panel.poll(bpy.context) for panel in found)
+    scenes.set_level(root, Level(1, splats(5)))
+    assert all(panel.poll(bpy.context) for panel in found)

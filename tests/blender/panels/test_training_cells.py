@@ -56,7 +56,7 @@ def test_the_plan_is_offered_for_more_than_one_cell(bpy, root, draw, line):
     assert "One cell: the scene is trained as a whole." in notes.texts
     settings.columns = 2
     notes = draw()
-    assert notes.operators == ["lodgs.plan_cells"] and notes.properties[-1] == "at_once"
+    assert notes.operators == ["lodgs.plan_cells"] and notes.properties[-1] == "polish"
     bpy.ops.lodgs.plan_cells()
     notes = draw()
     assert {"Views", "Splats", "Memory"} <= set(notes.texts)
@@ -80,7 +80,7 @@ def test_cells_are_found_by_what_one_may_have(bpy, lodgs, root, draw, monkeypatc
 
     monkeypatch.setattr(cells, "cells_within", found)
     settings.divide_by, settings.cell_splats, grid = "SPLATS", settings.parameters.preset_max_splats, ""
-    assert draw().properties == ["divide_by", "cell_splats", "at_once"]
+    assert draw().properties == ["divide_by", "cell_splats", "at_once", "polish"]
     bpy.ops.lodgs.plan_cells()
     assert (settings.columns, settings.rows) == (1, 1), "it fits as it is"
     assert not any("plan again" in text for text in draw().texts)
@@ -115,6 +115,9 @@ def test_each_cell_says_how_it_gets_on(lodgs, root, draw_panel, line, watch):
     assert line("blocks", 0).texts == ["1", "Waiting"] and line("blocks", 0).operators == [
         "lodgs.cancel_block"
     ]
+    watch.stopping = {("block", 1)}
+    assert line("blocks", 0).texts[:2] == ["1", "Cancelled"] and not line("blocks", 0).operators
+    watch.stopping = set()
     watch._take_blocks(root, [_part(0, "coarse", "done", 100), _part(1, "block", "running", 25),
                               _part(2, "block", "cancelled", 50)])  # fmt: skip
     assert "Coarse levels" not in panel().texts

@@ -16,8 +16,6 @@ ELSEWHERE = {
     "lodgs.select_all_splats",
     # a stroke of the toolbar's tools
     "lodgs.select_splats",
-    # of one item of a list, beside it
-    "lodgs.show_only_level", "lodgs.remove_crop", "lodgs.cancel_block", "lodgs.resume_block",
 }  # fmt: skip
 
 

@@ -1,0 +1,72 @@
+"""Which splat scene is seen at a pixel of a viewport."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ..attributes import BASE, SCALE, WEIGHT, read_attribute
+from .objects import root_of
+from .shown import SplatInstance, splat_instances
+
+DIM = 0.5
+"""Share of the light that the picked splats and those before them let through at most: fog is not picked."""
+FAINTEST = 1 / 255
+"""Splats of less opacity at the pixel do not count."""
+
+
+def scene_at(
+    depsgraph: bpy.types.Depsgraph,
+    viewport: bpy.types.SpaceView3D | None,
+    clip: Matrix,
+    size: tuple[int, int],
+    at: tuple[float, float],
+) -> bpy.types.Object | None:
+    """The root of the splats that are seen at a pixel, or their object where they are in no scene.
+
+    Splats count as round there, of their mean width; which one comes first is told by their means.
+
+    Args:
+        viewport: see ``shown.splat_instances``.
+        clip: from the world to clip space.
+        size: the viewport's (W, H) in pixels.
+        at: the pixel, x from the left and y from below.
+
+    Returns:
+        None where no splats are, or not enough of them to hide half of what is behind.
+    """
+    instances = splat_instances(depsgraph, viewport)
+    found = [_at_pixel(instance, np.array(clip), np.array(size), np.array(at)) for instance in instances]
+    if not found:
+        return None
+    depths, alphas = (np.concatenate(each) for each in zip(*found, strict=True))
+    owners = np.repeat(np.arange(len(found)), [len(each) for each, _ in found])
+    order = np.argsort(depths)
+    hidden = np.cumprod(1 - alphas[order]) <= DIM
+    if not hidden.any():
+        return None
+    obj = instances[owners[order[hidden.argmax()]]].object
+    return root_of(obj) or obj
+
+
+def _at_pixel(
+    instance: SplatInstance, clip: np.ndarray, size: np.ndarray, at: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Depths (M,) in clip space and opacities (M,) of the splats of an instance that cover a pixel."""
+    cloud = instance.evaluated.data
+    means, scales, base = (read_attribute(cloud, name) for name in ("position", SCALE, BASE))
+    if means is None or scales is None or base is None or not len(means):
+        return np.zeros(0), np.zeros(0)
+    to_clip = clip @ instance.matrix_world
+    x, y, z, w = to_clip[:, :3] @ means.T + to_clip[:, 3:]
+    there = np.flatnonzero((w > 0) & (np.abs(z) < w))
+    w = w[there]
+    away = (np.stack([x[there], y[there]]) / w + 1) / 2 * size[:, None] - at[:, None]
+    pixels = np.linalg.norm(to_clip[1, :3]) * size[1] / 2 / w  # that a unit of the splats' covers
+    sigma = scales[there].mean(1) * pixels
+    alphas = base[there, 3] * np.exp(-(away**2).sum(0) / 2 / (sigma**2 + 0.3))  # 3DGS's dilation
+    weights = read_attribute(cloud, WEIGHT)
+    alphas = np.minimum(alphas if weights is None else alphas * weights[there], 0.99)
+    covers = alphas > FAINTEST
+    return z[there][covers] / w[covers], alphas[covers]
