@@ -77,7 +77,9 @@ def step(
     at, count = torch.from_numpy(places).to(records.device)[seen], len(lr)
     some, shares = records[at], shares[seen]
     told = some[:, 3 * count :]
-    score = rendering.grad2d[seen].norm(dim=1) * rendering.radii[seen] * some[:, OPACITY_LOGIT].sigmoid() ** 0.2
+    score = (
+        rendering.grad2d[seen].norm(dim=1) * rendering.radii[seen] * some[:, OPACITY_LOGIT].sigmoid() ** 0.2
+    )
     told[:, SCORE] = torch.maximum(told[:, SCORE], score)
     told[:, SEEN] = float(number)
     moves = shares != 0

@@ -31,7 +31,7 @@ def test_what_is_gathered_lies_in_the_order_of_gaussians():
 
 
 def test_each_record_makes_steps_of_its_own():
-    """Against Algorithm 1 in float64, record by record; they are not all there, nor in the image, in every step."""
+    """Against Algorithm 1 in float64, record by record; not all are there or in the image each time."""
     some, rates = made(), torch.logspace(-4, -2, C)
     values, m, v = some[:, :C].double(), torch.zeros(COUNT, C).double(), torch.zeros(COUNT, C).double()
     times, largest, last = torch.zeros(COUNT, 1), torch.zeros(COUNT), torch.zeros(COUNT)
