@@ -20,10 +20,12 @@ from ..training.runs.folder import RunFolder
 from ..training.runs.job import Job, check_views
 from ..training.runs.options import add_options, job_from, size_of
 from ..training.splats.bundle import write_bundle
+from ..training.splats.dialects import Warn
 from . import extension
 from .data import scenes, viewpoints
 from .render.capture import render_views, write_model
-from .runs import environment, jobs
+from .render.video import MOST_FRAMES, extract_frames
+from .runs import environment, jobs, preparing
 from .runs.watch import Watch
 from .runs.words import duration, level_line
 
@@ -110,6 +112,16 @@ def _parser() -> argparse.ArgumentParser:
         "for several computers, before one does the same without it",
     )  # fmt: skip
 
+    frames = commands.add_parser(
+        "frames", help="sharp frames of a video, from which lodgs scene --photos --ordered finds cameras"
+    )
+    frames.set_defaults(command=_frames)
+    frames.add_argument("video", type=Path, help="any video that Blender reads")
+    frames.add_argument("--out", type=Path, required=True, help="folder of the frames")
+    frames.add_argument(
+        "--most", type=int, default=MOST_FRAMES, metavar="N", help=f"at most so many ({MOST_FRAMES})"
+    )
+
     info = commands.add_parser("info", help="say what a bundle or any 3DGS PLY holds")
     info.set_defaults(command=_info)
     info.add_argument("file", type=Path)
@@ -153,9 +165,16 @@ def _imported(job: Job) -> bpy.types.Object:
         _print(f"warning: {message}")
 
     if not job.capture:
-        return scenes.import_colmap(bpy.context, Path(job.scene), warn=warn)
+        return _photographed(Path(job.scene), warn)
     run = RunFolder(job.base)
     return scenes.import_splats(bpy.context, run.bundle if run.bundle.exists() else run.path, warn=warn)
+
+
+def _photographed(folder: Path, warn: Warn) -> bpy.types.Object:
+    """A COLMAP scene, its photographs straightened where their lens bends lines."""
+    root = scenes.import_colmap(bpy.context, folder, warn=warn)
+    preparing.straighten(root, warn)
+    return root
 
 
 def _methods(args: argparse.Namespace) -> int:
@@ -166,7 +185,7 @@ def _methods(args: argparse.Namespace) -> int:
 def _import(args: argparse.Namespace) -> int:
     _empty_file()
     if args.source.is_dir():
-        scenes.import_colmap(bpy.context, args.source.resolve(), warn=lambda m: _print(f"warning: {m}"))
+        _photographed(args.source.resolve(), lambda m: _print(f"warning: {m}"))
     else:
         scenes.import_splats(bpy.context, args.source.resolve(), warn=lambda m: _print(f"warning: {m}"))
     _save(args.blend)
@@ -213,6 +232,21 @@ def _capture(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         _print("Cancelled. The same command goes on from here.")
         return CANCELLED
+    return DONE
+
+
+def _frames(args: argparse.Namespace) -> int:
+    if args.most < 2:
+        raise LodgsError(f"{args.most} frames make no scene.", "Ask for some dozens with --most.")
+    if not args.video.is_file():
+        raise LodgsError(f"There is no file {args.video}.", "Choose a video.")
+
+    def tell(number: int, count: int) -> None:
+        _print(f"Frames of the video: {number} of {count}")
+
+    folder = args.out.resolve()
+    count = extract_frames(args.video.resolve(), folder, args.most, tell)
+    _print(f"{folder}: {count} frames")
     return DONE
 
 

@@ -24,6 +24,8 @@ from ...training.lod.rule import Control, Tables, find_rule
 from ...training.lod.selection import complete, known_rule, not_alone, unknown_rule
 from ...training.methods import METHODS
 from ...training.scenes.colmap import Scene, read_scene
+from ...training.scenes.formats import colmap_scene
+from ...training.scenes.undistort import already_undistorted
 from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder, read_head
 from ...training.splats.gaussians import Splats
 from ..nodes import ellipsoids
@@ -89,7 +91,8 @@ def import_colmap(
     Where the Blender scene has no camera, the first view becomes its camera and gives the render its size.
 
     Args:
-        folder: the scene's folder, or that of a model in it.
+        folder: the scene's folder, or that of a model in it; or another program's export, which is then made
+            a COLMAP scene (``formats.colmap_scene``).
         model: folder of the model; by default the largest one. Training takes the same one.
         images: folder of the photographs; by default found beside the model. Training takes the same one.
         upright: turn the root so that the cameras' mean up direction is +z; otherwise leave COLMAP's axes.
@@ -106,16 +109,14 @@ def import_colmap(
     manager.progress_begin(0, 1)  # at the mouse pointer
     try:
         model, images = (Path(path) if path else None for path in (model, images))
-        scene = read_scene(Path(folder), model, images, manager.progress_update)
+        folder = Path(folder) if model else colmap_scene(Path(folder), warn)
+        scene = read_scene(folder, model, images, manager.progress_update)
     finally:
         manager.progress_end()
     for message in scene.warnings:
         warn(message)
-    if scene.distorted:
-        warn(
-            f"{len(scene.distorted)} of {len(scene.cameras)} views have lens distortion: their photographs "
-            "fit the points only roughly here. Training undistorts them."
-        )
+    straight = already_undistorted(scene)
+    shown = {camera.name: camera for camera in straight.cameras} if straight else {}
     extent, near = _extent(scene), _near(scene)
     with _new_scene(context, scene.folder.name) as root:
         axes = axes_of(root)
@@ -131,7 +132,8 @@ def import_colmap(
         root.lodgs.cameras = bpy.data.collections.new(f"{root.name} cameras")
         _collection(root).children.link(root.lodgs.cameras)
         for place, camera in enumerate(scene.cameras):
-            distorted = camera.name in scene.distorted
+            distorted = camera.name in scene.distorted and camera.name not in shown
+            camera = shown.get(camera.name, camera)
             view = new_camera(camera, extent, near, photograph=photographs, distorted=distorted)
             view.parent, view.data.lodgs.place = axes, place
             root.lodgs.cameras.objects.link(view)
@@ -143,8 +145,8 @@ def import_colmap(
             _collection(root).objects.link(points)
             root.lodgs.points = points
         if context.scene.camera is None and scene.cameras:
-            context.scene.camera = root.lodgs.cameras.objects[0]
-            match_render(context.scene, scene.cameras[0], context.scene.render.resolution_percentage)
+            context.scene.camera = first = root.lodgs.cameras.objects[0]
+            match_render(context.scene, first.data.lodgs, context.scene.render.resolution_percentage)
     return root
 
 
