@@ -17,7 +17,7 @@ from ..data import scenes, selection
 from .parts import OnLevels, report_errors
 
 
-class _AsPlaced(OnLevels):
+class _AsShown(OnLevels):
     """What all exports can be told."""
 
     placed: bpy.props.BoolProperty(
@@ -27,9 +27,15 @@ class _AsPlaced(OnLevels):
         "scene is moved by itself, count in neither",
         default=False,
     )
+    looked: bpy.props.BoolProperty(
+        name="With Look",
+        description="Write the splats in the colours and opacities that the Look panel gives them. Otherwise "
+        "as they were trained",
+        default=True,
+    )
 
 
-class _Export(_AsPlaced, ExportHelper):
+class _Export(_AsShown, ExportHelper):
     """What exports to one PLY have in common: a name after the scene, and the browser's overwrite check."""
 
     filename_ext = ".ply"
@@ -73,7 +79,7 @@ class LODGS_OT_export_bundle(_Export, bpy.types.Operator):
                 "The coarser level of these splats is no scene by itself, which other viewers would show.",
                 "Put the finest level first.",
             )
-        bundle = scenes.read_levels(root, self.placed)
+        bundle = scenes.read_levels(root, self.placed, self.looked)
         write_bundle(self._path(), bundle, self.order)
         self.report({"INFO"}, f"{len(bundle.levels)} levels written to {self._path()}")
         return {"FINISHED"}
@@ -107,20 +113,21 @@ class LODGS_OT_export_plain(_Export, bpy.types.Operator):
         if self.source == "LEVEL":
             self.layout.prop(self, "level")
         self.layout.prop(self, "placed")
+        self.layout.prop(self, "looked")
 
     @report_errors
     def execute(self, context):
         root = scenes.active_root(context)
         if self.source == "LEVEL":
-            splats = scenes.read_level(root, self.level, self.placed)
+            splats = scenes.read_level(root, self.level, self.placed, self.looked)
         else:
-            splats = scenes.shown_splats(context, root, self.placed)
+            splats = scenes.shown_splats(context, root, self.placed, self.looked)
         write_ply(self._path(), splats, comments_of(selection.read_json(root.lodgs.meta)))
         self.report({"INFO"}, f"{len(splats):,} splats written to {self._path()}")
         return {"FINISHED"}
 
 
-class LODGS_OT_export_folder(_AsPlaced, bpy.types.Operator):
+class LODGS_OT_export_folder(_AsShown, bpy.types.Operator):
     """Export levels as files of their own, whole scenes each; splat-transform streams them for the web"""
 
     bl_idname = "lodgs.export_folder"
@@ -146,7 +153,7 @@ class LODGS_OT_export_folder(_AsPlaced, bpy.types.Operator):
         if not self.replace and any(folder.glob("lod*.ply")):
             raise LodgsError(f"{folder} already holds levels.", "Choose another folder, or tick Replace.")
         root = scenes.active_root(context)
-        bundle = scenes.read_levels(root, self.placed)
+        bundle = scenes.read_levels(root, self.placed, self.looked)
         if is_tree(bundle):
             bundle = complete_levels(bundle)
         command = write_folder(folder, bundle)

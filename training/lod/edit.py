@@ -1,4 +1,4 @@
-"""A file of splats without clutter: ``lodgs edit``."""
+"""A file of splats without clutter, or in another look: ``lodgs edit``."""
 
 from __future__ import annotations
 
@@ -9,16 +9,18 @@ from ..splats.bundle import DrawableRows, open_bundle, read_folder, write_bundle
 from ..splats.dialects import Warn, comments_of, silent
 from ..splats.ply import write_ply
 from .cleaning import Cleaning, cleaned
+from .look import Looks, looked_levels
 from .selection import known_rule
 
 
-def edit(source: Path, out: Path, cleaning: Cleaning, warn: Warn = silent) -> str:
+def edit(source: Path, out: Path, cleaning: Cleaning, warn: Warn = silent, *, looks: Looks = ()) -> str:
     """Writes what a cleaning leaves of a bundle, a folder of levels or any 3DGS PLY, as such a file.
 
     Of a binary PLY only some rows at a time are in memory.
 
     Args:
         warn: as for ``read_ply``.
+        looks: what is made of the colours and opacities of what stays.
 
     Returns:
         How many splats of each level stay, as a few lines of text.
@@ -35,7 +37,7 @@ def edit(source: Path, out: Path, cleaning: Cleaning, warn: Warn = silent) -> st
         for level in bundle.levels:
             level.elsewhere = DrawableRows(rows[level.number], warn)
     known_rule(bundle)
-    found = cleaned(bundle, cleaning)
+    found = looked_levels(cleaned(bundle, cleaning), looks)
     if source.is_dir():
         write_folder(out, found)
     elif bundle.method or bundle.rule or len(bundle.levels) > 1:
