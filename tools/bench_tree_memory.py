@@ -232,6 +232,14 @@ def told(row: dict) -> str:
     )
 
 
+def add_row(path: Path, row: dict) -> None:
+    """Puts a row into the report, for an earlier one of its town and way: sizes can be run one by one."""
+    report = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"rows": []}
+    named = row["name"], row["times"]
+    report["rows"] = [each for each in report["rows"] if (each["name"], each.get("times")) != named] + [row]
+    path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="measure training of trees larger than memory")
     parser.add_argument("--out", type=Path, default=Path("build/bench/tree.json"))
@@ -266,7 +274,6 @@ def main() -> None:
     program = [run("train", options.small, options, budget=half) for _ in range(2)][1]  # one may compile
     program, small = program["peak_mb"] - program["cache_mb"], run("draw", options.small, options)["peak_mb"]
     print(f"beside the budget and a tenth: program {program:.0f} MB, and drawing")
-    rows = []
     for times in options.times:
         leaves = round(options.budget * 1e6 * times / (4 * layout_of(0).width) / 2)
         made = run("build", leaves, options)
@@ -279,11 +286,8 @@ def main() -> None:
             allowed = 1.1 * options.budget + program + drawing
             row |= {"name": way, "times": times, "budget_mb": options.budget, "program_mb": program,
                     "drawing_mb": drawing, "allowed_mb": allowed, "pixels": pixels}  # fmt: skip
-            rows.append({key: round(x, 4) if isinstance(x, float) else x for key, x in row.items()})
+            add_row(options.out, {key: round(x, 4) if isinstance(x, float) else x for key, x in row.items()})
             print(f"  {times:>4g} x {pixels:.2f} px  {way:<17} {told(row)}", flush=True)
-    report = json.loads(options.out.read_text(encoding="utf-8")) if options.out.exists() else {"rows": []}
-    report["rows"] = [row for row in report["rows"] if row.get("peak_mb") is None] + rows
-    options.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

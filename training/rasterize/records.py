@@ -49,7 +49,9 @@ def step(
     betas: tuple[float, float] = adam.BETAS,
     eps: float = adam.EPS,
 ) -> None:
-    """One step of Adam in place for some records, each with the number of steps of its own.
+    """One step of Adam in place for those of some records that are in the image, by their radii.
+
+    Each has a number of steps of its own; what is out of the image stays as it is, moments and all.
 
     Args:
         records: (N, width).
@@ -71,17 +73,20 @@ def step(
         radii, rates = rendering.radii.numpy(), np.ascontiguousarray(lr.numpy(), np.float32)
         step_on_cpu(records.numpy(), places, told, grad2d, radii, number, rates, shares.numpy(), betas, eps)
         return
-    at, count = torch.from_numpy(places).to(records.device), len(lr)
-    some = records[at]
+    seen = rendering.radii > 0
+    at, count = torch.from_numpy(places).to(records.device)[seen], len(lr)
+    some, shares = records[at], shares[seen]
     told = some[:, 3 * count :]
-    score = rendering.grad2d.norm(dim=1) * rendering.radii * some[:, OPACITY_LOGIT].sigmoid() ** 0.2
+    score = (
+        rendering.grad2d[seen].norm(dim=1) * rendering.radii[seen] * some[:, OPACITY_LOGIT].sigmoid() ** 0.2
+    )
     told[:, SCORE] = torch.maximum(told[:, SCORE], score)
-    told[:, SEEN] = torch.where(rendering.radii > 0, float(number), told[:, SEEN])
+    told[:, SEEN] = float(number)
     moves = shares != 0
     moving, share = some[moves], shares[moves, None]
     moving[:, 3 * count + STEPS] += 1
     values, m, v = (moving[:, i * count : (i + 1) * count] for i in range(3))
-    gradient = torch.cat([each.reshape(len(places), -1) for each in gradients], 1)[moves]
+    gradient = torch.cat([each.reshape(len(places), -1) for each in gradients], 1)[seen][moves]
     times = moving[:, 3 * count + STEPS, None].double()
     adam.update_in_torch(values, gradient, m, v, lr.to(share) * share, betas, eps, times)
     some[moves] = moving

@@ -41,7 +41,7 @@ LEAF_REST = 0.03
 
 
 class SeenRecords:
-    """Adam's step for the records alone that a picture was made of.
+    """Adam's step for the records alone that are in a picture; of a cut, a half to three quarters are not.
 
     Args:
         store: of all records.
@@ -83,7 +83,7 @@ class SeenRecords:
         cache = self._store.cache
         told = self.rendering, self._number, torch.cat(rates), self._shares
         records.step(cache.records, self._places, gradients, *told)
-        cache.changed(self._places)
+        cache.changed(self._places[(self.rendering.radii > 0).numpy(force=True)])
 
     def zero_grad(self) -> None:
         """The next picture has other records."""

@@ -47,14 +47,15 @@ def _step(
     count = lr.shape[0]
     terms = count - 11
     for k in range(begin, end):
+        if radii[k] <= 0:
+            continue
         i = places[k] * width
         told = i + 3 * count
         x, y = grad2d[2 * k], grad2d[2 * k + 1]
         opacity = 1 / (1 + np.exp(-records[i + 10]))
         score = np.sqrt(x * x + y * y) * radii[k] * opacity ** f32(0.2)
         records[told + 1] = max(records[told + 1], score)
-        if radii[k] > 0:
-            records[told + 2] = number
+        records[told + 2] = number
         if shares[k] == 0:
             continue
         records[told] += f32(1)
