@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import LodgsError
+from ..scenes import views
+from ..scenes.ground import about_cameras, find_ground, level_at_zero
 from ..splats.bundle import (
     META_LENGTHS,
     NO_SPLATS,
@@ -65,10 +67,37 @@ def placed(bundle: Bundle, placement: Placement) -> Bundle:
     for name in rule.tables if rule else ():
         if name in tables:
             tables[name] = placement.columns(tables[name], lengths, places)
+    if views.VIEWS in tables:
+        tables[views.VIEWS] = views.placed(tables[views.VIEWS], placement)
     if BOUNDS[0] in tables.get(BLOCKS, {}):
         tables[BLOCKS] = table_of_pages({x.number: c for x, c in zip(bundle.levels, remade, strict=True)})
     meta = _meta(bundle.meta, placement)
     return replace(bundle, levels=levels, facts=facts(bundle.facts), tables=tables, meta=meta)
+
+
+def standing(bundle: Bundle, upright: bool = False, ground: bool = False) -> Placement:
+    """What stands a bundle's scene upright, z up, and where it is asked for its ground on z = 0.
+
+    Of splats in a file those of the finest level are read, some at a time.
+
+    Raises:
+        LodgsError: there is no ground.
+    """
+    left, _, right = np.linalg.svd(bundle.upright)  # of numbers that have been rounded
+    stands = Placement(left @ right if upright or ground else np.eye(3), 1.0, np.zeros(3))
+    if not ground:
+        return stands
+    rows, meta = bundle.levels[-1].rows, bundle.meta
+    parts = [np.zeros((0, 3), np.float32)]
+    for begin in range(0, len(rows), AT_ONCE):
+        some = rows.select(slice(begin, begin + AT_ONCE))
+        parts.append(some.means[some.opacity_logits > 0])
+    places = np.concatenate(parts)
+    center, depth = meta.get("camera_center"), meta.get("median_depth", 0)
+    if center is not None and isinstance(depth, int | float):
+        places = about_cameras(places, np.asarray(center), depth)
+    plane = find_ground(stands.points(places), np.array([0.0, 0.0, 1.0]))
+    return level_at_zero(*plane).after(stands)
 
 
 def place_file(source: Path, out: Path, placement: Placement, warn: Warn = silent) -> int:
@@ -105,9 +134,7 @@ def upright_of(source: Path) -> Placement:
     Raises:
         LodgsError: as ``read_head`` and ``read_folder``.
     """
-    bundle = (read_folder if source.is_dir() else read_head)(source)
-    left, _, right = np.linalg.svd(bundle.upright)  # of numbers that have been rounded
-    return Placement(left @ right, 1.0, np.zeros(3))
+    return standing((read_folder if source.is_dir() else read_head)(source), upright=True)
 
 
 def _meta(meta: dict, placement: Placement) -> dict:
