@@ -238,7 +238,10 @@ def _parser() -> argparse.ArgumentParser:
         help="how large clusters of floaters are at most, as a share of all splats (default 0.001)",
     )  # fmt: skip
     edit.add_argument(
-        "--scene", type=Path, metavar="DIR", help="COLMAP folder of the photographs, for the next two"
+        "--scene",
+        type=Path,
+        metavar="DIR",
+        help="COLMAP folder of the photographs, for --max-distance, --min-views and --ground",
     )
     edit.add_argument(
         "--max-distance", type=float, metavar="N", help="drop splats farther from every photograph's eye"
@@ -528,12 +531,14 @@ def _edit(chosen: argparse.Namespace) -> int:
     outside = chosen.keep == "outside"
     crops = [Crop.box(box[:3], box[3:], outside) for box in chosen.crop_box]
     crops += [Crop.sphere(sphere[:3], sphere[3], outside) for sphere in chosen.crop_sphere]
-    if given.keys() & {"max_distance", "min_views"}:
-        if chosen.scene is None:
-            raise LodgsError("Photographs' views are in their scene.", "Name its folder with --scene.")
+    if given.keys() & {"max_distance", "min_views"} and chosen.scene is None:
+        raise LodgsError("Photographs' views are in their scene.", "Name its folder with --scene.")
+    points = None
+    if chosen.scene is not None:
         from .scenes.colmap import read_scene
 
-        given["cameras"] = tuple(read_scene(chosen.scene).cameras)
+        scene = read_scene(chosen.scene)
+        given["cameras"], points = tuple(scene.cameras), scene.points
     if not (chosen.out or chosen.plain or chosen.folder or chosen.streamed):
         raise LodgsError("It is not said what to write.", "Add --out FILE, or --plain, --folder, --streamed.")
     cleaning = Cleaning(tuple(crops), drop_floaters=chosen.drop_floaters, **given)
@@ -541,7 +546,7 @@ def _edit(chosen: argparse.Namespace) -> int:
         print(
             edit(
                 source, chosen.out, cleaning, _warn,
-                placement=_placement(chosen), upright=chosen.upright, ground=chosen.ground,
+                placement=_placement(chosen), upright=chosen.upright, ground=chosen.ground, points=points,
                 plain=chosen.plain, folder=chosen.folder, streamed=chosen.streamed,
             )
         )  # fmt: skip
@@ -553,7 +558,7 @@ def _info(chosen: argparse.Namespace) -> int:
     from .splats.formats import as_ply
 
     with as_ply(chosen.file) as there:
-        print(describe(there))
+        print(describe(there).replace(str(there), str(chosen.file)))
     return 0
 
 

@@ -113,4 +113,6 @@ def _places(root: bpy.types.Object) -> np.ndarray:
     base = read_attribute(obj.data, BASE)
     places = places if base is None else places[base[:, 3] > 0.5]
     depth = root.lodgs.training.median_depth or read_json(root.lodgs.meta).get("median_depth", 0)
-    return about_cameras(places, np.array(root.lodgs.camera_center), depth if isinstance(depth, int | float) else 0)
+    return about_cameras(
+        places, np.array(root.lodgs.camera_center), depth if isinstance(depth, int | float) else 0
+    )

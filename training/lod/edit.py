@@ -31,6 +31,7 @@ def edit(
     placement: Placement | None = None,
     upright: bool = False,
     ground: bool = False,
+    points: np.ndarray | None = None,
     plain: Sequence[Path] = (),
     folder: Path | None = None,
     streamed: Path | None = None,
@@ -44,7 +45,7 @@ def edit(
         warn: as for ``read_ply``.
         placement: where the scene is put, after it stands; crops and lengths of the cleaning are those of
             the source.
-        upright, ground: see ``placing.standing``.
+        upright, ground, points: see ``placing.standing``.
         plain: files of the finest level alone, each the kind that its name asks for.
         folder: receives a folder of levels.
         streamed: folder that receives levels as browsers load them.
@@ -71,8 +72,10 @@ def edit(
     known_rule(bundle)
     found = cleaned(bundle, cleaning)
     if placement is not None or upright or ground:
-        stands = standing(found, upright, ground)
+        stands = standing(bundle, upright, ground, points)
         found = placed(found, stands if placement is None else placement.after(stands))
+        if upright or ground:
+            found.meta["up_rotation"] = np.eye(3)
     if out is None:
         pass
     elif source.is_dir():

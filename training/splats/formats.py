@@ -187,13 +187,12 @@ def as_ply(path: Path) -> Iterator[Path]:
     Raises:
         LodgsError: the file cannot be read, or the program for it is missing or fails.
     """
-    name = path.name.lower()
     if path.is_dir() and (path / STREAMED).is_file():
-        path, name = path / STREAMED, STREAMED
-    packed = name.endswith(".ply") and path.is_file() and _is_packed(path)
-    if path.is_dir() or not (packed or name.endswith(READABLE[1:])):
+        path = path / STREAMED
+    if path.is_dir() or is_ply(path):
         yield path
         return
+    name = path.name.lower()
     open_file(path).close()  # says why it cannot be read
     stem = path.resolve().parent.name if name == STREAMED else path.name.split(".")[0]
     with tempfile.TemporaryDirectory(prefix="lodgs-") as folder:
@@ -276,10 +275,17 @@ def _last_line(log: Path) -> str:
     return next(filter(None, lines), "")
 
 
-def _is_packed(path: Path) -> bool:
-    """Whether a PLY is a compressed one, by its header."""
+def is_ply(path: Path) -> bool:
+    """Whether a file is read as it is: a PLY that is not compressed, or nothing that is known here.
+
+    Raises:
+        LodgsError: it cannot be read.
+    """
+    name = path.name.lower()
+    if not name.endswith(PLY.suffix):
+        return not name.endswith(READABLE)
     with open_file(path) as file:
-        return b"packed_position" in file.read(4096)
+        return b"packed_position" not in file.read(4096)
 
 
 def _count_of_lods(path: Path) -> int:
