@@ -35,6 +35,8 @@ from .objects import root_of
 from .photographs import camera_of, is_held_out, match_render, new_camera, photographed, views
 from .placement import axes_of, new_axes, placement_of
 
+ABOUT = "About these splats"
+"""The name of the text that tells of LODGS where it is not installed."""
 LINKED = (
     "This splat scene is linked from another file, where its settings are. To change them here, append it "
     "instead of linking it (File, Append), or make it local (Object, Relations, Make Local, All)."
@@ -257,7 +259,7 @@ def place_splats(
         for level in bundle.levels:
             made.append(objects.new_splats(f"{file.path.stem} {level.number}", level.splats))
             yield
-        with _new_scene(context, file.path.stem) as root:
+        with _new_scene(context, file.path.stem.removesuffix(".compressed")) as root:
             if upright:
                 axes_of(root).rotation_quaternion = Matrix(bundle.upright.tolist()).to_quaternion()
             _fill(root, file, made)
@@ -548,11 +550,23 @@ def _new_scene(context: bpy.types.Context, name: str) -> Iterator[bpy.types.Obje
         collection.objects.link(root)
         context.scene.collection.children.link(collection)
         new_axes(root)
+        _tell_others()
         yield root
     for obj in context.selected_objects:
         obj.select_set(False)
     context.view_layer.objects.active = root
     root.select_set(True)
+
+
+def _tell_others() -> None:
+    """Leaves a text in the file for whoever opens it without LODGS, and sees points."""
+    if ABOUT not in bpy.data.texts:
+        bpy.data.texts.new(ABOUT).write(
+            "The point clouds in this file are Gaussian splats. Without the extension LODGS, Blender shows "
+            "the finest level of each scene as points.\n\nWith it they are drawn as splats, in viewports and "
+            "in renders, with detail by distance, and can be cleaned, placed and exported: Edit > Preferences "
+            "> Get Extensions > Install from Disk. Nothing is lost when the file is saved without it.\n"
+        )
 
 
 def _require_alone(root: bpy.types.Object, number: int) -> None:

@@ -83,8 +83,8 @@ FORMATS = (
         tuple(16.3 + _rest(degree) for degree in range(4)), 3,
     ),
     Format(
-        ".spz", "SPZ", "Niantic's kind, for phones, Cesium and glTF: a tenth of a PLY",
-        (16.0, 19.0, 24.0, 31.0), 3,
+        ".spz", "SPZ", "Niantic's kind, for phones, Cesium and glTF: a twelfth of a PLY",
+        (17.0, 18.0, 18.0, 18.0), 3,
     ),
     Format(
         ".sog", "SOG", "PlayCanvas' kind for the web, the smallest. Takes minutes without a graphics card",
@@ -194,7 +194,7 @@ def as_ply(path: Path) -> Iterator[Path]:
         return
     name = path.name.lower()
     open_file(path).close()  # says why it cannot be read
-    stem = path.resolve().parent.name if name == STREAMED else path.name.split(".")[0]
+    stem = path.resolve().parent.name if name == STREAMED else path.stem.removesuffix(".compressed")
     with tempfile.TemporaryDirectory(prefix="lodgs-") as folder:
         made = Path(folder, f"{stem or 'splats'}.ply")
         if name == STREAMED:
