@@ -11,7 +11,7 @@ from . import commands, operators, panels, viewport
 from .data import changes, loaded, older_files, properties, removal, scenes, updates
 from .nodes import building
 from .render import compare, engine, renderer
-from .runs import capturing, jobs
+from .runs import capturing, jobs, preparing
 from .viewport import wipe
 
 MODULES = (
@@ -32,6 +32,7 @@ MODULES = (
     compare,
     jobs,
     capturing,
+    preparing,
     commands,
 )
 

@@ -15,15 +15,19 @@ import bpy
 from ..training.errors import LodgsError
 from ..training.evaluate.words import summary_lines
 from ..training.lod.describe import describe
+from ..training.lod.selection import complete
 from ..training.methods.describe import describe_method, describe_methods
 from ..training.runs.folder import RunFolder
 from ..training.runs.job import Job, check_views
 from ..training.runs.options import add_options, job_from, size_of
 from ..training.splats.bundle import write_bundle
+from ..training.splats.dialects import Warn
+from ..training.splats.formats import PLY, format_of, write_splats
 from . import extension
 from .data import scenes, viewpoints
 from .render.capture import render_views, write_model
-from .runs import environment, jobs
+from .render.video import MOST_FRAMES, extract_frames
+from .runs import environment, jobs, preparing
 from .runs.watch import Watch
 from .runs.words import duration, level_line
 
@@ -73,15 +77,21 @@ def _parser() -> argparse.ArgumentParser:
     methods.set_defaults(command=_methods)
     methods.add_argument("name", nargs="?", metavar="NAME", help="method whose parameters to list")
 
-    convert = commands.add_parser("import", help="a COLMAP folder, a bundle or any 3DGS PLY to a .blend")
+    convert = commands.add_parser(
+        "import", help="a COLMAP folder, a bundle or any file of splats to a .blend"
+    )
     convert.set_defaults(command=_import)
-    convert.add_argument("source", type=Path, help="folder or PLY file")
+    convert.add_argument("source", type=Path, help="folder or file")
     convert.add_argument("--blend", type=Path, required=True, help=".blend file to save")
 
-    export = commands.add_parser("export", help="the levels of a .blend to a bundle")
+    export = commands.add_parser(
+        "export", help="the levels of a .blend to a bundle, or the finest to another kind of file"
+    )
     export.set_defaults(command=_export)
     export.add_argument("blend", type=Path, help=".blend file")
-    export.add_argument("bundle", type=Path, help="bundle to write (PLY)")
+    export.add_argument(
+        "bundle", type=Path, help="bundle to write (.ply); or .spz, .sog, .compressed.ply, .splat"
+    )
     export.add_argument("--root", help="name of the scene root, where the file holds several")
     export.add_argument(
         "--placed",
@@ -109,6 +119,16 @@ def _parser() -> argparse.ArgumentParser:
         "--range", type=_range, metavar="A-B", help="render only these views, from 1 on, and make no model: "
         "for several computers, before one does the same without it",
     )  # fmt: skip
+
+    frames = commands.add_parser(
+        "frames", help="sharp frames of a video, from which lodgs scene --photos --ordered finds cameras"
+    )
+    frames.set_defaults(command=_frames)
+    frames.add_argument("video", type=Path, help="any video that Blender reads")
+    frames.add_argument("--out", type=Path, required=True, help="folder of the frames")
+    frames.add_argument(
+        "--most", type=int, default=MOST_FRAMES, metavar="N", help=f"at most so many ({MOST_FRAMES})"
+    )
 
     info = commands.add_parser("info", help="say what a bundle or any 3DGS PLY holds")
     info.set_defaults(command=_info)
@@ -153,9 +173,16 @@ def _imported(job: Job) -> bpy.types.Object:
         _print(f"warning: {message}")
 
     if not job.capture:
-        return scenes.import_colmap(bpy.context, Path(job.scene), warn=warn)
+        return _photographed(Path(job.scene), warn)
     run = RunFolder(job.base)
     return scenes.import_splats(bpy.context, run.bundle if run.bundle.exists() else run.path, warn=warn)
+
+
+def _photographed(folder: Path, warn: Warn) -> bpy.types.Object:
+    """A COLMAP scene, its photographs straightened where their lens bends lines."""
+    root = scenes.import_colmap(bpy.context, folder, warn=warn)
+    preparing.straighten(root, warn)
+    return root
 
 
 def _methods(args: argparse.Namespace) -> int:
@@ -166,7 +193,7 @@ def _methods(args: argparse.Namespace) -> int:
 def _import(args: argparse.Namespace) -> int:
     _empty_file()
     if args.source.is_dir():
-        scenes.import_colmap(bpy.context, args.source.resolve(), warn=lambda m: _print(f"warning: {m}"))
+        _photographed(args.source.resolve(), lambda m: _print(f"warning: {m}"))
     else:
         scenes.import_splats(bpy.context, args.source.resolve(), warn=lambda m: _print(f"warning: {m}"))
     _save(args.blend)
@@ -179,7 +206,12 @@ def _export(args: argparse.Namespace) -> int:
     if len(found) != 1:
         names = ", ".join(root.name for root in bpy.data.objects if root.lodgs.is_root) or "none"
         raise LodgsError(f"{args.blend} holds {len(found)} such scenes.", f"Name one with --root: {names}.")
-    write_bundle(args.bundle, scenes.read_levels(found[0], args.placed))
+    bundle = scenes.read_levels(found[0], args.placed)
+    if format_of(args.bundle) is PLY:
+        write_bundle(args.bundle, bundle)
+    else:
+        for _ in write_splats(args.bundle, complete(bundle, bundle.levels[-1]), bundle.meta):
+            pass
     return DONE
 
 
@@ -213,6 +245,21 @@ def _capture(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         _print("Cancelled. The same command goes on from here.")
         return CANCELLED
+    return DONE
+
+
+def _frames(args: argparse.Namespace) -> int:
+    if args.most < 2:
+        raise LodgsError(f"{args.most} frames make no scene.", "Ask for some dozens with --most.")
+    if not args.video.is_file():
+        raise LodgsError(f"There is no file {args.video}.", "Choose a video.")
+
+    def tell(number: int, count: int) -> None:
+        _print(f"Frames of the video: {number} of {count}")
+
+    folder = args.out.resolve()
+    count = extract_frames(args.video.resolve(), folder, args.most, tell)
+    _print(f"{folder}: {count} frames")
     return DONE
 
 

@@ -99,6 +99,12 @@ def set_input(modifier: bpy.types.NodesModifier, name: str, value) -> None:
     modifier.id_data.update_tag()
 
 
+def strips(scene: bpy.types.Scene):
+    """The strips of a scene's sequencer, which Blender 4.3 and before call sequences."""
+    editor = scene.sequence_editor_create()
+    return editor.strips if hasattr(editor, "strips") else editor.sequences
+
+
 def png(settings: bpy.types.ImageFormatSettings, alpha: bool) -> None:
     """Has pictures saved as PNGs of 8 bits."""
     if hasattr(settings, "media_type"):

@@ -54,8 +54,10 @@ def undo_step(message: str) -> None:
 
 
 def redraw() -> None:
-    """Has the panels of the extension drawn anew, soon."""
+    """Has the panels of the extension and the status bar drawn anew, soon."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type in {"VIEW_3D", "PREFERENCES"}:
                 area.tag_redraw()
+        if not window.modal_operators:  # which may have a text of their own in the status bar
+            window.workspace.status_text_set_internal(None)

@@ -170,6 +170,48 @@ def _parser() -> argparse.ArgumentParser:
     )
     capture.add_argument("--backend", default="auto", help="auto, cpu, cuda or reference")
 
+    scene = commands.add_parser(
+        "scene",
+        help="photographs alone, or what another program has exported, as a COLMAP scene",
+        description="Given again, finding the cameras of photographs goes on where it stopped.",
+    )
+    given = scene.add_mutually_exclusive_group(required=True)
+    given.add_argument(
+        "--photos", type=Path, metavar="DIR", help="folder of photographs, whose cameras are to be found"
+    )
+    given.add_argument(
+        "--from", dest="source", type=Path, metavar="DIR",
+        help="folder of the export, told by what is in it: transforms.json (nerfstudio, instant-ngp, "
+        "NeRF-synthetic), Polycam, Record3D, Metashape XML, OpenMVG, Bundler",
+    )  # fmt: skip
+    scene.add_argument(
+        "--out", type=Path, metavar="DIR",
+        help="folder that becomes the scene; of an export otherwise the folder itself",
+    )  # fmt: skip
+    scene.add_argument(
+        "--preset", choices=("draft", "standard"), default="draft",
+        help="features of photographs 1000 pixels wide (default), or twice as many, of 1600 pixels",
+    )  # fmt: skip
+    scene.add_argument(
+        "--ordered", action="store_true", help="names follow the way that was walked: compares neighbours"
+    )
+    scene.add_argument(
+        "--lens", choices=("one", "folder", "each"), default="",
+        help="which photographs one lens took: all, those of a folder, or each its own (otherwise one, if "
+        "all are of one size)",
+    )  # fmt: skip
+    scene.add_argument(
+        "--masks", type=Path, metavar="DIR",
+        help="pictures that are black where nothing is to be recognised: of a.jpg a.jpg.png, or a.png",
+    )  # fmt: skip
+
+    undistort = commands.add_parser(
+        "undistort", help="undo a scene's lens distortion once, for all runs and for Blender"
+    )
+    undistort.add_argument("scene", type=Path, help="COLMAP folder")
+    undistort.add_argument("--model", type=Path, metavar="DIR", help="folder of its model")
+    undistort.add_argument("--images", type=Path, metavar="DIR", help="folder of its photographs")
+
     model = commands.add_parser(
         "model", help="views that Blender captured of its own scene, as the COLMAP model of their folder"
     )
@@ -481,6 +523,49 @@ def _capture(chosen: argparse.Namespace) -> int:
     return 0
 
 
+def _scene(chosen: argparse.Namespace) -> int:
+    if chosen.photos:
+        return _reconstruct(chosen)
+    from .scenes.formats import convert
+
+    made = convert(chosen.source, chosen.out)
+    for message in made.warnings:
+        _warn(message)
+    print(f"{made.folder}: {made.views} views, {made.points:,} points, from {made.what}")
+    return 0
+
+
+def _reconstruct(chosen: argparse.Namespace) -> int:
+    from .scenes.reconstruct import reconstruct
+
+    if chosen.out is None:
+        raise LodgsError("It is not said where the scene is to be.", "Add --out DIR.")
+
+    def tell(what: str, done: int, of: int) -> None:
+        print(f"{what} {done} of {of}" if of > 1 else what, file=sys.stderr, flush=True)
+
+    made = reconstruct(
+        chosen.photos, chosen.out, preset=chosen.preset, ordered=chosen.ordered, lens=chosen.lens,
+        masks=chosen.masks, tell=tell,
+    )  # fmt: skip
+    for message in made.left_out:
+        _warn(message)
+    print(f"{made.folder}: {made.points:,} points, {made.error:.2f} pixels off in the mean. {made.words}")
+    return 0
+
+
+def _undistort(chosen: argparse.Namespace) -> int:
+    from .scenes.colmap import read_scene
+    from .scenes.undistort import CACHE, undistorted
+
+    scene = read_scene(chosen.scene, chosen.model, chosen.images)
+    found = undistorted(scene, scene.folder / CACHE)
+    for message in found.warnings:
+        _warn(message)
+    print(f"{found.images_folder}: {len(found.cameras)} photographs, {len(scene.distorted)} straightened")
+    return 0
+
+
 def _model(chosen: argparse.Namespace) -> int:
     from .scenes.rendered import write_model
 
@@ -607,6 +692,8 @@ _COMMANDS = {
     "evaluate": _evaluate,
     "render": _render,
     "capture": _capture,
+    "scene": _scene,
+    "undistort": _undistort,
     "model": _model,
     "serve": _serve,
     "transform": _transform,

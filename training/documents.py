@@ -57,14 +57,14 @@ def shown(value: Any) -> str:
     return printable(_QUOTES.repr(value))
 
 
-def read_json(path: str | Path, what: str = "") -> dict:
-    """The object in a JSON file; ``what`` as for `open_file`.
+def read_json(path: str | Path, what: str = "", most: int = MOST_JSON) -> dict:
+    """The object in a JSON file; ``what`` as for `open_file`, ``most`` as for `json_object`.
 
     Raises:
         LodgsError: the file cannot be read, or as `json_object`.
     """
     what = what or printable(path)
-    return json_object(_read(path, what, MOST_JSON), what)
+    return json_object(_read(path, what, most), what, most)
 
 
 def read_toml(path: str | Path, what: str = "") -> dict:
@@ -82,18 +82,19 @@ def read_toml(path: str | Path, what: str = "") -> dict:
     return table
 
 
-def json_object(text: str | bytes, what: str) -> dict:
+def json_object(text: str | bytes, what: str, most: int = MOST_JSON) -> dict:
     """The JSON object that a text is.
 
     Args:
         text: UTF-8 where it is bytes.
         what: what a message calls it, such as "The camera view.json".
+        most: bytes that it may have.
 
     Raises:
         LodgsError: it is no JSON, no object, or breaks a bound of this module.
     """
     try:
-        values = json.loads(_text(text, MOST_JSON), parse_int=_whole)
+        values = json.loads(_text(text, most), parse_int=_whole)
         if not isinstance(values, dict):
             raise ValueError("it is no object")
         _check(values, DEEPEST)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import re
+import shutil
 import stat
 import uuid
 from collections.abc import Iterator
@@ -54,6 +55,26 @@ def remove_temporaries(folder: Path) -> None:
         if re.fullmatch(r"\..+\.[0-9a-f]{8}\.tmp", path.name):
             with suppress(OSError):
                 path.unlink()
+
+
+def link_or_copy(source: Path, target: Path) -> None:
+    """Makes ``target``, if it is not there, the same file where the disk can have one twice; else a copy.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    if target.exists():
+        return
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source, target)
+    except OSError:
+        beside = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.tmp")
+        try:
+            shutil.copyfile(source, beside)
+            os.replace(beside, target)
+        finally:
+            beside.unlink(missing_ok=True)
 
 
 def open_regular(path: str | Path) -> BinaryIO:

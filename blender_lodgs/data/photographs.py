@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import bpy
@@ -10,6 +11,7 @@ from mathutils import Matrix, Vector
 
 from ...training.errors import LodgsError
 from ...training.scenes.cameras import Camera
+from ...training.scenes.colmap import Scene
 from ...training.splats.dialects import Warn, silent
 from ..attributes import read_attribute
 from . import selection
@@ -45,6 +47,49 @@ def new_camera(
         distorted: the lens bends lines in the photograph.
     """
     data = bpy.data.cameras.new(camera.name)
+    _fit(data, camera, distorted)
+    data.display_size = extent / 20
+    data.clip_start, data.clip_end = near, extent * 1000
+    if photograph and camera.image is not None:
+        picture = data.background_images.new()
+        picture.image = bpy.data.images.load(str(camera.image), check_existing=True)
+        picture.alpha = 1.0
+        picture.frame_method = "STRETCH"
+        data.show_background_images = True
+    obj = bpy.data.objects.new(camera.name, data)
+    obj.matrix_basis = Matrix((np.linalg.inv(camera.world_to_camera) @ np.diag([1, -1, -1, 1])).tolist())
+    return obj
+
+
+def show_undistorted(
+    context: bpy.types.Context, root: bpy.types.Object, names: Sequence[str], scene: Scene
+) -> None:
+    """Gives a scene's views the photographs without their lens's distortion, and cameras that fit these.
+
+    Args:
+        names: of the model's views, in order.
+        scene: see ``undistort.undistorted``.
+    """
+    found = {camera.name: camera for camera in scene.cameras}
+    for view in views(root):
+        facts = view.data.lodgs
+        camera = found.get(names[facts.place]) if 0 <= facts.place < len(names) else None
+        if camera is None or not facts.distorted:
+            continue
+        _fit(view.data, camera, distorted=False)
+        for picture in view.data.background_images:
+            before, picture.image = (
+                picture.image,
+                bpy.data.images.load(str(camera.image), check_existing=True),
+            )
+            if before is not None and not before.users:
+                bpy.data.images.remove(before)
+        if context.scene.camera == view:
+            match_render(context.scene, camera, context.scene.render.resolution_percentage)
+
+
+def _fit(data: bpy.types.Camera, camera: Camera, distorted: bool) -> None:
+    """Has a camera see what a view's photograph shows."""
     long = max(camera.width, camera.height)
     wide = camera.width >= camera.height
     data.sensor_fit = "HORIZONTAL" if wide else "VERTICAL"
@@ -58,17 +103,6 @@ def new_camera(
     view.width, view.height, view.fx, view.fy = camera.width, camera.height, camera.fx, camera.fy
     view.photograph = str(camera.image) if camera.image else ""
     view.distorted = distorted
-    data.display_size = extent / 20
-    data.clip_start, data.clip_end = near, extent * 1000
-    if photograph and camera.image is not None:
-        picture = data.background_images.new()
-        picture.image = bpy.data.images.load(str(camera.image), check_existing=True)
-        picture.alpha = 1.0
-        picture.frame_method = "STRETCH"
-        data.show_background_images = True
-    obj = bpy.data.objects.new(camera.name, data)
-    obj.matrix_basis = Matrix((np.linalg.inv(camera.world_to_camera) @ np.diag([1, -1, -1, 1])).tolist())
-    return obj
 
 
 def camera_of(view: bpy.types.Object) -> Camera:

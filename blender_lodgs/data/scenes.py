@@ -25,6 +25,8 @@ from ...training.lod.selection import complete, known_rule, not_alone, unknown_r
 from ...training.methods import METHODS
 from ...training.scenes.cameras import Camera, extent_of
 from ...training.scenes.colmap import Scene, read_scene
+from ...training.scenes.formats import colmap_scene
+from ...training.scenes.undistort import already_undistorted
 from ...training.scenes.views import tables_of, views_in
 from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder, read_head
 from ...training.splats.formats import STREAMED, as_ply, is_ply
@@ -94,7 +96,8 @@ def import_colmap(
     Where the Blender scene has no camera, the first view becomes its camera and gives the render its size.
 
     Args:
-        folder: the scene's folder, or that of a model in it.
+        folder: the scene's folder, or that of a model in it; or another program's export, which is then made
+            a COLMAP scene (``formats.colmap_scene``).
         model: folder of the model; by default the largest one. Training takes the same one.
         images: folder of the photographs; by default found beside the model. Training takes the same one.
         upright: turn the root so that the cameras' mean up direction is +z; otherwise leave COLMAP's axes.
@@ -111,16 +114,14 @@ def import_colmap(
     manager.progress_begin(0, 1)  # at the mouse pointer
     try:
         model, images = (Path(path) if path else None for path in (model, images))
-        scene = read_scene(Path(folder), model, images, manager.progress_update)
+        folder = Path(folder) if model else colmap_scene(Path(folder), warn)
+        scene = read_scene(folder, model, images, manager.progress_update)
     finally:
         manager.progress_end()
     for message in scene.warnings:
         warn(message)
-    if scene.distorted:
-        warn(
-            f"{len(scene.distorted)} of {len(scene.cameras)} views have lens distortion: their photographs "
-            "fit the points only roughly here. Training undistorts them."
-        )
+    straight = already_undistorted(scene)
+    shown = {camera.name: camera for camera in straight.cameras} if straight else {}
     extent, near = _extent(scene), _near(scene)
     with _new_scene(context, scene.folder.name) as root:
         axes = axes_of(root)
@@ -133,7 +134,8 @@ def import_colmap(
         root.lodgs.training.model = str(scene.model) if model else ""
         root.lodgs.training.images = str(scene.images_folder) if images else ""
 
-        _add_views(context, root, scene.cameras, extent, near, photographs, scene.distorted)
+        seen = [shown.get(camera.name, camera) for camera in scene.cameras]
+        _add_views(context, root, seen, extent, near, photographs, set(scene.distorted) - shown.keys())
         if len(scene.points):
             points = objects.new_points(
                 f"{root.name} points", scene.points, scene.point_colors, radius=extent / 400
@@ -564,8 +566,8 @@ def _tell_others() -> None:
         bpy.data.texts.new(ABOUT).write(
             "The point clouds in this file are Gaussian splats. Without the extension LODGS, Blender shows "
             "the finest level of each scene as points.\n\nWith it they are drawn as splats, in viewports and "
-            "in renders, with detail by distance, and can be cleaned, placed and exported: Edit > Preferences "
-            "> Get Extensions > Install from Disk. Nothing is lost when the file is saved without it.\n"
+            "in renders, with detail by distance, and can be cleaned, placed and exported: Edit, "
+            "Preferences, Get Extensions, Install from Disk. Nothing is lost when the file is saved without it.\n"
         )
 
 

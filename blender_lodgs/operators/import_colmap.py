@@ -7,6 +7,7 @@ from pathlib import Path
 import bpy
 
 from ..data import photographs, scenes
+from ..runs import preparing
 from .parts import report_errors
 
 
@@ -19,7 +20,8 @@ class LODGS_OT_import_colmap(bpy.types.Operator):
 
     directory: bpy.props.StringProperty(
         name="Folder",
-        description="Folder of the COLMAP scene: photographs and sparse model",
+        description="Folder of the COLMAP scene, with photographs and sparse model; or of what nerfstudio, "
+        "Polycam, Record3D, Metashape, OpenMVG or Bundler have exported",
         subtype="DIR_PATH",
     )
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
@@ -49,6 +51,7 @@ class LODGS_OT_import_colmap(bpy.types.Operator):
             photographs=self.photographs,
             warn=warn,
         )
+        preparing.straighten(root, warn)
         if first:  # otherwise the artist is looking at something
             photographs.look_at_scene(context, root, warn)
         self.report({"INFO"}, f"'{root.name}': {scenes.contents(root)}")

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import bpy
+
 from ..data import photographs, scenes
+from ..runs import preparing
 from .parts import Panel, say, split_column
 
 
@@ -13,7 +16,9 @@ class LODGS_PT_scene(Panel):
     def draw(self, context):
         layout = self.layout
         column = layout.column(align=True)
-        column.operator("lodgs.import_colmap", text="Import Photographs (COLMAP)…", icon="CAMERA_DATA")
+        _draw_finding(column)
+        column.operator("lodgs.find_cameras", text="Import Photographs…", icon="IMAGE_DATA")
+        column.operator("lodgs.import_colmap", text="Import COLMAP or Export…", icon="CAMERA_DATA")
         column.operator("lodgs.import_splats", text="Import Splats…", icon="POINTCLOUD_DATA")
         root = scenes.active_root(context)
         if scenes.linked(context):
@@ -42,6 +47,19 @@ class LODGS_PT_scene(Panel):
             name = camera.name if camera in views else "Look Through"
             row.operator("lodgs.look_through", text=name, icon="OUTLINER_DATA_CAMERA").step = 0
             row.operator("lodgs.look_through", text="", icon="TRIA_RIGHT").step = 1
+
+
+def _draw_finding(column: bpy.types.UILayout) -> None:
+    """How far the cameras of photographs are found, or how it went."""
+    work = preparing.current
+    if work is None:
+        return
+    if work.running:
+        row = column.row(align=True)
+        row.progress(text=work.message, factor=work.fraction)
+        row.operator("lodgs.cancel_find_cameras", text="", icon="X")
+    else:
+        say(column, work.problem or work.message, "ERROR" if work.problem else "INFO")
 
 
 CLASSES = (LODGS_PT_scene,)

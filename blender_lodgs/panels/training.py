@@ -33,6 +33,8 @@ class LODGS_PT_training(Panel):
         if watch is not None and watch.running:
             _draw_running(self.layout, watch, root)
             return
+        if root.lodgs.training.run:
+            self.layout.menu("LODGS_MT_runs", icon="FILE_FOLDER")
         if watch is not None:
             _draw_ended(self.layout, watch, root)
         elif root.lodgs.training.run:

@@ -50,17 +50,12 @@ class Capturing:
             self.message = "Finding points"
         if code is not None:
             self.message = "Captured" if code == 0 else f"Stopped after {there} of {self._count} views"
-            self.problem = "" if code == 0 or self._cancelled else self._why(code)
+            self.problem = "" if code == 0 or self._cancelled else processes.problem_of(self._log, code)
         extension.redraw()
         return self.running
 
     def _there(self) -> int:
         return len(list((self.folder / CAMERAS).glob("*.json")))
-
-    def _why(self, code: int) -> str:
-        said = self._log.read_text(encoding="utf-8", errors="replace").splitlines()
-        errors = [line for line in said if line.lower().startswith("error: ")]
-        return errors[-1][7:] if errors else f"Blender has ended with {code}; {self._log} tells more."
 
 
 current: Capturing | None = None

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path, PureWindowsPath
 from typing import TYPE_CHECKING, Any
@@ -35,6 +35,15 @@ if TYPE_CHECKING:
 
 LOG = "LODGS trainer log"
 """Name of the text block that shows a trainer's log."""
+
+
+@dataclass(frozen=True)
+class KnownRun:
+    """A run on disk: its folder, its job, and its state as ``RunFolder.state``."""
+
+    folder: RunFolder
+    job: Job
+    state: str
 
 
 def run_folder(root: bpy.types.Object) -> RunFolder | None:
@@ -467,6 +476,24 @@ def runs_folder(root: bpy.types.Object) -> Path:
     if bpy.data.is_saved:
         return Path(bpy.path.abspath("//lodgs_runs"))
     return Path.home() / "lodgs_runs"
+
+
+def runs_of(root: bpy.types.Object) -> list[KnownRun]:
+    """The runs of a root's photographs, or of its base, by name: where new ones would lie, and beside its
+    newest one."""
+    mine = run_folder(root)
+    places = {runs_folder(root), *([mine.path.parent] if mine else [])}
+    scene = Path(bpy.path.abspath(root.lodgs.scene_folder)) if root.lodgs.scene_folder else None
+    found = {}
+    for place in places:
+        for file in place.glob("*/job.toml"):
+            with suppress(LodgsError, OSError):
+                run = RunFolder(file.parent)
+                job = Job.from_file(file)
+                here = mine is not None and run.path == mine.path
+                if here or (scene is not None and job.scene and Path(job.scene) == scene):
+                    found[run.path] = KnownRun(run, job, run.state())
+    return [found[path] for path in sorted(found)]
 
 
 def new_folder(root: bpy.types.Object) -> Path:

@@ -21,6 +21,9 @@ if sys.platform != "win32":
 INTERVAL = 0.1
 """Seconds between two looks at a program."""
 
+LOG_END = 1 << 14
+"""Bytes of a log that are looked at."""
+
 MARK = "lodgs-in-use"
 """File in an environment that the extension makes: locked by whatever is at work in it."""
 
@@ -104,6 +107,22 @@ def in_use(folder: Path) -> bool:
     except OSError:  # it has none: a part of one
         return False
     return False
+
+
+def last_lines(log: Path) -> list[str]:
+    """Lines of a program's log, or of its end where that is long; none where there is none yet."""
+    try:
+        with open(log, "rb") as file:
+            file.seek(max(file.seek(0, 2) - LOG_END, 0))
+            return file.read().decode("utf-8", "replace").splitlines()
+    except OSError:
+        return []
+
+
+def problem_of(log: Path, code: int) -> str:
+    """Why a program of ours that ended with a code did so, by what it said last."""
+    errors = [line for line in last_lines(log) if line.lower().startswith("error: ")]
+    return errors[-1][7:] if errors else f"It has ended with {code}; {log} tells more."
 
 
 def follow(step: Callable[[], bool]) -> None:

@@ -101,6 +101,19 @@ def fake(tmp_path, monkeypatch):
     return lambda mode="": monkeypatch.setenv("LODGS_FAKE", mode)
 
 
+@pytest.fixture
+def blender(bpy, tmp_path, monkeypatch):
+    """Blender as a program that panels start: ``as_blender.py`` plays it."""
+    program = tmp_path / "blender"
+    program.write_text(
+        f'#!/bin/sh\nexec "{sys.executable}" "{Path(__file__).with_name("as_blender.py")}" "$@"\n'
+    )
+    program.chmod(0o755)
+    monkeypatch.setattr(bpy.app, "binary_path", str(program))
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    return program
+
+
 @pytest.fixture(scope="session")
 def _one_renderer(bpy):
     """Starting the renderer takes seconds: all tests share one, though each has a new file."""

@@ -1,4 +1,4 @@
-"""The doors of photographs: JPEG, PNG and EXR, their sizes and their pixels; and depths of meshes."""
+"""The doors of photographs, of every kind: their sizes and their pixels; and depths of meshes."""
 
 from __future__ import annotations
 
@@ -33,6 +33,11 @@ def seeds(folder) -> list[bytes]:
         ("b.png", image.convert("P"), {}),
         ("c.png", image.convert("I;16"), {}),
         ("d.png", image.convert("LA"), {}),
+        ("a.tif", image, {}),
+        ("b.tif", image, {"compression": "tiff_lzw", "big_tiff": False}),
+        ("a.webp", image, {}),
+        ("b.webp", image, {"lossless": True}),
+        ("c.webp", image.convert("RGBA"), {}),
     ):
         made.save(folder / name, **options)
         found.append((folder / name).read_bytes())

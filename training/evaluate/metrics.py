@@ -8,21 +8,37 @@ MOST_PSNR = 100.0
 """What equal images count as, in dB, so that means over views stay numbers."""
 
 
+COUNTS = 0.5
+"""Pixels whose mask is above this count."""
+
+
 def to_8_bit(image: torch.Tensor) -> torch.Tensor:
     """Clamped to [0, 1] and rounded to the 256 values that a file holds, still float32."""
     return (image.detach().clamp(0, 1) * 255).round() / 255
 
 
-def psnr(image: torch.Tensor, target: torch.Tensor) -> float:
-    """Peak signal-to-noise ratio in dB of two images (H, W, 3), display-coded; MOST_PSNR at most."""
+def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio in dB of two images (H, W, 3), display-coded; MOST_PSNR at most.
+
+    Args:
+        mask: (H, W), only pixels where it is above a half count, if there are such.
+    """
     from torchmetrics.functional.image import peak_signal_noise_ratio
 
+    if mask is not None and bool((mask > COUNTS).any()):
+        image, target = image[mask > COUNTS], target[mask > COUNTS]
     return min(float(peak_signal_noise_ratio(to_8_bit(image), to_8_bit(target), data_range=1.0)), MOST_PSNR)
 
 
-def ssim(image: torch.Tensor, target: torch.Tensor) -> float:
-    """Structural similarity of (H, W, 3) images, 11x11 Gaussian window of sigma 1.5 (Wang et al. 2004)."""
+def ssim(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float:
+    """Structural similarity of (H, W, 3) images, 11x11 Gaussian window of sigma 1.5 (Wang et al. 2004).
+
+    Args:
+        mask: (H, W), where it is not above a half the target stands for the image.
+    """
     from torchmetrics.functional.image import structural_similarity_index_measure
 
+    if mask is not None:
+        image = torch.where((mask > COUNTS)[..., None], image, target)
     pair = [to_8_bit(each).permute(2, 0, 1)[None] for each in (image, target)]
     return float(structural_similarity_index_measure(*pair, data_range=1.0))  # type: ignore[arg-type]

@@ -35,7 +35,7 @@ def level_picture(path: Path, bundle: Bundle, evaluation: Evaluation, camera: Ca
 
     def tile(name: str, splats: Splats, weights: np.ndarray | None = None) -> tuple[str, torch.Tensor]:
         image = evaluation.draw(splats, camera, weights)
-        return f"{name}   {len(splats):,} splats   {psnr(image, target):.1f} dB", image
+        return f"{name}   {len(splats):,} splats   {psnr(image, target.image, target.mask):.1f} dB", image
 
     rule = find_rule(bundle.rule)
     tiles = []

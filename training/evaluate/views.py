@@ -13,7 +13,7 @@ from ..lod.rule import Values, find_rule
 from ..lod.selection import Choice, complete, settings
 from ..lod.sight import Sight
 from ..methods.data import TrainingData
-from ..rasterize import Gaussians, Rendering, device_of, rasterize
+from ..rasterize import Gaussians, Rendering, Target, device_of, rasterize
 from ..rasterize.resident import Chosen, Resident, SplatSet, draw
 from ..scenes.cameras import Camera, evenly
 from ..splats.bundle import Bundle, Level
@@ -82,9 +82,9 @@ class Evaluation:
         self.cameras = data.test or evenly(data.train, MOST_TRAINING_VIEWS)
         self.prefix = "" if data.test else "train_"
 
-    def target(self, camera: Camera) -> torch.Tensor:
-        """The photograph of a view, (H, W, 3)."""
-        return self.data.photographs.target(camera).image
+    def target(self, camera: Camera) -> Target:
+        """The photograph of a view, on black where it is transparent, and what of it counts."""
+        return self.data.photographs.target(camera)
 
     def load(self, splats: Splats | Gaussians) -> Gaussians:
         """Splats where they are drawn, for those that are drawn again and again."""
@@ -119,7 +119,8 @@ class Evaluation:
         found = []
         for camera in cameras:
             splats, weights = shown_to(camera)
-            found.append(psnr(self.draw(splats, camera, weights), self.target(camera)))
+            target = self.target(camera)
+            found.append(psnr(self.draw(splats, camera, weights), target.image, target.mask))
         return np.array(found)
 
     def measure(self, render: Callable[[Camera], Rendering], count: Callable[[Camera], int]) -> dict:
@@ -153,7 +154,8 @@ class Evaluation:
             image = picture(camera)
             seconds = time.perf_counter() - started
             target = self.target(camera)
-            rows.append((psnr(image, target), ssim(image, target), seconds))
+            pair = image, target.image, target.mask
+            rows.append((psnr(*pair), ssim(*pair), seconds))
         table = np.array(rows)
         return {
             f"{self.prefix}psnr": round(float(table[:, 0].mean()), 3),

@@ -13,11 +13,16 @@ import torch
 
 from ..errors import LodgsError
 from ..rasterize import Target
-from ..scenes.cameras import Camera
+from ..scenes.cameras import Camera, evenly
 from ..scenes.colmap import Scene
 from ..scenes.images import load_image
 from .support import Support
 from .targets import Targets, default_budget
+
+TRIED = 3
+"""Photographs that are looked at for whether they are transparent."""
+OPAQUE = 0.99
+"""Alpha from here on is no transparency, but rounding."""
 
 Planned = Callable[[int], tuple[int, float] | None]
 """Of a step: the index of its training view, and how many times smaller that is; None: it needs none."""
@@ -140,6 +145,15 @@ class TrainingData:
         pixels = np.median([camera.width * camera.height for camera in self.whole_train])
         return float(np.sqrt(1e6 / pixels))
 
+    @cached_property
+    def transparent(self) -> bool:
+        """Whether photographs have alpha that counts: one of TRIED training views is not opaque."""
+        return any(
+            load_image(camera.image, camera.width, camera.height, alpha=True)[..., 3].min() < OPAQUE
+            for camera in evenly(self.train, TRIED)
+            if camera.image is not None
+        )
+
     def training_view(self, step: int, seed: int) -> int:
         """The index of the view to train at a step: every epoch is a new shuffle, from (seed, epoch)."""
         epoch, place = divmod(step, len(self.train))
@@ -174,8 +188,11 @@ class TrainingData:
     def _read(self, camera: Camera) -> Target:
         """The photograph at the camera's size, its planes one after the other as losses take them."""
         assert camera.image is not None
-        image = load_image(camera.image, camera.width, camera.height, exposure=self.exposure)
-        return Target(torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))).permute(1, 2, 0))
+        size, alpha = (camera.width, camera.height), self.transparent
+        image = load_image(camera.image, *size, exposure=self.exposure, alpha=alpha)
+        planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))
+        mask = None if camera.mask is None else load_image(camera.mask, *size)[..., 0]
+        return Target(planes[:3].permute(1, 2, 0), mask, planes[3] if alpha else None)
 
 
 def _among(cameras: Sequence[Camera], others: Sequence[Camera]) -> list[Camera]:

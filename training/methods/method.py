@@ -152,7 +152,7 @@ class Method(ABC, Generic[P, D]):
             optimizer.step()
             optimizer.zero_grad()
         self.control_density(step)
-        if self.parameters.margin and self.continues_margins(step):
+        if self.parameters.margin and not self.data.transparent and self.continues_margins(step):
             self.continue_margins(step)
         if due(INTERVAL, step + 1) or self.ends_level(step):
             self.exposure.center()
@@ -189,10 +189,10 @@ class Method(ABC, Generic[P, D]):
         It is a sum so that the first picture's gradients are what they would be alone: densification's
         threshold means the same.
         """
-        weight = self.parameters.ssim_weight
+        weight, target = self.parameters.ssim_weight, view.target.over(self.background(step))
         first, *others = (
             photometric_loss(
-                self.exposure(drawing.rendering.image, view.index), view.target, weight, backend=self.backend
+                self.exposure(drawing.rendering.image, view.index), target, weight, backend=self.backend
             )
             for drawing in drawings
         )
@@ -302,8 +302,11 @@ class Method(ABC, Generic[P, D]):
         )
 
     def background(self, step: int) -> tuple[float, float, float]:
-        """The colour behind everything in a step, the same for all of its pictures."""
-        if not self.parameters.random_background:
+        """The colour behind everything in a step, the same for all of its pictures.
+
+        Behind transparent photographs it is always a random one: so splats are as transparent as these are.
+        """
+        if not (self.parameters.random_background or self.data.transparent):
             return 0.0, 0.0, 0.0
         red, green, blue = np.random.default_rng([self.seed, step, 5]).random(3)
         return red, green, blue

@@ -180,18 +180,30 @@ class Target:
     Args:
         image: (H, W, 3) float32 in [0, 1], torch or numpy.
         mask: (H, W) in [0, 1], how much each pixel counts in the loss; None: all do.
+        alpha: (H, W) in [0, 1], of a photograph that is transparent, over black; None: it is opaque.
 
     The cpu backend keeps 36 bytes a pixel: the photograph and its two local moments. Drop the target and make
     it anew where a scene has more views than memory.
     """
 
     def __init__(
-        self, image: torch.Tensor | np.ndarray, mask: torch.Tensor | np.ndarray | None = None
+        self,
+        image: torch.Tensor | np.ndarray,
+        mask: torch.Tensor | np.ndarray | None = None,
+        alpha: torch.Tensor | np.ndarray | None = None,
     ) -> None:
         self.image = torch.as_tensor(image)
         self.mask = None if mask is None else torch.as_tensor(mask)
+        self.alpha = None if alpha is None else torch.as_tensor(alpha)
         if self.image.ndim != 3 or self.image.shape[2] != 3:
             raise ValueError(f"a target has shape (H, W, 3), not {tuple(self.image.shape)}")
         if self.mask is not None and self.mask.shape != self.image.shape[:2]:
             raise ValueError(f"a mask has shape {tuple(self.image.shape[:2])}, not {tuple(self.mask.shape)}")
         self.cache: dict[str, Any] = {}
+
+    def over(self, background: tuple[float, float, float]) -> Target:
+        """A transparent photograph over a colour; the same, if it is opaque."""
+        if self.alpha is None:
+            return self
+        behind = (1 - self.alpha[..., None]) * torch.tensor(background).to(self.image)
+        return Target(self.image + behind, self.mask)

@@ -13,7 +13,7 @@ from ..scenes.cameras import Camera
 from ..scenes.colmap import read_scene, without
 from ..scenes.images import check_image
 from ..scenes.regions import Region
-from ..scenes.undistort import undistorted
+from ..scenes.undistort import cache_of, undistorted
 from .capture import capture
 from .folder import RunFolder
 from .job import Job
@@ -25,7 +25,7 @@ DECODERS = 4
 def training_data(
     job: Job, folder: RunFolder, tell: Callable[..., None] | None = None, *, pixels: bool = True
 ) -> TrainingData:
-    """The job's scene, read and where needed captured and undistorted (once, into the run folder).
+    """The job's scene, read and where needed captured and undistorted (once, beside it).
 
     Where it is trained in cells, units and held-out views are those of the model as it was read, whatever
     photographs cannot be decoded: so the same in all blocks, and where they are measured together.
@@ -47,7 +47,7 @@ def training_data(
     if scene.distorted:
         if tell:
             tell("status", message=f"Undistorting {len(scene.distorted)} views")
-        scene = undistorted(scene, folder.path / "undistorted")
+        scene = undistorted(scene, cache_of(scene, folder.undistorted))
         warnings += [warning for warning in scene.warnings if warning not in warnings]
     for warning in warnings:
         if tell:

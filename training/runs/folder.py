@@ -3,7 +3,7 @@
     run/  job.toml  events.jsonl  checkpoints/  levels/level_1.ply ..  bundle.ply  metrics.json
           costs.png (what finding the distances of levels has told)
           model.npz (what a method with networks has beside its levels)
-          undistorted/ (photographs without their lens's distortion, where they had some)
+          undistorted/ (photographs without their lens's distortion, where the scene may not be written to)
           blocks/ (the runs of cells of a scene that is trained in cells, and what they are together)
       captured/ (the pictures of splats that had no photographs, as a COLMAP scene)
           base.ply, cameras/ (the splats, and the views of them, that Blender has handed over)

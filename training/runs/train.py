@@ -263,7 +263,8 @@ class _Run:
             now = time.monotonic()
             pause = min(max(PROGRESS_SECONDS[0], (now - self._started) / 1000), PROGRESS_SECONDS[1])
             if now - last_progress >= pause or self.step == method.steps:
-                self._tell_progress(level, loss, psnr(image.cpu(), target.image.cpu()))
+                quality = psnr(image.cpu(), target.image.cpu(), target.mask)
+                self._tell_progress(level, loss, quality)
                 last_progress = now
             del image, target  # which the next step's photograph may need the room of
             self._write_levels(levels)

@@ -34,6 +34,7 @@ class Camera:
         fx, fy, cx, cy: intrinsics in pixels; pixel centres lie at +0.5, as in COLMAP.
         world_to_camera: (4, 4) float64, rigid, OpenCV axes, COLMAP world.
         image: path of the photograph, or None where there is none.
+        mask: path of a picture of the same proportions that is black where the photograph does not count.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Camera:
     cy: float
     world_to_camera: np.ndarray
     image: Path | None = None
+    mask: Path | None = None
 
     @property
     def center(self) -> np.ndarray:
@@ -124,7 +126,7 @@ class Camera:
         across, down = round(share * self.width), round(share * self.height)
         return replace(
             self, width=self.width + 2 * across, height=self.height + 2 * down,
-            cx=self.cx + across, cy=self.cy + down, image=None,
+            cx=self.cx + across, cy=self.cy + down, image=None, mask=None,
         )  # fmt: skip
 
     def within(self, matrix: np.ndarray) -> tuple[Camera, float]:

@@ -24,10 +24,12 @@ from .model import (
     registered,
 )
 from .orientation import up_rotation
-from .photographs import Photographs, image_folder
+from .photographs import Masks, Photographs, image_folder
 
 ASTRAY = 1000
 """What lies so many times as far from the middle of the cameras as most cameras or points is an error."""
+MASKS = "masks"
+"""Folder beside that of the photographs, or in the scene's where they are that."""
 NAMED = 5
 """Of so many views that are odd in one way each is named; more are summed up."""
 MOST_FOLDERS = 20_000
@@ -197,7 +199,9 @@ def read_scene(
     images = _absolute(images)
     if not images.is_dir():
         raise LodgsError(f"There is no image folder {images}.", "Choose the folder of the photographs.")
-    views = _Views(Photographs(images, folder))
+    views = _Views(
+        Photographs(images, folder), Masks((folder if images == folder else images.parent) / MASKS)
+    )
     for number, pose in enumerate(poses):
         if progress and number % 50 == 0:
             progress(0.5 * number / len(poses))
@@ -257,7 +261,7 @@ def without(scene: Scene, reasons: dict[str, str]) -> Scene:
         scene,
         cameras=kept,
         distorted=[name for name in scene.distorted if name not in reasons],
-        warnings=[*scene.warnings, *_told(list(reasons.items()))],
+        warnings=[*scene.warnings, *told(list(reasons.items()))],
     )
 
 
@@ -294,7 +298,8 @@ def _largest_model(folder: Path, warnings: list[str]) -> Path:
     if not models:
         raise LodgsError(
             f"{folder} holds no COLMAP model.",
-            "Choose a folder with sparse/0/cameras.bin, images.bin and points3D.bin (or .txt).",
+            "Choose a folder with sparse/0/cameras.bin, images.bin and points3D.bin (or .txt), or make one "
+            "of another program's export: lodgs scene --from DIR --out DIR.",
         )
     views = [registered(model) for model in models]
     for model, count in zip(models, views, strict=True):
@@ -310,8 +315,8 @@ class _Views:
         left_out: names, and a sentence each.
     """
 
-    def __init__(self, files: Photographs) -> None:
-        self._files = files
+    def __init__(self, files: Photographs, masks: Masks) -> None:
+        self._files, self._masks = files, masks
         self._missing: list[str] = []
         self._reshaped: list[str] = []
         self.cameras: list[Camera] = []
@@ -331,7 +336,8 @@ class _Views:
                 self._missing.append(name)
                 return
             width, height = image_size(image)
-            camera = Camera(name, lens.width, lens.height, *lens.pinhole, pose.world_to_camera, image)
+            mask = self._masks.find(name)
+            camera = Camera(name, lens.width, lens.height, *lens.pinhole, pose.world_to_camera, image, mask)
             if (width, height) != (lens.width, lens.height):
                 camera = camera.resized(width, height)
             if flaw := camera.flaw:
@@ -361,7 +367,7 @@ class _Views:
 
     def warnings(self, folder: Path) -> list[str]:
         """What is odd, in few sentences however many views there are."""
-        found = _told(self.left_out)
+        found = told(self.left_out)
         match self._missing:
             case []:
                 pass
@@ -379,7 +385,7 @@ class _Views:
         return found
 
 
-def _told(left_out: Sequence[tuple[str, str]]) -> list[str]:
+def told(left_out: Sequence[tuple[str, str]]) -> list[str]:
     """Names and reasons as sentences; many are summed up."""
     found = [f"{_shown(name)} is left out: {why}" for name, why in left_out[:NAMED]]
     if len(left_out) > NAMED:

@@ -20,6 +20,9 @@ from .exr import MAGIC, Truncated, exr_size, read_parts
 MOST_PIXELS = 178_956_970
 """Pixels of an image that is read: Pillow opens no larger ones, which take it 4 bytes a pixel."""
 
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
+"""How names of photographs end, in lower case; beside ``.exr``, which only renderers write."""
+
 _LARGE = 1 << 25
 """Pixels from which on a JPEG is not decoded larger than twice the size that is needed."""
 _STRIP = 1 << 20
@@ -30,9 +33,10 @@ _START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height in pixels of a JPEG, PNG or EXR file, from its header; EXIF rotation is ignored.
+    """Width and height in pixels of a photograph, from its header; EXIF rotation is ignored.
 
-    The kind is told by the file's content, not by its name. The size of an EXR is its display window.
+    The kind, JPEG, PNG, TIFF, WebP or EXR, is told by the file's content, not by its name. The size of an EXR
+    is its display window, that of a TIFF its first picture's.
 
     Raises:
         LodgsError: the file is missing, no regular file, empty, of another kind, cut short, or of no size
@@ -59,7 +63,11 @@ def _size(path: Path, file: IO[bytes]) -> tuple[int, int]:
         return _png_size(file)
     if head[:4] == MAGIC:
         return exr_size(file)
-    raise LodgsError(f"{path} is not a JPEG, PNG or EXR image.", "Convert it to one of these.")
+    if head[:4] in (b"II*\0", b"MM\0*"):
+        return _tiff_size(file, "<" if head[:2] == b"II" else ">")
+    if head[:4] == b"RIFF":
+        return _webp_size(file)
+    raise LodgsError(f"{path} is not a JPEG, PNG, TIFF, WebP or EXR image.", "Convert it to one of these.")
 
 
 def _checked(path: Path, size: tuple[int, int]) -> tuple[int, int]:
@@ -109,6 +117,40 @@ def _png_size(file) -> tuple[int, int]:
     return width, height
 
 
+def _tiff_size(file, order: str) -> tuple[int, int]:
+    """From the first directory; 16-bit tags 256 and 257, whose values are of 16 or 32 bits (TIFF 6.0)."""
+    file.seek(4)
+    (directory,) = struct.unpack(order + "I", file.read(4))
+    file.seek(directory)
+    (count,) = struct.unpack(order + "H", file.read(2))
+    found = {}
+    for _ in range(count):
+        tag, kind, _, value = struct.unpack(order + "HHI4s", file.read(12))
+        if tag in (256, 257):
+            found[tag] = struct.unpack(order + ("H2x" if kind == 3 else "I"), value)[0]
+    return found[256], found[257]
+
+
+def _webp_size(file) -> tuple[int, int]:
+    """From the first chunk, whose kind says where it stands (RFC 9649); the file is as long as it says."""
+    file.seek(4)
+    length, kind, chunk = struct.unpack("<I4s4s", file.read(12))
+    if kind != b"WEBP":
+        raise ValueError
+    body = file.read(14)[4:]
+    file.seek(0, 2)
+    if file.tell() < length + 8:
+        raise Truncated
+    if chunk == b"VP8 ":
+        width, height = struct.unpack("<6xHH", body)
+        return width & 0x3FFF, height & 0x3FFF
+    if chunk == b"VP8L":
+        (packed,) = struct.unpack("<xI5x", body)
+        return (packed & 0x3FFF) + 1, (packed >> 14 & 0x3FFF) + 1
+    across, down = body[4:7], body[7:10]
+    return int.from_bytes(across, "little") + 1, int.from_bytes(down, "little") + 1
+
+
 def _expect_end(file, marker: bytes) -> None:
     """The marker ends the file or, before what some cameras append, stands somewhere after this place."""
     here = file.tell()
@@ -126,37 +168,41 @@ class _Source:
     """An image whose rows are had when they are needed.
 
     Attributes:
-        rows: (bottom - top, width, 3) float32 from ``top`` to ``bottom``.
+        rows: (bottom - top, width, channels) float32 from ``top`` to ``bottom``.
+        channels: 3; or 4 with alpha, by which colours are multiplied then.
         linear: whether values are light rather than coded.
     """
 
     width: int
     height: int
     rows: Callable[[int, int], np.ndarray]
+    channels: int = 3
     linear: bool = False
 
 
-def load_image(path: Path, width: int, height: int, exposure: float = 0.0) -> np.ndarray:
+def load_image(path: Path, width: int, height: int, exposure: float = 0.0, alpha: bool = False) -> np.ndarray:
     """An image at the given size, (height, width, 3) float32 in [0, 1], display (sRGB) coded.
 
     Sizes below the file's are area averages (each pixel the mean of the rectangle that it covers: an exact
-    2x2 box at half size). JPEG and PNG are averaged as they are coded; an EXR is taken as linear, averaged
+    2x2 box at half size). All but EXR are averaged as they are coded; an EXR is taken as linear, averaged
     so, multiplied by 2**exposure and coded by the sRGB transfer function (IEC 61966-2-1). Alpha is ignored
     and grey becomes RGB.
 
     Args:
         exposure: stops, for EXR only.
+        alpha: do not ignore it: the image over black, and alpha as a fourth channel.
 
     Raises:
         LodgsError: the file cannot be read.
     """
-    with _opened(path, width, height, large=_LARGE) as source:
-        result = np.empty((height, width, 3), np.float32)
+    with _opened(path, width, height, large=_LARGE, alpha=alpha) as source:
+        result = np.empty((height, width, 4 if alpha else 3), np.float32)
         top = 0
         for strip in _strips(source, height):
             pixels = _area_average(strip, width, 1)
             if source.linear:
-                pixels = srgb_from_linear(np.clip(pixels * 2.0**exposure, 0.0, 1.0))
+                light = np.clip(pixels[..., :3] * 2.0**exposure, 0.0, 1.0)
+                pixels = np.concatenate([srgb_from_linear(light), pixels[..., 3:]], axis=-1)
             result[top : top + len(pixels)] = np.clip(pixels, 0.0, 1.0)
             top += len(pixels)
         return result
@@ -173,7 +219,7 @@ def check_image(path: Path) -> None:
 
 
 @contextmanager
-def _opened(path: Path, width: int, height: int, large: int) -> Iterator[_Source]:
+def _opened(path: Path, width: int, height: int, large: int, alpha: bool = False) -> Iterator[_Source]:
     """The decoded image, of which a size is wanted; whatever goes wrong with it is a LodgsError.
 
     Args:
@@ -183,19 +229,23 @@ def _opened(path: Path, width: int, height: int, large: int) -> Iterator[_Source
     try:
         with open_file(path) as file:
             if file.read(4) == MAGIC:
-                yield _exr(path)
+                yield _exr(path, alpha)
                 return
             from PIL import Image
 
             file.seek(0)
-            with Image.open(file, formats=("JPEG", "PNG")) as image:
+            with Image.open(file, formats=("JPEG", "PNG", "TIFF", "WEBP")) as image:
                 if image.width * image.height > large:
                     image.draft(None, (2 * width, 2 * height))
                     times = min(image.width // (2 * width), image.height // (2 * height))
                     if times > 1 and image.mode in ("L", "RGB"):
                         image = image.reduce(times)
                 image.load()
-                yield _Source(image.width, image.height, lambda top, bottom: _pillow_rows(image, top, bottom))
+
+                def rows(top: int, bottom: int) -> np.ndarray:
+                    return _pillow_rows(image, top, bottom, alpha)
+
+                yield _Source(image.width, image.height, rows, 4 if alpha else 3)
     except LodgsError:
         raise
     except Exception as error:  # the libraries raise many kinds for damaged files
@@ -204,16 +254,24 @@ def _opened(path: Path, width: int, height: int, large: int) -> Iterator[_Source
         ) from error
 
 
-def _pillow_rows(image, top: int, bottom: int) -> np.ndarray:
-    """Rows of a Pillow image, (H, W, 3) float32 in [0, 1]."""
+def _pillow_rows(image, top: int, bottom: int, alpha: bool) -> np.ndarray:
+    """Rows of a Pillow image, (H, W, 3) float32 in [0, 1], or 4."""
     rows = image.crop((0, top, image.width, bottom))
+    if alpha:
+        codes = np.ones((rows.height, rows.width, 4), np.float32)
+        if "A" in rows.mode or "transparency" in rows.info:
+            codes[:] = np.asarray(rows.convert("RGBA"), np.float32) / 255
+            codes[..., :3] *= codes[..., 3:]
+        else:
+            codes[..., :3] = _pillow_rows(image, top, bottom, alpha=False)
+        return codes
     if rows.mode.startswith("I"):  # 16-bit grey, which convert("RGB") would clip
         grey = np.asarray(rows, np.float32) / 65535
         return np.repeat(grey[..., None], 3, axis=2)
     return np.asarray(rows.convert("RGB"), np.float32) / 255
 
 
-def _exr(path: Path) -> _Source:
+def _exr(path: Path, alpha: bool) -> _Source:
     """Linear light over the display window; black where the data window leaves it empty."""
     image_size(path)  # refuses a file cut short, of which OpenEXR would print and give nothing
     part = next((part for part in read_parts(path) if _rgb_names(part[2])), None)
@@ -225,17 +283,21 @@ def _exr(path: Path) -> _Source:
     across, down = high - low + 1
     width, height = _checked(path, (int(across), int(down)))
     x, y = int(left - low[0]), int(above - low[1])
-    planes = [channels[name] for name in _rgb_names(channels)]
+    names = _rgb_names(channels)
+    planes = [channels[name] for name in names]
+    if alpha:
+        its = names[0][:-1] + "A"
+        planes.append(channels[its] if its in channels else np.ones_like(planes[0]))
 
     def rows(top: int, bottom: int) -> np.ndarray:
-        pixels = np.zeros((bottom - top, width, 3), np.float32)
+        pixels = np.zeros((bottom - top, width, len(planes)), np.float32)
         for plane, channel in zip(planes, np.moveaxis(pixels, 2, 0), strict=True):
             data = plane[max(top - y, 0) : max(bottom - y, 0), max(-x, 0) :]
             seen = channel[max(y - top, 0) :, max(x, 0) :][: data.shape[0], : data.shape[1]]
             seen[:] = data[: seen.shape[0], : seen.shape[1]]
         return np.nan_to_num(pixels, posinf=float(np.finfo(np.float32).max))
 
-    return _Source(width, height, rows, linear=True)
+    return _Source(width, height, rows, len(planes), linear=True)
 
 
 def _rgb_names(channels) -> list[str]:
@@ -260,7 +322,7 @@ def _strips(source: _Source, height: int) -> Iterator[np.ndarray]:
         return
     below, part = _edges(old, height)
     step = max(most * height // old, 1)
-    before = np.zeros((source.width, 3))  # the sum of all rows before the strip's first
+    before = np.zeros((source.width, source.channels))  # the sum of all rows before the strip's first
     for top in range(0, height, step):
         place = slice(top, min(top + step, height) + 1)
         first, last = below[place][0], below[place][-1]

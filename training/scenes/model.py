@@ -8,7 +8,7 @@ at most five times as much, and for text ten times.
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -206,6 +206,69 @@ def _intrinsics(lens: _Lens, width: int, height: int, parameters: np.ndarray) ->
     if not sized or not np.isfinite(parameters).all() or (parameters[: lens.focals] <= 0).any():
         raise ValueError("a camera has no size or focal length")
     return Intrinsics(lens, width, height, parameters)
+
+
+def intrinsics(name: str, width: int, height: int, parameters: np.ndarray) -> Intrinsics:
+    """A record by the name of its lens.
+
+    Raises:
+        ValueError: there is no such lens, or it has no size or focal length.
+    """
+    return _intrinsics(_LENS_BY_NAME[name], width, height, parameters)
+
+
+def write_model(
+    model: Path,
+    lenses: Sequence[Intrinsics],
+    poses: Sequence[tuple[str, np.ndarray]],
+    points: np.ndarray,
+    colors: np.ndarray,
+) -> None:
+    """Writes a binary model without tracks; pycolmap, which writes these too, is not where Blender is.
+
+    Args:
+        model: its folder, new.
+        lenses: of each view.
+        poses: name and world_to_camera (4, 4) of each view.
+        points: (P, 3).
+        colors: (P, 3) uint8.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    model.mkdir(parents=True)
+    numbers: dict[bytes, int] = {}
+    images = []
+    for place, (lens, (name, pose)) in enumerate(zip(lenses, poses, strict=True), 1):
+        model_id = next(number for number, each in _LENSES.items() if each is lens.lens)
+        camera = (
+            struct.pack("<iQQ", model_id, lens.width, lens.height) + lens.parameters.astype("<f8").tobytes()
+        )
+        number = numbers.setdefault(camera, len(numbers) + 1)
+        values = *_quaternion(pose[:3, :3]), *pose[:3, 3]
+        text = name.encode("utf-8", "surrogateescape")
+        images.append(struct.pack("<i7di", place, *values, number) + text + b"\0" + struct.pack("<Q", 0))
+    cameras = [struct.pack("<i", number) + camera for camera, number in numbers.items()]
+    rows = np.zeros(len(points), _POINT)
+    rows["id"], rows["xyz"], rows["rgb"] = np.arange(1, len(points) + 1), points, colors
+    for file, count, parts in (
+        ("cameras.bin", len(cameras), cameras),
+        ("images.bin", len(images), images),
+        ("points3D.bin", len(rows), [rows.tobytes()]),
+    ):
+        (model / file).write_bytes(struct.pack("<Q", count) + b"".join(parts))
+
+
+def _quaternion(rotation: np.ndarray) -> np.ndarray:
+    """w, x, y, z of a rotation (3, 3): the eigenvector that does not suffer from a small w (Bar-Itzhack)."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = rotation.ravel()
+    matrix = np.array([
+        [xx + yy + zz, zy - yz, xz - zx, yx - xy],
+        [zy - yz, xx - yy - zz, xy + yx, xz + zx],
+        [xz - zx, xy + yx, yy - xx - zz, yz + zy],
+        [yx - xy, xz + zx, yz + zy, zz - xx - yy],
+    ])  # fmt: skip
+    return np.linalg.eigh(matrix)[1][:, -1]
 
 
 def _images_bin(data: bytes) -> list[Pose]:

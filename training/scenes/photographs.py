@@ -46,6 +46,27 @@ class Photographs:
         return found
 
 
+class Masks:
+    """Pictures that are black where photographs do not count, as COLMAP and nerfstudio name them.
+
+    Args:
+        folder: of the masks; it need not be there.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._there = folder.is_dir()
+
+    def find(self, name: str) -> Path | None:
+        """That of a photograph: of ``a/b.jpg`` ``a/b.jpg.png``, or ``a/b.png``; None where there is none."""
+        if not self._there:
+            return None
+        for path in (self.folder / f"{name}.png", (self.folder / name).with_suffix(".png")):
+            if path.is_file():
+                return path
+        return None
+
+
 def inside(name: str) -> PurePosixPath:
     """An image's name as a path in the folder of the images, on every system.
 

@@ -1,38 +1,38 @@
-"""Distorted photographs made pinhole, by COLMAP through pycolmap: for the trainer's environment only.
-
-pycolmap runs in a process of its own, because Pillow, which the trainer uses, corrupts memory beside it.
-"""
+"""Distorted photographs made pinhole, by COLMAP through pycolmap: for the trainer's environment only."""
 
 from __future__ import annotations
 
 import hashlib
-import json
 import os
-import subprocess
+import shutil
 import sys
 import tempfile
-import threading
 import time
 from collections import defaultdict
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from ..errors import LodgsError
-from .colmap import Scene, read_scene
+import numpy as np
 
-_VERSION = b"1"  # of what is kept in the cache
-_ROOM = 1 << 18  # bytes that are still free on a disk that is not full
-LOOKS = 2.0
-"""Seconds between two looks at whether the disk is full."""
+from ..errors import LodgsError
+from . import apart
+from .colmap import MASKS, Scene, read_scene
+from .images import load_image, write_png
+
+CACHE = ".undistorted"
+"""Folder in a scene's of what is made of it once, for all runs and for Blender."""
+_VERSION = b"2"  # of what is kept in the cache
+_LEFT = 86_400.0
+"""Seconds after which what is half done in a cache is nobody's."""
 
 
 def undistorted(scene: Scene, cache: Path) -> Scene:
     """The scene with every lens undone: all views pinhole, `distorted` empty, the world unchanged.
 
-    Photographs and model are written into a folder of `cache` that is named after their content, and taken
-    from there the next time; it appears whole or not at all. A scene without distorted views is returned as
-    it is. Undistorted images are cropped so that no pixel is empty (COLMAP's blank_pixels = 0).
+    Photographs and model are written into a folder of `cache` that is named after them, and taken from there
+    the next time; it appears whole or not at all. A scene without distorted views is returned as it is.
+    Undistorted images are cropped so that no pixel is empty (COLMAP's blank_pixels = 0).
 
     Raises:
         LodgsError: pycolmap is missing or fails, one camera's photographs have several sizes, or the cache
@@ -41,32 +41,70 @@ def undistorted(scene: Scene, cache: Path) -> Scene:
     if not scene.distorted:
         return scene
     try:
-        target = Path(cache) / _content_key(scene)
+        target = cache / _key(scene)
         if not target.is_dir():
+            _remove_left(cache)
             _undistort_into(target, scene)
     except OSError as error:
         raise LodgsError(
             f"The lens distortion of {scene.folder} could not be undone: {error.strerror or error}.",
             "Check the images and the free space.",
         ) from error
+    return _read(target, scene)
+
+
+def cache_of(scene: Scene, otherwise: Path) -> Path:
+    """The cache beside a scene's photographs; another folder, where that may not be written to."""
+    cache = scene.folder / CACHE
+    try:
+        cache.mkdir(exist_ok=True)
+        with tempfile.TemporaryFile(dir=cache):
+            return cache
+    except OSError:
+        return otherwise
+
+
+def already_undistorted(scene: Scene) -> Scene | None:
+    """As :func:`undistorted`, where that was done before and is kept with the scene; else None.
+
+    Raises:
+        LodgsError: what is kept is damaged.
+    """
+    if not scene.distorted:
+        return scene
+    try:
+        target = scene.folder / CACHE / _key(scene)
+        return _read(target, scene) if target.is_dir() else None
+    except OSError:
+        return None
+
+
+def _read(target: Path, scene: Scene) -> Scene:
     result = read_scene(target, model=target / "sparse", images=target / "images")
     missing = {camera.name for camera in scene.cameras} - {camera.name for camera in result.cameras}
     lost = [f"{name} is left out: its lens distortion could not be undone." for name in sorted(missing)]
     return replace(result, warnings=[*scene.warnings, *lost])
 
 
-def _content_key(scene: Scene) -> str:
-    """A digest of the model's files and of every photograph with its name."""
+def _key(scene: Scene) -> str:
+    """A digest of names, sizes and times of the model's files and of every photograph."""
     digest = hashlib.blake2b(_VERSION, digest_size=16)
     model = sorted(path for path in scene.model.iterdir() if path.suffix in (".bin", ".txt"))
     files = [(path.name, path) for path in model]
     files += [(camera.name, camera.image) for camera in scene.cameras if camera.image is not None]
+    files += [(camera.name, camera.mask) for camera in scene.cameras if camera.mask is not None]
     for name, path in files:
-        digest.update(f"{name}\0{path.stat().st_size}\0".encode("utf-8", "surrogateescape"))
-        with path.open("rb") as file:
-            while block := file.read(1 << 20):
-                digest.update(block)
+        status = path.stat()
+        text = f"{name}\0{status.st_size}\0{status.st_mtime_ns}\0"
+        digest.update(text.encode("utf-8", "surrogateescape"))
     return digest.hexdigest()
+
+
+def _remove_left(cache: Path) -> None:
+    """Removes what killed programs have left half done."""
+    for left in cache.glob("undistorting-*"):
+        if time.time() - left.stat().st_mtime > _LEFT:
+            shutil.rmtree(left, ignore_errors=True)
 
 
 def _undistort_into(target: Path, scene: Scene) -> None:
@@ -79,27 +117,17 @@ def _undistort_into(target: Path, scene: Scene) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix="undistorting-") as work:
         request["work"] = work
-        package = Path(__file__).resolve().parents[1]  # training, or lodgs where pip has installed it
-        with subprocess.Popen(
-            [sys.executable, "-m", f"{package.name}.scenes.undistort"],
-            cwd=package.parent,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            encoding="utf-8",
-            errors="replace",
-        ) as child:
-            threading.Thread(target=_end_without_room, args=(child, Path(work)), daemon=True).start()
-            try:
-                problems = _converse(child, json.dumps(request))
-            except BaseException:
-                child.kill()
-                raise
-        _require_room(Path(work))
-        if child.returncode:
-            lines = problems.strip().splitlines() or [f"exit code {child.returncode}"]
+        masks = Path(work) / MASKS
+        for camera in scene.cameras:
+            if camera.mask is not None:
+                light = load_image(camera.mask, camera.width, camera.height)
+                path = masks / f"{camera.name}.png"
+                path.parent.mkdir(parents=True, exist_ok=True)
+                write_png(path, np.rint(255 * light).astype(np.uint8))
+        problem = apart.run_apart("undistort", request, Path(work))
+        if problem:
             raise LodgsError(
-                f"The lens distortion of {scene.folder} could not be undone: {lines[-1]}",
+                f"The lens distortion of {scene.folder} could not be undone: {problem}",
                 "Check the trainer's environment and the free space, or give an undistorted scene "
                 "(colmap image_undistorter).",
             )
@@ -110,59 +138,9 @@ def _undistort_into(target: Path, scene: Scene) -> None:
                 raise
 
 
-def _end_without_room(child: subprocess.Popen[str], folder: Path) -> None:
-    """Ends a program when the disk that it writes to is full: COLMAP's threads may wait for good then."""
-    while child.poll() is None:
-        try:
-            _require_room(folder)
-        except OSError:
-            child.kill()
-        time.sleep(LOOKS)
-
-
-def _require_room(folder: Path) -> None:
-    """Raises OSError where a disk is full: COLMAP crashes then, or hangs, or writes half a photograph."""
-    with tempfile.TemporaryFile(dir=folder) as file:
-        file.write(os.urandom(_ROOM))
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def _converse(child: subprocess.Popen[str], request: str) -> str:
-    """Sends a program its request in a line and returns what it said on standard error when it has ended.
-
-    Its standard input stays open until then: the program ends when that is closed, as it is however this
-    process ends.
-    """
-    assert child.stdin is not None and child.stderr is not None
-    with suppress(OSError):  # it has ended already, and said why
-        child.stdin.write(request + "\n")
-        child.stdin.flush()
-    problems = child.stderr.read()
-    child.wait()
-    with suppress(OSError):
-        child.stdin.close()
-    return problems
-
-
-def _end_with_parent() -> None:
-    """Ends this process as soon as its standard input is closed."""
-
-    def wait() -> None:
-        while os.read(0, 4096):
-            pass
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
-
-
 def _main() -> None:
-    request = json.loads(sys.stdin.readline())
-    _end_with_parent()
-    try:
-        import pycolmap
-    except ImportError as error:
-        sys.exit(f"pycolmap cannot be loaded: {error}.")
+    request = apart.request()
+    pycolmap = apart.load_pycolmap()
     model = pycolmap.Reconstruction(request["model"])
     sizes = defaultdict(set)
     for image in model.images.values():
@@ -190,6 +168,17 @@ def _main() -> None:
         image_names=list(request["sizes"]),
         jpeg_quality=98,
     )
+    masks = work / MASKS
+    if masks.is_dir():  # bent like their photographs, whose names theirs begin with
+        for image in model.images.values():
+            image.name = f"{image.name}.png"
+        (work / "masked").mkdir()
+        model.write(str(work / "masked"))
+        names = [path.relative_to(masks).as_posix() for path in masks.rglob("*.png")]
+        pycolmap.undistort_images(
+            output_path=work / "straight", input_path=work / "masked", image_path=masks, image_names=names
+        )
+        (work / "straight" / "images").rename(work / "undistorted" / MASKS)
 
 
 if __name__ == "__main__":

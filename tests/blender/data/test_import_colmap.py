@@ -1,11 +1,13 @@
 """COLMAP scenes in Blender, against the cameras' own projection and Blender's."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from training.scenes.colmap import read_scene
+from training.scenes.images import write_png
 
 
 @pytest.fixture
@@ -173,7 +175,8 @@ def test_odd_scenes_import(bpy, lodgs, shared_scenes, name):
     assert len([o for o in root.children_recursive if o.type == "CAMERA"]) == len(scene.cameras) > 0
     assert bool([o for o in root.children_recursive if o.type == "POINTCLOUD"]) == bool(len(scene.points))
     assert all(message in told for message in scene.warnings)
-    assert bool(scene.distorted) == any("distortion" in message for message in told)
+    views = lodgs("data.photographs").views(root)
+    assert bool(scene.distorted) == any(view.data.lodgs.distorted for view in views)
 
 
 def test_failures_are_said_and_leave_nothing(bpy, lodgs, tmp_path, mini, monkeypatch):
@@ -199,3 +202,31 @@ def test_undo_leaves_nothing(bpy, mini):
     assert _everything(bpy)["cameras"] > before["cameras"]
     bpy.ops.ed.undo()
     assert _everything(bpy) == before
+
+
+def test_another_program_s_export(bpy, lodgs, tmp_path):
+    """Cameras stand as nerfstudio's own matrices say; the folder is a COLMAP scene from then on."""
+    poses = [np.eye(4), np.eye(4)]
+    poses[1][:3, 3] = 1, 2, 3
+    frames = []
+    for number, pose in enumerate(poses):
+        write_png(tmp_path / f"{number}.png", np.zeros((30, 40, 3), np.uint8))
+        frames.append({"file_path": f"{number}.png", "transform_matrix": pose.tolist()})
+    (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": frames}))
+    said = []
+    root = lodgs("data.scenes").import_colmap(bpy.context, tmp_path, upright=False, warn=said.append)
+    assert "at random" in said[0]
+    bpy.context.view_layer.update()
+    for number, pose in enumerate(poses):
+        camera = next(each for each in root.lodgs.cameras.objects if each.name == f"{number}.png")
+        np.testing.assert_allclose(camera.matrix_world, pose, atol=1e-5)  # Blender's cameras look so, too
+        assert camera.data.angle_x == pytest.approx(1.0, abs=1e-4)
+    assert len(read_scene(tmp_path).cameras) == 2
+
+
+def test_a_damaged_export_is_a_sentence_and_leaves_nothing(bpy, lodgs, tmp_path):
+    (tmp_path / "transforms.json").write_text("{")
+    before = _everything(bpy)
+    with pytest.raises(RuntimeError, match=r"transforms\.json is not valid"):
+        bpy.ops.lodgs.import_colmap(directory=str(tmp_path))
+    assert _everything(bpy) == before and [each.name for each in tmp_path.iterdir()] == ["transforms.json"]

@@ -33,6 +33,9 @@ class Notes:
         self.buttons.append(text)
         return SimpleNamespace()
 
+    def menu(self, name, **_):
+        self.texts.append(name)
+
     def separator(self, **_):
         pass
 

@@ -2,7 +2,6 @@
 
 import os
 import subprocess
-import sys
 import time
 from math import radians
 from pathlib import Path
@@ -285,17 +284,6 @@ def test_without_a_trainer_nothing_is_rendered(bpy, scene, capture, tmp_path, ca
     monkeypatch.delenv("LODGS_TRAINER_PYTHON", raising=False)
     assert capture("--around", "--views", "2") == 2
     assert "none is set up" in capfd.readouterr().err and not (tmp_path / "out").exists()
-
-
-@pytest.fixture
-def blender(bpy, tmp_path, monkeypatch):
-    """The program that the panel starts."""
-    program = tmp_path / "blender"
-    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{AS_BLENDER}" "$@"\n')
-    program.chmod(0o755)
-    monkeypatch.setattr(bpy.app, "binary_path", str(program))
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    return program
 
 
 @needs_trainer

@@ -63,3 +63,15 @@ def test_the_selective_view_is_the_papers_inequality(start, end):
     assert weights is None
     np.testing.assert_array_equal(chosen.means, np.array(expected, np.float32).reshape(-1, 3))
     assert len(chosen.sh) == len(chosen.means)
+
+
+def test_only_what_a_mask_leaves_counts():
+    """By hand: within it all pixels are off by 0.1, beside it by 0.9."""
+    target = torch.full((20, 20, 3), 0.05)
+    image, mask = target + 0.9, torch.zeros(20, 20)
+    image[:, :10], mask[:, :10] = target[:, :10] + 0.1, 1.0
+    off = to_8_bit(target + 0.1)[0, 0, 0] - to_8_bit(target)[0, 0, 0]
+    assert psnr(image, target, mask) == pytest.approx(-20 * np.log10(float(off)), abs=1e-3)
+    assert psnr(image, target) < psnr(image, target, mask)
+    clean = torch.where(mask[..., None] > 0, image, target)
+    assert ssim(image, target, mask) == pytest.approx(ssim(clean, target))

@@ -95,8 +95,53 @@ def test_jpeg_with_something_appended_is_whole(tmp_path):
     assert image_size(path) == (41, 23)
 
 
+@pytest.mark.parametrize(
+    ("mode", "options"),
+    [
+        ("RGB", {}),
+        ("RGB", {"compression": "tiff_lzw"}),
+        ("RGB", {"compression": "tiff_adobe_deflate"}),
+        ("L", {}),
+        ("RGBA", {}),
+    ],
+)
+def test_tiff(tmp_path, pixels, mode, options):
+    Image.fromarray(pixels).convert(mode).save(tmp_path / "a.tif", **options)
+    assert image_size(tmp_path / "a.tif") == (44, 30)
+    expected = np.asarray(Image.fromarray(pixels).convert("L").convert("RGB")) if mode == "L" else pixels
+    np.testing.assert_allclose(load_image(tmp_path / "a.tif", 44, 30), expected / 255, atol=1e-6)
+
+
+def test_tiff_of_the_other_byte_order(tmp_path):
+    """By hand, as TIFF 6.0 has it: 5x3 grey, one strip, big-endian; width of 32 bits, height of 16."""
+    tags = [(256, 4, 5), (257, 3, 3 << 16), (258, 3, 8 << 16), (259, 3, 1 << 16), (262, 3, 1 << 16),
+            (273, 4, 8), (277, 3, 1 << 16), (278, 3, 3 << 16), (279, 4, 15)]  # fmt: skip
+    grey = bytes(range(0, 150, 10))
+    data = b"MM\0*" + struct.pack(">I", 24) + grey + b"\0" + struct.pack(">H", len(tags))
+    data += b"".join(struct.pack(">HHII", tag, kind, 1, value) for tag, kind, value in tags) + bytes(4)
+    (tmp_path / "a.tif").write_bytes(data)
+    assert image_size(tmp_path / "a.tif") == (5, 3)
+    image = load_image(tmp_path / "a.tif", 5, 3)
+    np.testing.assert_allclose(image[..., 1].ravel(), np.arange(0, 150, 10) / 255, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("mode", "options"),
+    [("RGB", {"quality": 100}), ("RGB", {"lossless": True}), ("RGBA", {"lossless": True})],
+)
+def test_webp(tmp_path, pixels, mode, options):
+    """Lossy, lossless and extended files say their size in three ways."""
+    image = Image.fromarray(pixels).convert(mode)
+    if mode == "RGBA":
+        image.putalpha(120)
+    image.save(tmp_path / "a.webp", **options)
+    assert image_size(tmp_path / "a.webp") == (44, 30)
+    off = np.abs(load_image(tmp_path / "a.webp", 44, 30) - pixels / 255)
+    assert off.max() <= 1e-6 if "lossless" in options else off.mean() < 0.2
+
+
 @pytest.mark.parametrize("part", [0.02, 0.3, 0.5, 0.9, 0.999])
-@pytest.mark.parametrize("kind", ["jpg", "png"])
+@pytest.mark.parametrize("kind", ["jpg", "png", "webp"])
 def test_a_file_cut_short_is_refused(tmp_path, pixels, kind, part):
     path = tmp_path / f"a.{kind}"
     if kind == "png":

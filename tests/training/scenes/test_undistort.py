@@ -14,7 +14,7 @@ import pytest
 
 from tests.training.scenes import synthetic
 from training.errors import LodgsError
-from training.scenes import undistort
+from training.scenes import apart
 from training.scenes.colmap import read_scene
 from training.scenes.images import load_image
 from training.scenes.undistort import undistorted
@@ -159,10 +159,10 @@ def test_a_program_that_hangs_on_a_full_disk_is_ended_and_that_is_said(monkeypat
     synthetic.write_scene(tmp_path, synthetic.camera("OPENCV"), names=["a.png"], pixels=ramps())
     scene = read_scene(tmp_path)
     assert scene.distorted
-    real, room = subprocess.Popen, undistort._require_room
+    real, room = subprocess.Popen, apart._require_room
     hangs = [sys.executable, "-c", "import sys, time; sys.stdin.readline(); time.sleep(600)"]
-    monkeypatch.setattr(undistort.subprocess, "Popen", lambda _, **settings: real(hangs, **settings))
-    monkeypatch.setattr(undistort, "LOOKS", 0.05)
+    monkeypatch.setattr(apart.subprocess, "Popen", lambda _, **settings: real(hangs, **settings))
+    monkeypatch.setattr(apart, "LOOKS", 0.05)
     full = []
 
     def looks(folder):
@@ -171,7 +171,7 @@ def test_a_program_that_hangs_on_a_full_disk_is_ended_and_that_is_said(monkeypat
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         room(folder)
 
-    monkeypatch.setattr(undistort, "_require_room", looks)
+    monkeypatch.setattr(apart, "_require_room", looks)
     with pytest.raises(LodgsError, match="No space left on device"):
         undistorted(scene, tmp_path / "cache")
     assert not list((tmp_path / "cache").iterdir())

@@ -471,7 +471,7 @@ class Method(method.Method[NeuralOctreeParameters, Drawing]):
 
     def with_margins(self, baked: Splats) -> Splats:
         """Baked splats with those that continue the photographs, in the coarsest level."""
-        if not self.parameters.margin:
+        if not self.parameters.margin or self.data.transparent:
             return baked
         room = self.parameters.margin_room(self.parameters.max_splats)
         margins = self.margins().continued(Gaussians.of(baked, self.device), room)

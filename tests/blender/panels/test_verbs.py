@@ -1,0 +1,103 @@
+"""Every verb is in a menu, the status bar tells of what is at work, and runs can be switched between."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
+ELSEWHERE = {
+    # File's menus
+    "lodgs.import_colmap", "lodgs.find_cameras", "lodgs.import_splats", "lodgs.export_bundle",
+    "lodgs.export_plain", "lodgs.export_folder",
+    # Object's and View's
+    "lodgs.set_ground", "lodgs.set_scale", "lodgs.camera_path", "lodgs.turntable", "lodgs.frame_scene",
+    "lodgs.add_crop", "lodgs.hide_splats", "lodgs.show_hidden_splats", "lodgs.delete_left_out",
+    # of one item of a list, beside it
+    "lodgs.show_only_level", "lodgs.remove_crop", "lodgs.cancel_block", "lodgs.resume_block",
+}  # fmt: skip
+
+
+def test_every_verb_is_in_a_menu(lodgs):
+    operators = lodgs("operators")
+    ours = {
+        cls.bl_idname
+        for module in operators.MODULES
+        for cls in getattr(module, "CLASSES", ())
+        if "_OT_" in cls.__name__ and "INTERNAL" not in getattr(cls, "bl_options", ())
+    }
+    listed = [name for group in lodgs("panels.verbs").VERBS for name in group]
+    assert len(listed) == len(set(listed)) and not set(listed) & ELSEWHERE
+    assert set(listed) | ELSEWHERE == ours
+
+
+class Notes:
+    def __init__(self):
+        self.texts, self.operators = [], []
+
+    def row(self, **_):
+        return self
+
+    def label(self, text="", icon=""):
+        self.texts.append((text, icon))
+
+    def progress(self, text, factor):
+        self.texts.append((text, factor))
+
+    def operator(self, name, text="", icon=""):
+        self.operators.append((name, text, icon, chosen := SimpleNamespace()))
+        return chosen
+
+
+@pytest.fixture
+def work(lodgs, monkeypatch):
+    work = SimpleNamespace(message="Photographs placed: 3 of 6", fraction=0.5, problem="", running=True)
+    monkeypatch.setattr(lodgs("runs.preparing"), "current", work)
+    return work
+
+
+def test_the_status_bar_tells_of_work_and_for_a_while_of_its_end(lodgs, work, monkeypatch):
+    status = lodgs("panels.status")
+    (now,) = status.shown(100.0)
+    assert now.running and (now.text, now.share) == ("Photographs placed: 3 of 6", 0.5)
+    work.running, work.message = False, "All 6 photographs found their place."
+    assert [each.text for each in status.shown(110.0)] == [work.message]
+    assert status.shown(110.0 + status.NOTICE - 1) and not status.shown(110.0 + status.NOTICE + 1)
+    work.running, work.message, work.fraction = True, "Again", 0.1
+    monkeypatch.setattr(status.time, "monotonic", lambda: 300.0)
+    notes = Notes()
+    status._draw(SimpleNamespace(layout=notes), None)
+    assert notes.texts == [("Again", 0.1)]
+    work.running, work.problem = False, "No."
+    notes = Notes()
+    status._draw(SimpleNamespace(layout=notes), None)
+    assert notes.texts == [("Again", "ERROR")]
+
+
+def test_what_ended_before_it_was_seen_is_no_news(lodgs, work):
+    work.running = False
+    assert lodgs("panels.status").shown(0.0) == []
+
+
+def test_runs_of_a_scene_are_listed_and_opened(bpy, lodgs, tmp_path, fake):
+    fake()
+    root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+    jobs = lodgs("runs.jobs")
+    root.lodgs.training.output = str(tmp_path / "runs")
+    assert jobs.runs_of(root) == []
+    for _ in range(2):
+        jobs.follow(jobs.start(root))
+    other = tmp_path / "runs" / "other"
+    other.mkdir()
+    (other / "job.toml").write_text('scene = "/nowhere"\nout = "."\nmethod = "flod"\n')
+    (tmp_path / "runs" / "broken").mkdir()
+    (tmp_path / "runs" / "broken" / "job.toml").write_text("]")
+    first, second = jobs.runs_of(root)
+    assert first.state == second.state == "done" and second.folder.path == jobs.run_folder(root).path
+    notes = Notes()
+    lodgs("panels.verbs").LODGS_MT_runs.draw(SimpleNamespace(layout=notes), bpy.context)
+    (name, text, icon, chosen), (_, _, icon_of_second, _) = notes.operators
+    assert name == "lodgs.open_run" and "FLoD" in text and "done" in text
+    assert (icon, icon_of_second) == ("RADIOBUT_OFF", "RADIOBUT_ON")
+    assert bpy.ops.lodgs.open_run(directory=chosen.directory) == {"FINISHED"}
+    assert jobs.run_folder(root).path == first.folder.path and any(item.exists for item in root.lodgs.levels)

@@ -1,0 +1,122 @@
+"""The door of other programs' exports: each is a COLMAP scene that can be read, or a sentence."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.fuzz.doors import attempt
+from tests.fuzz.mutations import spoiled, spoiled_value
+from tests.training.scenes.synthetic import noise, write_image
+from training.scenes.colmap import read_scene
+from training.scenes.formats import convert
+
+POSE = np.diag([1.0, -1.0, -1.0, 1.0])
+TRANSFORMS = {
+    "w": 96, "h": 72, "fl_x": 80.0, "fl_y": 82.0, "cx": 47.0, "cy": 37.0, "k1": 0.1, "p1": 0.01,
+    "ply_file_path": "points.ply",
+    "frames": [{"file_path": f"images/{name}", "transform_matrix": POSE.tolist()} for name in ("a.png", "b")],
+}  # fmt: skip
+POLYCAM = {f"t_{row}{column}": float(POSE[row, column]) for row in range(3) for column in range(4)} | {
+    "fx": 80.0, "fy": 82.0, "cx": 47.0, "cy": 37.0, "width": 96, "height": 72, "blur_score": 90,
+}  # fmt: skip
+RECORD3D = {
+    "poses": [[0, 0, 0, 1, 0, 0, k] for k in range(2)],
+    "K": [80, 0, 0, 0, 82, 0, 47, 37, 1],
+    "w": 96,
+    "h": 72,
+}
+LENS = {
+    "value0": {"width": 96, "height": 72, "focal_length": 80, "principal_point": [47, 37]},
+    "disto_k3": [0.1, 0, 0],
+}
+OPENMVG = {
+    "root_path": "",
+    "views": [
+        {"key": 0, "value": {"ptr_wrapper": {"data": {"filename": "a.png", "id_intrinsic": 0, "id_pose": 0}}}}
+    ],
+    "intrinsics": [{"key": 0, "value": {"ptr_wrapper": {"data": LENS}}}],
+    "extrinsics": [{"key": 0, "value": {"rotation": np.eye(3).tolist(), "center": [0, 0, 1]}}],
+    "structure": [{"key": 0, "value": {"X": [0, 0, 5]}}],
+}
+BUNDLER = (
+    "# Bundle file v0.3\n1 2\n80 0.1 0\n1 0 0\n0 1 0\n0 0 1\n0 0 0\n" + "0 0 -5\n9 8 7\n1 0 1 2.5 3\n" * 2
+)
+METASHAPE = """<document version="2.0.0"><chunk><sensors><sensor id="0" type="frame"><calibration>
+<resolution width="96" height="72"/><f>80</f><cx>1</cx><cy>2</cy><k1>0.1</k1><p1>0.01</p1></calibration>
+</sensor></sensors><cameras><camera id="0" sensor_id="0" label="a">
+<transform>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform>
+</camera></cameras><transform><scale>2</scale></transform></chunk></document>"""
+CLOUD = "ply\nformat ascii 1.0\nelement vertex 2\n"
+CLOUD += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+WHOLE = {
+    "transforms.json": json.dumps(TRANSFORMS),
+    "keyframes/cameras/a.json": json.dumps(POLYCAM),
+    "metadata": json.dumps(RECORD3D),
+    "sfm_data.json": json.dumps(OPENMVG),
+    "bundle.out": BUNDLER,
+    "cameras.xml": METASHAPE,
+}
+JSON = {
+    "transforms.json": TRANSFORMS,
+    "keyframes/cameras/a.json": POLYCAM,
+    "metadata": RECORD3D,
+    "sfm_data.json": OPENMVG,
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Photographs where each format looks for them, and points."""
+    folder = tmp_path_factory.mktemp("export")
+    for place in ("images", "rgb", "keyframes/images"):
+        for name in ("a.png", "b.png"):
+            write_image(folder / place / name, noise())
+    (folder / "list.txt").write_text("images/a.png\nimages/b.png\n")
+    (folder / "points.ply").write_text(CLOUD + "0 0 5\n0 1 5\n")
+    return folder
+
+
+def check(folder, name: str, content: bytes) -> None:
+    for each in WHOLE:
+        (folder / each).unlink(missing_ok=True)
+    shutil.rmtree(folder / "sparse", ignore_errors=True)
+    path = folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content)
+    made = attempt(f"export {path.suffix}", lambda: convert(folder), (name, content))
+    if made is None:
+        assert not (folder / "sparse" / "0").exists()
+    else:
+        scene = attempt("COLMAP of an export", lambda: read_scene(folder), (name, content))
+        assert scene is None or scene.cameras
+
+
+def test_the_seeds_are_exports(folder):
+    for name, content in WHOLE.items():
+        check(folder, name, content.encode())
+        assert (folder / "sparse" / "0" / "cameras.bin").is_file(), name
+
+
+@pytest.mark.cases(short=120, weight=2)
+@given(data=st.data(), name=st.sampled_from(sorted(WHOLE)))
+def test_texts(folder, data, name):
+    check(folder, name, data.draw(spoiled([WHOLE[name].encode()])))
+
+
+@pytest.mark.cases(short=120, weight=2)
+@given(data=st.data(), name=st.sampled_from(sorted(JSON)))
+def test_values(folder, data, name):
+    check(folder, name, json.dumps(data.draw(spoiled_value(JSON[name]))).encode("utf-8", "surrogatepass"))
+
+
+@pytest.mark.cases(short=60, weight=1)
+@given(data=st.data())
+def test_points(folder, data):
+    (folder / "points.ply").write_bytes(data.draw(spoiled([(CLOUD + "0 0 5\n0 1 5\n").encode()])))
+    check(folder, "transforms.json", WHOLE["transforms.json"].encode())

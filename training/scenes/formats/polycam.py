@@ -1,0 +1,53 @@
+"""Polycam's raw data: a camera in a JSON file beside each photograph.
+
+Facts: https://github.com/PolyCam/polyform (keyframes, corrected ones, blur score).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import LodgsError
+from .views import Exported, View, find_image, lens_of, number, read_document, world_to_camera
+
+NAME = "Polycam raw data"
+LEAST_SHARP = 25.0
+"""Photographs with a lower blur score are left out, as nerfstudio does."""
+_FOLDERS = ("corrected_cameras", "corrected_images"), ("cameras", "images")
+
+
+def find(folder: Path) -> Path | None:
+    """The folder of the cameras, corrected ones where there are some."""
+    for keyframes in (folder / "keyframes", folder):
+        for cameras, images in _FOLDERS:
+            if (keyframes / images).is_dir() and any((keyframes / cameras).glob("*.json")):
+                return keyframes / cameras
+    return None
+
+
+def read(path: Path) -> Exported:
+    """Views; Polycam's points are in depth maps, which are not read.
+
+    Raises:
+        LodgsError: nothing; a camera that cannot be read is left out.
+    """
+    images = path.parent / dict(_FOLDERS)[path.name]
+    views, left_out = [], []
+    for file in sorted(path.glob("*.json")):
+        try:
+            told = read_document(file)
+            if number(told, "blur_score", LEAST_SHARP) < LEAST_SHARP:
+                raise LodgsError("it is blurred, says Polycam.")
+            width, height = number(told, "width"), number(told, "height")
+            lens = lens_of(
+                width, height, (number(told, "fx"), number(told, "fy")),
+                (number(told, "cx", width / 2), number(told, "cy", height / 2)),
+            )  # fmt: skip
+            rows = [[number(told, f"t_{row}{column}") for column in range(4)] for row in range(3)]
+            pose = world_to_camera(np.array(rows), opengl=True)
+            views.append(View(find_image(images, file.stem), lens, pose))
+        except LodgsError as error:
+            left_out.append((file.name, error.what))
+    return Exported(views, left_out=left_out)

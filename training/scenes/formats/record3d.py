@@ -1,0 +1,60 @@
+"""Record3D's export: metadata of all frames in one JSON file, photographs in ``rgb``.
+
+Facts: https://record3d.app (poses as x, y, z, w and place, camera to world, OpenGL axes; K by columns).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import LodgsError
+from ..images import SUFFIXES
+from .views import Exported, View, lens_of, number, numbers, read_document, world_to_camera
+
+NAME = "Record3D"
+
+
+def find(folder: Path) -> Path | None:
+    """The file of the metadata, if photographs stand beside it."""
+    there = (folder / name for name in ("metadata", "metadata.json"))
+    return next((path for path in there if path.is_file() and (folder / "rgb").is_dir()), None)
+
+
+def read(path: Path) -> Exported:
+    """Views: the n-th photograph by number has the n-th pose.
+
+    Raises:
+        LodgsError: the file is damaged.
+    """
+    told = read_document(path)
+    try:
+        poses = numbers(told.get("poses"), -1, 7)
+        focal_x, focal_y, *center = numbers(told.get("K"), 3, 3).T[[0, 1, 0, 1], [0, 1, 2, 2]]
+        lens = lens_of(number(told, "w"), number(told, "h"), (focal_x, focal_y), (center[0], center[1]))
+    except LodgsError as error:
+        raise LodgsError(f"{path} is damaged: {error.what}", "Export it again.") from error
+    files = [file for file in (path.parent / "rgb").iterdir() if file.suffix.lower() in SUFFIXES]
+    files.sort(key=lambda file: (len(file.stem), file.stem))
+    views, left_out = [], []
+    for place, pose in enumerate(poses):
+        if place >= len(files):
+            left_out.append((f"frame {place}", "it has no photograph."))
+            continue
+        try:
+            views.append(View(files[place], lens, world_to_camera(_matrix(pose), opengl=True)))
+        except LodgsError as error:
+            left_out.append((files[place].name, error.what))
+    return Exported(views, left_out=left_out)
+
+
+def _matrix(pose: np.ndarray) -> np.ndarray:
+    """(3, 4) of qx, qy, qz, qw and a place."""
+    x, y, z, w = pose[:4] / max(float(np.linalg.norm(pose[:4])), 1e-30)
+    rotation = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.column_stack([rotation, pose[4:]])

@@ -1,0 +1,86 @@
+"""transforms.json, as nerfstudio, instant-ngp and Blender's exports for NeRF write it.
+
+Facts: https://docs.nerf.studio/quickstart/data_conventions.html; instant-ngp's docs/nerf_dataset_tips.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import tan
+from pathlib import Path
+from typing import Any
+
+from ...errors import LodgsError
+from ..images import image_size
+from .ply import read_points
+from .views import Exported, View, find_image, lens_of, number, numbers, read_document, world_to_camera
+
+NAME = "transforms.json"
+_FILES = "transforms.json", "transforms_train.json"
+_PERSPECTIVE = ("", "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE")
+
+
+def find(folder: Path) -> Path | None:
+    """The file; of NeRF's synthetic scenes, the one of the training views."""
+    return next((folder / name for name in _FILES if (folder / name).is_file()), None)
+
+
+def read(path: Path) -> Exported:
+    """Views, and points if a PLY is named.
+
+    Of a scene in several files (train, val, test) the training views alone are read.
+
+    Raises:
+        LodgsError: the file is damaged.
+    """
+    document = read_document(path)
+    frames = document.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise LodgsError(f"{path} has no frames.", "Export it again.")
+    common = {name: value for name, value in document.items() if name != "frames"}
+    views, left_out = [], []
+    for place, frame in enumerate(frames, 1):
+        told = common | (frame if isinstance(frame, dict) else {})
+        try:
+            views.append(_view(path.parent, told))
+        except LodgsError as error:
+            left_out.append((str(told.get("file_path", f"frame {place}")), error.what))
+    cloud = document.get("ply_file_path")
+    if not isinstance(cloud, str):
+        return Exported(views, left_out=left_out)
+    return Exported(views, *read_points(find_image(path.parent, cloud)), left_out)
+
+
+def _view(folder: Path, told: Mapping[str, Any]) -> View:
+    if not isinstance(told.get("file_path"), str):
+        raise LodgsError("it names no file.")
+    image = find_image(folder, told["file_path"])
+    width, height = number(told, "w", 0), number(told, "h", 0)
+    if not (width > 0 and height > 0):
+        width, height = image_size(image)
+    if "fl_x" in told:
+        fx = number(told, "fl_x")
+        fy = number(told, "fl_y", fx)
+    else:
+        fx = _focal(number(told, "camera_angle_x"), width)
+        fy = _focal(number(told, "camera_angle_y"), height) if "camera_angle_y" in told else fx
+    center = number(told, "cx", width / 2), number(told, "cy", height / 2)
+    kind = str(told.get("camera_model", "")).upper()
+    if kind not in _PERSPECTIVE:
+        raise LodgsError(f"its camera model {kind} is none that is known here.")
+    fisheye = kind == "OPENCV_FISHEYE" or told.get("is_fisheye") is True
+    radial = tuple(number(told, f"k{n}", 0) for n in range(1, 7))
+    if not fisheye and radial[3] and not any(radial[4:]):
+        raise LodgsError("its k4 is of a lens that COLMAP does not have.")
+    tangential = number(told, "p1", 0), number(told, "p2", 0)
+    lens = lens_of(width, height, (fx, fy), center, radial, tangential, fisheye)
+    pose = numbers(told.get("transform_matrix"), -1, 4)
+    mask = find_image(folder, told["mask_path"]) if isinstance(told.get("mask_path"), str) else None
+    return View(image, lens, world_to_camera(pose, opengl=True), mask)
+
+
+def _focal(angle: float, size: float) -> float:
+    """In pixels, of a field of view in radians."""
+    if not 0 < angle < 3.14:
+        raise LodgsError("its field of view is impossible.")
+    return 0.5 * size / tan(0.5 * angle)
