@@ -77,9 +77,7 @@ def _parser() -> argparse.ArgumentParser:
     methods.set_defaults(command=_methods)
     methods.add_argument("name", nargs="?", metavar="NAME", help="method whose parameters to list")
 
-    convert = commands.add_parser(
-        "import", help="a COLMAP folder, a bundle or any file of splats to a .blend"
-    )
+    convert = commands.add_parser("import", help="a COLMAP folder or any file of splats to a .blend")
     convert.set_defaults(command=_import)
     convert.add_argument("source", type=Path, help="folder or file")
     convert.add_argument("--blend", type=Path, required=True, help=".blend file to save")

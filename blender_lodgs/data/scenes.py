@@ -567,7 +567,7 @@ def _tell_others() -> None:
             "The point clouds in this file are Gaussian splats. Without the extension LODGS, Blender shows "
             "the finest level of each scene as points.\n\nWith it they are drawn as splats, in viewports and "
             "in renders, with detail by distance, and can be cleaned, placed and exported: Edit, "
-            "Preferences, Get Extensions, Install from Disk. Nothing is lost when the file is saved without it.\n"
+            "Preferences, Get Extensions, Install from Disk. Nothing is lost without it.\n"
         )
 
 

@@ -50,6 +50,8 @@ class Format(NamedTuple):
         bytes_of: of one splat, for each degree of spherical harmonics from 0 on. For the kinds that compress
             by content, what splats of trained scenes took (``docs/formats.md``).
         degree: the highest degree of spherical harmonics that it holds.
+        shared: where splats share coefficients of spherical harmonics: how many sets of them there are at
+            most, else a power of two.
     """
 
     suffix: str
@@ -57,10 +59,13 @@ class Format(NamedTuple):
     about: str
     bytes_of: tuple[float, ...]
     degree: int
+    shared: int = 0
 
     def size(self, count: int, degree: int) -> float:
         """About how many bytes so many splats take."""
-        return count * self.bytes_of[min(degree, len(self.bytes_of) - 1)]
+        degree = min(degree, len(self.bytes_of) - 1)
+        kept = min(1 << count.bit_length() - 1, self.shared) if count else 0
+        return count * self.bytes_of[degree] + 0.88 * kept * _rest(degree)
 
 
 def _rest(degree: int) -> int:
@@ -88,7 +93,7 @@ FORMATS = (
     ),
     Format(
         ".sog", "SOG", "PlayCanvas' kind for the web, the smallest. Takes minutes without a graphics card",
-        (14.0, 15.0, 16.0, 17.0), 3,
+        (13.0, 14.6, 14.6, 14.6), 3, 1 << 16,
     ),
     SPLAT,
 )  # fmt: skip
