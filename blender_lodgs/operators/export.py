@@ -180,6 +180,7 @@ class LODGS_OT_export_plain(_Export, _Converting, bpy.types.Operator):
         layout.prop(self, "placed")
         layout.label(text="Format, and about how large:")
         column = layout.column(align=True)
+        column.use_property_split = False
         for kind in FORMATS:
             size = _size(context, kind, self.level if self.source == "LEVEL" else 0)
             column.prop_enum(self, "kind", kind.suffix, text=f"{kind.label}   {size}")
