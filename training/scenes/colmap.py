@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import LodgsError, printable
-from .cameras import FARTHEST, Camera, extent_of
+from .cameras import FARTHEST, Camera, evenly, extent_of
 from .images import image_size
 from .model import (
     DAMAGED,
@@ -30,6 +31,8 @@ ASTRAY = 1000
 """What lies so many times as far from the middle of the cameras as most cameras or points is an error."""
 MASKS = "masks"
 """Folder beside that of the photographs, or in the scene's where they are that."""
+MOST_EYES = 500
+"""Cameras, evenly chosen, that tell the median depth."""
 NAMED = 5
 """Of so many views that are odd in one way each is named; more are summed up."""
 MOST_FOLDERS = 20_000
@@ -95,14 +98,18 @@ class Scene:
         """The median over the cameras of the median depth of the points that each sees, in COLMAP units.
 
         A camera sees what lies in front of it and within its image. At most 50,000 points, evenly taken from
-        the model's order, are looked at.
+        the model's order, are looked at, from MOST_EYES cameras.
 
         Raises:
             LodgsError: no camera sees a point.
         """
+        return self._median_depth
+
+    @cached_property
+    def _median_depth(self) -> float:
         points = self.points[:: max(1, len(self.points) // 50_000)].astype(np.float64)
         medians = []
-        for camera in self.cameras:
+        for camera in evenly(self.cameras, MOST_EYES):
             depths = camera.view_space(points)[camera.sees(points), 2]
             if len(depths):
                 medians.append(np.median(depths))
