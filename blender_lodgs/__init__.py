@@ -8,7 +8,7 @@ unregistered in reverse.
 import bpy
 
 from . import commands, operators, panels, viewport
-from .data import changes, loaded, older_files, properties, removal, scenes, updates
+from .data import changes, loaded, looks, older_files, properties, removal, scenes, updates
 from .nodes import building
 from .render import compare, engine, renderer
 from .runs import capturing, jobs, preparing
@@ -16,6 +16,7 @@ from .viewport import wipe
 
 MODULES = (
     properties,
+    looks,
     building,
     updates,
     changes,

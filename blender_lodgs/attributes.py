@@ -16,6 +16,10 @@ import numpy as np
 BASE, SH, SCALE, ROTATION = "radiance:base", "radiance:sh_{}", "scale", "rotation"
 LOG_SCALE, OPACITY_LOGIT, QUATERNION = "log_scale", "opacity_logit", "quaternion"
 COLOR, RADIUS, WEIGHT, HIDDEN = "display_color", "radius", "lod_weight", "hidden"
+SELECTION = ".selection"
+"""Blender's own of the points that are selected in Edit Mode."""
+LOOK_OPACITY = "look_opacity"
+"""What a look makes of opacities, a factor, where Blender itself draws splats (``nodes.look``)."""
 COLUMN = "column:{}"
 """A file's column whose own name may mean something else to Blender; every column of a table."""
 

@@ -96,6 +96,9 @@ def _parser() -> argparse.ArgumentParser:
         action="store_true",
         help="where the scene stands in the .blend, not in COLMAP's coordinates",
     )
+    export.add_argument(
+        "--as-trained", action="store_true", help="without the look that the scene has in the .blend"
+    )
 
     capture = commands.add_parser(
         "capture",
@@ -204,7 +207,7 @@ def _export(args: argparse.Namespace) -> int:
     if len(found) != 1:
         names = ", ".join(root.name for root in bpy.data.objects if root.lodgs.is_root) or "none"
         raise LodgsError(f"{args.blend} holds {len(found)} such scenes.", f"Name one with --root: {names}.")
-    bundle = scenes.read_levels(found[0], args.placed)
+    bundle = scenes.read_levels(found[0], args.placed, not args.as_trained)
     if format_of(args.bundle) is PLY:
         write_bundle(args.bundle, bundle)
     else:

@@ -9,7 +9,9 @@ Viewport, where this Blender has graphics in background: what the main thread do
 Blender's own evaluation (the rules, the list of splats onto the graphics card), what the thread beside it
 does (choosing and sorting), how long the first picture's splats take onto the card, from their attributes,
 and what comes there later.
-Clean Up, of five levels: how long a moved crop, and a search for floaters, hold the main thread.
+Clean Up, of five levels: how long a moved crop, a search for floaters, and a stroke of the brush hold the
+main thread.
+Look, of the same: how long each step of a slider does, where LODGS draws the splats and where Blender does.
 Streaming, there as well: a tree is flown through of which a part fits into the budget. How long each redraw
 holds up the main thread, all that LODGS does there but drawing itself, and how soon all has come at the end.
 ``--tree FILE --budget N`` takes a bundle of your own, of ten million splats say.
@@ -200,7 +202,22 @@ def clean_up(bpy, count: int) -> None:
     moves = []
     for _ in range(11):
         crop.location.x += 0.1
-        moves.append(least(bpy.context.view_layer.update, 1))
+        begun, own = time.perf_counter(), time.process_time()
+        bpy.context.view_layer.update()
+        moves.append((time.perf_counter() - begun, time.process_time() - own))
+    wall, own = 1e3 * np.median(moves, axis=0)
+    steps = []
+    for splats in (True, False):
+        bpy.context.scene.lodgs_viewport.splats = splats
+        root.lodgs_look.exposure = 0.0  # makes what shows it
+        bpy.context.view_layer.update()
+        for _ in range(11):
+            root.lodgs_look.exposure += 0.1
+            steps.append(least(bpy.context.view_layer.update, 1))
+    print(
+        f"look, {count:,} splats in five levels, ms of the main thread: a slider's step"
+        f" {1e3 * np.median(steps[:11]):.0f}, as points {1e3 * np.median(steps[11:]):.0f} (medians of 11)"
+    )
     counts = least(
         lambda: (cleaning._counts.clear(), cleaning.count_left(root, bpy.context.view_layer.depsgraph))
     )
@@ -209,12 +226,26 @@ def clean_up(bpy, count: int) -> None:
     bpy.context.view_layer.update()
     everywhere = least(lambda: cleaning.find_floaters(bpy.context, root, 0.0, 0.001))
     found = cleaning.find_floaters(bpy.context, root, 0.0, 0.001)
+    strokes, depsgraph = load("blender_lodgs.viewport.strokes"), bpy.context.evaluated_depsgraph_get()
+    look, size = np.eye(4), (1280, 800)
+    look[2, 3] = -15.0
+    clip = np.array([[2, 0, 0, 0], [0, 3.2, 0, 0], [0, 0, -1, -0.1], [0, 0, -1, 0]], float)
+    path = [(400, 400), (900, 400)]
+
+    def begin():
+        return strokes.Picture(root, depsgraph, look, clip, size)
+
+    picture = begin()
+    begins, covers = least(begin), least(lambda: picture.brush(path, 50))
+    selects = least(lambda: cleaning.select_also(root, picture.brush(path, 50)))
     hide = least(lambda: cleaning.hide(root, found), 1)
     print(
-        f"clean up, {count:,} splats in five levels, ms of the main thread: a moved crop"
-        f" {1e3 * np.median(moves):.0f} (median of 11; its counts {1e3 * counts:.0f} more), floaters"
-        f" {1e3 * everywhere:.0f}, within the crop {1e3 * floaters:.0f}; hiding"
-        f" {sum(map(np.count_nonzero, found.values())):,} {1e3 * hide:.0f}"
+        f"clean up, {count:,} splats in five levels, ms of the main thread:\n"
+        f"  a moved crop {wall:.0f} (goal 100; median of 11, {own:.0f} of the processors; its counts"
+        f" {1e3 * counts:.0f} more), floaters {1e3 * everywhere:.0f} (goal 500), within the crop"
+        f" {1e3 * floaters:.0f}; hiding {sum(map(np.count_nonzero, found.values())):,} {1e3 * hide:.0f};\n"
+        f"  a stroke of the brush: to begin {1e3 * begins:.0f} and to hit {1e3 * covers:.0f} (goal 300"
+        f" together), to have it selected {1e3 * selects:.0f}"
     )
 
 

@@ -234,8 +234,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_placement(transform)
     edit = commands.add_parser(
         "edit",
-        help="a copy without clutter: what lies outside of crops, floaters, splats that are too large; "
-        "also placed elsewhere, and as other kinds of files",
+        help="a copy without clutter (what lies outside of crops, floaters, ...) or in another look",
         description="Every level is edited alike, and stays what its rule chooses from. Places and lengths "
         "of what goes are in the splats' own units; lodgs info tells their bounds.",
     )
@@ -261,8 +260,8 @@ def _parser() -> argparse.ArgumentParser:
         help="centre and radius of a sphere, X Y Z R",
     )  # fmt: skip
     edit.add_argument(
-        "--keep", choices=("inside", "outside"), default="inside",
-        help="what stays of boxes and spheres (default inside)",
+        "--keep", choices=("inside", "outside", "all"), default="inside",
+        help="what stays of boxes and spheres (default inside); all: nothing goes, the look counts in them",
     )  # fmt: skip
     edit.add_argument(
         "--max-size", type=float, metavar="N", help="drop splats with a larger standard deviation"
@@ -296,6 +295,15 @@ def _parser() -> argparse.ArgumentParser:
     places.add_argument(
         "--ground", action="store_true", help="first stand upright, with the ground that is found at z = 0"
     )
+    look = edit.add_argument_group("look, of all that stays, or with --keep all in boxes and spheres")
+    look.add_argument("--exposure", type=float, metavar="N", help="stops: 1 is twice the light")
+    look.add_argument(
+        "--temperature", type=float, metavar="K",
+        help="white balance: the light that is to look white, in kelvins; above 6500 warmer",
+    )  # fmt: skip
+    look.add_argument("--tint", type=float, nargs=3, metavar="N", help="colour that white gets, each 0 to 1")
+    look.add_argument("--saturation", type=float, metavar="N", help="0 is grey, 1 as it is")
+    look.add_argument("--opacity", type=float, metavar="N", help="factor on opacities, 0 to 1")
 
     info = commands.add_parser("info", help="say what a bundle or any 3DGS PLY holds")
     info.add_argument("file", type=Path)
@@ -606,6 +614,7 @@ def _edit(chosen: argparse.Namespace) -> int:
     from .lod.cleaning import Cleaning
     from .lod.crop import Crop
     from .lod.edit import edit
+    from .lod.look import RANGES, Look
     from .splats.formats import as_ply
 
     names = "max_size", "min_opacity", "max_distance", "min_views", "gap", "share"
@@ -616,6 +625,14 @@ def _edit(chosen: argparse.Namespace) -> int:
     outside = chosen.keep == "outside"
     crops = [Crop.box(box[:3], box[3:], outside) for box in chosen.crop_box]
     crops += [Crop.sphere(sphere[:3], sphere[3], outside) for sphere in chosen.crop_sphere]
+    parts = {name: value for name in RANGES if (value := getattr(chosen, name)) is not None}
+    if "tint" in parts:
+        parts["tint"] = tuple(parts["tint"])
+    look, places = Look(**parts), [None]
+    if chosen.keep == "all":
+        if crops and not parts:
+            raise LodgsError("With --keep all nothing goes.", "Say what is to look otherwise in there.")
+        crops, places = [], crops or [None]
     if given.keys() & {"max_distance", "min_views"} and chosen.scene is None:
         raise LodgsError("Photographs' views are in their scene.", "Name its folder with --scene.")
     points = None
@@ -632,6 +649,7 @@ def _edit(chosen: argparse.Namespace) -> int:
             edit(
                 source, chosen.out, cleaning, _warn,
                 placement=_placement(chosen), upright=chosen.upright, ground=chosen.ground, points=points,
+                looks=[(place, look) for place in places] if parts else (),
                 plain=chosen.plain, folder=chosen.folder, streamed=chosen.streamed,
             )
         )  # fmt: skip

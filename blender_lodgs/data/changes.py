@@ -7,6 +7,8 @@ reports nothing of what no view layer of a window shows.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import bpy
 
@@ -14,6 +16,8 @@ Version = tuple[int, int]
 
 _reported: Counter[int] = Counter()
 _files = 0
+_selections = 0
+_selecting = False
 
 
 def version(datablock: bpy.types.ID) -> Version:
@@ -21,9 +25,37 @@ def version(datablock: bpy.types.ID) -> Version:
     return _files, _reported[datablock.session_uid]
 
 
+@contextmanager
+def selecting() -> Iterator[None]:
+    """In the block only selections change. To Blender that is a change of points, to :func:`version` none:
+    what was made of them stays."""
+    global _selecting
+    bpy.context.view_layer.update()  # what has changed before is one
+    _selecting = True
+    try:
+        yield
+        bpy.context.view_layer.update()
+    finally:
+        _selecting = False
+        others_selected()
+
+
+def others_selected() -> None:
+    """Says that viewports are to show other points as selected."""
+    global _selections
+    _selections += 1
+
+
+def selection() -> Version:
+    """Another one after other points are to be shown as selected."""
+    return _files, _selections
+
+
 @bpy.app.handlers.persistent
 def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    if depsgraph.mode == "RENDER":  # a render's first evaluation: everything counts as new there
+    if (
+        _selecting or depsgraph.mode == "RENDER"
+    ):  # a render's first evaluation: everything counts as new there
         return
     _reported.update(
         update.id.original.session_uid for update in depsgraph.updates if update.is_updated_geometry

@@ -19,14 +19,11 @@ from ...training.lod.paging import COLUMNS
 from ...training.lod.rules.cut import RULE as CUT
 from ...training.scenes.cameras import Camera
 from ...training.splats.bundle import Bundle
-from ..attributes import BASE, HIDDEN, SCALE, read_attribute, view_attribute, write_attribute
+from ..attributes import BASE, HIDDEN, SCALE, SELECTION, read_attribute, view_attribute, write_attribute
 from . import changes, crops, photographs, selection
 from .cameras import view_from
 from .placement import axes_of
 from .properties import SplatLevel
-
-SELECTION = ".selection"
-"""Blender's own attribute of the points that are selected in Edit Mode."""
 
 TESTS = [
     ("LARGE", "Large", "Splats larger than a length: fog, and what stands in the way"),
@@ -34,13 +31,15 @@ TESTS = [
     ("FAR", "Far", "Splats far from every camera of the photographs"),
     ("UNSEEN", "Seen by Few", "Splats in the frames of few cameras, whether or not something hides them"),
     ("FLOATERS", "Floaters", "Clusters of few splats with nothing near them"),
-    ("SELECTED", "Selected", "Splats that are selected in Edit Mode"),
+    ("SELECTED", "Selected", "Splats that are selected, with the brush, the lasso or in Edit Mode"),
 ]
 """What can be found, as Blender lists it."""
 
 Test = Callable[[bpy.types.PointCloud], np.ndarray]
 """Which splats of a level it finds, (N,) bool."""
 
+_in_stroke: dict[int, np.ndarray] = {}
+"""What a stroke that is not over would have selected of point clouds, by ``session_uid``."""
 _counts: dict[int, tuple[tuple, int]] = {}
 """How many splats of a point cloud are left, by ``session_uid``, and what that depends on."""
 
@@ -48,12 +47,12 @@ _counts: dict[int, tuple[tuple, int]] = {}
 def large(root: bpy.types.Object, most: float) -> Test:
     """Finds splats whose largest standard deviation is above a length of the world."""
     most /= unit_of(root)
-    return lambda cloud: cleaning.large(_view(cloud, SCALE), most)
+    return lambda cloud: cleaning.large(view_of(cloud, SCALE), most)
 
 
 def faint(least: float) -> Test:
     """Finds splats of less opacity."""
-    return lambda cloud: cleaning.faint(_view(cloud, BASE)[:, 3], least)
+    return lambda cloud: cleaning.faint(view_of(cloud, BASE)[:, 3], least)
 
 
 def far(context: bpy.types.Context, root: bpy.types.Object, most: float) -> Test:
@@ -64,7 +63,7 @@ def far(context: bpy.types.Context, root: bpy.types.Object, most: float) -> Test
     """
     eyes = np.array([camera.center for camera in cameras(context, root)])
     most /= unit_of(root)
-    return lambda cloud: cleaning.far(_view(cloud, "position"), eyes, most)
+    return lambda cloud: cleaning.far(view_of(cloud, "position"), eyes, most)
 
 
 def unseen(context: bpy.types.Context, root: bpy.types.Object, least: int) -> Test:
@@ -74,11 +73,11 @@ def unseen(context: bpy.types.Context, root: bpy.types.Object, least: int) -> Te
         LodgsError: as :func:`cameras`.
     """
     views = cameras(context, root)
-    return lambda cloud: cleaning.unseen(_view(cloud, "position"), views, least)
+    return lambda cloud: cleaning.unseen(view_of(cloud, "position"), views, least)
 
 
 def selected(cloud: bpy.types.PointCloud) -> np.ndarray:
-    """Finds splats that are selected in Edit Mode."""
+    """Finds splats that are selected, by a stroke or in Edit Mode."""
     found = read_attribute(cloud, SELECTION)
     return np.zeros(len(cloud.points), bool) if found is None else found.astype(bool)
 
@@ -99,7 +98,7 @@ def find_floaters(
         gap: a length of the world; 0: ``cleaning.typical_gap``.
     """
     cropped = crops.as_objects_stand(root, context.evaluated_depsgraph_get())
-    means = {item.number: _view(item.object.data, "position") for item in levels(root)}
+    means = {item.number: view_of(item.object.data, "position") for item in levels(root)}
     left = {
         item.number: ~hidden(item.object.data) & kept(cropped, means[item.number]) for item in levels(root)
     }
@@ -123,11 +122,50 @@ def hide(root: bpy.types.Object, found: Mapping[int, np.ndarray]) -> int:
 
 
 def select(root: bpy.types.Object, found: Mapping[int, np.ndarray]) -> int:
-    """Selects splats for Edit Mode, in place of those that are; how many."""
-    for item in levels(root):
-        write_attribute(item.object.data, SELECTION, "BOOLEAN", found[item.number])
-        item.object.data.update_tag()
+    """Selects splats, in place of those that are, as Edit Mode does; how many."""
+    with changes.selecting():
+        for item in levels(root):
+            write_attribute(item.object.data, SELECTION, "BOOLEAN", found[item.number])
+            item.object.data.update_tag()
     return sum(int(mask.sum()) for mask in found.values())
+
+
+def select_also(root: bpy.types.Object, found: Mapping[int, np.ndarray], remove: bool = False) -> int:
+    """Selects splats, (N,) bool of each level by its number, beside those that are, or no longer.
+
+    Hidden ones are not; of a tree leaves are, with the nodes that stand for nothing else.
+
+    Returns:
+        How many are.
+    """
+    both = {}
+    for item in levels(root):
+        both[item.number] = mask = selected(item.object.data)
+        mask[found[item.number]] = not remove
+        mask &= ~hidden(item.object.data)
+    return select(root, _with_nodes(root, both))
+
+
+def show_selected(root: bpy.types.Object | None, found: Mapping[int, np.ndarray]) -> None:
+    """Has viewports show splats as selected while a stroke lasts; without any level those that are."""
+    _in_stroke.clear()
+    for item in levels(root) if root is not None and found else ():
+        _in_stroke[item.object.data.session_uid] = found[item.number]
+    changes.others_selected()
+
+
+def shown_selected(cloud: bpy.types.PointCloud) -> np.ndarray:
+    """(N,) bool, which splats viewports show as selected."""
+    found = _in_stroke.get(cloud.session_uid)
+    return selected(cloud) if found is None or len(found) != len(cloud.points) else found
+
+
+def count_selected(root: bpy.types.Object) -> dict[int, int]:
+    """How many splats of each level are selected, and not hidden, by its number."""
+    return {
+        item.number: int(np.count_nonzero(selected(item.object.data) & ~hidden(item.object.data)))
+        for item in levels(root)
+    }
 
 
 def show_all(root: bpy.types.Object) -> int:
@@ -165,7 +203,7 @@ def count_left(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> dict[i
         cloud = item.object.data
         there = changes.version(cloud), len(cloud.points), cropped
         if _counts.get(cloud.session_uid, (None, 0))[0] != there:
-            mask = kept(cropped, _view(cloud, "position")) & ~hidden(cloud)
+            mask = kept(cropped, view_of(cloud, "position")) & ~hidden(cloud)
             _counts[cloud.session_uid] = there, int(np.count_nonzero(mask))
         found[item.number] = _counts[cloud.session_uid][1], len(cloud.points)
     return found
@@ -208,7 +246,7 @@ def suggestions(context: bpy.types.Context, root: bpy.types.Object) -> dict[str,
     """Limits to begin with, by name, lengths in the world: such that of the finest level about one splat in a
     hundred is larger, and one in twenty is farther off."""
     cloud, unit = levels(root)[-1].object.data, unit_of(root)
-    means, scales = _view(cloud, "position"), _view(cloud, SCALE)
+    means, scales = view_of(cloud, "position"), view_of(cloud, SCALE)
     some = slice(None, None, max(len(means) // 100_000, 1))
     found = {
         "size": float(np.quantile(scales[some].max(axis=1), 0.99)) * unit,
@@ -227,7 +265,7 @@ def suggestions(context: bpy.types.Context, root: bpy.types.Object) -> dict[str,
 def bounds(root: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
     """Corners (3,), along the world's axes, of a box with some room around nine tenths of the finest level on
     each: flat ground often lies in its outermost layer."""
-    means = _view(levels(root)[-1].object.data, "position")
+    means = view_of(levels(root)[-1].object.data, "position")
     matrix = np.array(axes_of(root).matrix_world, np.float64)
     placed = means[:: max(len(means) // 100_000, 1)] @ matrix[:3, :3].T + matrix[:3, 3]
     low, high = np.quantile(placed, (0.05, 0.95), axis=0)
@@ -264,7 +302,12 @@ def _family(root: bpy.types.Object) -> cleaning.Family | None:
     return cleaning.Family(columns, means)
 
 
-def _view(cloud: bpy.types.PointCloud, name: str) -> np.ndarray:
+def view_of(cloud: bpy.types.PointCloud, name: str) -> np.ndarray:
+    """An attribute of splats, see ``attributes.view_attribute``.
+
+    Raises:
+        LodgsError: the cloud has it no more.
+    """
     found = view_attribute(cloud, name)
     if found is None:
         raise LodgsError(f"{cloud.name} carries no splats.", "Undo what took its attributes away.")

@@ -16,7 +16,7 @@ from ...training.lod.crop import Crop
 from .. import compat
 from ..attributes import HIDDEN
 from ..nodes import crops as groups
-from ..nodes.building import fresh_driver, take_away
+from ..nodes.building import fresh_driver, modifier_with, take_away
 from .placement import axes_of
 
 DRAWN_AS = {"BOX": "CUBE", "SPHERE": "SPHERE"}
@@ -27,6 +27,11 @@ def crops_of(root: bpy.types.Object) -> list[bpy.types.Object]:
     """The crops under a root, in the order of their names."""
     found = [obj for obj in bpy.data.objects if obj.lodgs_crop.is_crop and _is_under(obj, root)]
     return sorted((obj for obj in found if obj.users_collection), key=lambda obj: obj.name)
+
+
+def cutting(root: bpy.types.Object) -> list[bpy.types.Object]:
+    """Those of them that leave something out; others only say where a look counts (``looks``)."""
+    return [obj for obj in crops_of(root) if obj.lodgs_crop.keep != "ALL"]
 
 
 def new_crop(root: bpy.types.Object, shape: str, matrix: Matrix) -> bpy.types.Object:
@@ -43,14 +48,13 @@ def new_crop(root: bpy.types.Object, shape: str, matrix: Matrix) -> bpy.types.Ob
 def as_objects_stand(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> tuple[Crop, ...]:
     """The crops in use, in the splats' own space, as of the depsgraph."""
     to_own = axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe()
-    return tuple(
-        _crop(
-            to_own, obj, depsgraph, obj.empty_display_size,
-            obj.empty_display_type == DRAWN_AS["SPHERE"], obj.lodgs_crop.keep == "OUTSIDE",
-        )
-        for obj in crops_of(root)
-        if obj.lodgs_crop.use
-    )  # fmt: skip
+    return tuple(as_it_stands(obj, to_own, depsgraph) for obj in cutting(root) if obj.lodgs_crop.use)
+
+
+def as_it_stands(obj: bpy.types.Object, to_own: Matrix, depsgraph: bpy.types.Depsgraph) -> Crop:
+    """A crop's box or sphere, as of the depsgraph, in the space that ``to_own`` leads to from the world."""
+    sphere = obj.empty_display_type == DRAWN_AS["SPHERE"]
+    return _crop(to_own, obj, depsgraph, obj.empty_display_size, sphere, obj.lodgs_crop.keep == "OUTSIDE")
 
 
 def of_modifier(
@@ -79,7 +83,7 @@ def of_modifier(
 def attach(root: bpy.types.Object) -> None:
     """Gives every level the modifier for the crops and hidden points that there are, anew where there are
     others now; takes it away where there are none."""
-    crops = crops_of(root)
+    crops = cutting(root)
     for item in root.lodgs.levels:
         if item.exists:
             if crops or HIDDEN in item.object.data.attributes:
@@ -89,27 +93,30 @@ def attach(root: bpy.types.Object) -> None:
 
 
 def outdated(root: bpy.types.Object) -> bool:
-    """Whether crops have come or gone since modifiers were last given them."""
-    crops = crops_of(root)
-    return any(followed_by(item.object) != crops for item in root.lodgs.levels if item.exists)
+    """Whether crops have come or gone since modifiers were last given them, or an older version gave them."""
+    crops = cutting(root)
+    levels = [item.object for item in root.lodgs.levels if item.exists]
+    given = [modifier.node_group for obj in levels if (modifier := modifier_of(obj))]
+    return any(followed_by(obj) != crops for obj in levels) or not all(
+        groups.serves(group, len(crops)) for group in given
+    )
 
 
 def modifier_of(obj: bpy.types.Object) -> bpy.types.NodesModifier | None:
     """The modifier of a level that follows crops, of any version."""
-    for modifier in obj.modifiers:
-        if isinstance(modifier, bpy.types.NodesModifier) and (
-            modifier.node_group and groups.COUNT in modifier.node_group
-        ):
-            return modifier
-    return None
+    return modifier_with(obj, groups.COUNT)
 
 
-def followed_by(obj: bpy.types.Object) -> list[bpy.types.Object | None]:
-    """The objects that a level's modifier follows."""
-    modifier = modifier_of(obj)
+def followed_by(obj: bpy.types.Object, count_key: str = groups.COUNT) -> list[bpy.types.Object | None]:
+    """The objects that a level's modifier follows.
+
+    Args:
+        count_key: the custom property by which its group tells how many it has places for.
+    """
+    modifier = modifier_with(obj, count_key)
     if modifier is None or modifier.node_group is None:
         return []
-    count = range(1, modifier.node_group[groups.COUNT] + 1)
+    count = range(1, modifier.node_group[count_key] + 1)
     names = [groups.OBJECT.format(number) for number in count]
     return [compat.get_input(modifier, name) for name in names if compat.has_input(modifier, name)]
 
@@ -146,19 +153,36 @@ def _attach(obj: bpy.types.Object, crops: list[bpy.types.Object]) -> None:
     assert isinstance(modifier, bpy.types.NodesModifier)
     modifier.node_group, modifier.show_expanded = groups.crops_group(len(crops)), False
     obj.modifiers.move(len(obj.modifiers) - 1, 0)
-    sphere = bpy.types.Object.bl_rna.properties["empty_display_type"].enum_items["SPHERE"].value  # type: ignore[attr-defined]
     for number, crop in enumerate(crops, 1):
-        compat.set_input(modifier, groups.OBJECT.format(number), crop)
-        driven = (
-            (groups.SIZE, "empty_display_size", "value", 1.0),
-            (groups.SPHERE, "empty_display_type", f"value == {sphere}", 0.0),
-            (groups.OUTSIDE, "lodgs_crop.keep", "value", 0.0),
-            (groups.USE, "lodgs_crop.use", "value", 1.0),
-        )
-        for name, source, expression, without in driven:
-            driver = fresh_driver(obj, compat.input_path(modifier, name.format(number)), expression)
-            variable = driver.variables.new()
-            variable.name, variable.type = "value", "SINGLE_PROP"
-            target = variable.targets[0]
-            target.id, target.data_path = crop, source
-            target.use_fallback_value, target.fallback_value = True, without
+        follow(obj, modifier, number, crop)
+
+
+def follow(
+    obj: bpy.types.Object, modifier: bpy.types.NodesModifier, number: int, crop: bpy.types.Object
+) -> None:
+    """Has the sockets of a number, as far as a level's modifier has them, follow a crop."""
+    sphere = bpy.types.Object.bl_rna.properties["empty_display_type"].enum_items["SPHERE"].value  # type: ignore[attr-defined]
+    compat.set_input(modifier, groups.OBJECT.format(number), crop)
+    driven = (
+        (groups.SIZE, "empty_display_size", "value", 1.0),
+        (groups.SPHERE, "empty_display_type", f"value == {sphere}", 0.0),
+        (groups.OUTSIDE, "lodgs_crop.keep", "value", 0.0),
+        (groups.USE, "lodgs_crop.use", "value", 1.0),
+    )
+    for name, source, expression, without in driven:
+        if compat.has_input(modifier, name.format(number)):
+            path = compat.input_path(modifier, name.format(number))
+            read_from(fresh_driver(obj, path, expression), crop, source, without)
+
+
+def read_from(driver: bpy.types.Driver, obj: bpy.types.Object, source: str, without: float) -> None:
+    """Gives a driver the variable ``value``: an object's property.
+
+    Args:
+        without: its value where this extension, and with it the property, is missing.
+    """
+    variable = driver.variables.new()
+    variable.name, variable.type = "value", "SINGLE_PROP"
+    target = variable.targets[0]
+    target.id, target.data_path = obj, source
+    target.use_fallback_value, target.fallback_value = True, without

@@ -25,6 +25,7 @@ from ..attributes import (
     HIDDEN,
     LAYOUTS,
     LOG_SCALE,
+    LOOK_OPACITY,
     OPACITY_LOGIT,
     QUATERNION,
     RADIUS,
@@ -39,6 +40,7 @@ from ..nodes import display
 
 _OWN = {
     "position", BASE, SCALE, ROTATION, LOG_SCALE, OPACITY_LOGIT, QUATERNION, COLOR, RADIUS, WEIGHT, HIDDEN,
+    LOOK_OPACITY,
 }  # fmt: skip
 _TYPE = "lodgs_type:"  # custom property that remembers a column's type
 _EXTRA = COLUMN.format("")

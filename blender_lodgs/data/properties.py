@@ -391,6 +391,11 @@ class ViewportSettings(bpy.types.PropertyGroup):
         update=_changed,
         options=set(),
     )
+    points: bpy.props.BoolProperty(
+        description="Whether Blender draws splats, as points",
+        get=lambda self: not self.splats,
+        options={"HIDDEN"},
+    )
     budget: bpy.props.IntProperty(
         name="Splats at Most",
         description="How many splats a viewport draws at most. Where there are more, coarser levels stand "
@@ -459,11 +464,32 @@ class CropSettings(bpy.types.PropertyGroup):
         items=[
             ("INSIDE", "Keep Inside", "Splats in this crop stay, and those in others that keep theirs"),
             ("OUTSIDE", "Cut Out", "Splats in this crop go"),
+            ("ALL", "Keep All", "None go: only the look of the splats in it is its own"),
         ],
         update=_changed,
     )
     use: bpy.props.BoolProperty(
         name="Use", description="Whether the crop has an effect", default=True, update=_changed
+    )
+
+
+class BrushSettings(bpy.types.PropertyGroup):
+    """How strokes select splats, on the Blender scene (``Scene.lodgs_brush``)."""
+
+    radius: bpy.props.IntProperty(
+        name="Radius",
+        description="Of the brush, in pixels of the viewport; press F over it to change it there",
+        default=40,
+        min=1,
+        max=2000,
+        soft_max=400,
+        subtype="PIXEL",
+        options=set(),
+    )
+    through: bpy.props.BoolProperty(
+        name="Through",
+        description="Select what other splats hide from the view as well, to any depth",
+        options=set(),
     )
 
 
@@ -489,9 +515,14 @@ class RenderSettings(bpy.types.PropertyGroup):
         "reflections. Fine up to some hundred thousand splats",
         update=_ellipsoids_changed,
     )
+    draws_points: bpy.props.BoolProperty(
+        description="Whether renders of this scene are Blender's, which show points or ellipsoids",
+        get=lambda self: self.id_data.render.engine != "LODGS",
+        options={"HIDDEN"},
+    )
     draws_ellipsoids: bpy.props.BoolProperty(
         description="Whether renders of this scene show ellipsoids: LODGS draws true splats instead",
-        get=lambda self: self.ellipsoids and self.id_data.render.engine != "LODGS",
+        get=lambda self: self.ellipsoids and self.draws_points,
         options={"HIDDEN"},
     )
     holdout: bpy.props.StringProperty(
@@ -538,7 +569,8 @@ SplatScene.__annotations__ |= {
 
 CLASSES = (
     ViewSettings, ViewportSettings, *PARAMETERS.values(), TrainingCell, TrainingSettings, SplatLevel,
-    SplatTable, SplatStream, *CONTROLS.values(), SplatScene, CropSettings, RenderSettings, CaptureSettings,
+    SplatTable, SplatStream, *CONTROLS.values(), SplatScene, CropSettings, BrushSettings, RenderSettings,
+    CaptureSettings,
 )  # fmt: skip
 
 
@@ -549,12 +581,14 @@ def register() -> None:
     bpy.types.Camera.lodgs = bpy.props.PointerProperty(type=ViewSettings)
     bpy.types.Scene.lodgs_render = bpy.props.PointerProperty(type=RenderSettings)
     bpy.types.Scene.lodgs_viewport = bpy.props.PointerProperty(type=ViewportSettings)
+    bpy.types.Scene.lodgs_brush = bpy.props.PointerProperty(type=BrushSettings)
     bpy.types.Scene.lodgs_capture = bpy.props.PointerProperty(type=CaptureSettings)
 
 
 def unregister() -> None:
     """Detach them again."""
     del bpy.types.Scene.lodgs_capture
+    del bpy.types.Scene.lodgs_brush
     del bpy.types.Scene.lodgs_render
     del bpy.types.Scene.lodgs_viewport
     del bpy.types.Camera.lodgs

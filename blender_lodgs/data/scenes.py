@@ -18,7 +18,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...training.errors import LodgsError
-from ...training.lod import placing
+from ...training.lod import look, placing
 from ...training.lod.paging import TreeFile, is_tree, read_within
 from ...training.lod.rule import Control, Tables, find_rule
 from ...training.lod.selection import complete, known_rule, not_alone, unknown_rule
@@ -32,7 +32,7 @@ from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder, r
 from ...training.splats.formats import STREAMED, as_ply, is_ply
 from ...training.splats.gaussians import Splats
 from ..nodes import ellipsoids
-from . import cleaning, crops, objects, selection, streams, tables
+from . import cleaning, crops, looks, objects, selection, streams, tables
 from .objects import root_of
 from .photographs import camera_of, is_held_out, match_render, new_camera, photographed, views
 from .placement import axes_of, new_axes, placement_of
@@ -386,7 +386,7 @@ def make_room(root: bpy.types.Object, number: int) -> None:
     _levels_changed(root)
 
 
-def read_levels(root: bpy.types.Object, placed: bool = False) -> Bundle:
+def read_levels(root: bpy.types.Object, placed: bool = False, looked: bool = False) -> Bundle:
     """The levels of a splat scene with all that artists have changed in them, modifiers not applied.
 
     What is hidden, and what crops leave out, is not among them.
@@ -394,6 +394,7 @@ def read_levels(root: bpy.types.Object, placed: bool = False) -> Bundle:
     Args:
         placed: where the scene stands in Blender, upright there; otherwise in the splats' own world. What of
             its objects has been moved by itself counts in neither.
+        looked: as the scene's look has them (``looks``); otherwise as they were trained.
 
     Raises:
         LodgsError: there are none, or crops leave nothing; or of a placed one, its root is stretched or its
@@ -413,6 +414,8 @@ def read_levels(root: bpy.types.Object, placed: bool = False) -> Bundle:
         tables.read_tables(root) | _views_of(root),
     )  # fmt: skip
     bundle = cleaning.left(root, bundle, bpy.context.evaluated_depsgraph_get())
+    if looked:
+        bundle = look.looked_levels(bundle, _looks(root))
     if placed:
         bundle = placing.placed(bundle, placement_of(root))
         bundle.meta["up_rotation"] = np.eye(3)
@@ -432,7 +435,8 @@ def _views_of(root: bpy.types.Object) -> dict[str, dict[str, np.ndarray]]:
 
 
 def delete_left_out(root: bpy.types.Object) -> int:
-    """Deletes what is hidden and what crops leave out, of every level, and the crops; how many splats.
+    """Deletes what is hidden and what crops leave out, of every level, and the crops, but for their looks;
+    how many splats.
 
     Raises:
         LodgsError: as :func:`read_levels`, or the levels are only the top of a tree in a file.
@@ -449,21 +453,25 @@ def delete_left_out(root: bpy.types.Object) -> int:
         _put_level(root, level)
     for item in root.lodgs.levels:
         item.lost = 0
-    bpy.data.batch_remove(crops.crops_of(root))
+    for obj in crops.cutting(root):
+        if looks.is_set(obj):  # which stays with what is left there
+            obj.lodgs_crop.keep = "ALL"
+        else:
+            bpy.data.objects.remove(obj)
     _levels_changed(root)
     return before - sum(len(level.splats) for level in bundle.levels)
 
 
-def read_level(root: bpy.types.Object, number: int, placed: bool = False) -> Splats:
+def read_level(root: bpy.types.Object, number: int, placed: bool = False, looked: bool = False) -> Splats:
     """One level with all that artists have changed in it; where levels add up, with all coarser ones.
 
     Args:
-        placed: see :func:`read_levels`.
+        placed, looked: see :func:`read_levels`.
 
     Raises:
         LodgsError: there is no such level, or it is no scene by itself; or as :func:`read_levels`.
     """
-    bundle = read_levels(root, placed)
+    bundle = read_levels(root, placed, looked)
     for level in bundle.levels:
         if level.number == number:
             _require_alone(root, number)
@@ -471,13 +479,15 @@ def read_level(root: bpy.types.Object, number: int, placed: bool = False) -> Spl
     raise LodgsError(f"{root.name} has no level {number}.", "Choose one from the list of levels.")
 
 
-def shown_splats(context: bpy.types.Context, root: bpy.types.Object, placed: bool = False) -> Splats:
+def shown_splats(
+    context: bpy.types.Context, root: bpy.types.Object, placed: bool = False, looked: bool = False
+) -> Splats:
     """The splats that the detail settings, and artists' own modifiers, leave visible in the view layer.
 
     Columns that not every visible level has are left out.
 
     Args:
-        placed: see :func:`read_levels`.
+        placed, looked: see :func:`read_levels`.
 
     Raises:
         LodgsError: nothing is visible, or the levels have spherical harmonics of different degrees; or of
@@ -499,6 +509,8 @@ def shown_splats(context: bpy.types.Context, root: bpy.types.Object, placed: boo
         **{name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays},
         extras={name: np.concatenate([part.extras[name] for part in parts]) for name in shared},
     )
+    if looked:
+        splats = look.looked(splats, _looks(root))
     rule = find_rule(root.lodgs.rule)
     if not placed:
         return splats
@@ -569,6 +581,13 @@ def _tell_others() -> None:
             "in renders, with detail by distance, and can be cleaned, placed and exported: Edit, "
             "Preferences, Get Extensions, Install from Disk. Nothing is lost without it.\n"
         )
+
+
+def _looks(root: bpy.types.Object) -> look.Looks:
+    """The looks of a scene as it stands now."""
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    to_own = axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe()
+    return looks.looks_of(root, depsgraph, to_own)
 
 
 def _require_alone(root: bpy.types.Object, number: int) -> None:
@@ -731,7 +750,7 @@ def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
                 _levels_changed(root)
     if depsgraph.id_type_updated("OBJECT"):
         for root in editable:
-            if crops.outdated(root):
+            if crops.outdated(root) or looks.outdated(root):
                 selection.follow_crops(root)
     if any(update.is_updated_geometry for update in depsgraph.updates):
         for root in editable:

@@ -20,10 +20,11 @@ from ...training.lod.choice import Choice
 from ...training.lod.rule import Rule, fact_names, facts_of, find_rule
 from .. import compat
 from ..nodes import crops as crop_groups
+from ..nodes import look as look_groups
 from ..nodes import rules as groups
 from ..nodes.building import fresh_driver, take_away
 from ..nodes.display import NAME as DISPLAY
-from . import crops
+from . import crops, looks
 from .placement import axes_of
 from .tables import read_table
 
@@ -79,8 +80,12 @@ def only_chosen(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> 
 
 
 def _chooses(group: bpy.types.NodeTree | None) -> bool:
-    """Whether a modifier's group is a rule's or the crops', and what they made it."""
-    return groups.rule_of_group(group) is not None or crop_groups.crops_of_group(group) is not None
+    """Whether a modifier's group is a rule's, the crops' or the look's, and what they made it."""
+    return (
+        groups.rule_of_group(group) is not None
+        or crop_groups.crops_of_group(group) is not None
+        or look_groups.is_look(group)
+    )
 
 
 def _is_on(modifier: bpy.types.Modifier, depsgraph: bpy.types.Depsgraph) -> bool:
@@ -133,6 +138,7 @@ def attach(root: bpy.types.Object) -> None:
     """
     settings = root.lodgs
     crops.attach(root)
+    looks.attach(root)
     _drive_focal_length(root)
     rule = find_rule(settings.rule)
     levels = [(item.number, read_facts(item.facts)) for item in settings.levels if item.exists]
@@ -156,8 +162,9 @@ def attach(root: bpy.types.Object) -> None:
 
 
 def follow_crops(root: bpy.types.Object) -> None:
-    """Has the levels' modifiers follow the crops and hidden splats that there are now."""
+    """Has the levels' modifiers follow the crops, looks and hidden splats that there are now."""
     crops.attach(root)
+    looks.attach(root)
     _order(root)
     update_inputs(root)
 

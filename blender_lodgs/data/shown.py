@@ -13,7 +13,7 @@ import bpy
 import numpy as np
 
 from .. import attributes
-from . import scenes, selection, streams
+from . import looks, scenes, selection, streams
 from .placement import axes_of
 
 
@@ -29,6 +29,7 @@ class SplatInstance:
         antialias: see ``SplatScene.antialias``.
         source: from where finer splats are to be read than the levels of its scene hold. All of them are
             instances beside it then, and what is read stands for them all, in the place of the finest.
+        looks: see ``looks.looks_of``.
     """
 
     object: bpy.types.Object
@@ -37,6 +38,7 @@ class SplatInstance:
     level: int
     antialias: bool
     source: streams.Source | None = None
+    looks: tuple[looks.PlacedLook, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,7 @@ def splat_instances(
         for item in root.lodgs.levels
         if item.object is not None
     }
-    found = []
+    found, own_looks = [], {}
     for instance in depsgraph.object_instances:  # visible ones only
         obj = instance.object
         if obj.type != "POINTCLOUD" or not is_splats(obj.original.data):
@@ -95,7 +97,11 @@ def splat_instances(
         evaluated = original.evaluated_get(depsgraph)
         level, root = levels.get(original) or (0, scenes.root_of(original))
         antialias = root is not None and root.lodgs.antialias
-        found.append(SplatInstance(original, evaluated, matrix, level, antialias))
+        together = root, evaluated.matrix_world.copy().freeze()  # levels mostly are, and have one look
+        if root is not None and together not in own_looks:
+            own_looks[together] = looks.looks_of(root, depsgraph, evaluated.matrix_world.inverted_safe())
+        look = own_looks.get(together, ())
+        found.append(SplatInstance(original, evaluated, matrix, level, antialias, looks=look))
     found.sort(key=lambda instance: (instance.level, instance.object.name))
     return _with_sources(found, depsgraph)
 

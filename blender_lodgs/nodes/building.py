@@ -167,6 +167,9 @@ class Field:
     def exp(self) -> Field:
         return self._math("EXPONENT", self)
 
+    def power(self, exponent: float) -> Field:
+        return self._math("POWER", self, exponent)
+
     def sqrt(self) -> Field:
         return self._math("SQRT", self)
 
@@ -303,21 +306,34 @@ def take_away(obj: bpy.types.Object, modifier: bpy.types.NodesModifier) -> None:
         bpy.data.node_groups.remove(group)
 
 
-def switched(obj: bpy.types.Object, group: bpy.types.GeometryNodeTree, where: str, by: str) -> None:
-    """A new modifier with a group, which is on only in one place and where the active scene says so.
+def modifier_with(obj: bpy.types.Object, key: str) -> bpy.types.NodesModifier | None:
+    """The modifier whose group has a custom property, of any version."""
+    for modifier in obj.modifiers:
+        if (
+            isinstance(modifier, bpy.types.NodesModifier)
+            and modifier.node_group
+            and key in modifier.node_group
+        ):
+            return modifier
+    return None
+
+
+def switched(obj: bpy.types.Object, group: bpy.types.GeometryNodeTree, **by: str) -> bpy.types.NodesModifier:
+    """A new modifier with a group, which is on only where the active scene says so.
 
     Args:
-        where: "show_viewport" or "show_render"; it is off in the other.
-        by: data path of a property of scenes. Without this extension it is off.
+        by: for "show_viewport", "show_render" or both the data path of a property of scenes. Without this
+            extension it is off.
     """
     modifier = obj.modifiers.new(group.name, "NODES")
     assert isinstance(modifier, bpy.types.NodesModifier)
     modifier.node_group, modifier.show_expanded = group, False
     modifier.show_viewport = modifier.show_render = False
-    driver = obj.driver_add(f'modifiers["{modifier.name}"].{where}').driver
-    driver.type, driver.expression = "SCRIPTED", "on"
-    variable = driver.variables.new()
-    variable.name, variable.type = "on", "CONTEXT_PROP"
-    target = variable.targets[0]
-    target.context_property, target.data_path = "ACTIVE_SCENE", by
-    target.use_fallback_value, target.fallback_value = True, 0.0
+    for where, path in by.items():
+        driver = fresh_driver(obj, f'modifiers["{modifier.name}"].{where}', "on")
+        variable = driver.variables.new()
+        variable.name, variable.type = "on", "CONTEXT_PROP"
+        target = variable.targets[0]
+        target.context_property, target.data_path = "ACTIVE_SCENE", path
+        target.use_fallback_value, target.fallback_value = True, 0.0
+    return modifier

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import bpy
 
+from ...training.lod.crop import FACE
 from ..attributes import HIDDEN
 from .building import VERSION, Field, Nodes, edited, group
 
@@ -21,7 +22,7 @@ _SOCKETS = {
     OBJECT: "NodeSocketObject", SIZE: "NodeSocketFloat", SPHERE: "NodeSocketFloat",
     OUTSIDE: "NodeSocketFloat", USE: "NodeSocketFloat",
 }  # fmt: skip
-_VERSION = 1
+_VERSION = 2
 MATERIAL = "material"
 
 
@@ -65,7 +66,7 @@ def _kept(nodes: Nodes, sockets, count: int) -> Field:
     inside, none_inside = None, None
     for number in range(1, count + 1):
         used, out = (nodes.field(sockets[name.format(number)]) for name in (USE, OUTSIDE))
-        held = _holds(nodes, sockets, number, position) & used
+        held = holds(nodes, sockets, number, position) & used
         keeps = used * (1.0 - out)
         inside = held * keeps if inside is None else inside.maximum(held * keeps)
         none_inside = 1.0 - keeps if none_inside is None else none_inside * (1.0 - keeps)
@@ -73,8 +74,8 @@ def _kept(nodes: Nodes, sockets, count: int) -> Field:
     return kept if inside is None or none_inside is None else kept * inside.maximum(none_inside)
 
 
-def _holds(nodes: Nodes, sockets, number: int, position: bpy.types.NodeSocket) -> Field:
-    """1 for points that lie in a crop. One that is flat holds none."""
+def holds(nodes: Nodes, sockets, number: int, position: bpy.types.NodeSocket) -> Field:
+    """1 for points that lie in the crop of a number, used or not. One that is flat holds none."""
     info = nodes.add("GeometryNodeObjectInfo", transform_space="RELATIVE")
     nodes.link(sockets[OBJECT.format(number)], info, "Object")
     inverse = nodes.add("FunctionNodeInvertMatrix")
@@ -88,4 +89,4 @@ def _holds(nodes: Nodes, sockets, number: int, position: bpy.types.NodeSocket) -
     x, y, z = (nodes.field(apart.outputs[axis]) for axis in "XYZ")
     size, sphere = (nodes.field(sockets[name.format(number)]) for name in (SIZE, SPHERE))
     away = (sphere > 0.5).where(x + y + z, x.maximum(y).maximum(z))
-    return nodes.field(inverse.outputs["Invertible"]) & (away <= size * size)
+    return nodes.field(inverse.outputs["Invertible"]) & (away <= size * size * FACE)

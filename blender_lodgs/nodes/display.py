@@ -28,4 +28,4 @@ def attach(obj: bpy.types.Object) -> None:
     Where Blender draws them as such by itself, there is nothing to hide.
     """
     if not compat.make_native(obj.data):
-        switched(obj, display(), "show_viewport", "lodgs_viewport.splats")
+        switched(obj, display(), show_viewport="lodgs_viewport.splats")

@@ -11,8 +11,8 @@ import math
 
 import bpy
 
-from ..attributes import COLOR, OPACITY_LOGIT, ROTATION, SCALE, WEIGHT
-from .building import Nodes, group, switched
+from ..attributes import COLOR, LOOK_OPACITY, OPACITY_LOGIT, ROTATION, SCALE, WEIGHT
+from .building import Nodes, edited, group, switched
 
 NAME = "LODGS Ellipsoids"
 MATERIAL = "LODGS Ellipsoids"
@@ -29,13 +29,18 @@ samples that remove it cost far more time than going on.
 
 def attach(obj: bpy.types.Object) -> None:
     """Gives an object of splats this modifier, last of all; it is on where its scene wants ellipsoids."""
-    if NAME not in obj.modifiers:
-        switched(obj, ellipsoids(), "show_render", "lodgs_render.draws_ellipsoids")
+    modifier = obj.modifiers.get(NAME)
+    if modifier is None:
+        switched(obj, ellipsoids(), show_render="lodgs_render.draws_ellipsoids")
+    elif isinstance(modifier, bpy.types.NodesModifier) and (
+        modifier.node_group is None or not edited(modifier.node_group)
+    ):
+        modifier.node_group = ellipsoids()  # an older file has an older one
 
 
 def ellipsoids() -> bpy.types.GeometryNodeTree:
     """The group."""
-    return group(NAME, 1, _build)
+    return group(NAME, 2, _build)
 
 
 def _build(nodes: Nodes) -> None:
@@ -50,14 +55,14 @@ def _build(nodes: Nodes) -> None:
         return next(s for s in node.outputs if s.name == "Attribute" and s.enabled)
 
     points = add("NodeGroupInput").outputs[0]
-    logit, weight = attribute(OPACITY_LOGIT, "FLOAT"), attribute(WEIGHT, "FLOAT")
-    opacity = 1.0 / ((nodes.field(value(logit)) * -1.0).exp() + 1.0)
-    # splats without the attribute are there in full
-    faded = nodes.field(weight.outputs["Exists"]).where(nodes.field(value(weight)), 1.0)
+    opacity = 1.0 / ((nodes.field(value(attribute(OPACITY_LOGIT, "FLOAT"))) * -1.0).exp() + 1.0)
+    for factor in (attribute(WEIGHT, "FLOAT"), attribute(LOOK_OPACITY, "FLOAT")):
+        # splats without the attribute are there in full
+        opacity = opacity * nodes.field(factor.outputs["Exists"]).where(nodes.field(value(factor)), 1.0)
     store = add("GeometryNodeStoreNamedAttribute", data_type="FLOAT", domain="POINT")
     store.inputs["Name"].default_value = ALPHA
     link(points, store, "Geometry")
-    link((opacity * faded).socket, store, "Value")
+    link(opacity.socket, store, "Value")
 
     sphere = add("GeometryNodeMeshIcoSphere")
     sphere.inputs["Radius"].default_value, sphere.inputs["Subdivisions"].default_value = 1.0, 3

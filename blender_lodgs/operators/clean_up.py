@@ -8,23 +8,11 @@ from mathutils import Matrix
 from ...training.errors import LodgsError
 from ...training.lod.cleaning import SHARE
 from ..data import cleaning, crops, scenes
-from .parts import OnScene, report_errors
+from .brush import TOOLS
+from .parts import OnOwnLevels, report_errors
 
 
-class _OnLevels(OnScene):
-    """An operator that changes the levels of the active splat scene."""
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if not super().poll(context):
-            return False
-        if scenes.root_with_levels(context) is None:
-            cls.poll_message_set("Select a splat scene that has levels")  # type: ignore[attr-defined]
-            return False
-        return True
-
-
-class LODGS_OT_add_crop(_OnLevels, bpy.types.Operator):
+class LODGS_OT_add_crop(OnOwnLevels, bpy.types.Operator):
     """Add an object that crops every level of the splat scene: move, turn and scale it like any other"""
 
     bl_idname = "lodgs.add_crop"
@@ -42,6 +30,7 @@ class LODGS_OT_add_crop(_OnLevels, bpy.types.Operator):
         items=[
             ("INSIDE", "Inside", "What lies in the crop stays"),
             ("OUTSIDE", "Outside", "What lies in the crop goes"),
+            ("ALL", "All", "Nothing goes: what lies in the crop can be given a look of its own"),
         ],
     )
 
@@ -64,6 +53,8 @@ def add_crop(
         half[:] = half.max()
     obj = crops.new_crop(root, shape, Matrix.LocRotScale((low + high) / 2, None, half))
     obj.lodgs_crop.keep = keep
+    if keep == "ALL":
+        obj.name = f"Region {shape.title()}"
     for other in context.selected_objects:
         other.select_set(False)
     obj.select_set(True)
@@ -71,7 +62,7 @@ def add_crop(
     return obj
 
 
-class LODGS_OT_remove_crop(_OnLevels, bpy.types.Operator):
+class LODGS_OT_remove_crop(OnOwnLevels, bpy.types.Operator):
     """Remove this crop; what it left out is there again"""
 
     bl_idname = "lodgs.remove_crop"
@@ -95,7 +86,7 @@ class LODGS_OT_remove_crop(_OnLevels, bpy.types.Operator):
         )
 
 
-class LODGS_OT_hide_splats(_OnLevels, bpy.types.Operator):
+class LODGS_OT_hide_splats(OnOwnLevels, bpy.types.Operator):
     """Hide splats of every level, or select them for Edit Mode; hidden ones can be shown again"""
 
     bl_idname = "lodgs.hide_splats"
@@ -180,7 +171,7 @@ class LODGS_OT_hide_splats(_OnLevels, bpy.types.Operator):
         return cleaning.find(root, test)
 
 
-class LODGS_OT_show_hidden_splats(_OnLevels, bpy.types.Operator):
+class LODGS_OT_show_hidden_splats(OnOwnLevels, bpy.types.Operator):
     """Show all hidden splats of the scene again"""
 
     bl_idname = "lodgs.show_hidden_splats"
@@ -193,7 +184,7 @@ class LODGS_OT_show_hidden_splats(_OnLevels, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LODGS_OT_delete_left_out(_OnLevels, bpy.types.Operator):
+class LODGS_OT_delete_left_out(OnOwnLevels, bpy.types.Operator):
     """Delete the splats that are hidden or cropped, of every level, and the crops with them"""
 
     bl_idname = "lodgs.delete_left_out"
@@ -227,6 +218,10 @@ class LODGS_MT_clean_up(bpy.types.Menu):
         for test, name, _ in cleaning.TESTS[:-1]:
             operator = layout.operator("lodgs.hide_splats", text=f"Select {_named(test, name)}")
             operator.test, operator.action = test, "SELECT"
+        for tool in TOOLS if context.mode == "OBJECT" else ():
+            layout.operator("wm.tool_set_by_id", text=tool.bl_label).name = tool.bl_idname
+        for action, name in (("DESELECT", "Deselect Splats"), ("INVERT", "Invert Selected Splats")):
+            layout.operator("lodgs.select_all_splats", text=name).action = action
         layout.separator()
         layout.operator("lodgs.show_hidden_splats")
         layout.operator("lodgs.delete_left_out", text="Delete Hidden and Cropped Splats")

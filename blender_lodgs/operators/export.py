@@ -45,7 +45,7 @@ def _size(context: bpy.types.Context, kind: Format, level: int = 0) -> str:
     return f"{size / 1e6:,.1f} MB" if size > 1e5 else f"{size / 1e3:,.0f} kB"
 
 
-class _AsPlaced(OnLevels):
+class _AsShown(OnLevels):
     """What all exports can be told."""
 
     placed: bpy.props.BoolProperty(
@@ -55,9 +55,15 @@ class _AsPlaced(OnLevels):
         "scene is moved by itself, count in neither",
         default=False,
     )
+    looked: bpy.props.BoolProperty(
+        name="With Look",
+        description="Write the splats in the colours and opacities that the Look panel gives them. Otherwise "
+        "as they were trained",
+        default=True,
+    )
 
 
-class _Export(_AsPlaced, ExportHelper):
+class _Export(_AsShown, ExportHelper):
     """What exports to one PLY have in common: a name after the scene, and the browser's overwrite check."""
 
     filename_ext = ".ply"
@@ -115,6 +121,7 @@ class LODGS_OT_export_bundle(_Export, bpy.types.Operator):
         self.layout.use_property_split = True
         self.layout.prop(self, "order")
         self.layout.prop(self, "placed")
+        self.layout.prop(self, "looked")
         self.layout.label(text=f"All levels: {_size(context, PLY, -1)}")
 
     @report_errors
@@ -125,7 +132,7 @@ class LODGS_OT_export_bundle(_Export, bpy.types.Operator):
                 "The coarser level of these splats is no scene by itself, which other viewers would show.",
                 "Put the finest level first.",
             )
-        bundle = scenes.read_levels(root, self.placed)
+        bundle = scenes.read_levels(root, self.placed, self.looked)
         write_bundle(self._path(), bundle, self.order)
         self.report({"INFO"}, f"{len(bundle.levels)} levels written to {self._path()}")
         return {"FINISHED"}
@@ -178,6 +185,7 @@ class LODGS_OT_export_plain(_Export, _Converting, bpy.types.Operator):
         if self.source == "LEVEL":
             layout.prop(self, "level")
         layout.prop(self, "placed")
+        layout.prop(self, "looked")
         layout.label(text="Format, and about how large:")
         column = layout.column(align=True)
         column.use_property_split = False
@@ -188,9 +196,9 @@ class LODGS_OT_export_plain(_Export, _Converting, bpy.types.Operator):
     def work(self, context):
         root = scenes.active_root(context)
         if self.source == "LEVEL":
-            splats = scenes.read_level(root, self.level, self.placed)
+            splats = scenes.read_level(root, self.level, self.placed, self.looked)
         else:
-            splats = scenes.shown_splats(context, root, self.placed)
+            splats = scenes.shown_splats(context, root, self.placed, self.looked)
         meta = selection.read_json(root.lodgs.meta)
         yield from self.told(write_splats(self._path(), splats, meta))
         self.written = f"{len(splats):,} splats written to {self._path()}"
@@ -199,7 +207,7 @@ class LODGS_OT_export_plain(_Export, _Converting, bpy.types.Operator):
 _SUFFIXES = sorted((kind.suffix for kind in FORMATS), key=len, reverse=True)
 
 
-class _IntoFolder(_AsPlaced):
+class _IntoFolder(_AsShown):
     """What exports into a folder have in common."""
 
     directory: bpy.props.StringProperty(
@@ -214,7 +222,7 @@ class _IntoFolder(_AsPlaced):
 
     def draw(self, context):
         self.layout.use_property_split = True
-        for name in ("placed", "replace"):
+        for name in ("placed", "looked", "replace"):
             if name in self.bl_rna.properties:
                 self.layout.prop(self, name)
         self.layout.label(text=f"About {_size(context, self.kind, -1)} in all")
@@ -224,7 +232,7 @@ class _IntoFolder(_AsPlaced):
 
     def _bundle(self, context) -> Bundle:
         """The levels, each a scene by itself."""
-        bundle = scenes.read_levels(scenes.active_root(context), self.placed)
+        bundle = scenes.read_levels(scenes.active_root(context), self.placed, self.looked)
         return complete_levels(bundle) if is_tree(bundle) else bundle
 
 

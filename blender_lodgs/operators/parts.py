@@ -11,15 +11,16 @@ from ..data import scenes
 
 
 def report_errors(execute):
-    """Wraps an operator's execute: a LodgsError becomes a report of its sentences, and it cancels.
+    """Wraps an operator's execute, or what its other methods call: a LodgsError becomes a report of its
+    sentences, and it cancels.
 
     So does a lack of memory.
     """
 
     @functools.wraps(execute)
-    def wrapper(self, context):
+    def wrapper(self, context, *event):
         try:
-            return execute(self, context)
+            return execute(self, context, *event)
         except LodgsError as error:
             self.report({"ERROR"}, str(error))
         except MemoryError:
@@ -62,7 +63,19 @@ class OnLevels:
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if scenes.root_with_levels(context) is None:
-            cls.poll_message_set("Select a splat scene that has levels")  # type: ignore[attr-defined]
-            return False
-        return True
+        return _has_levels(cls, context)
+
+
+class OnOwnLevels(OnScene):
+    """An operator that changes the levels of the active splat scene."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return super().poll(context) and _has_levels(cls, context)
+
+
+def _has_levels(cls, context: bpy.types.Context) -> bool:
+    if scenes.root_with_levels(context) is None:
+        cls.poll_message_set("Select a splat scene that has levels")
+        return False
+    return True

@@ -25,6 +25,21 @@ class LODGS_PT_clean_up(LevelsPanel):
             row.prop(crop.lodgs_crop, "keep", text="")
             row.operator("lodgs.remove_crop", text="", icon="X").name = crop.name
 
+        layout.label(text="Select splats of all levels:")
+        column, brush = layout.column(align=True), context.scene.lodgs_brush
+        row = column.row(align=True)
+        row.enabled = context.mode == "OBJECT"
+        for name, tool in (("Brush", "lodgs.brush"), ("Lasso", "lodgs.lasso")):
+            row.operator("wm.tool_set_by_id", text=name).name = tool
+        row = column.row(align=True)
+        row.prop(brush, "radius")
+        row.prop(brush, "through", toggle=True)
+        if count := sum(cleaning.count_selected(root).values()):
+            row = column.row(align=True)
+            row.operator("lodgs.hide_splats", text=f"Hide {count:,}").test = "SELECTED"
+            row.operator("lodgs.select_all_splats", text="Deselect").action = "DESELECT"
+            row.operator("lodgs.select_all_splats", text="Invert").action = "INVERT"
+
         layout.label(text="Hide splats of all levels:")
         grid = layout.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
         for test, name, _ in cleaning.TESTS:

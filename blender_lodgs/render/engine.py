@@ -161,17 +161,21 @@ def placed_splats(depsgraph: bpy.types.Depsgraph) -> list[renderer.PlacedSplats 
         evaluated, matrix, level = instance.evaluated, instance.matrix_world, instance.level
         place, empty = (matrix, level, instance.antialias), not len(evaluated.data.points)
         if instance.source is not None and (choice := shown.choice_of_picture(instance, depsgraph)):
-            found.append(renderer.PlacedTree(instance.source.path, matrix, instance.antialias, choice))
+            tree = instance.source.path, matrix, instance.antialias, choice, instance.looks
+            found.append(renderer.PlacedTree(*tree))
             continue
         if not _chosen_by_rule(instance, depsgraph):
             if not empty:
                 read = partial(_splats_of, evaluated.data)
-                found.append(renderer.PlacedSplats(instance.object.session_uid, read, *place))
+                uid = instance.object.session_uid
+                found.append(renderer.PlacedSplats(uid, read, *place, looks=instance.looks))
             continue
         own = instance.object.data
         read = partial(_splats_of, own.evaluated_get(depsgraph), every_column())
         version, choice = changes.version(own), selection.choice(evaluated, depsgraph)
-        found.append(renderer.PlacedSplats(own.session_uid, read, *place, version, choice, empty))
+        found.append(
+            renderer.PlacedSplats(own.session_uid, read, *place, version, choice, empty, instance.looks)
+        )
     return found
 
 

@@ -25,6 +25,7 @@ import numpy as np
 
 from ...training.errors import LodgsError
 from ...training.lod.choice import Choice
+from ...training.lod.look import Looks, looks_as_dicts
 from ...training.render import wire
 from ...training.scenes.cameras import Camera, camera_as_dict
 from ...training.splats.gaussians import Splats
@@ -70,6 +71,7 @@ class PlacedSplats:
         version: the splats with this key do not change as long as it stays; None: nobody knows.
         choice: by what splats are weighted; None: all are drawn.
         empty: whether nothing is seen of them. What has not been seen so far is not even read.
+        looks: what is made of their colours and opacities.
     """
 
     key: int
@@ -80,6 +82,7 @@ class PlacedSplats:
     version: Version | None = None
     choice: Choice | None = None
     empty: bool = False
+    looks: Looks = ()
 
 
 @dataclass(frozen=True)
@@ -88,13 +91,14 @@ class PlacedTree:
 
     Attributes:
         path: a bundle of the rule ``cut``.
-        matrix, antialias, choice: see :class:`PlacedSplats`.
+        matrix, antialias, choice, looks: see :class:`PlacedSplats`.
     """
 
     path: Path
     matrix: np.ndarray
     antialias: bool
     choice: Choice
+    looks: Looks = ()
 
 
 class _Known(NamedTuple):
@@ -228,7 +232,7 @@ class Renderer:
                 named.append(
                     {
                         "tree": str(one.path), "matrix": one.matrix.tolist(), "antialias": one.antialias,
-                        "choice": one.choice.as_dict(),
+                        "choice": one.choice.as_dict(), "looks": looks_as_dicts(one.looks),
                     }
                 )  # fmt: skip
                 continue
@@ -242,6 +246,7 @@ class Renderer:
                     "file": file.name, "count": count, "columns": columns,
                     "matrix": one.matrix.tolist(), "level": one.level, "antialias": one.antialias,
                     "choice": None if one.choice is None else one.choice.as_dict(),
+                    "looks": looks_as_dicts(one.looks),
                 }
             )  # fmt: skip
         self._known = known

@@ -16,6 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from ...training.lod.choice import Choice, Chooser
+from ...training.lod.look import Looks
 from ...training.lod.rule import OPACITY
 
 SAMPLE, LEAST_SAMPLE = 16, 10_000
@@ -143,6 +144,8 @@ class Placement:
         tell: what its colours tell, see ``SplatScene.tell``.
         antialias: see ``SplatScene.antialias``.
         arrived: of paged splats, how much has come.
+        looks: what is made of their colours and opacities where they are drawn: no other splats, nor another
+            order.
     """
 
     first: int
@@ -154,6 +157,7 @@ class Placement:
     tell: str
     antialias: bool = False
     arrived: int = 0
+    looks: Looks = field(default=(), compare=False)
 
     @property
     def world(self) -> np.ndarray:

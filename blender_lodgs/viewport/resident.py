@@ -19,6 +19,7 @@ import numpy as np
 
 from ...training.lod.rule import every_column
 from .. import attributes
+from ..data import changes, cleaning
 from . import splats
 from .arranging import WIDTH, Pool
 from .streaming import Stream, record_texels
@@ -46,6 +47,7 @@ class Resident:
         starts, counts: where each cloud's splats begin, and how many they are.
         higher: how many coefficients beyond the first they have at most, of whole degrees up to 4.
         store: those on the graphics card; none as long as nothing was drawn.
+        selected: (N,) bool, see :meth:`see_selection`; None where none is.
     """
 
     pool: Pool
@@ -53,6 +55,8 @@ class Resident:
     counts: list[int]
     higher: int
     store: Store | None = None
+    selected: np.ndarray | None = None
+    _selection: changes.Version | None = None
 
     @property
     def total(self) -> int:
@@ -73,6 +77,16 @@ class Resident:
             self.store = Store(self.total, room, self.higher)
         self.store.hold(held)
         return self.store
+
+    def see_selection(self, clouds: Sequence[Cloud | None]) -> None:
+        """Takes over which splats are selected, where others are since it was asked last."""
+        if self._selection == (now := changes.selection()):
+            return
+        self._selection, found = now, np.zeros(self.total, bool)
+        for start, count, cloud in zip(self.starts, self.counts, clouds, strict=True):
+            if isinstance(cloud, bpy.types.PointCloud) and len(cloud.points) == count:
+                found[start : start + count] = cleaning.shown_selected(cloud)
+        self.selected = found if found.any() else None
 
     def of_one_cloud(self, wanted: np.ndarray) -> int:
         """How many of some splats (M,), ascending, are of the first one's cloud."""

@@ -16,10 +16,15 @@ import numpy as np
 from mathutils import Matrix
 
 from ...training.lod.colors import LEVEL_COLORS
+from ...training.lod.crop import FACE
+from ...training.lod.look import Looks
 from .arranging import WIDTH, Arrangement
 
 MOST_COEFFICIENTS = 24
 """Coefficients beyond the first: degree 4."""
+
+SELECTED = (1.0, 0.45, 0.05)
+"""The colour of what is selected, sRGB."""
 
 PARTS = 8
 """Textures that splats' records are in at most: a driver may take long for one that holds them all."""
@@ -91,7 +96,7 @@ vec3 seen_color(ivec2 record, vec3 base, vec3 d)
            * coefficient(24, record);
     }
   }
-  return max(c, 0.0);
+  return c;
 }
 
 void main()
@@ -100,15 +105,30 @@ void main()
   place = vec2(0.0);
   color_opacity = vec4(0.0);
 
-  vec4 instance = texel(instances, gl_InstanceID);  // splat, weight, placement, level whose colour it gets
+  // splat, weight, placement, level whose colour it gets; -1: that of what is selected
+  vec4 instance = texel(instances, gl_InstanceID);
   int slot = int(instance.x), row = int(instance.z) * 5;
   ivec2 record = ivec2(slot / part_size, slot % part_size * texels);
   vec4 mean = stored(record, 0);
   float opacity = mean.w * instance.y;
+  mean.w = 1.0;
+  vec4 filtered = texel(placements, row + 4);  // added variance, whether opacity pays for it, looks
+  mat3 look = mat3(1.0);
+  for (int i = int(filtered.z); i < int(filtered.w); i++) {  // see ``_looks``
+    int at = 6 * i;
+    vec4 red = texel(looks, at + 3), green = texel(looks, at + 4), blue = texel(looks, at + 5);
+    vec3 own = vec3(dot(texel(looks, at), mean), dot(texel(looks, at + 1), mean),
+                    dot(texel(looks, at + 2), mean));
+    own *= own;
+    float away = green.w > 0.0 ? own.x + own.y + own.z : max(own.x, max(own.y, own.z));
+    if ((away <= FACE) != (blue.w > 0.0)) {
+      look = transpose(mat3(red.xyz, green.xyz, blue.xyz)) * look;
+      opacity *= red.w;
+    }
+  }
   if (opacity <= 1.0 / 255.0) {
     return;
   }
-  mean.w = 1.0;
   vec4 to_view_x = texel(placements, row), to_view_y = texel(placements, row + 1);
   vec4 to_view_z = texel(placements, row + 2), eye = texel(placements, row + 3);
   vec3 position = vec3(dot(to_view_x, mean), dot(to_view_y, mean), dot(to_view_z, mean));
@@ -132,7 +152,6 @@ void main()
   mat3 to_view = transpose(mat3(to_view_x.xyz, to_view_y.xyz, to_view_z.xyz));
   mat3 half_covariance = to_view * turn * mat3(s.x, 0.0, 0.0, 0.0, s.y, 0.0, 0.0, 0.0, s.z);
   vec3 row_x = by_x * half_covariance, row_y = by_y * half_covariance;
-  vec2 filtered = texel(placements, row + 4).xy;  // variance that is added; whether opacity pays for it
   float xx = dot(row_x, row_x) + filtered.x, xy = dot(row_x, row_y), yy = dot(row_y, row_y) + filtered.x;
   if (filtered.y > 0.0) {
     vec3 area = cross(row_x, row_y);
@@ -155,10 +174,11 @@ void main()
   gl_Position = vec4(ndc.xy + offset * 2.0 / size, ndc.z, 1.0);
 
   vec3 base = vec3(s.w, stored(record, 3).xy);
-  vec3 color = seen_color(record, base, normalize(mean.xyz * eye.w - eye.xyz));
-  if (instance.w > 0.0) {  // in the lightness of its own colour, so that the scene stays readable
-    float lightness = min(dot(color, vec3(1.0 / 3.0)), 1.0);
-    color = (0.35 + 0.65 * lightness) * texelFetch(palette, ivec2(int(instance.w - 1.0) % PALETTE, 0), 0).rgb;
+  vec3 color = max(look * seen_color(record, base, normalize(mean.xyz * eye.w - eye.xyz)), 0.0);
+  if (instance.w != 0.0) {  // in the lightness of its own colour, so that the scene stays readable
+    float lightness = 0.35 + 0.65 * min(dot(color, vec3(1.0 / 3.0)), 1.0);
+    color = lightness * (instance.w < 0.0
+      ? SELECTED : texelFetch(palette, ivec2(int(instance.w - 1.0) % PALETTE, 0), 0).rgb);
   }
   color_opacity = vec4(color, opacity);
 }
@@ -247,11 +267,14 @@ void main()
 """
 
 
-def instances_texture(arrangement: Arrangement, places: np.ndarray) -> tuple[gpu.types.GPUTexture, int]:
+def instances_texture(
+    arrangement: Arrangement, places: np.ndarray, selected: np.ndarray | None = None
+) -> tuple[gpu.types.GPUTexture, int]:
     """An arrangement's list on the graphics card, and how many splats it has: those that have a place there.
 
     Args:
         places: see ``resident.Store``.
+        selected: see ``resident.Resident``; these get the colour of what is selected.
     """
     there = places[arrangement.splats]
     some = there >= 0
@@ -260,6 +283,8 @@ def instances_texture(arrangement: Arrangement, places: np.ndarray) -> tuple[gpu
     data = gpu.types.Buffer("FLOAT", height * WIDTH * 4)
     listed = np.frombuffer(data, np.float32).reshape(-1, 4)[: len(rows)]  # type: ignore[arg-type]
     listed[:], listed[:, 0] = rows, there[some]
+    if selected is not None:
+        listed[selected[arrangement.splats[some]], 3] = -1
     return gpu.types.GPUTexture((WIDTH, height), format="RGBA32F", data=data), len(rows)
 
 
@@ -337,6 +362,7 @@ def draw(
     canvas: Canvas,
     *,
     antialias: Sequence[bool] = (),
+    looks: Sequence[Looks] = (),
     resolution: float = 1.0,
     under_overlays: bool = True,
 ) -> None:
@@ -349,6 +375,7 @@ def draw(
         worlds: each placement's ``matrix_world``, (4, 4) float64.
         view, projection: from the world to the camera's space, and on to clip space.
         antialias: of each placement, see ``SplatScene.antialias``; none: no one is.
+        looks: of each placement; none: they are as they are.
         resolution: of the splats, over that of the framebuffer.
         under_overlays: leave what the framebuffer shows already on top, where it has alpha; it is coded in
             sRGB, as a viewport's is.
@@ -362,7 +389,9 @@ def draw(
             (width, height), format="RGBA8", data=frame.read_color(0, 0, width, height, 4, 0, "FLOAT")
         )
     flags = antialias or [False] * len(worlds)
-    placements = _placements(worlds, flags, view, projection)  # a texture is freed with its last name
+    looks = looks or [()] * len(worlds)
+    every_look = _looks(looks)  # a texture is freed with its last name
+    placements = _placements(worlds, flags, list(map(len, looks)), view, projection)
     size = max(1, round(width * resolution)), max(1, round(height * resolution))
     canvas.resize(size)
     with canvas.frame.bind():  # type: ignore[union-attr]
@@ -387,6 +416,7 @@ def draw(
             shader.uniform_sampler(f"records_{number}", texture or alike)
         shader.uniform_sampler("instances", instances)
         shader.uniform_sampler("placements", placements)
+        shader.uniform_sampler("looks", every_look)
         shader.uniform_sampler("palette", _palette())
         shader.uniform_float("projection", projection)
         shader.uniform_float("size", size)
@@ -415,10 +445,14 @@ def reset_state() -> None:
 
 
 def _placements(
-    worlds: Sequence[np.ndarray], antialias: Sequence[bool], view: Matrix, projection: Matrix
+    worlds: Sequence[np.ndarray],
+    antialias: Sequence[bool],
+    looks: Sequence[int],
+    view: Matrix,
+    projection: Matrix,
 ) -> gpu.types.GPUTexture:
-    """Five texels a placement: three rows that take its splats to the camera's space, the eye in its own, and
-    the filter.
+    """Five texels a placement: three rows that take its splats to the camera's space, the eye in its own, the
+    filter, and which looks it has.
 
     The eye's fourth number is 1; without perspective it is 0, and the rest the direction against the view.
     """
@@ -427,12 +461,29 @@ def _placements(
     back = np.linalg.inv(view_matrix)
     eye = back[:, 3] if perspective else back[:, 2]
     data = np.zeros((-(-5 * len(worlds) // WIDTH) * WIDTH, 4), np.float32)
-    for number, (world, filtered) in enumerate(zip(worlds, antialias, strict=True)):
+    last = 0
+    for number, (world, filtered, count) in enumerate(zip(worlds, antialias, looks, strict=True)):
         rows = data[5 * number : 5 * number + 5]
+        rows[4, 2:] = last, last + count
+        last += count
         rows[4, :2] = MIP_FILTER if filtered else DILATION
         rows[:3] = (view_matrix @ world)[:3]
         rows[3, :3] = (np.linalg.pinv(world) @ eye)[:3]
         rows[3, 3] = perspective
+    buffer = gpu.types.Buffer("FLOAT", data.size, data.reshape(-1))
+    return gpu.types.GPUTexture((WIDTH, len(data) // WIDTH), format="RGBA32F", data=buffer)
+
+
+def _looks(of_placements: Sequence[Looks]) -> gpu.types.GPUTexture:
+    """Six texels a look: three rows to the space of its crop, zeros where it counts everywhere, and three
+    rows of its matrix; beside these its opacity, whether the crop is a sphere, whether it counts outside."""
+    every = [each for looks in of_placements for each in looks]
+    data = np.zeros((max(-(-6 * len(every) // WIDTH), 1) * WIDTH, 4), np.float32)
+    for number, (crop, look) in enumerate(every):
+        rows = data[6 * number : 6 * number + 6]
+        if crop is not None:
+            rows[:3], rows[4:, 3] = crop.to_own, (crop.shape == "SPHERE", crop.outside)
+        rows[3:, :3], rows[3, 3] = look.matrix, look.opacity
     buffer = gpu.types.Buffer("FLOAT", data.size, data.reshape(-1))
     return gpu.types.GPUTexture((WIDTH, len(data) // WIDTH), format="RGBA32F", data=buffer)
 
@@ -482,11 +533,13 @@ def _splat_shader() -> gpu.types.GPUShader:
     info, between = _shader("splats")
     between.smooth("VEC2", "place")
     between.flat("VEC4", "color_opacity")
-    names = ("instances", "placements", "palette", *(f"records_{part}" for part in range(PARTS)))
+    names = ("instances", "placements", "looks", "palette", *(f"records_{part}" for part in range(PARTS)))
     for slot, name in enumerate(names):
         info.sampler(slot, "FLOAT_2D", name)
     info.define("WIDTH", str(WIDTH))
     info.define("PALETTE", str(len(LEVEL_COLORS)))
+    info.define("FACE", repr(FACE))
+    info.define("SELECTED", f"vec3{SELECTED}")
     info.push_constant("MAT4", "projection")
     info.push_constant("VEC2", "size")
     info.push_constant("INT", "degree")

@@ -64,6 +64,8 @@ class ViewState:
         matrix: from the world to clip space when it was last drawn.
         moved: when it last moved.
         arrived: how much had come from files when it last asked for an arrangement with all of it.
+        selected: of what it draws what has the colour of what is selected, see ``resident.Resident``.
+        tells_selected: whether it shows that.
     """
 
     canvas: splats.Canvas = field(default_factory=splats.Canvas)
@@ -80,6 +82,8 @@ class ViewState:
     moved: float = 0.0
     arrived: int = 0
     resolution: float = 1.0
+    selected: np.ndarray | None = None
+    tells_selected: bool = False
 
     def reads(self, of: Resident) -> bool:
         """Whether splats are on their way, or will be, so that they must stay what they are."""
@@ -123,6 +127,7 @@ def draw(context: bpy.types.Context) -> None:
     view.matrix = matrix
     settings = context.scene.lodgs_viewport
     view.resolution = settings.moving / 100 if now - view.moved < STILL else 1.0
+    view.tells_selected = space.overlay.show_overlays
     draw_splats(
         view, instances, context.evaluated_depsgraph_get(),
         region_data.view_matrix, region_data.window_matrix, settings.budget, moving=True,
@@ -185,7 +190,8 @@ def draw_splats(
     splats.draw(
         view.store.textures, view.store.part, view.store.higher, view.instances, view.count,
         [placement.world for placement in placements], view_matrix, projection, view.canvas,
-        antialias=[placement.antialias for placement in placements], resolution=view.resolution,
+        antialias=[placement.antialias for placement in placements],
+        looks=[placement.looks for placement in placements], resolution=view.resolution,
         under_overlays=under_overlays,
     )  # fmt: skip
 
@@ -229,7 +235,10 @@ def prepare(
     asked = _arrange(view, of, request, wait, take_over)
     if view.arrived != NOTHING:  # what is not asked for yet has the view redrawn again
         view.arrived = arrived if take_over and asked else before
+    of.see_selection(clouds)
     _load(view, of, clouds, wait)
+    if view.arrangement is not None and view.selected is not _selected(view):
+        _list(view)
     return request
 
 
@@ -262,7 +271,7 @@ def _from_files(
             if there is not None:
                 there.stop()
             there = _streams[source.scene] = Stream(source)
-        choice = _choice(instance, depsgraph, moving)
+        choice = choice_of_view(instance, depsgraph, moving)
         if choice is not None and not (there.problem and not there.ready):
             there.ask(choice, _direction(instance, choice, view_matrix))
             while wait and there.busy and not there.problem:
@@ -383,20 +392,25 @@ def _placements(
                 count=of.counts[number],
                 matrix=instance.matrix_world.tobytes(),
                 level=instance.level,
-                choice=_choice(instance, depsgraph, moving),
+                choice=choice_of_view(instance, depsgraph, moving),
                 scene=(root or instance.object).session_uid,
                 tell=root.lodgs.tell if root else "OWN",
                 antialias=instance.antialias,
                 arrived=(paged.arrived if take_over else paged.taken) if paged else 0,
+                looks=instance.looks,
             )
         )
     return tuple(found)
 
 
-def _choice(
-    instance: shown.SplatInstance, depsgraph: bpy.types.Depsgraph, moving: bool
+def choice_of_view(
+    instance: shown.SplatInstance, depsgraph: bpy.types.Depsgraph, moving: bool = True
 ) -> selection.Choice | None:
-    """By what an instance's splats are chosen, from where the eye is now."""
+    """By what an instance's splats are chosen, from where the eye is now.
+
+    Args:
+        moving: see :func:`prepare`.
+    """
     if not _plain(instance, depsgraph):
         return None
     if not moving:
@@ -496,13 +510,24 @@ def _show(view: ViewState, of: Resident, loading: Arrangement, store: Store, mis
     if len(missing) and not part and view.arrangement is not None:
         return False
     view.resident, view.arrangement, view.store = of, loading, store
-    view.instances, view.count = splats.instances_texture(loading, store.places)
+    _list(view)
     drawn = [other.arrangement for other in _all if other.store is store and other.arrangement]
     if all(each.serial == loading.serial for each in drawn):
         store.release()
     if not len(missing):
         view.loading = view.missing = None
     return True
+
+
+def _list(view: ViewState) -> None:
+    """Brings the list of what a view draws to the graphics card."""
+    assert view.arrangement is not None and view.store is not None
+    view.selected = _selected(view)
+    view.instances, view.count = splats.instances_texture(view.arrangement, view.store.places, view.selected)
+
+
+def _selected(view: ViewState) -> np.ndarray | None:
+    return view.resident.selected if view.resident is not None and view.tells_selected else None
 
 
 def _alike(one: tuple[Placement, ...], other: tuple[Placement, ...]) -> bool:

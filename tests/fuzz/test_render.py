@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 
 from tests.fuzz.doors import attempt
 from tests.fuzz.mutations import spoiled, spoiled_value
+from training.lod.crop import Crop
+from training.lod.look import Look, looks_as_dicts
 from training.render import wire
 from training.render.requests import FrameRequest, read_line, read_request
 from training.render.scene import Instance, SplatSet, draw
@@ -21,11 +23,12 @@ from training.splats.gaussians import Splats
 POSE = np.eye(4)
 POSE[2, 3] = 4
 ONE = {"file": "set-1", "count": 20, "matrix": np.diag([2.0, 1.0, 1.0, 1.0]).tolist(), "level": 2}
+LOOKS = looks_as_dicts([(None, Look(0.5)), (Crop.sphere((0, 0, 0), 1), Look(opacity=0.5))])
 REQUEST = {
     "frame": 7, "out": "frame-7", "background": [0.1, 0.2, 0.3], "depth": True, "levels": True,
     "camera": camera_as_dict(Camera("", 32, 24, 30.0, 30.0, 16.0, 12.0, POSE), 0.1),
     "window": [2, 3, 20, 16], "photograph": None, "holdout": None,
-    "sets": [ONE, ONE | {"matrix": np.eye(4).tolist(), "level": 0}],
+    "sets": [ONE | {"looks": LOOKS}, ONE | {"matrix": np.eye(4).tolist(), "level": 0}],
 }  # fmt: skip
 
 
@@ -51,7 +54,7 @@ def answer(request, splats: Splats) -> None:
         assert 1 <= width * height <= MOST_PIXELS
         if width * height <= 10_000:
             held = SplatSet(splats, backend="cpu")
-            instances = [Instance(held, one.matrix, one.level) for one in request.sets]
+            instances = [Instance(held, one.matrix, one.level, looks=one.looks) for one in request.sets]
             picture = draw(
                 instances, request.camera, near=request.near, background=request.background,
                 depth=request.depth, levels=request.levels, window=request.window, backend="cpu",

@@ -51,7 +51,7 @@ def level_picture(path: Path, bundle: Bundle, evaluation: Evaluation, camera: Ca
         tiles.append(tile("by distance", *select(bundle, *view)))
         colored, weights = select(_in_level_colors(bundle), *view)
         tiles.append(("which level where", evaluation.draw(colored, camera, weights)))
-    tiles.append(("photograph", target))
+    tiles.append(("photograph", target.image))
     _write_sheet(path, tiles)
 
 

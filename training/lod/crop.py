@@ -10,6 +10,9 @@ import numpy as np
 from ..errors import LodgsError
 
 SHAPES = ("BOX", "SPHERE")
+FACE = (1 + 1e-5) ** 2
+"""The square of how far a crop reaches in its own space: what lies on its face is in it, however numbers were
+rounded on the way there."""
 _NOWHERE = ((0.0, 0.0, 0.0, 2.0),) * 3
 """The way into a crop that is flat: every place is outside."""
 
@@ -81,7 +84,7 @@ class Crop:
             else:
                 np.maximum(squares, axis, out=squares)
         assert squares is not None
-        return squares <= 1
+        return squares <= np.float32(FACE)
 
     def as_dict(self) -> dict:
         """The same as JSON has it."""

@@ -1,4 +1,4 @@
-"""A file of splats without clutter, placed, in other forms: ``lodgs edit``."""
+"""A file of splats without clutter, in another look, placed, in other forms: ``lodgs edit``."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from ..splats.gaussians import SplatRows, Splats
 from ..splats.placing import Placement
 from ..splats.ply import write_ply
 from .cleaning import Cleaning, cleaned
+from .look import Looks, looked_levels
 from .paging import is_tree
 from .placing import placed, standing
 from .selection import known_rule
@@ -28,6 +29,7 @@ def edit(
     cleaning: Cleaning,
     warn: Warn = silent,
     *,
+    looks: Looks = (),
     placement: Placement | None = None,
     upright: bool = False,
     ground: bool = False,
@@ -43,6 +45,7 @@ def edit(
     Args:
         out: written in the source's form; None: not.
         warn: as for ``read_ply``.
+        looks: what is made of the colours and opacities of what stays.
         placement: where the scene is put, after it stands; crops and lengths of the cleaning are those of
             the source.
         upright, ground, points: see ``placing.standing``.
@@ -70,7 +73,7 @@ def edit(
         for level in bundle.levels:
             level.elsewhere = DrawableRows(rows[level.number], warn)
     known_rule(bundle)
-    found = cleaned(bundle, cleaning)
+    found = looked_levels(cleaned(bundle, cleaning), looks)
     if placement is not None or upright or ground:
         stands = standing(bundle, upright, ground, points)
         found = placed(found, stands if placement is None else placement.after(stands))

@@ -9,6 +9,7 @@ blocks it reads what the eye's region needs.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ from torch.nn.functional import pad
 from ..errors import LodgsError
 from ..lod.blocks import SIZE, spatial_order
 from ..lod.choice import Choice, Chooser
+from ..lod.look import Looks, changed
 from ..lod.rule import OPACITY, Region, Values, every_column, facts_of
 from ..lod.selection import known_rule, levels_alone, not_alone, rule_of
 from ..lod.sight import Sight, open_if_large
@@ -68,6 +70,7 @@ class SplatSet:
         self._chooser: Chooser | None = None
         self._in_world: tuple[bytes, Gaussians] | None = None
         self._joined: tuple[list[SplatSet], Gaussians] | None = None
+        self._looked: tuple[Looks, SplatSet] | None = None
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -100,6 +103,20 @@ class SplatSet:
         if self._in_world is None or self._in_world[0] != key:
             self._in_world = key, transformed(self.gaussians, matrix)
         return self._in_world[1]
+
+    def looked(self, looks: Looks) -> SplatSet:
+        """The set as looks have it, with everything else shared; kept while they are the same."""
+        if not looks:
+            self._looked = None
+            return self
+        if self._looked is None or self._looked[0] != looks:
+            own, other = self.gaussians, copy(self)
+            sh, logits = changed(looks, *(x.cpu().numpy() for x in (own.means, own.sh, own.opacity_logits)))
+            sh, logits = (torch.from_numpy(x).to(own.means.device) for x in (sh, logits))
+            other.gaussians = replace(own, sh=sh, opacity_logits=logits)
+            other._in_world = other._joined = other._looked = None
+            self._looked = looks, other
+        return self._looked[1]
 
     def joined(self, others: Sequence[SplatSet]) -> Gaussians:
         """These splats and those of other sets as one, kept as long as these are the others.

@@ -13,6 +13,7 @@ from ..documents import json_object
 from ..errors import LodgsError
 from ..lod.choice import Choice
 from ..lod.crop import SHAPES, Crop
+from ..lod.look import RANGES, Look
 from ..lod.rule import EVERYTHING, Rule, fact_names, find_rule
 from ..lod.rules.cut import RULE as CUT
 from ..scenes.cameras import FARTHEST, Camera, camera_from_dict, check_size
@@ -44,6 +45,7 @@ class NamedSet:
 
     Attributes:
         file: a name in the folder of arrays.
+        looks: what is made of its colours and opacities, and where; see ``scene.Instance``.
         tree: a bundle of the rule ``cut`` somewhere else, of which the choice's cut is read instead, with its
             levels; or None.
         count: of its splats.
@@ -60,6 +62,7 @@ class NamedSet:
     columns: tuple[str, ...] = ()
     choice: Choice | None = None
     tree: Path | None = None
+    looks: tuple[tuple[Crop | None, Look], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -156,6 +159,7 @@ def _named_set(values: Any) -> NamedSet:
         columns=_columns(values),
         choice=choice,
         tree=tree,
+        looks=_looks(values),
     )
 
 
@@ -188,17 +192,37 @@ def _choice(values: dict) -> Choice:
 def _crops(values: dict) -> tuple[Crop, ...] | None:
     if values.get("crops") is None:
         return None
-    given, found = _of_kind(values, "crops", list), []
+    return tuple(map(_crop, _some(values, "crops")))
+
+
+def _some(values: dict, key: str) -> list:
+    given = _of_kind(values, key, list)
     if len(given) > MOST_CROPS:
-        raise _refused("crops", f"{len(given)} of them")
-    for crop in given:
-        if not isinstance(crop, dict) or crop.get("shape") not in SHAPES:
-            raise _refused("crops", crop)
-        rows = _of_kind(crop, "to_own", list)
-        if len(rows) != 3:
-            raise _refused("to_own", rows)
-        a, b, c = (_numbers({"to_own": row}, "to_own", 4, LARGEST) for row in rows)
-        found.append(Crop(crop["shape"], tuple(map(tuple, (a, b, c))), bool(crop.get("outside"))))
+        raise _refused(key, f"{len(given)} of them")
+    return given
+
+
+def _crop(crop: Any) -> Crop:
+    if not isinstance(crop, dict) or crop.get("shape") not in SHAPES:
+        raise _refused("crops", crop)
+    rows = _of_kind(crop, "to_own", list)
+    if len(rows) != 3:
+        raise _refused("to_own", rows)
+    a, b, c = (_numbers({"to_own": row}, "to_own", 4, LARGEST) for row in rows)
+    return Crop(crop["shape"], tuple(map(tuple, (a, b, c))), bool(crop.get("outside")))
+
+
+def _looks(values: dict) -> tuple[tuple[Crop | None, Look], ...]:
+    found = []
+    for one in _some({"looks": []} | values, "looks"):
+        if not isinstance(one, dict):
+            raise _refused("looks", one)
+        look = dict(_of_kind(one, "look", dict))
+        red, green, blue = _numbers(look, "tint", 3, LARGEST)
+        del look["tint"]
+        parts = _by_name({"look": look}, "look", [name for name in RANGES if name != "tint"])
+        crop = None if one.get("crop") is None else _crop(one["crop"])
+        found.append((crop, Look(tint=(red, green, blue), **parts)))
     return tuple(found)
 
 

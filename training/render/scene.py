@@ -11,6 +11,7 @@ from torch.nn.functional import normalize
 
 from ..errors import LodgsError, out_of_memory
 from ..lod.choice import Choice
+from ..lod.look import Looks
 from ..rasterize import Gaussians, strips
 from ..rasterize.resident import Chosen, SplatSet, looked_at
 from ..scenes.cameras import Camera, check_size
@@ -34,6 +35,7 @@ class Instance:
         level: number of the level of detail that it is; 0 where it is none.
         antialias: how it is drawn, see ``Bundle.antialias``.
         choice: by what its splats are weighted, on top of the set's own weights; None: by these alone.
+        looks: what is made of its colours and opacities, places in the set's coordinates.
     """
 
     splats: SplatSet
@@ -41,6 +43,7 @@ class Instance:
     level: int = 0
     antialias: bool = False
     choice: Choice | None = None
+    looks: Looks = ()
 
 
 def draw(
@@ -91,7 +94,9 @@ def draw(
         if limit is not None:  # the background, too, is behind meshes: over black here, added elsewhere
             picture.image[limit < NOTHING], picture.alpha[limit < NOTHING] = 0, 0
             behind = 0.0, 0.0, 0.0
-        instances = [one for one in instances if len(one.splats)]
+        instances = [
+            replace(one, splats=one.splats.looked(one.looks)) for one in instances if len(one.splats)
+        ]
         if not instances:
             return picture
         gaussians, rows, weights, counts, camera, near, unit = _in_one_frame(instances, camera, near)

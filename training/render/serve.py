@@ -8,8 +8,8 @@ is removed when standard input ends, however the other program ended.
      "depth": true, "levels": true, "window": [left, top, width, height] or null,
      "photograph": PATH or null, "holdout": PATH or null,
      "sets": [{"file": NAME, "count": N, "matrix": 4x4, "level": 3,
-               "columns": [NAME, ...], "choice": {...} or null},
-              {"tree": PATH, "matrix": 4x4, "choice": {...}}, ...]}
+               "columns": [NAME, ...], "choice": {...} or null, "looks": [...]},
+              {"tree": PATH, "matrix": 4x4, "choice": {...}, "looks": [...]}, ...]}
     {"cancel": 7}
 
 answer ``progress`` (frame, share) and ``warning`` (frame, message), then one of ``frame`` (frame, passes,
@@ -22,7 +22,8 @@ A set is read when its file is first named, and forgotten when a frame does not 
 an answer ``frame``. With a choice (``lod.choice``: ``rule``, ``eye`` in the set's coordinates, ``focal_px``,
 and by name ``facts``, ``values`` and ``tables``) its splats are weighted as the rule says, times the file's
 weights; what the rule knows of each splat are the file's columns of these names. A tree is a bundle of the
-rule ``cut``, of which is read what the frame shows.
+rule ``cut``, of which is read what the frame shows. Looks (``lod.look``) are what is made of its colours and
+opacities: {"crop": {...} or null for everywhere, "look": {"exposure": 0.5, ...}}.
 """
 
 from __future__ import annotations
@@ -176,13 +177,14 @@ class _Server:
                 if key not in self._cuts:
                     self._cuts[key] = read()
                 instances += [
-                    Instance(splats, one.matrix, level, one.antialias, one.choice)
+                    Instance(splats, one.matrix, level, one.antialias, one.choice, one.looks)
                     for level, splats in self._cuts[key]
                 ]
                 continue
             if one.file not in kept:
                 kept[one.file] = self._sets.get(one.file) or self._read_set(frame, one)
-            instances.append(Instance(kept[one.file], one.matrix, one.level, one.antialias, one.choice))
+            place = one.matrix, one.level, one.antialias, one.choice, one.looks
+            instances.append(Instance(kept[one.file], *place))
         self._sets = kept
         return instances
 

@@ -380,3 +380,43 @@ def test_views_of_photographs_are_the_cameras(bpy, lodgs):
     for one, other in zip(found, read_scene(GARDEN).cameras, strict=True):
         np.testing.assert_allclose(one.center, other.center, atol=1e-4)
         np.testing.assert_allclose((one.fx, one.width), (other.fx, other.width), rtol=1e-4)
+
+
+@pytest.mark.parametrize("shape", ["BOX", "SPHERE"])
+def test_what_lies_on_a_crops_face_is_in_it_for_nodes_and_for_numpy(bpy, lodgs, scene_of, shape):
+    """However the crop is turned: rounding puts such places on both sides of its face."""
+    rng, bundle = np.random.default_rng(6), bundle_of("bands", np.random.default_rng(6))
+    matrix = placed((3, -7, 11), (0.7, 0.4, -0.9), (2, 0.5, 3))
+    own = np.linalg.inv(PLACE) @ matrix
+    for level in bundle.levels:
+        local = rng.normal(size=(len(level.splats), 3))
+        size = np.abs(local).max(axis=1) if shape == "BOX" else np.linalg.norm(local, axis=1)
+        local *= (np.where(np.arange(len(local)) % 2, 1, 1.0001) / size)[:, None]
+        level.splats.means[:] = local @ own[:3, :3].T + own[:3, 3]
+    root, bundle = scene_of(bundle)
+    lodgs("data.crops").new_crop(root, shape, blender(matrix))
+    lodgs("data.selection").follow_crops(root)
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    crops = lodgs("data.crops").as_objects_stand(root, depsgraph)
+    root.lodgs.mode = "SINGLE"
+    for level, item in zip(bundle.levels, root.lodgs.levels, strict=True):
+        root.lodgs.single_level = item.number
+        bpy.context.view_layer.update()
+        on_face = np.arange(1, len(level.splats), 2)
+        np.testing.assert_array_equal(shown_rows(bpy, lodgs, item.object), on_face)
+        np.testing.assert_array_equal(np.flatnonzero(crops[0].holds(level.splats.means)), on_face)
+
+
+def test_an_older_files_crops_are_given_this_versions_group(bpy, lodgs, scene_of):
+    root, _ = scene_of(bundle_of("bands", np.random.default_rng(7)))
+    bpy.ops.lodgs.add_crop(shape="BOX")
+    crop, crops, version = bpy.context.active_object, lodgs("data.crops"), lodgs("nodes.building").VERSION
+    levels = [item.object for item in root.lodgs.levels]
+    bpy.context.view_layer.update()
+    older = crops.modifier_of(levels[0]).node_group
+    now, older[version] = older[version], older[version] - 1
+    assert crops.outdated(root)
+    crop.location.x += 0.1
+    bpy.context.view_layer.update()
+    assert not crops.outdated(root)
+    assert {crops.modifier_of(obj).node_group[version] for obj in levels} == {now}

@@ -14,6 +14,13 @@ def test_crops_tests_and_counts_are_there(bpy, lodgs, draw_panel, tmp_path):
     assert seen.buttons.count("Floaters") == 1 and "lodgs.delete_left_out" in seen.operators
     assert "keep" not in seen.properties
 
+    assert {"Brush", "Lasso"} <= set(seen.buttons) and {"radius", "through"} <= set(seen.properties)
+    assert "Deselect" not in seen.buttons
+    assert bpy.ops.lodgs.select_all_splats(action="INVERT") == {"FINISHED"}
+    seen = draw_panel("clean_up", "LODGS_PT_clean_up")
+    assert {"Hide 4,200", "Deselect", "Invert"} <= set(seen.buttons)
+    bpy.ops.lodgs.select_all_splats(action="DESELECT")
+
     bpy.ops.lodgs.add_crop(shape="SPHERE", keep="OUTSIDE")
     bpy.ops.lodgs.hide_splats(test="FAINT", opacity=0.3)
     bpy.context.view_layer.update()

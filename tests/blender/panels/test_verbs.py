@@ -13,6 +13,9 @@ ELSEWHERE = {
     # Object's and View's
     "lodgs.set_ground", "lodgs.set_scale", "lodgs.camera_path", "lodgs.turntable", "lodgs.frame_scene",
     "lodgs.add_crop", "lodgs.hide_splats", "lodgs.show_hidden_splats", "lodgs.delete_left_out",
+    "lodgs.select_all_splats",
+    # a stroke of the toolbar's tools
+    "lodgs.select_splats",
     # of one item of a list, beside it
     "lodgs.show_only_level", "lodgs.remove_crop", "lodgs.cancel_block", "lodgs.resume_block",
 }  # fmt: skip

@@ -9,6 +9,7 @@ import torch
 
 from training.lod.choice import Choice
 from training.lod.crop import Crop
+from training.lod.look import Look, looks_as_dicts
 from training.lod.rule import NO_FINER, fact_names, rules
 from training.lod.rules.chunks import TABLE, member_columns
 from training.render.requests import read_request
@@ -152,6 +153,35 @@ def test_a_choice_travels_as_json(camera):
             json.dumps({"frame": 1, "out": "o", "camera": camera_as_dict(camera, 0.1), "sets": [one]})
         )
         assert read_request(asked).sets[0].choice == choice
+
+
+def test_looks_travel_as_json(camera):
+    looks = ((None, Look(0.5, 5000, (1, 0.5, 0.2), 0.8, 0.9)), (Crop.sphere((1, 2, 3), 4), Look(opacity=0.1)))
+    one = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "looks": looks_as_dicts(looks)}
+    asked = {"frame": 1, "out": "o", "camera": camera_as_dict(camera, 0.1), "sets": [one]}
+    assert read_request(json.loads(json.dumps(asked))).sets[0].looks == looks
+
+
+NEUTRAL = {"exposure": 0, "temperature": 6500, "tint": [1, 1, 1], "saturation": 1, "opacity": 1}
+
+
+@pytest.mark.parametrize(
+    ("looks", "said"),
+    [
+        ("red", "not valid"), (["red"], "not valid"), ([{"look": {}}], "not valid"),
+        ([{"look": NEUTRAL | {"tint": [1, 1]}}], "not valid"),
+        ([{"look": NEUTRAL | {"contrast": 1}}], "not valid"),
+        ([{"look": NEUTRAL, "crop": {"shape": "BOX"}}], "not valid"),
+        ([{"look": NEUTRAL | {"saturation": 99}}], "saturation of a look"),
+        ([{"look": NEUTRAL}] * 300, "not valid"),
+    ],
+)  # fmt: skip
+def test_impossible_looks_are_a_sentence(camera, looks, said):
+    from training.errors import LodgsError
+
+    one = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "looks": looks}
+    with pytest.raises(LodgsError, match=said):
+        read_request({"frame": 1, "out": "o", "camera": camera_as_dict(camera, 0.1), "sets": [one]})
 
 
 def low(values: dict) -> dict:

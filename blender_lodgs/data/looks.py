@@ -1,0 +1,215 @@
+"""How a splat scene looks: exposure, white balance, tint, saturation and opacity, on its root and its crops.
+
+``Object.lodgs_look`` of a root counts everywhere in the scene, that of a crop in the crop, upon the root's
+(``training.lod.look``). Splats stay what they are: what LODGS draws, in viewports, F12 and comparisons, gets
+:func:`looks_of`, and exports what that makes of them. For points and ellipsoids, which Blender draws, every
+level has a modifier (``nodes.look``) as soon as somebody has set something.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ...training.lod.crop import Crop
+from ...training.lod.look import DAYLIGHT, NEUTRAL, RANGES, Look
+from .. import compat
+from ..nodes import ellipsoids
+from ..nodes import look as groups
+from ..nodes.building import fresh_driver, modifier_with, switched, take_away
+from . import crops
+from .objects import root_of
+
+PARTS = tuple(RANGES)
+"""The properties of a look, in the order of panels."""
+
+
+class PlacedLook(NamedTuple):
+    """A look, and the crop in which it counts, or outside of which, in the splats' own space; None:
+    everywhere."""
+
+    crop: Crop | None
+    look: Look
+
+
+def _changed(self, context: bpy.types.Context) -> None:
+    root = root_of(self.id_data)
+    if root is not None:
+        attach(root)
+    self.id_data.update_tag()
+
+
+def _matrix(self) -> list[float]:
+    return _as_set(self).matrix.reshape(-1).tolist()
+
+
+class LookSettings(bpy.types.PropertyGroup):
+    """A look: see ``training.lod.look.Look``."""
+
+    exposure: bpy.props.FloatProperty(
+        name="Exposure",
+        description="How much lighter the splats are, in stops: one more is twice the light",
+        default=NEUTRAL.exposure, min=RANGES["exposure"][0], max=RANGES["exposure"][1],
+        soft_min=-4.0, soft_max=4.0, step=10, precision=2, update=_changed,
+    )  # fmt: skip
+    temperature: bpy.props.FloatProperty(
+        name="Temperature",
+        description="White balance: the colour temperature of the light that is to look white. Below "
+        f"{DAYLIGHT:.0f} K colours get colder, above it warmer",
+        default=NEUTRAL.temperature, min=RANGES["temperature"][0], max=RANGES["temperature"][1],
+        soft_max=12_000.0, step=10_000, precision=0, subtype="COLOR_TEMPERATURE", update=_changed,
+    )  # fmt: skip
+    tint: bpy.props.FloatVectorProperty(
+        name="Tint",
+        description="The colour that white gets, as the display shows it; all others are multiplied by it",
+        default=NEUTRAL.tint, min=RANGES["tint"][0], max=RANGES["tint"][1], size=3,
+        subtype="COLOR_GAMMA", update=_changed,
+    )  # fmt: skip
+    saturation: bpy.props.FloatProperty(
+        name="Saturation",
+        description="How colourful the splats are: 0 is grey, 1 as they were trained",
+        default=NEUTRAL.saturation, min=RANGES["saturation"][0], max=RANGES["saturation"][1],
+        soft_max=2.0, precision=3, subtype="FACTOR", update=_changed,
+    )  # fmt: skip
+    opacity: bpy.props.FloatProperty(
+        name="Opacity",
+        description="Factor on the opacity of every splat",
+        default=NEUTRAL.opacity, min=RANGES["opacity"][0], max=RANGES["opacity"][1], precision=3,
+        subtype="FACTOR", update=_changed,
+    )  # fmt: skip
+    outside: bpy.props.BoolProperty(
+        name="Outside",
+        description="Have the look of the region count outside of it, to leave what lies in it as it is",
+        update=_changed,
+    )
+    matrix: bpy.props.FloatVectorProperty(
+        name="Matrix",
+        description="What the look makes of display-coded colours, row by row, for node groups",
+        size=9, get=_matrix, options={"HIDDEN"},
+    )  # fmt: skip
+
+
+def looks_of(
+    root: bpy.types.Object, depsgraph: bpy.types.Depsgraph, to_own: Matrix
+) -> tuple[PlacedLook, ...]:
+    """The looks of a scene that change anything, as of the depsgraph, the one everywhere first.
+
+    Args:
+        to_own: leads from the world to the splats' own space.
+    """
+    everywhere, found = _as_set(root.evaluated_get(depsgraph).lodgs_look), []
+    if everywhere != NEUTRAL:
+        found.append(PlacedLook(None, everywhere))
+    for obj in regions_of(root):
+        settings = obj.evaluated_get(depsgraph).lodgs_look
+        look = _as_set(settings)
+        if obj.lodgs_crop.use and look != NEUTRAL:
+            crop = crops.as_it_stands(obj, to_own, depsgraph)
+            found.append(PlacedLook(replace(crop, outside=settings.outside), look))
+    return tuple(found)
+
+
+def regions_of(root: bpy.types.Object) -> list[bpy.types.Object]:
+    """The crops in which a look of their own may count."""
+    return [obj for obj in crops.crops_of(root) if obj.lodgs_crop.keep == "ALL" or is_set(obj)]
+
+
+def is_set(obj: bpy.types.Object) -> bool:
+    """Whether somebody has set something of a root's or a crop's look."""
+    return any(obj.lodgs_look.is_property_set(name) for name in PARTS)
+
+
+def reset(root: bpy.types.Object, obj: bpy.types.Object) -> None:
+    """Gives the root, or one of its crops, the look that changes nothing; it may still be animated."""
+    for name in (*PARTS, "outside"):
+        obj.lodgs_look.property_unset(name)
+    attach(root)
+    obj.update_tag()
+
+
+def attach(root: bpy.types.Object) -> None:
+    """Gives every level the modifier for the looks that there are, anew where there are other regions now;
+    takes it away where nobody has set any."""
+    regions = regions_of(root)
+    wanted = bool(regions) or is_set(root)
+    for item in root.lodgs.levels:
+        if item.exists and wanted:
+            _attach(item.object, root, regions)
+        elif item.exists:
+            _detach(item.object)
+
+
+def modifier_of(obj: bpy.types.Object) -> bpy.types.NodesModifier | None:
+    """The modifier of a level that shows looks, of any version."""
+    return modifier_with(obj, groups.COUNT)
+
+
+def outdated(root: bpy.types.Object) -> bool:
+    """Whether regions have come or gone since modifiers were last given them."""
+    regions = regions_of(root)
+    return any(
+        crops.followed_by(item.object, groups.COUNT) != regions for item in root.lodgs.levels if item.exists
+    )
+
+
+def _as_set(settings: LookSettings) -> Look:
+    """A look as its properties have it; animation may lead them anywhere."""
+
+    def held(name: str) -> float:
+        return float(np.clip(getattr(settings, name), *RANGES[name]))
+
+    red, green, blue = np.clip(settings.tint, *RANGES["tint"]).tolist()
+    return Look(
+        held("exposure"), held("temperature"), (red, green, blue), held("saturation"), held("opacity")
+    )
+
+
+def _attach(obj: bpy.types.Object, root: bpy.types.Object, regions: list[bpy.types.Object]) -> None:
+    modifier = modifier_of(obj)
+    if (
+        modifier is not None
+        and groups.serves(modifier.node_group, len(regions))
+        and crops.followed_by(obj, groups.COUNT) == regions
+    ):
+        return
+    _detach(obj)
+    modifier = switched(
+        obj, groups.look_group(len(regions)),
+        show_viewport="lodgs_viewport.points", show_render="lodgs_render.draws_points",
+    )  # fmt: skip
+    last = obj.modifiers.find(ellipsoids.NAME)
+    if last >= 0:
+        obj.modifiers.move(len(obj.modifiers) - 1, last)
+    for number, source in enumerate((root, *regions)):
+        if number:
+            crops.follow(obj, modifier, number, source)
+            driver = fresh_driver(obj, compat.input_path(modifier, groups.BEYOND.format(number)), "value")
+            crops.read_from(driver, source, "lodgs_look.outside", 0.0)
+        for row, name in enumerate(groups.ROWS):
+            path = compat.input_path(modifier, name.format(number))
+            for column in range(3):
+                driver = fresh_driver(obj, path, "value", column)
+                crops.read_from(driver, source, f"lodgs_look.matrix[{3 * row + column}]", row == column)
+        driver = fresh_driver(obj, compat.input_path(modifier, groups.OPACITY.format(number)), "value")
+        crops.read_from(driver, source, "lodgs_look.opacity", 1.0)
+
+
+def _detach(obj: bpy.types.Object) -> None:
+    modifier = modifier_of(obj)
+    if modifier is not None:
+        take_away(obj, modifier)
+
+
+CLASSES = (LookSettings,)
+
+
+def register() -> None:
+    bpy.types.Object.lodgs_look = bpy.props.PointerProperty(type=LookSettings)
+
+
+def unregister() -> None:
+    del bpy.types.Object.lodgs_look

@@ -1,0 +1,57 @@
+"""The Look panel: exposure, white balance, tint, saturation and opacity, everywhere and in regions."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..data import crops, looks, scenes
+from .parts import LevelsPanel, split_column
+
+
+class LODGS_PT_look(LevelsPanel):
+    bl_label = "Look"
+    bl_order = 4
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context):
+        return super().poll(context) and scenes.active_root(context).is_editable
+
+    def draw(self, context):
+        layout, root = self.layout, scenes.active_root(context)
+        _draw_look(layout, root)
+        layout.operator("lodgs.reset_look", icon="LOOP_BACK")
+
+
+class LODGS_PT_look_regions(LevelsPanel):
+    bl_label = "In Regions"
+    bl_parent_id = "LODGS_PT_look"
+
+    def draw(self, context):
+        layout, root = self.layout, scenes.active_root(context)
+        row = layout.row(align=True)
+        for shape, icon in (("BOX", "MESH_CUBE"), ("SPHERE", "MESH_UVSPHERE")):
+            operator = row.operator("lodgs.add_crop", text=shape.title(), icon=icon)
+            operator.shape, operator.keep = shape, "ALL"
+        regions = looks.regions_of(root)
+        for crop in crops.crops_of(root):
+            if crop in regions or crop == context.active_object:
+                box = layout.box()
+                row = box.row(align=True)
+                used = "CHECKBOX_HLT" if crop.lodgs_crop.use else "CHECKBOX_DEHLT"
+                row.prop(crop.lodgs_crop, "use", text="", icon=used)
+                row.prop(crop, "name", text="")
+                row.operator("lodgs.reset_look", text="", icon="LOOP_BACK").name = crop.name
+                row.operator("lodgs.remove_crop", text="", icon="X").name = crop.name
+                _draw_look(box, crop)
+                split_column(box).prop(crop.lodgs_look, "outside")
+
+
+def _draw_look(layout: bpy.types.UILayout, obj: bpy.types.Object) -> None:
+    column = split_column(layout)
+    column.use_property_decorate = True  # a look may be animated
+    for name in looks.PARTS:
+        column.prop(obj.lodgs_look, name)
+
+
+CLASSES = (LODGS_PT_look, LODGS_PT_look_regions)

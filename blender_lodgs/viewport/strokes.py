@@ -1,0 +1,89 @@
+"""What strokes over a viewport hit of a splat scene: of every level, as ``training.lod.brush`` tells it."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+
+from ...training.lod.brush import Front, Projection, brushed, hits, lassoed
+from ...training.lod.choice import Chooser
+from ...training.lod.crop import kept
+from ...training.lod.rule import HIDDEN, OPACITY
+from .. import attributes
+from ..data import cleaning, crops, shown
+from ..data.placement import axes_of
+from . import views
+
+
+class Picture:
+    """A splat scene in a viewport, as long as neither changes.
+
+    Args:
+        view, projection: (4, 4) from the world to the camera's space, and on to clip space.
+        size: of the region in pixels.
+        viewport: see ``shown.splat_instances``.
+
+    Raises:
+        LodgsError: a level has lost its splats' attributes.
+    """
+
+    def __init__(
+        self,
+        root: bpy.types.Object,
+        depsgraph: bpy.types.Depsgraph,
+        view: np.ndarray,
+        projection: np.ndarray,
+        size: tuple[int, int],
+        viewport: bpy.types.SpaceView3D | None = None,
+    ) -> None:
+        self.size = size
+        instances = {each.object: each for each in shown.splat_instances(depsgraph, viewport)}
+        cropped = crops.as_objects_stand(root, depsgraph)
+        # levels that are not shown are not evaluated
+        world = np.array(axes_of(root).evaluated_get(depsgraph).matrix_world, np.float64)
+        projected = Projection.of(view @ world, projection, size)
+        self._levels, parts = {}, []
+        for item in cleaning.levels(root):
+            obj, cloud = item.object, item.object.data
+            means, scales = (cleaning.view_of(cloud, name) for name in ("position", attributes.SCALE))
+            placed = projected.place(means)
+            there = kept(cropped, means) & ~cleaning.hidden(cloud)
+            self._levels[item.number] = placed, 2 * scales.max(axis=1, initial=0), there
+            if (instance := instances.get(obj)) is not None:
+                choice = views.choice_of_view(instance, depsgraph)
+                parts.append((placed, scales, _drawn(cloud, means, choice)))
+        self._front = Front(parts)
+
+    def brush(self, path: np.ndarray, radius: float, through: bool = False) -> dict[int, np.ndarray]:
+        """What a brush hits of each level, (N,) bool by its number: see ``brush.brushed``.
+
+        Args:
+            path: (P, 2) in the region's pixels.
+            through: hit what is hidden by other splats as well.
+        """
+        return self._hits(brushed(path, radius, self.size), through)
+
+    def lasso(self, path: np.ndarray, through: bool = False) -> dict[int, np.ndarray]:
+        """What a lasso hits of each level, as :meth:`brush`: see ``brush.lassoed``."""
+        return self._hits(lassoed(path, self.size), through)
+
+    def _hits(self, covered: np.ndarray, through: bool) -> dict[int, np.ndarray]:
+        front = None if through else self._front
+        return {
+            number: hits(covered, placed, reach, front) & there
+            for number, (placed, reach, there) in self._levels.items()
+        }
+
+
+def _drawn(cloud: bpy.types.PointCloud, means: np.ndarray, choice) -> np.ndarray:
+    """(N,) opacities of the splats that a choice shows; of others 0."""
+    opacities = cleaning.view_of(cloud, attributes.BASE)[:, 3]
+    if choice is None:
+        return opacities
+    names = {name for name in choice.columns if name in cloud.attributes}
+    columns = {name: attributes.view_attribute(cloud, name) for name in names - {HIDDEN}}
+    columns |= {OPACITY: opacities, HIDDEN: cleaning.hidden(cloud)}
+    rows, weights = Chooser(means, columns).chosen(choice)
+    drawn = np.zeros(len(means), np.float32)
+    drawn[rows] = weights * opacities[rows]
+    return drawn

@@ -1,0 +1,227 @@
+"""Looks act on every level, as points, ellipsoids and exports show them: against numpy, splat by splat."""
+
+import numpy as np
+import pytest
+
+from tests.blender.data.test_cleaning import PLACE, blender, inside, placed, scene_of  # noqa: F401
+from tests.training.lod.test_cleaning import bundle_of
+from training.lod.look import Look
+from training.scenes.color import linear_from_srgb
+from training.splats.bundle import read_bundle
+from training.splats.gaussians import SH_C0
+from training.splats.ply import read_ply
+
+EVERYWHERE = Look(0.4, 5000, (1.0, 0.9, 0.7), 0.6, 0.8)
+REGIONS = (
+    (placed((3, 0, 2), (0.2, 0.5, 0.9), (6, 5, 7)), "BOX", Look(saturation=0.0, opacity=0.5)),
+    (placed((2, -1, 3), (0, 1, 0), (3, 4, 3)), "SPHERE", Look(-1.0, 9000, (0.3, 1.0, 1.0), 1.5)),
+)
+
+
+def give(settings, look):
+    for name, value in vars(look).items():
+        setattr(settings, name, value)
+
+
+def wanted(means, sh):
+    """(N, 3) display-coded colours without view dependence, and (N,) factors on opacities."""
+    color, factor = 0.5 + SH_C0 * sh[:, 0].astype(np.float64), np.full(len(means), EVERYWHERE.opacity)
+    color = color @ EVERYWHERE.matrix.T
+    for matrix, shape, look in REGIONS:
+        held, clear = inside(matrix, means, shape == "SPHERE")
+        held ^= shape == "SPHERE"  # outside of it
+        assert clear.all() and 0 < held.sum() < len(held)
+        color[held] = color[held] @ look.matrix.T
+        factor[held] *= look.opacity
+    return color, factor
+
+
+@pytest.fixture
+def looking(bpy, lodgs, scene_of):  # noqa: F811
+    """``looking(name)``: a scene of that rule with a look everywhere and two regions; and the bundle."""
+
+    def make(name):
+        root, bundle = scene_of(bundle_of(name, np.random.default_rng(3)))
+        give(root.lodgs_look, EVERYWHERE)
+        for matrix, shape, look in REGIONS:
+            obj = lodgs("data.crops").new_crop(root, shape, blender(matrix))
+            obj.lodgs_crop.keep = "ALL"
+            obj.lodgs_look.outside = shape == "SPHERE"
+            give(obj.lodgs_look, look)
+        bpy.context.view_layer.update()
+        return root, bundle
+
+    return make
+
+
+def shown(bpy, lodgs, obj):
+    """Rows, colours (N, 3) linear and opacity factors of a level as Blender evaluates it."""
+    cloud = obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+    attributes = lodgs("attributes")
+    color = attributes.read_attribute(cloud, attributes.COLOR)[:, :3]
+    return (
+        attributes.read_attribute(cloud, "row"), color,
+        attributes.read_attribute(cloud, attributes.LOOK_OPACITY),
+    )  # fmt: skip
+
+
+def check(bpy, lodgs, obj, splats):
+    rows, color, factor = shown(bpy, lodgs, obj)
+    place = {row: i for i, row in enumerate(splats.extras["row"].tolist())}
+    some = [place[row] for row in rows.tolist()]
+    display, opacity = wanted(splats.means[some], splats.sh[some])
+    np.testing.assert_allclose(color, linear_from_srgb(display.clip(0, 1)), atol=2e-5)
+    np.testing.assert_allclose(factor, opacity, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["bands", "octree", "chunks", "decay"])
+def test_node_groups_show_of_every_level_what_numpy_does(bpy, lodgs, looking, name):
+    root, bundle = looking(name)
+    bpy.context.scene.lodgs_viewport.splats = False  # points, which Blender draws
+    root.lodgs.mode = "SINGLE"
+    for item, level in zip(root.lodgs.levels, bundle.levels, strict=True):
+        root.lodgs.single_level = item.number
+        bpy.context.view_layer.update()
+        check(bpy, lodgs, item.object, level.splats)
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        assert lodgs("data.selection").only_chosen(item.object.evaluated_get(depsgraph), depsgraph)
+    bpy.context.scene.lodgs_viewport.splats = True  # what LODGS draws has its look without them
+    bpy.context.view_layer.update()
+    obj = root.lodgs.levels[2].object
+    assert shown(bpy, lodgs, obj)[2] is None
+    for engine in ("CYCLES", "LODGS"):
+        bpy.context.scene.render.engine = engine
+        bpy.context.view_layer.update()
+        assert lodgs("data.looks").modifier_of(obj).show_render == (engine == "CYCLES")
+
+
+def test_a_look_is_animated_and_levels_that_come_have_it(bpy, lodgs, looking):
+    root, bundle = looking("bands")
+    bpy.context.scene.lodgs_viewport.splats = False
+    root.lodgs.single_level = 3
+    look, obj = root.lodgs_look, root.lodgs.levels[2].object
+    for frame, exposure in ((1, 0.4), (11, -1.6)):
+        look.exposure = exposure
+        look.keyframe_insert("exposure", frame=frame)
+    bpy.context.scene.frame_set(11)
+    dark = shown(bpy, lodgs, obj)[1]
+    bpy.context.scene.frame_set(1)
+    check(bpy, lodgs, obj, bundle.levels[2].splats)
+    assert dark.mean() < 0.5 * shown(bpy, lodgs, obj)[1].mean()
+
+    fresh = bundle_of("bands", np.random.default_rng(6)).levels[2]
+    lodgs("data.scenes").set_level(root, fresh)
+    bpy.context.view_layer.update()
+    check(bpy, lodgs, root.lodgs.levels[2].object, fresh.splats)
+
+
+@pytest.mark.parametrize("placed_too", [False, True])
+def test_an_export_has_the_look_and_comes_back_equal(bpy, lodgs, looking, tmp_path, placed_too):
+    root, bundle = looking("bands")
+    bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"), placed=placed_too)
+    found = read_bundle(tmp_path / "out.ply")
+    for level, before in zip(found.levels, bundle.levels, strict=True):
+        color, factor = wanted(before.splats.means, before.splats.sh)
+        np.testing.assert_allclose(0.5 + SH_C0 * level.splats.sh[:, 0], color, atol=2e-5)
+        there, then = (1 / (1 + np.exp(-s.opacity_logits)) for s in (level.splats, before.splats))
+        np.testing.assert_allclose(there, factor * then, rtol=1e-4, atol=1e-6)
+        assert level.splats.extras.keys() == before.splats.extras.keys()
+    again = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "out.ply", upright=False)
+    for level, back in zip(
+        found.levels, lodgs("data.scenes").read_levels(again, looked=True).levels, strict=True
+    ):
+        for part in ("means", "quats", "log_scales", "opacity_logits", "sh"):
+            np.testing.assert_array_equal(getattr(back.splats, part), getattr(level.splats, part))
+    bpy.context.view_layer.objects.active = root
+    bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "trained.ply"), looked=False)
+    for level, before in zip(read_bundle(tmp_path / "trained.ply").levels, bundle.levels, strict=True):
+        np.testing.assert_array_equal(level.splats.sh, before.splats.sh)
+
+
+@pytest.mark.parametrize("points", [False, True])
+def test_what_is_exported_as_shown_has_the_look_once(bpy, lodgs, looking, tmp_path, points):
+    root, bundle = looking("bands")
+    bpy.context.scene.lodgs_viewport.splats = not points
+    root.lodgs.single_level = 2
+    bpy.context.view_layer.update()
+    splats = bundle.levels[1].splats
+    color, factor = wanted(splats.means, splats.sh)
+    for source in ({"source": "SHOWN"}, {"source": "LEVEL", "level": 2}):
+        bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "plain.ply"), **source)
+        found = read_ply(tmp_path / "plain.ply")
+        np.testing.assert_allclose(0.5 + SH_C0 * found.sh[:, 0], color, atol=2e-5)
+        there, then = (1 / (1 + np.exp(-s.opacity_logits)) for s in (found, splats))
+        np.testing.assert_allclose(there, factor * then, rtol=1e-4, atol=2e-6)
+        assert found.extras.keys() == splats.extras.keys()
+
+
+def test_a_look_is_undone_saved_duplicated_and_reset(bpy, lodgs, looking, tmp_path):
+    root, bundle = looking("octree")
+    looks, name = lodgs("data.looks"), root.name
+    scene = bpy.context.scene
+    scene.lodgs_viewport.splats = False
+    root.lodgs.single_level = 1
+
+    def everywhere():
+        root = bpy.data.objects[name]
+        bpy.context.view_layer.update()
+        found = looks.looks_of(root, bpy.context.evaluated_depsgraph_get(), blender(np.eye(4)))
+        return [look for _, look in found]
+
+    before = everywhere()
+    assert len(before) == 3
+    np.testing.assert_allclose(before[0].matrix, EVERYWHERE.matrix, atol=1e-5)
+    bpy.ops.ed.undo_push(message="before")
+    bpy.ops.lodgs.reset_look("EXEC_DEFAULT", True)
+    assert everywhere() == before[1:]
+    bpy.ops.ed.undo()
+    assert everywhere() == before
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "saved.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "saved.blend"))
+    assert everywhere() == before
+    root = bpy.data.objects[name]
+    check(bpy, lodgs, root.lodgs.levels[0].object, bundle.levels[0].splats)
+
+    for obj in (root, *root.children_recursive):
+        obj.hide_set(False)
+        obj.select_set(True)
+    bpy.ops.object.duplicate()
+    copy = next(obj for obj in bpy.context.selected_objects if obj.lodgs.is_root)
+    copy.location.x += 5
+    give(bpy.data.objects[name].lodgs_look, Look(exposure=-2.0))
+    bpy.context.view_layer.update()
+    bpy.context.view_layer.update()
+    splats, obj = bundle.levels[0].splats, copy.lodgs.levels[0].object
+    assert obj != root.lodgs.levels[0].object
+    check(bpy, lodgs, obj, splats)
+
+    bpy.context.view_layer.objects.active = copy
+    regions = looks.regions_of(copy)
+    bpy.ops.lodgs.reset_look()
+    bpy.ops.lodgs.reset_look(name=regions[0].name)
+    assert looks.modifier_of(obj)  # a region is there that could have a look
+    for region in regions:
+        bpy.ops.lodgs.remove_crop(name=region.name)
+    bpy.context.view_layer.update()
+    assert looks.modifier_of(obj) is None and looks.modifier_of(root.lodgs.levels[0].object)
+    with pytest.raises(RuntimeError, match="no crop of the name"):
+        bpy.ops.lodgs.reset_look(name="nobody")
+
+
+def test_a_crop_that_cuts_has_a_look_too_which_outlives_it(bpy, lodgs, looking):
+    root, _ = looking("bands")
+    root.lodgs.single_level = 3
+    bpy.ops.lodgs.add_crop(shape="BOX", keep="INSIDE")
+    crop = bpy.context.active_object
+    crop.lodgs_look.exposure = 1.0
+    bpy.context.view_layer.update()
+    depsgraph, crops = bpy.context.evaluated_depsgraph_get(), lodgs("data.crops")
+    assert crops.cutting(root) == [crop] and len(crops.crops_of(root)) == 3
+    assert len(crops.as_objects_stand(root, depsgraph)) == 1
+    assert len(lodgs("data.looks").looks_of(root, depsgraph, blender(np.eye(4)))) == 4
+    bpy.ops.lodgs.delete_left_out()
+    assert crop.lodgs_crop.keep == "ALL" and not crops.cutting(root)
+    crop.lodgs_crop.use = False
+    bpy.context.view_layer.update()
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    assert len(lodgs("data.looks").looks_of(root, depsgraph, blender(np.eye(4)))) == 3

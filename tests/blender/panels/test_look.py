@@ -1,0 +1,25 @@
+"""The Look panel: everywhere, in regions, and in a crop that is selected."""
+
+import numpy as np
+
+from tests.training.lod.test_cleaning import bundle_of
+from training.lod.look import RANGES
+from training.splats.bundle import write_bundle
+
+
+def test_the_look_of_the_scene_of_regions_and_of_a_selected_crop(bpy, lodgs, draw_panel, tmp_path):
+    write_bundle(tmp_path / "in.ply", bundle_of("bands", np.random.default_rng(0)))
+    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "in.ply")
+    seen = draw_panel("look", "LODGS_PT_look")
+    assert seen.properties == list(RANGES) and "lodgs.reset_look" in seen.operators
+
+    def in_regions():
+        return draw_panel("look", "LODGS_PT_look_regions")
+
+    assert not in_regions().properties and in_regions().operators == ["lodgs.add_crop"] * 2
+    bpy.ops.lodgs.add_crop(shape="BOX", keep="ALL")
+    assert in_regions().properties == ["use", "name", *RANGES, "outside"]
+    bpy.ops.lodgs.add_crop(shape="SPHERE", keep="INSIDE")
+    assert in_regions().properties.count("exposure") == 2
+    bpy.context.view_layer.objects.active = root
+    assert in_regions().properties.count("exposure") == 1

@@ -1,0 +1,167 @@
+"""Strokes hit what loops in Python say, and what is seen is what light reaches."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from training.lod.brush import Front, Projection, brushed, hits, lassoed
+from training.scenes.cameras import Camera, look_at
+
+SIZE = (96, 64)
+PERSPECTIVE = np.float64([[2, 0, 0.1, 0], [0, 3, 0, 0], [0, 0, -1.002, -0.2], [0, 0, -1, 0]])
+FLAT = np.diag([0.2, 0.3, -0.02, 1.0])
+
+
+def centres():
+    return [(x + 0.5, y + 0.5) for y in range(SIZE[1]) for x in range(SIZE[0])]
+
+
+def mask_of(test):
+    return np.array([test(x, y) for x, y in centres()]).reshape(SIZE[1], SIZE[0])
+
+
+def to_segment(x, y, begin, end):
+    along, here = np.subtract(end, begin), np.subtract((x, y), begin)
+    share = min(max(here @ along / (along @ along), 0), 1) if along.any() else 0
+    return np.hypot(*(here - share * along))
+
+
+def odd(x, y, corners):
+    """Whether an odd number of edges is met from (x, y) to the left."""
+    found = False
+    for (ax, ay), (bx, by) in zip(corners, [*corners[1:], corners[0]], strict=True):
+        if (ay > y) != (by > y) and ax + (y - ay) * (bx - ax) / (by - ay) < x:
+            found = not found
+    return found
+
+
+@pytest.mark.parametrize(
+    "path", [[(20.3, 30.1)], [(10.2, 10.7), (70.1, 50.3), (72.4, 12.9)], [(-30.0, 5.0), (3.1, 70.2)]]
+)
+def test_a_brush_covers_the_pixels_that_are_near_its_path(path):
+    ends = list(pairwise(path)) or [(path[0], path[0])]
+    wanted = mask_of(lambda x, y: min(to_segment(x, y, *each) for each in ends) <= 7.3)
+    np.testing.assert_array_equal(brushed(path, 7.3, SIZE), wanted)
+    assert 0 < wanted.sum() < wanted.size
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        [(10.2, 10.7), (70.1, 50.3), (72.4, 12.9)],
+        [(5.3, 5.1), (60.7, 55.2), (60.1, 5.9), (5.8, 55.6)],  # crosses itself
+        [(-40.3, -10.2), (150.8, 20.7), (30.4, 90.9)],  # leaves the picture
+        [(3, 3), (90, 3), (90, 60), (3, 60), (3, 30), (50, 30), (50, 20), (3, 20)],
+    ],
+)
+def test_a_lasso_covers_the_pixels_that_it_encloses(path):
+    wanted = mask_of(lambda x, y: odd(x, y, path))
+    np.testing.assert_array_equal(lassoed(path, SIZE), wanted)
+    assert 0 < wanted.sum() < wanted.size
+
+
+def test_a_lasso_of_no_area_covers_nothing():
+    for path in ([], [(4, 4)], [(4, 4), (40, 50)]):
+        assert not lassoed(np.reshape(path, (-1, 2)), SIZE).any()
+
+
+@pytest.mark.parametrize("clip", [PERSPECTIVE, FLAT])
+def test_a_stroke_hits_the_means_that_are_projected_onto_it(clip):
+    rng = np.random.default_rng(0)
+    means = rng.normal(0, 3, (3000, 3)).astype(np.float32)
+    to_camera = np.eye(4)
+    to_camera[:3, :3] = 1.7 * np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    to_camera[:3, 3] = (0.4, -0.2, -4)
+    covered = brushed([(20, 20), (70, 50)], 11, SIZE)
+    wanted, clear = np.zeros(len(means), bool), np.ones(len(means), bool)
+    for i, mean in enumerate(means):
+        x, y, z, w = clip @ to_camera @ (*mean, 1)
+        clear[i] = abs(abs(z) - w) > 1e-4
+        if w > 0 and abs(z) < w:
+            u, v = (x / w + 1) / 2 * SIZE[0], (y / w + 1) / 2 * SIZE[1]
+            clear[i] &= min(abs(u - round(u)), abs(v - round(v))) > 1e-4
+            wanted[i] = 0 <= u < SIZE[0] and 0 <= v < SIZE[1] and covered[int(v), int(u)]
+    found = hits(covered, Projection.of(to_camera, clip, SIZE).place(means))
+    np.testing.assert_array_equal(found[clear], wanted[clear])
+    assert 20 < wanted.sum() < 2000 and clear.mean() > 0.95
+
+
+def test_a_pinhole_camera_projects_alike():
+    pose = look_at(np.array([3.0, -4.0, 1.0]), np.zeros(3), (0.0, 0.0, 1.0))
+    camera = Camera("", *SIZE, 80.0, 80.0, SIZE[0] / 2, SIZE[1] / 2, pose)
+    means = np.random.default_rng(1).normal(0, 1, (500, 3)).astype(np.float32)
+    clip = np.float64([[160 / SIZE[0], 0, 0, 0], [0, 160 / SIZE[1], 0, 0], [0, 0, -1, -0.02], [0, 0, -1, 0]])
+    placed = Projection.of(np.diag([1.0, -1, -1, 1]) @ pose, clip, SIZE).place(means)
+    pixels, depths = camera.project(means)
+    np.testing.assert_allclose(placed.x, pixels[:, 0], atol=1e-3)
+    np.testing.assert_allclose(SIZE[1] - placed.y, pixels[:, 1], atol=1e-3)
+    np.testing.assert_allclose(placed.depth, depths, rtol=1e-5)
+    np.testing.assert_allclose(placed.pixel, depths / 80, rtol=1e-5)
+
+
+def wall(rng, count, depth, sigma, opacity=0.8, tilt=0.0):
+    means = np.column_stack([rng.uniform(-6, 6, (count, 2)), np.full(count, -depth)]).astype(np.float32)
+    means[:, 2] += tilt * means[:, 0]
+    return means, np.full((count, 3), sigma, np.float32), np.full(count, opacity, np.float32)
+
+
+@pytest.mark.parametrize("clip", [PERSPECTIVE, FLAT])
+@pytest.mark.parametrize(
+    ("sigma", "tilt"), [(0.03, 0), (0.15, 0), (0.6, 0), (0.03, 0.8), (0.15, 0.8), (0.6, 0.8), (0.03, 3)]
+)
+def test_only_the_first_wall_is_seen_whatever_its_splats_are_and_fog_hides_none(clip, sigma, tilt):
+    """Of walls turned by 40 and 70 degrees, too; and in front of it thin fog, which is seen."""
+    rng = np.random.default_rng(2)
+    count = int(150 / sigma**2)
+    parts = [
+        wall(rng, 300, 8, 0.05, 0.02),
+        wall(rng, count, 18, sigma, tilt=tilt),
+        wall(rng, count, 30, sigma, tilt=tilt),
+    ]
+    size = (480, 320)
+    projection, covered = Projection.of(np.eye(4), clip, size), brushed([(200, 160), (280, 160)], 60, size)
+    placed = [projection.place(means) for means, _, _ in parts]
+    front = Front(
+        [(where, scales, opacities) for where, (_, scales, opacities) in zip(placed, parts, strict=True)]
+    )
+    shares = []
+    for where, (_, scales, _) in zip(placed, parts, strict=True):
+        under = hits(covered, where)
+        seen = hits(covered, where, 2 * scales.max(axis=1), front)
+        assert under.any() and not (seen & ~under).any()
+        shares.append(seen.sum() / under.sum())
+    assert shares[0] == 1 and shares[1] > 0.95 and shares[2] < 0.02, shares
+
+
+def test_what_is_seen_is_what_light_reaches():
+    """Against each splat's transmittance: all other splats' Gaussians at its mean, one by one.
+
+    What is seen may be as deep as a cell is wide: here at most 16 pixels, half a radius of the balls.
+    """
+    rng = np.random.default_rng(3)
+    size, focal = (320, 240), 160.0
+    clip = np.float64([[1, 0, 0, 0], [0, 4 / 3, 0, 0], [0, 0, -1, -0.02], [0, 0, -1, 0]])
+    ball = rng.normal(size=(3000, 3))
+    ball *= 2 / np.linalg.norm(ball, axis=1)[:, None]
+    means = np.concatenate([ball + np.array((0, 0, -8)), ball * 0.8 + (1.5, 0.5, -14)]).astype(np.float32)
+    scales = np.exp(rng.normal(-2.3, 0.3, (len(means), 3))).astype(np.float32)
+    scales[:] = scales[:, :1]
+    opacities = rng.uniform(0.2, 0.9, len(means)).astype(np.float32)
+    placed = Projection.of(np.eye(4), clip, size).place(means)
+    front = Front([(placed, scales, opacities)])
+    everywhere = np.ones(size[::-1], bool)
+    seen = hits(everywhere, placed, 2 * scales[:, 0], front)
+
+    depth = -means[:, 2].astype(np.float64)
+    u, v = focal * means[:, 0] / depth, focal * means[:, 1] / depth
+    sigma, here, before = focal * scales[:, 0] / depth, np.ones(len(means)), np.ones(len(means))
+    for i in range(len(means)):
+        away = ((u - u[i]) ** 2 + (v - v[i]) ** 2) / sigma**2
+        passed = 1 - opacities * np.exp(-away / 2)
+        here[i] = np.prod(passed[depth < depth[i] - 2 * scales[i, 0]])
+        before[i] = np.prod(passed[depth < depth[i] - 2 * scales[i, 0] - 1])
+    inside = hits(everywhere, placed)
+    assert seen[inside & (here > 0.7)].mean() > 0.97
+    assert seen[inside & (before < 0.05)].mean() < 0.05
+    assert min((here[inside] > 0.7).sum(), (before[inside] < 0.05).sum()) > 400

@@ -1,0 +1,191 @@
+"""Looks of splats: against the sRGB curve, Planck's law, colours seen from anywhere, and pictures."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.training.conftest import look_at
+from tests.training.lod.test_cleaning import bundle_of
+from tests.training.splats.test_placing import drawn, some_splats
+from training.__main__ import main
+from training.errors import LodgsError
+from training.lod.crop import Crop
+from training.lod.look import LUMA, NEUTRAL, Look, LookedRows, looked
+from training.scenes.cameras import Camera
+from training.scenes.color import linear_from_srgb, srgb_from_linear
+from training.splats.bundle import read_bundle, write_bundle
+from training.splats.gaussians import SH_C0
+from training.splats.sh import basis, coefficients
+
+LOOK = Look(exposure=-0.7, temperature=8000, tint=(1, 0.8, 0.9), saturation=0.4, opacity=0.6)
+
+
+def seen(splats, degree, direction):
+    """(N, 3) float64, colours from a direction, before black is their end."""
+    values = np.empty(coefficients(degree))
+    basis(*direction, degree, values)
+    return 0.5 + np.einsum("k,nkc->nc", values, splats.sh.astype(np.float64))
+
+
+def opacities(splats):
+    return 1 / (1 + np.exp(-splats.opacity_logits.astype(np.float64)))
+
+
+def test_a_neutral_look_changes_nothing():
+    splats = some_splats(20, 3)
+    np.testing.assert_allclose(NEUTRAL.matrix, np.eye(3), atol=1e-12)
+    found = looked(splats, [(None, NEUTRAL)])
+    np.testing.assert_allclose(found.sh, splats.sh, atol=1e-6)
+    np.testing.assert_array_equal(found.opacity_logits, splats.opacity_logits)
+
+
+@pytest.mark.parametrize("exposure", [-2, -1, 0.5, 1])
+def test_exposure_is_what_it_is_in_light(exposure):
+    codes = np.linspace(0.2, 0.65, 10)
+    light = srgb_from_linear(2.0**exposure * linear_from_srgb(codes))
+    np.testing.assert_allclose(Look(exposure=exposure).matrix[0, 0] * codes, light, atol=0.02)
+
+
+def planck_in_srgb(kelvins):
+    """(3,) linear sRGB of a black body: Planck's law, and the observer as Wyman et al. (2013) fit it."""
+
+    def lobe(x, height, middle, left, right):
+        return height * np.exp(-0.5 * ((x - middle) * np.where(x < middle, left, right)) ** 2)
+
+    nm = np.arange(360.0, 831.0)
+    power = nm**-5 / np.expm1(1.438777e7 / (nm * kelvins))
+    x = lobe(nm, 0.362, 442, 0.0624, 0.0374) + lobe(nm, 1.056, 599.8, 0.0264, 0.0323)
+    x += lobe(nm, -0.065, 501.1, 0.0490, 0.0382)
+    y = lobe(nm, 0.821, 568.8, 0.0213, 0.0247) + lobe(nm, 0.286, 530.9, 0.0613, 0.0322)
+    z = lobe(nm, 1.217, 437, 0.0845, 0.0278) + lobe(nm, 0.681, 459, 0.0385, 0.0725)
+    xyz = np.array([x, y, z]) @ power
+    to_srgb = np.linalg.inv(
+        ((0.41239, 0.35758, 0.18048), (0.21264, 0.71517, 0.07219), (0.01933, 0.11919, 0.95053))
+    )
+    return to_srgb @ xyz / xyz[1]
+
+
+@pytest.mark.parametrize("kelvins", [2500, 3200, 4000, 5000, 9000, 15000])
+def test_white_balance_makes_grey_in_that_light_grey(kelvins):
+    """Within 1 %, as coded, of what daylight makes of it."""
+    grey = (0.3 * planck_in_srgb(kelvins) / planck_in_srgb(6500)) ** (1 / 2.2)
+    found = Look(temperature=kelvins).matrix @ grey
+    np.testing.assert_allclose(found / found.mean(), 1, atol=0.01)
+    white = Look(temperature=kelvins).matrix @ np.ones(3)
+    assert white @ LUMA == pytest.approx(1) and (white[2] > white[0]) == (kelvins < 6500)
+
+
+def test_saturation_keeps_lightness_and_tint_is_what_white_becomes():
+    color = np.array([0.7, 0.3, 0.1])
+    grey = Look(saturation=0).matrix @ color
+    np.testing.assert_allclose(grey, 0.2126 * 0.7 + 0.7152 * 0.3 + 0.0722 * 0.1, rtol=1e-12)
+    strong = Look(saturation=2).matrix @ color
+    np.testing.assert_allclose(strong, 2 * color - grey, rtol=1e-12)
+    for saturation in (0, 0.5, 2):
+        look = Look(tint=(0.9, 0.5, 0.2), saturation=saturation)
+        np.testing.assert_allclose(look.matrix @ np.ones(3), (0.9, 0.5, 0.2), rtol=1e-12)
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_every_degree_is_seen_as_the_matrix_has_it_from_anywhere(degree):
+    splats = some_splats(200, degree)
+    found = looked(splats, [(None, LOOK)])
+    for direction in ((0, 0, 1), (0.6, -0.8, 0), (-0.48, 0.6, 0.64)):
+        wanted = seen(splats, degree, direction) @ LOOK.matrix.T
+        np.testing.assert_allclose(seen(found, degree, direction), wanted, atol=1e-5)
+    np.testing.assert_allclose(opacities(found), 0.6 * opacities(splats), rtol=1e-5)
+    for name in ("means", "quats", "log_scales"):
+        assert getattr(found, name) is getattr(splats, name)
+
+
+def test_opacities_of_any_logit():
+    splats = replace(some_splats(5, 0), opacity_logits=np.float32([-200, -5, 0, 5, 200]))
+    for factor in (0.0, 0.25, 1.0):
+        found = looked(splats, [(None, Look(opacity=factor))])
+        assert np.isfinite(found.opacity_logits).all()
+        np.testing.assert_allclose(opacities(found), factor * opacities(splats), rtol=1e-4, atol=1e-5)
+
+
+def test_regions_come_upon_the_look_everywhere():
+    splats, ball = some_splats(500, 1), Crop.sphere((0.2, 0, 0), 0.8)
+    box, there = Crop.box((-2, -2, -2), (2, 2, 0), outside=True), Look(tint=(0.2, 1, 1))
+    found = looked(splats, [(None, LOOK), (ball, there), (box, Look(opacity=0.5))])
+    held = np.linalg.norm(splats.means - np.float32([0.2, 0, 0]), axis=1) <= 0.8
+    above = splats.means[:, 2] >= 0
+    assert 50 < held.sum() < 450 and 50 < above.sum() < 450
+    wanted = seen(splats, 1, (0, 0, 1)) @ LOOK.matrix.T
+    wanted[held] *= (0.2, 1, 1)
+    np.testing.assert_allclose(seen(found, 1, (0, 0, 1)), wanted, atol=1e-5)
+    np.testing.assert_allclose(opacities(found), 0.6 * opacities(splats) * np.where(above, 0.5, 1), rtol=1e-5)
+
+
+def test_the_picture_is_the_colour_mapped_picture():
+    """Blending is linear in colours, and the matrix leaves black black: what is over black is mapped, too."""
+    splats = some_splats(300, 2)
+    splats.sh[:, 0] = np.abs(splats.sh[:, 0]) / 2
+    splats.sh[:, 1:] *= 0.1
+    camera = Camera("", 96, 72, 90.0, 80.0, 50.0, 33.0, look_at((2.5, 0.4, 1.5)))
+    look = replace(LOOK, exposure=0.6, opacity=1.0)
+    before, after = drawn(splats, camera, 0.01), drawn(looked(splats, [(None, look)]), camera, 0.01)
+    assert before.std() > 0.1 and np.abs(after - before).max() > 0.1
+    np.testing.assert_allclose(after, before @ look.matrix.T, atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{"exposure": 11}, {"temperature": 900}, {"tint": (1, 2, 1)}, {"saturation": -1}, {"opacity": 1.5},
+     {"exposure": float("nan")}],
+)  # fmt: skip
+def test_bad_values_are_told(values):
+    with pytest.raises(LodgsError, match=f"The {next(iter(values))} of a look cannot be"):
+        Look(**values)
+
+
+@pytest.mark.parametrize("name", ["bands", "octree", "chunks", "decay"])
+def test_the_command_edits_every_level(name, tmp_path, capsys):
+    bundle = bundle_of(name, np.random.default_rng(0))
+    write_bundle(tmp_path / "in.ply", bundle)
+    arguments = [
+        "--exposure", "0.5", "--saturation", "0.8", "--tint", "1", "0.9", "0.8", "--temperature", "5000",
+        "--opacity", "0.7",
+    ]  # fmt: skip
+    out = tmp_path / "out.ply"
+    assert main(["edit", str(tmp_path / "in.ply"), "--out", str(out), *arguments]) == 0
+    look = Look(0.5, 5000, (1, 0.9, 0.8), 0.8, 0.7)
+    found, before = read_bundle(out), read_bundle(tmp_path / "in.ply")
+    assert (found.rule, found.facts, list(found.tables)) == (before.rule, before.facts, list(before.tables))
+    for one, other in zip(found.levels, before.levels, strict=True):
+        wanted = 0.5 + SH_C0 * other.splats.sh[:, 0]
+        np.testing.assert_allclose(0.5 + SH_C0 * one.splats.sh[:, 0], wanted @ look.matrix.T, atol=1e-5)
+        np.testing.assert_allclose(opacities(one.splats), 0.7 * opacities(other.splats), rtol=1e-4)
+        np.testing.assert_array_equal(one.splats.means, other.splats.means)
+    assert "level 3:" in capsys.readouterr().out
+
+
+def test_the_command_edits_regions_and_folders(tmp_path, capsys):
+    bundle = bundle_of("bands", np.random.default_rng(0))
+    write_bundle(tmp_path / "in.ply", bundle)
+    box = ["--keep", "all", "--crop-box", "0", "-99", "-99", "99", "99", "99"]
+    out = tmp_path / "out.ply"
+    command = ["edit", str(tmp_path / "in.ply"), "--out", str(out)]
+    assert main([*command, *box, "--exposure", "1"]) == 0
+    for one, other in zip(read_bundle(out).levels, bundle.levels, strict=True):
+        held = other.splats.means[:, 0] >= 0
+        assert 0 < held.sum() < len(held) == len(one.splats)
+        np.testing.assert_array_equal((one.splats.sh != other.splats.sh).any(axis=(1, 2)), held)
+    for wrong, text in (
+        (box, "nothing goes"), (["--opacity", "2"], "The opacity of a look cannot be 2. Choose from 0 to 1."),
+        (["--tint", "1", "1", "7"], "The tint of a look cannot be 1 1 7"),
+    ):  # fmt: skip
+        out.unlink(missing_ok=True)
+        assert main([*command, *wrong]) == 2 and not out.exists()
+        assert text in capsys.readouterr().err
+
+
+def test_rows_that_are_read_by_and_by_are_the_same():
+    splats = some_splats(50, 1)
+    looks = [(None, LOOK), (Crop.sphere((0, 0, 0), 0.7), Look(exposure=1))]
+    rows = LookedRows(splats, looks)
+    assert len(rows) == 50
+    np.testing.assert_array_equal(rows.select(slice(10, 30)).sh, looked(splats, looks).sh[10:30])
