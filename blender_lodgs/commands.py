@@ -15,12 +15,14 @@ import bpy
 from ..training.errors import LodgsError
 from ..training.evaluate.words import summary_lines
 from ..training.lod.describe import describe
+from ..training.lod.selection import complete
 from ..training.methods.describe import describe_method, describe_methods
 from ..training.runs.folder import RunFolder
 from ..training.runs.job import Job, check_views
 from ..training.runs.options import add_options, job_from, size_of
 from ..training.splats.bundle import write_bundle
 from ..training.splats.dialects import Warn
+from ..training.splats.formats import PLY, format_of, write_splats
 from . import extension
 from .data import scenes, viewpoints
 from .render.capture import render_views, write_model
@@ -75,15 +77,19 @@ def _parser() -> argparse.ArgumentParser:
     methods.set_defaults(command=_methods)
     methods.add_argument("name", nargs="?", metavar="NAME", help="method whose parameters to list")
 
-    convert = commands.add_parser("import", help="a COLMAP folder, a bundle or any 3DGS PLY to a .blend")
+    convert = commands.add_parser("import", help="a COLMAP folder or any file of splats to a .blend")
     convert.set_defaults(command=_import)
-    convert.add_argument("source", type=Path, help="folder or PLY file")
+    convert.add_argument("source", type=Path, help="folder or file")
     convert.add_argument("--blend", type=Path, required=True, help=".blend file to save")
 
-    export = commands.add_parser("export", help="the levels of a .blend to a bundle")
+    export = commands.add_parser(
+        "export", help="the levels of a .blend to a bundle, or the finest to another kind of file"
+    )
     export.set_defaults(command=_export)
     export.add_argument("blend", type=Path, help=".blend file")
-    export.add_argument("bundle", type=Path, help="bundle to write (PLY)")
+    export.add_argument(
+        "bundle", type=Path, help="bundle to write (.ply); or .spz, .sog, .compressed.ply, .splat"
+    )
     export.add_argument("--root", help="name of the scene root, where the file holds several")
     export.add_argument(
         "--placed",
@@ -201,7 +207,12 @@ def _export(args: argparse.Namespace) -> int:
     if len(found) != 1:
         names = ", ".join(root.name for root in bpy.data.objects if root.lodgs.is_root) or "none"
         raise LodgsError(f"{args.blend} holds {len(found)} such scenes.", f"Name one with --root: {names}.")
-    write_bundle(args.bundle, scenes.read_levels(found[0], args.placed, not args.as_trained))
+    bundle = scenes.read_levels(found[0], args.placed, not args.as_trained)
+    if format_of(args.bundle) is PLY:
+        write_bundle(args.bundle, bundle)
+    else:
+        for _ in write_splats(args.bundle, complete(bundle, bundle.levels[-1]), bundle.meta):
+            pass
     return DONE
 
 

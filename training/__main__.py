@@ -20,8 +20,10 @@ from .errors import LodgsError, out_of_memory
 
 if TYPE_CHECKING:
     from .runs.job import Job
+    from .splats.placing import Placement
 
 PROGRAM = "lodgs" if __package__ == "lodgs" else "python -m training"
+_OTHERS = " (and, with splat-transform, .spz, .sog and others: see docs/formats.md)"
 _INSTALL = "Install the packages of requirements/trainer.txt."
 
 
@@ -69,6 +71,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     from .runs.options import add_options, size_of
+    from .splats.formats import FORMATS
 
     parser = argparse.ArgumentParser(prog=PROGRAM, description="Gaussian splats with levels of detail.")
     parser.add_argument("--version", action="version", version=f"lodgs {VERSION}")
@@ -228,29 +231,26 @@ def _parser() -> argparse.ArgumentParser:
         "source", type=Path, help="bundle, folder of levels, any 3DGS PLY, or a run's folder"
     )
     transform.add_argument("out", type=Path, help="file or folder to write, in the form of the source")
-    transform.add_argument(
-        "--upright", action="store_true", help="first turn as the file says that its scene stands upright"
-    )
-    transform.add_argument(
-        "--rotate", type=_reals(3), default=(0, 0, 0), metavar="X,Y,Z",
-        help="degrees about x, then y, then z, as Blender's Euler angles",
-    )  # fmt: skip
-    transform.add_argument("--scale", type=float, default=1.0, metavar="N", help="times the size")
-    transform.add_argument(
-        "--translate", type=_reals(3), default=(0, 0, 0), metavar="X,Y,Z", help="shift in the new units"
-    )
-    transform.add_argument(
-        "--matrix", type=_reals(16), metavar="A,B,...",
-        help="16 numbers, row by row, instead of these three; no stretching, shearing, mirroring",
-    )  # fmt: skip
+    _add_placement(transform)
     edit = commands.add_parser(
         "edit",
         help="a copy without clutter (what lies outside of crops, floaters, ...) or in another look",
         description="Every level is edited alike, and stays what its rule chooses from. Places and lengths "
-        "are in the splats' own units; lodgs info tells their bounds.",
+        "of what goes are in the splats' own units; lodgs info tells their bounds.",
     )
-    edit.add_argument("source", type=Path, help="bundle, folder of levels or any 3DGS PLY")
-    edit.add_argument("--out", type=Path, required=True, help="file, or folder, to write")
+    edit.add_argument("source", type=Path, help=f"bundle, folder of levels, any 3DGS PLY{_OTHERS}")
+    edit.add_argument("--out", type=Path, help="file, or folder, to write in the form of the source")
+    edit.add_argument(
+        "--plain", type=Path, action="append", default=[], metavar="FILE",
+        help="file of the finest level alone: " + ", ".join(kind.suffix for kind in FORMATS),
+    )  # fmt: skip
+    edit.add_argument("--folder", type=Path, metavar="DIR", help="folder of levels to write")
+    edit.add_argument(
+        "--streamed",
+        type=Path,
+        metavar="DIR",
+        help="folder of levels to write as browsers load them",
+    )
     edit.add_argument(
         "--crop-box", type=float, nargs=6, action="append", default=[], metavar="N",
         help="two opposite corners of a box, X Y Z X Y Z; of several boxes and spheres any one counts",
@@ -279,13 +279,21 @@ def _parser() -> argparse.ArgumentParser:
         help="how large clusters of floaters are at most, as a share of all splats (default 0.001)",
     )  # fmt: skip
     edit.add_argument(
-        "--scene", type=Path, metavar="DIR", help="COLMAP folder of the photographs, for the next two"
+        "--scene",
+        type=Path,
+        metavar="DIR",
+        help="COLMAP folder of the photographs, for --max-distance, --min-views and --ground",
     )
     edit.add_argument(
         "--max-distance", type=float, metavar="N", help="drop splats farther from every photograph's eye"
     )
     edit.add_argument(
         "--min-views", type=int, metavar="N", help="drop splats in the frames of fewer photographs"
+    )
+    places = edit.add_argument_group("where what is left stands")
+    _add_placement(places)
+    places.add_argument(
+        "--ground", action="store_true", help="first stand upright, with the ground that is found at z = 0"
     )
     look = edit.add_argument_group("look, of all that stays, or with --keep all in boxes and spheres")
     look.add_argument("--exposure", type=float, metavar="N", help="stops: 1 is twice the light")
@@ -303,6 +311,39 @@ def _parser() -> argparse.ArgumentParser:
     commands.add_parser("check", help="say as JSON whether this Python can train")
 
     return parser
+
+
+def _add_placement(parser: argparse._ActionsContainer) -> None:
+    """The options that place splats elsewhere."""
+    parser.add_argument(
+        "--upright", action="store_true", help="first turn as the file says that its scene stands upright"
+    )
+    parser.add_argument(
+        "--rotate", type=_reals(3), default=(0, 0, 0), metavar="X,Y,Z",
+        help="degrees about x, then y, then z, as Blender's Euler angles",
+    )  # fmt: skip
+    parser.add_argument("--scale", type=float, default=1.0, metavar="N", help="times the size")
+    parser.add_argument(
+        "--translate", type=_reals(3), default=(0, 0, 0), metavar="X,Y,Z", help="shift in the new units"
+    )
+    parser.add_argument(
+        "--matrix", type=_reals(16), metavar="A,B,...",
+        help="16 numbers, row by row, instead of these three; no stretching, shearing, mirroring",
+    )  # fmt: skip
+
+
+def _placement(chosen: argparse.Namespace) -> Placement | None:
+    """What the options of :func:`_add_placement` say but for --upright; None: nothing."""
+    import numpy as np
+
+    from .splats.placing import Placement
+
+    unmoved = (chosen.rotate, chosen.scale, chosen.translate) == ((0, 0, 0), 1.0, (0, 0, 0))
+    if chosen.matrix is None:
+        return None if unmoved else Placement.composed(chosen.rotate, chosen.scale, chosen.translate)
+    if not unmoved:
+        raise LodgsError("--matrix says all that --rotate, --scale and --translate say.", "Choose one.")
+    return Placement.of(np.reshape(chosen.matrix, (4, 4)))
 
 
 def _add_controls(parser: argparse.ArgumentParser) -> None:
@@ -542,24 +583,19 @@ def _model(chosen: argparse.Namespace) -> int:
 
 
 def _transform(chosen: argparse.Namespace) -> int:
-    import numpy as np
-
     from .lod.placing import place_file, upright_of
     from .runs.folder import RunFolder
+    from .splats.formats import as_ply
     from .splats.placing import Placement
 
     source = chosen.source
     if (bundle := RunFolder(source).bundle).exists():
         source = bundle
-    if chosen.matrix is None:
-        placement = Placement.composed(chosen.rotate, chosen.scale, chosen.translate)
-    elif (chosen.rotate, chosen.scale, chosen.translate) == ((0, 0, 0), 1.0, (0, 0, 0)):
-        placement = Placement.of(np.reshape(chosen.matrix, (4, 4)))
-    else:
-        raise LodgsError("--matrix says all that --rotate, --scale and --translate say.", "Choose one.")
-    if chosen.upright:
-        placement = placement.after(upright_of(source))
-    count = place_file(source, chosen.out, placement, _warn)
+    placement = _placement(chosen) or Placement.composed()
+    with as_ply(source) as there:
+        if chosen.upright:
+            placement = placement.after(upright_of(there))
+        count = place_file(there, chosen.out, placement, _warn)
     print(f"{chosen.out}: {count:,} splats")
     return 0
 
@@ -579,6 +615,7 @@ def _edit(chosen: argparse.Namespace) -> int:
     from .lod.crop import Crop
     from .lod.edit import edit
     from .lod.look import RANGES, Look
+    from .splats.formats import as_ply
 
     names = "max_size", "min_opacity", "max_distance", "min_views", "gap", "share"
     given = {name: value for name in names if (value := getattr(chosen, name)) is not None}
@@ -596,26 +633,35 @@ def _edit(chosen: argparse.Namespace) -> int:
         if crops and not parts:
             raise LodgsError("With --keep all nothing goes.", "Say what is to look otherwise in there.")
         crops, places = [], crops or [None]
-    if given.keys() & {"max_distance", "min_views"}:
-        if chosen.scene is None:
-            raise LodgsError("Photographs' views are in their scene.", "Name its folder with --scene.")
+    if given.keys() & {"max_distance", "min_views"} and chosen.scene is None:
+        raise LodgsError("Photographs' views are in their scene.", "Name its folder with --scene.")
+    points = None
+    if chosen.scene is not None:
         from .scenes.colmap import read_scene
 
-        given["cameras"] = tuple(read_scene(chosen.scene).cameras)
-    print(
-        edit(
-            chosen.source, chosen.out,
-            Cleaning(tuple(crops), drop_floaters=chosen.drop_floaters, **given), _warn,
-            looks=[(place, look) for place in places] if parts else (),
-        )
-    )  # fmt: skip
+        scene = read_scene(chosen.scene)
+        given["cameras"], points = tuple(scene.cameras), scene.points
+    if not (chosen.out or chosen.plain or chosen.folder or chosen.streamed):
+        raise LodgsError("It is not said what to write.", "Add --out FILE, or --plain, --folder, --streamed.")
+    cleaning = Cleaning(tuple(crops), drop_floaters=chosen.drop_floaters, **given)
+    with as_ply(chosen.source) as source:
+        print(
+            edit(
+                source, chosen.out, cleaning, _warn,
+                placement=_placement(chosen), upright=chosen.upright, ground=chosen.ground, points=points,
+                looks=[(place, look) for place in places] if parts else (),
+                plain=chosen.plain, folder=chosen.folder, streamed=chosen.streamed,
+            )
+        )  # fmt: skip
     return 0
 
 
 def _info(chosen: argparse.Namespace) -> int:
     from .lod.describe import describe
+    from .splats.formats import as_ply
 
-    print(describe(chosen.file))
+    with as_ply(chosen.file) as there:
+        print(describe(there).replace(str(there), str(chosen.file)))
     return 0
 
 

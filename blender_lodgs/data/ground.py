@@ -6,16 +6,12 @@ import bpy
 import numpy as np
 
 from ...training.errors import LodgsError
-from ...training.lod.rule import distances
-from ...training.scenes.ground import find_ground, level_at_zero, plane_through, scaled_about
+from ...training.scenes.ground import about_cameras, find_ground, level_at_zero, plane_through, scaled_about
 from ..attributes import BASE, read_attribute
 from .photographs import views
 from .placement import axes_of, move, placement_of
 from .selection import read_json
 
-NEAR, FEW = 1.5, 100
-"""How far from the cameras a ground is looked for, in the depths that they mostly see, if so many places are
-there."""
 APART = 1e-6
 """Of two places, over the size of the scene: nearer ones are one."""
 
@@ -107,10 +103,8 @@ def measured(places: np.ndarray) -> float:
 
 
 def _places(root: bpy.types.Object) -> np.ndarray:
-    """(P, 3) in the scene's own space: COLMAP's points, else where the finest level's opaque splats are.
-
-    Those about the cameras alone, where it is known how deep these look: land rises farther away.
-    """
+    """(P, 3) in the scene's own space: COLMAP's points, else where the finest level's opaque splats are;
+    those about the cameras alone, where it is known how deep these look."""
     found = [item.object for item in root.lodgs.levels if item.exists][-1:]
     obj = root.lodgs.points or (found[0] if found else None)
     places = None if obj is None else read_attribute(obj.data, "position")
@@ -119,6 +113,6 @@ def _places(root: bpy.types.Object) -> np.ndarray:
     base = read_attribute(obj.data, BASE)
     places = places if base is None else places[base[:, 3] > 0.5]
     depth = root.lodgs.training.median_depth or read_json(root.lodgs.meta).get("median_depth", 0)
-    away = distances(places, np.array(root.lodgs.camera_center))
-    near = places[away < NEAR * depth] if isinstance(depth, int | float) else places
-    return near if len(near) > FEW else places
+    return about_cameras(
+        places, np.array(root.lodgs.camera_center), depth if isinstance(depth, int | float) else 0
+    )

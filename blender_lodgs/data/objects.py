@@ -175,6 +175,12 @@ def megabytes(cloud: bpy.types.PointCloud) -> float:
     return len(cloud.points) * 4e-6 * (sum(widths) + normals)
 
 
+def sh_degree(cloud: bpy.types.PointCloud) -> int:
+    """The degree of the spherical harmonics that a point cloud of splats carries."""
+    bands = sum(a.name.startswith(SH.format("")) for a in cloud.attributes)
+    return int(np.sqrt(bands + 1)) - 1
+
+
 def to_bytes(colors: np.ndarray) -> np.ndarray:
     """Display colours in [0, 1], clipped and rounded to uint8."""
     return (np.clip(colors, 0, 1) * np.float32(255) + np.float32(0.5)).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""The photographs of a COLMAP scene in Blender: camera objects that stand where they were taken."""
+"""The views of a splat scene in Blender: camera objects that stand where its photographs were taken."""
 
 from __future__ import annotations
 
@@ -105,11 +105,29 @@ def _fit(data: bpy.types.Camera, camera: Camera, distorted: bool) -> None:
     view.distorted = distorted
 
 
+def camera_of(view: bpy.types.Object) -> Camera:
+    """The view that :func:`new_camera` has made a camera object of, as far as Blender's float32 hold it."""
+    data, own = view.data, view.data.lodgs
+    long, wide, pixel = max(own.width, own.height), own.width >= own.height, own.fy / own.fx
+    pose = np.array(view.matrix_basis, np.float64) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    return Camera(
+        view.name, own.width, own.height, own.fx, own.fy,
+        own.width / 2 - data.shift_x * long / (1 if wide else pixel),
+        own.height / 2 + data.shift_y * long * (pixel if wide else 1),
+        np.linalg.inv(pose),
+    )  # fmt: skip
+
+
 def views(root: bpy.types.Object) -> list[bpy.types.Object]:
-    """The camera objects of a COLMAP scene that are still there, by name."""
+    """The camera objects of a scene that are still there, by name."""
     cameras = root.lodgs.cameras
     found = [obj for obj in cameras.objects if obj.type == "CAMERA"] if cameras else []
     return sorted(found, key=lambda obj: obj.name)
+
+
+def photographed(root: bpy.types.Object) -> list[bpy.types.Object]:
+    """The views that have a photograph: those of an imported file of splats have none."""
+    return [view for view in views(root) if view.data.lodgs.photograph]
 
 
 def held_out(root: bpy.types.Object) -> list[bpy.types.Object]:

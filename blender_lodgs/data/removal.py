@@ -11,6 +11,7 @@ import bpy
 
 from . import crops, photographs, tables
 from .placement import axes_of
+from .scenes import ABOUT
 
 
 def remove(root: bpy.types.Object) -> None:
@@ -38,6 +39,8 @@ def remove(root: bpy.types.Object) -> None:
     bpy.data.batch_remove(list(parts))
     for unused in (data, pictures):
         bpy.data.batch_remove([one for one in unused if not one.users])
+    if ABOUT in bpy.data.texts and not any(obj.lodgs.is_root for obj in bpy.data.objects):
+        bpy.data.texts.remove(bpy.data.texts[ABOUT])
     while empty := [part for part in collections if not part.objects and not part.children]:
         collections -= set(empty)
         bpy.data.batch_remove(empty)

@@ -8,7 +8,7 @@ operators call and what scripts may call.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,17 +23,22 @@ from ...training.lod.paging import TreeFile, is_tree, read_within
 from ...training.lod.rule import Control, Tables, find_rule
 from ...training.lod.selection import complete, known_rule, not_alone, unknown_rule
 from ...training.methods import METHODS
+from ...training.scenes.cameras import Camera, extent_of
 from ...training.scenes.colmap import Scene, read_scene
 from ...training.scenes.formats import colmap_scene
 from ...training.scenes.undistort import already_undistorted
+from ...training.scenes.views import tables_of, views_in
 from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder, read_head
+from ...training.splats.formats import STREAMED, as_ply, is_ply
 from ...training.splats.gaussians import Splats
 from ..nodes import ellipsoids
 from . import cleaning, crops, looks, objects, selection, streams, tables
 from .objects import root_of
-from .photographs import match_render, new_camera, views
+from .photographs import camera_of, is_held_out, match_render, new_camera, photographed, views
 from .placement import axes_of, new_axes, placement_of
 
+ABOUT = "About these splats"
+"""The name of the text that tells of LODGS where it is not installed."""
 LINKED = (
     "This splat scene is linked from another file, where its settings are. To change them here, append it "
     "instead of linking it (File, Append), or make it local (Object, Relations, Make Local, All)."
@@ -135,14 +140,8 @@ def import_colmap(
         root.lodgs.training.model = str(scene.model) if model else ""
         root.lodgs.training.images = str(scene.images_folder) if images else ""
 
-        root.lodgs.cameras = bpy.data.collections.new(f"{root.name} cameras")
-        _collection(root).children.link(root.lodgs.cameras)
-        for place, camera in enumerate(scene.cameras):
-            distorted = camera.name in scene.distorted and camera.name not in shown
-            camera = shown.get(camera.name, camera)
-            view = new_camera(camera, extent, near, photograph=photographs, distorted=distorted)
-            view.parent, view.data.lodgs.place = axes, place
-            root.lodgs.cameras.objects.link(view)
+        seen = [shown.get(camera.name, camera) for camera in scene.cameras]
+        _add_views(context, root, seen, extent, near, photographs, set(scene.distorted) - shown.keys())
         if len(scene.points):
             points = objects.new_points(
                 f"{root.name} points", scene.points, scene.point_colors, radius=extent / 400
@@ -150,10 +149,28 @@ def import_colmap(
             points.parent = axes
             _collection(root).objects.link(points)
             root.lodgs.points = points
-        if context.scene.camera is None and scene.cameras:
-            context.scene.camera = first = root.lodgs.cameras.objects[0]
-            match_render(context.scene, first.data.lodgs, context.scene.render.resolution_percentage)
     return root
+
+
+def _add_views(
+    context: bpy.types.Context,
+    root: bpy.types.Object,
+    cameras: Sequence[Camera],
+    extent: float,
+    near: float,
+    photographs: bool = False,
+    distorted: Collection[str] = (),
+) -> None:
+    """Gives a scene a camera object for each view; see :func:`new_camera`."""
+    root.lodgs.cameras = bpy.data.collections.new(f"{root.name} cameras")
+    _collection(root).children.link(root.lodgs.cameras)
+    for place, camera in enumerate(cameras):
+        view = new_camera(camera, extent, near, photograph=photographs, distorted=camera.name in distorted)
+        view.parent, view.data.lodgs.place = axes_of(root), place
+        root.lodgs.cameras.objects.link(view)
+    if context.scene.camera is None and cameras:
+        context.scene.camera = root.lodgs.cameras.objects[0]
+        match_render(context.scene, cameras[0], context.scene.render.resolution_percentage)
 
 
 def import_splats(
@@ -205,7 +222,8 @@ class SplatsFile:
 
 
 def read_splats_file(path: Path | str, budget: int = 0) -> SplatsFile:
-    """What :func:`place_splats` places: a bundle, a folder of levels, or any 3DGS PLY as a single level.
+    """What :func:`place_splats` places: a bundle, a folder of levels, or any other file of splats (see
+    ``training.splats.formats``) as a single level.
 
     Nothing of Blender is touched, so that a thread may do it.
 
@@ -218,7 +236,9 @@ def read_splats_file(path: Path | str, budget: int = 0) -> SplatsFile:
         LodgsError: the file cannot be read.
     """
     path, warnings, total = Path(path), [], 0
-    if budget and not path.is_dir() and is_tree(read_head(path)):
+    if path.name == STREAMED:
+        path = path.resolve().parent
+    if budget and not path.is_dir() and is_ply(path) and is_tree(read_head(path)):
         total = TreeFile(path).total
         bundle, _ = read_within(path, budget if total <= budget else streams.held_of(budget))
         here = sum(len(level.splats) for level in bundle.levels)
@@ -229,7 +249,8 @@ def read_splats_file(path: Path | str, budget: int = 0) -> SplatsFile:
             )
         total = total if here < total else 0
     else:
-        bundle = (read_folder if path.is_dir() else read_bundle)(path, warnings.append)
+        with as_ply(path) as there:
+            bundle = (read_folder if there.is_dir() else read_bundle)(there, warnings.append)
     return SplatsFile(path, bundle, total, budget, warnings)
 
 
@@ -241,14 +262,17 @@ def place_splats(
     for message in file.warnings:
         warn(message)
     bundle, made = file.bundle, []
+    cameras, near, _ = views_in(bundle.tables)
     try:
         for level in bundle.levels:
             made.append(objects.new_splats(f"{file.path.stem} {level.number}", level.splats))
             yield
-        with _new_scene(context, file.path.stem) as root:
+        with _new_scene(context, file.path.stem.removesuffix(".compressed")) as root:
             if upright:
                 axes_of(root).rotation_quaternion = Matrix(bundle.upright.tolist()).to_quaternion()
             _fill(root, file, made)
+            if cameras:
+                _add_views(context, root, cameras, extent_of(cameras) or 1.0, near)
             root.lodgs.training.method = next(info.name for info in METHODS.values() if info.for_splats)
     except BaseException:
         bpy.data.batch_remove([obj.data for obj in made])  # which takes the objects along
@@ -335,7 +359,8 @@ def contents(root: bpy.types.Object) -> str:
     """What a splat scene holds, in a few words: photographs, points, levels and their splats."""
     levels = [item.object for item in root.lodgs.levels if item.exists]
     counts = (
-        (sum(bool(view.data.lodgs.photograph) for view in views(root)), "photograph"),
+        (len(photographed(root)), "photograph"),
+        (len(views(root)) - len(photographed(root)), "view"),
         (len(root.lodgs.points.data.points) if root.lodgs.points else 0, "point"),
         (len(levels), "level"),
         (sum(len(obj.data.points) for obj in levels), "splat"),
@@ -392,7 +417,7 @@ def read_levels(root: bpy.types.Object, placed: bool = False, looked: bool = Fal
     facts, meta = selection.read_facts(settings.facts), selection.read_json(settings.meta)
     bundle = Bundle(
         settings.method, levels, settings.rule, facts, _set_controls(root), settings.cumulative, meta,
-        tables.read_tables(root),
+        tables.read_tables(root) | _views_of(root),
     )  # fmt: skip
     bundle = cleaning.left(root, bundle, bpy.context.evaluated_depsgraph_get())
     if looked:
@@ -401,6 +426,18 @@ def read_levels(root: bpy.types.Object, placed: bool = False, looked: bool = Fal
         bundle = placing.placed(bundle, placement_of(root))
         bundle.meta["up_rotation"] = np.eye(3)
     return bundle
+
+
+def _views_of(root: bpy.types.Object) -> dict[str, dict[str, np.ndarray]]:
+    """A scene's views as tables of its bundle, in the order in which they came."""
+    found = sorted(
+        (view for view in views(root) if view.data.lodgs.width), key=lambda view: view.data.lodgs.place
+    )
+    near = min((view.data.clip_start for view in found), default=0.0)
+    axes = axes_of(root)
+    unit = 1.0 if axes == root else axes.matrix_basis.to_scale().x  # ``ground.scale`` takes clips along
+    unseen = {view.name for view in found if is_held_out(root, view)}
+    return tables_of([camera_of(view) for view in found], near / unit, unseen)
 
 
 def delete_left_out(root: bpy.types.Object) -> int:
@@ -533,11 +570,23 @@ def _new_scene(context: bpy.types.Context, name: str) -> Iterator[bpy.types.Obje
         collection.objects.link(root)
         context.scene.collection.children.link(collection)
         new_axes(root)
+        _tell_others()
         yield root
     for obj in context.selected_objects:
         obj.select_set(False)
     context.view_layer.objects.active = root
     root.select_set(True)
+
+
+def _tell_others() -> None:
+    """Leaves a text in the file for whoever opens it without LODGS, and sees points."""
+    if ABOUT not in bpy.data.texts:
+        bpy.data.texts.new(ABOUT).write(
+            "The point clouds in this file are Gaussian splats. Without the extension LODGS, Blender shows "
+            "the finest level of each scene as points.\n\nWith it they are drawn as splats, in viewports and "
+            "in renders, with detail by distance, and can be cleaned, placed and exported: Edit, "
+            "Preferences, Get Extensions, Install from Disk. Nothing is lost without it.\n"
+        )
 
 
 def _looks(root: bpy.types.Object) -> look.Looks:

@@ -14,6 +14,7 @@ import numpy as np
 from ...training.lod.rule import Tables, find_rule
 from ...training.lod.rules.chunks import COLUMNS as SPHERE
 from ...training.lod.streaming import BLOCKS
+from ...training.scenes.views import TABLES as VIEWS
 from ..attributes import COLUMN
 from .objects import read_column, write_column
 from .placement import axes_of
@@ -27,6 +28,8 @@ def set_tables(root: bpy.types.Object, tables: Tables) -> None:
     remove_tables(root)
     rule = find_rule(root.lodgs.rule)
     for name, columns in tables.items():
+        if name in VIEWS:  # which are cameras
+            continue
         if name == BLOCKS:  # where rows are in a file: not true any more when somebody removes one
             continue
         collection = bpy.data.collections.new(f"{root.name} {name}")

@@ -17,7 +17,7 @@ class _OnViews:
     @classmethod
     def poll(cls, context):
         root = scenes.root_with_levels(context)
-        if root is None or not photographs.views(root):
+        if root is None or not photographs.photographed(root):
             cls.poll_message_set("Select a splat scene that has levels and photographs")
             return False
         return True

@@ -1,7 +1,8 @@
-"""Exports of a splat scene: the bundle, one plain PLY, a folder of levels."""
+"""Exports of a splat scene: the bundle, one level for other programs, a folder of levels, and for the web."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import bpy
@@ -10,11 +11,38 @@ from bpy_extras.io_utils import ExportHelper
 from ...training.errors import LodgsError
 from ...training.lod.paging import is_tree
 from ...training.lod.tree import complete_levels
-from ...training.splats.bundle import write_bundle, write_folder
-from ...training.splats.dialects import comments_of
-from ...training.splats.ply import write_ply
+from ...training.splats.bundle import Bundle, write_bundle, write_folder
+from ...training.splats.formats import FORMATS, PLY, STREAMED, Format, format_of, write_splats, write_streamed
 from ..data import scenes, selection
+from ..data.objects import megabytes, sh_degree
+from .frames import BesideBlender
 from .parts import OnLevels, report_errors
+
+_SOG = format_of(Path("level.sog"))
+
+
+def _size(context: bpy.types.Context, kind: Format, level: int = 0) -> str:
+    """About how large a file of the active scene's splats gets.
+
+    Args:
+        level: of one level, with the coarser ones where levels add up; 0: of what is shown; -1: of all.
+    """
+    root = scenes.active_root(context)
+    items = [item for item in root.lodgs.levels if item.exists]
+    if not level:
+        count = scenes.count_shown(context, root)[0]
+    else:
+        items = [
+            item
+            for item in items
+            if level in (-1, item.number) or (root.lodgs.cumulative and item.number < level)
+        ]
+        count = sum(len(item.object.data.points) for item in items)
+    if kind is PLY and level:
+        size = 1e6 * sum(megabytes(item.object.data) for item in items)
+    else:
+        size = kind.size(count, sh_degree(items[0].object.data)) if items else 0
+    return f"{size / 1e6:,.1f} MB" if size > 1e5 else f"{size / 1e3:,.0f} kB"
 
 
 class _AsShown(OnLevels):
@@ -52,6 +80,24 @@ class _Export(_AsShown, ExportHelper):
         return Path(bpy.path.abspath(self.filepath))
 
 
+class _Converting(BesideBlender):
+    """What exports have in common that another program may have to do with."""
+
+    written = said = ""
+
+    def told(self, work: Iterable[str]) -> Iterator[None]:
+        """Goes on with what the program does, and tells what it says."""
+        for said in work:
+            self.said = said
+            yield
+
+    def done(self, count):
+        return self.written
+
+    def status(self, context, count):
+        return f"splat-transform: {self.said}; Esc stops"
+
+
 class LODGS_OT_export_bundle(_Export, bpy.types.Operator):
     """Export all levels as one file, which other viewers open showing the finest level"""
 
@@ -71,6 +117,13 @@ class LODGS_OT_export_bundle(_Export, bpy.types.Operator):
         ],
     )
 
+    def draw(self, context):
+        self.layout.use_property_split = True
+        self.layout.prop(self, "order")
+        self.layout.prop(self, "placed")
+        self.layout.prop(self, "looked")
+        self.layout.label(text=f"All levels: {_size(context, PLY, -1)}")
+
     @report_errors
     def execute(self, context):
         root = scenes.active_root(context)
@@ -85,13 +138,21 @@ class LODGS_OT_export_bundle(_Export, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LODGS_OT_export_plain(_Export, bpy.types.Operator):
-    """Export one level, or the splats that are shown now, as a plain splat file for any viewer"""
+class LODGS_OT_export_plain(_Export, _Converting, bpy.types.Operator):
+    """Export one level, or the splats that are shown now, as a plain file of splats for other programs"""
 
     bl_idname = "lodgs.export_plain"
-    bl_label = "Export Plain PLY"
+    bl_label = "Export Splats"
     suffix = "_plain"
 
+    filter_glob: bpy.props.StringProperty(
+        default=";".join(f"*{kind.suffix}" for kind in FORMATS), options={"HIDDEN"}
+    )
+    kind: bpy.props.EnumProperty(
+        name="Format",
+        description="The kind of file; in a script the file's name says it",
+        items=[(kind.suffix, kind.label, kind.about) for kind in FORMATS],
+    )
     source: bpy.props.EnumProperty(
         name="Splats",
         description="What is exported",
@@ -107,67 +168,116 @@ class LODGS_OT_export_plain(_Export, bpy.types.Operator):
     )
     level: bpy.props.IntProperty(name="Level", description="1 is the coarsest", default=1, min=1)
 
-    def draw(self, context):
-        self.layout.use_property_split = True
-        self.layout.prop(self, "source")
-        if self.source == "LEVEL":
-            self.layout.prop(self, "level")
-        self.layout.prop(self, "placed")
-        self.layout.prop(self, "looked")
+    def check(self, context):
+        """The name follows the kind that is chosen."""
+        path = next(
+            (self.filepath[: -len(suffix)] for suffix in _SUFFIXES if self.filepath.endswith(suffix)),
+            self.filepath,
+        )
+        changed = path + self.kind != self.filepath
+        self.filepath = path + self.kind
+        return changed
 
-    @report_errors
-    def execute(self, context):
+    def draw(self, context):
+        layout = self.layout
+        layout.use_property_split = True
+        layout.prop(self, "source")
+        if self.source == "LEVEL":
+            layout.prop(self, "level")
+        layout.prop(self, "placed")
+        layout.prop(self, "looked")
+        layout.label(text="Format, and about how large:")
+        column = layout.column(align=True)
+        column.use_property_split = False
+        for kind in FORMATS:
+            size = _size(context, kind, self.level if self.source == "LEVEL" else 0)
+            column.prop_enum(self, "kind", kind.suffix, text=f"{kind.label}   {size}")
+
+    def work(self, context):
         root = scenes.active_root(context)
         if self.source == "LEVEL":
             splats = scenes.read_level(root, self.level, self.placed, self.looked)
         else:
             splats = scenes.shown_splats(context, root, self.placed, self.looked)
-        write_ply(self._path(), splats, comments_of(selection.read_json(root.lodgs.meta)))
-        self.report({"INFO"}, f"{len(splats):,} splats written to {self._path()}")
-        return {"FINISHED"}
+        meta = selection.read_json(root.lodgs.meta)
+        yield from self.told(write_splats(self._path(), splats, meta))
+        self.written = f"{len(splats):,} splats written to {self._path()}"
 
 
-class LODGS_OT_export_folder(_AsShown, bpy.types.Operator):
-    """Export levels as files of their own, whole scenes each; splat-transform streams them for the web"""
+_SUFFIXES = sorted((kind.suffix for kind in FORMATS), key=len, reverse=True)
 
-    bl_idname = "lodgs.export_folder"
-    bl_label = "Export Folder of Levels"
+
+class _IntoFolder(_AsShown):
+    """What exports into a folder have in common."""
 
     directory: bpy.props.StringProperty(
-        name="Folder",
-        description="Folder that receives lod0.ply (the finest), lod1.ply, ...",
-        subtype="DIR_PATH",
+        name="Folder", description="Folder that receives the files", subtype="DIR_PATH"
     )
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
-    replace: bpy.props.BoolProperty(
-        name="Replace", description="Replace levels that are in the folder already", options={"SKIP_SAVE"}
-    )
+    kind = PLY
 
     def invoke(self, context, event):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
+    def draw(self, context):
+        self.layout.use_property_split = True
+        for name in ("placed", "looked", "replace"):
+            if name in self.bl_rna.properties:
+                self.layout.prop(self, name)
+        self.layout.label(text=f"About {_size(context, self.kind, -1)} in all")
+
+    def _folder(self) -> Path:
+        return Path(bpy.path.abspath(self.directory))
+
+    def _bundle(self, context) -> Bundle:
+        """The levels, each a scene by itself."""
+        bundle = scenes.read_levels(scenes.active_root(context), self.placed, self.looked)
+        return complete_levels(bundle) if is_tree(bundle) else bundle
+
+
+class LODGS_OT_export_folder(_IntoFolder, bpy.types.Operator):
+    """Export levels as PLYs of their own, whole scenes each: lod0.ply (the finest), lod1.ply, ..."""
+
+    bl_idname = "lodgs.export_folder"
+    bl_label = "Export Folder of Levels"
+
+    replace: bpy.props.BoolProperty(
+        name="Replace", description="Replace levels that are in the folder already", options={"SKIP_SAVE"}
+    )
+
     @report_errors
     def execute(self, context):
-        folder = Path(bpy.path.abspath(self.directory))
+        folder = self._folder()
         if not self.replace and any(folder.glob("lod*.ply")):
             raise LodgsError(f"{folder} already holds levels.", "Choose another folder, or tick Replace.")
-        root = scenes.active_root(context)
-        bundle = scenes.read_levels(root, self.placed, self.looked)
-        if is_tree(bundle):
-            bundle = complete_levels(bundle)
-        command = write_folder(folder, bundle)
-        self.report({"INFO"}, f"{len(bundle.levels)} levels written. For the web: {command}")
+        bundle = self._bundle(context)
+        write_folder(folder, bundle)
+        self.report({"INFO"}, f"{len(bundle.levels)} levels written to {folder}")
         return {"FINISHED"}
+
+
+class LODGS_OT_export_streamed(_IntoFolder, _Converting, bpy.types.Operator):
+    """Export levels for the web, where PlayCanvas and SuperSplat load them piece by piece, by distance"""
+
+    bl_idname = "lodgs.export_streamed"
+    bl_label = "Export for the Web"
+    kind = _SOG
+
+    def work(self, context):
+        bundle = self._bundle(context)
+        yield from self.told(write_streamed(self._folder(), bundle))
+        self.written = f"{len(bundle.levels)} levels written: {self._folder() / STREAMED}"
 
 
 def _menu(self, context):
     self.layout.operator(LODGS_OT_export_bundle.bl_idname, text="Splat Levels, Bundle (.ply)")
-    self.layout.operator(LODGS_OT_export_plain.bl_idname, text="Splats, Plain (.ply)")
+    self.layout.operator(LODGS_OT_export_plain.bl_idname, text="Splats, Plain (.ply, .spz, .sog, .splat)")
     self.layout.operator(LODGS_OT_export_folder.bl_idname, text="Splat Levels (folder)")
+    self.layout.operator(LODGS_OT_export_streamed.bl_idname, text="Splat Levels for the Web (folder)")
 
 
-CLASSES = (LODGS_OT_export_bundle, LODGS_OT_export_plain, LODGS_OT_export_folder)
+CLASSES = (LODGS_OT_export_bundle, LODGS_OT_export_plain, LODGS_OT_export_folder, LODGS_OT_export_streamed)
 
 
 def register() -> None:

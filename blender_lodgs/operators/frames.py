@@ -77,6 +77,16 @@ class PieceByPiece:
         return result
 
 
+class BesideBlender(PieceByPiece):
+    """Such an operator whose work is somebody else's, a thread's or a program's, to be waited for: in a
+    window Blender goes on, once a file has been chosen or dropped; a script waits."""
+
+    def execute(self, context):
+        pressed = self.options.is_invoke and not self.options.is_repeat
+        self._beside = pressed and not bpy.app.background and context.window is not None
+        return self.begin(context) if self._beside else super().execute(context)
+
+
 class FrameByFrame(PieceByPiece):
     """What an operator inherits that draws frames; ``animation`` says whether there is more than one."""
 

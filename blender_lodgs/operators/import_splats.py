@@ -7,25 +7,31 @@ from pathlib import Path
 
 import bpy
 
+from ...training.splats.formats import READABLE
 from ..data import photographs, scenes
-from .frames import PieceByPiece
+from .frames import BesideBlender
 
 
-class LODGS_OT_import_splats(PieceByPiece, bpy.types.Operator):
-    """Import a bundle of levels, or any Gaussian splat PLY as a single level"""
+class LODGS_OT_import_splats(BesideBlender, bpy.types.Operator):
+    """Import a bundle of levels, streamed levels, or any file of Gaussian splats as a single level"""
 
     bl_idname = "lodgs.import_splats"
     bl_label = "Import Splats"
     bl_options = {"REGISTER", "UNDO", "PRESET"}
 
     filepath: bpy.props.StringProperty(
-        name="File", description="Bundle or splat PLY", subtype="FILE_PATH", options={"SKIP_SAVE"}
+        name="File",
+        description="Bundle, or any file of splats: " + ", ".join(READABLE),
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
     )
     directory: bpy.props.StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE", "HIDDEN"})
     files: bpy.props.CollectionProperty(
         type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE", "HIDDEN"}
     )
-    filter_glob: bpy.props.StringProperty(default="*.ply", options={"HIDDEN"})
+    filter_glob: bpy.props.StringProperty(
+        default=";".join(f"*{ending}" for ending in READABLE), options={"HIDDEN"}
+    )
     upright: bpy.props.BoolProperty(
         name="Upright",
         description="Turn the scene so that the file's -Y, which is up in most splat files, is up in Blender",
@@ -47,11 +53,6 @@ class LODGS_OT_import_splats(PieceByPiece, bpy.types.Operator):
             return self.execute(context)
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
-
-    def execute(self, context):
-        pressed = self.options.is_invoke and not self.options.is_repeat
-        self._beside = pressed and not bpy.app.background and context.window is not None
-        return self.begin(context) if self._beside else super().execute(context)
 
     def paths(self) -> list[Path]:
         found = [Path(self.directory, file.name) for file in self.files if file.name]
@@ -88,7 +89,7 @@ class LODGS_FH_splats(bpy.types.FileHandler):
     bl_idname = "LODGS_FH_splats"
     bl_label = "Gaussian Splats (LODGS)"
     bl_import_operator = LODGS_OT_import_splats.bl_idname
-    bl_file_extensions = ".ply"
+    bl_file_extensions = ";".join(ending for ending in READABLE if ending.startswith("."))
 
     @classmethod
     def poll_drop(cls, context):
@@ -96,7 +97,7 @@ class LODGS_FH_splats(bpy.types.FileHandler):
 
 
 def _menu(self, context):
-    self.layout.operator(LODGS_OT_import_splats.bl_idname, text="Gaussian Splats (.ply)")
+    self.layout.operator(LODGS_OT_import_splats.bl_idname, text="Gaussian Splats (.ply, .spz, .sog, .splat)")
 
 
 CLASSES = (LODGS_OT_import_splats, LODGS_FH_splats)

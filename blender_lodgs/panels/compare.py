@@ -57,7 +57,7 @@ class LODGS_PT_compare(Panel):
     @classmethod
     def poll(cls, context):
         root = scenes.active_root(context)
-        return root is not None and bool(photographs.views(root))
+        return root is not None and bool(photographs.photographed(root))
 
     def draw(self, context):
         layout, root = self.layout, scenes.active_root(context)

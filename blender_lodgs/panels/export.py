@@ -13,8 +13,9 @@ class LODGS_PT_export(LevelsPanel):
     def draw(self, context):
         column = self.layout.column(align=True)
         column.operator("lodgs.export_bundle", text="Bundle, All Levels…", icon="EXPORT")
-        column.operator("lodgs.export_plain", text="Plain PLY…")
+        column.operator("lodgs.export_plain", text="Splats for Other Programs…")
         column.operator("lodgs.export_folder", text="Folder of Levels…")
+        column.operator("lodgs.export_streamed", text="Levels for the Web…")
 
 
 CLASSES = (LODGS_PT_export,)

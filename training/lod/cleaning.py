@@ -14,6 +14,7 @@ import numpy as np
 
 from ..errors import LodgsError
 from ..scenes.cameras import Camera
+from ..scenes.views import TABLES
 from ..splats.bundle import Bundle
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.ply import AT_ONCE
@@ -192,7 +193,7 @@ def without(bundle: Bundle, masks: Masks, family: Family | None = None) -> Bundl
         LodgsError: nothing is left, or the levels have tables of a rule that is not known here.
     """
     rule = find_rule(bundle.rule)
-    if bundle.rule and rule is None and bundle.tables:
+    if bundle.rule and rule is None and bundle.tables.keys() - set(TABLES):
         raise LodgsError(*unknown_rule(bundle.rule))
     changed: dict[int, dict[str, np.ndarray]] = {}
     if is_tree(bundle):

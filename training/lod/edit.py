@@ -1,26 +1,57 @@
-"""A file of splats without clutter, or in another look: ``lodgs edit``."""
+"""A file of splats without clutter, in another look, placed, in other forms: ``lodgs edit``."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from ..errors import LodgsError
-from ..splats.bundle import DrawableRows, open_bundle, read_folder, write_bundle, write_folder
+from ..splats.bundle import Bundle, DrawableRows, Level, open_bundle, read_folder, write_bundle, write_folder
 from ..splats.dialects import Warn, comments_of, silent
+from ..splats.formats import OWN, format_of, program, write_splats, write_streamed
+from ..splats.gaussians import SplatRows, Splats
+from ..splats.placing import Placement
 from ..splats.ply import write_ply
 from .cleaning import Cleaning, cleaned
 from .look import Looks, looked_levels
+from .paging import is_tree
+from .placing import placed, standing
 from .selection import known_rule
+from .tree import complete_levels
 
 
-def edit(source: Path, out: Path, cleaning: Cleaning, warn: Warn = silent, *, looks: Looks = ()) -> str:
-    """Writes what a cleaning leaves of a bundle, a folder of levels or any 3DGS PLY, as such a file.
+def edit(
+    source: Path,
+    out: Path | None,
+    cleaning: Cleaning,
+    warn: Warn = silent,
+    *,
+    looks: Looks = (),
+    placement: Placement | None = None,
+    upright: bool = False,
+    ground: bool = False,
+    points: np.ndarray | None = None,
+    plain: Sequence[Path] = (),
+    folder: Path | None = None,
+    streamed: Path | None = None,
+) -> str:
+    """Writes what a cleaning leaves of a bundle, a folder of levels or any 3DGS PLY, placed elsewhere.
 
     Of a binary PLY only some rows at a time are in memory.
 
     Args:
+        out: written in the source's form; None: not.
         warn: as for ``read_ply``.
         looks: what is made of the colours and opacities of what stays.
+        placement: where the scene is put, after it stands; crops and lengths of the cleaning are those of
+            the source.
+        upright, ground, points: see ``placing.standing``.
+        plain: files of the finest level alone, each the kind that its name asks for.
+        folder: receives a folder of levels.
+        streamed: folder that receives levels as browsers load them.
 
     Returns:
         How many splats of each level stay, as a few lines of text.
@@ -28,8 +59,13 @@ def edit(source: Path, out: Path, cleaning: Cleaning, warn: Warn = silent, *, lo
     Raises:
         LodgsError: it cannot be read or written, contradicts its rule, or nothing is left.
     """
-    if out.resolve() == source.resolve():
-        raise LodgsError(f"{out} is what is to be edited.", "Give another name with --out.")
+    for path in (out, *plain, folder, streamed):
+        if path is not None and path.resolve() == source.resolve():
+            raise LodgsError(f"{path} is what is to be edited.", "Give another name.")
+    for path in plain:
+        format_of(path)
+    if streamed is not None or any(not path.name.lower().endswith(OWN) for path in plain):
+        program()  # is missed before minutes of work
     if source.is_dir():
         bundle = read_folder(source, warn)
     else:
@@ -38,7 +74,14 @@ def edit(source: Path, out: Path, cleaning: Cleaning, warn: Warn = silent, *, lo
             level.elsewhere = DrawableRows(rows[level.number], warn)
     known_rule(bundle)
     found = looked_levels(cleaned(bundle, cleaning), looks)
-    if source.is_dir():
+    if placement is not None or upright or ground:
+        stands = standing(bundle, upright, ground, points)
+        found = placed(found, stands if placement is None else placement.after(stands))
+        if upright or ground:
+            found.meta["up_rotation"] = np.eye(3)
+    if out is None:
+        pass
+    elif source.is_dir():
         write_folder(out, found)
     elif bundle.method or bundle.rule or len(bundle.levels) > 1:
         write_bundle(out, found)
@@ -48,4 +91,47 @@ def edit(source: Path, out: Path, cleaning: Cleaning, warn: Warn = silent, *, lo
         f"level {before.number}: {len(after.rows):,} of {len(before.rows):,} splats"
         for before, after in zip(bundle.levels, found.levels, strict=True)
     ]
-    return "\n".join([*lines, f"{out}: written"])
+    finest = found.levels[-1]
+    for path in plain:
+        rows = [level.rows for level in found.upto(finest.number)]
+        finish(write_splats(path, Joined(rows), found.meta))
+    if folder is not None or streamed is not None:
+        levels = complete_levels(_in_memory(found)) if is_tree(found) else found
+        if folder is not None:
+            write_folder(folder, levels)
+        if streamed is not None:
+            finish(write_streamed(streamed, levels))
+    paths = [path for path in (out, *plain, folder, streamed) if path is not None]
+    return "\n".join([*lines, *(f"{path}: written" for path in paths)])
+
+
+def finish(work: Iterator[str]) -> None:
+    """Waits for what goes on beside."""
+    for _ in work:
+        pass
+
+
+@dataclass(frozen=True)
+class Joined:
+    """Splats of several sets, one after the other, as they are read: where levels add up, a whole scene."""
+
+    sets: Sequence[SplatRows]
+
+    def __len__(self) -> int:
+        return sum(map(len, self.sets))
+
+    def select(self, some: slice | np.ndarray, /) -> Splats:
+        """The splats of a range of all rows."""
+        assert isinstance(some, slice)
+        begin, end, _ = some.indices(len(self))
+        parts, first = [], 0
+        for rows in self.sets:
+            here = slice(max(begin - first, 0), max(min(end - first, len(rows)), 0))
+            parts.append(rows.select(here))
+            first += len(rows)
+        return Splats.concatenated(parts)
+
+
+def _in_memory(bundle: Bundle) -> Bundle:
+    levels = [Level(x.number, x.rows.select(slice(0, len(x.rows))), x.facts) for x in bundle.levels]
+    return replace(bundle, levels=levels)

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import LodgsError
+from ..scenes import views
+from ..scenes.ground import about_cameras, find_ground, level_at_zero
 from ..splats.bundle import (
     META_LENGTHS,
     NO_SPLATS,
@@ -22,7 +24,7 @@ from ..splats.bundle import (
     write_folder,
 )
 from ..splats.dialects import Warn, comments_of, meta_of, silent
-from ..splats.gaussians import Splats
+from ..splats.gaussians import SplatRows, Splats
 from ..splats.placing import PlacedRows, Placement
 from ..splats.ply import AT_ONCE, Columns, write_ply
 from .paging import BOUNDS, table_of_pages
@@ -65,10 +67,50 @@ def placed(bundle: Bundle, placement: Placement) -> Bundle:
     for name in rule.tables if rule else ():
         if name in tables:
             tables[name] = placement.columns(tables[name], lengths, places)
+    if views.VIEWS in tables:
+        tables[views.VIEWS] = views.placed(tables[views.VIEWS], placement)
     if BOUNDS[0] in tables.get(BLOCKS, {}):
         tables[BLOCKS] = table_of_pages({x.number: c for x, c in zip(bundle.levels, remade, strict=True)})
     meta = _meta(bundle.meta, placement)
     return replace(bundle, levels=levels, facts=facts(bundle.facts), tables=tables, meta=meta)
+
+
+def standing(
+    bundle: Bundle, upright: bool = False, ground: bool = False, points: np.ndarray | None = None
+) -> Placement:
+    """What stands a bundle's scene upright, z up, and where it is asked for its ground on z = 0.
+
+    Args:
+        points: (P, 3) among which the ground is looked for; None: where the finest level's opaque splats are,
+            which are read some at a time.
+
+    Raises:
+        LodgsError: no ground is found.
+    """
+    left, _, right = np.linalg.svd(bundle.upright)  # of numbers that have been rounded
+    stands = Placement(left @ right if upright or ground else np.eye(3), 1.0, np.zeros(3))
+    if not ground:
+        return stands
+    meta, places = bundle.meta, _opaque(bundle.levels[-1].rows) if points is None else points
+    center, depth = meta.get("camera_center"), meta.get("median_depth", 0)
+    if center is not None and isinstance(depth, int | float):
+        places = about_cameras(places, np.asarray(center), depth)
+    try:
+        plane = find_ground(stands.points(places), np.array([0.0, 0.0, 1.0]))
+    except LodgsError as error:
+        raise LodgsError(
+            error.what, "Name its photographs' folder with --scene, or place it by --rotate and --translate."
+        ) from error
+    return level_at_zero(*plane).after(stands)
+
+
+def _opaque(rows: SplatRows) -> np.ndarray:
+    """(P, 3) float32, where splats are that are more opaque than not."""
+    found = [np.zeros((0, 3), np.float32)]
+    for begin in range(0, len(rows), AT_ONCE):
+        some = rows.select(slice(begin, begin + AT_ONCE))
+        found.append(some.means[some.opacity_logits > 0])
+    return np.concatenate(found)
 
 
 def place_file(source: Path, out: Path, placement: Placement, warn: Warn = silent) -> int:
@@ -105,9 +147,7 @@ def upright_of(source: Path) -> Placement:
     Raises:
         LodgsError: as ``read_head`` and ``read_folder``.
     """
-    bundle = (read_folder if source.is_dir() else read_head)(source)
-    left, _, right = np.linalg.svd(bundle.upright)  # of numbers that have been rounded
-    return Placement(left @ right, 1.0, np.zeros(3))
+    return standing((read_folder if source.is_dir() else read_head)(source), upright=True)
 
 
 def _meta(meta: dict, placement: Placement) -> dict:

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ..scenes.views import TABLES
 from ..splats.bundle import MOST_LEVELS, Bundle, Level
 from ..splats.gaussians import Splats
 from .paging import streaming_order
@@ -215,5 +216,6 @@ def complete_levels(bundle: Bundle) -> Bundle:
         Level(number, splats.select((own <= size) & (above > size)), {"s_min": size})
         for number, size in enumerate(reversed(cuts), 1)
     ]
+    tables = {name: table for name, table in bundle.tables.items() if name in TABLES}
     controls = {"gamma": bundle.controls.get("pixels", RULE.controls[0].default), "first": 1}
-    return replace(bundle, levels=levels, rule=BANDS.name, controls=controls, tables={})
+    return replace(bundle, levels=levels, rule=BANDS.name, controls=controls, tables=tables)

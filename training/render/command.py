@@ -14,7 +14,8 @@ from ..runs.folder import RunFolder
 from ..runs.job import Job
 from ..scenes.cameras import Camera
 from ..scenes.colmap import read_scene
-from ..splats.bundle import Bundle, read_folder, read_head
+from ..scenes.views import views_in
+from ..splats.bundle import Bundle, read_folder, read_head, read_tables
 from ..splats.dialects import Warn, silent
 from .picture import read_depth, write_picture
 from .scene import Instance, draw
@@ -63,7 +64,7 @@ class Source:
 
         Args:
             name: the photograph's name, or its unmistakable end.
-            scene: folder of the COLMAP scene; None: the run's.
+            scene: folder of the COLMAP scene; None: the run's, or what the bundle says.
 
         Raises:
             LodgsError: there is no such photograph, or no scene.
@@ -75,6 +76,9 @@ class Source:
             data = training_data(Job.from_file(self.run.job), self.run, pixels=False)
             there, near = data.scene.cameras, data.near
         else:
+            tables = self.levels.tables if isinstance(self.levels, Bundle) else read_tables(self.levels)
+            there, near, _ = views_in(tables)
+        if not there:
             raise LodgsError(
                 "This file does not know the photographs that it was trained from.",
                 "Name their folder with --scene, or give a --camera.",

@@ -36,10 +36,11 @@ from ..rasterize import Gaussians, contributions, cuda, device_of, resolve, warm
 from ..rasterize.resident import Resident
 from ..scenes.orientation import up_rotation
 from ..scenes.regions import Region
+from ..scenes.views import tables_of
 from ..splats.bundle import NO_SPLATS, Bundle, Level, open_ply, read_bundle, write_bundle
 from ..splats.dialects import comments_of
 from ..splats.gaussians import SplatRows, Splats
-from ..splats.ply import AT_ONCE, read_ply, write_ply
+from ..splats.ply import AT_ONCE, Columns, read_ply, write_ply
 from .base import open_base
 from .blocks.plan import write_plan
 from .blocks.train import BlocksStopped, train_blocks
@@ -280,7 +281,9 @@ class _Run:
         meta = {**self.method.meta(), "up_rotation": up, "seed": self.job.seed}
         if self.job.test_every:
             meta["held_out"] = [self.job.test_every // 2 if self.job.validation else 0, self.job.test_every]
-        bundle = replace(self._without_splats(), levels=levels, meta=meta, tables=self.method.tables())
+        bundle = replace(
+            self._without_splats(), levels=levels, meta=meta, tables=self.method.tables() | self._views()
+        )
         if arrays := self.method.arrays():
             with atomic_write(self.folder.model) as temporary, open(temporary, "wb") as file:
                 np.savez(file, **arrays)
@@ -293,6 +296,12 @@ class _Run:
                 self._warn(message)
         write_bundle(self.folder.bundle, bundle)
         return bundle
+
+    def _views(self) -> dict[str, Columns]:
+        """Where the scene was photographed from, as tables."""
+        cameras = self.data.whole.cameras
+        unseen = {camera.name for camera in cameras} - {camera.name for camera in self.data.whole_train}
+        return tables_of(cameras, self.data.near, unseen)
 
     def _written(self, record: dict) -> Level:
         """A level as it was written; large ones stay in their file."""

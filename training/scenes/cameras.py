@@ -164,6 +164,13 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray | tuple[float, f
 T = TypeVar("T")
 
 
+def extent_of(cameras: Sequence[Camera]) -> float:
+    """1.1 x the largest distance of a camera from the cameras' mean, as 3DGS has it; 0 where all stand in one
+    place."""
+    centers = np.array([camera.center for camera in cameras])
+    return 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+
+
 def evenly(cameras: Sequence[T], most: int) -> list[T]:
     """At most so many of the cameras (or of anything), evenly chosen, the first and the last among them."""
     chosen = np.linspace(0, len(cameras) - 1, min(most, len(cameras)))

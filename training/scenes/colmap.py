@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LodgsError, printable
-from .cameras import FARTHEST, Camera, evenly
+from .cameras import FARTHEST, Camera, evenly, extent_of
 from .images import image_size
 from .model import (
     DAMAGED,
@@ -92,9 +92,7 @@ class Scene:
 
         Where all cameras stand in one place, that is nothing to measure by: then the median depth.
         """
-        centers = np.array([camera.center for camera in self.cameras])
-        radius = float(np.linalg.norm(centers - self.center, axis=1).max())
-        return 1.1 * radius if radius > 0 else self.median_depth()
+        return extent_of(self.cameras) or self.median_depth()
 
     def median_depth(self) -> float:
         """The median over the cameras of the median depth of the points that each sees, in COLMAP units.

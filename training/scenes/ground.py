@@ -19,6 +19,9 @@ THICK = 0.005
 """A plane has the places that are no farther from it than this share of the scene's size..."""
 BELOW = 2.0
 """... and each place that is farther below it counts against so many of these."""
+NEAR, FEW = 1.5, 100
+"""How far from the cameras a ground is looked for, in the depths that they mostly see, if so many places are
+there."""
 FEWEST = 0.02
 """A ground has at least this share of the places."""
 
@@ -100,6 +103,17 @@ def find_ground(places: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndar
     raise LodgsError(
         "No plane lies under this scene.", "Select points of its ground in Edit Mode, or empties on it."
     )
+
+
+def about_cameras(places: np.ndarray, center: np.ndarray, depth: float) -> np.ndarray:
+    """Those of places (P, 3) among which a ground is looked for: land rises farther away.
+
+    Args:
+        center: (3,) the middle of the cameras.
+        depth: how deep they mostly look; 0: not known, and all count.
+    """
+    near = places[np.linalg.norm(places - center, axis=1) < NEAR * depth]
+    return near if len(near) > FEW else places
 
 
 def level_at_zero(normal: np.ndarray, middle: np.ndarray) -> Placement:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import shlex
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
@@ -390,7 +389,7 @@ def read_tables(path: str | Path) -> dict[str, Columns]:
         raise _contradiction(path, error) from error
 
 
-def write_folder(folder: str | Path, bundle: Bundle) -> str:
+def write_folder(folder: str | Path, bundle: Bundle) -> None:
     """Write every level as a complete plain PLY, ``lod0.ply`` the finest, and ``manifest.json``.
 
     All files have the same columns, as splat-transform wants it: extras that not every level has are left
@@ -398,24 +397,20 @@ def write_folder(folder: str | Path, bundle: Bundle) -> str:
     moved into place last. Then what an earlier export has left that this one has no place for (``lodN.ply``,
     ``tables.ply``) is removed, and nothing else.
 
-    Returns:
-        The command line that makes streamed LOD for the web of the folder with splat-transform.
-
     Raises:
         LodgsError: as `write_bundle`.
     """
     _check(bundle)
     folder = Path(folder)
-    first = columns_of_extras(bundle.levels[0].splats)
+    first, *others = [columns_of_extras(level.rows.select(slice(0, 0))) for level in bundle.levels]
     shared = {
         name
         for name, column in first.items()
-        if all(name in x.splats.extras and x.splats.extras[name].dtype == column.dtype for x in bundle.levels)
+        if all(name in other and other[name].dtype == column.dtype for other in others)
     }
     manifest = _head(bundle) | {"levels": [], "meta": bundle.meta}
     if bundle.tables:
         manifest["tables"] = _table_lines(bundle)
-    command = ["splat-transform"]
     with ExitStack() as stack:
         manifest_file = stack.enter_context(atomic_write(folder / "manifest.json"))
         for lod, level in enumerate(reversed(bundle.levels)):
@@ -424,7 +419,7 @@ def write_folder(folder: str | Path, bundle: Bundle) -> str:
             drawn = bundle.upto(level.number)
             element = Element.of_splats(
                 "vertex",
-                [x.splats for x in drawn],
+                [x.rows for x in drawn],
                 lambda some: columns_of(some) | {name: some.extras[name] for name in sorted(shared)},
             )
             write_elements(temporary, [element], comments_of(bundle.meta))
@@ -440,7 +435,6 @@ def write_folder(folder: str | Path, bundle: Bundle) -> str:
                 }
                 | {"bounds": bounds_of([x.rows for x in drawn])}
             )
-            command += [str(path), "-l", str(lod)]
         if bundle.tables:
             temporary = stack.enter_context(atomic_write(folder / TABLES_FILE))
             no_splats = Element.of("vertex", columns_of(NO_SPLATS))
@@ -456,7 +450,6 @@ def write_folder(folder: str | Path, bundle: Bundle) -> str:
     for file in unused if bundle.tables else [*unused, folder / TABLES_FILE]:
         with suppress(OSError):  # the manifest does not name it
             file.unlink()
-    return shlex.join([*command, str(folder / "web" / "lod-meta.json")])
 
 
 def read_folder(folder: str | Path, warn: Warn = silent) -> Bundle:

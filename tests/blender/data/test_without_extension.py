@@ -22,6 +22,7 @@ for obj in bpy.data.objects:
         cloud.attributes["radius"].data.foreach_get("value", radii)
         seen[obj.name] = [len(radii), float(radii.min()), obj.hide_render]
 assert not hasattr(bpy.types.Object, "lodgs")
+seen["told"] = bpy.data.texts["About these splats"].as_string()
 sys.stdout.write("\\nSEEN" + json.dumps(seen))
 sys.stdout.flush()
 import os
@@ -42,6 +43,7 @@ def test_the_finest_level_is_there_as_points(bpy, lodgs, tmp_path, cumulative):
     command = [sys.executable, "-c", LOOK, str(tmp_path / "b.blend")]
     out = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout
     seen = json.loads(out.rpartition("SEEN")[2])
+    assert "extension LODGS" in seen.pop("told")
     shown = COUNTS if cumulative else {3: COUNTS[3]}
     assert {name: found[0] for name, found in seen.items()} == {
         f"b level {number}": count for number, count in shown.items()

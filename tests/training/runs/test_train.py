@@ -24,6 +24,7 @@ from training.runs.folder import RunFolder
 from training.runs.job import Job
 from training.scenes.colmap import read_scene
 from training.scenes.orientation import up_rotation
+from training.scenes.views import views_in
 from training.splats.bundle import NO_SPLATS, read_bundle
 from training.splats.ply import read_ply
 from training.splats.scratch import Scratch
@@ -137,6 +138,16 @@ def test_levels_and_bundle_agree_and_record_the_constraint(unbroken):
         assert bundle.cumulative and bundle.rule == "octree"
         d_max, focal_px = bundle.facts["d_max"], bundle.facts["d_max_focal"]
         assert bundle.meta["voxel"] * focal_px / d_max == pytest.approx(6.0)
+
+
+def test_the_bundle_tells_where_the_scene_was_photographed_from(unbroken):
+    cameras, near, unseen = views_in(read_bundle(RunFolder(unbroken["keys"]["out"]).bundle).tables)
+    scene = read_scene(Path(unbroken["keys"]["scene"]))
+    assert [camera.name for camera in cameras] == [camera.name for camera in scene.cameras]
+    for camera, view in zip(cameras, scene.cameras, strict=True):
+        assert np.array_equal(camera.world_to_camera, view.world_to_camera)
+        assert (camera.fx, camera.cy, camera.width) == (view.fx, view.cy, view.width)
+    assert near == scene.near() and unseen == {view.name for view in scene.split(4)[1]}
 
 
 def test_training_makes_the_pictures_better(unbroken):

@@ -1,0 +1,75 @@
+"""Other kinds of files out of Blender and in again, through the operators."""
+
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.blender.fake_trainer import splats
+from training.splats.bundle import Bundle, Level, write_bundle
+from training.splats.formats import PROGRAM
+
+HERE = Path(__file__).parents[3] / "build" / "interop" / "node_modules" / ".bin"
+
+
+@pytest.fixture
+def root(bpy, lodgs, tmp_path):
+    levels = [Level(number, splats(40 * number), {"s_min": 0.1 * (2 - number)}) for number in (1, 2)]
+    write_bundle(tmp_path / "in.ply", Bundle("made", levels, "bands"))
+    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "in.ply")
+    bpy.context.view_layer.update()
+    return root
+
+
+@pytest.fixture
+def theirs(monkeypatch):
+    monkeypatch.setenv("PATH", f"{HERE}{os.pathsep}{os.environ['PATH']}")
+    if not shutil.which(PROGRAM):
+        pytest.skip("splat-transform is not installed; make interop installs it, where Node.js is")
+
+
+def means(obj):
+    found = np.empty((len(obj.data.points), 3), np.float32)
+    obj.data.attributes["position"].data.foreach_get("vector", found.reshape(-1))
+    return found[np.lexsort(found.round(2).T)]
+
+
+def back(bpy, lodgs, path):
+    root = lodgs("data.scenes").import_splats(bpy.context, path)
+    return [item.object for item in root.lodgs.levels]
+
+
+@pytest.mark.parametrize("ending", [".splat", ".spz", ".compressed.ply"])
+def test_a_level_goes_out_and_comes_back(bpy, lodgs, root, tmp_path, request, ending):
+    if ending != ".splat":
+        request.getfixturevalue("theirs")
+    path = tmp_path / f"out{ending}"
+    done = bpy.ops.lodgs.export_plain(filepath=str(path), source="LEVEL", level=1)
+    assert done == {"FINISHED"} and path.exists()
+    (obj,) = back(bpy, lodgs, path)
+    np.testing.assert_allclose(means(obj), means(root.lodgs.levels[0].object), atol=0.01)
+    assert obj.name.startswith("out level 1")
+
+
+def test_streamed_levels_go_out_and_come_back(bpy, lodgs, root, tmp_path, theirs):
+    assert bpy.ops.lodgs.export_streamed(directory=str(tmp_path / "web")) == {"FINISHED"}
+    for path in (tmp_path / "web", tmp_path / "web" / "lod-meta.json"):
+        objects = back(bpy, lodgs, path)
+        for obj, item in zip(objects, root.lodgs.levels, strict=True):
+            np.testing.assert_allclose(means(obj), means(item.object), atol=0.01)
+
+
+def test_without_the_program_a_sentence_says_what_to_install(bpy, lodgs, root, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(lodgs("training.splats.formats"), "_FOLDERS", ())
+    for export in (
+        lambda: bpy.ops.lodgs.export_streamed(directory=str(tmp_path / "web")),
+        lambda: bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "a.spz"), source="LEVEL", level=1),
+        lambda: bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "b.spz")),
+    ):
+        (tmp_path / "b.spz").touch()
+        with pytest.raises(RuntimeError, match="npm install --global"):
+            export()
+    assert {path.name for path in tmp_path.iterdir()} == {"in.ply", "b.spz"}

@@ -1,0 +1,94 @@
+"""Views as tables of a bundle: they come back, and go along where the scene is placed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from training.errors import LodgsError
+from training.lod.cleaning import Cleaning, cleaned
+from training.lod.crop import Crop
+from training.lod.placing import placed
+from training.scenes.cameras import Camera, look_at
+from training.scenes.views import NAMES, VIEWS, tables_of, views_in
+from training.splats.bundle import Bundle, Level, read_bundle, read_folder, write_bundle, write_folder
+from training.splats.gaussians import Splats
+from training.splats.placing import Placement
+
+POSE = [f"w2c_{row}{column}" for row in range(3) for column in range(4)]
+
+
+def cameras(count=3):
+    rng = np.random.default_rng(0)
+    return [
+        Camera(
+            f"a/{number} é.jpg", 640, 480 + number, 500.5, 501.25, 320.5, 240.25,
+            look_at(rng.normal(size=3) * 4, rng.normal(size=3), (0, -1, 0.1)),
+        )
+        for number in range(count)
+    ]  # fmt: skip
+
+
+def bundle_of(views, count=50):
+    rng = np.random.default_rng(1)
+    splats = Splats(
+        rng.normal(size=(count, 3)).astype(np.float32), rng.normal(size=(count, 4)).astype(np.float32),
+        rng.normal(size=(count, 3)).astype(np.float32) - 3, rng.normal(size=count).astype(np.float32),
+        rng.normal(size=(count, 16, 3)).astype(np.float32),
+    )  # fmt: skip
+    levels = [Level(number, splats.select(slice(0, 10 * number))) for number in range(1, 6)]
+    return Bundle("3dgs", levels, tables=tables_of(views, 0.25, {views[1].name}))
+
+
+def check(found, views, near=0.25):
+    cameras, depth, held_out = views_in(found.tables)
+    assert depth == near and held_out == {views[1].name}
+    for camera, view in zip(cameras, views, strict=True):
+        assert replace(camera, world_to_camera=None) == replace(view, world_to_camera=None)
+        assert np.array_equal(camera.world_to_camera, view.world_to_camera)
+
+
+@pytest.mark.parametrize("count", [3, 400])
+def test_views_come_back_to_the_bit_and_the_header_stays_small(tmp_path, count):
+    views = cameras(count)
+    write_bundle(tmp_path / "b.ply", bundle_of(views))
+    check(read_bundle(tmp_path / "b.ply"), views)
+    assert (tmp_path / "b.ply").read_bytes().index(b"end_header\n") < 10 * 1024
+    write_folder(tmp_path / "f", bundle_of(views))
+    check(read_folder(tmp_path / "f"), views)
+
+
+def test_views_of_a_placed_scene_see_the_same():
+    views, rng = cameras(), np.random.default_rng(2)
+    placement = Placement.composed((20, 40, 60), 2.5, (1, -2, 3))
+    there, near, _ = views_in(placed(bundle_of(views), placement).tables)
+    assert near == 0.625
+    points = rng.normal(size=(20, 3))
+    for before, after in zip(views, there, strict=True):
+        pixels, depths = before.project(points)
+        assert np.allclose(after.project(placement.points(points))[0], pixels, atol=1e-8)
+        assert np.allclose(after.project(placement.points(points))[1], 2.5 * depths)
+
+
+def test_cleaning_leaves_views_alone_whatever_the_rule():
+    bundle = replace(bundle_of(cameras()), rule="of a newer version")
+    left = cleaned(bundle, Cleaning((Crop.sphere((0, 0, 0), 1.0, False),)))
+    check(left, cameras())
+
+
+@pytest.mark.parametrize("name", ["names", "lacks", "pose"])
+def test_damaged_views_are_one_sentence(name):
+    tables = tables_of(cameras(), 0.1)
+    if name == "names":
+        tables[NAMES] = {"utf8": tables[NAMES]["utf8"][:5]}
+    elif name == "lacks":
+        del tables[VIEWS][POSE[3]]
+    else:
+        tables[VIEWS][POSE[0]] = np.full(3, np.nan)
+    with pytest.raises(LodgsError):
+        views_in(tables)
+
+
+def test_a_bundle_of_before_has_no_views():
+    assert views_in({}) == ([], 0.0, set())
+    assert tables_of([], 0.0) == {}
