@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import LodgsError
 from ..splats.bundle import Bundle, DrawableRows, Level, open_bundle, read_folder, write_bundle, write_folder
 from ..splats.dialects import Warn, comments_of, silent
-from ..splats.formats import OWN, format_of, program, write_splats, write_streamed
+from ..splats.formats import PLY, SPLAT, format_of, program, write_splats, write_streamed
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.placing import Placement
 from ..splats.ply import write_ply
@@ -62,9 +62,8 @@ def edit(
     for path in (out, *plain, folder, streamed):
         if path is not None and path.resolve() == source.resolve():
             raise LodgsError(f"{path} is what is to be edited.", "Give another name.")
-    for path in plain:
-        format_of(path)
-    if streamed is not None or any(not path.name.lower().endswith(OWN) for path in plain):
+    kinds = {format_of(path) for path in plain}
+    if streamed is not None or not kinds <= {PLY, SPLAT}:
         program()  # is missed before minutes of work
     if source.is_dir():
         bundle = read_folder(source, warn)

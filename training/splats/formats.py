@@ -97,8 +97,6 @@ FORMATS = (
     ),
     SPLAT,
 )  # fmt: skip
-OWN = (PLY.suffix, SPLAT.suffix)
-"""What is read and written without another program; but not a compressed PLY."""
 READABLE = (".ply", ".spz", ".sog", ".splat", ".ksplat", STREAMED)
 """How the names of files end that are opened; those of :data:`STREAMED` are its whole name."""
 
