@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -148,11 +149,13 @@ class TrainingData:
     @cached_property
     def transparent(self) -> bool:
         """Whether photographs have alpha that counts: one of TRIED training views is not opaque."""
-        return any(
-            load_image(camera.image, camera.width, camera.height, alpha=True)[..., 3].min() < OPAQUE
-            for camera in evenly(self.train, TRIED)
-            if camera.image is not None
-        )
+        for camera in evenly(self.train, TRIED):
+            if camera.image is not None:
+                with suppress(LodgsError):  # which the step that needs it tells
+                    pixels = load_image(camera.image, camera.width, camera.height, alpha=True)
+                    if pixels[..., 3].min() < OPAQUE:
+                        return True
+        return False
 
     def training_view(self, step: int, seed: int) -> int:
         """The index of the view to train at a step: every epoch is a new shuffle, from (seed, epoch)."""
