@@ -5,10 +5,11 @@ import time
 import numpy as np
 import pytest
 
-from tests.training.scenes import synthetic
-from tests.training.scenes.test_reconstruct import EYES, photograph
+from tests.training.scenes.walls import EYES, photograph
+from training.scenes.cameras import look_at
 from training.scenes.colmap import read_scene
 from training.scenes.images import write_png
+from training.scenes.model import intrinsics, write_model
 from training.scenes.undistort import already_undistorted
 
 
@@ -64,7 +65,16 @@ def test_what_is_no_scene_is_a_sentence(bpy, lodgs, tmp_path):
 @pytest.fixture
 def bent(tmp_path):
     """A scene whose lens distorts."""
-    synthetic.write_scene(tmp_path / "bent", synthetic.camera("OPENCV"))
+    names, random = ("a.png", "b.png", "c.png"), np.random.default_rng(0)
+    lens = intrinsics("OPENCV", 320, 240, np.array([260.0, 262.0, 158.0, 121.0, 0.1, -0.02, 0.005, -0.004]))
+    poses = [look_at(eye, np.array([0.0, 0.6, 0.4]), (0, 0, 1)) for eye in EYES]
+    (tmp_path / "bent" / "images").mkdir(parents=True)
+    for name, eye in zip(names, EYES, strict=False):
+        write_png(tmp_path / "bent" / "images" / name, photograph(eye))
+    write_model(
+        tmp_path / "bent" / "sparse" / "0", [lens] * 3, list(zip(names, poses, strict=False)),
+        random.normal(size=(50, 3)), np.full((50, 3), 99, np.uint8),
+    )  # fmt: skip
     return tmp_path / "bent"
 
 
