@@ -71,6 +71,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     from .runs.options import add_options, size_of
+    from .scenes.reconstruct import LENSES, PRESETS
     from .splats.formats import FORMATS
 
     parser = argparse.ArgumentParser(prog=PROGRAM, description="Gaussian splats with levels of detail.")
@@ -189,14 +190,14 @@ def _parser() -> argparse.ArgumentParser:
         help="folder that becomes the scene; of an export otherwise the folder itself",
     )  # fmt: skip
     scene.add_argument(
-        "--preset", choices=("draft", "standard"), default="draft",
+        "--preset", choices=list(PRESETS), default="draft",
         help="features of photographs 1000 pixels wide (default), or twice as many, of 1600 pixels",
     )  # fmt: skip
     scene.add_argument(
         "--ordered", action="store_true", help="names follow the way that was walked: compares neighbours"
     )
     scene.add_argument(
-        "--lens", choices=("one", "folder", "each"), default="",
+        "--lens", choices=LENSES, default="",
         help="which photographs one lens took: all, those of a folder, or each its own (otherwise one, if "
         "all are of one size)",
     )  # fmt: skip

@@ -53,9 +53,7 @@ def selection() -> Version:
 
 @bpy.app.handlers.persistent
 def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    if (
-        _selecting or depsgraph.mode == "RENDER"
-    ):  # a render's first evaluation: everything counts as new there
+    if _selecting or depsgraph.mode == "RENDER":  # in a render's first evaluation everything counts as new
         return
     _reported.update(
         update.id.original.session_uid for update in depsgraph.updates if update.is_updated_geometry

@@ -78,10 +78,8 @@ def show_undistorted(
             continue
         _fit(view.data, camera, distorted=False)
         for picture in view.data.background_images:
-            before, picture.image = (
-                picture.image,
-                bpy.data.images.load(str(camera.image), check_existing=True),
-            )
+            before = picture.image
+            picture.image = bpy.data.images.load(str(camera.image), check_existing=True)
             if before is not None and not before.users:
                 bpy.data.images.remove(before)
         if context.scene.camera == view:

@@ -97,7 +97,7 @@ class LODGS_OT_cancel_find_cameras(bpy.types.Operator):
 
 
 def _menu(self, context):
-    self.layout.operator(LODGS_OT_find_cameras.bl_idname, text="Photographs (folder)")
+    self.layout.operator(LODGS_OT_find_cameras.bl_idname, text="Photographs (folder) or Video")
 
 
 CLASSES = (LODGS_OT_find_cameras, LODGS_OT_cancel_find_cameras)

@@ -120,9 +120,7 @@ class Evaluation:
         self,
         cameras: Sequence[Camera],
         shown_to: ShownTo,
-        measure: Callable[
-            [torch.Tensor, torch.Tensor, torch.Tensor | None], float | tuple[float, ...]
-        ] = psnr,
+        measure: Measure = psnr,
     ) -> np.ndarray:
         """The PSNR of each of some views with a photograph, in dB, (V,); or what else ``measure`` finds."""
         found = []

@@ -17,6 +17,7 @@ import numpy as np
 
 from ..documents import open_file
 from ..errors import LodgsError, printable
+from ..splats.placing import Placement
 
 DAMAGED = "Copy the model again, or write it anew with COLMAP's model_converter."
 
@@ -245,7 +246,7 @@ def write_model(
             struct.pack("<iQQ", model_id, lens.width, lens.height) + lens.parameters.astype("<f8").tobytes()
         )
         number = numbers.setdefault(camera, len(numbers) + 1)
-        values = *_quaternion(pose[:3, :3]), *pose[:3, 3]
+        values = *Placement(pose[:3, :3], 1.0, pose[:3, 3]).quat, *pose[:3, 3]
         text = name.encode("utf-8", "surrogateescape")
         images.append(struct.pack("<i7di", place, *values, number) + text + b"\0" + struct.pack("<Q", 0))
     cameras = [struct.pack("<i", number) + camera for camera, number in numbers.items()]
@@ -257,18 +258,6 @@ def write_model(
         ("points3D.bin", len(rows), [rows.tobytes()]),
     ):
         (model / file).write_bytes(struct.pack("<Q", count) + b"".join(parts))
-
-
-def _quaternion(rotation: np.ndarray) -> np.ndarray:
-    """w, x, y, z of a rotation (3, 3): the eigenvector that does not suffer from a small w (Bar-Itzhack)."""
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = rotation.ravel()
-    matrix = np.array([
-        [xx + yy + zz, zy - yz, xz - zx, yx - xy],
-        [zy - yz, xx - yy - zz, xy + yx, xz + zx],
-        [xz - zx, xy + yx, yy - xx - zz, yz + zy],
-        [yx - xy, xz + zx, yz + zy, zz - xx - yy],
-    ])  # fmt: skip
-    return np.linalg.eigh(matrix)[1][:, -1]
 
 
 def _images_bin(data: bytes) -> list[Pose]:
@@ -339,17 +328,21 @@ def _pose(name: bytes, camera_id: int, pose: list[float]) -> Pose:
     text = name.decode("utf-8", "surrogateescape")
     if not (np.isfinite(pose).all() and quaternion.any()):
         raise ValueError(f"image {printable(text)} has no pose")
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, :3], world_to_camera[:3, 3] = rotation_of(quaternion), translation
+    return Pose(text, camera_id, world_to_camera)
+
+
+def rotation_of(quaternion: np.ndarray) -> np.ndarray:
+    """(3, 3) of a quaternion wxyz (4,) of any length above 0."""
     # by a power of two, which rounds nothing, so that no square overflows
     quaternion = np.ldexp(quaternion, -np.frexp(np.abs(quaternion).max())[1])
     w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    world_to_camera = np.eye(4)
-    world_to_camera[:3, :3] = [
+    return np.array([
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    world_to_camera[:3, 3] = translation
-    return Pose(text, camera_id, world_to_camera)
+    ])  # fmt: skip
 
 
 # A record of points3D.bin, packed; `track` pairs of 4-byte integers follow it.

@@ -32,6 +32,8 @@ PRESETS = {"draft": (1000, 2048), "standard": (1600, 4096)}
 """Pixels of the longer side in which features are looked for, and at most so many of a photograph."""
 LENSES = "one", "folder", "each"
 """One lens took all photographs, all of a folder, or each its own."""
+SETTINGS = "settings.json"
+"""What marks the folder of what COLMAP knows as ours, and says how it was found."""
 FEWEST = 3
 """Photographs that make a scene."""
 STAGES = {
@@ -99,6 +101,7 @@ def reconstruct(
         LodgsError: there are too few photographs, too few overlap, or something could not be written.
     """
     photos, out = Path(os.path.abspath(photos)), Path(os.path.abspath(out))
+    masks = None if masks is None else Path(os.path.abspath(masks))
     names, left_out, sizes = _photographs(photos, masks)
     if len(names) < FEWEST:
         raise LodgsError(
@@ -107,8 +110,13 @@ def reconstruct(
             "Choose the folder of the photographs.",
         )
     work = out / "colmap"
-    if not work.is_dir() and out.is_dir() and find_models(out):
-        raise LodgsError(f"{out} holds a COLMAP scene already.", "Choose another folder.")
+    if not (work / SETTINGS).is_file():  # what is there is somebody's
+        if out.is_dir() and find_models(out):
+            raise LodgsError(f"{out} holds a COLMAP scene already.", "Choose another folder.")
+        if work.exists():
+            raise LodgsError(
+                f"{out} holds a folder {work.name} of somebody else's.", "Choose another folder."
+            )
     size, features = PRESETS[preset]
     settings = {
         "size": size, "features": features,
@@ -257,8 +265,8 @@ def _taken_over(photos: Path, name: str, images: Path) -> str:
 
 def _begin(work: Path, settings: Mapping[str, object]) -> None:
     """What was found with other settings is of no use."""
-    file, text = work / "settings.json", json.dumps(settings)
-    if work.is_dir() and (not file.is_file() or file.read_text(encoding="utf-8") != text):
+    file, text = work / SETTINGS, json.dumps(settings)
+    if file.is_file() and file.read_text(encoding="utf-8") != text:
         shutil.rmtree(work)
     work.mkdir(parents=True, exist_ok=True)
     with atomic_write(file) as temporary:

@@ -170,7 +170,6 @@ def _report(database: Path, best: pycolmap.Reconstruction | None) -> None:
     say(
         result={
             "features": features, "pairs": common, "placed": sorted(placed),
-            "lenses": 0 if best is None else best.num_cameras(),
             "points": 0 if best is None else best.num_points3D(),
             "error": 0.0 if best is None else best.compute_mean_reprojection_error(),
         }

@@ -148,6 +148,12 @@ def test_what_cannot_be(photos, tmp_path):
         (scene / "sparse" / "0" / name).write_text("")
     with pytest.raises(LodgsError, match="holds a COLMAP scene already"):
         reconstruct(photos, scene)
+    theirs = tmp_path / "theirs" / "colmap" / "database.db"
+    theirs.parent.mkdir(parents=True)
+    theirs.write_bytes(b"days of work")
+    with pytest.raises(LodgsError, match="holds a folder colmap of somebody else's"):
+        reconstruct(photos, tmp_path / "theirs")
+    assert theirs.read_bytes() == b"days of work"
     with pytest.raises(LodgsError, match="holds no mask"):
         reconstruct(photos, tmp_path / "masked", masks=tmp_path / "few")
     assert main(["scene", "--photos", str(photos)]) == 2

@@ -11,6 +11,7 @@ import numpy as np
 
 from ...errors import LodgsError
 from ..images import SUFFIXES
+from ..model import rotation_of
 from .views import Exported, View, lens_of, number, numbers, read_document, world_to_camera
 
 NAME = "Record3D"
@@ -50,11 +51,11 @@ def read(path: Path) -> Exported:
 
 
 def _matrix(pose: np.ndarray) -> np.ndarray:
-    """(3, 4) of qx, qy, qz, qw and a place."""
-    x, y, z, w = pose[:4] / max(float(np.linalg.norm(pose[:4])), 1e-30)
-    rotation = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.column_stack([rotation, pose[4:]])
+    """(3, 4) of qx, qy, qz, qw and a place.
+
+    Raises:
+        LodgsError: it is no rotation.
+    """
+    if not pose[:4].any():
+        raise LodgsError("its pose is no rotation and translation.")
+    return np.column_stack([rotation_of(pose[[3, 0, 1, 2]]), pose[4:]])
