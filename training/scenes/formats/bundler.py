@@ -6,6 +6,7 @@ Facts: the manual of Bundler v0.4 (https://www.cs.cornell.edu/~snavely/bundler/)
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -40,13 +41,13 @@ def read(path: Path) -> Exported:
     try:
         with open_file(path) as file:
             data = file.read(MOST_BYTES + 1)
-        head, _, rest = data.partition(b"\n")
+        head, *lines = filter(None, map(bytes.strip, data.split(b"\n")))
         if not head.startswith(b"# Bundle file v0.3") or len(data) > MOST_BYTES:
             raise ValueError("it is not of version 0.3, or too large")
-        values = np.array(rest.split(), np.float64)
-        count, points = int(values[0]), int(values[1])
-        cameras = values[2 : 2 + 15 * count].reshape(count, 15)
-        places = _records(values[2 + 15 * count :], points)
+        count, points = map(int, lines[0].split())
+        cameras = _numbers(lines[1 : 1 + 5 * count], (count, 15))
+        # of each point three lines: its place, its colour, and the views that see it
+        places, colors = (_numbers(lines[1 + 5 * count + n :: 3], (points, 3)) for n in range(2))
     except (ValueError, IndexError, OverflowError) as error:
         raise LodgsError(f"{path} is damaged or cut short ({error}).", "Export it again.") from error
     if len(names) < count:
@@ -64,18 +65,15 @@ def read(path: Path) -> Exported:
             views.append(View(image, lens, world_to_camera(np.linalg.inv(OPENGL @ matrix))))
         except (LodgsError, ValueError, np.linalg.LinAlgError) as error:
             left_out.append((name, error.what if isinstance(error, LodgsError) else f"{error}."))
-    return Exported(views, places[:, :3], places[:, 3:].clip(0, 255).astype(np.uint8), left_out)
+    return Exported(views, places, colors.clip(0, 255).astype(np.uint8), left_out)
 
 
-def _records(values: np.ndarray, count: int) -> np.ndarray:
-    """(count, 6) places and colours; behind each are the length of a list of views, and four numbers each."""
-    rows, at = np.empty((count, 6)), 0
-    for row in rows:  # each tells where the next begins
-        row[:] = values[at : at + 6]
-        at += 7 + 4 * int(values[at + 6])
-    if at > len(values):
-        raise ValueError("it ends within a point")
-    return rows
+def _numbers(lines: Sequence[bytes], shape: tuple[int, int]) -> np.ndarray:
+    """The finite numbers of some lines, as an array."""
+    found = np.array(b" ".join(lines).split(), np.float64).reshape(shape)
+    if not np.isfinite(found).all():
+        raise ValueError("it has something that is no number")
+    return found
 
 
 def _list_of(path: Path) -> Path | None:
