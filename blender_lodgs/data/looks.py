@@ -17,6 +17,7 @@ from mathutils import Matrix
 
 from ...training.lod.crop import Crop
 from ...training.lod.look import DAYLIGHT, NEUTRAL, RANGES, Look
+from ...training.lod.paint import COLUMNS as PAINT
 from .. import compat
 from ..nodes import ellipsoids
 from ..nodes import look as groups
@@ -132,10 +133,11 @@ def reset(root: bpy.types.Object, obj: bpy.types.Object) -> None:
 
 
 def attach(root: bpy.types.Object) -> None:
-    """Gives every level the modifier for the looks that there are, anew where there are other regions now;
-    takes it away where nobody has set any."""
+    """Gives every level the modifier for paint and the looks that there are, anew where there are other
+    regions now; takes it away where nobody has painted, nor set any."""
     regions = regions_of(root)
-    wanted = bool(regions) or is_set(root)
+    painted = any(PAINT[-1] in item.object.data.attributes for item in root.lodgs.levels if item.exists)
+    wanted = bool(regions) or is_set(root) or painted
     for item in root.lodgs.levels:
         if item.exists and wanted:
             _attach(item.object, root, regions)
