@@ -20,8 +20,8 @@ from .cleaning import cells_of, typical_gap
 
 COLUMNS = ("paint_red", "paint_green", "paint_blue", "paint_amount")
 """Of the splats: p, then a."""
-OCTAVES = 4
-"""So often the cells halve in which painted splats are looked for, see :func:`carried`."""
+CELLS = (1 / 8, 1 / 4, 1 / 2, 1, 2, 4)
+"""How long cells are in which painted splats are looked for, over ``cleaning.typical_gap``."""
 
 
 def paint_of(columns: Mapping[str, np.ndarray]) -> np.ndarray | None:
@@ -62,8 +62,8 @@ def painted(splats: Splats) -> Splats:
 def carried(paint: np.ndarray, means: np.ndarray, to: np.ndarray) -> np.ndarray:
     """(M, 4) the paint that splats at means ``to`` (M, 3) take over, by their places, from others.
 
-    It is the mean of all that are in the same cell of space: the smallest that has any, of cells as long as
-    ``cleaning.typical_gap`` and of halves, quarters, ... of that. Who is alone in the largest gets none.
+    It is the mean of all that are in the same cell of space, the smallest of CELLS that has any. Who is alone
+    in the largest gets none.
 
     Args:
         paint: (N, 4).
@@ -73,13 +73,13 @@ def carried(paint: np.ndarray, means: np.ndarray, to: np.ndarray) -> np.ndarray:
     some = paint[:, 3] > 0
     if not some.any():
         return found
-    gap = typical_gap(means)
-    low, high = means[some].min(axis=0) - gap, means[some].max(axis=0) + gap
+    lengths = typical_gap(means) * np.array(CELLS)
+    low, high = means[some].min(axis=0) - lengths[-1], means[some].max(axis=0) + lengths[-1]
     near = ((means >= low) & (means <= high)).all(axis=1)
     means, paint = means[near], paint[near]
     left = np.flatnonzero(((to >= low) & (to <= high)).all(axis=1))
-    for octave in reversed(range(OCTAVES)):
-        cell, cells = cells_of(np.concatenate([means, to[left]]), gap / 2**octave)
+    for length in lengths:
+        cell, cells = cells_of(np.concatenate([means, to[left]]), length)
         own, other = cell[: len(means)], cell[len(means) :]
         counts = np.bincount(own, minlength=len(cells))[other]
         sums = np.stack([np.bincount(own, each, len(cells))[other] for each in paint.T], axis=1)
