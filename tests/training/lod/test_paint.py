@@ -64,7 +64,7 @@ def test_others_take_paint_over_from_where_they_are():
     paint = np.zeros((len(means), 4), np.float32)
     paint = over(paint, (means[:, 0] > 0).astype(np.float32), RED)
     paint = over(paint, 0.5 * patch.astype(np.float32), BLUE)
-    to = np.concatenate([rng.uniform(-5, 5, (3000, 3)), rng.uniform(50, 60, (100, 3))]).astype(np.float32)
+    to = np.concatenate([rng.uniform(-4, 4, (3000, 3)), rng.uniform(50, 60, (100, 3))]).astype(np.float32)
     found, clear = carried(paint, means, to), 1.2  # as long as the largest cells are
     away, far = np.linalg.norm(to - (-3, 0, 0), axis=1), to[:, 0] > 20
     in_half, in_patch = (to[:, 0] > clear) & ~far, away < 2.5 - clear
