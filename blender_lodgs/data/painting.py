@@ -24,6 +24,9 @@ from .cleaning import levels, view_of
 
 Color = tuple[float, float, float]
 
+_in_stroke: dict[int, np.ndarray] = {}
+"""How a stroke that is not over would have painted point clouds, by ``session_uid``."""
+
 
 def paint_of(cloud: bpy.types.PointCloud, rows: slice | np.ndarray = slice(None)) -> np.ndarray | None:
     """(N, 4) the paint of a cloud's splats, or of some rows of them; None where it has none."""
@@ -70,10 +73,19 @@ def over(
     return found
 
 
-def show(root: bpy.types.Object, painted: Mapping[int, np.ndarray]) -> None:
-    """Has viewports show levels painted so, while a stroke lasts; :func:`write` ends it."""
-    for item in levels(root):
-        _set(item.object.data, painted[item.number])
+def show(root: bpy.types.Object | None, painted: Mapping[int, np.ndarray]) -> None:
+    """Has viewports show levels painted so while a stroke lasts; without any level as they are."""
+    for cloud in [item.object.data for item in levels(root)] if root is not None else ():
+        changes.others_painted(cloud)
+    _in_stroke.clear()
+    for item in levels(root) if root is not None and painted else ():
+        _in_stroke[item.object.data.session_uid] = painted[item.number]
+
+
+def shown_paint(cloud: bpy.types.PointCloud, rows: slice | np.ndarray = slice(None)) -> np.ndarray | None:
+    """The paint that viewports show of a cloud, as :func:`paint_of`."""
+    found = _in_stroke.get(cloud.session_uid)
+    return paint_of(cloud, rows) if found is None or len(found) != len(cloud.points) else found[rows]
 
 
 def write(root: bpy.types.Object, painted: Mapping[int, np.ndarray]) -> int:
@@ -83,10 +95,12 @@ def write(root: bpy.types.Object, painted: Mapping[int, np.ndarray]) -> int:
     with changes.painting():
         for item in levels(root):
             cloud = item.object.data
-            _set(cloud, painted[item.number])
+            for name, column in paint.columns_of(painted[item.number]).items():
+                write_attribute(cloud, name, "FLOAT", column)
             for name in paint.COLUMNS if not count else ():
                 cloud.attributes.remove(cloud.attributes[name])
             cloud.update_tag()
+            changes.others_painted(cloud)
         _forget(root)
         selection.follow_crops(root)
     return count
@@ -121,9 +135,3 @@ def _forget(root: bpy.types.Object) -> None:
     if (kept := root.lodgs.painted) is not None:
         root.lodgs.painted = None
         bpy.data.pointclouds.remove(kept)
-
-
-def _set(cloud: bpy.types.PointCloud, painted: np.ndarray) -> None:
-    for name, column in paint.columns_of(painted).items():
-        write_attribute(cloud, name, "FLOAT", column)
-    changes.others_painted(cloud)

@@ -53,8 +53,8 @@ class OnStroke(OnOwnLevels):
         """Does it; what was done, in words."""
         raise NotImplementedError
 
-    def leave(self, root: bpy.types.Object | None, finished: bool) -> None:
-        """Has viewports show what is, after a stroke that has ended, or was cancelled."""
+    def leave(self, root: bpy.types.Object | None) -> None:
+        """Has viewports show what is, after a stroke that has ended or was cancelled."""
         raise NotImplementedError
 
     @report_errors
@@ -70,11 +70,11 @@ class OnStroke(OnOwnLevels):
     def modal(self, context, event):
         result = self._go_on(context, event)
         if "RUNNING_MODAL" not in result:
-            self._stop(context, "FINISHED" in result)
+            self._stop(context)
         return result
 
     def cancel(self, context):
-        self._stop(context, False)
+        self._stop(context)
 
     @report_errors
     def _begin(self, context, event):
@@ -140,8 +140,8 @@ class OnStroke(OnOwnLevels):
         self.report({"INFO"}, self.apply(root, hit))
         return {"FINISHED"}
 
-    def _stop(self, context, finished):
-        self.leave(scenes.active_root(context), finished)
+    def _stop(self, context):
+        self.leave(scenes.active_root(context))
         extension.redraw()
         if self._line is not None:
             context.space_data.draw_handler_remove(self._line, "WINDOW")
@@ -193,7 +193,7 @@ class LODGS_OT_select_splats(OnStroke, bpy.types.Operator):
         by_level = ", ".join(f"level {number} {count:,}" for number, count in counts.items())
         return f"{sum(counts.values()):,} splats selected: {by_level}"
 
-    def leave(self, root, finished):
+    def leave(self, root):
         cleaning.show_selected(root, {})
 
 
@@ -262,9 +262,8 @@ class LODGS_OT_paint_splats(OnStroke, bpy.types.Operator):
         count = painting.write(root, self._painted(hit))
         return f"{count:,} splats of all levels are painted"
 
-    def leave(self, root, finished):
-        if not finished and root is not None:
-            painting.write(root, self._before)
+    def leave(self, root):
+        painting.show(root, {})
 
     def _painted(self, hit):
         share = {number: self.strength * each for number, each in hit.items()}
@@ -401,7 +400,7 @@ class SplatPaint(bpy.types.WorkSpaceTool):
     bl_context_mode = "OBJECT"
     bl_idname = "lodgs.paint"
     bl_label = "Paint Splats"
-    bl_icon = "ops.gpencil.draw"
+    bl_icon = "brush.sculpt.paint"
     bl_keymap = (
         ("lodgs.paint_splats", _DRAG, {"properties": [("action", "PAINT")]}),
         ("lodgs.paint_splats", _DRAG | {"ctrl": True}, {"properties": [("action", "ERASE")]}),

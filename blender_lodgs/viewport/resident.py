@@ -100,7 +100,7 @@ class Resident:
             version, before = self.painted.get(number, (None, None))
             if version == (now := changes.paint(cloud)):
                 continue
-            paint = painting.paint_of(cloud)
+            paint = painting.shown_paint(cloud)
             self.painted[number] = now, paint
             if version is None or self.store is None:
                 continue
@@ -333,7 +333,7 @@ def read_records(cloud: bpy.types.PointCloud, rows: np.ndarray, higher: int) -> 
         records[:, place : place + 3] = attributes.view_attribute(cloud, attributes.SH.format(k + 1))[rows]
     if (weights := attributes.view_attribute(cloud, attributes.WEIGHT)) is not None:
         records[:, 3] *= weights[rows]
-    if (paint := painting.paint_of(cloud, rows)) is not None:
+    if (paint := painting.shown_paint(cloud, rows)) is not None:
         colors = records[:, 11 : 14 + 3 * higher].reshape(len(records), -1, 3)  # a view
         colors[:] = mixed(colors, paint)
     return records

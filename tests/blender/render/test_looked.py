@@ -119,14 +119,14 @@ def test_viewports_draw_what_is_exported(bpy, lodgs, seen, tmp_path):
     assert np.abs(box - looked).max() > 0.02 and np.abs(box - around).max() > 0.05
 
 
-def paint(lodgs, root, share=0.7):
+def half_painted(lodgs, root, share=0.7):
     """Half of the scene in green."""
     painting = lodgs("data.painting")
     half = {
         item.number: share * (lodgs("data.objects").read_splats(item.object).means[:, 0] > 0)
         for item in root.lodgs.levels
     }
-    painting.write(root, painting.over(painting.read(root), half, (0.1, 0.8, 0.2)))
+    return painting.over(painting.read(root), half, (0.1, 0.8, 0.2))
 
 
 @pytest.mark.usefixtures("renderer", "camera")
@@ -136,7 +136,7 @@ def test_frames_show_paint_as_what_is_exported_with_it(bpy, lodgs, seen, tmp_pat
     root = scenes.import_splats(bpy.context, file_of(tmp_path), upright=False)
     root.lodgs.mode, root.lodgs.single_level = mode, 3
     before = seen()
-    paint(lodgs, root)
+    lodgs("data.painting").write(root, half_painted(lodgs, root))
     painted = seen()
     assert np.abs(before - painted).max() > 0.05
     copy = scenes.shown_splats(bpy.context, root, looked=True)
@@ -162,12 +162,16 @@ def test_viewports_show_paint_at_once_and_read_no_splat_anew(bpy, lodgs, seen, t
         there = [nodes.nodes.new(name) for name in ("NodeGroupInput", "NodeGroupOutput")]
         nodes.links.new(there[0].outputs[0], there[1].inputs[0])
         root.lodgs.levels[2].object.modifiers.new("own", "NODES").node_group = nodes
-    before, read = seen(quick), views.reads
-    paint(lodgs, root)
+    before, painting, there = seen(quick), lodgs("data.painting"), half_painted(lodgs, root)
+    read = views.reads
+    painting.show(root, there)  # as long as a stroke lasts
+    during = seen(quick)
+    painting.show(root, {})
+    np.testing.assert_array_equal(seen(quick), before)
+    painting.write(root, there)
     painted = seen(quick)
     assert np.abs(before - painted).max() > 0.05 and (views.reads == read) == (not modifier)
-    painting = lodgs("data.painting")
-    there = painting.read(root)
+    np.testing.assert_array_equal(during, before if modifier else painted)
     painting.write(root, painting.over(there, {n: np.full(len(x), 0.5) for n, x in there.items()}, None))
     half = seen(quick)
     assert np.abs(before - half).max() > 0.02 and np.abs(painted - half).max() > 0.02
