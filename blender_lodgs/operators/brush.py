@@ -187,8 +187,7 @@ class LODGS_OT_select_splats(OnStroke, bpy.types.Operator):
         })  # fmt: skip
 
     def apply(self, root, hit):
-        masks = {number: each > 0 for number, each in hit.items()}
-        cleaning.select_also(root, masks, self.action == "REMOVE")
+        cleaning.select_also(root, hit, self.action == "REMOVE")
         counts = cleaning.count_selected(root)
         by_level = ", ".join(f"level {number} {count:,}" for number, count in counts.items())
         return f"{sum(counts.values()):,} splats selected: {by_level}"
