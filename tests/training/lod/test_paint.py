@@ -20,7 +20,8 @@ RED, BLUE = (0.9, 0.2, 0.1), (0.1, 0.3, 0.8)
 def seen(sh, direction):
     """(N, 3) float64 colours from a direction."""
     values = [0.0] * sh.shape[1]
-    basis(*direction, round(sh.shape[1] ** 0.5) - 1, values)
+    x, y, z = direction
+    basis(x, y, z, round(sh.shape[1] ** 0.5) - 1, values)
     return 0.5 + np.einsum("k,nkc->nc", np.array(values, float), sh.astype(np.float64))
 
 
@@ -46,7 +47,9 @@ def test_paint_is_columns_that_looks_act_upon_and_mixing_takes_away():
     share = np.random.default_rng(2).uniform(0, 1, len(splats)).astype(np.float32)
     paint = over(np.zeros((len(splats), 4), np.float32), share, RED)
     there = replace(splats, extras=splats.extras | columns_of(paint))
-    np.testing.assert_array_equal(paint_of(there.extras), paint)
+    found = paint_of(there.extras)
+    assert found is not None
+    np.testing.assert_array_equal(found, paint)
     look = Look(0.5, 5000, (1.0, 0.8, 0.9), 0.4)
     found = looked(there, [(None, look)])
     assert found.extras.keys() == splats.extras.keys()
