@@ -9,8 +9,8 @@ Viewport, where this Blender has graphics in background: what the main thread do
 Blender's own evaluation (the rules, the list of splats onto the graphics card), what the thread beside it
 does (choosing and sorting), how long the first picture's splats take onto the card, from their attributes,
 and what comes there later.
-Clean Up, of five levels: how long a moved crop, a search for floaters, and a stroke of the brush hold the
-main thread.
+Clean Up, of five levels: how long a moved crop, a search for floaters, and strokes that select or paint hold
+the main thread.
 Look, of the same: how long each step of a slider does, where LODGS draws the splats and where Blender does.
 Streaming, there as well: a tree is flown through of which a part fits into the budget. How long each redraw
 holds up the main thread, all that LODGS does there but drawing itself, and how soon all has come at the end.
@@ -238,6 +238,16 @@ def clean_up(bpy, count: int) -> None:
     picture = begin()
     begins, covers = least(begin), least(lambda: picture.brush(path, 50))
     selects = least(lambda: cleaning.select_also(root, picture.brush(path, 50)))
+    painting, step = load("blender_lodgs.data.painting"), path[:1] * 2
+    before = painting.read(root)
+
+    def paint(along):
+        return painting.over(before, picture.brush(along, 50, hardness=0.5), (0.8, 0.1, 0.1))
+
+    follows = least(lambda: painting.show(root, paint(step)))
+    painting.show(root, {})
+    painting.write(root, paint(path))  # gives all levels their columns
+    paints = least(lambda: painting.write(root, paint(path)))
     hide = least(lambda: cleaning.hide(root, found), 1)
     print(
         f"clean up, {count:,} splats in five levels, ms of the main thread:\n"
@@ -245,7 +255,8 @@ def clean_up(bpy, count: int) -> None:
         f" {1e3 * counts:.0f} more), floaters {1e3 * everywhere:.0f} (goal 500), within the crop"
         f" {1e3 * floaters:.0f}; hiding {sum(map(np.count_nonzero, found.values())):,} {1e3 * hide:.0f};\n"
         f"  a stroke of the brush: to begin {1e3 * begins:.0f} and to hit {1e3 * covers:.0f} (goal 300"
-        f" together), to have it selected {1e3 * selects:.0f}"
+        f" together), to have it selected {1e3 * selects:.0f}; of paint {1e3 * follows:.0f} each step of the"
+        f" mouse, to have it painted {1e3 * paints:.0f}"
     )
 
 

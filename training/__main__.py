@@ -222,24 +222,17 @@ def _parser() -> argparse.ArgumentParser:
     serve.add_argument("folder", type=Path, help="folder for arrays, new or empty; removed at the end")
     serve.add_argument("--backend", default="auto", help="auto, cpu, cuda or reference")
 
-    transform = commands.add_parser(
-        "transform",
-        help="turn, scale and move splats in a file, with all that it says of places and lengths",
-        description="Angles first, then the scale, then the shift. Numbers below 0 go behind a =, as in "
-        "--translate=-1,0,2.",
-    )
-    transform.add_argument(
-        "source", type=Path, help="bundle, folder of levels, any 3DGS PLY, or a run's folder"
-    )
-    transform.add_argument("out", type=Path, help="file or folder to write, in the form of the source")
-    _add_placement(transform)
     edit = commands.add_parser(
         "edit",
-        help="a copy without clutter (what lies outside of crops, floaters, ...) or in another look",
+        help="a copy without clutter (what lies outside of crops, floaters, ...), in another look, or turned,"
+        " scaled and moved",
         description="Every level is edited alike, and stays what its rule chooses from. Places and lengths "
-        "of what goes are in the splats' own units; lodgs info tells their bounds.",
+        "of what goes are in the splats' own units; lodgs info tells their bounds. What is left is turned "
+        "first, then scaled, then moved. Numbers below 0 go behind a =, as in --translate=-1,0,2.",
     )
-    edit.add_argument("source", type=Path, help=f"bundle, folder of levels, any 3DGS PLY{_OTHERS}")
+    edit.add_argument(
+        "source", type=Path, help=f"bundle, folder of levels, a run's folder, any 3DGS PLY{_OTHERS}"
+    )
     edit.add_argument("--out", type=Path, help="file, or folder, to write in the form of the source")
     edit.add_argument(
         "--plain", type=Path, action="append", default=[], metavar="FILE",
@@ -583,24 +576,6 @@ def _model(chosen: argparse.Namespace) -> int:
     return 0
 
 
-def _transform(chosen: argparse.Namespace) -> int:
-    from .lod.placing import place_file, upright_of
-    from .runs.folder import RunFolder
-    from .splats.formats import as_ply
-    from .splats.placing import Placement
-
-    source = chosen.source
-    if (bundle := RunFolder(source).bundle).exists():
-        source = bundle
-    placement = _placement(chosen) or Placement.composed()
-    with as_ply(source) as there:
-        if chosen.upright:
-            placement = placement.after(upright_of(there))
-        count = place_file(there, chosen.out, placement, _warn)
-    print(f"{chosen.out}: {count:,} splats")
-    return 0
-
-
 def _warn(message: str) -> None:
     print(f"warning: {message}", file=sys.stderr)
 
@@ -616,6 +591,7 @@ def _edit(chosen: argparse.Namespace) -> int:
     from .lod.crop import Crop
     from .lod.edit import edit
     from .lod.look import RANGES, Look
+    from .runs.folder import RunFolder
     from .splats.formats import as_ply
 
     names = "max_size", "min_opacity", "max_distance", "min_views", "gap", "share"
@@ -645,7 +621,8 @@ def _edit(chosen: argparse.Namespace) -> int:
     if not (chosen.out or chosen.plain or chosen.folder or chosen.streamed):
         raise LodgsError("It is not said what to write.", "Add --out FILE, or --plain, --folder, --streamed.")
     cleaning = Cleaning(tuple(crops), drop_floaters=chosen.drop_floaters, **given)
-    with as_ply(chosen.source) as source:
+    run = RunFolder(chosen.source)
+    with as_ply(run.bundle if run.bundle.exists() else run.path) as source:
         print(
             edit(
                 source, chosen.out, cleaning, _warn,
@@ -715,7 +692,6 @@ _COMMANDS = {
     "undistort": _undistort,
     "model": _model,
     "serve": _serve,
-    "transform": _transform,
     "edit": _edit,
     "info": _info,
 }

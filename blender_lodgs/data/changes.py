@@ -8,36 +8,61 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
 import bpy
 
-Version = tuple[int, int]
+Version = tuple[int, ...]
 
 _reported: Counter[int] = Counter()
+_painted: Counter[int] = Counter()
 _files = 0
 _selections = 0
-_selecting = False
+_only = ""
 
 
 def version(datablock: bpy.types.ID) -> Version:
-    """Another one after the points of a datablock, or of an object as modifiers leave it, have changed."""
+    """Another one after the points of a datablock, or of an object as modifiers leave it, have changed in
+    anything but their paint."""
     return _files, _reported[datablock.session_uid]
+
+
+def paint(cloud: bpy.types.PointCloud) -> Version:
+    """Another one after points have been painted (``painting``)."""
+    return _files, _painted[cloud.session_uid]
 
 
 @contextmanager
 def selecting() -> Iterator[None]:
     """In the block only selections change. To Blender that is a change of points, to :func:`version` none:
     what was made of them stays."""
-    global _selecting
-    bpy.context.view_layer.update()  # what has changed before is one
-    _selecting = True
+    try:
+        with _nothing_but("selection"):
+            yield
+    finally:
+        others_selected()
+
+
+def painting() -> AbstractContextManager[None]:
+    """In the block points are painted, which :func:`version` tells of what modifiers make of them alone."""
+    return _nothing_but("paint")
+
+
+@contextmanager
+def _nothing_but(what: str) -> Iterator[None]:
+    global _only
+    bpy.context.view_layer.update()  # what has changed before is more
+    _only = what
     try:
         yield
         bpy.context.view_layer.update()
     finally:
-        _selecting = False
-        others_selected()
+        _only = ""
+
+
+def others_painted(cloud: bpy.types.PointCloud) -> None:
+    """Says that points have been painted."""
+    _painted[cloud.session_uid] += 1
 
 
 def others_selected() -> None:
@@ -53,11 +78,12 @@ def selection() -> Version:
 
 @bpy.app.handlers.persistent
 def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    if _selecting or depsgraph.mode == "RENDER":  # in a render's first evaluation everything counts as new
+    if _only == "selection" or depsgraph.mode == "RENDER":  # where at first everything counts as new
         return
-    _reported.update(
-        update.id.original.session_uid for update in depsgraph.updates if update.is_updated_geometry
-    )
+    changed = [update.id.original for update in depsgraph.updates if update.is_updated_geometry]
+    if _only == "paint":
+        changed = [each for each in changed if isinstance(each, bpy.types.Object)]
+    _reported.update(each.session_uid for each in changed)
 
 
 @bpy.app.handlers.persistent
@@ -66,6 +92,7 @@ def _on_load(*_) -> None:
     global _files
     _files += 1
     _reported.clear()
+    _painted.clear()
 
 
 def register() -> None:

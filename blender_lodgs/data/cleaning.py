@@ -131,7 +131,8 @@ def select(root: bpy.types.Object, found: Mapping[int, np.ndarray]) -> int:
 
 
 def select_also(root: bpy.types.Object, found: Mapping[int, np.ndarray], remove: bool = False) -> int:
-    """Selects splats, (N,) bool of each level by its number, beside those that are, or no longer.
+    """Selects splats, (N,) of each level by its number and not 0 where it is found, beside those that are, or
+    no longer.
 
     Hidden ones are not; of a tree leaves are, with the nodes that stand for nothing else.
 
@@ -141,7 +142,7 @@ def select_also(root: bpy.types.Object, found: Mapping[int, np.ndarray], remove:
     both = {}
     for item in levels(root):
         both[item.number] = mask = selected(item.object.data)
-        mask[found[item.number]] = not remove
+        mask[found[item.number] > 0] = not remove
         mask &= ~hidden(item.object.data)
     return select(root, _with_nodes(root, both))
 

@@ -9,14 +9,15 @@ level has a modifier (``nodes.look``) as soon as somebody has set something.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import bpy
-import numpy as np
 from mathutils import Matrix
 
 from ...training.lod.crop import Crop
 from ...training.lod.look import DAYLIGHT, NEUTRAL, RANGES, Look
+from ...training.lod.paint import COLUMNS as PAINT
 from .. import compat
 from ..nodes import ellipsoids
 from ..nodes import look as groups
@@ -43,8 +44,13 @@ def _changed(self, context: bpy.types.Context) -> None:
     self.id_data.update_tag()
 
 
+@lru_cache(maxsize=64)
+def _rows(look: Look) -> list[float]:
+    return look.matrix.reshape(-1).tolist()
+
+
 def _matrix(self) -> list[float]:
-    return _as_set(self).matrix.reshape(-1).tolist()
+    return _rows(_as_set(self))  # which every driver of every level asks for
 
 
 class LookSettings(bpy.types.PropertyGroup):
@@ -132,10 +138,11 @@ def reset(root: bpy.types.Object, obj: bpy.types.Object) -> None:
 
 
 def attach(root: bpy.types.Object) -> None:
-    """Gives every level the modifier for the looks that there are, anew where there are other regions now;
-    takes it away where nobody has set any."""
+    """Gives every level the modifier for paint and the looks that there are, anew where there are other
+    regions now; takes it away where nobody has painted, nor set any."""
     regions = regions_of(root)
-    wanted = bool(regions) or is_set(root)
+    painted = any(PAINT[-1] in item.object.data.attributes for item in root.lodgs.levels if item.exists)
+    wanted = bool(regions) or is_set(root) or painted
     for item in root.lodgs.levels:
         if item.exists and wanted:
             _attach(item.object, root, regions)
@@ -159,13 +166,15 @@ def outdated(root: bpy.types.Object) -> bool:
 def _as_set(settings: LookSettings) -> Look:
     """A look as its properties have it; animation may lead them anywhere."""
 
-    def held(name: str) -> float:
-        return float(np.clip(getattr(settings, name), *RANGES[name]))
+    def held(name: str, value: float) -> float:
+        low, high = RANGES[name]
+        return min(max(value, low), high)
 
-    red, green, blue = np.clip(settings.tint, *RANGES["tint"]).tolist()
-    return Look(
-        held("exposure"), held("temperature"), (red, green, blue), held("saturation"), held("opacity")
+    red, green, blue = (held("tint", each) for each in settings.tint)
+    exposure, temperature, saturation, opacity = (
+        held(name, getattr(settings, name)) for name in PARTS if name != "tint"
     )
+    return Look(exposure, temperature, (red, green, blue), saturation, opacity)
 
 
 def _attach(obj: bpy.types.Object, root: bpy.types.Object, regions: list[bpy.types.Object]) -> None:

@@ -6,6 +6,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+from ...training.lod.brush import Projection
 from ..attributes import BASE, SCALE, WEIGHT, read_attribute
 from .objects import root_of
 from .shown import SplatInstance, splat_instances
@@ -19,7 +20,8 @@ FAINTEST = 1 / 255
 def scene_at(
     depsgraph: bpy.types.Depsgraph,
     viewport: bpy.types.SpaceView3D | None,
-    clip: Matrix,
+    view: Matrix,
+    projection: Matrix,
     size: tuple[int, int],
     at: tuple[float, float],
 ) -> bpy.types.Object | None:
@@ -29,7 +31,7 @@ def scene_at(
 
     Args:
         viewport: see ``shown.splat_instances``.
-        clip: from the world to clip space.
+        view, projection: from the world to the camera's space, and on to clip space.
         size: the viewport's (W, H) in pixels.
         at: the pixel, x from the left and y from below.
 
@@ -37,7 +39,7 @@ def scene_at(
         None where no splats are, or not enough of them to hide half of what is behind.
     """
     instances = splat_instances(depsgraph, viewport)
-    found = [_at_pixel(instance, np.array(clip), np.array(size), np.array(at)) for instance in instances]
+    found = [_at_pixel(each, np.array(view), np.array(projection), size, at) for each in instances]
     if not found:
         return None
     depths, alphas = (np.concatenate(each) for each in zip(*found, strict=True))
@@ -51,22 +53,24 @@ def scene_at(
 
 
 def _at_pixel(
-    instance: SplatInstance, clip: np.ndarray, size: np.ndarray, at: np.ndarray
+    instance: SplatInstance,
+    view: np.ndarray,
+    projection: np.ndarray,
+    size: tuple[int, int],
+    at: tuple[float, float],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Depths (M,) in clip space and opacities (M,) of the splats of an instance that cover a pixel."""
+    """Depths (M,) in the world and opacities (M,) of the splats of an instance that cover a pixel."""
     cloud = instance.evaluated.data
     means, scales, base = (read_attribute(cloud, name) for name in ("position", SCALE, BASE))
     if means is None or scales is None or base is None or not len(means):
         return np.zeros(0), np.zeros(0)
-    to_clip = clip @ instance.matrix_world
-    x, y, z, w = to_clip[:, :3] @ means.T + to_clip[:, 3:]
-    there = np.flatnonzero((w > 0) & (np.abs(z) < w))
-    w = w[there]
-    away = (np.stack([x[there], y[there]]) / w + 1) / 2 * size[:, None] - at[:, None]
-    pixels = np.linalg.norm(to_clip[1, :3]) * size[1] / 2 / w  # that a unit of the splats' covers
-    sigma = scales[there].mean(1) * pixels
-    alphas = base[there, 3] * np.exp(-(away**2).sum(0) / 2 / (sigma**2 + 0.3))  # 3DGS's dilation
+    placed = Projection.of(view @ instance.matrix_world, projection, size).place(means)
+    away = np.square(placed.x - at[0]) + np.square(placed.y - at[1])
+    with np.errstate(divide="ignore"):
+        sigma = scales.mean(1) / placed.pixel
+    alphas = base[:, 3] * np.exp(-away / 2 / (sigma**2 + 0.3))  # 3DGS's dilation
     weights = read_attribute(cloud, WEIGHT)
-    alphas = np.minimum(alphas if weights is None else alphas * weights[there], 0.99)
+    alphas = np.minimum(alphas if weights is None else alphas * weights, 0.99)
     covers = alphas > FAINTEST
-    return z[there][covers] / w[covers], alphas[covers]
+    unit = np.cbrt(abs(np.linalg.det(instance.matrix_world[:3, :3])))  # what is compared stands in the world
+    return placed.depth[covers] * unit, alphas[covers]

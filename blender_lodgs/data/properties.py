@@ -275,6 +275,12 @@ class SplatScene(bpy.types.PropertyGroup):
         type=SplatTable, name="Tables", description="What the rule knows besides the splats"
     )
 
+    painted: bpy.props.PointerProperty(
+        name="Paint",
+        description="The finest level's places and paint, from before all levels were replaced",
+        type=bpy.types.PointCloud,
+        options={"HIDDEN"},
+    )
     stream: bpy.props.PointerProperty(
         name="Streaming", description="The file of which the levels are the top", type=SplatStream
     )
@@ -481,7 +487,7 @@ class CropSettings(bpy.types.PropertyGroup):
 
 
 class BrushSettings(bpy.types.PropertyGroup):
-    """How strokes select splats, on the Blender scene (``Scene.lodgs_brush``)."""
+    """How strokes select and paint splats, on the Blender scene (``Scene.lodgs_brush``)."""
 
     radius: bpy.props.IntProperty(
         name="Radius",
@@ -495,7 +501,35 @@ class BrushSettings(bpy.types.PropertyGroup):
     )
     through: bpy.props.BoolProperty(
         name="Through",
-        description="Select what other splats hide from the view as well, to any depth",
+        description="Select and paint what other splats hide from the view as well, to any depth",
+        options=set(),
+    )
+    color: bpy.props.FloatVectorProperty(
+        name="Colour",
+        description="What is painted, as the display shows it before the look",
+        default=(0.8, 0.1, 0.1),
+        min=0,
+        max=1,
+        size=3,
+        subtype="COLOR_GAMMA",
+        options=set(),
+    )
+    strength: bpy.props.FloatProperty(
+        name="Strength",
+        description="How much of the colour one stroke puts over the splats' own; press Shift F to change it",
+        default=1.0,
+        min=0,
+        max=1,
+        subtype="FACTOR",
+        options=set(),
+    )
+    hardness: bpy.props.FloatProperty(
+        name="Hardness",
+        description="Share of the radius in which the brush has its full strength; beyond it falls off",
+        default=0.5,
+        min=0,
+        max=1,
+        subtype="FACTOR",
         options=set(),
     )
 

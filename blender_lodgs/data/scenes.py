@@ -32,7 +32,7 @@ from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder, r
 from ...training.splats.formats import STREAMED, as_ply, is_ply
 from ...training.splats.gaussians import Splats
 from ..nodes import ellipsoids
-from . import cleaning, crops, looks, objects, selection, streams, tables
+from . import cleaning, crops, looks, objects, painting, selection, streams, tables
 from .objects import root_of
 from .photographs import camera_of, is_held_out, match_render, new_camera, photographed, views
 from .placement import axes_of, new_axes, placement_of
@@ -377,6 +377,7 @@ def make_room(root: bpy.types.Object, number: int) -> None:
     """
     tables.remove_tables(root)
     streams.end(root)
+    painting.keep(root)
     there = [item for item in root.lodgs.levels if item.exists]
     kept = next((item for item in there if item.number == number), there[-1] if there else None)
     for item in there:
@@ -400,7 +401,8 @@ def read_levels(root: bpy.types.Object, placed: bool = False, looked: bool = Fal
     Args:
         placed: where the scene stands in Blender, upright there; otherwise in the splats' own world. What of
             its objects has been moved by itself counts in neither.
-        looked: as the scene's look has them (``looks``); otherwise as they were trained.
+        looked: as paint and the scene's look have them (``looks``); otherwise as they were trained, with
+            their paint beside.
 
     Raises:
         LodgsError: there are none, or crops leave nothing; or of a placed one, its root is stretched or its
@@ -503,6 +505,8 @@ def shown_splats(
     parts = [
         objects.read_splats(item.object, depsgraph) for item in root.lodgs.levels if _visible(context, item)
     ]
+    if looked:
+        parts = [look.looked(part, _looks(root)) for part in parts]
     if not any(len(part) for part in parts):
         raise LodgsError(f"No splats of {root.name} are shown.", "Look at the detail settings.")
     if len({part.sh_degree for part in parts}) > 1:
@@ -515,8 +519,6 @@ def shown_splats(
         **{name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays},
         extras={name: np.concatenate([part.extras[name] for part in parts]) for name in shared},
     )
-    if looked:
-        splats = look.looked(splats, _looks(root))
     rule = find_rule(root.lodgs.rule)
     if not placed:
         return splats
@@ -694,7 +696,7 @@ def _put_level(
         made: an object of the level's splats that is in no collection; None: there is none yet.
     """
     settings = root.lodgs
-    fresh = made or objects.new_splats("", level.splats)
+    fresh = made or objects.new_splats("", painting.carried(root, level).splats)
     fresh.name = fresh.data.name = _level_name(root, level.number)
     item = next((entry for entry in settings.levels if entry.number == level.number), None)
     if item is None:

@@ -1,4 +1,5 @@
-"""``training.lod.look`` in geometry nodes: the colours and opacities in which Blender itself draws splats.
+"""``training.lod.look`` in geometry nodes, and ``paint``: the colours and opacities in which Blender itself
+draws splats.
 
 What LODGS draws gets its look from the same settings without this group (``data.looks``). Splats keep their
 harmonics and opacities; the colour of points and ellipsoids is made of them, and the opacity's factor stands
@@ -9,6 +10,7 @@ from __future__ import annotations
 
 import bpy
 
+from ...training.lod.paint import COLUMNS as PAINT
 from ...training.splats.gaussians import SH_C0
 from ..attributes import BASE, COLOR, LOOK_OPACITY
 from .building import VERSION, Field, Nodes, edited, group
@@ -20,7 +22,7 @@ NAME = "LODGS Look"
 ROWS, OPACITY, BEYOND = ("red_{}", "green_{}", "blue_{}"), "opacity_{}", "beyond_{}"
 """Sockets of each look: the rows of its matrix, and its opacity. 0 is the look everywhere; regions follow,
 with the sockets of crops, and what is 1 where a look counts outside of one."""
-_VERSION = 1
+_VERSION = 2
 
 
 def look_group(count: int) -> bpy.types.GeometryNodeTree:
@@ -78,12 +80,19 @@ def _add_sockets(tree: bpy.types.GeometryNodeTree, number: int) -> None:
 
 
 def _own_color(nodes: Nodes) -> list[Field]:
-    """Red, green and blue of the splats without view dependence, display-coded."""
-    base = nodes.add("GeometryNodeInputNamedAttribute", data_type="FLOAT_COLOR")
-    base.inputs["Name"].default_value = BASE
+    """Red, green and blue of the splats with their paint, without view dependence, display-coded."""
     apart = nodes.add("ShaderNodeSeparateXYZ")
-    nodes.link(next(s for s in base.outputs if s.name == "Attribute" and s.enabled), apart, "Vector")
-    return [nodes.field(apart.outputs[axis]) * SH_C0 + 0.5 for axis in "XYZ"]
+    nodes.link(_attribute(nodes, "FLOAT_COLOR", BASE), apart, "Vector")
+    own = [nodes.field(apart.outputs[axis]) * SH_C0 + 0.5 for axis in "XYZ"]
+    *paint, amount = (nodes.field(_attribute(nodes, "FLOAT", name)) for name in PAINT)
+    return [(1.0 - amount) * channel + over for channel, over in zip(own, paint, strict=True)]
+
+
+def _attribute(nodes: Nodes, kind: str, name: str) -> bpy.types.NodeSocket:
+    """A named attribute, 0 where the points have none."""
+    node = nodes.add("GeometryNodeInputNamedAttribute", data_type=kind)
+    node.inputs["Name"].default_value = name
+    return next(s for s in node.outputs if s.name == "Attribute" and s.enabled)
 
 
 def _mapped(nodes: Nodes, sockets, number: int, color: list[Field]) -> list[Field]:

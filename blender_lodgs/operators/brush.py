@@ -1,4 +1,4 @@
-"""Select splats as they are seen, with a brush or a lasso over the viewport, at every level alike.
+"""Select and paint splats as they are seen, by strokes over the viewport, at every level alike.
 
 Each stroke is one operator and one undo step; the tools of the toolbar start it, and Blender's own operator
 changes the brush's size.
@@ -14,7 +14,7 @@ from gpu_extras.presets import draw_circle_2d
 
 from ...training.errors import LodgsError
 from .. import extension
-from ..data import cleaning, scenes
+from ..data import cleaning, painting, scenes
 from ..viewport.strokes import Picture
 from .parts import OnOwnLevels, report_errors
 
@@ -22,7 +22,133 @@ _POINT_APART = 2.0
 """Pixels that the mouse has to move for a lasso's next corner."""
 
 
-class LODGS_OT_select_splats(OnOwnLevels, bpy.types.Operator):
+class OnStroke(OnOwnLevels):
+    """An operator that does something to the splats of every level under a stroke over the viewport."""
+
+    through: bpy.props.BoolProperty(
+        name="Through", description="Also what other splats hide from the view", options={"SKIP_SAVE"}
+    )
+    radius: bpy.props.IntProperty(
+        name="Radius", description="Of the brush, in pixels", default=40, min=1, max=2000, subtype="PIXEL",
+        options={"SKIP_SAVE"},
+    )  # fmt: skip
+    path: bpy.props.CollectionProperty(
+        name="Path", type=bpy.types.OperatorMousePath, options={"HIDDEN", "SKIP_SAVE"}
+    )
+
+    as_set = ("radius", "through")
+    """What a stroke that is drawn takes from ``Scene.lodgs_brush``, unless it is given."""
+    shape = "BRUSH"
+    hardness = 1.0
+
+    def prepare(self, root: bpy.types.Object) -> None:
+        """Reads what the stroke changes, before it does."""
+        raise NotImplementedError
+
+    def show(self, root: bpy.types.Object, hit: dict[int, np.ndarray]) -> None:
+        """Has viewports show what the stroke has hit so far."""
+        raise NotImplementedError
+
+    def apply(self, root: bpy.types.Object, hit: dict[int, np.ndarray]) -> str:
+        """Does it; what was done, in words."""
+        raise NotImplementedError
+
+    def leave(self, root: bpy.types.Object | None) -> None:
+        """Has viewports show what is, after a stroke that has ended or was cancelled."""
+        raise NotImplementedError
+
+    @report_errors
+    def execute(self, context):
+        root = scenes.active_root(context)
+        self.prepare(root)
+        path = np.array([point.loc for point in self.path])
+        return self._finish(root, self._hit(picture_of(context, root), path))
+
+    def invoke(self, context, event):
+        return self._begin(context, event)
+
+    def modal(self, context, event):
+        result = self._go_on(context, event)
+        if "RUNNING_MODAL" not in result:
+            self._stop(context)
+        return result
+
+    def cancel(self, context):
+        self._stop(context)
+
+    @report_errors
+    def _begin(self, context, event):
+        settings = context.scene.lodgs_brush
+        for name in self.as_set:
+            if not self.properties.is_property_set(name):
+                setattr(self, name, getattr(settings, name))
+        root = scenes.active_root(context)
+        self.path.clear()
+        self._picture = picture_of(context, root)
+        self.prepare(root)
+        counts = {item.number: len(item.object.data.points) for item in cleaning.levels(root)}
+        self._found = {number: np.zeros(count, np.float32) for number, count in counts.items()}
+        self._line = None
+        if self.shape == "LASSO":
+            self._line = context.space_data.draw_handler_add(_draw_path, (self.path,), "WINDOW", "POST_PIXEL")
+        self._go_to(context, event)
+        context.window_manager.modal_handler_add(self)
+        return {"RUNNING_MODAL"}
+
+    @report_errors
+    def _go_on(self, context, event):
+        if event.type in {"MOUSEMOVE", "INBETWEEN_MOUSEMOVE"}:
+            self._go_to(context, event)
+        elif event.type == "LEFTMOUSE" and event.value == "RELEASE":
+            root = self._same_root(context)
+            if self.shape == "LASSO":
+                self._found = self._hit(self._picture, np.array([point.loc for point in self.path]))
+            return self._finish(root, self._found)
+        elif event.type in {"ESC", "RIGHTMOUSE"} and event.value == "PRESS":
+            return {"CANCELLED"}
+        return {"RUNNING_MODAL"}
+
+    def _go_to(self, context, event):
+        """Takes the stroke on to the mouse; what a brush hits on the way is shown at once."""
+        here = event.mouse_region_x + 0.5, event.mouse_region_y + 0.5
+        last = np.array(self.path[-1].loc if self.path else here)
+        if self.path and np.linalg.norm(last - here) < _POINT_APART:
+            return
+        self.path.add().loc = here
+        context.region.tag_redraw()
+        if self.shape == "BRUSH":
+            root = self._same_root(context)
+            for number, hit in self._hit(self._picture, np.array([last, here])).items():
+                np.maximum(self._found[number], hit, out=self._found[number])
+            self.show(root, self._found)
+
+    def _same_root(self, context):
+        """The splat scene, as long as it has the levels with which the stroke began: training may go on."""
+        root = scenes.active_root(context)
+        there = {item.number: len(item.object.data.points) for item in cleaning.levels(root)}
+        if there != {number: len(hit) for number, hit in self._found.items()}:
+            raise LodgsError("The levels have been renewed during the stroke.", "Draw it again.")
+        return root
+
+    def _hit(self, picture: Picture, path: np.ndarray) -> dict[int, np.ndarray]:
+        path = np.reshape(path, (-1, 2))
+        if self.shape == "LASSO":
+            return picture.lasso(path, self.through)
+        return picture.brush(path, self.radius, self.through, self.hardness)
+
+    def _finish(self, root, hit):
+        self.report({"INFO"}, self.apply(root, hit))
+        return {"FINISHED"}
+
+    def _stop(self, context):
+        self.leave(scenes.active_root(context))
+        extension.redraw()
+        if self._line is not None:
+            context.space_data.draw_handler_remove(self._line, "WINDOW")
+            self._line = None
+
+
+class LODGS_OT_select_splats(OnStroke, bpy.types.Operator):
     """Select the splats of every level that a stroke over the viewport covers"""
 
     bl_idname = "lodgs.select_splats"
@@ -41,16 +167,6 @@ class LODGS_OT_select_splats(OnOwnLevels, bpy.types.Operator):
         items=[("ADD", "Select", "Select them as well"), ("REMOVE", "Deselect", "Select them no longer")],
         options={"SKIP_SAVE"},
     )
-    radius: bpy.props.IntProperty(
-        name="Radius", description="Of the brush, in pixels", default=40, min=1, max=2000, subtype="PIXEL",
-        options={"SKIP_SAVE"},
-    )  # fmt: skip
-    through: bpy.props.BoolProperty(
-        name="Through", description="Also what other splats hide from the view", options={"SKIP_SAVE"}
-    )
-    path: bpy.props.CollectionProperty(
-        name="Path", type=bpy.types.OperatorMousePath, options={"HIDDEN", "SKIP_SAVE"}
-    )
 
     def draw(self, context):
         layout = self.layout
@@ -60,97 +176,24 @@ class LODGS_OT_select_splats(OnOwnLevels, bpy.types.Operator):
             layout.prop(self, "radius")
         layout.prop(self, "through")
 
-    @report_errors
-    def execute(self, context):
-        root = scenes.active_root(context)
-        self._select(root, picture_of(context, root), np.array([point.loc for point in self.path]))
-        return self._finish(root)
-
-    def invoke(self, context, event):
-        return self._begin(context, event)
-
-    def modal(self, context, event):
-        result = self._go_on(context, event)
-        if "RUNNING_MODAL" not in result:
-            self._stop(context)
-        return result
-
-    def cancel(self, context):
-        self._stop(context)
-
-    @report_errors
-    def _begin(self, context, event):
-        settings = context.scene.lodgs_brush
-        for name in ("radius", "through"):
-            if not self.properties.is_property_set(name):
-                setattr(self, name, getattr(settings, name))
-        root = scenes.active_root(context)
-        self.path.clear()
-        self._picture = picture_of(context, root)
+    def prepare(self, root):
         self._before = {item.number: cleaning.selected(item.object.data) for item in cleaning.levels(root)}
-        self._found = {number: np.zeros(len(mask), bool) for number, mask in self._before.items()}
-        self._line = None
-        if self.shape == "LASSO":
-            self._line = context.space_data.draw_handler_add(_draw_path, (self.path,), "WINDOW", "POST_PIXEL")
-        self._go_to(context, event)
-        context.window_manager.modal_handler_add(self)
-        return {"RUNNING_MODAL"}
 
-    @report_errors
-    def _go_on(self, context, event):
-        if event.type in {"MOUSEMOVE", "INBETWEEN_MOUSEMOVE"}:
-            self._go_to(context, event)
-        elif event.type == "LEFTMOUSE" and event.value == "RELEASE":
-            root = self._same_root(context)
-            if self.shape == "LASSO":
-                self._select(root, self._picture, np.array([point.loc for point in self.path]))
-            else:
-                cleaning.select_also(root, self._found, self.action == "REMOVE")
-            return self._finish(root)
-        elif event.type in {"ESC", "RIGHTMOUSE"} and event.value == "PRESS":
-            return {"CANCELLED"}
-        return {"RUNNING_MODAL"}
+    def show(self, root, hit):
+        remove = self.action == "REMOVE"
+        cleaning.show_selected(root, {
+            number: mask & ~(hit[number] > 0) if remove else mask | (hit[number] > 0)
+            for number, mask in self._before.items()
+        })  # fmt: skip
 
-    def _go_to(self, context, event):
-        """Takes the stroke on to the mouse; what a brush hits on the way is shown as selected at once."""
-        here = event.mouse_region_x + 0.5, event.mouse_region_y + 0.5
-        last = np.array(self.path[-1].loc if self.path else here)
-        if self.path and np.linalg.norm(last - here) < _POINT_APART:
-            return
-        self.path.add().loc = here
-        context.region.tag_redraw()
-        if self.shape == "BRUSH":
-            root, remove = self._same_root(context), self.action == "REMOVE"
-            for number, mask in self._picture.brush([last, here], self.radius, self.through).items():
-                self._found[number] |= mask
-            cleaning.show_selected(root, {
-                number: mask & ~self._found[number] if remove else mask | self._found[number]
-                for number, mask in self._before.items()
-            })  # fmt: skip
-
-    def _same_root(self, context):
-        """The splat scene, as long as it has the levels with which the stroke began: training may go on."""
-        root = scenes.active_root(context)
-        there = {item.number: len(item.object.data.points) for item in cleaning.levels(root)}
-        if there != {number: len(mask) for number, mask in self._before.items()}:
-            raise LodgsError("The levels have been renewed during the stroke.", "Draw it again.")
-        return root
-
-    def _select(self, root, picture, path):
-        select_by_stroke(root, picture, path, self.shape, self.radius, self.through, self.action == "REMOVE")
-
-    def _finish(self, root):
+    def apply(self, root, hit):
+        cleaning.select_also(root, hit, self.action == "REMOVE")
         counts = cleaning.count_selected(root)
         by_level = ", ".join(f"level {number} {count:,}" for number, count in counts.items())
-        self.report({"INFO"}, f"{sum(counts.values()):,} splats selected: {by_level}")
-        return {"FINISHED"}
+        return f"{sum(counts.values()):,} splats selected: {by_level}"
 
-    def _stop(self, context):
-        cleaning.show_selected(scenes.active_root(context), {})
-        extension.redraw()
-        if self._line is not None:
-            context.space_data.draw_handler_remove(self._line, "WINDOW")
-            self._line = None
+    def leave(self, root):
+        cleaning.show_selected(root, {})
 
 
 def picture_of(context: bpy.types.Context, root: bpy.types.Object) -> Picture:
@@ -171,25 +214,82 @@ def picture_of(context: bpy.types.Context, root: bpy.types.Object) -> Picture:
     )  # fmt: skip
 
 
-def select_by_stroke(
-    root: bpy.types.Object,
-    picture: Picture,
-    path: np.ndarray,
-    shape: str = "BRUSH",
-    radius: float = 40,
-    through: bool = False,
-    remove: bool = False,
-) -> int:
-    """Selects the splats that a stroke hits beside those that are, or no longer; how many are then.
+class LODGS_OT_paint_splats(OnStroke, bpy.types.Operator):
+    """Paint a colour over the splats of every level that a stroke over the viewport covers"""
 
-    Args:
-        path: (P, 2) in the region's pixels.
-        shape: "BRUSH" or "LASSO".
-        through: see ``Picture.brush``.
-    """
-    path = np.reshape(path, (-1, 2))
-    found = picture.lasso(path, through) if shape == "LASSO" else picture.brush(path, radius, through)
-    return cleaning.select_also(root, found, remove)
+    bl_idname = "lodgs.paint_splats"
+    bl_label = "Paint Splats"
+    bl_options = {"REGISTER", "UNDO"}
+
+    action: bpy.props.EnumProperty(
+        name="Do",
+        description="What is done with the splats that are hit",
+        items=[("PAINT", "Paint", "Put the colour over theirs"), ("ERASE", "Erase", "Bring back their own")],
+        options={"SKIP_SAVE"},
+    )
+    color: bpy.props.FloatVectorProperty(
+        name="Colour", description="What is painted, as the display shows it before the look",
+        default=(0.8, 0.1, 0.1), min=0, max=1, size=3, subtype="COLOR_GAMMA", options={"SKIP_SAVE"},
+    )  # fmt: skip
+    strength: bpy.props.FloatProperty(
+        name="Strength", description="How much of the colour the stroke puts over the splats' own",
+        default=1.0, min=0, max=1, subtype="FACTOR", options={"SKIP_SAVE"},
+    )  # fmt: skip
+    hardness: bpy.props.FloatProperty(
+        name="Hardness", description="Share of the radius in which the brush has its full strength",
+        default=0.5, min=0, max=1, subtype="FACTOR", options={"SKIP_SAVE"},
+    )  # fmt: skip
+
+    as_set = ("radius", "through", "color", "strength", "hardness")
+
+    def draw(self, context):
+        layout = self.layout
+        layout.use_property_split = True
+        layout.prop(self, "action")
+        if self.action == "PAINT":
+            layout.prop(self, "color")
+        for name in ("radius", "strength", "hardness", "through"):
+            layout.prop(self, name)
+
+    def prepare(self, root):
+        self._before = painting.read(root)
+
+    def show(self, root, hit):
+        painting.show(root, self._painted(hit))
+
+    def apply(self, root, hit):
+        count = painting.write(root, self._painted(hit))
+        return f"{count:,} splats of all levels are painted"
+
+    def leave(self, root):
+        painting.show(root, {})
+
+    def _painted(self, hit):
+        share = {number: self.strength * each for number, each in hit.items()}
+        return painting.over(self._before, share, tuple(self.color) if self.action == "PAINT" else None)
+
+
+class LODGS_OT_remove_paint(OnOwnLevels, bpy.types.Operator):
+    """Show all splats in their own colours again"""
+
+    bl_idname = "lodgs.remove_paint"
+    bl_label = "Remove Paint"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context):
+        if not super().poll(context):
+            return False
+        painted = painting.is_painted(scenes.active_root(context))
+        if not painted:
+            cls.poll_message_set("Nothing is painted")
+        return painted
+
+    @report_errors
+    def execute(self, context):
+        root = scenes.active_root(context)
+        painting.write(root, {number: 0 * there for number, there in painting.read(root).items()})
+        return {"FINISHED"}
 
 
 class LODGS_OT_select_all_splats(OnOwnLevels, bpy.types.Operator):
@@ -231,13 +331,25 @@ def _draw_path(path) -> None:
     )
 
 
-def _keymap(shape: str):
+_DRAG = {"type": "LEFTMOUSE", "value": "PRESS"}
+
+
+def _selects(shape: str):
     """Drag selects; with Ctrl or Shift it deselects."""
-    drag = {"type": "LEFTMOUSE", "value": "PRESS"}
     return tuple(
-        ("lodgs.select_splats", drag | held, {"properties": [("shape", shape), ("action", action)]})
+        ("lodgs.select_splats", _DRAG | held, {"properties": [("shape", shape), ("action", action)]})
         for held, action in (({}, "ADD"), ({"ctrl": True}, "REMOVE"), ({"shift": True}, "REMOVE"))
     )
+
+
+def _turns(name: str, **held):
+    """F and the mouse change a number of the brush."""
+    properties = {"properties": [("data_path_primary", f"scene.lodgs_brush.{name}")]}
+    return "wm.radial_control", {"type": "F", "value": "PRESS"} | held, properties
+
+
+def _draw_brush(context, tool, xy) -> None:
+    draw_circle_2d(xy, (1, 1, 1, 1), context.scene.lodgs_brush.radius, segments=48)
 
 
 class SplatBrush(bpy.types.WorkSpaceTool):
@@ -251,23 +363,13 @@ class SplatBrush(bpy.types.WorkSpaceTool):
     bl_idname = "lodgs.brush"
     bl_label = "Brush Splats"
     bl_icon = "ops.generic.select_circle"
-    bl_keymap = (
-        *_keymap("BRUSH"),
-        (
-            "wm.radial_control",
-            {"type": "F", "value": "PRESS"},
-            {"properties": [("data_path_primary", "scene.lodgs_brush.radius")]},
-        ),
-    )
+    bl_keymap = (*_selects("BRUSH"), _turns("radius"))
+    draw_cursor = staticmethod(_draw_brush)
 
     @staticmethod
     def draw_settings(context, layout, tool):
         layout.prop(context.scene.lodgs_brush, "radius")
         layout.prop(context.scene.lodgs_brush, "through")
-
-    @staticmethod
-    def draw_cursor(context, tool, xy):
-        draw_circle_2d(xy, (1, 1, 1, 1), context.scene.lodgs_brush.radius, segments=48)
 
 
 class SplatLasso(bpy.types.WorkSpaceTool):
@@ -280,20 +382,48 @@ class SplatLasso(bpy.types.WorkSpaceTool):
     bl_idname = "lodgs.lasso"
     bl_label = "Lasso Splats"
     bl_icon = "ops.generic.select_lasso"
-    bl_keymap = _keymap("LASSO")
+    bl_keymap = _selects("LASSO")
 
     @staticmethod
     def draw_settings(context, layout, tool):
         layout.prop(context.scene.lodgs_brush, "through")
 
 
-TOOLS = (SplatBrush, SplatLasso)
-CLASSES = (LODGS_OT_select_splats, LODGS_OT_select_all_splats)
+class SplatPaint(bpy.types.WorkSpaceTool):
+    """Drag over splats to paint them at every level.
+
+    \u2022 Ctrl to erase.
+    \u2022 F for the size, Shift F for the strength"""
+
+    bl_space_type = "VIEW_3D"
+    bl_context_mode = "OBJECT"
+    bl_idname = "lodgs.paint"
+    bl_label = "Paint Splats"
+    bl_icon = "brush.sculpt.paint"
+    bl_keymap = (
+        ("lodgs.paint_splats", _DRAG, {"properties": [("action", "PAINT")]}),
+        ("lodgs.paint_splats", _DRAG | {"ctrl": True}, {"properties": [("action", "ERASE")]}),
+        _turns("radius"),
+        _turns("strength", shift=True),
+    )
+    draw_cursor = staticmethod(_draw_brush)
+
+    @staticmethod
+    def draw_settings(context, layout, tool):
+        for name in ("color", "radius", "strength", "hardness", "through"):
+            layout.prop(context.scene.lodgs_brush, name)
+
+
+TOOLS = (SplatBrush, SplatLasso, SplatPaint)
+CLASSES = (
+    LODGS_OT_select_splats, LODGS_OT_select_all_splats, LODGS_OT_paint_splats, LODGS_OT_remove_paint,
+)  # fmt: skip
 
 
 def register() -> None:
     bpy.utils.register_tool(SplatBrush, separator=True, group=True)
     bpy.utils.register_tool(SplatLasso, after={SplatBrush.bl_idname})
+    bpy.utils.register_tool(SplatPaint, after={SplatLasso.bl_idname})
 
 
 def unregister() -> None:

@@ -33,9 +33,9 @@ def select(context: bpy.types.Context, at: tuple[float, float]) -> bool:
     Args:
         at: x from the left and y from below.
     """
-    region = context.region
+    region, looks = context.region, context.region_data
     obj = picking.scene_at(
-        context.evaluated_depsgraph_get(), context.space_data, context.region_data.perspective_matrix,
+        context.evaluated_depsgraph_get(), context.space_data, looks.view_matrix, looks.window_matrix,
         (region.width, region.height), at,
     )  # fmt: skip
     if obj is None or not obj.visible_get(view_layer=context.view_layer):

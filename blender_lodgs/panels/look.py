@@ -1,4 +1,4 @@
-"""The Look panel: exposure, white balance, tint, saturation and opacity, everywhere and in regions."""
+"""The Look panel: exposure, white balance, tint, saturation and opacity, everywhere and in regions; paint."""
 
 from __future__ import annotations
 
@@ -21,6 +21,21 @@ class LODGS_PT_look(LevelsPanel):
         layout, root = self.layout, scenes.active_root(context)
         _draw_look(layout, root)
         layout.operator("lodgs.reset_look", icon="LOOP_BACK")
+
+
+class LODGS_PT_look_paint(LevelsPanel):
+    bl_label = "Paint"
+    bl_parent_id = "LODGS_PT_look"
+
+    def draw(self, context):
+        layout, brush = self.layout, context.scene.lodgs_brush
+        row = layout.row()
+        row.enabled = context.mode == "OBJECT"
+        row.operator("wm.tool_set_by_id", text="Paint Splats", icon="BRUSH_DATA").name = "lodgs.paint"
+        column = split_column(layout)
+        for name in ("color", "radius", "strength", "hardness", "through"):
+            column.prop(brush, name)
+        layout.operator("lodgs.remove_paint", icon="LOOP_BACK")
 
 
 class LODGS_PT_look_regions(LevelsPanel):
@@ -54,4 +69,4 @@ def _draw_look(layout: bpy.types.UILayout, obj: bpy.types.Object) -> None:
         column.prop(obj.lodgs_look, name)
 
 
-CLASSES = (LODGS_PT_look, LODGS_PT_look_regions)
+CLASSES = (LODGS_PT_look, LODGS_PT_look_paint, LODGS_PT_look_regions)

@@ -16,6 +16,8 @@ import bpy
 import numpy as np
 
 from ...training.errors import LodgsError
+from ...training.lod.paint import COLUMNS as PAINT
+from ...training.lod.paint import painted
 from ...training.lod.rule import every_column
 from ...training.splats.gaussians import Splats
 from .. import attributes
@@ -172,7 +174,8 @@ def placed_splats(depsgraph: bpy.types.Depsgraph) -> list[renderer.PlacedSplats 
             continue
         own = instance.object.data
         read = partial(_splats_of, own.evaluated_get(depsgraph), every_column())
-        version, choice = changes.version(own), selection.choice(evaluated, depsgraph)
+        version = *changes.version(own), *changes.paint(own)
+        choice = selection.choice(evaluated, depsgraph)
         found.append(
             renderer.PlacedSplats(own.session_uid, read, *place, version, choice, empty, instance.looks)
         )
@@ -192,16 +195,16 @@ def _chosen_by_rule(instance: shown.SplatInstance, depsgraph: bpy.types.Depsgrap
 
 
 def _splats_of(cloud: bpy.types.PointCloud, columns: Iterable[str] = ()) -> tuple[Splats, np.ndarray | None]:
-    """The splats of a point cloud with what it has of some columns, and their weights."""
+    """The splats of a point cloud as painted, with what it has of some columns, and their weights."""
     splats = objects.splats_of(cloud)
     if splats is None:  # modifiers have taken their attributes away
         nothing = np.zeros((0, 4), np.float32)
         return Splats(nothing[:, :3], nothing, nothing[:, :3], nothing[:, 0], np.zeros((0, 1, 3))), None
-    for name in columns:
+    for name in (*columns, *PAINT):
         values = attributes.read_attribute(cloud, name)
         if values is not None and values.ndim == 1:
             splats.extras[name] = values
-    return splats, attributes.read_attribute(cloud, attributes.WEIGHT)
+    return painted(splats), attributes.read_attribute(cloud, attributes.WEIGHT)
 
 
 def size(render: bpy.types.RenderSettings) -> tuple[int, int]:

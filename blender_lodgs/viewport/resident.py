@@ -10,16 +10,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf
 
 import bpy
 import gpu
 import numpy as np
 
+from ...training.lod.paint import mixed
 from ...training.lod.rule import every_column
 from .. import attributes
-from ..data import changes, cleaning
+from ..data import changes, cleaning, painting
 from . import splats
 from .arranging import WIDTH, Pool
 from .streaming import Stream, record_texels
@@ -48,6 +49,8 @@ class Resident:
         higher: how many coefficients beyond the first they have at most, of whole degrees up to 4.
         store: those on the graphics card; none as long as nothing was drawn.
         selected: (N,) bool, see :meth:`see_selection`; None where none is.
+        painted: the paint (N, 4) of each cloud, by its place among them, that was seen last; see
+            :meth:`see_paint`.
     """
 
     pool: Pool
@@ -56,6 +59,7 @@ class Resident:
     higher: int
     store: Store | None = None
     selected: np.ndarray | None = None
+    painted: dict[int, tuple[changes.Version, np.ndarray | None]] = field(default_factory=dict)
     _selection: changes.Version | None = None
 
     @property
@@ -87,6 +91,26 @@ class Resident:
             if isinstance(cloud, bpy.types.PointCloud) and len(cloud.points) == count:
                 found[start : start + count] = cleaning.shown_selected(cloud)
         self.selected = found if found.any() else None
+
+    def see_paint(self, clouds: Sequence[Cloud | None]) -> None:
+        """Brings what has been painted since it was asked last to where it is on the graphics card."""
+        for number, cloud in enumerate(clouds):
+            if not isinstance(cloud, bpy.types.PointCloud) or len(cloud.points) != self.counts[number]:
+                continue
+            version, before = self.painted.get(number, (None, None))
+            if version == (now := changes.paint(cloud)):
+                continue
+            paint = painting.shown_paint(cloud)
+            self.painted[number] = now, paint
+            if version is None or self.store is None:
+                continue
+            nothing = np.zeros((1, 4), np.float32)
+            others = (nothing if before is None else before) != (nothing if paint is None else paint)
+            rows = np.flatnonzero(np.broadcast_to(others.any(axis=1), self.counts[number]))
+            there = rows[self.store.places[self.starts[number] + rows] >= 0]
+            for begin in range(0, len(there), PIECE):
+                some = there[begin : begin + PIECE]
+                self.store.renew(self.starts[number] + some, read_records(cloud, some, self.store.higher))
 
     def of_one_cloud(self, wanted: np.ndarray) -> int:
         """How many of some splats (M,), ascending, are of the first one's cloud."""
@@ -166,12 +190,22 @@ class Store:
         Args:
             records: (M, 4 * texels) float32.
         """
-        global bytes_uploaded
         places = self._free(len(splats_))
         gone = self.owners[places]
         gone = gone[gone >= 0]
         self.places[gone] = -1
         self.owners[places], self.places[splats_], self._drawn[places] = splats_, places, self._now
+        self._write(places, records)
+
+    def renew(self, splats_: np.ndarray, records: np.ndarray) -> None:
+        """Gives splats (M,) that are there other records, (M, 4 * texels) float32."""
+        places = self.places[splats_]
+        order = np.argsort(places)
+        self._write(places[order], records[order])
+
+    def _write(self, places: np.ndarray, records: np.ndarray) -> None:
+        """Brings records to places (M,), ascending."""
+        global bytes_uploaded
         for number in range(places[0] // self.part, places[-1] // self.part + 1):
             begin, end = np.searchsorted(places, (number * self.part, (number + 1) * self.part))
             if begin < end:
@@ -299,6 +333,9 @@ def read_records(cloud: bpy.types.PointCloud, rows: np.ndarray, higher: int) -> 
         records[:, place : place + 3] = attributes.view_attribute(cloud, attributes.SH.format(k + 1))[rows]
     if (weights := attributes.view_attribute(cloud, attributes.WEIGHT)) is not None:
         records[:, 3] *= weights[rows]
+    if (paint := painting.shown_paint(cloud, rows)) is not None:
+        colors = records[:, 11 : 14 + 3 * higher].reshape(len(records), -1, 3)  # a view
+        colors[:] = mixed(colors, paint)
     return records
 
 

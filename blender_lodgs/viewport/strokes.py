@@ -54,23 +54,25 @@ class Picture:
                 parts.append((placed, scales, _drawn(cloud, means, choice)))
         self._front = Front(parts)
 
-    def brush(self, path: np.ndarray, radius: float, through: bool = False) -> dict[int, np.ndarray]:
-        """What a brush hits of each level, (N,) bool by its number: see ``brush.brushed``.
+    def brush(
+        self, path: np.ndarray, radius: float, through: bool = False, hardness: float = 1.0
+    ) -> dict[int, np.ndarray]:
+        """How strongly a brush hits each level, (N,) float32 by its number: see ``brush.brushed``.
 
         Args:
             path: (P, 2) in the region's pixels.
             through: hit what is hidden by other splats as well.
         """
-        return self._hits(brushed(path, radius, self.size), through)
+        return self._hits(brushed(path, radius, self.size, hardness), through)
 
     def lasso(self, path: np.ndarray, through: bool = False) -> dict[int, np.ndarray]:
-        """What a lasso hits of each level, as :meth:`brush`: see ``brush.lassoed``."""
+        """What a lasso hits of each level, (N,) bool by its number: see ``brush.lassoed``."""
         return self._hits(lassoed(path, self.size), through)
 
     def _hits(self, covered: np.ndarray, through: bool) -> dict[int, np.ndarray]:
         front = None if through else self._front
         return {
-            number: hits(covered, placed, reach, front) & there
+            number: hits(covered, placed, reach, front) * there
             for number, (placed, reach, there) in self._levels.items()
         }
 

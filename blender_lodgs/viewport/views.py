@@ -236,6 +236,7 @@ def prepare(
     if view.arrived != NOTHING:  # what is not asked for yet has the view redrawn again
         view.arrived = arrived if take_over and asked else before
     of.see_selection(clouds)
+    of.see_paint(clouds)
     _load(view, of, clouds, wait)
     if view.arrangement is not None and view.selected is not _selected(view):
         _list(view)

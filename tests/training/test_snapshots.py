@@ -133,7 +133,7 @@ def test_what_methods_says(name, capsys, file_regression):
     file_regression.check(capsys.readouterr().out, basename=f"methods_{name or 'all'}")
 
 
-@pytest.mark.parametrize("command", ["", "train", "evaluate", "render", "transform", "info", "methods"])
+@pytest.mark.parametrize("command", ["", "train", "evaluate", "render", "edit", "info", "methods"])
 def test_help(command, monkeypatch, capsys, file_regression):
     monkeypatch.setenv("COLUMNS", "100")
     with pytest.raises(SystemExit):

@@ -1,7 +1,7 @@
 """Which splats a stroke over a picture hits, a brush's or a lasso's: those that are seen there, or all.
 
-A stroke is the pixels that it covers, and hits splats whose means are projected onto them: the same test for
-every level. What is seen is told from the splats that a picture shows, a cell of pixels at a time.
+A stroke is how strongly it covers each pixel, and hits splats whose means are projected there: the same test
+for every level. What is seen is told from the splats that a picture shows, a cell of pixels at a time.
 
 numpy only.
 """
@@ -21,15 +21,17 @@ DARK = float(np.log(2))
 _NOWHERE = np.float32(-1e9)
 
 
-def brushed(path: np.ndarray, radius: float, size: tuple[int, int]) -> np.ndarray:
-    """(H, W) bool, which pixels have their centres within a radius of a path's points (P, 2) or between them.
+def brushed(path: np.ndarray, radius: float, size: tuple[int, int], hardness: float = 1.0) -> np.ndarray:
+    """(H, W) float32, how strongly a brush covers pixels whose centres are within a radius of a path's points
+    (P, 2), or of the way between them: from 1 down to 0 where it does not.
 
     Args:
         path: in pixels, x and y from the corner of the first one.
         size: (W, H).
+        hardness: share of the radius up to which it is 1; beyond that it falls by 3 t^2 - 2 t^3.
     """
     width, height = size
-    covered = np.zeros((height, width), bool)
+    covered = np.zeros((height, width), np.float32)
     path = np.asarray(path, np.float64).reshape(-1, 2)
     for begin, end in zip(path, path[1:] if len(path) > 1 else path, strict=False):
         low = np.floor(np.minimum(begin, end) - radius).astype(int).clip(0)
@@ -38,8 +40,10 @@ def brushed(path: np.ndarray, radius: float, size: tuple[int, int]) -> np.ndarra
         y = (np.arange(low[1], high[1]) + 0.5 - begin[1])[:, None]
         along = end - begin
         share = ((x * along[0] + y * along[1]) / max(along @ along, 1e-12)).clip(0, 1)
-        near = (x - share * along[0]) ** 2 + (y - share * along[1]) ** 2 <= radius * radius
-        covered[low[1] : high[1], low[0] : high[0]] |= near
+        away = np.hypot(x - share * along[0], y - share * along[1]) / radius
+        t = ((1 - away) / max(1 - hardness, 1e-6)).clip(0, 1)
+        here = covered[low[1] : high[1], low[0] : high[0]]
+        np.maximum(here, np.where(away <= hardness, 1, t * t * (3 - 2 * t)), out=here)
     return covered
 
 
@@ -169,14 +173,14 @@ class Front:
 def hits(
     covered: np.ndarray, splats: Placed, reach: np.ndarray | None = None, front: Front | None = None
 ) -> np.ndarray:
-    """(N,) bool, which splats a stroke hits.
+    """(N,) how strongly a stroke hits splats; what it does not is 0, or False.
 
     Args:
-        covered: (H, W) bool, the stroke's pixels: see :func:`brushed` and :func:`lassoed`.
+        covered: (H, W) the stroke, see :func:`brushed` and :func:`lassoed`.
         reach: (N,) how far splats reach, in their units, where only what is seen is to be hit.
         front: of the same picture; who reaches before its depth is seen.
     """
-    found = np.zeros(len(splats.x), bool)
+    found = np.zeros(len(splats.x), covered.dtype)
     rows, columns = np.flatnonzero(covered.any(axis=1)), np.flatnonzero(covered.any(axis=0))
     if not len(rows):
         return found
@@ -184,11 +188,13 @@ def hits(
     near &= (splats.y >= rows[0]) & (splats.y < rows[-1] + 1)
     some = np.flatnonzero(near)
     x, y = splats.x[some], splats.y[some]
-    on = covered[y.astype(np.int32), x.astype(np.int32)]
-    some, x, y = some[on], x[on], y[on]
+    hit = covered[y.astype(np.int32), x.astype(np.int32)]
+    on = hit > 0
+    some, x, y, hit = some[on], x[on], y[on], hit[on]
     if front is not None and reach is not None:
-        some = some[splats.depth[some] - reach[some] <= front.depth(x, y)]
-    found[some] = True
+        seen = splats.depth[some] - reach[some] <= front.depth(x, y)
+        some, hit = some[seen], hit[seen]
+    found[some] = hit
     return found
 
 

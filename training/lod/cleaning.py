@@ -83,7 +83,7 @@ def floaters(means: np.ndarray, gap: float = 0.0, share: float = SHARE) -> np.nd
     """
     if not len(means):
         return np.zeros(0, bool)
-    cell_of, cells = _cells(means, gap or typical_gap(means))
+    cell_of, cells = cells_of(means, gap or typical_gap(means))
     cluster = _clusters(cells)
     counts = np.bincount(cluster[cell_of], minlength=len(cells))
     return (counts <= share * len(means))[cluster][cell_of]
@@ -334,9 +334,13 @@ def _or_zeros(column: np.ndarray | None, count: int) -> np.ndarray:
     return np.zeros(count, np.float32) if column is None else column
 
 
-def _cells(means: np.ndarray, gap: float) -> tuple[np.ndarray, np.ndarray]:
-    """The number of each splat's cell (N,), and the cells (V,) int64 themselves, ascending, three numbers of
-    21 bits each; none is at the border of what 21 bits can tell."""
+def cells_of(means: np.ndarray, gap: float) -> tuple[np.ndarray, np.ndarray]:
+    """Which cubes of an edge ``gap`` splats at means (N, 3) are in.
+
+    Returns:
+        The number of each splat's cell (N,), and the cells (V,) int64 themselves, ascending, three numbers of
+        21 bits each; none is at the border of what 21 bits can tell.
+    """
     low = np.median(means[:: max(len(means) // 100_000, 1)], axis=0)
     keys = np.zeros(len(means), np.int64)
     for axis in range(3):

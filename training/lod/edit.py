@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import LodgsError
 from ..splats.bundle import Bundle, DrawableRows, Level, open_bundle, read_folder, write_bundle, write_folder
-from ..splats.dialects import Warn, comments_of, silent
+from ..splats.dialects import Warn, comments_of, meta_of, silent
 from ..splats.formats import PLY, SPLAT, format_of, program, write_splats, write_streamed
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.placing import Placement
@@ -82,10 +82,10 @@ def edit(
         pass
     elif source.is_dir():
         write_folder(out, found)
-    elif bundle.method or bundle.rule or len(bundle.levels) > 1:
-        write_bundle(out, found)
-    else:
+    elif bundle == Bundle("", bundle.levels[:1], meta=meta_of(comments_of(bundle.meta))):
         write_ply(out, found.levels[0].rows, comments_of(bundle.meta))
+    else:
+        write_bundle(out, found)
     lines = [
         f"level {before.number}: {len(after.rows):,} of {len(before.rows):,} splats"
         for before, after in zip(bundle.levels, found.levels, strict=True)

@@ -18,6 +18,7 @@ from ..errors import LodgsError
 from ..splats.bundle import Bundle
 from ..splats.gaussians import SH_C0, SplatRows, Splats
 from .crop import Crop
+from .paint import painted
 
 GAMMA = 2.2
 """Of the power that stands for the sRGB curve."""
@@ -139,14 +140,15 @@ def changed(
 
 
 def looked(splats: Splats, looks: Looks) -> Splats:
-    """Splats as looks have them; places of regions are in the splats' own space."""
+    """Splats as paint and looks have them; places of regions are in the splats' own space."""
+    splats = painted(splats)
     sh, opacity_logits = changed(looks, splats.means, splats.sh, splats.opacity_logits)
     return replace(splats, sh=sh, opacity_logits=opacity_logits)
 
 
 @dataclass(frozen=True)
 class LookedRows:
-    """Splats that are read a few at a time, as looks have them."""
+    """Splats that are read a few at a time, as paint and looks have them."""
 
     of: SplatRows
     looks: Looks
@@ -160,8 +162,8 @@ class LookedRows:
 
 
 def looked_levels(bundle: Bundle, looks: Looks) -> Bundle:
-    """A bundle whose levels are as looks have them; those that are in files stay there until they are
-    written."""
+    """A bundle whose levels are as paint and looks have them; those that are in files stay there until they
+    are written."""
     levels = [
         replace(level, splats=looked(level.splats, looks))
         if level.elsewhere is None

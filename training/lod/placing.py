@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,22 +10,10 @@ import numpy as np
 from ..errors import LodgsError
 from ..scenes import views
 from ..scenes.ground import about_cameras, find_ground, level_at_zero
-from ..splats.bundle import (
-    META_LENGTHS,
-    NO_SPLATS,
-    Bundle,
-    DrawableRows,
-    Level,
-    open_bundle,
-    read_folder,
-    read_head,
-    write_bundle,
-    write_folder,
-)
-from ..splats.dialects import Warn, comments_of, meta_of, silent
+from ..splats.bundle import META_LENGTHS, NO_SPLATS, Bundle, Level
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.placing import PlacedRows, Placement
-from ..splats.ply import AT_ONCE, Columns, write_ply
+from ..splats.ply import AT_ONCE, Columns
 from .paging import BOUNDS, table_of_pages
 from .rule import Rule, find_rule
 from .selection import columns_of, unknown_rule
@@ -111,43 +98,6 @@ def _opaque(rows: SplatRows) -> np.ndarray:
         some = rows.select(slice(begin, begin + AT_ONCE))
         found.append(some.means[some.opacity_logits > 0])
     return np.concatenate(found)
-
-
-def place_file(source: Path, out: Path, placement: Placement, warn: Warn = silent) -> int:
-    """Writes a bundle, a folder of levels or any 3DGS PLY as it stands elsewhere, in the same form.
-
-    Splats of a PLY are read and written a few at a time.
-
-    Returns:
-        How many splats there are.
-
-    Raises:
-        LodgsError: as :func:`placed`, ``open_bundle``, ``read_folder``, or the file cannot be written.
-    """
-    if source.is_dir():
-        there = placed(read_folder(source, warn), placement)
-        write_folder(out, there)
-        return sum(len(level.splats) for level in there.levels)
-    bundle, rows = open_bundle(source)
-    for level in bundle.levels:
-        level.elsewhere = DrawableRows(rows[level.number], warn)
-    if any(len(level.rows) < len(rows[level.number]) for level in bundle.levels):
-        bundle.tables.pop(BLOCKS, None)  # which tells of rows
-    there = placed(bundle, placement)
-    if bundle == Bundle("", bundle.levels, meta=meta_of(comments_of(bundle.meta))):
-        write_ply(out, there.levels[0].rows, comments_of(bundle.meta))
-    else:
-        write_bundle(out, there)
-    return sum(len(level.rows) for level in there.levels)
-
-
-def upright_of(source: Path) -> Placement:
-    """What stands a file's scene upright, z up.
-
-    Raises:
-        LodgsError: as ``read_head`` and ``read_folder``.
-    """
-    return standing((read_folder if source.is_dir() else read_head)(source), upright=True)
 
 
 def _meta(meta: dict, placement: Placement) -> dict:

@@ -37,11 +37,12 @@ def at(bpy, lodgs):
     """What is at a pixel, seen along -z without perspective, 4 units wide and 2 high."""
     from mathutils import Matrix
 
-    clip = Matrix.Diagonal((0.5, 1, -0.1, 1))
+    view, clip = Matrix.Identity(4), Matrix.Diagonal((0.5, 1, -0.1, 1))
 
     def found(x, y):
         bpy.context.view_layer.update()
-        return lodgs("data.picking").scene_at(bpy.context.evaluated_depsgraph_get(), None, clip, SIZE, (x, y))
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        return lodgs("data.picking").scene_at(depsgraph, None, view, clip, SIZE, (x, y))
 
     return found
 
@@ -52,6 +53,8 @@ def test_the_nearest_that_hides_what_is_behind_is_picked(scene_of, at):
     assert at(50, 50) is None and at(150, 95) is None
     near.location.x = -2
     assert at(50, 50) == near and at(150, 50) == far
+    near.scale, near.location = (0.1, 0.1, 0.1), (0.9, 0, -0.9)  # the same place but nearer, in other units
+    assert at(150, 50) == near
 
 
 def test_fog_is_looked_through(scene_of, at):

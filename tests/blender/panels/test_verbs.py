@@ -14,8 +14,8 @@ ELSEWHERE = {
     "lodgs.set_ground", "lodgs.set_scale", "lodgs.camera_path", "lodgs.turntable", "lodgs.frame_scene",
     "lodgs.add_crop", "lodgs.hide_splats", "lodgs.show_hidden_splats", "lodgs.delete_left_out",
     "lodgs.select_all_splats",
-    # a stroke of the toolbar's tools
-    "lodgs.select_splats",
+    # strokes of the toolbar's tools
+    "lodgs.select_splats", "lodgs.paint_splats",
 }  # fmt: skip
 
 

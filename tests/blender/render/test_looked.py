@@ -119,6 +119,73 @@ def test_viewports_draw_what_is_exported(bpy, lodgs, seen, tmp_path):
     assert np.abs(box - looked).max() > 0.02 and np.abs(box - around).max() > 0.05
 
 
+def half_painted(lodgs, root, share=0.7):
+    """Half of the scene in green."""
+    painting = lodgs("data.painting")
+    half = {
+        item.number: share * (lodgs("data.objects").read_splats(item.object).means[:, 0] > 0)
+        for item in root.lodgs.levels
+    }
+    return painting.over(painting.read(root), half, (0.1, 0.8, 0.2))
+
+
+@pytest.mark.usefixtures("renderer", "camera")
+@pytest.mark.parametrize("mode", ["SINGLE", "SELECTIVE"])
+def test_frames_show_paint_as_what_is_exported_with_it(bpy, lodgs, seen, tmp_path, mode):
+    scenes = lodgs("data.scenes")
+    root = scenes.import_splats(bpy.context, file_of(tmp_path), upright=False)
+    root.lodgs.mode, root.lodgs.single_level = mode, 3
+    before = seen()
+    lodgs("data.painting").write(root, half_painted(lodgs, root))
+    painted = seen()
+    assert np.abs(before - painted).max() > 0.05
+    copy = scenes.shown_splats(bpy.context, root, looked=True)
+    bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"))
+    lodgs("data.removal").remove(root)
+    again = scenes.import_splats(bpy.context, tmp_path / "out.ply", upright=False)
+    again.lodgs.mode, again.lodgs.single_level = mode, 3
+    np.testing.assert_allclose(seen(), painted, atol=1e-4)
+    np.testing.assert_allclose(scenes.shown_splats(bpy.context, again).sh, copy.sh, atol=1e-6)
+
+
+@pytest.mark.usefixtures("camera", "frame")
+@pytest.mark.parametrize("modifier", [False, True])
+def test_viewports_show_paint_at_once_and_read_no_splat_anew(bpy, lodgs, seen, tmp_path, modifier):
+    """But of those that a modifier of somebody's own changes."""
+    quick, scenes, views = lodgs("render.quick")._frame, lodgs("data.scenes"), lodgs("viewport.views")
+    root = scenes.import_splats(bpy.context, file_of(tmp_path), upright=False)
+    root.lodgs.mode, root.lodgs.single_level = "SINGLE", 3
+    if modifier:
+        nodes = bpy.data.node_groups.new("own", "GeometryNodeTree")
+        for kind in ("INPUT", "OUTPUT"):
+            nodes.interface.new_socket("Geometry", in_out=kind, socket_type="NodeSocketGeometry")
+        there = [nodes.nodes.new(name) for name in ("NodeGroupInput", "NodeGroupOutput")]
+        nodes.links.new(there[0].outputs[0], there[1].inputs[0])
+        root.lodgs.levels[2].object.modifiers.new("own", "NODES").node_group = nodes
+    before, painting, there = seen(quick), lodgs("data.painting"), half_painted(lodgs, root)
+    read = views.reads
+    painting.show(root, there)  # as long as a stroke lasts
+    during = seen(quick)
+    painting.show(root, {})
+    np.testing.assert_array_equal(seen(quick), before)
+    painting.write(root, there)
+    painted = seen(quick)
+    assert np.abs(before - painted).max() > 0.05 and (views.reads == read) == (not modifier)
+    np.testing.assert_array_equal(during, before if modifier else painted)
+    painting.write(root, painting.over(there, {n: np.full(len(x), 0.5) for n, x in there.items()}, None))
+    half = seen(quick)
+    assert np.abs(before - half).max() > 0.02 and np.abs(painted - half).max() > 0.02
+    painting.write(root, there)
+    np.testing.assert_array_equal(seen(quick), painted)
+    bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"))
+    painting.write(root, {number: 0 * each for number, each in there.items()})
+    np.testing.assert_array_equal(seen(quick), before)
+    lodgs("data.removal").remove(root)
+    again = scenes.import_splats(bpy.context, tmp_path / "out.ply", upright=False)
+    again.lodgs.mode, again.lodgs.single_level = "SINGLE", 3
+    np.testing.assert_allclose(seen(quick), painted, atol=0.01)
+
+
 @pytest.mark.usefixtures("renderer", "camera")
 def test_a_tree_that_is_read_from_its_file_has_its_look(bpy, lodgs, seen, tmp_path):
     write_in_pages(tmp_path / "tree.ply", tree_of(random_leaves(6000, np.random.default_rng(3), degree=1)))

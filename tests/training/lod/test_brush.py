@@ -46,6 +46,29 @@ def test_a_brush_covers_the_pixels_that_are_near_its_path(path):
     assert 0 < wanted.sum() < wanted.size
 
 
+@pytest.mark.parametrize("hardness", [0.0, 0.4, 1.0])
+def test_a_soft_brush_falls_off_towards_its_edge_and_splats_are_hit_so_strongly(hardness):
+    path, radius = [(10.2, 10.7), (70.1, 50.3), (72.4, 12.9)], 13.7
+
+    def strength(x, y):
+        t = min(to_segment(x, y, *each) for each in pairwise(path)) / radius
+        if t <= hardness:
+            return 1.0
+        rest = (1 - t) / (1 - hardness) if t < 1 else 0.0
+        return 3 * rest**2 - 2 * rest**3
+
+    wanted = np.array([strength(x, y) for x, y in centres()]).reshape(SIZE[1], SIZE[0])
+    covered = brushed(path, radius, SIZE, hardness)
+    np.testing.assert_allclose(covered, wanted, atol=1e-5)
+    means = np.random.default_rng(3).uniform((-3, -2, -9), (3, 2, -1), (500, 3)).astype(np.float32)
+    placed = Projection.of(np.eye(4), PERSPECTIVE, SIZE).place(means)
+    x, y = np.floor(placed.x).astype(int), np.floor(placed.y).astype(int)
+    inside = (x >= 0) & (x < SIZE[0]) & (y >= 0) & (y < SIZE[1])
+    found = hits(covered, placed)
+    np.testing.assert_array_equal(found[inside], covered[y[inside], x[inside]])
+    assert not found[~inside].any() and 20 < np.count_nonzero(found) < 480
+
+
 @pytest.mark.parametrize(
     "path",
     [
@@ -120,7 +143,8 @@ def test_only_the_first_wall_is_seen_whatever_its_splats_are_and_fog_hides_none(
         wall(rng, count, 30, sigma, tilt=tilt),
     ]
     size = (480, 320)
-    projection, covered = Projection.of(np.eye(4), clip, size), brushed([(200, 160), (280, 160)], 60, size)
+    projection = Projection.of(np.eye(4), clip, size)
+    covered = brushed([(200, 160), (280, 160)], 60, size) > 0
     placed = [projection.place(means) for means, _, _ in parts]
     front = Front(
         [(where, scales, opacities) for where, (_, scales, opacities) in zip(placed, parts, strict=True)]

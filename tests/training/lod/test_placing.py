@@ -197,7 +197,7 @@ def test_the_command_writes_the_same_form(tmp_path, capsys):
     options = ["--rotate", "10,20,30", "--scale", "2", "--translate=-1,0,3"]
     for name in ("b.ply", "levels", "p.ply"):
         out = tmp_path / f"out_{name}"
-        assert main(["transform", str(tmp_path / name), str(out), *options]) == 0
+        assert main(["edit", str(tmp_path / name), "--out", str(out), *options]) == 0
         assert f"{out}:" in capsys.readouterr().out
         read = read_folder if out.is_dir() else read_bundle
         found, wanted = read(out), placed(read(tmp_path / name), placement)
@@ -207,7 +207,7 @@ def test_the_command_writes_the_same_form(tmp_path, capsys):
             np.testing.assert_array_equal(one.splats.sh, other.splats.sh)
     text = (tmp_path / "out_p.ply").read_bytes()[:4000]
     assert b"lodsplat" not in text and b"property float mine" in text and b"SplatRenderMode: mip" in text
-    assert main(["transform", str(tmp_path / "b.ply"), str(tmp_path / "u.ply"), "--upright"]) == 0
+    assert main(["edit", str(tmp_path / "b.ply"), "--out", str(tmp_path / "u.ply"), "--upright"]) == 0
     up = read_bundle(tmp_path / "u.ply")
     np.testing.assert_allclose(up.upright, np.eye(3), atol=1e-6)
     x, y, z = bundle.levels[0].splats.means.T
@@ -224,5 +224,5 @@ def test_the_command_writes_the_same_form(tmp_path, capsys):
 )
 def test_the_command_refuses_in_a_sentence(tmp_path, capsys, options, words):
     write_bundle(tmp_path / "b.ply", choosable("bands"))
-    assert main(["transform", str(tmp_path / "b.ply"), str(tmp_path / "o.ply"), *options]) == 2
+    assert main(["edit", str(tmp_path / "b.ply"), "--out", str(tmp_path / "o.ply"), *options]) == 2
     assert words in capsys.readouterr().err and not (tmp_path / "o.ply").exists()

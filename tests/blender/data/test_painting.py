@@ -1,0 +1,224 @@
+"""Strokes paint every level as a formula by hand has it, beside the splats' own colours: against numpy."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from tests.blender.data.test_brush import (
+    NAMES,
+    pixels_of,
+    scene_of,  # noqa: F401
+    viewport,  # noqa: F401
+)
+from tests.training.lod.test_cleaning import bundle_of
+from tests.training.lod.trees import random_leaves, tree_of, write_in_pages
+from training.lod.look import Look
+from training.lod.paint import COLUMNS
+from training.scenes.color import linear_from_srgb
+from training.splats.bundle import read_bundle
+from training.splats.gaussians import SH_C0
+from training.splats.ply import read_ply
+
+RED, BLUE = (0.9, 0.2, 0.1), (0.1, 0.3, 0.8)
+
+
+def stroke(bpy, *path, **options):
+    path = [{"name": "", "loc": place, "time": 0.0} for place in path]
+    return bpy.ops.lodgs.paint_splats(path=path, through=True, **options)
+
+
+def strength(looks, size, means, place, radius, hardness):
+    """(N,) how strongly a dab hits means, by the distance of the middles of pixels; NaN between two."""
+    pixels, depth = pixels_of(looks, size, means)
+    t = np.linalg.norm(np.floor(pixels) + 0.5 - place, axis=1) / radius
+    rest = ((1 - t) / (1 - hardness)).clip(0, 1)
+    found = np.where(t <= hardness, 1, 3 * rest**2 - 2 * rest**3)
+    found[(np.abs(pixels - np.round(pixels)) < 1e-3).any(axis=1)] = np.nan
+    return found * (depth > 0.1)
+
+
+def check(found, colors, atol=5e-5):
+    clear = ~np.isnan(colors).any(axis=1)
+    assert clear.mean() > 0.98
+    np.testing.assert_allclose(found[clear], colors[clear], atol=atol)
+
+
+def colors_of(splats):
+    return 0.5 + SH_C0 * splats.sh[:, 0].astype(np.float64)
+
+
+def mix(color, share, new):
+    return (1 - share[:, None]) * color + share[:, None] * np.array(new)
+
+
+@pytest.fixture
+def painted(bpy, lodgs, scene_of, viewport):  # noqa: F811
+    """``painted(bundle)``: a scene with two soft dabs and one erased, its bundle, and what numpy makes of the
+    colours of each level without view dependence."""
+
+    def make(bundle):
+        root, bundle = scene_of(bundle)
+        looks, size = viewport
+        middle = np.array(size) / 2
+        stroke(bpy, tuple(middle), radius=180, color=RED, strength=0.8, hardness=0.3)
+        stroke(bpy, (middle[0] + 60, middle[1]), radius=120, color=BLUE, strength=1.0, hardness=0.5)
+        stroke(bpy, tuple(middle - (40, 30)), radius=60, strength=1.0, hardness=0.0, action="ERASE")
+        colors = {}
+        for level in bundle.levels:
+            means, own = level.splats.means, colors_of(level.splats)
+            one = 0.8 * strength(looks, size, means, middle, 180, 0.3)
+            two = strength(looks, size, means, (middle[0] + 60, middle[1]), 120, 0.5)
+            three = strength(looks, size, means, middle - (40, 30), 60, 0.0)
+            colors[level.number] = mix(mix(own, one, RED), two, BLUE)
+            colors[level.number] = mix(colors[level.number], three, (0, 0, 0)) + three[:, None] * own
+            assert 10 < np.count_nonzero(one) < len(one) and two.any() and three.any()
+        return root, bundle, colors
+
+    return make
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_stroke_paints_every_level_as_points_and_exports_show_it(bpy, lodgs, painted, tmp_path, name):
+    root, bundle, colors = painted(bundle_of(name, np.random.default_rng(0)))
+    root.lodgs_look.exposure, root.lodgs_look.tint = 0.3, (1.0, 0.8, 0.9)
+    matrix = Look(0.3, tint=(1.0, 0.8, 0.9)).matrix
+    bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"))
+    for level, before in zip(read_bundle(tmp_path / "out.ply").levels, bundle.levels, strict=True):
+        check(colors_of(level.splats), colors[level.number] @ matrix.T)
+        assert level.splats.extras.keys() == before.splats.extras.keys()
+        for part in ("means", "quats", "log_scales"):
+            np.testing.assert_array_equal(getattr(level.splats, part), getattr(before.splats, part))
+    bpy.context.scene.lodgs_viewport.splats = False  # points, which Blender draws
+    root.lodgs.mode = "SINGLE"
+    attributes = lodgs("attributes")
+    for item, level in zip(root.lodgs.levels, bundle.levels, strict=True):
+        root.lodgs.single_level = item.number
+        bpy.context.view_layer.update()
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        evaluated = item.object.evaluated_get(depsgraph)
+        rows = attributes.read_attribute(evaluated.data, "row")
+        place = {row: i for i, row in enumerate(level.splats.extras["row"].tolist())}
+        some = [place[row] for row in rows.tolist()]
+        wanted = linear_from_srgb((colors[item.number][some] @ matrix.T).clip(0, 1))
+        found = attributes.read_attribute(evaluated.data, attributes.COLOR)[:, :3]
+        check(found, wanted)
+        assert lodgs("data.selection").only_chosen(evaluated, depsgraph)
+
+
+def test_files_that_keep_the_splats_as_trained_keep_their_paint_beside(bpy, lodgs, painted, tmp_path):
+    root, bundle, colors = painted(bundle_of("bands", np.random.default_rng(1)))
+    bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "trained.ply"), looked=False)
+    for level, before in zip(read_bundle(tmp_path / "trained.ply").levels, bundle.levels, strict=True):
+        np.testing.assert_array_equal(level.splats.sh, before.splats.sh)
+    scenes = lodgs("data.scenes")
+    again = scenes.import_splats(bpy.context, tmp_path / "trained.ply", upright=False)
+    assert lodgs("data.looks").modifier_of(again.lodgs.levels[0].object) is not None
+    for one in (root, again):
+        for level in scenes.read_levels(one, looked=True).levels:
+            check(colors_of(level.splats), colors[level.number])
+    for source in ({"source": "SHOWN"}, {"source": "LEVEL", "level": 3}):
+        again.lodgs.mode, again.lodgs.single_level = "SINGLE", 3
+        bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "plain.ply"), **source)
+        check(colors_of(read_ply(tmp_path / "plain.ply")), colors[3])
+
+
+def test_strokes_are_undone_one_by_one_saved_and_removed(bpy, lodgs, scene_of, viewport, tmp_path):  # noqa: F811
+    root, _ = scene_of(bundle_of("bands", np.random.default_rng(2)))
+    name, (_, size), scenes = root.name, viewport, lodgs("data.scenes")
+
+    def colors():
+        levels = scenes.read_levels(bpy.data.objects[name], looked=True).levels
+        return np.concatenate([level.splats.sh[:, 0] for level in levels])
+
+    assert not bpy.ops.lodgs.remove_paint.poll()
+    states = [colors()]
+    bpy.ops.ed.undo_push(message="start")
+    for x in (0.3, 0.45, 0.6):
+        stroke(bpy, (size[0] * x, size[1] / 2), radius=60, color=RED)
+        bpy.ops.ed.undo_push(message="stroke")
+        states.append(colors())
+    assert all((one != other).any() for one, other in pairwise(states))
+    for wanted in states[-2::-1]:
+        bpy.ops.ed.undo()
+        np.testing.assert_array_equal(colors(), wanted)
+    bpy.ops.ed.redo()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "saved.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "saved.blend"))
+    np.testing.assert_array_equal(colors(), states[1])
+    assert bpy.ops.lodgs.remove_paint() == {"FINISHED"}
+    np.testing.assert_array_equal(colors(), states[0])
+    root = bpy.data.objects[name]
+    for item in root.lodgs.levels:
+        assert not set(COLUMNS) & set(item.object.data.attributes.keys())
+        assert lodgs("data.looks").modifier_of(item.object) is None
+
+
+def test_paint_is_no_other_splats_and_stays_with_those_that_are_left(bpy, lodgs, painted):
+    changes = lodgs("data.changes")
+    root, bundle, colors = painted(bundle_of("bands", np.random.default_rng(3)))
+    clouds = [item.object.data for item in root.lodgs.levels]
+    bpy.context.view_layer.update()
+    versions, paint = [list(map(each, clouds)) for each in (changes.version, changes.paint)]
+    stroke(bpy, (3, 3), radius=2, color=RED)
+    bpy.context.view_layer.update()
+    assert versions == list(map(changes.version, clouds)) and paint != list(map(changes.paint, clouds))
+
+    bpy.ops.lodgs.hide_splats(test="FAINT", opacity=0.4)
+    bpy.ops.lodgs.delete_left_out()
+    for level, now in zip(
+        bundle.levels, lodgs("data.scenes").read_levels(root, looked=True).levels, strict=True
+    ):
+        stays = 1 / (1 + np.exp(-level.splats.opacity_logits)) >= 0.4
+        assert 0 < stays.sum() < len(stays)
+        check(colors_of(now.splats), colors[level.number][stays])
+
+
+@pytest.mark.parametrize("anew", [False, True])
+def test_levels_that_are_trained_anew_take_paint_over_by_position(bpy, lodgs, scene_of, anew):  # noqa: F811
+    """One level in the place of another, or all of another run: a painted half stays painted."""
+    scenes, painting = lodgs("data.scenes"), lodgs("data.painting")
+    root, bundle = scene_of(bundle_of("bands", np.random.default_rng(4)))
+    half = {level.number: (level.splats.means[:, 0] > 0).astype(np.float32) for level in bundle.levels}
+    painting.write(root, painting.over(painting.read(root), half, RED))
+    rng, fresh = np.random.default_rng(5), bundle_of("bands", np.random.default_rng(5)).levels
+    finest = bundle.levels[2].splats.means
+    if anew:
+        scenes.make_room(root, 1)
+    for level in fresh if anew else fresh[2:]:
+        some = rng.integers(len(finest), size=len(level.splats))
+        level.splats.means[:] = finest[some] + rng.normal(0, 0.001, (len(some), 3))
+        scenes.set_level(root, level)
+    found = scenes.read_levels(root, looked=True).levels
+    for level in found if anew else found[2:]:
+        x, before = level.splats.means[:, 0], colors_of(fresh[level.number - 1].splats)
+        wanted = np.where((x > 0)[:, None], RED, before)
+        clear = np.abs(x) > 0.1
+        assert 20 < (x > 0.1).sum() < len(x) - 20
+        np.testing.assert_allclose(colors_of(level.splats)[clear], wanted[clear], atol=1e-4)
+    assert (root.lodgs.painted is not None) == anew
+    bpy.ops.lodgs.remove_paint()
+    assert root.lodgs.painted is None and not any(" paint" in cloud.name for cloud in bpy.data.pointclouds)
+
+
+def test_a_tree_is_painted_node_by_node_and_half_a_tree_is_not(bpy, lodgs, painted, tmp_path, viewport):  # noqa: F811
+    root, _, colors = painted(tree_of(random_leaves(2000, np.random.default_rng(6))))
+    for level in lodgs("data.scenes").read_levels(root, looked=True).levels:
+        check(colors_of(level.splats), colors[level.number])
+    write_in_pages(tmp_path / "paged.ply", tree_of(random_leaves(3000, np.random.default_rng(7))))
+    lodgs("data.scenes").import_splats(bpy.context, tmp_path / "paged.ply", budget=1500)
+    with pytest.raises(RuntimeError, match="Most of these splats are in paged"):
+        stroke(bpy, (100, 100), radius=50, color=RED)
+
+
+def test_what_is_seen_is_painted_and_what_is_behind_is_not(bpy, lodgs, scene_of, viewport):  # noqa: F811
+    root, _ = scene_of(bundle_of("bands", np.random.default_rng(8)))
+    _, size = viewport
+    counts = []
+    for through in (False, True):
+        path = [{"name": "", "loc": (size[0] / 2, size[1] / 2), "time": 0.0}]
+        bpy.ops.lodgs.paint_splats(path=path, radius=200, color=RED, through=through)
+        painted = lodgs("data.painting").read(root)
+        counts.append(sum(int((paint[:, 3] > 0).sum()) for paint in painted.values()))
+        bpy.ops.lodgs.remove_paint()
+    assert 0 < counts[0] < counts[1]
