@@ -1,0 +1,110 @@
+"""What the gpu backend is made of, against numpy: its sums and sorts, its limits, and what it says."""
+
+import numpy as np
+import pytest
+
+from training.errors import LodgsError
+from training.rasterize.gpu import bin, device
+from training.rasterize.gpu.device import Adapter, Device, adapters, open_device
+
+SIZES = [0, 1, 63, 64, 1024, 1025, 70_000]
+
+
+@pytest.fixture
+def opened() -> Device:
+    """The first graphics device, or the software that stands for one."""
+    try:
+        return open_device()
+    except LodgsError as problem:
+        pytest.skip(f"no graphics device: {problem}")
+
+
+@pytest.fixture
+def narrow(opened, monkeypatch) -> Device:
+    """The same, of which a dispatch has no more than seven workgroups along a dimension."""
+    monkeypatch.setattr(opened, "most_groups", 7)
+    return opened
+
+
+@pytest.mark.parametrize("count", SIZES)
+def test_sums_are_numpys(opened, count):
+    values = np.random.default_rng(count).integers(0, 50, count).astype(np.uint32)
+    buffer = opened.upload(values)
+    total = opened.read(bin.sum_up(opened, buffer, count))[-1]
+    np.testing.assert_array_equal(opened.read(buffer), np.cumsum(values) - values)
+    assert total == values.sum()
+
+
+@pytest.mark.parametrize("count", SIZES)
+def test_sorts_are_numpys_stable_ones(narrow, count):
+    """Also where workgroups are dealt out along two dimensions."""
+    keys = np.random.default_rng(count).integers(0, 2**32, count, dtype=np.uint32)
+    keys[::3] &= 255
+    order = np.argsort(keys, kind="stable")
+    found = bin.sort(narrow, narrow.upload(keys), narrow.upload(np.arange(count, dtype=np.uint32)), 32)
+    for buffer, expected in zip(found, (keys[order], order), strict=True):
+        np.testing.assert_array_equal(narrow.read(buffer), expected)
+
+
+def test_software_comes_last_and_a_part_of_a_name_is_enough(opened):
+    found = adapters()
+    assert [a.software for a in found] == sorted(a.software for a in found)
+    assert open_device(found[-1].name.upper()[:4]) is not None
+    with pytest.raises(LodgsError, match=r'no graphics device "Voodoo 2".*There are: '):
+        open_device("Voodoo 2")
+
+
+def test_what_is_too_large_for_a_device_is_said(opened, monkeypatch):
+    monkeypatch.setattr(opened, "most_bytes", 1 << 20)
+    with pytest.raises(LodgsError, match=r"takes 1 MB at a time, and this scene needs 4 MB"):
+        opened.empty(np.float32, 1 << 20)
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (MemoryError("Not enough memory left"), "has no more memory"),
+        (RuntimeError("Parent device is lost\nand a long trace"), "does not answer any more: Parent device"),
+    ],
+)
+def test_what_goes_wrong_on_a_device_is_a_sentence(opened, monkeypatch, error, said):
+    def fail(**_):
+        raise error
+
+    monkeypatch.setattr(opened._device, "create_buffer", fail)
+    monkeypatch.setattr(opened, "lost", False)
+    with pytest.raises(LodgsError, match=said) as caught:
+        opened.empty(np.float32, 4)
+    assert "trace" not in str(caught.value) and opened.lost == ("lost" in str(error))
+
+
+def test_another_device_is_opened_after_one_was_lost(opened, monkeypatch):
+    monkeypatch.setattr(opened, "lost", True)
+    other = open_device(opened.adapter.name)
+    assert other is not opened and not other.lost
+
+
+def test_without_wgpu_or_a_driver_there_is_a_sentence(monkeypatch):
+    device._wgpu.cache_clear()
+    device._found.cache_clear()
+    try:
+        with monkeypatch.context() as patch:
+            patch.setitem(__import__("sys").modules, "wgpu", None)
+            with pytest.raises(LodgsError, match=r"needs wgpu.*pip install wgpu"):
+                adapters()
+
+        class Nothing:
+            gpu = type("", (), {"enumerate_adapters_sync": staticmethod(list)})
+
+        with monkeypatch.context() as patch:
+            patch.setattr(device, "_wgpu", Nothing)
+            with pytest.raises(LodgsError, match="No graphics device with Vulkan, Metal or D3D12"):
+                adapters()
+    finally:
+        device._wgpu.cache_clear()
+        device._found.cache_clear()
+
+
+def test_software_is_told_from_cards():
+    assert Adapter("llvmpipe", "software", "Vulkan", "").software
+    assert not Adapter("Radeon", "discrete", "Vulkan", "").software

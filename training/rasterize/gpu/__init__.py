@@ -1,0 +1,1 @@
+"""The rasterizer on any graphics card: compute shaders in WGSL, through wgpu."""
