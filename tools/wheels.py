@@ -2,8 +2,8 @@
 
 tools/wheels.py [requirements/trainer.txt]
 
-pip's own resolver answers (``--dry-run --platform``), with the lock's hashes; it takes markers for those of the
-system that it runs on, so lines for other systems are left out before. Minutes; nothing is installed.
+pip's own resolver answers (``--dry-run --platform``), with the lock's hashes. It takes markers for those of
+the system that it runs on, so lines for other systems are left out before. Takes minutes; installs nothing.
 """
 
 from __future__ import annotations
