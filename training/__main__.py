@@ -153,7 +153,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="DEPTH.exr",
         help="leave out what lies behind this Depth pass of meshes",
     )
-    render.add_argument("--backend", default="auto", help="auto, cpu, cuda or reference")
+    render.add_argument("--backend", default="auto", help="auto, cpu, cuda, gpu or reference")
 
     capture = commands.add_parser(
         "capture", help="pictures of splats that have no photographs, as a COLMAP scene to train from"
@@ -169,7 +169,7 @@ def _parser() -> argparse.ArgumentParser:
     capture.add_argument(
         "--view-width", type=int, default=960, help="pixels that these are wide (default 960)"
     )
-    capture.add_argument("--backend", default="auto", help="auto, cpu, cuda or reference")
+    capture.add_argument("--backend", default="auto", help="auto, cpu, cuda, gpu or reference")
 
     scene = commands.add_parser(
         "scene",
@@ -220,7 +220,7 @@ def _parser() -> argparse.ArgumentParser:
 
     serve = commands.add_parser("serve", help="draw frame after frame for Blender")
     serve.add_argument("folder", type=Path, help="folder for arrays, new or empty; removed at the end")
-    serve.add_argument("--backend", default="auto", help="auto, cpu, cuda or reference")
+    serve.add_argument("--backend", default="auto", help="auto, cpu, cuda, gpu or reference")
 
     transform = commands.add_parser(
         "transform",

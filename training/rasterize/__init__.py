@@ -1,8 +1,9 @@
 """Splats to pixels and back: one meaning, several backends.
 
 ``reference`` (plain torch) is the definition, ``cpu`` (Numba, gradients by hand) the fast path on any
-computer, ``cuda`` (gsplat) that on NVIDIA graphics cards. A backend is a module with ``rasterize``,
-``contributions`` and ``photometric_loss`` of the reference's signatures, imported when it is first used.
+computer, ``cuda`` (gsplat) that on NVIDIA graphics cards, ``gpu`` (compute shaders) runs on any graphics card.
+A backend is a module with ``rasterize``, ``contributions`` and ``photometric_loss`` of the reference's
+signatures, imported when it is first used.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ __all__ = [
     "contributions", "device_of", "photometric_loss", "rasterize", "render", "resolve", "strips", "warm_up",
 ]  # fmt: skip
 
-BACKENDS = ("cpu", "cuda", "reference")
+BACKENDS = ("cpu", "cuda", "gpu", "reference")
 """Backends by name; :func:`resolve` says which one ``auto`` is."""
 
 STRIP = 1 << 21
@@ -289,6 +290,10 @@ def resolve(backend: str) -> str:
         )
     if backend == "cuda" and (problem := cuda.problem()):
         raise problem
+    if backend == "gpu":
+        from .gpu.device import open_device
+
+        open_device()
     return backend
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from training.rasterize import BACKENDS, Gaussians
+from training.errors import LodgsError
+from training.rasterize import BACKENDS, Gaussians, resolve
 from training.scenes.cameras import Camera
 
 
@@ -29,12 +30,26 @@ def make_splats():
     return random_splats
 
 
+def working(request) -> str:
+    """The backend of a fixture's parameter; the test is skipped where it cannot work."""
+    if request.param == "cuda":
+        request.getfixturevalue("fake_card")
+    try:
+        return resolve(request.param)
+    except LodgsError as problem:
+        pytest.skip(f"no backend {request.param}: {problem}")
+
+
 @pytest.fixture(params=BACKENDS)
 def backend(request) -> str:
     """Every backend by name; cuda on the CPU, as ``fake_card`` has it."""
-    if request.param == "cuda":
-        request.getfixturevalue("fake_card")
-    return request.param
+    return working(request)
+
+
+@pytest.fixture(params=["cpu", "gpu"])
+def kernels(request) -> str:
+    """The backends with kernels of our own: what the reference is in float64, they are in float32."""
+    return working(request)
 
 
 @pytest.fixture
