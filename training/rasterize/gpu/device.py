@@ -10,7 +10,7 @@ import re
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -27,6 +27,8 @@ STORAGE_BUFFERS = 8
 """Most storage buffers that a shader of ours binds: what every device has."""
 LANES = 64
 """Invocations of a workgroup, in every shader."""
+SMALLEST = 64
+"""Bytes of a buffer of nothing: one element of whatever a shader takes it for."""
 BINDING = re.compile(r"@group\(0\) @binding\((\d+)\) var<(uniform|storage)[^>]*> (\w+)")
 REMEDY = "Train on the CPU (Train On in Blender, backend = cpu in a job), or install the device's driver."
 
@@ -126,7 +128,8 @@ def _wgpu() -> Any:
             f"The rasterizer for graphics devices needs wgpu: {_first_line(error)}.",
             f"Install it with: {sys.executable} -m pip install wgpu",
         ) from error
-    extras.set_instance_extras(backends=["Vulkan", "Metal", "DX12"])  # OpenGL's compute shaders are no help
+    with suppress(RuntimeError):  # somebody in this process has begun with all
+        extras.set_instance_extras(backends=["Vulkan", "Metal", "DX12"])
     return wgpu
 
 
@@ -165,7 +168,7 @@ class Device:
         """
         flags = _wgpu().BufferUsage
         usage = flags.STORAGE | flags.COPY_SRC | flags.COPY_DST
-        size = max(int(np.prod(shape, dtype=np.int64)) * 4, 16)
+        size = max(int(np.prod(shape, dtype=np.int64)) * 4, SMALLEST)
         if size > self.most_bytes:
             raise LodgsError(
                 f"{self.adapter.name} takes {self.most_bytes >> 20} MB at a time, "
@@ -233,7 +236,7 @@ class Device:
             return np.zeros(buffer.shape, buffer.kind)
         with self._said():
             data = self._device.queue.read_buffer(buffer.handle, 0, size)
-        return np.frombuffer(data, buffer.kind).reshape(buffer.shape)
+        return np.frombuffer(data, buffer.kind).reshape(buffer.shape).copy()  # what is mapped is read-only
 
     def submit(self) -> None:
         """Let what was recorded begin; LodgsError: the device was lost."""

@@ -17,3 +17,18 @@ struct Row {
 fn group_of(group: vec3u, groups: vec3u) -> u32 {
     return group.x + group.y * groups.x;
 }
+
+// Columns of what blending's backward pass sums up for a splat, with sigma = -ln(alpha / opacity), g = d loss / d sigma
+// and e = conic d: g, g e, g e et, and the sums over pixels of |g e|.
+const G: u32 = 0;
+const G_X: u32 = 1;
+const G_Y: u32 = 2;
+const G_XX: u32 = 3;
+const G_XY: u32 = 4;
+const G_YY: u32 = 5;
+const ABS_X: u32 = 6;
+const ABS_Y: u32 = 7;
+const SUMS: u32 = 8;
+// A pair has d loss / d colour besides.
+const RED: u32 = 8;
+const PAIR_SUMS: u32 = 11;
