@@ -67,6 +67,8 @@ class LodgsPreferences(bpy.types.AddonPreferences):
                 say(layout, problem, "ERROR")
             if report.devices:
                 say(layout, report.devices, "INFO")
+                if self.backend == "gpu" and not report.graphics:
+                    say(layout, "There is no graphics card to train on: choose Automatic or CPU.", "ERROR")
 
 
 CLASSES = (LodgsPreferences,)

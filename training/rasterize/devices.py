@@ -57,12 +57,12 @@ class Devices:
         cores = f"the processor ({threads()} thread{'s' * (threads() > 1)})"
         if self.card and find_spec("gsplat"):
             return f"Automatic trains on {self.card} if gsplat works there, else on {cores}."
-        if self.chosen is not None:
+        if self.chosen is not None and not self.chosen.software:
             may = f"The graphics card may be faster: choose it to try {self.chosen.name}."
         elif self.adapters or not self.missing:
             may = "A graphics card might be faster, and none was found."
         else:
-            may = f"No graphics card can be used: {self.missing}"
+            may = self.missing
         if self.card:
             may += f" So may {self.card} be with CUDA, once gsplat is installed."
         return f"Automatic trains on {cores}. {may}"
