@@ -310,6 +310,11 @@ def _parser() -> argparse.ArgumentParser:
     info.add_argument("file", type=Path)
 
     commands.add_parser("check", help="say as JSON whether this Python can train")
+    devices = commands.add_parser("devices", help="say what this computer can train on, and try it")
+    devices.add_argument("--time", action="store_true", help="measure a training step on each, too")
+    devices.add_argument(
+        "--json", action="store_true", help="only what drivers say, as JSON; nothing is tried"
+    )
 
     return parser
 
@@ -666,6 +671,13 @@ def _info(chosen: argparse.Namespace) -> int:
     return 0
 
 
+def _devices(chosen: argparse.Namespace) -> int:
+    from .rasterize.devices import Devices, describe
+
+    print(json.dumps(Devices.found().as_json()) if chosen.json else describe(chosen.time))
+    return 0
+
+
 def _check() -> int:
     found = _environment()
     print(json.dumps(found))
@@ -718,6 +730,7 @@ _COMMANDS = {
     "transform": _transform,
     "edit": _edit,
     "info": _info,
+    "devices": _devices,
 }
 
 

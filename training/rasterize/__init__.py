@@ -30,6 +30,7 @@ from .rendering import OUTPUTS, Contributions, Rendering, Settings, Target, View
 __all__ = [
     "BACKENDS", "OUTPUTS", "Adam", "Contributions", "Gaussians", "Rendering", "Target",
     "contributions", "device_of", "photometric_loss", "rasterize", "render", "resolve", "strips", "warm_up",
+    "why_cpu",
 ]  # fmt: skip
 
 BACKENDS = ("cpu", "cuda", "gpu", "reference")
@@ -277,6 +278,9 @@ def photometric_loss(
 def resolve(backend: str) -> str:
     """The backend that a name means on this computer: ``auto`` is cuda where that works, else cpu.
 
+    ``gpu`` is cpu where the graphics device does not draw what the reference draws, which is tried before the
+    device is first used (:func:`why_cpu` says so).
+
     Raises:
         LodgsError: for a backend that does not exist, or does not work on this computer.
     """
@@ -291,10 +295,31 @@ def resolve(backend: str) -> str:
     if backend == "cuda" and (problem := cuda.problem()):
         raise problem
     if backend == "gpu":
-        from .gpu.device import open_device
+        from .gpu import choice
 
-        open_device()
+        return "cpu" if choice.difference(choice.chosen()) else "gpu"
     return backend
+
+
+def why_cpu(backend: str) -> str:
+    """Why the cpu draws where a GPU was asked for, or could be; nothing where there is no reason to say so.
+
+    Raises:
+        LodgsError: as :func:`resolve`.
+    """
+    from . import cuda
+
+    if backend == "auto" and torch.cuda.is_available() and (problem := cuda.problem()):
+        return f"The NVIDIA GPU is not used. {problem}"
+    if backend == "gpu" and resolve(backend) == "cpu":
+        from .gpu import choice
+
+        device = choice.chosen()
+        return (
+            f"{device.name} is not used: {choice.difference(device)}. The processor takes its place; a newer "
+            "driver may help."
+        )
+    return ""
 
 
 def device_of(backend: str) -> torch.device:

@@ -11,27 +11,18 @@ SIZES = [0, 1, 63, 64, 1024, 1025, 70_000]
 
 
 @pytest.fixture
-def opened() -> Device:
-    """The first graphics device, or the software that stands for one."""
-    try:
-        return open_device()
-    except LodgsError as problem:
-        pytest.skip(f"no graphics device: {problem}")
-
-
-@pytest.fixture
-def narrow(opened, monkeypatch) -> Device:
+def narrow(graphics, monkeypatch) -> Device:
     """The same, of which a dispatch has no more than seven workgroups along a dimension."""
-    monkeypatch.setattr(opened, "most_groups", 7)
-    return opened
+    monkeypatch.setattr(graphics, "most_groups", 7)
+    return graphics
 
 
 @pytest.mark.parametrize("count", SIZES)
-def test_sums_are_numpys(opened, count):
+def test_sums_are_numpys(graphics, count):
     values = np.random.default_rng(count).integers(0, 50, count).astype(np.uint32)
-    buffer = opened.upload(values)
-    total = opened.read(bin.sum_up(opened, buffer, count))[-1]
-    np.testing.assert_array_equal(opened.read(buffer), np.cumsum(values) - values)
+    buffer = graphics.upload(values)
+    total = graphics.read(bin.sum_up(graphics, buffer, count))[-1]
+    np.testing.assert_array_equal(graphics.read(buffer), np.cumsum(values) - values)
     assert total == values.sum()
 
 
@@ -46,7 +37,7 @@ def test_sorts_are_numpys_stable_ones(narrow, count):
         np.testing.assert_array_equal(narrow.read(buffer), expected)
 
 
-def test_software_comes_last_and_a_part_of_a_name_is_enough(opened):
+def test_software_comes_last_and_a_part_of_a_name_is_enough(graphics):
     found = adapters()
     assert [a.software for a in found] == sorted(a.software for a in found)
     assert open_device(found[-1].name.upper()[:4]) is not None
@@ -54,10 +45,10 @@ def test_software_comes_last_and_a_part_of_a_name_is_enough(opened):
         open_device("Voodoo 2")
 
 
-def test_what_is_too_large_for_a_device_is_said(opened, monkeypatch):
-    monkeypatch.setattr(opened, "most_bytes", 1 << 20)
+def test_what_is_too_large_for_a_device_is_said(graphics, monkeypatch):
+    monkeypatch.setattr(graphics, "most_bytes", 1 << 20)
     with pytest.raises(LodgsError, match=r"takes 1 MB at a time, and this scene needs 4 MB"):
-        opened.empty(np.float32, 1 << 20)
+        graphics.empty(np.float32, 1 << 20)
 
 
 @pytest.mark.parametrize(
@@ -67,21 +58,21 @@ def test_what_is_too_large_for_a_device_is_said(opened, monkeypatch):
         (RuntimeError("Parent device is lost\nand a long trace"), "does not answer any more: Parent device"),
     ],
 )
-def test_what_goes_wrong_on_a_device_is_a_sentence(opened, monkeypatch, error, said):
+def test_what_goes_wrong_on_a_device_is_a_sentence(graphics, monkeypatch, error, said):
     def fail(**_):
         raise error
 
-    monkeypatch.setattr(opened._device, "create_buffer", fail)
-    monkeypatch.setattr(opened, "lost", False)
+    monkeypatch.setattr(graphics._device, "create_buffer", fail)
+    monkeypatch.setattr(graphics, "lost", False)
     with pytest.raises(LodgsError, match=said) as caught:
-        opened.empty(np.float32, 4)
-    assert "trace" not in str(caught.value) and opened.lost == ("lost" in str(error))
+        graphics.empty(np.float32, 4)
+    assert "trace" not in str(caught.value) and graphics.lost == ("lost" in str(error))
 
 
-def test_another_device_is_opened_after_one_was_lost(opened, monkeypatch):
-    monkeypatch.setattr(opened, "lost", True)
-    other = open_device(opened.adapter.name)
-    assert other is not opened and not other.lost
+def test_another_device_is_graphics_after_one_was_lost(graphics, monkeypatch):
+    monkeypatch.setattr(graphics, "lost", True)
+    other = open_device(graphics.adapter.name)
+    assert other is not graphics and not other.lost
 
 
 def test_without_wgpu_or_a_driver_there_is_a_sentence(monkeypatch):

@@ -17,7 +17,8 @@ import torch
 from ..gaussians import Gaussians
 from ..rendering import Drawn, Settings, Target, View
 from .bin import TILE, Pairs, bin_splats, groups_of
-from .device import Buffer, Device, open_device
+from .choice import open_chosen
+from .device import Buffer, Device
 from .loss import loss_and_gradient, moments_of
 
 ROW = 12
@@ -64,7 +65,7 @@ def contributions(
     gaussians: Gaussians, weights: torch.Tensor | None, settings: Settings
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """See :func:`training.rasterize.contributions`: of one view, the largest, the sum, pixels and radii."""
-    count, device = len(gaussians), open_device()
+    count, device = len(gaussians), open_chosen()
     gaussians = replace(gaussians, sh=gaussians.means.new_zeros(count, 1, 3))
     weights = torch.ones(0) if weights is None else weights
     with device.lock:
@@ -172,7 +173,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, means, quats, log_scales, logits, sh, weights, features, settings, side):
-        tensors, device, view = [means, quats, log_scales, logits, sh, weights], open_device(), settings.view
+        tensors, device, view = [means, quats, log_scales, logits, sh, weights], open_chosen(), settings.view
         with device.lock:
             scene = _Scene.of(device, tensors, settings)
             pairs, limit = scene.pairs, np.zeros(1, np.float32)
@@ -260,7 +261,7 @@ class _Rasterize(torch.autograd.Function):
 class _Photometric(torch.autograd.Function):
     @staticmethod
     def forward(ctx, image, target, ssim_weight):
-        device = open_device()
+        device = open_chosen()
         with device.lock:
             if target.cache.get("gpu", (None,))[0] is not device:
                 truth = device.upload(target.image.float().numpy())
