@@ -1,9 +1,9 @@
 """Splats to pixels and back: one meaning, several backends.
 
 ``reference`` (plain torch) is the definition, ``cpu`` (Numba, gradients by hand) the fast path on any
-computer, ``cuda`` (gsplat) that on NVIDIA graphics cards, ``gpu`` (compute shaders) runs on any graphics card.
-A backend is a module with ``rasterize``, ``contributions`` and ``photometric_loss`` of the reference's
-signatures, imported when it is first used.
+computer, ``cuda`` (gsplat) that on NVIDIA graphics cards, ``gpu`` (compute shaders) runs on graphics cards of
+any make. A backend is a module with ``rasterize``, ``contributions`` and ``photometric_loss`` of the
+reference's signatures, imported when it is first used.
 """
 
 from __future__ import annotations

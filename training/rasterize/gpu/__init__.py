@@ -1,8 +1,8 @@
 """The rasterizer on any graphics device: compute shaders in WGSL through wgpu, gradients by hand.
 
-As the cpu backend: ``project`` makes ellipses of splats, ``bin`` sorts them into tiles, ``blend`` makes pixels of
-them, and gradients are summed in rows of their own for each pair of splat and tile, then in a fixed order for each
-splat. So nothing is added by atomics, and a device gives the same bits every time.
+As the cpu backend: ``project`` makes ellipses of splats, ``bin`` sorts them into tiles, ``blend`` makes
+pixels of them, and gradients are summed in a row of their own for each pair of splat and tile, then in a
+fixed order for each splat. So nothing is added by atomics, and a device gives the same bits every time.
 
 Tensors live on the CPU. What a step needs is copied to the device, and what comes of it back.
 """

@@ -1,4 +1,4 @@
-"""L1 and structural similarity with their gradient, on a device; the formulas stand in ``shaders/loss.wgsl``."""
+"""L1 and structural similarity with their gradient, on a device; ``shaders/loss.wgsl`` has the formulas."""
 
 from __future__ import annotations
 

@@ -26,29 +26,8 @@ fn tile_range(middle: f32, reach: f32, tiles: u32) -> vec2u {
     return vec2u(clamp(vec2f(low, high), vec2f(0.0), vec2f(f32(tiles))));
 }
 
-// Whether the ellipse on which alpha is ALPHA_MIN meets the rectangle of a tile's pixel centres. The quadratic
-// form is convex: outside the rectangle its minimum lies on one of the edges that face the mean.
-fn touches(row: Row, x: u32, y: u32) -> bool {
-    let low = vec2f(f32(x * TILE), f32(y * TILE)) + 0.5 - row.mean;
-    let high = low + SPAN;
-    let beside = low.x > 0.0 || high.x < 0.0;
-    let above = low.y > 0.0 || high.y < 0.0;
-    let a = row.conic.x;
-    let b = row.conic.y;
-    let c = row.conic.z;
-    let reach = 2.0 * LN2 * (row.log2_opacity - LOG2_ALPHA_MIN);
-    var meets = !beside && !above;
-    if (beside) {
-        let dx = select(high.x, low.x, low.x > 0.0);
-        let dy = clamp(-b * dx / c, low.y, high.y);
-        meets = meets || (a * dx + 2.0 * b * dy) * dx + c * dy * dy <= reach;
-    }
-    if (above) {
-        let dy = select(high.y, low.y, low.y > 0.0);
-        let dx = clamp(-b * dy / a, low.x, high.x);
-        meets = meets || (a * dx + 2.0 * b * dy) * dx + c * dy * dy <= reach;
-    }
-    return meets;
+fn touches_tile(row: Row, x: u32, y: u32) -> bool {
+    return touches(row, vec2f(f32(x * TILE), f32(y * TILE)) + 0.5, vec2f(SPAN));
 }
 
 @compute @workgroup_size(LANES)
@@ -63,7 +42,7 @@ fn count(
         let columns = tile_range(row.mean.x, row.half_size.x, u.across);
         let lines = tile_range(row.mean.y, row.half_size.y, u.down);
         for (var y = lines.x; y < lines.y; y++) {
-            for (var x = columns.x; x < columns.y; x++) { found += u32(touches(row, x, y)); }
+            for (var x = columns.x; x < columns.y; x++) { found += u32(touches_tile(row, x, y)); }
         }
     }
     counts[k] = found;
@@ -87,7 +66,7 @@ fn make_pairs(
         let lines = tile_range(row.mean.y, row.half_size.y, u.down);
         for (var y = lines.x; y < lines.y; y++) {
             for (var x = columns.x; x < columns.y; x++) {
-                if (at < end && touches(row, x, y)) {
+                if (at < end && touches_tile(row, x, y)) {
                     owners[at] = splat;
                     tiles[at] = y * u.across + x;
                     pairs[at] = at;

@@ -1,9 +1,10 @@
 // Every tile's splats blended front to back, and the gradients on the way back.
 //
-// A workgroup is a tile: each of its 64 invocations has one column and four rows, four apart, so what it knows of its
-// pixels are vectors of four. Splats come to it 64 at a time. A pixel sees the sum of w c with w = alpha T, T the
-// transmittance of what lies in front (3DGS, Eq. 3). T turns negative when a pixel is finished, and is so from the
-// start outside the image: whatever follows then fails the test against TRANSMITTANCE_MIN, and |T| stays.
+// A workgroup is a tile: each of its 64 invocations has one column and four rows, so what it knows of its pixels are
+// vectors of four; eight side by side are a strip of 8x4 pixels. Splats come to the tile 64 at a time, and each strip
+// looks at those alone that touch it. A pixel sees the sum of w c with w = alpha T, T the transmittance of what lies in
+// front (3DGS, Eq. 3). T turns negative when a pixel is finished, and is so from the start outside the image: whatever
+// follows then fails the test against TRANSMITTANCE_MIN, and |T| stays.
 
 struct Parameters { background: vec4f, width: u32, height: u32, across: u32, tiles: u32, limited: u32 }
 @group(0) @binding(0) var<uniform> u: Parameters;
@@ -21,12 +22,16 @@ struct Parameters { background: vec4f, width: u32, height: u32, across: u32, til
 @group(0) @binding(12) var<storage, read_write> pair_sums: array<f32>;  // (P, PAIR_SUMS)
 @group(0) @binding(13) var<storage, read_write> pair_weights: array<f32>;  // (P, 3): largest, sum, pixels
 
-const FOUR_ROWS = vec4f(0.0, 4.0, 8.0, 12.0);
+const STRIPS: u32 = 8;
+const STRIP_LANES: u32 = 8;
+const FOUR_ROWS = vec4f(0.0, 1.0, 2.0, 3.0);
 const AT_ONCE: u32 = 4;  // splats whose shares are summed over the tile at a time
 const APART: u32 = LANES + 1u;  // between the shares of one sum and the next, so that lanes read from other banks
 
 var<workgroup> batch_rows: array<Row, LANES>;
 var<workgroup> batch_colours: array<vec3f, LANES>;
+var<workgroup> strips_of: array<u32, LANES>;  // a bit for each strip that a splat touches
+var<workgroup> touching: array<atomic<u32>, 2 * STRIPS>;  // a bit for each splat that touches a strip
 var<workgroup> furthest: atomic<u32>;
 var<workgroup> shares: array<f32, AT_ONCE * PAIR_SUMS * APART>;
 
@@ -37,14 +42,41 @@ struct Pixels {
 }
 
 fn pixels_of(tile: u32, lane: u32) -> Pixels {
-    let first = vec2u(tile % u.across * TILE + lane % TILE, tile / u.across * TILE + lane / TILE);
-    let lines = vec4u(first.y, first.y + 4u, first.y + 8u, first.y + 12u);
+    let first = corner_of(tile, lane / STRIP_LANES) + vec2u(lane % STRIP_LANES, 0u);
+    let lines = vec4u(first.y, first.y + 1u, first.y + 2u, first.y + 3u);
     let inside = (lines < vec4u(u.height)) & vec4<bool>(first.x < u.width);
     return Pixels(first, vec2f(first) + 0.5, inside);
 }
 
+// The first pixel of a tile's strip.
+fn corner_of(tile: u32, strip: u32) -> vec2u {
+    return vec2u(tile % u.across, tile / u.across) * TILE + vec2u(strip % 2u * STRIP_LANES, strip / 2u * 4u);
+}
+
 fn index_of(pixels: Pixels, k: u32) -> u32 {
-    return (pixels.first.y + 4u * k) * u.width + pixels.first.x;
+    return (pixels.first.y + k) * u.width + pixels.first.x;
+}
+
+// Brings the next splats to the tile, and finds out which strips they touch. All invocations come here together.
+fn fetch(tile: u32, first: u32, count: u32, lane: u32) {
+    workgroupBarrier();
+    if (lane < 2u * STRIPS) { atomicStore(&touching[lane], 0u); }
+    workgroupBarrier();
+    if (lane < count) {
+        let splat = owners[first + lane];
+        let row = rows[splat];
+        var bits = 0u;
+        for (var strip = 0u; strip < STRIPS; strip++) {
+            if (touches(row, vec2f(corner_of(tile, strip)) + 0.5, vec2f(7.0, 3.0))) {
+                bits |= 1u << strip;
+                atomicOr(&touching[2u * strip + lane / 32u], 1u << (lane % 32u));
+            }
+        }
+        strips_of[lane] = bits;
+        batch_rows[lane] = row;
+        batch_colours[lane] = colours[splat].xyz;
+    }
+    workgroupBarrier();
 }
 
 struct Alpha {
@@ -90,27 +122,25 @@ fn forward(
     if (lane == 0u) { atomicStore(&furthest, 0u); }  // not every driver clears what workgroups share
     for (var first = range.x; first < range.y; first += LANES) {
         let count = min(LANES, range.y - first);
-        workgroupBarrier();
-        if (lane < count) {
-            let splat = owners[first + lane];
-            batch_rows[lane] = rows[splat];
-            batch_colours[lane] = colours[splat].xyz;
-        }
-        workgroupBarrier();
-        for (var k = 0u; k < count; k++) {
-            if (all(t < vec4f(0.0))) { break; }
-            reached = first + k + 1u;
-            let a = alpha_of(batch_rows[k], pixels.center).alpha;
-            let behind = t - a * t;
-            var takes = behind > vec4f(TRANSMITTANCE_MIN);
-            if (u.limited != 0u) { takes = takes & (vec4f(batch_rows[k].depth) <= limits); }
-            let w = select(vec4f(0.0), a * t, takes);
-            red += w * batch_colours[k].x;
-            green += w * batch_colours[k].y;
-            blue += w * batch_colours[k].z;
-            let halves = takes & (t > vec4f(0.5)) & (behind <= vec4f(0.5));
-            if (any(halves)) { middle = select(middle, vec4i(i32(owners[first + k])), halves); }
-            t = select(-abs(t), behind, takes);
+        fetch(tile, first, count, lane);
+        for (var half = 0u; half < 2u; half++) {
+            var left = atomicLoad(&touching[lane / STRIP_LANES * 2u + half]);
+            while (left != 0u && any(t > vec4f(0.0))) {
+                let k = half * 32u + countTrailingZeros(left);
+                left &= left - 1u;
+                reached = first + k + 1u;
+                let a = alpha_of(batch_rows[k], pixels.center).alpha;
+                let behind = t - a * t;
+                var takes = behind > vec4f(TRANSMITTANCE_MIN);
+                if (u.limited != 0u) { takes = takes & (vec4f(batch_rows[k].depth) <= limits); }
+                let w = select(vec4f(0.0), a * t, takes);
+                red += w * batch_colours[k].x;
+                green += w * batch_colours[k].y;
+                blue += w * batch_colours[k].z;
+                let halves = takes & (t > vec4f(0.5)) & (behind <= vec4f(0.5));
+                if (any(halves)) { middle = select(middle, vec4i(i32(owners[first + k])), halves); }
+                t = select(-abs(t), behind, takes);
+            }
         }
     }
     workgroupBarrier();
@@ -128,6 +158,18 @@ fn forward(
 
 fn share(splat: u32, column: u32, lane: u32, lanes: vec4f) {
     shares[(splat * PAIR_SUMS + column) * APART + lane] = lanes.x + lanes.y + lanes.z + lanes.w;
+}
+
+// What the strips with these bits share of a sum.
+fn sum_of(column: u32, strips: u32) -> f32 {
+    var sum = 0.0;
+    var left = strips;
+    while (left != 0u) {
+        let first = column * APART + countTrailingZeros(left) * STRIP_LANES;
+        left &= left - 1u;
+        for (var k = 0u; k < STRIP_LANES; k++) { sum += shares[first + k]; }
+    }
+    return sum;
 }
 
 // Each pair's share of its splat's gradients.
@@ -163,16 +205,13 @@ fn backward(
     }
     for (var first = range.x; first < range.y; first += LANES) {
         let count = min(LANES, range.y - first);
-        workgroupBarrier();
-        if (lane < count) {
-            let splat = owners[first + lane];
-            batch_rows[lane] = rows[splat];
-            batch_colours[lane] = colours[splat].xyz;
-        }
-        workgroupBarrier();
+        fetch(tile, first, count, lane);
         for (var some = 0u; some < count; some += AT_ONCE) {
             let here = min(AT_ONCE, count - some);
-            for (var k = 0u; k < here; k++) {
+            var left = (atomicLoad(&touching[lane / STRIP_LANES * 2u + some / 32u]) >> (some % 32u)) % (1u << AT_ONCE);
+            while (left != 0u) {
+                let k = countTrailingZeros(left);
+                left &= left - 1u;
                 let colour = batch_colours[some + k];
                 let a = alpha_of(batch_rows[some + k], pixels.center);
                 let behind = t - a.alpha * t;
@@ -199,9 +238,8 @@ fn backward(
             }
             workgroupBarrier();
             if (lane < here * PAIR_SUMS) {
-                var sum = 0.0;
-                for (var k = 0u; k < LANES; k++) { sum += shares[lane * APART + k]; }
-                pair_sums[sorted_pairs[first + some + lane / PAIR_SUMS] * PAIR_SUMS + lane % PAIR_SUMS] = sum;
+                let k = some + lane / PAIR_SUMS;
+                pair_sums[sorted_pairs[first + k] * PAIR_SUMS + lane % PAIR_SUMS] = sum_of(lane, strips_of[k]);
             }
             workgroupBarrier();
         }

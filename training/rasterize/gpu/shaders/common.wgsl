@@ -13,6 +13,32 @@ struct Row {
     radius: f32,  // three standard deviations along the longest axis; 0: it is not drawn
 }
 
+// Whether the ellipse on which alpha is ALPHA_MIN meets a rectangle of pixel centres, from the first to the first and
+// the span. The quadratic form is convex: outside the rectangle its minimum lies on one of the edges that face the
+// mean.
+fn touches(row: Row, first: vec2f, span: vec2f) -> bool {
+    let low = first - row.mean;
+    let high = low + span;
+    let beside = low.x > 0.0 || high.x < 0.0;
+    let above = low.y > 0.0 || high.y < 0.0;
+    let a = row.conic.x;
+    let b = row.conic.y;
+    let c = row.conic.z;
+    let reach = 2.0 * LN2 * (row.log2_opacity - LOG2_ALPHA_MIN);
+    var meets = !beside && !above;
+    if (beside) {
+        let dx = select(high.x, low.x, low.x > 0.0);
+        let dy = clamp(-b * dx / c, low.y, high.y);
+        meets = meets || (a * dx + 2.0 * b * dy) * dx + c * dy * dy <= reach;
+    }
+    if (above) {
+        let dy = select(high.y, low.y, low.y > 0.0);
+        let dx = clamp(-b * dy / a, low.x, high.x);
+        meets = meets || (a * dx + 2.0 * b * dy) * dx + c * dy * dy <= reach;
+    }
+    return meets;
+}
+
 // Which workgroup it is: they lie along two dimensions where one is too short for them.
 fn group_of(group: vec3u, groups: vec3u) -> u32 {
     return group.x + group.y * groups.x;
