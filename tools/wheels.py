@@ -23,7 +23,6 @@ SYSTEMS = {
     "Windows, x86-64": ("win32", "Windows", "AMD64", ["win_amd64"]),
     "macOS 14, Apple": ("darwin", "Darwin", "arm64", [f"macosx_{v}_0_arm64" for v in (14, 13, 12, 11)]),
     "Linux, x86-64": ("linux", "Linux", "x86_64", [f"manylinux{v}_x86_64" for v in GLIBC]),
-    "Linux, ARM": ("linux", "Linux", "aarch64", [f"manylinux{v}_aarch64" for v in GLIBC]),
 }
 
 
