@@ -2,8 +2,11 @@
 
 import numpy as np
 import pytest
+import torch
 
+from tests.training.rasterize.scenes import drawn_and_differentiated
 from training.errors import LodgsError
+from training.rasterize import render
 from training.rasterize.gpu import bin, device
 from training.rasterize.gpu.device import Adapter, Device, adapters, open_device
 
@@ -37,6 +40,26 @@ def test_sorts_are_numpys_stable_ones(narrow, count):
         np.testing.assert_array_equal(narrow.read(buffer), expected)
 
 
+def test_a_picture_does_not_depend_on_how_workgroups_are_dealt_out(
+    graphics, make_splats, odd_camera, monkeypatch
+):
+    """Twenty tiles, and seven workgroups along a dimension: as in an image of more tiles than fit one."""
+    found = []
+    for most in (7, graphics.limits["max-compute-workgroups-per-dimension"]):
+        monkeypatch.setattr(graphics, "most_groups", most)
+        found.append(drawn_and_differentiated("degree 3", make_splats, odd_camera, "gpu", torch.float32))
+    for name, one in found[0].items():
+        assert torch.equal(one, found[1][name]), name
+
+
+def test_pictures_are_the_cpus_to_a_count(graphics, make_splats, odd_camera):
+    """Of 256, in all but one value of a thousand."""
+    splats = make_splats(2000).to(dtype=torch.float32)
+    one, other = (next(render(splats, [odd_camera], dtype="uint8", backend=b)) for b in ("gpu", "cpu"))
+    apart = np.abs(one.astype(int) - other)
+    assert apart.max() <= 1 and (apart > 0).mean() <= 1e-3
+
+
 def test_software_comes_last_and_a_part_of_a_name_is_enough(graphics):
     found = adapters()
     assert [a.software for a in found] == sorted(a.software for a in found)
@@ -55,7 +78,7 @@ def test_what_is_too_large_for_a_device_is_said(graphics, monkeypatch):
     ("error", "said"),
     [
         (MemoryError("Not enough memory left"), "has no more memory"),
-        (RuntimeError("Parent device is lost\nand a long trace"), "does not answer any more: Parent device"),
+        (RuntimeError("a long trace\n    Parent device is lost"), "does not answer any more: Parent device"),
     ],
 )
 def test_what_goes_wrong_on_a_device_is_a_sentence(graphics, monkeypatch, error, said):
@@ -69,10 +92,21 @@ def test_what_goes_wrong_on_a_device_is_a_sentence(graphics, monkeypatch, error,
     assert "trace" not in str(caught.value) and graphics.lost == ("lost" in str(error))
 
 
-def test_another_device_is_graphics_after_one_was_lost(graphics, monkeypatch):
+def test_a_lost_device_is_a_sentence_and_another_is_opened(graphics, monkeypatch):
+    lost = Device(graphics.adapter, device._found()[graphics.adapter])
+    buffer = lost.upload(np.arange(5, dtype=np.uint32))
+    lost._device.destroy()
+    with pytest.raises(LodgsError, match=r"does not answer any more: .*lost\. Resume the run"):
+        lost.read(buffer)
+    assert lost.lost and open_device(graphics.adapter.name) is graphics
     monkeypatch.setattr(graphics, "lost", True)
     other = open_device(graphics.adapter.name)
     assert other is not graphics and not other.lost
+
+
+def test_mistakes_of_ours_stay_what_they_are(graphics):
+    with pytest.raises(KeyError):
+        graphics.run("scan", "blocks", 1, (1,), no_such_buffer=graphics.empty(np.uint32, 1))
 
 
 def test_without_wgpu_or_a_driver_there_is_a_sentence(monkeypatch):

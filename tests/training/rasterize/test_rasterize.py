@@ -321,6 +321,27 @@ def test_no_splats_leave_the_background(backend, axis_camera):
     )
 
 
+def test_a_picture_may_be_one_pixel_and_a_splat_larger_than_the_world(kernels):
+    """All finite, and what the reference has."""
+    camera = Camera("dot", 1, 1, 20.0, 20.0, 0.5, 0.5, np.eye(4))
+    means = torch.tensor([[0.0, 0, 2], [1e4, 0, 3], [0, 0, -2], [0, 1e-3, 1e5], [0, 0, 0.0101]]).double()
+    count = len(means)
+    log_scales = torch.tensor([-3.0, 12, 0, 9, -20]).double()[:, None].expand(count, 3).contiguous()
+    quats = torch.eye(4).double()[[0, 1, 2, 3, 0]]
+    splats = Gaussians(
+        means, quats, log_scales, torch.zeros(count).double(), torch.ones(count, 4, 3).double()
+    )
+    found = []
+    for backend, kind in ((kernels, torch.float32), ("reference", torch.float64)):
+        leaves = splats.map(lambda t, kind=kind: t.to(kind, copy=True).requires_grad_())
+        drawn = rasterize(leaves, camera, backend=backend)
+        (drawn.image * torch.tensor([1, 2, 3])).sum().backward()
+        gradients = [leaf.grad for leaf in vars(leaves).values()]
+        found.append([drawn.image.detach(), drawn.alpha.detach(), drawn.tile_counts, *gradients])
+    for one, truth in zip(*found, strict=True):
+        torch.testing.assert_close(one.double(), truth.double(), rtol=1e-3, atol=1e-5)
+
+
 @pytest.mark.slow
 def test_the_references_gradients_are_finite_differences(make_splats):
     camera = Camera("small", 9, 7, 12.0, 11.0, 4.2, 3.3, np.eye(4))

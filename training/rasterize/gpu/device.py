@@ -82,6 +82,7 @@ def open_device(name: str = "") -> Device:
     """
     found = _found()
     fitting = [adapter for adapter in found if name.casefold() in adapter.name.casefold()]
+    fitting.sort(key=lambda adapter: adapter.name != name)  # one may be called as another begins
     if not fitting:
         raise LodgsError(
             f'There is no graphics device "{name}" here.', f"There are: {', '.join(a.name for a in found)}."
@@ -100,7 +101,7 @@ def _found() -> dict[Adapter, Any]:
     try:
         handles = wgpu.gpu.enumerate_adapters_sync()
     except Exception as error:
-        raise LodgsError(f"Graphics devices cannot be listed: {_first_line(error)}.", REMEDY) from error
+        raise LodgsError(f"Graphics devices cannot be listed: {_reason(error)}.", REMEDY) from error
     found: dict[str, tuple[Adapter, Any]] = {}
     for handle in handles:
         info = handle.info
@@ -125,7 +126,7 @@ def _wgpu() -> Any:
         extras = import_module("wgpu.backends.wgpu_native.extras")
     except (ImportError, OSError, RuntimeError) as error:
         raise LodgsError(
-            f"The rasterizer for graphics devices needs wgpu: {_first_line(error)}.",
+            f"The rasterizer for graphics devices needs wgpu: {_reason(error)}.",
             f"Install it with: {sys.executable} -m pip install wgpu",
         ) from error
     with suppress(RuntimeError):  # somebody in this process has begun with all
@@ -133,8 +134,9 @@ def _wgpu() -> Any:
     return wgpu
 
 
-def _first_line(error: BaseException) -> str:
-    return str(error).strip().partition("\n")[0].rstrip(".") or type(error).__name__
+def _reason(error: BaseException) -> str:
+    """wgpu's messages end in what went wrong."""
+    return str(error).strip().rpartition("\n")[2].strip().rstrip(".") or type(error).__name__
 
 
 class Device:
@@ -152,8 +154,10 @@ class Device:
     def __init__(self, adapter: Adapter, handle: Any) -> None:
         self.adapter, self.lost, self.lock = adapter, False, threading.RLock()
         self.limits: dict[str, int] = dict(handle.limits)
-        with self._said():
+        try:
             self._device = handle.request_device_sync(required_limits=self.limits)
+        except Exception as error:  # of the driver
+            raise LodgsError(f"{adapter.name} cannot be opened: {_reason(error)}.", REMEDY) from error
         self.most_bytes = min(self.limits["max-storage-buffer-binding-size"], self.limits["max-buffer-size"])
         self.most_groups = self.limits["max-compute-workgroups-per-dimension"]
         self._pipelines: dict[tuple[str, str], tuple[Any, Any, dict[str, int]]] = {}
@@ -261,25 +265,23 @@ class Device:
 
     @contextmanager
     def _said(self) -> Iterator[None]:
-        """What goes wrong on a device, in a sentence."""
+        """What goes wrong on a device, in a sentence; mistakes of ours stay what they are."""
         try:
             yield
-        except LodgsError:
-            raise
-        except Exception as error:
+        except (RuntimeError, MemoryError, _wgpu().GPUError) as error:
             self._pass = self._encoder = None
-            name, memory = self.adapter.name, isinstance(error, MemoryError) or "memory" in str(error).lower()
-            if memory and "lost" not in str(error).lower():
+            name, said = self.adapter.name, str(error).lower()
+            if "lost" not in said and (isinstance(error, MemoryError) or "memory" in said):
                 raise LodgsError(
                     f"{name} has no more memory.",
                     "Close other programs that use it, take fewer splats or smaller images, or go on "
                     "with the run on the cpu.",
                 ) from error
-            if type(error).__name__ == "GPUValidationError" and "lost" not in str(error).lower():
-                raise  # a mistake of ours
+            if "lost" not in said and isinstance(error, _wgpu().GPUValidationError):
+                raise
             self.lost = True
             raise LodgsError(
-                f"{name} does not answer any more: {_first_line(error)}.",
+                f"{name} does not answer any more: {_reason(error)}.",
                 "Resume the run, on this device or on the cpu; a newer driver may help.",
             ) from error
 
