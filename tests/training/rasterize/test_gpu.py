@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from tests.training.rasterize.scenes import drawn_and_differentiated
+from tests.training.rasterize.scenes import contributed, drawn_and_differentiated
 from training.errors import LodgsError
-from training.rasterize import render
+from training.rasterize import Target, gpu, photometric_loss, render
 from training.rasterize.gpu import bin, device
 from training.rasterize.gpu.device import Adapter, Device, adapters, open_device
 
@@ -50,6 +50,34 @@ def test_a_picture_does_not_depend_on_how_workgroups_are_dealt_out(
         found.append(drawn_and_differentiated("degree 3", make_splats, odd_camera, "gpu", torch.float32))
     for name, one in found[0].items():
         assert torch.equal(one, found[1][name]), name
+
+
+def test_the_least_that_a_device_can_do_is_enough(graphics, make_splats, odd_camera, monkeypatch):
+    """WebGPU's limits, which every device keeps: nothing is compiled that needs more."""
+    handle = device._found()[graphics.adapter]
+
+    class Least:
+        limits = {
+            **handle.limits,
+            "max-storage-buffers-per-shader-stage": 8,
+            "max-compute-workgroup-storage-size": 16384,
+            "max-compute-invocations-per-workgroup": 256,
+            "max-storage-buffer-binding-size": 128 << 20,
+            "max-buffer-size": 256 << 20,
+        }
+        request_device_sync = handle.request_device_sync
+
+    least = Device(graphics.adapter, Least)
+    assert least._device.limits["max-storage-buffers-per-shader-stage"] == 8
+    found = []
+    for each in (least, graphics):
+        monkeypatch.setattr(gpu, "open_chosen", lambda each=each: each)
+        drawn = drawn_and_differentiated("degree 3", make_splats, odd_camera, "gpu", torch.float32)
+        share, _ = contributed("degree 3", make_splats, odd_camera, "gpu", torch.float32)
+        loss = photometric_loss(drawn["image"].float(), Target(torch.zeros(50, 75, 3)), backend="gpu")
+        found.append([*drawn.values(), *share.values(), loss])
+    for one, other in zip(*found, strict=True):
+        assert torch.equal(one, other)
 
 
 def test_pictures_are_the_cpus_to_a_count(graphics, make_splats, odd_camera):

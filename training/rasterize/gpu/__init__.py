@@ -73,12 +73,9 @@ def contributions(
         pairs = scene.pairs
         shares = device.empty(np.float32, pairs.count, 3)
         found = device.empty(np.float32, len(scene.some), 3)
+        scene.blend("weigh", ranges=pairs.ranges, sorted_pairs=pairs.sorted_pairs, pair_weights=shares)
         device.run(
-            "blend", "weigh", scene.tiles, scene.numbers(settings), rows=scene.rows, owners=pairs.owners,
-            ranges=pairs.ranges, sorted_pairs=pairs.sorted_pairs, pair_weights=shares,
-        )  # fmt: skip
-        device.run(
-            "gather", "contributions", groups_of(len(scene.some)), (len(scene.some), 0),
+            "gather", "contributions", groups_of(len(scene.some)), (len(scene.some),),
             spans=pairs.spans, pair_weights=shares, weights=found,
         )  # fmt: skip
         everywhere = np.zeros((count, 3), np.float32)
@@ -161,11 +158,19 @@ class _Scene:
         radii[self.some] = self.device.read(self.projected_radii)
         return radii
 
-    def numbers(self, settings: Settings, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> tuple:
-        """What blend.wgsl knows of the view."""
-        view = self.view
-        size = view.width, view.height, -(-view.width // TILE), self.tiles
-        return (*background, 0.0, *size, int(settings.limit is not None))
+    def blend(
+        self,
+        entry: str,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        limited: bool = False,
+        absolute: bool = False,
+        **buffers: Buffer,
+    ) -> None:
+        """Record a function of blend.wgsl for every tile."""
+        size = self.view.width, self.view.height, -(-self.view.width // TILE), self.tiles
+        numbers = (*background, 0.0, *size, int(limited), int(absolute))
+        rows, owners = self.rows, self.pairs.owners
+        self.device.run("blend", entry, self.tiles, numbers, rows=rows, owners=owners, **buffers)
 
 
 class _Rasterize(torch.autograd.Function):
@@ -185,11 +190,10 @@ class _Rasterize(torch.autograd.Function):
             shades = [scene.colours, *_as_colours(device, features.detach().numpy()[scene.some])]
             pictures = [device.empty(np.float32, view.height, view.width, 4) for _ in shades]
             for k, (shade, picture) in enumerate(zip(shades, pictures, strict=True)):
-                device.run(
-                    "blend", "forward", scene.tiles,
-                    scene.numbers(settings, (0.0, 0.0, 0.0) if k else settings.background),
-                    rows=scene.rows, colours=shade, owners=pairs.owners, ranges=pairs.ranges, limit=limit,
-                    drawn=picture, walked=walked, median=median,
+                scene.blend(
+                    "forward", (0.0, 0.0, 0.0) if k else settings.background, settings.limit is not None,
+                    colours=shade, ranges=pairs.ranges, limit=limit, drawn=picture, walked=walked,
+                    median=median,
                 )  # fmt: skip
             drawn, *blended = (torch.from_numpy(device.read(picture)) for picture in pictures)
             side.radii.numpy()[:] = scene.radii(len(means))
@@ -221,19 +225,17 @@ class _Rasterize(torch.autograd.Function):
                     by_picture[..., : three.shape[2]] = three
                 else:
                     by_picture[..., :3], by_picture[..., 3] = by_image, by_alpha
-                device.run(
-                    "blend", "backward", scene.tiles, scene.numbers(settings), rows=scene.rows, colours=shade,
-                    owners=pairs.owners, ranges=walked, sorted_pairs=pairs.sorted_pairs, picture=picture,
-                    by_picture=device.upload(by_picture), pair_sums=pair_sums,
+                scene.blend(
+                    "backward", absolute=settings.absolute and k == 0, colours=shade, ranges=walked,
+                    sorted_pairs=pairs.sorted_pairs, picture=picture, by_picture=device.upload(by_picture),
+                    pair_sums=pair_sums,
                 )  # fmt: skip
                 device.run(
                     "gather", "gradients", groups_of(count), (count, GEOMETRY if k else SUMS),
                     spans=pairs.spans, pair_sums=pair_sums, sums=sums, by_colours=by_shade,
                 )  # fmt: skip
-            by_splats, by_sh = (
-                device.empty(np.float32, count, BY_SPLAT),
-                device.empty(np.float32, *scene.sh.shape),
-            )
+            by_splats = device.empty(np.float32, count, BY_SPLAT)
+            by_sh = device.empty(np.float32, *scene.sh.shape)
             device.run(
                 "project", "backward", groups_of(count), scene.lens, splats=scene.splats, sh=scene.sh,
                 projected=scene.rows, seen_colours=scene.colours, sums=sums, by_colours=by_shades[0],

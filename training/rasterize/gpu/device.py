@@ -23,8 +23,6 @@ from .source import source_of
 
 KINDS = {"DiscreteGPU": "discrete", "IntegratedGPU": "integrated", "CPU": "software"}
 """wgpu's kinds of adapters as ours; others are "other"."""
-STORAGE_BUFFERS = 8
-"""Most storage buffers that a shader of ours binds: what every device has."""
 LANES = 64
 """Invocations of a workgroup, in every shader."""
 SMALLEST = 64

@@ -24,19 +24,14 @@ CONSTANTS = {
     "TRANSMITTANCE_MIN": TRANSMITTANCE_MIN,
     "LOG2_E": math.log2(math.e),
     "LN2": math.log(2),
+    "WINDOW_MIDDLE": 1 / sum(math.exp(-(distance**2) / 4.5) for distance in range(-5, 6)),
 }
-
-WINDOW = [math.exp(-(distance**2) / (2 * 1.5**2)) for distance in range(6)]
-"""SSIM's window from its middle outwards, before it is made to sum to one."""
 
 
 @cache
 def source_of(shader: str) -> str:
     """The text of a shader, by the name of its file without the ending."""
     constants = "\n".join(f"const {name}: f32 = {value!r};" for name, value in CONSTANTS.items())
-    total = 2 * sum(WINDOW) - WINDOW[0]
-    weights = ", ".join(repr(weight / total) for weight in WINDOW)
-    constants += f"\nconst WINDOW = array<f32, {len(WINDOW)}>({weights});"
     shared, own = ((SHADERS / f"{name}.wgsl").read_text(encoding="utf-8") for name in ("common", shader))
     return "\n".join([constants, shared, _harmonics() if "basis" in own else "", own])
 

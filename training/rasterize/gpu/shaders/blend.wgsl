@@ -6,7 +6,7 @@
 // front (3DGS, Eq. 3). T turns negative when a pixel is finished, and is so from the start outside the image: whatever
 // follows then fails the test against TRANSMITTANCE_MIN, and |T| stays.
 
-struct Parameters { background: vec4f, width: u32, height: u32, across: u32, tiles: u32, limited: u32 }
+struct Parameters { background: vec4f, width: u32, height: u32, across: u32, tiles: u32, limited: u32, absolute: u32 }
 @group(0) @binding(0) var<uniform> u: Parameters;
 @group(0) @binding(1) var<storage, read> rows: array<Row>;
 @group(0) @binding(2) var<storage, read> colours: array<vec4f>;
@@ -230,8 +230,10 @@ fn backward(
                 share(k, G_XX, lane, g_x * a.e_x);
                 share(k, G_XY, lane, g_x * a.e_y);
                 share(k, G_YY, lane, g_y * a.e_y);
-                share(k, ABS_X, lane, abs(g_x));
-                share(k, ABS_Y, lane, abs(g_y));
+                if (u.absolute != 0u) {
+                    share(k, ABS_X, lane, abs(g_x));
+                    share(k, ABS_Y, lane, abs(g_y));
+                }
                 share(k, RED, lane, w * by_red);
                 share(k, RED + 1u, lane, w * by_green);
                 share(k, RED + 2u, lane, w * by_blue);
@@ -239,7 +241,10 @@ fn backward(
             workgroupBarrier();
             if (lane < here * PAIR_SUMS) {
                 let k = some + lane / PAIR_SUMS;
-                pair_sums[sorted_pairs[first + k] * PAIR_SUMS + lane % PAIR_SUMS] = sum_of(lane, strips_of[k]);
+                let column = lane % PAIR_SUMS;
+                if (u.absolute != 0u || (column != ABS_X && column != ABS_Y)) {
+                    pair_sums[sorted_pairs[first + k] * PAIR_SUMS + column] = sum_of(lane, strips_of[k]);
+                }
             }
             workgroupBarrier();
         }

@@ -1,6 +1,9 @@
 // What a splat's pairs hold, added up in the order in which the splat met its tiles: the same bits every time.
 
-struct Parameters { count: u32, columns: u32 }  // columns of sums that are added to
+struct Parameters {
+    count: u32,
+    columns: u32,  // of sums, that are added to: features have no part in the absolute gradients
+}
 @group(0) @binding(0) var<uniform> u: Parameters;
 @group(0) @binding(1) var<storage, read> spans: array<vec2u>;
 @group(0) @binding(2) var<storage, read> pair_sums: array<f32>;  // (P, PAIR_SUMS)

@@ -26,7 +26,7 @@ const C2: f32 = 0.0009;
 const EACH: u32 = 256;
 
 fn window(k: i32) -> f32 {
-    return WINDOW[u32(abs(k))];
+    return WINDOW_MIDDLE * exp(f32(k * k) / -4.5);
 }
 
 struct Place { index: u32, x: i32, y: i32, inside: bool }
