@@ -27,6 +27,8 @@ SPLAT, BY_SPLAT = 13, 16
 """Numbers of a splat on the device, and of its gradient (project.wgsl)."""
 SUMS, PAIR_SUMS = 8, 11
 """Numbers that blending's backward pass sums up for a splat, and for a pair (common.wgsl)."""
+TILES = 1024
+"""That a device blends at a time."""
 GEOMETRY = 6
 """Those of a splat without the absolute gradients, in which features have no part."""
 
@@ -167,10 +169,10 @@ class _Scene:
         **buffers: Buffer,
     ) -> None:
         """Record a function of blend.wgsl for every tile."""
-        size = self.view.width, self.view.height, -(-self.view.width // TILE), self.tiles
+        size = self.view.width, self.view.height, -(-self.view.width // TILE)
         numbers = (*background, 0.0, *size, int(limited), int(absolute))
         rows, owners = self.rows, self.pairs.owners
-        self.device.run("blend", entry, self.tiles, numbers, rows=rows, owners=owners, **buffers)
+        self.device.run("blend", entry, self.tiles, numbers, TILES, rows=rows, owners=owners, **buffers)
 
 
 class _Rasterize(torch.autograd.Function):

@@ -144,7 +144,7 @@ class Device:
         adapter: what it is.
         limits: by wgpu's names, all that the adapter has.
         most_bytes: the largest buffer.
-        most_groups: most workgroups along a dimension of a dispatch.
+        most_groups: workgroups that are submitted at a time.
         lost: it answers no more; :func:`open_device` opens another.
         lock: held by who records, so that two threads do not mix their dispatches.
     """
@@ -158,6 +158,7 @@ class Device:
             raise LodgsError(f"{adapter.name} cannot be opened: {_reason(error)}.", REMEDY) from error
         self.most_bytes = min(self.limits["max-storage-buffer-binding-size"], self.limits["max-buffer-size"])
         self.most_groups = self.limits["max-compute-workgroups-per-dimension"]
+        self._firsts: dict[int, Any] = {}
         self._pipelines: dict[tuple[str, str], tuple[Any, Any, dict[str, int]]] = {}
         self._encoder: Any = None
         self._pass: Any = None
@@ -190,41 +191,51 @@ class Device:
                 self._device.queue.write_buffer(buffer.handle, 0, array.reshape(-1))
         return buffer
 
-    def run(self, shader: str, entry: str, groups: int, numbers: tuple = (), **buffers: Buffer) -> None:
+    def run(
+        self,
+        shader: str,
+        entry: str,
+        groups: int,
+        numbers: tuple = (),
+        at_once: int = 1 << 30,
+        **buffers: Buffer,
+    ) -> None:
         """Record a dispatch; it has run when something is read.
 
         Args:
             shader, entry: name of a file in ``shaders/`` without its ending, and of a function in it.
-            groups: workgroups. They are dealt out along two dimensions where one is too short for them; the
-                shader learns from ``group_of`` which one it is, and leaves those beyond alone.
+            groups: workgroups; each learns from ``group_of`` which one it is.
             numbers: what the shader's uniform holds, in order: integers, floats or arrays of them.
+            at_once: workgroups that are submitted at a time, at most: between them the device can do other
+                things, such as draw windows.
             buffers: those that the function uses, by the shader's names.
 
         Raises:
             LodgsError: the device was lost.
         """
-        if not groups:
-            return
         with self._said():
             pipeline, layout, bindings = self._pipeline(shader, entry)
             bound = {bindings[name]: buffer.handle for name, buffer in buffers.items()}
             if numbers:
-                flags = _wgpu().BufferUsage
-                words = np.concatenate([_as_words(number) for number in numbers])
-                words = np.pad(words, (0, -len(words) % 4))
-                bound[bindings["u"]] = self._device.create_buffer_with_data(data=words, usage=flags.UNIFORM)
-            entries = [
-                {"binding": at, "resource": {"buffer": handle, "offset": 0, "size": handle.size}}
-                for at, handle in bound.items()
-            ]
-            group = self._device.create_bind_group(layout=layout, entries=entries)
-            if self._pass is None:
-                self._encoder = self._device.create_command_encoder()
-                self._pass = self._encoder.begin_compute_pass()
-            self._pass.set_pipeline(pipeline)
-            self._pass.set_bind_group(0, group)
-            down = -(-groups // self.most_groups)
-            self._pass.dispatch_workgroups(-(-groups // down), down, 1)
+                bound[bindings["u"]] = self._uniform(*numbers)
+            at_once = min(at_once, self.most_groups)
+            for first in range(0, groups, at_once):
+                if first not in self._firsts:
+                    self._firsts[first] = self._uniform(first)
+                bound[bindings["first_group"]] = self._firsts[first]
+                entries = [
+                    {"binding": at, "resource": {"buffer": handle, "offset": 0, "size": handle.size}}
+                    for at, handle in bound.items()
+                ]
+                group = self._device.create_bind_group(layout=layout, entries=entries)
+                if self._pass is None:
+                    self._encoder = self._device.create_command_encoder()
+                    self._pass = self._encoder.begin_compute_pass()
+                self._pass.set_pipeline(pipeline)
+                self._pass.set_bind_group(0, group)
+                self._pass.dispatch_workgroups(min(at_once, groups - first))
+                if groups > at_once:
+                    self.submit()
 
     def read(self, buffer: Buffer) -> np.ndarray:
         """What a buffer holds once all that was recorded has run: a copy.
@@ -248,6 +259,11 @@ class Device:
             recorded, encoder, self._pass, self._encoder = self._pass, self._encoder, None, None
             recorded.end()
             self._device.queue.submit([encoder.finish()])
+
+    def _uniform(self, *numbers: Any) -> Any:
+        words = np.concatenate([_as_words(number) for number in numbers])
+        words = np.pad(words, (0, -len(words) % 4))
+        return self._device.create_buffer_with_data(data=words, usage=_wgpu().BufferUsage.UNIFORM)
 
     def _pipeline(self, shader: str, entry: str) -> tuple[Any, Any, dict[str, int]]:
         """Compiled when it is first used: the pipeline, its layout, and the bindings by name."""

@@ -31,10 +31,8 @@ fn touches_tile(row: Row, x: u32, y: u32) -> bool {
 }
 
 @compute @workgroup_size(LANES)
-fn count(
-    @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) wgs: vec3u, @builtin(local_invocation_index) lane: u32,
-) {
-    let k = group_of(wg, wgs) * LANES + lane;
+fn count(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let k = group_of(group) * LANES + lane;
     if (k >= u.count) { return; }
     let row = rows[order[k]];
     var found = 0u;
@@ -51,10 +49,8 @@ fn count(
 // A driver may compile the test above otherwise than in `count`: so no more pairs are made than were counted, and
 // one that is missing goes to a tile that does not exist.
 @compute @workgroup_size(LANES)
-fn make_pairs(
-    @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) wgs: vec3u, @builtin(local_invocation_index) lane: u32,
-) {
-    let k = group_of(wg, wgs) * LANES + lane;
+fn make_pairs(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let k = group_of(group) * LANES + lane;
     if (k >= u.count) { return; }
     let splat = order[k];
     let end = starts[k + 1u];
@@ -84,10 +80,8 @@ fn make_pairs(
 
 // Where each tile's pairs begin and end, and whose they are.
 @compute @workgroup_size(LANES)
-fn find_ranges(
-    @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) wgs: vec3u, @builtin(local_invocation_index) lane: u32,
-) {
-    let at = group_of(wg, wgs) * LANES + lane;
+fn find_ranges(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let at = group_of(group) * LANES + lane;
     if (at >= u.count) { return; }
     sorted_owners[at] = owner_of[sorted_pairs[at]];
     let tile = sorted_tiles[at];

@@ -6,7 +6,7 @@
 // front (3DGS, Eq. 3). T turns negative when a pixel is finished, and is so from the start outside the image: whatever
 // follows then fails the test against TRANSMITTANCE_MIN, and |T| stays.
 
-struct Parameters { background: vec4f, width: u32, height: u32, across: u32, tiles: u32, limited: u32, absolute: u32 }
+struct Parameters { background: vec4f, width: u32, height: u32, across: u32, limited: u32, absolute: u32 }
 @group(0) @binding(0) var<uniform> u: Parameters;
 @group(0) @binding(1) var<storage, read> rows: array<Row>;
 @group(0) @binding(2) var<storage, read> colours: array<vec4f>;
@@ -100,11 +100,8 @@ fn alpha_of(row: Row, center: vec2f) -> Alpha {
 }
 
 @compute @workgroup_size(LANES)
-fn forward(
-    @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) wgs: vec3u, @builtin(local_invocation_index) lane: u32,
-) {
-    let tile = group_of(wg, wgs);
-    if (tile >= u.tiles) { return; }
+fn forward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let tile = group_of(group);
     let pixels = pixels_of(tile, lane);
     let range = ranges[tile];
     var t = select(vec4f(-1.0), vec4f(1.0), pixels.inside);
@@ -181,11 +178,8 @@ fn sum_of(column: u32, strips: u32) -> f32 {
 //     g = d loss / d sigma = alpha_i Q_i / (1 - alpha_i) - w_i (c_i.h).
 // Q starts as the whole sum, colour.h - T_end d loss / d alpha, and is walked down front to back with T.
 @compute @workgroup_size(LANES)
-fn backward(
-    @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) wgs: vec3u, @builtin(local_invocation_index) lane: u32,
-) {
-    let tile = group_of(wg, wgs);
-    if (tile >= u.tiles) { return; }
+fn backward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let tile = group_of(group);
     let pixels = pixels_of(tile, lane);
     let range = ranges[tile];
     var t = select(vec4f(-1.0), vec4f(1.0), pixels.inside);
@@ -253,11 +247,8 @@ fn backward(
 
 // Of each pair the largest weight in a pixel, the sum of weights, and the number of pixels that have one.
 @compute @workgroup_size(LANES)
-fn weigh(
-    @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) wgs: vec3u, @builtin(local_invocation_index) lane: u32,
-) {
-    let tile = group_of(wg, wgs);
-    if (tile >= u.tiles) { return; }
+fn weigh(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let tile = group_of(group);
     let pixels = pixels_of(tile, lane);
     let range = ranges[tile];
     var t = select(vec4f(-1.0), vec4f(1.0), pixels.inside);

@@ -39,9 +39,11 @@ fn touches(row: Row, first: vec2f, span: vec2f) -> bool {
     return meets;
 }
 
-// Which workgroup it is: they lie along two dimensions where one is too short for them.
-fn group_of(group: vec3u, groups: vec3u) -> u32 {
-    return group.x + group.y * groups.x;
+// Work is done in pieces, and a piece begins with this workgroup.
+@group(0) @binding(15) var<uniform> first_group: u32;
+
+fn group_of(group: vec3u) -> u32 {
+    return first_group + group.x;
 }
 
 // Columns of what blending's backward pass sums up for a splat, with sigma = -ln(alpha / opacity), g = d loss / d sigma

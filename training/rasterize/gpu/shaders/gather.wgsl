@@ -13,10 +13,8 @@ struct Parameters {
 @group(0) @binding(6) var<storage, read_write> weights: array<f32>;  // (M, 3): largest, sum, pixels
 
 @compute @workgroup_size(LANES)
-fn gradients(
-    @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) wgs: vec3u, @builtin(local_invocation_index) lane: u32,
-) {
-    let i = group_of(wg, wgs) * LANES + lane;
+fn gradients(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let i = group_of(group) * LANES + lane;
     if (i >= u.count) { return; }
     var found: array<f32, PAIR_SUMS>;
     let end = spans[i].x + spans[i].y;
@@ -28,10 +26,8 @@ fn gradients(
 }
 
 @compute @workgroup_size(LANES)
-fn contributions(
-    @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) wgs: vec3u, @builtin(local_invocation_index) lane: u32,
-) {
-    let i = group_of(wg, wgs) * LANES + lane;
+fn contributions(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let i = group_of(group) * LANES + lane;
     if (i >= u.count) { return; }
     var found = vec3f(0.0);
     let end = spans[i].x + spans[i].y;

@@ -51,10 +51,8 @@ fn mean_down(k: u32, at: Place) -> f32 {
 }
 
 @compute @workgroup_size(LANES)
-fn products(
-    @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) wgs: vec3u, @builtin(local_invocation_index) lane: u32,
-) {
-    let at = place_of(group_of(wg, wgs), lane);
+fn products(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let at = place_of(group_of(group), lane);
     if (!at.inside) { return; }
     var sums = vec3f(0.0);
     for (var d = max(-REACH, -at.x); d <= min(REACH, i32(u.width) - 1 - at.x); d++) {
@@ -66,19 +64,15 @@ fn products(
 }
 
 @compute @workgroup_size(LANES)
-fn moments(
-    @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) wgs: vec3u, @builtin(local_invocation_index) lane: u32,
-) {
-    let at = place_of(group_of(wg, wgs), lane);
+fn moments(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let at = place_of(group_of(group), lane);
     if (!at.inside) { return; }
     for (var k = 0u; k < 2u; k++) { of_truth[k * plane() + at.index] = mean_down(k, at); }
 }
 
 @compute @workgroup_size(LANES)
-fn similarity(
-    @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) wgs: vec3u, @builtin(local_invocation_index) lane: u32,
-) {
-    let at = place_of(group_of(wg, wgs), lane);
+fn similarity(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let at = place_of(group_of(group), lane);
     if (!at.inside) { return; }
     let mx = mean_down(0u, at);
     let my = truths[at.index];
@@ -97,10 +91,8 @@ fn similarity(
 }
 
 @compute @workgroup_size(LANES)
-fn slopes_across(
-    @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) wgs: vec3u, @builtin(local_invocation_index) lane: u32,
-) {
-    let at = place_of(group_of(wg, wgs), lane);
+fn slopes_across(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let at = place_of(group_of(group), lane);
     if (!at.inside) { return; }
     for (var k = 0u; k < 3u; k++) {
         var sum = 0.0;
@@ -114,10 +106,8 @@ fn slopes_across(
 // The window is symmetric, so what the means' derivatives give back to a value is their own windowed mean; x reaches
 // the means of x, x^2 and xy with 1, 2x and y.
 @compute @workgroup_size(LANES)
-fn finish(
-    @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) wgs: vec3u, @builtin(local_invocation_index) lane: u32,
-) {
-    let at = place_of(group_of(wg, wgs), lane);
+fn finish(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let at = place_of(group_of(group), lane);
     if (!at.inside) { return; }
     let x = image[at.index];
     let y = truth[at.index];
@@ -127,10 +117,8 @@ fn finish(
 }
 
 @compute @workgroup_size(LANES)
-fn add(
-    @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) wgs: vec3u, @builtin(local_invocation_index) lane: u32,
-) {
-    let block = group_of(wg, wgs) * LANES + lane;
+fn add(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let block = group_of(group) * LANES + lane;
     if (block * EACH >= plane()) { return; }
     var sum = 0.0;
     for (var k = block * EACH; k < min((block + 1u) * EACH, plane()); k++) { sum += values[k]; }

@@ -97,10 +97,8 @@ fn ellipse_of(p: vec3f, axes: Axes) -> Ellipse {
 }
 
 @compute @workgroup_size(LANES)
-fn forward(
-    @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) wgs: vec3u, @builtin(local_invocation_index) lane: u32,
-) {
-    let i = group_of(wg, wgs) * LANES + lane;
+fn forward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let i = group_of(group) * LANES + lane;
     if (i >= u.count) { return; }
     depths[i] = 0xffffffffu;
     let first = i * SPLAT;
@@ -161,10 +159,8 @@ fn quat_gradient(q: vec4f, per_length: f32, r: mat3x3f) -> vec4f {
 
 // Gradients of splats that have been drawn; those of the others stay zero.
 @compute @workgroup_size(LANES)
-fn backward(
-    @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) wgs: vec3u, @builtin(local_invocation_index) lane: u32,
-) {
-    let i = group_of(wg, wgs) * LANES + lane;
+fn backward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let i = group_of(group) * LANES + lane;
     if (i >= u.count || projected[i].radius == 0.0) { return; }
     let first = i * SPLAT;
     let out = i * BY_SPLAT;

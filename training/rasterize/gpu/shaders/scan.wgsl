@@ -24,18 +24,17 @@ fn before(lane: u32) -> u32 {
 }
 
 @compute @workgroup_size(LANES)
-fn blocks(
-    @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) wgs: vec3u, @builtin(local_invocation_index) lane: u32,
-) {
-    let block = group_of(wg, wgs);
+fn blocks(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let block = group_of(group);
     shares[lane] = sum_of(block * BLOCK + lane * EACH);
     workgroupBarrier();
-    if (lane == 0u && block * BLOCK < u.count) { sums[block] = before(LANES); }
+    if (lane == 0u) { sums[block] = before(LANES); }
 }
 
-// One workgroup goes over all sums.
+// The one workgroup goes over all sums.
 @compute @workgroup_size(LANES)
-fn starts(@builtin(local_invocation_index) lane: u32) {
+fn starts(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    if (group_of(group) > 0u) { return; }
     let blocks = (u.count + BLOCK - 1u) / BLOCK;
     var done = 0u;
     for (var first = 0u; first < blocks; first += BLOCK) {
@@ -57,14 +56,11 @@ fn starts(@builtin(local_invocation_index) lane: u32) {
 }
 
 @compute @workgroup_size(LANES)
-fn spread(
-    @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) wgs: vec3u, @builtin(local_invocation_index) lane: u32,
-) {
-    let block = group_of(wg, wgs);
+fn spread(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let block = group_of(group);
     let first = block * BLOCK + lane * EACH;
     shares[lane] = sum_of(first);
     workgroupBarrier();
-    if (block * BLOCK >= u.count) { return; }
     var at = sums[block] + before(lane);
     for (var k = first; k < min(first + EACH, u.count); k++) {
         let value = values[k];

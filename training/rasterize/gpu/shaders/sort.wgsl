@@ -25,13 +25,11 @@ fn count_digits(first: u32, lane: u32) {
 }
 
 @compute @workgroup_size(LANES)
-fn count(
-    @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) wgs: vec3u, @builtin(local_invocation_index) lane: u32,
-) {
-    let block = group_of(wg, wgs);
+fn count(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let block = group_of(group);
     count_digits((block * LANES + lane) * EACH, lane);
     workgroupBarrier();
-    if (lane < DIGITS && block < u.blocks) {
+    if (lane < DIGITS) {
         var sum = 0u;
         for (var k = 0u; k < LANES; k++) { sum += tally[lane * LANES + k]; }
         places[lane * u.blocks + block] = sum;
@@ -39,14 +37,12 @@ fn count(
 }
 
 @compute @workgroup_size(LANES)
-fn scatter(
-    @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) wgs: vec3u, @builtin(local_invocation_index) lane: u32,
-) {
-    let block = group_of(wg, wgs);
+fn scatter(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let block = group_of(group);
     let first = (block * LANES + lane) * EACH;
     count_digits(first, lane);
     workgroupBarrier();
-    if (lane < DIGITS && block < u.blocks) {  // from how many to where
+    if (lane < DIGITS) {  // from how many to where
         var at = places[lane * u.blocks + block];
         for (var k = 0u; k < LANES; k++) {
             let count = tally[lane * LANES + k];
