@@ -75,7 +75,7 @@ def _compared() -> str:
 
 def _drawn(backend: ModuleType, kind: torch.dtype) -> dict[str, torch.Tensor]:
     """Pictures of some splats, and the gradients of what they lack of a photograph."""
-    random, count, size = np.random.default_rng(0), 400, (50, 75)
+    random, count, size = np.random.default_rng(0), 200, (50, 75)
     arrays = {
         "means": random.uniform((-1, -1, 2), (1, 1, 4), (count, 3)),
         "quats": random.normal(size=(count, 4)),
