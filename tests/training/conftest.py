@@ -79,6 +79,7 @@ def tiny_scene(tmp_path_factory) -> Path:
 def graphics():
     """A graphics device for the gpu backend: this computer's own, or the software that stands for one."""
     from training.errors import LodgsError
+    from training.rasterize import trial
     from training.rasterize.gpu import choice
 
     try:
@@ -87,7 +88,7 @@ def graphics():
         device = choice.open_chosen()
     except LodgsError as problem:
         pytest.skip(f"no graphics device: {problem}")
-    assert choice.test(device.adapter) == "", "or the cpu would stand for it in these tests"
+    assert trial.try_out(device.adapter) == "", "or the cpu would stand for it in these tests"
     return device
 
 

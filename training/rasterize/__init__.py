@@ -295,9 +295,10 @@ def resolve(backend: str) -> str:
     if backend == "cuda" and (problem := cuda.problem()):
         raise problem
     if backend == "gpu":
-        from .gpu import choice
+        from .gpu.choice import chosen
+        from .trial import difference
 
-        return "cpu" if choice.difference(choice.chosen()) else "gpu"
+        return "cpu" if difference(chosen()) else "gpu"
     return backend
 
 
@@ -312,11 +313,12 @@ def why_cpu(backend: str) -> str:
     if backend == "auto" and torch.cuda.is_available() and (problem := cuda.problem()):
         return f"The NVIDIA GPU is not used. {problem}"
     if backend == "gpu" and resolve(backend) == "cpu":
-        from .gpu import choice
+        from .gpu.choice import chosen
+        from .trial import difference
 
-        device = choice.chosen()
+        device = chosen()
         return (
-            f"{device.name} is not used: {choice.difference(device)}. The processor takes its place; a newer "
+            f"{device.name} is not used: {difference(device)}. The processor takes its place; a newer "
             "driver may help."
         )
     return ""

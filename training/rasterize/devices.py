@@ -15,6 +15,7 @@ from . import Adam, Gaussians, Target, cuda, device_of, photometric_loss, raster
 from .cpu.compile import threads
 from .gpu import choice
 from .gpu.device import Adapter, adapters, open_device
+from .trial import try_out
 
 SPLATS, SIZE = 50_000, (640, 426)
 """Of what :func:`step_seconds` draws."""
@@ -106,7 +107,7 @@ def _tried(adapter: Adapter) -> tuple[list[str], bool]:
     """What is to be said of the chosen device, and whether it works."""
     try:
         memory = f"{open_device(adapter.name).most_bytes >> 20} MB in one buffer"
-        differs = choice.test(adapter)
+        differs = try_out(adapter)
     except LodgsError as problem:
         return [str(problem)], False
     if differs:

@@ -5,7 +5,7 @@ import torch
 
 from training import __main__ as command
 from training.errors import LodgsError
-from training.rasterize import cpu, gpu, resolve, why_cpu
+from training.rasterize import cpu, gpu, resolve, trial, why_cpu
 from training.rasterize.devices import Devices, describe
 from training.rasterize.gpu import choice
 from training.rasterize.gpu.device import Adapter
@@ -33,13 +33,13 @@ def there(monkeypatch, tmp_path):
         most_bytes = 2 << 30
 
     monkeypatch.delenv(choice.VARIABLE, raising=False)
-    monkeypatch.setattr(choice, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(trial, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr("training.rasterize.devices.open_device", lambda name: Opened())
     for name in ("rasterize", "contributions", "photometric_loss"):
         monkeypatch.setattr(gpu, name, getattr(cpu, name), raising=False)
-    choice.difference.cache_clear()
+    trial.difference.cache_clear()
     yield are
-    choice.difference.cache_clear()
+    trial.difference.cache_clear()
 
 
 @pytest.fixture
@@ -82,12 +82,12 @@ def test_a_name_or_a_part_of_it_takes_another(there, monkeypatch, name, expected
 def test_a_device_that_draws_as_it_should_is_used_and_tested_once(there, monkeypatch):
     there(CARD)
     assert resolve("gpu") == "gpu" and why_cpu("gpu") == ""
-    choice.difference.cache_clear()  # as another process
+    trial.difference.cache_clear()  # as another process
 
     def refuse(*_):
         raise AssertionError("tested again")
 
-    monkeypatch.setattr(choice, "test", refuse)
+    monkeypatch.setattr(trial, "try_out", refuse)
     assert resolve("gpu") == "gpu"
     there(CARD._replace(driver="556.0"))
     with pytest.raises(AssertionError, match="tested again"):
@@ -98,7 +98,7 @@ def test_a_device_that_draws_otherwise_is_not_used_and_it_is_said(there, spoiled
     there(CARD)
     assert resolve("gpu") == "cpu"
     assert why_cpu("gpu").startswith("GeForce RTX 4070 Laptop is not used: its pictures are 2% off.")
-    choice.difference.cache_clear()
+    trial.difference.cache_clear()
     assert resolve("gpu") == "cpu", "remembered"
 
 
@@ -126,7 +126,7 @@ def test_wrong_gradients_are_found(there, monkeypatch, name):
         return cpu.rasterize(gaussians, weights, features, settings)
 
     monkeypatch.setattr(gpu, "rasterize", otherwise, raising=False)
-    assert choice.difference(CARD) == f"its gradients of {name} are 2% off"
+    assert trial.difference(CARD) == f"its gradients of {name} are 2% off"
 
 
 def test_what_is_not_the_same_twice_or_no_number_is_found(there, monkeypatch):
@@ -138,16 +138,27 @@ def test_what_is_not_the_same_twice_or_no_number_is_found(there, monkeypatch):
         return drawn._replace(image=drawn.image + next(noise))
 
     monkeypatch.setattr(gpu, "rasterize", restless, raising=False)
-    assert choice.test(CARD) == "its pictures change from run to run"
-    assert "off" in choice.test(CARD)
+    assert trial.try_out(CARD) == "its pictures change from run to run"
+    assert "off" in trial.try_out(CARD)
+
+
+def test_a_driver_that_refuses_a_shader_is_not_used(there, monkeypatch):
+    there(CARD)
+
+    def refuse(*_):
+        raise RuntimeError("Shader 'blend' does not compile\nand a long trace")
+
+    monkeypatch.setattr(gpu, "rasterize", refuse, raising=False)
+    assert resolve("gpu") == "cpu"
+    assert "is not used: it failed, Shader 'blend' does not compile. The processor" in why_cpu("gpu")
 
 
 def test_a_spoiled_cache_is_as_none(there, tmp_path):
     there(CARD)
-    (tmp_path / choice.ANSWERS).write_text("{no json")
+    (tmp_path / trial.ANSWERS).write_text("{no json")
     assert resolve("gpu") == "gpu"
-    choice.difference.cache_clear()
-    (tmp_path / choice.ANSWERS).write_text('{"x": 5}')
+    trial.difference.cache_clear()
+    (tmp_path / trial.ANSWERS).write_text('{"x": 5}')
     assert resolve("gpu") == "gpu"
 
 

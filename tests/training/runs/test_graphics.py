@@ -2,6 +2,7 @@
 
 import pytest
 
+from training.rasterize import trial
 from training.rasterize.gpu import choice
 from training.runs import train as training_loop
 from training.runs.folder import RunFolder
@@ -97,7 +98,7 @@ def test_a_lost_device_or_no_memory_is_a_sentence_and_the_run_goes_on(
 
 
 def test_a_device_that_draws_otherwise_is_a_warning_and_the_processor_trains(graphics, keys, monkeypatch):
-    monkeypatch.setattr(choice, "difference", lambda adapter: "its pictures are 3% off")
+    monkeypatch.setattr(trial, "difference", lambda adapter: "its pictures are 3% off")
     keys["parameters"]["steps"] = [1, 1, 1]
     code, events = run_in_process(keys)
     assert code == 0
