@@ -10,7 +10,7 @@ from training.rasterize import Target, gpu, photometric_loss, render
 from training.rasterize.gpu import bin, device
 from training.rasterize.gpu.device import Adapter, Device, adapters, open_device
 
-SIZES = [0, 1, 63, 64, 1024, 1025, 70_000]
+SIZES = [0, 1, 63, 64, 1024, 1025, 16_384, 16_385, 70_000]
 
 
 @pytest.fixture
@@ -24,9 +24,8 @@ def narrow(graphics, monkeypatch) -> Device:
 def test_sums_are_numpys(graphics, count):
     values = np.random.default_rng(count).integers(0, 50, count).astype(np.uint32)
     buffer = graphics.upload(values)
-    total = graphics.read(bin.sum_up(graphics, buffer, count))[-1]
+    bin.sum_up(graphics, buffer)
     np.testing.assert_array_equal(graphics.read(buffer), np.cumsum(values) - values)
-    assert total == values.sum()
 
 
 @pytest.mark.parametrize("count", SIZES)
@@ -132,7 +131,7 @@ def test_a_lost_device_is_a_sentence_and_another_is_opened(graphics, monkeypatch
 
 def test_mistakes_of_ours_stay_what_they_are(graphics):
     with pytest.raises(KeyError):
-        graphics.run("scan", "blocks", 1, (1,), no_such_buffer=graphics.empty(np.uint32, 1))
+        graphics.run("scan", "few", 1, (1,), no_such_buffer=graphics.empty(np.uint32, 1))
 
 
 def test_without_wgpu_or_a_driver_there_is_a_sentence(monkeypatch):

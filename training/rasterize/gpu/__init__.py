@@ -27,10 +27,10 @@ SPLAT, BY_SPLAT = 13, 16
 """Numbers of a splat on the device, and of its gradient (project.wgsl)."""
 SUMS, PAIR_SUMS = 8, 11
 """Numbers that blending's backward pass sums up for a splat, and for a pair (common.wgsl)."""
-TILES = 1024
-"""That a device blends at a time."""
 GEOMETRY = 6
 """Those of a splat without the absolute gradients, in which features have no part."""
+TILES = 1024
+"""That a device blends at a time, so that it gets to other work in between."""
 
 
 def rasterize(
@@ -80,10 +80,10 @@ def contributions(
             "gather", "contributions", groups_of(len(scene.some)), (len(scene.some),),
             spans=pairs.spans, pair_weights=shares, weights=found,
         )  # fmt: skip
-        everywhere = np.zeros((count, 3), np.float32)
+        everywhere, radii = np.zeros((count, 3), np.float32), scene.radii(count)
         everywhere[scene.some] = device.read(found)
     largest, total, pixels = torch.from_numpy(everywhere).unbind(1)
-    return largest, total, pixels.long(), torch.from_numpy(scene.radii(count))
+    return largest, total, pixels.long(), torch.from_numpy(radii)
 
 
 def photometric_loss(image: torch.Tensor, target: Target, ssim_weight: float) -> torch.Tensor:
@@ -109,9 +109,9 @@ class _Scene:
     Attributes:
         some: (M,) which of the N they are.
         lens: what project.wgsl knows of the view.
-        splats, sh: (M, SPLAT) and (M, coefficients in use, 3).
-        rows, colours: (M, ROW) and (M, 4).
-        tiles: how many the image has.
+        splats, sh: (M, SPLAT) and (M, coefficients in use, 3), copies.
+        rows, colours, projected_radii: (M, ROW), (M, 4) and (M,), projected.
+        pairs: with the tiles that they touch.
     """
 
     device: Device
@@ -139,7 +139,7 @@ class _Scene:
         columns = logits, quats, log_scales, weights[some] if len(weights) else ones, filtered
         packed = np.column_stack([means, *columns]).astype(np.float32, copy=False)
         count = len(some)
-        lens = (*_lens_of(view), settings.min_scale, count, settings.degree, sh.shape[1])
+        lens = (_lens_of(view), settings.min_scale, count, settings.degree, sh.shape[1])
         splats, coefficients = device.upload(packed), device.upload(sh)
         rows, colours = device.empty(np.float32, count, ROW), device.empty(np.float32, count, 4)
         depths, radii = device.empty(np.uint32, count), device.empty(np.float32, count)
@@ -152,6 +152,7 @@ class _Scene:
 
     @property
     def tiles(self) -> int:
+        """How many the image has."""
         return self.pairs.ranges.shape[0]
 
     def radii(self, count: int) -> np.ndarray:
@@ -214,10 +215,8 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx, by_image, by_alpha, by_features):
         scene, shades, pictures, walked, settings, side = ctx.rest
         device, pairs, count = scene.device, scene.pairs, len(scene.some)
-        sums, pair_sums = (
-            device.empty(np.float32, count, SUMS),
-            device.empty(np.float32, pairs.count, PAIR_SUMS),
-        )
+        sums = device.empty(np.float32, count, SUMS)
+        pair_sums = device.empty(np.float32, pairs.count, PAIR_SUMS)
         by_shades = [device.empty(np.float32, count, 3) for _ in shades]
         with device.lock:
             for k, (shade, picture, by_shade) in enumerate(zip(shades, pictures, by_shades, strict=True)):
@@ -291,9 +290,9 @@ def _as_colours(device: Device, features: np.ndarray) -> list[Buffer]:
     return found
 
 
-def _lens_of(view: View) -> tuple:
+def _lens_of(view: View) -> np.ndarray:
     """The view as project.wgsl takes it, as far as ``near``."""
     pose = np.column_stack([view.rotation, view.translation])
     limits = np.array([view.x_limits, view.y_limits]).T
-    size = float(view.width), float(view.height)
-    return pose, view.eye, 0.0, view.fx, view.fy, view.cx, view.cy, limits, *size, view.near
+    numbers = 0, view.fx, view.fy, view.cx, view.cy, *limits.flat, view.width, view.height, view.near
+    return np.concatenate([pose.flat, view.eye, numbers], dtype=np.float32)

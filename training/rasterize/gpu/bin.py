@@ -11,6 +11,8 @@ from .device import LANES, Buffer, Device
 TILE = 16
 BLOCK = 1024
 """Values that a workgroup sums up or sorts."""
+FEW = 16 * BLOCK
+"""Values that one workgroup sums up."""
 DIGIT_BITS = 4
 DEPTH_BITS = 32
 
@@ -39,18 +41,17 @@ def groups_of(count: int, each: int = LANES) -> int:
     return -(-count // each)
 
 
-def sum_up(device: Device, values: Buffer, count: int) -> Buffer:
-    """Makes of ``count`` values the sums of what lies before each, in place.
-
-    Returns:
-        A buffer that ends in the sum of all.
-    """
+def sum_up(device: Device, values: Buffer) -> None:
+    """Makes of values (N,) uint32 the sums of what lies before each, in place."""
+    (count,) = values.shape
+    if count <= FEW:
+        device.run("scan", "few", 1, (count,), values=values)
+        return
     blocks = groups_of(count, BLOCK)
-    sums = device.empty(np.uint32, blocks + 1)
-    device.run("scan", "blocks", blocks, (count,), values=values, sums=sums)
-    device.run("scan", "starts", 1, (count,), sums=sums)
-    device.run("scan", "spread", blocks, (count,), values=values, sums=sums)
-    return sums
+    totals = device.empty(np.uint32, blocks)
+    device.run("scan", "total", blocks, (count,), values=values, totals=totals)
+    sum_up(device, totals)
+    device.run("scan", "spread", blocks, (count,), values=values, starts=totals)
 
 
 def sort(device: Device, keys: Buffer, values: Buffer, bits: int) -> tuple[Buffer, Buffer]:
@@ -62,7 +63,7 @@ def sort(device: Device, keys: Buffer, values: Buffer, bits: int) -> tuple[Buffe
         places = device.empty(np.uint32, (1 << DIGIT_BITS) * blocks)
         numbers = count, shift, blocks
         device.run("sort", "count", blocks, numbers, keys=keys, places=places)
-        sum_up(device, places, places.shape[0])
+        sum_up(device, places)
         device.run(
             "sort", "scatter", blocks, numbers, keys=keys, values=values, places=places,
             sorted_keys=other[0], sorted_values=other[1],
@@ -85,7 +86,8 @@ def bin_splats(device: Device, rows: Buffer, depths: Buffer, width: int, height:
     starts = device.empty(np.uint32, count + 1)
     numbers = count, across, down
     device.run("bin", "count", groups_of(count), numbers, rows=rows, order=order, counts=starts)
-    total = int(device.read(sum_up(device, starts, count + 1))[-1])
+    sum_up(device, starts)
+    total = int(device.read(starts, count)[0])
     owners, tiles, pairs = (device.empty(np.uint32, total) for _ in range(3))
     device.run(
         "bin", "make_pairs", groups_of(count), numbers, rows=rows, order=order, starts=starts, spans=spans,

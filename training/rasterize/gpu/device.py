@@ -237,19 +237,21 @@ class Device:
                 if groups > at_once:
                     self.submit()
 
-    def read(self, buffer: Buffer) -> np.ndarray:
-        """What a buffer holds once all that was recorded has run: a copy.
+    def read(self, buffer: Buffer, begin: int = 0) -> np.ndarray:
+        """The rows of a buffer from ``begin`` on, once all that was recorded has run: a copy.
 
         Raises:
             LodgsError: the device was lost, or is out of memory.
         """
         self.submit()
-        size = int(np.prod(buffer.shape, dtype=np.int64)) * buffer.kind.itemsize
+        rows, *row = buffer.shape
+        shape = rows - begin, *row
+        size, row_size = (int(np.prod(each, dtype=np.int64)) * buffer.kind.itemsize for each in (shape, row))
         if not size:
-            return np.zeros(buffer.shape, buffer.kind)
+            return np.zeros(shape, buffer.kind)
         with self._said():
-            data = self._device.queue.read_buffer(buffer.handle, 0, size)
-        return np.frombuffer(data, buffer.kind).reshape(buffer.shape)
+            data = self._device.queue.read_buffer(buffer.handle, begin * row_size, size)
+        return np.frombuffer(data, buffer.kind).reshape(shape)
 
     def submit(self) -> None:
         """Let what was recorded begin; LodgsError: the device was lost."""

@@ -1,19 +1,24 @@
-// Exclusive prefix sums of unsigned integers, in place, in blocks of 1024: the sum of each block, then the sums
-// of what lies before each, then the blocks' own.
+// Exclusive prefix sums of unsigned integers, in place. One workgroup sums up a few thousand; of more, the sum of each
+// block of 1024 is taken first, and what lies before each is added in the end.
 
 struct Parameters { count: u32 }
 @group(0) @binding(0) var<uniform> u: Parameters;
 @group(0) @binding(1) var<storage, read_write> values: array<u32>;
-@group(0) @binding(2) var<storage, read_write> sums: array<u32>;  // of each block, and of all
+@group(0) @binding(2) var<storage, read_write> totals: array<u32>;  // of each block
+@group(0) @binding(3) var<storage, read> starts: array<u32>;  // what lies before each block
 
 const EACH: u32 = 16;  // values that an invocation takes, one after the other
 const BLOCK: u32 = LANES * EACH;
 var<workgroup> shares: array<u32, LANES>;
 
-fn sum_of(first: u32) -> u32 {
+// Each invocation's share of a block's sum; all invocations come here together.
+fn share_out(block: u32, lane: u32) {
     var sum = 0u;
+    let first = block * BLOCK + lane * EACH;
     for (var k = first; k < min(first + EACH, u.count); k++) { sum += values[k]; }
-    return sum;
+    workgroupBarrier();
+    shares[lane] = sum;
+    workgroupBarrier();
 }
 
 // The sum of the shares of the invocations before this one.
@@ -23,48 +28,36 @@ fn before(lane: u32) -> u32 {
     return sum;
 }
 
-@compute @workgroup_size(LANES)
-fn blocks(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
-    let block = group_of(group);
-    shares[lane] = sum_of(block * BLOCK + lane * EACH);
-    workgroupBarrier();
-    if (lane == 0u) { sums[block] = before(LANES); }
+fn write_sums(block: u32, lane: u32, start: u32) {
+    var at = start + before(lane);
+    let first = block * BLOCK + lane * EACH;
+    for (var k = first; k < min(first + EACH, u.count); k++) {
+        let value = values[k];
+        values[k] = at;
+        at += value;
+    }
 }
 
-// The one workgroup goes over all sums.
 @compute @workgroup_size(LANES)
-fn starts(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
-    if (group_of(group) > 0u) { return; }
-    let blocks = (u.count + BLOCK - 1u) / BLOCK;
-    var done = 0u;
-    for (var first = 0u; first < blocks; first += BLOCK) {
-        let mine = first + lane * EACH;
-        var sum = 0u;
-        for (var k = mine; k < min(mine + EACH, blocks); k++) { sum += sums[k]; }
-        shares[lane] = sum;
-        workgroupBarrier();
-        var at = done + before(lane);
-        for (var k = mine; k < min(mine + EACH, blocks); k++) {
-            let value = sums[k];
-            sums[k] = at;
-            at += value;
-        }
-        done += before(LANES);
-        workgroupBarrier();
-    }
-    if (lane == 0u) { sums[blocks] = done; }
+fn total(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let block = group_of(group);
+    share_out(block, lane);
+    if (lane == 0u) { totals[block] = before(LANES); }
 }
 
 @compute @workgroup_size(LANES)
 fn spread(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let block = group_of(group);
-    let first = block * BLOCK + lane * EACH;
-    shares[lane] = sum_of(first);
-    workgroupBarrier();
-    var at = sums[block] + before(lane);
-    for (var k = first; k < min(first + EACH, u.count); k++) {
-        let value = values[k];
-        values[k] = at;
-        at += value;
+    share_out(block, lane);
+    write_sums(block, lane, starts[block]);
+}
+
+@compute @workgroup_size(LANES)
+fn few(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    var done = 0u;
+    for (var block = group_of(group); block * BLOCK < u.count; block++) {
+        share_out(block, lane);
+        write_sums(block, lane, done);
+        done += before(LANES);
     }
 }
