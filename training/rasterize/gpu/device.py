@@ -249,7 +249,7 @@ class Device:
             return np.zeros(buffer.shape, buffer.kind)
         with self._said():
             data = self._device.queue.read_buffer(buffer.handle, 0, size)
-        return np.frombuffer(data, buffer.kind).reshape(buffer.shape).copy()  # what is mapped is read-only
+        return np.frombuffer(data, buffer.kind).reshape(buffer.shape)
 
     def submit(self) -> None:
         """Let what was recorded begin; LodgsError: the device was lost."""

@@ -23,7 +23,8 @@ const SPAN = f32(TILE - 1);  // from a tile's first pixel centre to its last
 fn tile_range(middle: f32, reach: f32, tiles: u32) -> vec2u {
     let low = floor((middle - reach - 0.5) / f32(TILE));
     let high = floor((middle + reach - 0.5) / f32(TILE)) + 1.0;
-    return vec2u(clamp(vec2f(low, high), vec2f(0.0), vec2f(f32(tiles))));
+    let range = vec2u(clamp(vec2f(low, high), vec2f(0.0), vec2f(f32(tiles))));
+    return min(range, vec2u(tiles));  // what is no number may become any whole one
 }
 
 fn touches_tile(row: Row, x: u32, y: u32) -> bool {
