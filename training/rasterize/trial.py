@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import sys
+import traceback
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
@@ -29,6 +31,9 @@ PICTURE_TOLERANCE, GRADIENT_TOLERANCE = 2e-3, 1e-2
 """Most that a device may differ by, of the norm of what the reference has. A pixel whose alpha is rounded
 across its threshold differs by a 255th."""
 
+MOST_REASON = 300
+"""Characters that are told of a failure; all of it goes to standard error."""
+
 
 @cache
 def difference(adapter: Adapter) -> str:
@@ -53,7 +58,8 @@ def try_out(adapter: Adapter) -> str:
     except LodgsError:
         raise
     except Exception as error:  # of a driver's compiler, which nobody has seen
-        found = f"it failed, {str(error).strip().partition(chr(10))[0].rstrip('.') or type(error).__name__}"
+        traceback.print_exc(file=sys.stderr)
+        found = f"it failed ({' '.join(f'{type(error).__name__}: {error}'.split())[:MOST_REASON]})"
     with suppress(LodgsError):
         _remember(_key(adapter), found)
     return found
@@ -61,9 +67,8 @@ def try_out(adapter: Adapter) -> str:
 
 def _compared() -> str:
     """What the device that is chosen does otherwise than the reference."""
-    theirs = _drawn(reference, torch.float64)
     ours, again = (_drawn(gpu, torch.float32) for _ in range(2))
-    for name, truth in theirs.items():
+    for name, truth in _truth().items():
         most = PICTURE_TOLERANCE if name == "pictures" else GRADIENT_TOLERANCE
         off = ((ours[name] - truth).norm() / truth.norm()).item()
         if not off <= most:  # not a number is neither
@@ -71,6 +76,11 @@ def _compared() -> str:
         if not torch.equal(ours[name], again[name]):
             return f"its {name} change from run to run"
     return ""
+
+
+@cache
+def _truth() -> dict[str, torch.Tensor]:
+    return _drawn(reference, torch.float64)
 
 
 def _drawn(backend: ModuleType, kind: torch.dtype) -> dict[str, torch.Tensor]:

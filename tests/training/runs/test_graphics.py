@@ -1,5 +1,7 @@
 """Runs on a graphics device: begun there, finished elsewhere; lost devices, and ones that draw otherwise."""
 
+from dataclasses import replace
+
 import pytest
 
 from training.rasterize import trial
@@ -7,6 +9,7 @@ from training.rasterize.gpu import choice
 from training.runs import train as training_loop
 from training.runs.folder import RunFolder
 from training.runs.job import Job
+from training.runs.measure import evaluate_run
 
 from .test_train import TINY, method_of, run_in_process
 
@@ -49,14 +52,21 @@ def test_a_run_moves_between_backends(graphics, fake_card, keys, monkeypatch):
     assert [message.split()[4] for message in went_on] == ["4", "8", "13"]
 
 
-def test_a_run_on_a_device_is_the_same_twice_and_when_it_was_stopped(graphics, keys, monkeypatch, tmp_path):
+def test_a_run_on_a_device_is_the_same_when_it_was_stopped_and_is_measured_there(
+    graphics, keys, monkeypatch, tmp_path
+):
     code, _ = run_in_process(keys)
     assert code == 0
     again = {**keys, "out": str(tmp_path / "again")}
     stopped_at(again, 9, monkeypatch)
     assert run_in_process(again)[0] == 0
-    first, second = (RunFolder(k["out"]).bundle.read_bytes() for k in (keys, again))
-    assert first == second
+    first, second = (RunFolder(k["out"]) for k in (keys, again))
+    assert first.bundle.read_bytes() == second.bundle.read_bytes()
+    replace(Job.from_file(second.job), backend="cpu").write(second.job)
+    drawn_there, drawn_here = (evaluate_run(folder.path) for folder in (first, second))
+    for ours, theirs in zip(drawn_there["levels"], drawn_here["levels"], strict=True):
+        assert ours["psnr"] == pytest.approx(theirs["psnr"], abs=1e-3)
+        assert ours["drawn"] == theirs["drawn"]
 
 
 @pytest.mark.parametrize(
