@@ -32,7 +32,7 @@ help:
 	@echo "make extension  dist/lodgs-VERSION.zip, checked by Blender"
 	@echo "make pins       requirements/*.txt anew from requirements/*.in (UPGRADE=1 takes the newest of what these leave open)"
 	@echo "make window     a tour in a real Blender window, with pictures (METHOD=flod; needs Blender, Xvfb, ImageMagick)"
-	@echo "make interop    other programs read our files (needs Node)"
+	@echo "make interop    other programs read our files, naga translates our shaders (needs Node)"
 	@echo "make attacks    trainers, workers and a scheduler killed at random moments, disks that fill up: half an hour"
 
 setup:
@@ -102,6 +102,7 @@ window: setup
 
 interop: setup
 	$(VENV) tools/interop.py
+	$(VENV) tools/shaders.py
 
 attacks: setup
 	$(VENV) tools/attacks.py

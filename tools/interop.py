@@ -34,7 +34,6 @@ def main() -> int:
     if not shutil.which("node") or not shutil.which("npm"):
         print("Nothing was checked: Node.js is missing; install it (with npm) and run this again.")
         return 2
-    FOLDER.mkdir(parents=True, exist_ok=True)
     if not install():
         print(f"Nothing was checked: npm could not install {PACKAGE} {VERSION} (see above).")
         return 2
@@ -49,14 +48,15 @@ def main() -> int:
     return 0 if all(same for *_, same in rows) else 1
 
 
-def install() -> bool:
-    """Install the pinned version into build/interop unless it is there."""
-    package = FOLDER / "node_modules" / PACKAGE / "package.json"
-    if package.exists() and json.loads(package.read_text("utf-8"))["version"] == VERSION:
+def install(name: str = PACKAGE, version: str = VERSION) -> bool:
+    """Install a pinned version from npm into build/interop unless it is there."""
+    package = FOLDER / "node_modules" / name / "package.json"
+    if package.exists() and json.loads(package.read_text("utf-8"))["version"] == version:
         return True
-    command = ["npm", "install", "--prefix", str(FOLDER), "--no-audit", "--no-fund", f"{PACKAGE}@{VERSION}"]
-    # npm finds a project in a parent folder unless this one has its own.
-    (FOLDER / "package.json").write_text('{"private": true}\n')
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    command = ["npm", "install", "--prefix", str(FOLDER), "--no-audit", "--no-fund", f"{name}@{version}"]
+    if not (FOLDER / "package.json").exists():  # npm finds a project in a parent folder otherwise
+        (FOLDER / "package.json").write_text('{"private": true}\n')
     return subprocess.run([shutil.which("npm") or "npm", *command[1:]]).returncode == 0
 
 

@@ -7,6 +7,7 @@ python3 tools/setup.py 5.0        .venv-blender-5.0 (Blender 5.0, Python 3.11)
 
 from __future__ import annotations
 
+import ctypes.util
 import hashlib
 import os
 import shutil
@@ -108,6 +109,12 @@ def main() -> int:
             make(".venv-blender-5.2", newer, "blender-5.2.txt")
         elif not (ROOT / ".venv-blender-5.2").exists():
             print("setup: no Python 3.13 here, so the tests in Blender 5.2 are left out.", file=sys.stderr)
+        if sys.platform.startswith("linux") and not ctypes.util.find_library("vulkan"):
+            print(
+                "setup: no Vulkan here, so tests of the gpu backend are left out; on Debian software",
+                file=sys.stderr,
+            )
+            print("setup: Vulkan is in mesa-vulkan-drivers.", file=sys.stderr)
     except subprocess.CalledProcessError as error:
         print(f"setup: this command failed: {' '.join(error.cmd)}", file=sys.stderr)
         print("setup: is the package index reachable, and is there room on the disk?", file=sys.stderr)

@@ -153,7 +153,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="DEPTH.exr",
         help="leave out what lies behind this Depth pass of meshes",
     )
-    render.add_argument("--backend", default="auto", help="auto, cpu, cuda or reference")
+    render.add_argument("--backend", default="auto", help="auto, cpu, cuda, gpu or reference")
 
     capture = commands.add_parser(
         "capture", help="pictures of splats that have no photographs, as a COLMAP scene to train from"
@@ -169,7 +169,7 @@ def _parser() -> argparse.ArgumentParser:
     capture.add_argument(
         "--view-width", type=int, default=960, help="pixels that these are wide (default 960)"
     )
-    capture.add_argument("--backend", default="auto", help="auto, cpu, cuda or reference")
+    capture.add_argument("--backend", default="auto", help="auto, cpu, cuda, gpu or reference")
 
     scene = commands.add_parser(
         "scene",
@@ -220,7 +220,7 @@ def _parser() -> argparse.ArgumentParser:
 
     serve = commands.add_parser("serve", help="draw frame after frame for Blender")
     serve.add_argument("folder", type=Path, help="folder for arrays, new or empty; removed at the end")
-    serve.add_argument("--backend", default="auto", help="auto, cpu, cuda or reference")
+    serve.add_argument("--backend", default="auto", help="auto, cpu, cuda, gpu or reference")
 
     edit = commands.add_parser(
         "edit",
@@ -303,6 +303,11 @@ def _parser() -> argparse.ArgumentParser:
     info.add_argument("file", type=Path)
 
     commands.add_parser("check", help="say as JSON whether this Python can train")
+    devices = commands.add_parser("devices", help="say what this computer can train on, and try it")
+    devices.add_argument("--time", action="store_true", help="measure a training step on each, too")
+    devices.add_argument(
+        "--json", action="store_true", help="only what drivers say, as JSON; nothing is tried"
+    )
 
     return parser
 
@@ -643,6 +648,13 @@ def _info(chosen: argparse.Namespace) -> int:
     return 0
 
 
+def _devices(chosen: argparse.Namespace) -> int:
+    from .rasterize.devices import Devices, describe
+
+    print(json.dumps(Devices.found().as_json()) if chosen.json else describe(chosen.time))
+    return 0
+
+
 def _check() -> int:
     found = _environment()
     print(json.dumps(found))
@@ -694,6 +706,7 @@ _COMMANDS = {
     "serve": _serve,
     "edit": _edit,
     "info": _info,
+    "devices": _devices,
 }
 
 

@@ -46,7 +46,7 @@ class LODGS_OT_cancel_environment(bpy.types.Operator):
 class LODGS_OT_check_environment(bpy.types.Operator):
     bl_idname = "lodgs.check_environment"
     bl_label = "Check"
-    bl_description = "Say what the trainer's Python lacks, if anything"
+    bl_description = "Say what the trainer's Python lacks, if anything, and what this computer can train on"
     bl_options = {"INTERNAL"}
 
     @report_errors

@@ -8,12 +8,26 @@ from .. import extension
 from ..runs import environment
 from .parts import draw_environment, say
 
-_BACKENDS = [
-    ("auto", "Automatic", "The NVIDIA graphics card where training works on it, else the processor"),
-    ("cpu", "CPU", "The processor: works on every computer"),
-    ("cuda", "NVIDIA GPU (CUDA)", "The graphics card: needs gsplat in the trainer's Python"),
-]
-"""The trainer's backends but for the reference, which is slow."""
+_items: list[tuple[str, str, str, int]] = []
+"""What :func:`_backends` gave last: Blender wants such texts kept."""
+
+
+def _backends(_self: object, _context: object) -> list[tuple[str, str, str, int]]:
+    """The trainer's backends but for the reference, which is slow."""
+    card = environment.report.graphics if environment.report else ""
+    _items[:] = [
+        ("auto", "Automatic", "An NVIDIA card where training works on it with CUDA, else the processor", 0),
+        ("cpu", "CPU", "The processor: works on every computer", 1),
+        ("cuda", "NVIDIA GPU (CUDA)", "The graphics card: needs gsplat in the trainer's Python", 2),
+        (
+            "gpu",
+            f"Graphics Card ({card})" if card else "Graphics Card",
+            "Any graphics card, by Vulkan, Metal or Direct3D 12. It is tried before it is first used: where "
+            "it draws otherwise than it should, the processor takes its place",
+            3,
+        ),
+    ]
+    return _items
 
 
 class LodgsPreferences(bpy.types.AddonPreferences):
@@ -29,7 +43,7 @@ class LodgsPreferences(bpy.types.AddonPreferences):
     backend: bpy.props.EnumProperty(
         name="Train On",
         description="What draws the splats while training; a run may go on with another one",
-        items=_BACKENDS,
+        items=_backends,
     )
     flamenco: bpy.props.StringProperty(
         name="Flamenco Manager",
@@ -51,6 +65,10 @@ class LodgsPreferences(bpy.types.AddonPreferences):
             say(layout, f"Ready to train: PyTorch {torch}" if report.ok else report.python, "INFO")
             for problem in report.problems:
                 say(layout, problem, "ERROR")
+            if report.devices:
+                say(layout, report.devices, "INFO")
+                if self.backend == "gpu" and not report.graphics:
+                    say(layout, "There is no graphics card to train on: choose Automatic or CPU.", "ERROR")
 
 
 CLASSES = (LodgsPreferences,)

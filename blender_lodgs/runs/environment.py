@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -29,11 +30,20 @@ _REMEDY = "Make an environment in the preferences of LODGS, or choose another Py
 
 @dataclass
 class Report:
-    """What is known of a trainer's Python: its versions by package, and a sentence for each problem."""
+    """What is known of a trainer's Python.
+
+    Attributes:
+        problems: a sentence for each.
+        versions: by package.
+        graphics: name of the graphics card that it would train on, where there is one.
+        devices: what trains on this computer, and what might be faster; empty where that was not asked.
+    """
 
     python: str
     problems: list[str] = field(default_factory=list)
     versions: dict[str, str] = field(default_factory=dict)
+    graphics: str = ""
+    devices: str = ""
 
     @property
     def ok(self) -> bool:
@@ -123,7 +133,17 @@ def check_now() -> Report:
     """
     global report
     report = check(trainer_python())
+    if report.ok:
+        _ask_devices(report)
     return report
+
+
+def _ask_devices(report: Report) -> None:
+    """Adds what this computer can train on (``python -m training devices --json``); takes some seconds."""
+    with suppress(OSError, ValueError, IndexError, AttributeError, subprocess.TimeoutExpired):
+        answer = _ask(Path(report.python), "-m", "training", "devices", "--json")
+        found = json.loads(answer.stdout.strip().splitlines()[-1])
+        report.graphics, report.devices = str(found.get("graphics", "")), str(found.get("sentence", ""))
 
 
 def python_of(environment: Path) -> Path:

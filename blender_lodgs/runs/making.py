@@ -31,7 +31,9 @@ REQUIREMENTS = extension.FOLDER / "requirements" / "cluster.txt"
 CUDA_REQUIREMENTS = extension.FOLDER / "requirements" / "cuda.txt"
 """The same and what an NVIDIA GPU needs: installed where there is one, and nvcc to compile with."""
 
-MODULES = ("torch", "numba", "scipy", "pycolmap", "OpenEXR", "PIL", "plyfile", "torchmetrics", "distributed")
+MODULES = (
+    "torch", "numba", "scipy", "pycolmap", "OpenEXR", "PIL", "plyfile", "torchmetrics", "wgpu", "distributed",
+)  # fmt: skip
 """What a new environment must be able to import before it serves."""
 
 

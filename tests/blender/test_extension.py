@@ -49,7 +49,8 @@ def test_zip_holds_what_it_needs_and_nothing_else(archive):
     code = {
         p.relative_to(REPOSITORY).as_posix()
         for r in ("blender_lodgs", "training")
-        for p in (REPOSITORY / r).rglob("*.py")
+        for p in (REPOSITORY / r).rglob("*.*")
+        if p.suffix in (".py", ".wgsl")
     }
     others = {"__init__.py", "blender_manifest.toml", "LICENSE"}
     others |= {"pyproject.toml", *(f"requirements/{name}.txt" for name in ("trainer", "cluster", "cuda"))}

@@ -1,5 +1,6 @@
 """A COLMAP scene small enough to train on in a second."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -72,6 +73,23 @@ def write_tiny_scene(folder: Path, views: int = 9, points: int = 60) -> Path:
 @pytest.fixture(scope="session")
 def tiny_scene(tmp_path_factory) -> Path:
     return write_tiny_scene(tmp_path_factory.mktemp("scene") / "tiny")
+
+
+@pytest.fixture(scope="session")
+def graphics():
+    """A graphics device for the gpu backend: this computer's own, or the software that stands for one."""
+    from training.errors import LodgsError
+    from training.rasterize import trial
+    from training.rasterize.gpu import choice
+
+    try:
+        if all(adapter.software for adapter in choice.adapters()):
+            os.environ.setdefault(choice.VARIABLE, "software")
+        device = choice.open_chosen()
+    except LodgsError as problem:
+        pytest.skip(f"no graphics device: {problem}")
+    assert trial.try_out(device.adapter) == "", "or the cpu would stand for it in these tests"
+    return device
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ import sys
 import sysconfig
 import tomllib
 import venv
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -30,6 +31,8 @@ def lodgs(tmp_path_factory):
     site = Path(sysconfig.get_path("purelib", "venv", paths))
     (site / "borrowed.pth").write_text(sysconfig.get_path("purelib") + "\n")
     (built,) = folder.glob("lodgs-*.whl")
+    with zipfile.ZipFile(built) as file:
+        assert "lodgs/rasterize/gpu/shaders/sort.wgsl" in file.namelist()
     subprocess.run([*pip, "--python", python, "install", *offline, built], check=True, timeout=120)
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
 
@@ -57,3 +60,4 @@ def test_the_installed_command_checks_trains_and_reads(lodgs, tiny_scene, tmp_pa
     )  # fmt: skip
     assert json.loads(events.splitlines()[-1])["event"] == "done"
     assert lodgs("info", tmp_path / "run" / "bundle.ply").count("\n") > 2
+    assert "Automatic trains on" in json.loads(lodgs("devices", "--json"))["sentence"]

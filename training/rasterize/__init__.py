@@ -1,8 +1,9 @@
 """Splats to pixels and back: one meaning, several backends.
 
 ``reference`` (plain torch) is the definition, ``cpu`` (Numba, gradients by hand) the fast path on any
-computer, ``cuda`` (gsplat) that on NVIDIA graphics cards. A backend is a module with ``rasterize``,
-``contributions`` and ``photometric_loss`` of the reference's signatures, imported when it is first used.
+computer, ``cuda`` (gsplat) that on NVIDIA graphics cards, ``gpu`` (compute shaders) runs on graphics cards of
+any make. A backend is a module with ``rasterize``, ``contributions`` and ``photometric_loss`` of the
+reference's signatures, imported when it is first used.
 """
 
 from __future__ import annotations
@@ -29,9 +30,10 @@ from .rendering import OUTPUTS, Contributions, Rendering, Settings, Target, View
 __all__ = [
     "BACKENDS", "OUTPUTS", "Adam", "Contributions", "Gaussians", "Rendering", "Target",
     "contributions", "device_of", "photometric_loss", "rasterize", "render", "resolve", "strips", "warm_up",
+    "why_cpu",
 ]  # fmt: skip
 
-BACKENDS = ("cpu", "cuda", "reference")
+BACKENDS = ("cpu", "cuda", "gpu", "reference")
 """Backends by name; :func:`resolve` says which one ``auto`` is."""
 
 STRIP = 1 << 21
@@ -276,6 +278,9 @@ def photometric_loss(
 def resolve(backend: str) -> str:
     """The backend that a name means on this computer: ``auto`` is cuda where that works, else cpu.
 
+    ``gpu`` is cpu where the graphics device does not draw what the reference draws, which is tried before the
+    device is first used (:func:`why_cpu` says so).
+
     Raises:
         LodgsError: for a backend that does not exist, or does not work on this computer.
     """
@@ -289,7 +294,34 @@ def resolve(backend: str) -> str:
         )
     if backend == "cuda" and (problem := cuda.problem()):
         raise problem
+    if backend == "gpu":
+        from .gpu.choice import chosen
+        from .trial import difference
+
+        return "cpu" if difference(chosen()) else "gpu"
     return backend
+
+
+def why_cpu(backend: str) -> str:
+    """Why the cpu draws where a GPU was asked for, or could be; nothing where there is no reason to say so.
+
+    Raises:
+        LodgsError: as :func:`resolve`.
+    """
+    from . import cuda
+
+    if backend == "auto" and torch.cuda.is_available() and (problem := cuda.problem()):
+        return f"The NVIDIA GPU is not used. {problem}"
+    if backend == "gpu" and resolve(backend) == "cpu":
+        from .gpu.choice import chosen
+        from .trial import difference
+
+        device = chosen()
+        return (
+            f"{device.name} is not used: {difference(device)}. The processor takes its place; a newer "
+            "driver may help."
+        )
+    return ""
 
 
 def device_of(backend: str) -> torch.device:

@@ -8,6 +8,7 @@ from pathlib import Path
 from ..errors import LodgsError
 from ..lod.rule import Values, find_rule
 from ..lod.selection import settings
+from ..rasterize import why_cpu
 from ..rasterize.resident import Resident
 from ..runs.data import training_data
 from ..runs.folder import RunFolder
@@ -128,6 +129,8 @@ def render(
     if out.suffix.lower() not in (".png", ".exr"):
         raise LodgsError(f"{out.name} is neither .png nor .exr.", "Choose one of these endings.")
     limit = None if holdout is None else read_depth(holdout, camera.width, camera.height, None)
+    if problem := why_cpu(backend):
+        warn(problem)
     resident = Resident(source.levels, backend, warn)
     bundle, rule = resident.bundle, find_rule(source.rule)
     if given is not None or (rule is not None and rule.always and not level):

@@ -46,7 +46,7 @@ from .. import VERSION
 from ..errors import LodgsError, out_of_memory
 from ..evaluate.metrics import psnr
 from ..lod.paging import TreeFile
-from ..rasterize import resolve
+from ..rasterize import resolve, why_cpu
 from ..runs.events import event_line
 from ..scenes.cameras import camera_as_dict
 from ..scenes.images import load_image
@@ -70,6 +70,8 @@ def serve(folder: Path, backend: str, requests: IO[bytes], answers: IO[str]) -> 
         LodgsError: for a backend that does not work here, or a folder with other things in it.
     """
     torch.set_num_threads(1)
+    if problem := why_cpu(backend):
+        print(problem, file=sys.stderr)
     backend = resolve(backend)
     wire.claim(folder)
     server = _Server(folder, backend, answers)

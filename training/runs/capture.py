@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from ..errors import LodgsError
-from ..rasterize import Gaussians, rasterize
+from ..rasterize import Gaussians, rasterize, why_cpu
 from ..scenes.cameras import Camera, read_views
 from ..scenes.viewpoints import dome
 from ..scenes.write_colmap import write_seen
@@ -53,6 +53,8 @@ def capture(
     Raises:
         LodgsError: the base or the camera files cannot be read, or as :func:`write_scene`.
     """
+    if problem := why_cpu(backend):
+        warn(problem)
     splats, antialias = read_base(base, warn)
     if where == DOME:
         cameras, near = dome(splats, views, width, round(width * 2 / 3))

@@ -14,7 +14,7 @@ from ..methods import METHODS, method_info, parameters_of
 from ..methods.parameters import Parameters
 from .folder import RunFolder
 
-BACKENDS = ("auto", "cpu", "cuda", "reference")
+BACKENDS = ("auto", "cpu", "cuda", "gpu", "reference")
 CHANGEABLE = ("backend", "out", "photo_memory", "splat_memory")
 """The keys that a run may go on with other values of: they say where it is trained, not what."""
 MOST_STOPS = 32

@@ -32,7 +32,8 @@ from ..methods import METHODS, create
 from ..methods.data import TrainingData
 from ..methods.memory import keep_freed_memory
 from ..methods.method import Method
-from ..rasterize import Gaussians, contributions, cuda, device_of, resolve, warm_up
+from ..rasterize import Gaussians, contributions, device_of, resolve, warm_up, why_cpu
+from ..rasterize.gpu.choice import chosen as graphics_device
 from ..rasterize.resident import Resident
 from ..scenes.orientation import up_rotation
 from ..scenes.regions import Region
@@ -139,7 +140,7 @@ def _train(job: Job, folder: RunFolder, events: Events, on: str, resources: dict
         keep_freed_memory()
         backend = resolve(job.backend)
         warm_up(backend)
-        _tell_backend(backend, events)
+        _tell_backend(job.backend, backend, events)
         if together:
             _hand_over(folder, events, data, backend, started)
             return DONE
@@ -393,12 +394,13 @@ def _seen(base: SplatRows, data: TrainingData) -> bool:
     return False
 
 
-def _tell_backend(backend: str, events: Events) -> None:
+def _tell_backend(asked: str, backend: str, events: Events) -> None:
     """Which rasterizer trains; and why it is not a GPU's, where there is a GPU that could."""
     names = {"cpu": "the CPU", "cuda": "the NVIDIA GPU", "reference": "the CPU, by the slow reference"}
-    if backend == "cpu" and torch.cuda.is_available() and (problem := cuda.problem()):
-        events("warning", message=f"The NVIDIA GPU is not used. {problem}")
-    events("status", message=f"Training on {names[backend]}", backend=backend)
+    if problem := why_cpu(asked):
+        events("warning", message=problem)
+    name = names.get(backend) or graphics_device().name
+    events("status", message=f"Training on {name}", backend=backend)
 
 
 # -- being stopped ------------------------------------------------------------

@@ -90,6 +90,21 @@ def test_operator_reports_the_check(bpy, environment, preferences, tmp_path):
     assert environment.report.ok and environment.report.versions["torch"] == "2.13.0"
 
 
+def test_the_check_tells_what_trains_here(bpy, lodgs, environment, preferences, tmp_path):
+    found = json.dumps({"graphics": "Radeon 780M", "sentence": "Automatic trains on the processor."})
+    ready = json.dumps({"ok": True, "problems": [], "torch": "2.13.0"})
+    script = f"""if [ "$3" = devices ]; then echo '{found}'; else echo '{ready}'; fi"""
+    preferences.python = str(_program(tmp_path / "good", script))
+    bpy.ops.lodgs.check_environment()
+    assert environment.report.devices == "Automatic trains on the processor."
+    backends = lodgs("panels.preferences")._backends(None, None)
+    assert [(name, label) for name, label, *_ in backends][-1] == ("gpu", "Graphics Card (Radeon 780M)")
+    assert [number for *_, number in backends] == [0, 1, 2, 3], "as files have saved them"
+    preferences.python = str(_program(tmp_path / "older", f"echo '{ready}'"))  # knows of no devices
+    bpy.ops.lodgs.check_environment()
+    assert environment.report.ok and environment.report.devices == ""
+
+
 def test_blender_is_left_out_of_the_trainers_environment(lodgs, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", "/blender")
     monkeypatch.setenv("PYTHONHOME", "/blender")

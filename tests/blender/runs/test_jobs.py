@@ -207,7 +207,7 @@ def test_the_panel_shows_a_jobs_distances(lodgs, jobs, root):
     assert jobs.changes(settings) == {}
 
 
-@pytest.mark.parametrize("backend", ["auto", "cpu", "cuda"])
+@pytest.mark.parametrize("backend", ["auto", "cpu", "cuda", "gpu"])
 def test_what_trains_is_a_preference(bpy, lodgs, jobs, fake, root, tmp_path, backend):
     preferences = lodgs("extension").preferences()
     assert preferences.backend == "auto"

@@ -29,12 +29,24 @@ def make_splats():
     return random_splats
 
 
+def working(request) -> str:
+    """The backend of a fixture's parameter; the test is skipped where it cannot work."""
+    needed = {"cuda": "fake_card", "gpu": "graphics"}
+    if request.param in needed:
+        request.getfixturevalue(needed[request.param])
+    return request.param
+
+
 @pytest.fixture(params=BACKENDS)
 def backend(request) -> str:
     """Every backend by name; cuda on the CPU, as ``fake_card`` has it."""
-    if request.param == "cuda":
-        request.getfixturevalue("fake_card")
-    return request.param
+    return working(request)
+
+
+@pytest.fixture(params=["cpu", "gpu"])
+def kernels(request) -> str:
+    """The backends with kernels of our own: what the reference is in float64, they are in float32."""
+    return working(request)
 
 
 @pytest.fixture

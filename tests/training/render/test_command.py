@@ -278,3 +278,19 @@ def test_what_is_drawn_otherwise_is_said(make_splats, camera, tmp_path, capsys):
     text = said(tmp_path / "foreign.ply")
     assert text.count("\n") == 1 and "the rule 'shadow'" in text and "the finest level is shown" in text
     assert said(tmp_path / "foreign.ply", "--level", 1) == ""
+
+
+@pytest.mark.parametrize("options", [[], ["--gamma", "2"], ["--background", "transparent"]])
+def test_a_graphics_device_draws_what_the_cpu_draws(graphics, bundle, camera, tmp_path, options):
+    """To one count of 255, in a thousandth of the values at most."""
+    path, _ = bundle
+    write_camera(tmp_path / "camera.json", camera.resized(640, 480), 0.01)
+    found = []
+    for backend in ("cpu", "gpu"):
+        out = tmp_path / f"{backend}.png"
+        common = ["render", str(path), "--camera", str(tmp_path / "camera.json"), "--out", str(out)]
+        assert main([*common, "--backend", backend, *options]) == 0
+        found.append(pixels(out).astype(int))
+    apart = np.abs(found[0] - found[1])
+    assert apart.max() <= 1 and (apart > 0).mean() <= 1e-3
+    assert found[0][..., :3].std() > 10, "there is something to see"

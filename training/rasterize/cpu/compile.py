@@ -21,25 +21,21 @@ from functools import wraps
 from pathlib import Path
 from typing import Any
 
+from ...files import cache_folder
 
-def _cache_folder() -> Path:
-    """Where this user's programs may keep what they can make again, one folder for each state of our sources.
+
+def _kernels_folder() -> Path:
+    """Where compiled kernels are kept, one folder for each state of our sources.
 
     Numba looks only at the file that a kernel is in, not at those that it takes its helpers from.
     """
-    if sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
-    elif sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    else:
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     sources = sorted(Path(__file__).resolve().parent.parent.rglob("*.py"))
     digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()
-    return base / "lodgs" / "numba" / digest[:16]
+    return cache_folder() / "numba" / digest[:16]
 
 
 # Read when numba is imported. Its default, beside the source, is not writable in every installation.
-os.environ.setdefault("NUMBA_CACHE_DIR", str(_cache_folder()))
+os.environ.setdefault("NUMBA_CACHE_DIR", str(_kernels_folder()))
 
 import numba  # noqa: E402
 import numpy as np  # noqa: E402

@@ -1,0 +1,298 @@
+"""The rasterizer on any graphics device: compute shaders in WGSL through wgpu, gradients by hand.
+
+As the cpu backend: ``project`` makes ellipses of splats, ``bin`` sorts them into tiles, ``blend`` makes
+pixels of them, and gradients are summed in a row of their own for each pair of splat and tile, then in a
+fixed order for each splat. So nothing is added by atomics, and a device gives the same bits every time.
+
+Tensors live on the CPU. What a step needs is copied to the device, and what comes of it back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from ..gaussians import Gaussians
+from ..rendering import Drawn, Settings, Target, View
+from .bin import TILE, Pairs, bin_splats, groups_of
+from .choice import open_chosen
+from .device import Buffer, Device
+from .loss import loss_and_gradient, moments_of
+
+ROW = 12
+"""Numbers of a projected splat (``Row`` in common.wgsl)."""
+SPLAT, BY_SPLAT = 13, 16
+"""Numbers of a splat on the device, and of its gradient (project.wgsl)."""
+SUMS, PAIR_SUMS = 8, 11
+"""Numbers that blending's backward pass sums up for a splat, and for a pair (common.wgsl)."""
+GEOMETRY = 6
+"""Those of a splat without the absolute gradients, in which features have no part."""
+TILES = 1024
+"""That a device blends at a time, so that it gets to other work in between."""
+
+
+def rasterize(
+    gaussians: Gaussians, weights: torch.Tensor | None, features: torch.Tensor, settings: Settings
+) -> Drawn:
+    """See :func:`training.rasterize.rasterize`. Tensors are float32 on the CPU; ValueError otherwise.
+
+    Raises:
+        LodgsError: there is no device, it was lost, or has too little memory.
+    """
+    view, count = settings.view, len(gaussians)
+    weights = torch.ones(0) if weights is None else weights
+    tensors = *vars(gaussians).values(), weights, features
+    for tensor in tensors:
+        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
+            raise ValueError(
+                f"the gpu backend takes float32 on the CPU, not {tensor.dtype} on {tensor.device}"
+            )
+    side = _SideOutputs(
+        radii=torch.zeros(count),
+        grad2d=torch.zeros(count, 2),
+        absgrad2d=torch.zeros(count, 2) if settings.absolute else None,
+        median=torch.empty(view.height, view.width, dtype=torch.int32) if settings.median else None,
+        tile_counts=torch.empty(-(-view.height // TILE), -(-view.width // TILE), dtype=torch.int64),
+    )
+    image, alpha, blended = _Rasterize.apply(*tensors, settings, side)  # type: ignore[misc]
+    return Drawn(
+        image, alpha, side.radii, side.grad2d, side.tile_counts, side.absgrad2d, blended, side.median
+    )
+
+
+@torch.no_grad()
+def contributions(
+    gaussians: Gaussians, weights: torch.Tensor | None, settings: Settings
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """See :func:`training.rasterize.contributions`: of one view, the largest, the sum, pixels and radii."""
+    count, device = len(gaussians), open_chosen()
+    gaussians = replace(gaussians, sh=gaussians.means.new_zeros(count, 1, 3))
+    weights = torch.ones(0) if weights is None else weights
+    with device.lock:
+        scene = _Scene.of(device, [*vars(gaussians).values(), weights], settings)
+        pairs = scene.pairs
+        shares = device.empty(np.float32, pairs.count, 3)
+        found = device.empty(np.float32, len(scene.some), 3)
+        scene.blend("weigh", ranges=pairs.ranges, sorted_pairs=pairs.sorted_pairs, pair_weights=shares)
+        device.run(
+            "gather", "contributions", groups_of(len(scene.some)), (len(scene.some),),
+            spans=pairs.spans, pair_weights=shares, weights=found,
+        )  # fmt: skip
+        everywhere, radii = np.zeros((count, 3), np.float32), scene.radii(count)
+        everywhere[scene.some] = device.read(found)
+    largest, total, pixels = torch.from_numpy(everywhere).unbind(1)
+    return largest, total, pixels.long(), torch.from_numpy(radii)
+
+
+def photometric_loss(image: torch.Tensor, target: Target, ssim_weight: float) -> torch.Tensor:
+    """See :func:`training.rasterize.photometric_loss`."""
+    return _Photometric.apply(image, target, ssim_weight)  # type: ignore[no-any-return]
+
+
+@dataclass
+class _SideOutputs:
+    """What a rendering has besides what autograd differentiates; see ``rendering.Drawn``."""
+
+    radii: torch.Tensor
+    grad2d: torch.Tensor
+    absgrad2d: torch.Tensor | None
+    median: torch.Tensor | None
+    tile_counts: torch.Tensor
+
+
+@dataclass
+class _Scene:
+    """The M splats that have a weight, on a device, projected and binned.
+
+    Attributes:
+        some: (M,) which of the N they are.
+        lens: what project.wgsl knows of the view.
+        splats, sh: (M, SPLAT) and (M, coefficients in use, 3), copies.
+        rows, colours, projected_radii: (M, ROW), (M, 4) and (M,), projected.
+        pairs: with the tiles that they touch.
+    """
+
+    device: Device
+    view: View
+    some: np.ndarray
+    lens: tuple
+    splats: Buffer
+    sh: Buffer
+    rows: Buffer
+    colours: Buffer
+    projected_radii: Buffer
+    pairs: Pairs
+
+    @classmethod
+    def of(cls, device: Device, tensors: list[torch.Tensor], settings: Settings) -> _Scene:
+        """Of means, quats, log-scales, logits, coefficients and weights; the last are empty for ones."""
+        arrays = [tensor.detach().numpy() for tensor in tensors]
+        means, weights, view = arrays[0], arrays[-1], settings.view
+        some = np.arange(len(means)) if settings.rows is None else settings.rows.numpy()
+        some = some[weights[some] > 0] if len(weights) else some
+        means, quats, log_scales, logits = (array[some] for array in arrays[:4])
+        sh = arrays[4][some, : (settings.degree + 1) ** 2]
+        filtered = np.broadcast_to(np.asarray(settings.antialias, np.float32), len(arrays[0]))[some]
+        ones = np.ones(len(some), np.float32)
+        columns = logits, quats, log_scales, weights[some] if len(weights) else ones, filtered
+        packed = np.column_stack([means, *columns]).astype(np.float32, copy=False)
+        count = len(some)
+        lens = (_lens_of(view), settings.min_scale, count, settings.degree, sh.shape[1])
+        splats, coefficients = device.upload(packed), device.upload(sh)
+        rows, colours = device.empty(np.float32, count, ROW), device.empty(np.float32, count, 4)
+        depths, radii = device.empty(np.uint32, count), device.empty(np.float32, count)
+        device.run(
+            "project", "forward", groups_of(count), lens, splats=splats, sh=coefficients, rows=rows,
+            colours=colours, depths=depths, radii=radii,
+        )  # fmt: skip
+        pairs = bin_splats(device, rows, depths, view.width, view.height)
+        return cls(device, view, some, lens, splats, coefficients, rows, colours, radii, pairs)
+
+    @property
+    def tiles(self) -> int:
+        """How many the image has."""
+        return self.pairs.ranges.shape[0]
+
+    def radii(self, count: int) -> np.ndarray:
+        """(count,) of all splats, as ``Rendering.radii``."""
+        radii = np.zeros(count, np.float32)
+        radii[self.some] = self.device.read(self.projected_radii)
+        return radii
+
+    def blend(
+        self,
+        entry: str,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        limited: bool = False,
+        absolute: bool = False,
+        **buffers: Buffer,
+    ) -> None:
+        """Record a function of blend.wgsl for every tile."""
+        size = self.view.width, self.view.height, -(-self.view.width // TILE)
+        numbers = (*background, 0.0, *size, int(limited), int(absolute))
+        rows, owners = self.rows, self.pairs.owners
+        self.device.run("blend", entry, self.tiles, numbers, TILES, rows=rows, owners=owners, **buffers)
+
+
+class _Rasterize(torch.autograd.Function):
+    """Features are blended as colours are, three to a pass that leaves everything else as it was."""
+
+    @staticmethod
+    def forward(ctx, means, quats, log_scales, logits, sh, weights, features, settings, side):
+        tensors, device, view = [means, quats, log_scales, logits, sh, weights], open_chosen(), settings.view
+        with device.lock:
+            scene = _Scene.of(device, tensors, settings)
+            pairs, limit = scene.pairs, np.zeros(1, np.float32)
+            if settings.limit is not None:  # not every device knows an infinity
+                most = torch.finfo(torch.float32).max
+                limit = settings.limit.to(torch.float32).clamp_max(most).numpy()
+            limit, walked = device.upload(limit), device.empty(np.uint32, scene.tiles, 2)
+            median = device.empty(np.int32, view.height, view.width)
+            shades = [scene.colours, *_as_colours(device, features.detach().numpy()[scene.some])]
+            pictures = [device.empty(np.float32, view.height, view.width, 4) for _ in shades]
+            for k, (shade, picture) in enumerate(zip(shades, pictures, strict=True)):
+                scene.blend(
+                    "forward", (0.0, 0.0, 0.0) if k else settings.background, settings.limit is not None,
+                    colours=shade, ranges=pairs.ranges, limit=limit, drawn=picture, walked=walked,
+                    median=median,
+                )  # fmt: skip
+            drawn, *blended = (torch.from_numpy(device.read(picture)) for picture in pictures)
+            side.radii.numpy()[:] = scene.radii(len(means))
+            begin, end = device.read(pairs.ranges).astype(np.int64).T
+            side.tile_counts.numpy()[:] = (end - begin).reshape(side.tile_counts.shape)
+            if side.median is not None:
+                found = device.read(median)
+                side.median.numpy()[:] = np.append(scene.some, -1)[found]
+        ctx.save_for_backward(*tensors)
+        ctx.rest = scene, shades, pictures, walked, settings, side
+        blended = [drawn[..., :0], *(each[..., :3] for each in blended)]
+        features = torch.cat(blended, 2)[..., : features.shape[1]]
+        return drawn[..., :3].contiguous(), 1 - drawn[..., 3], features.contiguous()
+
+    @staticmethod
+    def backward(ctx, by_image, by_alpha, by_features):
+        scene, shades, pictures, walked, settings, side = ctx.rest
+        device, pairs, count = scene.device, scene.pairs, len(scene.some)
+        sums = device.empty(np.float32, count, SUMS)
+        pair_sums = device.empty(np.float32, pairs.count, PAIR_SUMS)
+        by_shades = [device.empty(np.float32, count, 3) for _ in shades]
+        with device.lock:
+            for k, (shade, picture, by_shade) in enumerate(zip(shades, pictures, by_shades, strict=True)):
+                by_picture = np.zeros(picture.shape, np.float32)
+                if k:
+                    three = by_features[..., 3 * k - 3 : 3 * k]
+                    by_picture[..., : three.shape[2]] = three
+                else:
+                    by_picture[..., :3], by_picture[..., 3] = by_image, by_alpha
+                scene.blend(
+                    "backward", absolute=settings.absolute and k == 0, colours=shade, ranges=walked,
+                    sorted_pairs=pairs.sorted_pairs, picture=picture, by_picture=device.upload(by_picture),
+                    pair_sums=pair_sums,
+                )  # fmt: skip
+                device.run(
+                    "gather", "gradients", groups_of(count), (count, GEOMETRY if k else SUMS),
+                    spans=pairs.spans, pair_sums=pair_sums, sums=sums, by_colours=by_shade,
+                )  # fmt: skip
+            by_splats = device.empty(np.float32, count, BY_SPLAT)
+            by_sh = device.empty(np.float32, *scene.sh.shape)
+            device.run(
+                "project", "backward", groups_of(count), scene.lens, splats=scene.splats, sh=scene.sh,
+                projected=scene.rows, seen_colours=scene.colours, sums=sums, by_colours=by_shades[0],
+                by_splats=by_splats, by_sh=by_sh,
+            )  # fmt: skip
+            found, of_sh = device.read(by_splats), device.read(by_sh)
+            of_features = [device.read(by_shade) for by_shade in by_shades[1:]]
+        gradients = [torch.zeros_like(tensor, requires_grad=False) for tensor in ctx.saved_tensors]
+        parts = [slice(0, 3), slice(4, 8), slice(8, 11), 3]
+        some = scene.some
+        for gradient, part in zip(gradients, parts, strict=False):
+            gradient.numpy()[some] = found[:, part]
+        gradients[4].numpy()[some, : of_sh.shape[1]] = of_sh
+        if len(gradients[5]):
+            gradients[5].numpy()[some] = found[:, 11]
+        side.grad2d.numpy()[some] = found[:, 12:14]
+        if side.absgrad2d is not None:
+            side.absgrad2d.numpy()[some] = found[:, 14:16]
+        of_all = np.zeros((len(gradients[0]), by_features.shape[2]), np.float32)
+        if of_features:
+            of_all[some] = np.concatenate(of_features, 1)[:, : by_features.shape[2]]
+        return *gradients, torch.from_numpy(of_all), None, None
+
+
+class _Photometric(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, image, target, ssim_weight):
+        device = open_chosen()
+        with device.lock:
+            if target.cache.get("gpu", (None,))[0] is not device:
+                truth = device.upload(target.image.float().numpy())
+                target.cache["gpu"] = device, truth, moments_of(device, truth)
+            _, truth, moments = target.cache["gpu"]
+            loss, gradient = loss_and_gradient(
+                device, device.upload(image.detach().numpy()), truth, moments, ssim_weight
+            )
+            ctx.gradient = torch.from_numpy(device.read(gradient))
+        return torch.tensor(loss, dtype=torch.float32)
+
+    @staticmethod
+    def backward(ctx, by_loss):
+        return (ctx.gradient if by_loss == 1 else ctx.gradient * by_loss), None, None
+
+
+def _as_colours(device: Device, features: np.ndarray) -> list[Buffer]:
+    """Features (M, F) as colours (M, 4), three at a time, zeros where they run out."""
+    found = []
+    for first in range(0, features.shape[1], 3):
+        three = features[:, first : first + 3]
+        found.append(device.upload(np.pad(three, ((0, 0), (0, 4 - three.shape[1])))))
+    return found
+
+
+def _lens_of(view: View) -> np.ndarray:
+    """The view as project.wgsl takes it, as far as ``near``."""
+    pose = np.column_stack([view.rotation, view.translation])
+    limits = np.array([view.x_limits, view.y_limits]).T
+    numbers = 0, view.fx, view.fy, view.cx, view.cy, *limits.flat, view.width, view.height, view.near
+    return np.concatenate([pose.flat, view.eye, numbers], dtype=np.float32)

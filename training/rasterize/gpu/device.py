@@ -1,0 +1,307 @@
+"""Compute on any graphics device, through wgpu: by Vulkan, D3D12 (Windows) or Metal (macOS).
+
+A device records dispatches of compute shaders (:meth:`Device.run`) until something is read back. Buffers are
+bound by the names that the shader gives them.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...errors import LodgsError
+from .source import source_of
+
+KINDS = {"DiscreteGPU": "discrete", "IntegratedGPU": "integrated", "CPU": "software"}
+"""wgpu's kinds of adapters as ours; others are "other"."""
+LANES = 64
+"""Invocations of a workgroup, in every shader."""
+SMALLEST = 64
+"""Bytes of a buffer of nothing: one element of whatever a shader takes it for."""
+BINDING = re.compile(r"@group\(0\) @binding\((\d+)\) var<(uniform|storage)[^>]*> (\w+)")
+REMEDY = "Train on the CPU (Train On in Blender, backend = cpu in a job), or install the device's driver."
+
+
+class Adapter(NamedTuple):
+    """A device that can be opened.
+
+    Attributes:
+        name: as its driver calls it.
+        kind: "discrete", "integrated", "software" (shaders run on the processor) or "other".
+        api: "Vulkan", "Metal" or "D3D12".
+        driver: its name and version, where known.
+    """
+
+    name: str
+    kind: str
+    api: str
+    driver: str
+
+    @property
+    def software(self) -> bool:
+        """Whether it is no graphics device, but a program that stands for one."""
+        return self.kind == "software"
+
+
+@dataclass(frozen=True)
+class Buffer:
+    """An array of 4-byte numbers on a device."""
+
+    handle: Any
+    shape: tuple[int, ...]
+    kind: np.dtype
+
+
+def adapters() -> list[Adapter]:
+    """What can be opened on this computer: discrete devices first, software last, each name once.
+
+    Raises:
+        LodgsError: wgpu is not installed or finds no driver.
+    """
+    return list(_found())
+
+
+def open_device(name: str = "") -> Device:
+    """A device by its adapter's name, or by a part of it; the first of :func:`adapters` if that is empty.
+
+    It is opened once, and kept; anew only after it was lost.
+
+    Raises:
+        LodgsError: there is none of this name, or it cannot be opened.
+    """
+    found = _found()
+    fitting = [adapter for adapter in found if name.casefold() in adapter.name.casefold()]
+    fitting.sort(key=lambda adapter: adapter.name != name)  # one may be called as another begins
+    if not fitting:
+        raise LodgsError(
+            f'There is no graphics device "{name}" here.', f"There are: {', '.join(a.name for a in found)}."
+        )
+    device = _opened(fitting[0])
+    if device.lost:
+        _opened.cache_clear()
+        device = _opened(fitting[0])
+    return device
+
+
+@cache
+def _found() -> dict[Adapter, Any]:
+    """wgpu's adapters by ours, best first."""
+    wgpu = _wgpu()
+    try:
+        handles = wgpu.gpu.enumerate_adapters_sync()
+    except Exception as error:
+        raise LodgsError(f"Graphics devices cannot be listed: {_reason(error)}.", REMEDY) from error
+    found: dict[str, tuple[Adapter, Any]] = {}
+    for handle in handles:
+        info = handle.info
+        name, kind = info["device"] or info["vendor"], KINDS.get(info["adapter_type"], "other")
+        if name not in found and info["backend_type"] != "OpenGL":
+            found[name] = Adapter(name, kind, info["backend_type"], info["description"] or ""), handle
+    if not found:
+        raise LodgsError("No graphics device with Vulkan, Metal or D3D12 was found.", REMEDY)
+    ranks = {"discrete": 0, "integrated": 1, "other": 2, "software": 3}
+    return dict(sorted(found.values(), key=lambda pair: ranks[pair[0].kind]))
+
+
+@cache
+def _opened(adapter: Adapter) -> Device:
+    return Device(adapter, _found()[adapter])
+
+
+@cache
+def _wgpu() -> Any:
+    try:
+        wgpu = import_module("wgpu")
+        extras = import_module("wgpu.backends.wgpu_native.extras")
+    except (ImportError, OSError, RuntimeError) as error:
+        raise LodgsError(
+            f"The rasterizer for graphics devices needs wgpu: {_reason(error)}.",
+            f"Install it with: {sys.executable} -m pip install wgpu",
+        ) from error
+    with suppress(RuntimeError):  # somebody in this process has begun with all
+        extras.set_instance_extras(backends=["Vulkan", "Metal", "DX12"])
+    return wgpu
+
+
+def _reason(error: BaseException) -> str:
+    """wgpu's messages end in what went wrong."""
+    return str(error).strip().rpartition("\n")[2].strip().rstrip(".") or type(error).__name__
+
+
+class Device:
+    """An opened adapter.
+
+    Attributes:
+        adapter: what it is.
+        limits: by wgpu's names, all that the adapter has.
+        most_bytes: the largest buffer.
+        most_groups: workgroups that are submitted at a time.
+        lost: it answers no more; :func:`open_device` opens another.
+        lock: held by who records, so that two threads do not mix their dispatches.
+    """
+
+    def __init__(self, adapter: Adapter, handle: Any) -> None:
+        self.adapter, self.lost, self.lock = adapter, False, threading.RLock()
+        self.limits: dict[str, int] = dict(handle.limits)
+        try:
+            self._device = handle.request_device_sync(required_limits=self.limits)
+        except Exception as error:  # of the driver
+            raise LodgsError(f"{adapter.name} cannot be opened: {_reason(error)}.", REMEDY) from error
+        self.most_bytes = min(self.limits["max-storage-buffer-binding-size"], self.limits["max-buffer-size"])
+        self.most_groups = self.limits["max-compute-workgroups-per-dimension"]
+        self._firsts: dict[int, Any] = {}
+        self._pipelines: dict[tuple[str, str], tuple[Any, Any, dict[str, int]]] = {}
+        self._encoder: Any = None
+        self._pass: Any = None
+
+    def empty(self, kind: type, *shape: int) -> Buffer:
+        """A buffer of zeros: of np.float32, np.uint32 or np.int32.
+
+        Raises:
+            LodgsError: it is larger than the device binds, or than its memory.
+        """
+        flags = _wgpu().BufferUsage
+        usage = flags.STORAGE | flags.COPY_SRC | flags.COPY_DST
+        size = max(int(np.prod(shape, dtype=np.int64)) * 4, SMALLEST)
+        if size > self.most_bytes:
+            raise LodgsError(
+                f"{self.adapter.name} takes {self.most_bytes >> 20} MB at a time, "
+                f"and this scene needs {-(-size >> 20)} MB.",
+                "Choose the cpu backend, fewer splats or smaller images.",
+            )
+        with self._said():
+            handle = self._device.create_buffer(size=size, usage=usage)
+        return Buffer(handle, shape, np.dtype(kind))
+
+    def upload(self, array: np.ndarray) -> Buffer:
+        """A copy of an array of 4-byte numbers; LodgsError as :meth:`empty`."""
+        array = np.ascontiguousarray(array)
+        buffer = self.empty(array.dtype.type, *array.shape)
+        if array.size:
+            with self._said():
+                self._device.queue.write_buffer(buffer.handle, 0, array.reshape(-1))
+        return buffer
+
+    def run(
+        self,
+        shader: str,
+        entry: str,
+        groups: int,
+        numbers: tuple = (),
+        at_once: int = 1 << 30,
+        **buffers: Buffer,
+    ) -> None:
+        """Record a dispatch; it has run when something is read.
+
+        Args:
+            shader, entry: name of a file in ``shaders/`` without its ending, and of a function in it.
+            groups: workgroups; each learns from ``group_of`` which one it is.
+            numbers: what the shader's uniform holds, in order: integers, floats or arrays of them.
+            at_once: workgroups that are submitted at a time, at most: between them the device can do other
+                things, such as draw windows.
+            buffers: those that the function uses, by the shader's names.
+
+        Raises:
+            LodgsError: the device was lost.
+        """
+        with self._said():
+            pipeline, layout, bindings = self._pipeline(shader, entry)
+            bound = {bindings[name]: buffer.handle for name, buffer in buffers.items()}
+            if numbers:
+                bound[bindings["u"]] = self._uniform(*numbers)
+            at_once = min(at_once, self.most_groups)
+            for first in range(0, groups, at_once):
+                if first not in self._firsts:
+                    self._firsts[first] = self._uniform(first)
+                bound[bindings["first_group"]] = self._firsts[first]
+                entries = [
+                    {"binding": at, "resource": {"buffer": handle, "offset": 0, "size": handle.size}}
+                    for at, handle in bound.items()
+                ]
+                group = self._device.create_bind_group(layout=layout, entries=entries)
+                if self._pass is None:
+                    self._encoder = self._device.create_command_encoder()
+                    self._pass = self._encoder.begin_compute_pass()
+                self._pass.set_pipeline(pipeline)
+                self._pass.set_bind_group(0, group)
+                self._pass.dispatch_workgroups(min(at_once, groups - first))
+                if groups > at_once:
+                    self.submit()
+
+    def read(self, buffer: Buffer, begin: int = 0) -> np.ndarray:
+        """The rows of a buffer from ``begin`` on, once all that was recorded has run: a copy.
+
+        Raises:
+            LodgsError: the device was lost, or is out of memory.
+        """
+        self.submit()
+        rows, *row = buffer.shape
+        shape = rows - begin, *row
+        size, row_size = (int(np.prod(each, dtype=np.int64)) * buffer.kind.itemsize for each in (shape, row))
+        if not size:
+            return np.zeros(shape, buffer.kind)
+        with self._said():
+            data = self._device.queue.read_buffer(buffer.handle, begin * row_size, size)
+        return np.frombuffer(data, buffer.kind).reshape(shape)
+
+    def submit(self) -> None:
+        """Let what was recorded begin; LodgsError: the device was lost."""
+        if self._pass is None:
+            return
+        with self._said():
+            recorded, encoder, self._pass, self._encoder = self._pass, self._encoder, None, None
+            recorded.end()
+            self._device.queue.submit([encoder.finish()])
+
+    def _uniform(self, *numbers: Any) -> Any:
+        words = np.concatenate([_as_words(number) for number in numbers])
+        words = np.pad(words, (0, -len(words) % 4))
+        return self._device.create_buffer_with_data(data=words, usage=_wgpu().BufferUsage.UNIFORM)
+
+    def _pipeline(self, shader: str, entry: str) -> tuple[Any, Any, dict[str, int]]:
+        """Compiled when it is first used: the pipeline, its layout, and the bindings by name."""
+        if (shader, entry) not in self._pipelines:
+            source = source_of(shader)
+            module = self._device.create_shader_module(code=source)
+            pipeline = self._device.create_compute_pipeline(
+                layout="auto", compute={"module": module, "entry_point": entry}
+            )
+            bindings = {name: int(at) for at, _, name in BINDING.findall(source)}
+            self._pipelines[shader, entry] = pipeline, pipeline.get_bind_group_layout(0), bindings
+        return self._pipelines[shader, entry]
+
+    @contextmanager
+    def _said(self) -> Iterator[None]:
+        """What goes wrong on a device, in a sentence; mistakes of ours stay what they are."""
+        try:
+            yield
+        except (RuntimeError, MemoryError, _wgpu().GPUError) as error:
+            self._pass = self._encoder = None
+            name, said = self.adapter.name, str(error).lower()
+            if "lost" not in said and (isinstance(error, MemoryError) or "memory" in said):
+                raise LodgsError(
+                    f"{name} has no more memory.",
+                    "Close other programs that use it, take fewer splats or smaller images, or go on "
+                    "with the run on the cpu.",
+                ) from error
+            if "lost" not in said and isinstance(error, _wgpu().GPUValidationError):
+                raise
+            self.lost = True
+            raise LodgsError(
+                f"{name} does not answer any more: {_reason(error)}.",
+                "Resume the run, on this device or on the cpu; a newer driver may help.",
+            ) from error
+
+
+def _as_words(number: Any) -> np.ndarray:
+    array = np.atleast_1d(np.asarray(number)).reshape(-1)
+    return array.astype(np.float32 if array.dtype.kind == "f" else np.uint32).view(np.uint32)

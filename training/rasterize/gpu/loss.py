@@ -1,0 +1,49 @@
+"""L1 and structural similarity with their gradient, on a device; ``shaders/loss.wgsl`` has the formulas."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .device import LANES, Buffer, Device
+
+EACH = 256
+"""Values that one invocation adds up."""
+
+
+def moments_of(device: Device, truth: Buffer) -> Buffer:
+    """What :func:`loss_and_gradient` wants to know about a photograph (H, W, 3): (2, H, W, 3)."""
+    groups, numbers = _launch(truth, 0.0, 0.0)
+    lines, moments = device.empty(np.float32, 3, *truth.shape), device.empty(np.float32, 2, *truth.shape)
+    device.run("loss", "products", groups, numbers, image=truth, truth=truth, lines=lines)
+    device.run("loss", "moments", groups, numbers, across=lines, of_truth=moments)
+    return moments
+
+
+def loss_and_gradient(
+    device: Device, image: Buffer, truth: Buffer, moments: Buffer, ssim_weight: float
+) -> tuple[float, Buffer]:
+    """(1 − ssim_weight) L1 + ssim_weight (1 − SSIM) of images (H, W, 3), and its gradient by the first."""
+    size = int(np.prod(image.shape))
+    groups, numbers = _launch(image, (1 - ssim_weight) / size, ssim_weight / size)
+    lines, slopes = (device.empty(np.float32, 3, *image.shape) for _ in range(2))
+    similar, different, gradient = (device.empty(np.float32, *image.shape) for _ in range(3))
+    device.run("loss", "products", groups, numbers, image=image, truth=truth, lines=lines)
+    device.run(
+        "loss", "similarity", groups, numbers, across=lines, truths=moments, by_means=slopes, similar=similar
+    )
+    device.run("loss", "slopes_across", groups, numbers, slopes=slopes, lines=lines)
+    device.run(
+        "loss", "finish", groups, numbers, across=lines, image=image, truth=truth, gradient=gradient,
+        different=different,
+    )  # fmt: skip
+    blocks = -(-size // EACH)
+    totals = [device.empty(np.float32, blocks) for _ in range(2)]
+    for values, total in zip((similar, different), totals, strict=True):
+        device.run("loss", "add", -(-blocks // LANES), numbers, values=values, totals=total)
+    ssim, l1 = (device.read(total).sum(dtype=np.float64) / size for total in totals)
+    return (1 - ssim_weight) * float(l1) + ssim_weight * (1 - float(ssim)), gradient
+
+
+def _launch(image: Buffer, l1_weight: float, ssim_weight: float) -> tuple[int, tuple]:
+    height, width, channels = image.shape
+    return -(-height * width * channels // LANES), (l1_weight, ssim_weight, width, height)

@@ -1,0 +1,92 @@
+// Which splats touch which tile. Splats are in the order of their depths by now; each makes its pairs with tiles
+// in this order, and a stable sort by tile then leaves every tile with its splats front to back.
+
+struct Parameters { count: u32, across: u32, down: u32 }
+@group(0) @binding(0) var<uniform> u: Parameters;
+@group(0) @binding(1) var<storage, read> rows: array<Row>;
+@group(0) @binding(2) var<storage, read> order: array<u32>;  // splats by depth
+@group(0) @binding(3) var<storage, read_write> counts: array<u32>;  // of tiles, by depth
+@group(0) @binding(4) var<storage, read> starts: array<u32>;  // where the pairs of each begin, and the end
+@group(0) @binding(5) var<storage, read_write> spans: array<vec2u>;  // of each splat, its first pair and their number
+@group(0) @binding(6) var<storage, read_write> owners: array<u32>;  // of each pair, the splat
+@group(0) @binding(7) var<storage, read_write> tiles: array<u32>;  // of each pair, the tile
+@group(0) @binding(8) var<storage, read_write> pairs: array<u32>;  // of each pair, its own number
+@group(0) @binding(9) var<storage, read> sorted_tiles: array<u32>;
+@group(0) @binding(10) var<storage, read> sorted_pairs: array<u32>;
+@group(0) @binding(11) var<storage, read> owner_of: array<u32>;
+@group(0) @binding(12) var<storage, read_write> sorted_owners: array<u32>;
+@group(0) @binding(13) var<storage, read_write> ranges: array<vec2u>;  // of each tile, its first pair and past its last
+
+const SPAN = f32(TILE - 1);  // from a tile's first pixel centre to its last
+
+// The first tile and one past the last whose pixel centres may lie within reach of a point.
+fn tile_range(middle: f32, reach: f32, tiles: u32) -> vec2u {
+    let low = floor((middle - reach - 0.5) / f32(TILE));
+    let high = floor((middle + reach - 0.5) / f32(TILE)) + 1.0;
+    let range = vec2u(clamp(vec2f(low, high), vec2f(0.0), vec2f(f32(tiles))));
+    return min(range, vec2u(tiles));  // what is no number may become any whole one
+}
+
+fn touches_tile(row: Row, x: u32, y: u32) -> bool {
+    return touches(row, vec2f(f32(x * TILE), f32(y * TILE)) + 0.5, vec2f(SPAN));
+}
+
+@compute @workgroup_size(LANES)
+fn count(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let k = group_of(group) * LANES + lane;
+    if (k >= u.count) { return; }
+    let row = rows[order[k]];
+    var found = 0u;
+    if (row.radius > 0.0) {
+        let columns = tile_range(row.mean.x, row.half_size.x, u.across);
+        let lines = tile_range(row.mean.y, row.half_size.y, u.down);
+        for (var y = lines.x; y < lines.y; y++) {
+            for (var x = columns.x; x < columns.y; x++) { found += u32(touches_tile(row, x, y)); }
+        }
+    }
+    counts[k] = found;
+}
+
+// A driver may compile the test above otherwise than in `count`: so no more pairs are made than were counted, and
+// one that is missing goes to a tile that does not exist.
+@compute @workgroup_size(LANES)
+fn make_pairs(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let k = group_of(group) * LANES + lane;
+    if (k >= u.count) { return; }
+    let splat = order[k];
+    let end = starts[k + 1u];
+    var at = starts[k];
+    spans[splat] = vec2u(at, end - at);
+    let row = rows[splat];
+    if (row.radius > 0.0) {
+        let columns = tile_range(row.mean.x, row.half_size.x, u.across);
+        let lines = tile_range(row.mean.y, row.half_size.y, u.down);
+        for (var y = lines.x; y < lines.y; y++) {
+            for (var x = columns.x; x < columns.y; x++) {
+                if (at < end && touches_tile(row, x, y)) {
+                    owners[at] = splat;
+                    tiles[at] = y * u.across + x;
+                    pairs[at] = at;
+                    at++;
+                }
+            }
+        }
+    }
+    for (; at < end; at++) {
+        owners[at] = splat;
+        tiles[at] = u.across * u.down;
+        pairs[at] = at;
+    }
+}
+
+// Where each tile's pairs begin and end, and whose they are.
+@compute @workgroup_size(LANES)
+fn find_ranges(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let at = group_of(group) * LANES + lane;
+    if (at >= u.count) { return; }
+    sorted_owners[at] = owner_of[sorted_pairs[at]];
+    let tile = sorted_tiles[at];
+    if (tile == u.across * u.down) { return; }
+    if (at == 0u || sorted_tiles[at - 1u] != tile) { ranges[tile].x = at; }
+    if (at + 1u == u.count || sorted_tiles[at + 1u] != tile) { ranges[tile].y = at + 1u; }
+}

@@ -1,0 +1,249 @@
+// Splats to ellipses on the image, and the way back from the ellipses' gradients to the splats' parameters.
+//
+// p = R m + t the mean in camera coordinates, M = R Q diag(s) with covariance M Mt, J the Jacobian of
+// (fx x/z, fy y/z) at p (clamped to a frustum a little wider than the image), cov = J M Mt Jt + dilation (EWA
+// splatting, Zwicker et al. 2001, as in 3DGS Eq. 5). u and v are the rows of J M.
+
+struct View {
+    pose: array<vec4f, 3>,  // world to camera, row by row
+    eye: vec4f,
+    focal: vec2f,
+    center: vec2f,
+    low: vec2f,  // range of x/z and y/z in which the Jacobian is taken
+    high: vec2f,
+    size: vec2f,  // of the image in pixels
+    near: f32,
+    min_scale: f32,
+    count: u32,
+    degree: u32,  // of the harmonics to draw with
+    terms: u32,  // coefficients that there are
+}
+@group(0) @binding(0) var<uniform> u: View;
+@group(0) @binding(1) var<storage, read> splats: array<f32>;  // (M, SPLAT)
+@group(0) @binding(2) var<storage, read> sh: array<f32>;  // (M, terms, 3)
+@group(0) @binding(3) var<storage, read_write> rows: array<Row>;
+@group(0) @binding(4) var<storage, read_write> colours: array<vec4f>;
+@group(0) @binding(5) var<storage, read_write> depths: array<u32>;
+@group(0) @binding(6) var<storage, read_write> radii: array<f32>;
+@group(0) @binding(7) var<storage, read> projected: array<Row>;
+@group(0) @binding(8) var<storage, read> seen_colours: array<vec4f>;
+@group(0) @binding(9) var<storage, read> sums: array<f32>;  // (M, SUMS)
+@group(0) @binding(10) var<storage, read> by_colours: array<f32>;  // (M, 3)
+@group(0) @binding(11) var<storage, read_write> by_splats: array<f32>;  // (M, BY_SPLAT)
+@group(0) @binding(12) var<storage, read_write> by_sh: array<f32>;  // (M, terms, 3)
+
+// Columns of splats: mean, logit of the opacity, quaternion, logarithms of the scales, weight, whether it is
+// filtered as Mip-Splatting does. by_splats has gradients in the place of the first twelve, then grad2d and absgrad2d.
+const SPLAT: u32 = 13;
+const BY_SPLAT: u32 = 16;
+
+struct Axes {
+    turned: mat3x3f,  // R Q
+    scale: vec3f,
+    quat: vec4f,  // of unit length, as x, y, z, w
+    per_length: f32,
+}
+
+struct Ellipse {
+    u: vec3f,
+    v: vec3f,
+    jacobian: vec4f,  // j0, j2 of its first row, and k1, k2 of its second
+    uu: f32,
+    uv: f32,
+    vv: f32,
+    cross: vec3f,  // u x v: its square is the determinant before dilation, without the cancellation of needles
+}
+
+fn triple(first: u32) -> vec3f {
+    return vec3f(splats[first], splats[first + 1u], splats[first + 2u]);
+}
+
+fn to_camera(mean: vec3f) -> vec3f {
+    let m = vec4f(mean, 1.0);
+    return vec3f(dot(u.pose[0], m), dot(u.pose[1], m), dot(u.pose[2], m));
+}
+
+fn camera_rotation() -> mat3x3f {
+    return transpose(mat3x3f(u.pose[0].xyz, u.pose[1].xyz, u.pose[2].xyz));
+}
+
+fn sigmoid(x: f32) -> f32 {
+    let e = exp(-abs(x));
+    return select(e, 1.0, x >= 0.0) / (1.0 + e);
+}
+
+fn axes_of(first: u32) -> Axes {
+    let raw = vec4f(triple(first + 5u), splats[first + 4u]);
+    let per_length = 1.0 / sqrt(dot(raw, raw));
+    let q = raw * per_length;
+    let rotation = mat3x3f(  // column by column
+        vec3f(1.0 - 2.0 * (q.y * q.y + q.z * q.z), 2.0 * (q.x * q.y + q.w * q.z), 2.0 * (q.x * q.z - q.w * q.y)),
+        vec3f(2.0 * (q.x * q.y - q.w * q.z), 1.0 - 2.0 * (q.x * q.x + q.z * q.z), 2.0 * (q.y * q.z + q.w * q.x)),
+        vec3f(2.0 * (q.x * q.z + q.w * q.y), 2.0 * (q.y * q.z - q.w * q.x), 1.0 - 2.0 * (q.x * q.x + q.y * q.y)),
+    );
+    return Axes(camera_rotation() * rotation, exp(triple(first + 8u)) + u.min_scale, q, per_length);
+}
+
+fn ellipse_of(p: vec3f, axes: Axes) -> Ellipse {
+    let per_z = 1.0 / p.z;
+    let ratio = clamp(p.xy * per_z, u.low, u.high);
+    let j = vec4f(u.focal.x * per_z, -u.focal.x * ratio.x * per_z, u.focal.y * per_z, -u.focal.y * ratio.y * per_z);
+    let m = transpose(axes.turned);  // its columns are the rows of R Q
+    let row_u = (j.x * m[0] + j.y * m[2]) * axes.scale;
+    let row_v = (j.z * m[1] + j.w * m[2]) * axes.scale;
+    return Ellipse(
+        row_u, row_v, j, dot(row_u, row_u), dot(row_u, row_v), dot(row_v, row_v), cross(row_u, row_v),
+    );
+}
+
+@compute @workgroup_size(LANES)
+fn forward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let i = group_of(group) * LANES + lane;
+    if (i >= u.count) { return; }
+    depths[i] = 0xffffffffu;
+    let first = i * SPLAT;
+    let mean = triple(first);
+    let p = to_camera(mean);
+    var opacity = splats[first + 11u] * sigmoid(splats[first + 3u]);
+    if (!(p.z > u.near) || !(opacity > ALPHA_MIN)) { return; }
+    let e = ellipse_of(p, axes_of(first));
+    let filtered = splats[first + 12u] > 0.0;
+    let dilation = select(DILATION, MIP_VARIANCE, filtered);
+    let undilated = dot(e.cross, e.cross);
+    let determinant = undilated + dilation * (e.uu + e.vv + dilation);
+    if (filtered) {
+        opacity *= sqrt(undilated / determinant);
+        if (!(opacity > ALPHA_MIN)) { return; }
+    }
+    let xx = e.uu + dilation;
+    let yy = e.vv + dilation;
+    let middle = u.focal * p.xy / p.z + u.center;
+    let half_size = sqrt(2.0 * log(opacity / ALPHA_MIN)) * sqrt(vec2f(xx, yy));
+    if (any(middle + half_size <= vec2f(0.0)) || any(middle - half_size >= u.size)) { return; }
+    let half_difference = 0.5 * (xx - yy);
+    let longest = 0.5 * (xx + yy) + sqrt(half_difference * half_difference + e.uv * e.uv);
+    let radius = 3.0 * sqrt(longest);
+    let conic = vec3f(yy, -e.uv, xx) / determinant;
+    rows[i] = Row(middle, half_size, conic, log(opacity) * LOG2_E, p.z, radius);
+    radii[i] = radius;
+    depths[i] = bitcast<u32>(p.z);
+
+    var values: array<f32, 25>;
+    basis(normalize(mean - u.eye.xyz), u.degree, &values);
+    var colour = vec3f(0.5);
+    for (var k = 0u; k < (u.degree + 1u) * (u.degree + 1u); k++) {
+        let at = (i * u.terms + k) * 3u;
+        colour += values[k] * vec3f(sh[at], sh[at + 1u], sh[at + 2u]);
+    }
+    colours[i] = vec4f(max(colour, vec3f(0.0)), 0.0);
+}
+
+// d loss / d quat from d loss / d Q: entries of Q differentiated, then the normalisation. r[column][row].
+fn quat_gradient(q: vec4f, per_length: f32, r: mat3x3f) -> vec4f {
+    let by_w = 2.0 * (q.x * (r[1][2] - r[2][1]) + q.y * (r[2][0] - r[0][2]) + q.z * (r[0][1] - r[1][0]));
+    let by_x = 2.0 * (
+        -2.0 * q.x * (r[1][1] + r[2][2]) + q.y * (r[1][0] + r[0][1]) + q.z * (r[2][0] + r[0][2])
+        + q.w * (r[1][2] - r[2][1])
+    );
+    let by_y = 2.0 * (
+        q.x * (r[1][0] + r[0][1]) - 2.0 * q.y * (r[0][0] + r[2][2]) + q.z * (r[2][1] + r[1][2])
+        + q.w * (r[2][0] - r[0][2])
+    );
+    let by_z = 2.0 * (
+        q.x * (r[2][0] + r[0][2]) + q.y * (r[2][1] + r[1][2]) - 2.0 * q.z * (r[0][0] + r[1][1])
+        + q.w * (r[0][1] - r[1][0])
+    );
+    let by = vec4f(by_x, by_y, by_z, by_w);
+    return (by - dot(by, q) * q) * per_length;
+}
+
+// Gradients of splats that have been drawn; those of the others stay zero.
+@compute @workgroup_size(LANES)
+fn backward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let i = group_of(group) * LANES + lane;
+    if (i >= u.count || projected[i].radius == 0.0) { return; }
+    let first = i * SPLAT;
+    let out = i * BY_SPLAT;
+    let conic = projected[i].conic;
+    let at = i * SUMS;
+    let mean = triple(first);
+    let p = to_camera(mean);
+    let axes = axes_of(first);
+    let e = ellipse_of(p, axes);
+    let j = e.jacobian;
+
+    // sums are of g = d loss / d sigma with sigma = d . conic d / 2, and of g e and g e et with e = conic d:
+    // d sigma / d mean = -e, and d sigma / d cov = -e et / 2. Summing e, not d, spares needles a cancellation.
+    let by_log_opacity = -sums[at + G];
+    let by_mean2d = -vec2f(sums[at + G_X], sums[at + G_Y]);
+    var by_cov = vec3f(-0.5 * sums[at + G_XX], -sums[at + G_XY], -0.5 * sums[at + G_YY]);  // xx, xy (as one), yy
+    let half_size = 0.5 * u.size;
+    by_splats[out + 12u] = by_mean2d.x * half_size.x;
+    by_splats[out + 13u] = by_mean2d.y * half_size.y;
+    by_splats[out + 14u] = sums[at + ABS_X] * half_size.x;
+    by_splats[out + 15u] = sums[at + ABS_Y] * half_size.y;
+
+    // u and v: xx = u.u, xy = u.v, yy = v.v
+    var by_u = 2.0 * by_cov.x * e.u + by_cov.y * e.v;
+    var by_v = 2.0 * by_cov.z * e.v + by_cov.y * e.u;
+    if (splats[first + 12u] > 0.0) {
+        // the opacity has the factor |u x v| / sqrt(det cov)
+        let unit = by_log_opacity / dot(e.cross, e.cross);
+        let by_det = -0.5 * by_log_opacity * vec3f(conic.x, 2.0 * conic.y, conic.z);
+        by_u += cross(e.v, e.cross) * unit + 2.0 * by_det.x * e.u + by_det.y * e.v;
+        by_v += cross(e.cross, e.u) * unit + 2.0 * by_det.z * e.v + by_det.y * e.u;
+    }
+    let m = transpose(axes.turned);
+    let m0 = m[0] * axes.scale;
+    let m1 = m[1] * axes.scale;
+    let m2 = m[2] * axes.scale;
+    let by_j = vec4f(dot(by_u, m0), dot(by_u, m2), dot(by_v, m1), dot(by_v, m2));
+
+    // the mean is in its projection, fx x/z + cx, and in j0 = fx/z and j2 = -fx ratio_x/z,
+    let per_z = 1.0 / p.z;
+    let ratio = p.xy * per_z;
+    let kept = clamp(ratio, u.low, u.high);
+    var by_p = vec3f(by_mean2d * vec2f(j.x, j.z), 0.0);
+    by_p.z = -(dot(by_p.xy, p.xy) + dot(by_j, j)) * per_z;
+    // where ratio_x = x/z unless it is clamped
+    let free = (u.low < ratio) & (ratio < u.high);
+    let by_ratio = select(vec2f(0.0), -vec2f(by_j.y * j.x, by_j.w * j.z) * per_z, free);
+    by_p += vec3f(by_ratio, -dot(by_ratio, kept));
+
+    // M = R Q diag(s): d loss / d Q = Rt (d loss / d M) diag(s), and s = exp(log_scale) + min_scale
+    let by_m0 = j.x * by_u;
+    let by_m1 = j.z * by_v;
+    let by_m2 = j.y * by_u + j.w * by_v;
+    let by_scale = by_m0 * m[0] + by_m1 * m[1] + by_m2 * m[2];
+    let by_log_scale = by_scale * (axes.scale - u.min_scale);
+    let by_m = transpose(mat3x3f(by_m0 * axes.scale, by_m1 * axes.scale, by_m2 * axes.scale));
+    let by_quat = quat_gradient(axes.quat, axes.per_length, transpose(camera_rotation()) * by_m);
+
+    by_splats[out + 3u] = by_log_opacity * (1.0 - sigmoid(splats[first + 3u]));
+    by_splats[out + 4u] = by_quat.w;
+    for (var k = 0u; k < 3u; k++) {
+        by_splats[out + 5u + k] = by_quat[k];
+        by_splats[out + 8u + k] = by_log_scale[k];
+    }
+    by_splats[out + 11u] = by_log_opacity / splats[first + 11u];
+
+    let shown = vec3f(by_colours[3u * i], by_colours[3u * i + 1u], by_colours[3u * i + 2u]);
+    let by_colour = select(vec3f(0.0), shown, seen_colours[i].xyz > vec3f(0.0));
+    let towards = mean - u.eye.xyz;
+    let per_length = 1.0 / length(towards);
+    let direction = towards * per_length;
+    var values: array<f32, 25>;
+    var slopes: array<vec3f, 25>;
+    basis(direction, u.degree, &values);
+    basis_gradient(direction, u.degree, &slopes);
+    var by_direction = vec3f(0.0);
+    for (var k = 0u; k < (u.degree + 1u) * (u.degree + 1u); k++) {
+        let c = (i * u.terms + k) * 3u;
+        by_direction += dot(vec3f(sh[c], sh[c + 1u], sh[c + 2u]), by_colour) * slopes[k];
+        for (var channel = 0u; channel < 3u; channel++) { by_sh[c + channel] = values[k] * by_colour[channel]; }
+    }
+    // direction = (mean - eye) / length: only the part across the direction moves it
+    let through_colour = (by_direction - dot(by_direction, direction) * direction) * per_length;
+    let by_mean = through_colour + transpose(camera_rotation()) * by_p;
+    for (var k = 0u; k < 3u; k++) { by_splats[out + k] = by_mean[k]; }
+}
