@@ -14,9 +14,9 @@ is removed when standard input ends, however the other program ended.
 
 answer ``progress`` (frame, share) and ``warning`` (frame, message), then one of ``frame`` (frame, passes,
 height, width, seconds; the planes are in the file OUT), ``cancelled`` (frame) and ``error`` (frame, what,
-remedy). A photograph is read in the frame's size, over black, and its planes follow the others, display-coded;
-``psnr`` then says how alike both are, where the mask is not black. A holdout is an EXR with the depth of what hides splats, of the camera's size or
-the window's.
+remedy). A photograph is read in the frame's size, over black, and its planes follow the others,
+display-coded; ``psnr`` then says how alike both are, where the mask is not black. A holdout is an EXR with
+the depth of what hides splats, of the camera's size or the window's.
 
 A set is read when its file is first named, and forgotten when a frame does not name it; its file may go after
 an answer ``frame``. With a choice (``lod.choice``: ``rule``, ``eye`` in the set's coordinates, ``focal_px``,

@@ -11,6 +11,7 @@ from ..errors import LodgsError
 from ..methods.data import TrainingData
 from ..scenes.cameras import Camera
 from ..scenes.colmap import read_scene, without
+from ..scenes.depths import Depths, with_points
 from ..scenes.images import check_image
 from ..scenes.regions import Region
 from ..scenes.undistort import cache_of, undistorted
@@ -48,7 +49,13 @@ def training_data(
         if tell:
             tell("status", message=f"Undistorting {len(scene.distorted)} views")
         scene = undistorted(scene, cache_of(scene, folder.undistorted))
-        warnings += [warning for warning in scene.warnings if warning not in warnings]
+    parameters, depths = job.resolved_parameters(), None
+    if pixels and parameters.depth == "metric" and region is None and not job.cells:
+        scene = with_points(scene)
+    if pixels and parameters.depth_weight:
+        depths = Depths(scene, parameters.depth)
+        scene = replace(scene, warnings=[*scene.warnings, *depths.warnings])
+    warnings += [warning for warning in scene.warnings if warning not in warnings]
     for warning in warnings:
         if tell:
             tell("warning", message=warning)
@@ -61,6 +68,7 @@ def training_data(
         splat_memory=job.splat_memory * 10**6 or None,
         scratch=folder.checkpoints,
         whole=whole if job.region or job.cells else None,
+        depths=depths,
     )  # fmt: skip
 
 
