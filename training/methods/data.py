@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from ..errors import LodgsError
+from ..lod.crop import Crop
 from ..rasterize import Target
 from ..scenes.cameras import Camera, evenly
 from ..scenes.colmap import Scene
@@ -61,6 +62,7 @@ class TrainingData:
         splat_memory: bytes of splats that are kept by methods that have them in files; None: as they choose.
         scratch: where such methods make files, which a checkpoint tells of; None: in a temporary folder.
         depths: what is known of the depth in training views; None: nothing.
+        region: where splats are added, in the scene's coordinates; None: everywhere.
 
     Attributes:
         scene: what is trained on.
@@ -82,6 +84,7 @@ class TrainingData:
         scratch: Path | None = None,
         whole: Scene | None = None,
         depths: Depths | None = None,
+        region: Crop | None = None,
     ) -> None:
         if len(scene.points) == 0:
             raise LodgsError(
@@ -96,7 +99,7 @@ class TrainingData:
                 f"The scene {scene.folder} has {len(train)} usable view(s) to train on; 2 are needed.",
                 "Check that the image folder holds the photographs that the model names.",
             )
-        self.scene, self.exposure, self.depths = scene, exposure, depths
+        self.scene, self.exposure, self.depths, self.region = scene, exposure, depths, region
         self._trained = {camera.name for camera in train}
         self.whole_train = [camera.scaled(image_scale) for camera in all_train]
         self.train = [camera.scaled(image_scale) for camera in train]

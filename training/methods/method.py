@@ -19,7 +19,7 @@ from .data import TrainingData, TrainingView
 from .density import require_rows
 from .exposure import Exposure
 from .margins import Margins
-from .model import Model
+from .model import OUTSIDE, PEAKS, Model
 from .parameters import Parameters
 from .schedules import due, log_linear
 from .support import INTERVAL
@@ -150,6 +150,7 @@ class Method(ABC, Generic[P, D]):
         loss.backward()
         self.model.hold_still()
         self.accumulate_stats(drawings, view, step)
+        self.grow_inside(step)
         self.set_learning_rates(step)
         for optimizer in (*self.optimizers(), *self.exposure.optimizers(step / self.steps)):
             optimizer.step()
@@ -223,6 +224,18 @@ class Method(ABC, Generic[P, D]):
     @abstractmethod
     def accumulate_stats(self, drawings: Sequence[D], view: TrainingView, step: int) -> None:
         """After ``backward``: what :meth:`control_density` decides by is added up (``model.stats``)."""
+
+    def grow_inside(self, step: int) -> None:
+        """After :meth:`accumulate_stats`: outside of a job's region nothing asks for more splats."""
+        region, model = self.data.region, self.model
+        if region is None:
+            return
+        if OUTSIDE not in model.columns or due(INTERVAL, step):
+            outside = ~region.holds(model["means"].detach().cpu().numpy())
+            model.columns[OUTSIDE] = torch.from_numpy(outside).to(model["means"])
+        for name in ("gradient_sum", PEAKS[0]):
+            if name in model.stats:
+                model.stats[name][model.columns[OUTSIDE] > 0] = 0
 
     @abstractmethod
     def set_learning_rates(self, step: int) -> None:
