@@ -31,6 +31,8 @@ ASTRAY = 1000
 """What lies so many times as far from the middle of the cameras as most cameras or points is an error."""
 MASKS, DEPTHS = "masks", "depths"
 """Folders beside that of the photographs, or in the scene's where they are that."""
+DEPTH_SUFFIXES = ".exr", ".png"
+"""How names of depth maps end."""
 MOST_EYES = 500
 """Cameras, evenly chosen, that tell the median depth."""
 NAMED = 5
@@ -208,7 +210,7 @@ def read_scene(
         raise LodgsError(f"There is no image folder {images}.", "Choose the folder of the photographs.")
     beside = folder if images == folder else images.parent
     views = _Views(
-        Photographs(images, folder), Beside(beside / MASKS, ".png"), Beside(beside / DEPTHS, ".exr", ".png")
+        Photographs(images, folder), Beside(beside / MASKS, ".png"), Beside(beside / DEPTHS, *DEPTH_SUFFIXES)
     )
     for number, pose in enumerate(poses):
         if progress and number % 50 == 0:
