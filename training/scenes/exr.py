@@ -105,3 +105,18 @@ def _bytes_of(header: dict) -> int:
     low, high = (np.asarray(corner, np.int64) for corner in header["dataWindow"])
     width, height = (max(int(side), 0) for side in high - low + 1)
     return 4 * width * height * len(header["channels"])
+
+
+def write_depth(path: Path, depth: np.ndarray) -> None:
+    """Writes (H, W) float32 as the channel Z.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    import OpenEXR
+
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    try:
+        OpenEXR.File(header, {"Z": np.ascontiguousarray(depth, np.float32)}).write(str(path))
+    except RuntimeError as error:
+        raise OSError(f"{path} could not be written: {error}") from error

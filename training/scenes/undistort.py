@@ -17,12 +17,16 @@ import numpy as np
 
 from ..errors import LodgsError
 from . import apart
-from .colmap import MASKS, Scene, read_scene
+from .colmap import DEPTHS, MASKS, Scene, read_scene
+from .depths import read_map
+from .exr import write_depth
 from .images import load_image, write_png
 
 CACHE = ".undistorted"
 """Folder in a scene's of what is made of it once, for all runs and for Blender."""
-_VERSION = b"2"  # of what is kept in the cache
+_VERSION = b"3"  # of what is kept in the cache
+_BENT = "bent"
+"""Folder of where in a photograph each pixel of the straight one is, as shares of its sides."""
 _LEFT = 86_400.0
 """Seconds after which what is half done in a cache is nobody's."""
 
@@ -93,6 +97,7 @@ def _key(scene: Scene) -> str:
     files = [(path.name, path) for path in model]
     files += [(camera.name, camera.image) for camera in scene.cameras if camera.image is not None]
     files += [(camera.name, camera.mask) for camera in scene.cameras if camera.mask is not None]
+    files += [(camera.name, camera.depth) for camera in scene.cameras if camera.depth is not None]
     for name, path in files:
         status = path.stat()
         text = f"{name}\0{status.st_size}\0{status.st_mtime_ns}\0"
@@ -113,6 +118,7 @@ def _undistort_into(target: Path, scene: Scene) -> None:
         "model": str(scene.model),
         "images": str(scene.images_folder),
         "sizes": {camera.name: [camera.width, camera.height] for camera in scene.cameras},
+        "deep": [camera.name for camera in scene.cameras if camera.depth is not None],
     }
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix="undistorting-") as work:
@@ -131,11 +137,29 @@ def _undistort_into(target: Path, scene: Scene) -> None:
                 "Check the trainer's environment and the free space, or give an undistorted scene "
                 "(colmap image_undistorter).",
             )
+        _straighten_depths(scene, Path(work))
         try:
             os.replace(Path(work) / "undistorted", target)
         except OSError:
             if not target.is_dir():  # else another process was quicker, with the same content
                 raise
+
+
+def _straighten_depths(scene: Scene, work: Path) -> None:
+    """Depth maps like their photographs: each pixel has the value that the map has in its direction."""
+    for camera in scene.cameras:
+        places = work / _BENT / f"{camera.name}.npy"
+        if camera.depth is None or not places.exists():
+            continue
+        values = read_map(camera.depth)
+        height, width = values.shape
+        x, y = np.moveaxis(np.floor(np.load(places) * (width, height)), -1, 0)
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        x, y = (np.where(inside, each, 0).astype(int) for each in (x, y))
+        found = np.where(inside & np.isfinite(values[y, x]), values[y, x], 0).astype(np.float32)
+        path = work / "undistorted" / DEPTHS / f"{camera.name}.exr"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_depth(path, found)
 
 
 def _main() -> None:
@@ -168,6 +192,12 @@ def _main() -> None:
         image_names=list(request["sizes"]),
         jpeg_quality=98,
     )
+    straight = pycolmap.Reconstruction(work / "undistorted" / "sparse") if request["deep"] else None
+    for image in straight.images.values() if straight else ():
+        if image.name in request["deep"]:
+            file = work / _BENT / f"{image.name}.npy"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            np.save(file, _places(image.camera, model.cameras[image.camera_id]))
     masks = work / MASKS
     if masks.is_dir():  # bent like their photographs, whose names theirs begin with
         for image in model.images.values():
@@ -179,6 +209,14 @@ def _main() -> None:
             output_path=work / "straight", input_path=work / "masked", image_path=masks, image_names=names
         )
         (work / "straight" / "images").rename(work / "undistorted" / MASKS)
+
+
+def _places(straight, bent) -> np.ndarray:
+    """Where in a photograph of a bent lens a straight one's pixels are, (H, W, 2) shares of its sides."""
+    y, x = np.mgrid[: straight.height, : straight.width] + 0.5
+    rays = straight.cam_from_img(np.stack([x, y], axis=-1).reshape(-1, 2))
+    pixels = bent.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
+    return (pixels / (bent.width, bent.height)).reshape(*x.shape, 2).astype(np.float32)
 
 
 if __name__ == "__main__":

@@ -14,8 +14,10 @@ import pytest
 from training.errors import LodgsError
 from training.scenes.colmap import read_scene
 from training.scenes.depths import Depths, averaged, read_map, scale_and_shift, with_points
-from training.scenes.images import write_png
+from training.scenes.images import load_image, write_png
+from training.scenes.undistort import undistorted
 
+from . import synthetic
 from .depth_walls import FITTED, METRIC, depth_of, exr, grey, put, write_walls
 from .walls import HEIGHT, WIDTH, photograph
 
@@ -129,6 +131,24 @@ def test_points_come_from_maps_where_there_are_few(walls, tmp_path):
     assert abs(float(colors.mean()) - photograph(camera.center).mean()) < 12
     assert with_points(found) is found
     assert with_points(read_scene(walls)).points is not None
+
+
+@pytest.mark.parametrize("lens", ["OPENCV", "OPENCV_FISHEYE"])
+def test_they_are_straightened_like_their_photographs(tmp_path, lens):
+    """A photograph that is its own depth map still is; the map has another size."""
+    y, x = np.mgrid[: synthetic.HEIGHT, : synthetic.WIDTH]
+    ramp = (40 + x + y).astype(np.uint8)
+    synthetic.write_scene(tmp_path, synthetic.camera(lens), pixels=np.repeat(ramp[..., None], 3, axis=2))
+    for name in ("a.png", "b.png"):
+        grey(tmp_path / "depths" / name, np.repeat(np.repeat(ramp.astype(float), 2, axis=0), 2, axis=1))
+    scene = undistorted(read_scene(tmp_path), tmp_path / "cache")
+    assert [camera.depth is None for camera in scene.cameras] == [False, False, True]
+    for camera in scene.cameras[:2]:
+        assert camera.image is not None and camera.depth is not None
+        photograph = 255 * load_image(camera.image, camera.width, camera.height)[..., 0]
+        depth = 1000 * read_map(camera.depth)
+        assert depth.shape == photograph.shape and np.isfinite(depth).mean() > 0.99
+        assert np.nanmean(np.abs(depth - photograph)) < 1 and np.ptp(photograph) > 60
 
 
 @pytest.mark.parametrize(
