@@ -107,8 +107,8 @@ def _bytes_of(header: dict) -> int:
     return 4 * width * height * len(header["channels"])
 
 
-def write_depth(path: Path, depth: np.ndarray) -> None:
-    """Writes (H, W) float32 as the channel Z.
+def write_exr(path: Path, channels: dict[str, np.ndarray]) -> None:
+    """Writes channels (H, W) by name, as float32.
 
     Raises:
         OSError: it cannot be written.
@@ -117,6 +117,7 @@ def write_depth(path: Path, depth: np.ndarray) -> None:
 
     header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
     try:
-        OpenEXR.File(header, {"Z": np.ascontiguousarray(depth, np.float32)}).write(str(path))
+        planes = {name: np.ascontiguousarray(plane, np.float32) for name, plane in channels.items()}
+        OpenEXR.File(header, planes).write(str(path))
     except RuntimeError as error:
         raise OSError(f"{path} could not be written: {error}") from error

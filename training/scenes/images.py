@@ -304,6 +304,18 @@ def _exr(path: Path, alpha: bool) -> _Source:
     return _Source(width, height, rows, len(planes), linear=True)
 
 
+def exr_light(path: Path) -> np.ndarray:
+    """The light of an EXR over its display window, and alpha, by which it is multiplied: (H, W, 4) float32.
+
+    Raises:
+        LodgsError: the file cannot be read.
+    """
+    with _opened(path, 1, 1, large=_LARGE, alpha=True) as source:
+        if not source.linear:
+            raise LodgsError(f"{path} is no EXR image.", "Export it again.")
+        return source.rows(0, source.height)
+
+
 def _rgb_names(channels) -> list[str]:
     """The colour channels: plain R, G, B, else those of the combined pass or first layer, else luminance."""
     layers = [name[:-1] for name in channels if name.rpartition(".")[2] == "R"]

@@ -17,10 +17,11 @@ import numpy as np
 
 from ..errors import LodgsError
 from . import apart
+from .cameras import Camera
 from .colmap import DEPTHS, MASKS, Scene, read_scene
 from .depths import read_map
-from .exr import write_depth
-from .images import load_image, write_png
+from .exr import write_exr
+from .images import exr_light, load_image, write_png
 
 CACHE = ".undistorted"
 """Folder in a scene's of what is made of it once, for all runs and for Blender."""
@@ -118,7 +119,7 @@ def _undistort_into(target: Path, scene: Scene) -> None:
         "model": str(scene.model),
         "images": str(scene.images_folder),
         "sizes": {camera.name: [camera.width, camera.height] for camera in scene.cameras},
-        "deep": [camera.name for camera in scene.cameras if camera.depth is not None],
+        "here": [camera.name for camera in scene.cameras if camera.depth is not None or _is_foreign(camera)],
     }
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix="undistorting-") as work:
@@ -137,7 +138,10 @@ def _undistort_into(target: Path, scene: Scene) -> None:
                 "Check the trainer's environment and the free space, or give an undistorted scene "
                 "(colmap image_undistorter).",
             )
-        _straighten_depths(scene, Path(work))
+        for camera in scene.cameras:
+            places = Path(work) / _BENT / f"{camera.name}.npy"
+            if places.exists():
+                _straighten_here(camera, np.load(places), Path(work) / "undistorted")
         try:
             os.replace(Path(work) / "undistorted", target)
         except OSError:
@@ -145,21 +149,47 @@ def _undistort_into(target: Path, scene: Scene) -> None:
                 raise
 
 
-def _straighten_depths(scene: Scene, work: Path) -> None:
-    """Depth maps like their photographs: each pixel has the value that the map has in its direction."""
-    for camera in scene.cameras:
-        places = work / _BENT / f"{camera.name}.npy"
-        if camera.depth is None or not places.exists():
-            continue
-        values = read_map(camera.depth)
-        height, width = values.shape
-        x, y = np.moveaxis(np.floor(np.load(places) * (width, height)), -1, 0)
-        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        x, y = (np.where(inside, each, 0).astype(int) for each in (x, y))
-        found = np.where(inside & np.isfinite(values[y, x]), values[y, x], 0).astype(np.float32)
-        path = work / "undistorted" / DEPTHS / f"{camera.name}.exr"
+def _is_foreign(camera: Camera) -> bool:
+    """Whether pycolmap does not read a photograph of this kind, or loses its light."""
+    return camera.name.lower().endswith((".webp", ".exr"))
+
+
+def _straighten_here(camera: Camera, places: np.ndarray, out: Path) -> None:
+    """What pycolmap does not straighten of a view: its depth map, by the nearest pixel; a foreign photograph.
+
+    Args:
+        places: where each pixel is in the photograph, (H, W, 2) shares of its sides.
+        out: folder of what is straight.
+    """
+    from scipy.ndimage import map_coordinates  # which Blender lacks
+
+    def at(pixels: np.ndarray, order: int) -> np.ndarray:
+        height, width = pixels.shape
+        x, y = np.moveaxis(places * (width, height) - 0.5, -1, 0)
+        return map_coordinates(pixels, [y, x], order=order, mode="nearest")
+
+    if camera.depth is not None:
+        path = out / DEPTHS / f"{camera.name}.exr"
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_depth(path, found)
+        write_exr(path, {"Z": at(np.nan_to_num(read_map(camera.depth)), order=0)})
+    if camera.image is None or not _is_foreign(camera):
+        return
+    path = out / "images" / camera.name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    linear = camera.name.lower().endswith(".exr")
+    pixels = (
+        exr_light(camera.image)
+        if linear
+        else load_image(camera.image, camera.width, camera.height, alpha=True)
+    )
+    planes = [at(plane, order=1) for plane in np.moveaxis(pixels, -1, 0)]
+    if linear:
+        write_exr(path, dict(zip("RGBA", planes, strict=True)))
+    else:  # a PNG, which is told by its content
+        straight = np.stack(
+            [*(plane / np.maximum(planes[3], 1e-6) for plane in planes[:3]), planes[3]], axis=-1
+        )
+        write_png(path, np.rint(255 * straight.clip(0, 1)).astype(np.uint8))
 
 
 def _main() -> None:
@@ -192,9 +222,9 @@ def _main() -> None:
         image_names=list(request["sizes"]),
         jpeg_quality=98,
     )
-    straight = pycolmap.Reconstruction(work / "undistorted" / "sparse") if request["deep"] else None
+    straight = pycolmap.Reconstruction(work / "undistorted" / "sparse") if request["here"] else None
     for image in straight.images.values() if straight else ():
-        if image.name in request["deep"]:
+        if image.name in request["here"]:
             file = work / _BENT / f"{image.name}.npy"
             file.parent.mkdir(parents=True, exist_ok=True)
             np.save(file, _places(image.camera, model.cameras[image.camera_id]))
