@@ -96,7 +96,7 @@ class Parameters:
         "smaller than a pixel, instead of 3DGS's dilation. Where a run begins with a base, the base decides.",
     )
     depth_weight: float = parameter(
-        0.3,
+        0.0,
         "Weight in the loss, at the start, of how far off the depth of splats is where it is known (see "
         "depth): L1 of inverse depth, in inverse median depths. It falls to a hundredth; 0 for none.",
     )
@@ -207,7 +207,6 @@ AS_PUBLISHED: dict[str, Any] = {
     "largest": 0.0,
     "random_background": False,
     "margin": 0.0,
-    "depth_weight": 0.0,
 }
 """What presets *paper* leave out, whatever the method: it is in none of the papers."""
 PAPER: dict[str, Any] = AS_PUBLISHED | {
