@@ -109,7 +109,7 @@ def surface_points(
 def read_depth(file: Path) -> np.ndarray:
     """Depths (H, W) float64 of an EXR, the nearest of its layers' Depth.Z; FARTHEST where there is nothing.
 
-    Where there is none of that name: of channels that are called Z, depth or V, or of the only one.
+    Where there is none of that name: of channels that are called Z, depth or V.
 
     Raises:
         LodgsError: it cannot be read, or holds none.
@@ -120,8 +120,7 @@ def read_depth(file: Path) -> np.ndarray:
         raise LodgsError(f"{file} cannot be read: {error}.", "Render the view again.") from error
     layers = [pixels for name, pixels in channels if name.endswith("Depth.Z")]
     if not layers:
-        alone = len(channels) == 1
-        layers = [pixels for name, pixels in channels if alone or name.lower() in ("z", "depth", "v")]
+        layers = [pixels for name, pixels in channels if name.lower() in ("z", "depth", "v")]
     if not layers:
         raise LodgsError(f"{file} holds no depth.", "Render with an engine that has the pass Depth.")
     nearest = np.min(layers, axis=0).astype(np.float64)

@@ -157,15 +157,12 @@ def test_they_are_straightened_like_their_photographs(tmp_path, lens):
         (lambda path: write_png(path, np.zeros((HEIGHT, WIDTH, 3), np.uint8)), "is a picture in colours"),
         (lambda path: grey(path, np.ones((HEIGHT, WIDTH // 2))), "other proportions"),
         (lambda path: path.write_bytes(b"dear diary"), "cannot be read as a depth map"),
-        (lambda path: exr(path, ONES, "Combined.R"), None),
+        (lambda path: exr(path, ONES, "Combined.R"), "no depth"),
         (lambda path: exr(path, ONES, "R", G=ONES), "no depth"),
     ],
     ids=["colours", "proportions", "text", "one channel", "two channels"],
 )  # fmt: skip
 def test_what_is_no_depth_map_is_a_sentence(walls, tmp_path, write, words):
     scene = read_scene(put(walls, tmp_path, lambda folder, n, depth: write(folder / f"{n}.png")))
-    if words is None:
-        assert np.isfinite(read_map(tmp_path / "depths" / "0.png")).all()
-        return
     with pytest.raises(LodgsError, match=words):
         Depths(scene, "metric").inverse(scene.cameras[0])
