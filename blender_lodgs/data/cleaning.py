@@ -265,8 +265,15 @@ def suggestions(context: bpy.types.Context, root: bpy.types.Object) -> dict[str,
 
 def bounds(root: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
     """Corners (3,), along the world's axes, of a box with some room around nine tenths of the finest level on
-    each: flat ground often lies in its outermost layer."""
-    means = view_of(levels(root)[-1].object.data, "position")
+    each, or of the points where there is none: flat ground often lies in its outermost layer.
+
+    Raises:
+        LodgsError: there are neither.
+    """
+    objects = [item.object for item in levels(root)] or [root.lodgs.points]
+    if objects[-1] is None:
+        raise LodgsError(f"'{root.name}' has neither splats nor points.", "Import them, or train.")
+    means = view_of(objects[-1].data, "position")
     matrix = np.array(axes_of(root).matrix_world, np.float64)
     placed = means[:: max(len(means) // 100_000, 1)] @ matrix[:3, :3].T + matrix[:3, 3]
     low, high = np.quantile(placed, (0.05, 0.95), axis=0)

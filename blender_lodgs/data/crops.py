@@ -57,6 +57,13 @@ def as_it_stands(obj: bpy.types.Object, to_own: Matrix, depsgraph: bpy.types.Dep
     return _crop(to_own, obj, depsgraph, obj.empty_display_size, sphere, obj.lodgs_crop.keep == "OUTSIDE")
 
 
+def as_text(root: bpy.types.Object, obj: bpy.types.Object) -> str:
+    """A crop as a job's region has it, in the splats' own space (``Crop.from_text``)."""
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    to_own = axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe()
+    return as_it_stands(obj, to_own, depsgraph).as_text()
+
+
 def of_modifier(
     evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph, is_on
 ) -> tuple[Crop, ...] | None:

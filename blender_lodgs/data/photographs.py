@@ -99,7 +99,7 @@ def _fit(data: bpy.types.Camera, camera: Camera, distorted: bool) -> None:
     data.shift_y = (camera.cy - camera.height / 2) / long / (pixel if wide else 1)
     view = data.lodgs
     view.width, view.height, view.fx, view.fy = camera.width, camera.height, camera.fx, camera.fy
-    view.photograph = str(camera.image) if camera.image else ""
+    view.photograph, view.mask = (str(file) if file else "" for file in (camera.image, camera.mask))
     view.distorted = distorted
 
 

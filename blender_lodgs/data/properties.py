@@ -453,6 +453,11 @@ class ViewSettings(bpy.types.PropertyGroup):
     photograph: bpy.props.StringProperty(
         name="Photograph", description="File of the photograph", subtype="FILE_PATH"
     )
+    mask: bpy.props.StringProperty(
+        name="Mask",
+        description="File of a picture that is black where the photograph does not count; empty for none",
+        subtype="FILE_PATH",
+    )
     distorted: bpy.props.BoolProperty(
         name="Distorted", description="The lens bends lines in the photograph, which the camera does not show"
     )

@@ -10,7 +10,7 @@ import bpy
 from ...training.methods import METHODS, PRESETS, MethodInfo, method_info
 from ...training.runs.job import MOST_CELLS, Job
 from ...training.splats.bundle import MOST_LEVELS
-from . import photographs, viewpoints
+from . import crops, photographs, viewpoints
 
 _WHOLE_MOST, _MOST = 2**31 - 1, 3.4e38
 _LEAST = 1e-6
@@ -203,6 +203,13 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
         soft_min=0.1,
         max=1.0,
         subtype="FACTOR",
+    )
+    region: bpy.props.PointerProperty(
+        type=bpy.types.Object,
+        name="Region",
+        description="A box or sphere of this scene: what lies in it is trained in detail, all else coarsely. "
+        "Empty: everything",
+        poll=lambda settings, obj: obj in crops.crops_of(settings.id_data),
     )
     test_every: bpy.props.IntProperty(
         name="Hold Out Every",

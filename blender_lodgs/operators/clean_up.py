@@ -9,7 +9,7 @@ from ...training.errors import LodgsError
 from ...training.lod.cleaning import SHARE
 from ..data import cleaning, crops, scenes
 from .brush import TOOLS
-from .parts import OnOwnLevels, report_errors
+from .parts import OnOwnLevels, OnScene, report_errors
 
 
 class LODGS_OT_add_crop(OnOwnLevels, bpy.types.Operator):
@@ -60,6 +60,20 @@ def add_crop(
     obj.select_set(True)
     context.view_layer.objects.active = obj
     return obj
+
+
+class LODGS_OT_add_region(OnScene, bpy.types.Operator):
+    """Add a box of which the inside is trained in detail, and all else coarsely: move, turn and scale it"""
+
+    bl_idname = "lodgs.add_region"
+    bl_label = "Add Region"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @report_errors
+    def execute(self, context):
+        root = scenes.active_root(context)
+        root.lodgs.training.region = add_crop(context, root, "BOX", "ALL")
+        return {"FINISHED"}
 
 
 class LODGS_OT_remove_crop(OnOwnLevels, bpy.types.Operator):
@@ -238,8 +252,8 @@ def _menu(self, context):
 
 
 CLASSES = (
-    LODGS_OT_add_crop, LODGS_OT_remove_crop, LODGS_OT_hide_splats, LODGS_OT_show_hidden_splats,
-    LODGS_OT_delete_left_out, LODGS_MT_clean_up,
+    LODGS_OT_add_crop, LODGS_OT_add_region, LODGS_OT_remove_crop, LODGS_OT_hide_splats,
+    LODGS_OT_show_hidden_splats, LODGS_OT_delete_left_out, LODGS_MT_clean_up,
 )  # fmt: skip
 
 _MENUS = (bpy.types.VIEW3D_MT_object, bpy.types.VIEW3D_MT_edit_pointcloud)

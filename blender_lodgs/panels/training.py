@@ -70,6 +70,10 @@ class LODGS_PT_training_advanced(Panel):
         layout, settings = self.layout, root.lodgs.training
         layout.use_property_split = True
         layout.use_property_decorate = False
+        if root.lodgs.scene_folder:
+            row = layout.row(align=True)
+            row.prop(settings, "region")
+            row.operator("lodgs.add_region", text="", icon="ADD")
         layout.prop(settings, "seed")
         _draw_parameter(layout, settings, "test_every")
         for f in offered(settings.method):

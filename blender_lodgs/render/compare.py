@@ -1,7 +1,7 @@
 """Photographs beside what the splats show from the same place: how alike they are.
 
 Pictures and PSNR come from the renderer, at the size of the training images, as ``training evaluate`` has
-them; what is compared are the splats that the scene shows now.
+them, masks included; what is compared are the splats that the scene shows now.
 """
 
 from __future__ import annotations
@@ -63,6 +63,7 @@ def compare_view(
         drawn = renderer.frame(
             engine.placed_splats(depsgraph), camera, near, on_progress, background=(0.0, 0.0, 0.0),
             photograph=Path(bpy.path.abspath(facts.photograph)),
+            mask=Path(bpy.path.abspath(facts.mask)) if facts.mask else None,
         )  # fmt: skip
     if drawn is None:
         return None

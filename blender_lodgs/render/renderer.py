@@ -157,12 +157,14 @@ class Renderer:
         levels: bool = False,
         window: tuple[int, int, int, int] | None = None,
         photograph: Path | None = None,
+        mask: Path | None = None,
         holdout: Path | None = None,
     ) -> Frame | None:
         """A picture, or None where it was cancelled.
 
         Args: as ``training.render.scene.draw``, and
             photograph: to compare with.
+            mask: black where it does not count.
             holdout: EXR with the depth of what hides splats.
 
         Raises:
@@ -176,7 +178,8 @@ class Renderer:
             self._send(
                 frame=frame, out=out.name, sets=named, camera=camera_as_dict(camera, near),
                 background=background, depth=depth, levels=levels, window=window,
-                photograph=str(photograph) if photograph else None, holdout=str(holdout) if holdout else None,
+                photograph=str(photograph) if photograph else None, mask=str(mask) if mask else None,
+                holdout=str(holdout) if holdout else None,
             )  # fmt: skip
             answer = self._wait(frame, on_progress)
             done = {each.file for each in old.values()} - {each.file for each in self._known.values()}

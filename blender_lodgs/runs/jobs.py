@@ -25,7 +25,7 @@ from ...training.runs.job import CHANGEABLE, DOME, Job
 from ...training.scenes.cameras import write_camera
 from ...training.splats.bundle import write_bundle
 from .. import extension
-from ..data import cells, scenes, viewpoints
+from ..data import cells, crops, scenes, viewpoints
 from ..data.training import chooses_distances, hold_out, level_distances, offered
 from . import environment, processes
 from .watch import Watch, begin, root_by_uid, watch_of, watches
@@ -294,6 +294,7 @@ def make_job(root: bpy.types.Object, out: Path, parameters: dict) -> Job:
         "backend": extension.preferences().backend,
         "cells": "" if viewpoints.alone(root) else settings.grid,
         "polish": settings.polish,
+        "region": crops.as_text(root, settings.region) if settings.region in crops.crops_of(root) else "",
         "parameters": changes(settings) | parameters,
     }
     return Job.from_dict(values)

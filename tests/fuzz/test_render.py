@@ -27,7 +27,7 @@ LOOKS = looks_as_dicts([(None, Look(0.5)), (Crop.sphere((0, 0, 0), 1), Look(opac
 REQUEST = {
     "frame": 7, "out": "frame-7", "background": [0.1, 0.2, 0.3], "depth": True, "levels": True,
     "camera": camera_as_dict(Camera("", 32, 24, 30.0, 30.0, 16.0, 12.0, POSE), 0.1),
-    "window": [2, 3, 20, 16], "photograph": None, "holdout": None,
+    "window": [2, 3, 20, 16], "photograph": None, "mask": None, "holdout": None,
     "sets": [ONE | {"looks": LOOKS}, ONE | {"matrix": np.eye(4).tolist(), "level": 0}],
 }  # fmt: skip
 

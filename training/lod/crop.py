@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..documents import shown
 from ..errors import LodgsError
 
 SHAPES = ("BOX", "SPHERE")
@@ -86,6 +87,37 @@ class Crop:
         assert squares is not None
         return squares <= np.float32(FACE)
 
+    @classmethod
+    def from_text(cls, text: str) -> Crop:
+        """A crop in words: ``box X Y Z X Y Z`` (two opposite corners), ``sphere X Y Z R``, or either with the
+        12 numbers of ``to_own``, row by row, for what is turned or stretched.
+
+        Raises:
+            LodgsError: it is none, or holds nothing.
+        """
+        name, *told = text.split()
+        try:
+            numbers = [float(each) for each in told]
+        except ValueError:
+            numbers = []
+        if np.isfinite(numbers).all():
+            match name.upper(), len(numbers):
+                case "BOX", 6:
+                    return cls.box(numbers[:3], numbers[3:])
+                case "SPHERE", 4:
+                    return cls.sphere(numbers[:3], numbers[3])
+                case "BOX" | "SPHERE", 12:
+                    rows = (tuple(numbers[at : at + 4]) for at in (0, 4, 8))
+                    return cls(name.upper(), tuple(rows))
+        raise LodgsError(
+            f"{shown(text)} is no box and no sphere.",
+            "Give box X Y Z X Y Z (two opposite corners), or sphere X Y Z RADIUS.",
+        )
+
+    def as_text(self) -> str:
+        """What ``from_text`` makes the same of, whatever lies in it stays or goes."""
+        return " ".join([self.shape.lower(), *(repr(value) for row in self.to_own for value in row)])
+
     def as_dict(self) -> dict:
         """The same as JSON has it."""
         return {"shape": self.shape, "to_own": [list(row) for row in self.to_own], "outside": self.outside}
@@ -105,3 +137,8 @@ def kept(crops: Sequence[Crop], means: np.ndarray) -> np.ndarray:
         if crop.outside:
             found &= ~crop.holds(means)
     return found
+
+
+def is_text_of_crop(text: str) -> bool:
+    """Whether a text is meant to be one that :meth:`Crop.from_text` reads, and no path."""
+    return text.split(" ", 1)[0].upper() in SHAPES

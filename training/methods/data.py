@@ -13,15 +13,20 @@ import numpy as np
 import torch
 
 from ..errors import LodgsError
+from ..lod.crop import Crop
 from ..rasterize import Target
 from ..scenes.cameras import Camera, evenly
 from ..scenes.colmap import Scene
+from ..scenes.depths import Depths
 from ..scenes.images import load_image
+from .memory import TARGET_BYTES
 from .support import Support
 from .targets import Targets, default_budget
 
 TRIED = 3
 """Photographs that are looked at for whether they are transparent."""
+DEPTH_BYTES = 4
+"""Bytes a pixel that depth takes beside a photograph."""
 OPAQUE = 0.99
 """Alpha from here on is no transparency, but rounding."""
 
@@ -56,6 +61,8 @@ class TrainingData:
             does not depend on it.
         splat_memory: bytes of splats that are kept by methods that have them in files; None: as they choose.
         scratch: where such methods make files, which a checkpoint tells of; None: in a temporary folder.
+        depths: what is known of the depth in training views; None: nothing.
+        region: where splats are added, in the scene's coordinates; None: everywhere.
 
     Attributes:
         scene: what is trained on.
@@ -76,6 +83,8 @@ class TrainingData:
         splat_memory: int | None = None,
         scratch: Path | None = None,
         whole: Scene | None = None,
+        depths: Depths | None = None,
+        region: Crop | None = None,
     ) -> None:
         if len(scene.points) == 0:
             raise LodgsError(
@@ -90,11 +99,15 @@ class TrainingData:
                 f"The scene {scene.folder} has {len(train)} usable view(s) to train on; 2 are needed.",
                 "Check that the image folder holds the photographs that the model names.",
             )
-        self.scene, self.exposure = scene, exposure
+        self.scene, self.exposure, self.depths, self.region = scene, exposure, depths, region
+        self._trained = {camera.name for camera in train}
         self.whole_train = [camera.scaled(image_scale) for camera in all_train]
         self.train = [camera.scaled(image_scale) for camera in train]
         self.test = [camera.scaled(image_scale) for camera in test]
-        self.photographs = Targets(self._read, default_budget() if photo_memory is None else photo_memory)
+        budget = default_budget() if photo_memory is None else photo_memory
+        if depths:
+            budget = budget * TARGET_BYTES // (TARGET_BYTES + DEPTH_BYTES)
+        self.photographs = Targets(self._read, budget)
         self.splat_memory, self._scratch = splat_memory, scratch
         self._planned: Planned | None = None
 
@@ -195,7 +208,10 @@ class TrainingData:
         image = load_image(camera.image, *size, exposure=self.exposure, alpha=alpha)
         planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))
         mask = None if camera.mask is None else load_image(camera.mask, *size)[..., 0]
-        return Target(planes[:3].permute(1, 2, 0), mask, planes[3] if alpha else None)
+        known = self.depths.inverse(camera) if self.depths and camera.name in self._trained else None
+        if known is not None and mask is not None:
+            known[mask <= 0.5] = np.nan
+        return Target(planes[:3].permute(1, 2, 0), mask, planes[3] if alpha else None, known)
 
 
 def _among(cameras: Sequence[Camera], others: Sequence[Camera]) -> list[Camera]:

@@ -19,10 +19,13 @@ from .data import TrainingData, TrainingView
 from .density import require_rows
 from .exposure import Exposure
 from .margins import Margins
-from .model import Model
+from .model import OUTSIDE, PEAKS, Model
 from .parameters import Parameters
-from .schedules import due
+from .schedules import due, log_linear
 from .support import INTERVAL
+
+DEPTH_FALL = 0.01
+"""What is left of the weight of depths at the end."""
 
 
 @dataclass
@@ -147,6 +150,7 @@ class Method(ABC, Generic[P, D]):
         loss.backward()
         self.model.hold_still()
         self.accumulate_stats(drawings, view, step)
+        self.grow_inside(step)
         self.set_learning_rates(step)
         for optimizer in (*self.optimizers(), *self.exposure.optimizers(step / self.steps)):
             optimizer.step()
@@ -196,11 +200,42 @@ class Method(ABC, Generic[P, D]):
             )
             for drawing in drawings
         )
-        return sum(others, first)
+        return sum(others, first) + self.depth_loss(drawings[0].rendering, view, step)
+
+    def depth_loss(self, rendering: Rendering, view: TrainingView, step: int) -> torch.Tensor | float:
+        """Weighted mean |Σ w / z − 1 / depth| of a picture, where the depth of its view is known.
+
+        As H3DGS has it (Kerbl et al. 2024), but in inverse median depths.
+        """
+        drawn, truth = rendering.inverse_depth, view.target.inverse_depth
+        if drawn is None or truth is None:
+            return 0.0
+        p, truth = self.parameters, truth.to(drawn)
+        known = truth.isfinite()
+        apart = torch.where(known, drawn - truth, 0).abs().sum() / known.sum().clamp_min(1)
+        weight = log_linear(p.depth_weight, DEPTH_FALL * p.depth_weight, step / self.steps)
+        return weight * self.data.median_depth * apart
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """What pictures of steps show besides colours, as ``rasterize`` takes it."""
+        return ("inverse_depth",) if self.data.depths and self.parameters.depth_weight else ()
 
     @abstractmethod
     def accumulate_stats(self, drawings: Sequence[D], view: TrainingView, step: int) -> None:
         """After ``backward``: what :meth:`control_density` decides by is added up (``model.stats``)."""
+
+    def grow_inside(self, step: int) -> None:
+        """After :meth:`accumulate_stats`: outside of a job's region nothing asks for more splats."""
+        region, model = self.data.region, self.model
+        if region is None:
+            return
+        if OUTSIDE not in model.columns or due(INTERVAL, step):
+            outside = ~region.holds(model["means"].detach().cpu().numpy())
+            model.columns[OUTSIDE] = torch.from_numpy(outside).to(model["means"])
+        for name in ("gradient_sum", PEAKS[0]):
+            if name in model.stats:
+                model.stats[name][model.columns[OUTSIDE] > 0] = 0
 
     @abstractmethod
     def set_learning_rates(self, step: int) -> None:
@@ -298,6 +333,7 @@ class Method(ABC, Generic[P, D]):
             near=self.data.near,
             antialias=self.parameters.antialias,
             background=self.background(step),
+            outputs=self.outputs,
             backend=self.backend,
         )
 

@@ -21,6 +21,8 @@ PEAKS = ("gradient_max", "radius_max")
 """Stats that densification by maxima needs: as ``gradient_sum``, and in pixels, since the last reset."""
 
 
+OUTSIDE = "outside"
+"""Column of the rows beside which none are added, 1, where only a region is trained in detail."""
 HELD = "held"
 """Column of the rows that stay as they are, 1, where there are such: what they are beside is trained."""
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from ..documents import shown
 from ..errors import LodgsError
+from ..scenes.depths import KINDS
 
 MARGIN_SHARE, MARGIN_SPLATS = 0.1, 4000
 """The most of all splats that may continue photographs beyond their edges, and the most at all."""
@@ -93,6 +94,18 @@ class Parameters:
         False,
         "Whether splats are drawn through Mip-Splatting's 2D filter, which keeps the light of those that are "
         "smaller than a pixel, instead of 3DGS's dilation. Where a run begins with a base, the base decides.",
+    )
+    depth_weight: float = parameter(
+        0.0,
+        "Weight in the loss, at the start, of how far off the depth of splats is where it is known (see "
+        "depth): L1 of inverse depth, in inverse median depths. It falls to a hundredth; 0 for none.",
+    )
+    depth: str = parameter(
+        "metric",
+        "What is known of depth: maps in the folder depths, in the scene's unit (metric); maps of depth "
+        "(relative) or of inverse depth (inverse) of which scale and shift are found by the scene's points, "
+        "view by view; or only these points themselves (points).",
+        choices=KINDS,
     )
     lr_exposure: float = parameter(
         0.0,

@@ -104,8 +104,11 @@ def rasterize(
         if torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in leaves):
             raise ValueError("a limit is for pictures: it has no gradients")
     blended = [] if features is None else [features]
-    if "depth" in outputs:
-        blended.append(depths(means, view)[:, None])
+    plain = [name for name in ("depth", "inverse_depth") if name in outputs]
+    if plain:
+        depth = depths(means, view)[:, None]
+        values = {"depth": depth, "inverse_depth": 1 / depth.clamp_min(view.near or 1e-6)}
+        blended += [values[name] for name in plain]
     if "normals" in outputs:
         blended.append(normals(gaussians, view))
     red, green, blue = (float(value) for value in background)
@@ -122,11 +125,11 @@ def rasterize(
     given = 0 if features is None else features.shape[1]
     if features is not None:
         rendering.features = drawn.features[..., :given]
+    planes = dict(zip(plain, drawn.features[..., given:].unbind(-1), strict=False))
     if "depth" in outputs:
         nothing = drawn.alpha == 0
-        rendering.depth = torch.where(
-            nothing, 0, drawn.features[..., given] / drawn.alpha.masked_fill(nothing, 1)
-        )
+        rendering.depth = torch.where(nothing, 0, planes["depth"] / drawn.alpha.masked_fill(nothing, 1))
+    rendering.inverse_depth = planes.get("inverse_depth")
     if "normals" in outputs:
         rendering.normals = drawn.features[..., -3:]
     if drawn.median is not None:

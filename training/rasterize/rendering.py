@@ -14,7 +14,7 @@ DILATION = 0.3
 """Added to the variance of each projected splat, in square pixels (3DGS's low-pass filter)."""
 MIP_VARIANCE = 0.1
 """The same of Mip-Splatting's 2D filter, about a pixel's own extent (Yu et al. 2024, Eq. 10)."""
-OUTPUTS = ("depth", "median_depth", "normals", "absgrad2d")
+OUTPUTS = ("depth", "inverse_depth", "median_depth", "normals", "absgrad2d")
 """What can be asked for besides the image and its alpha."""
 ALPHA_MAX = 0.99
 ALPHA_MIN = 1 / 255
@@ -117,6 +117,7 @@ class Rendering:
         absgrad2d: (N, 2), on request: as grad2d, with the absolute values of the pixels' shares of image and
             alpha summed (AbsGS, Ye et al. 2024).
         depth: (H, W), on request: mean depth of what a pixel shows, Σ w z / Σ w, 0 where alpha is 0.
+        inverse_depth: (H, W), on request: Σ w / z, 0 where nothing is.
         median_depth: (H, W), on request: depth of the splat that brings the transmittance to a half or below,
             0 where none does.
         normals: (H, W, 3), on request: Σ w n in camera coordinates, n the unit vector of a splat's shortest
@@ -131,6 +132,7 @@ class Rendering:
     tile_counts: torch.Tensor
     absgrad2d: torch.Tensor | None = None
     depth: torch.Tensor | None = None
+    inverse_depth: torch.Tensor | None = None
     median_depth: torch.Tensor | None = None
     normals: torch.Tensor | None = None
     features: torch.Tensor | None = None
@@ -181,6 +183,8 @@ class Target:
         image: (H, W, 3) float32 in [0, 1], torch or numpy.
         mask: (H, W) in [0, 1], how much each pixel counts in the loss; None: all do.
         alpha: (H, W) in [0, 1], of a photograph that is transparent, over black; None: it is opaque.
+        inverse_depth: (H, W), what the view should show as ``Rendering.inverse_depth``, NaN where that is not
+            known; None: it is known nowhere.
 
     The cpu backend keeps 36 bytes a pixel: the photograph and its two local moments. Drop the target and make
     it anew where a scene has more views than memory.
@@ -191,10 +195,12 @@ class Target:
         image: torch.Tensor | np.ndarray,
         mask: torch.Tensor | np.ndarray | None = None,
         alpha: torch.Tensor | np.ndarray | None = None,
+        inverse_depth: torch.Tensor | np.ndarray | None = None,
     ) -> None:
         self.image = torch.as_tensor(image)
         self.mask = None if mask is None else torch.as_tensor(mask)
         self.alpha = None if alpha is None else torch.as_tensor(alpha)
+        self.inverse_depth = None if inverse_depth is None else torch.as_tensor(inverse_depth)
         if self.image.ndim != 3 or self.image.shape[2] != 3:
             raise ValueError(f"a target has shape (H, W, 3), not {tuple(self.image.shape)}")
         if self.mask is not None and self.mask.shape != self.image.shape[:2]:

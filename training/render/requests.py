@@ -73,6 +73,7 @@ class FrameRequest:
         frame: its number.
         out: the file for its planes, a name in the folder of arrays.
         photograph: to compare with, or None.
+        mask: black where the photograph does not count, or None.
         holdout: EXR of meshes' depths, or None.
     """
 
@@ -85,6 +86,7 @@ class FrameRequest:
     levels: bool
     window: tuple[int, int, int, int] | None
     photograph: Path | None
+    mask: Path | None
     holdout: Path | None
     sets: list[NamedSet]
 
@@ -132,6 +134,7 @@ def read_request(values: dict) -> FrameRequest | Cancel:
         levels=bool(values.get("levels")),
         window=window,
         photograph=photograph,
+        mask=_path(values, "mask"),
         holdout=_path(values, "holdout"),
         sets=[_named_set(one) for one in _of_kind(values, "sets", list)],
     )

@@ -6,7 +6,7 @@ is removed when standard input ends, however the other program ended.
 
     {"frame": 7, "out": NAME, "camera": {...}, "near": 0.1, "background": [r, g, b] or null,
      "depth": true, "levels": true, "window": [left, top, width, height] or null,
-     "photograph": PATH or null, "holdout": PATH or null,
+     "photograph": PATH or null, "mask": PATH or null, "holdout": PATH or null,
      "sets": [{"file": NAME, "count": N, "matrix": 4x4, "level": 3,
                "columns": [NAME, ...], "choice": {...} or null, "looks": [...]},
               {"tree": PATH, "matrix": 4x4, "choice": {...}, "looks": [...]}, ...]}
@@ -14,9 +14,9 @@ is removed when standard input ends, however the other program ended.
 
 answer ``progress`` (frame, share) and ``warning`` (frame, message), then one of ``frame`` (frame, passes,
 height, width, seconds; the planes are in the file OUT), ``cancelled`` (frame) and ``error`` (frame, what,
-remedy). A photograph is read in the frame's size and its planes follow the others, display-coded; ``psnr``
-then says how alike both are. A holdout is an EXR with the depth of what hides splats, of the camera's size or
-the window's.
+remedy). A photograph is read in the frame's size, over black, and its planes follow the others,
+display-coded; ``psnr`` then says how alike both are, where the mask is not black. A holdout is an EXR with
+the depth of what hides splats, of the camera's size or the window's.
 
 A set is read when its file is first named, and forgotten when a frame does not name it; its file may go after
 an answer ``frame``. With a choice (``lod.choice``: ``rule``, ``eye`` in the set's coordinates, ``focal_px``,
@@ -159,9 +159,11 @@ class _Server:
             return
         passes, (height, width), measured = picture.passes(), picture.alpha.shape, {}
         if request.photograph:
-            photograph = load_image(request.photograph, camera.width, camera.height)
+            size = camera.width, camera.height
+            photograph = load_image(request.photograph, *size, alpha=True)[..., :3]
             passes |= {f"Photograph.{channel}": photograph[..., i] for i, channel in enumerate("RGB")}
-            measured["psnr"] = psnr(torch.from_numpy(picture.image), torch.from_numpy(photograph))
+            mask = torch.from_numpy(load_image(request.mask, *size)[..., 0]) if request.mask else None
+            measured["psnr"] = psnr(torch.from_numpy(picture.image), torch.from_numpy(photograph), mask)
         wire.write_planes(self._folder / request.out, list(passes.values()))
         self.say(
             "frame", frame=frame, passes=list(passes), height=height, width=width,

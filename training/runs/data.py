@@ -7,17 +7,24 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ..errors import LodgsError
+from ..lod.crop import Crop
 from ..methods.data import TrainingData
 from ..scenes.cameras import Camera
-from ..scenes.colmap import read_scene, without
+from ..scenes.colmap import Scene, read_scene, without
+from ..scenes.depths import Depths, with_points
 from ..scenes.images import check_image
 from ..scenes.regions import Region
+from ..scenes.rendered import spread
 from ..scenes.undistort import cache_of, undistorted
 from .capture import capture
 from .folder import RunFolder
 from .job import Job
 
+OUTSIDE = 0.1
+"""Most points outside of a job's region, as a share of the splats that a model may have."""
 DECODERS = 4
 """Photographs that are decoded at once to see whether they can be."""
 
@@ -39,7 +46,7 @@ def training_data(
     """
     model, images = (Path(path) if path else None for path in (job.model, job.images))
     whole = read_scene(_scene_folder(job, folder, tell), model=model, images=images)
-    region = Region.read(Path(job.region)) if job.region else None
+    region = Region.read(Path(job.cell)) if job.cell else None
     scene = whole if region is None else region.views_of(whole)
     if pixels:
         scene = without(scene, _undecodable(scene.cameras))
@@ -48,7 +55,16 @@ def training_data(
         if tell:
             tell("status", message=f"Undistorting {len(scene.distorted)} views")
         scene = undistorted(scene, cache_of(scene, folder.undistorted))
-        warnings += [warning for warning in scene.warnings if warning not in warnings]
+    parameters, depths = job.resolved_parameters(), None
+    if pixels and parameters.depth == "metric" and region is None and not job.cells:
+        scene = with_points(scene)
+    whole = whole if job.cells or region is not None else scene
+    if pixels and parameters.depth_weight:
+        depths = Depths(scene, parameters.depth)
+        scene = replace(scene, warnings=[*scene.warnings, *depths.warnings])
+    if job.crop is not None:
+        scene = coarse_outside(scene, job.crop, int(OUTSIDE * parameters.max_splats))
+    warnings += [warning for warning in scene.warnings if warning not in warnings]
     for warning in warnings:
         if tell:
             tell("warning", message=warning)
@@ -60,7 +76,33 @@ def training_data(
         photo_memory=job.photo_memory * 10**6 or None,
         splat_memory=job.splat_memory * 10**6 or None,
         scratch=folder.checkpoints,
-        whole=whole if job.region or job.cells else None,
+        whole=whole,
+        depths=depths,
+        region=job.crop,
+    )  # fmt: skip
+
+
+def coarse_outside(scene: Scene, region: Crop, most: int) -> Scene:
+    """The scene with at most so many of its points outside of a region, even in space.
+
+    Raises:
+        LodgsError: the region holds no point.
+    """
+    inside = region.holds(scene.points)
+    if not inside.any():
+        raise LodgsError(
+            "The region holds none of the scene's points.",
+            "Move it to where they are, or leave it out. It is told in the scene's own coordinates.",
+        )
+    outside = np.flatnonzero(~inside)
+    if len(outside) > most:
+        points = scene.points[outside]
+        away = np.linalg.norm(points - scene.center, axis=1)
+        outside = outside[spread(points, away, most, np.random.default_rng(0))]
+    rows = np.sort(np.concatenate([np.flatnonzero(inside), outside]))
+    return replace(
+        scene, points=scene.points[rows], point_colors=scene.point_colors[rows],
+        point_ids=scene.point_ids[rows] if len(scene.point_ids) else scene.point_ids,
     )  # fmt: skip
 
 

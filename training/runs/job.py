@@ -10,6 +10,7 @@ from pathlib import Path
 from ..documents import read_json, read_toml, shown
 from ..errors import LodgsError
 from ..files import atomic_write
+from ..lod.crop import Crop, is_text_of_crop
 from ..methods import METHODS, method_info, parameters_of
 from ..methods.parameters import Parameters
 from .folder import RunFolder
@@ -65,7 +66,9 @@ class Job:
         splat_memory: megabytes of splats, with what training keeps of each, that are in memory at a time,
             where a method can have the others in a file (tree). 0: half of the memory that is free. With less
             than all need, what is trained depends on it a little.
-        region: a file of ``scenes.regions``: what of the scene is trained on; "" for all.
+        region: what of the scene is trained in detail, in its coordinates, as ``Crop.from_text`` has it; or,
+            of a part of a scene in cells, the file of ``scenes.regions`` that says what it is trained on; ""
+            for all.
         cells: how many cells on the ground are trained one by one, "COLUMNSxROWS", and then put together; ""
             for the scene as a whole.
         polish: steps that fit each cell's borders to the cells beside it, once all are trained; 0 for none.
@@ -135,8 +138,11 @@ class Job:
             if not values.get(key):
                 raise LodgsError(f"The job does not say '{key}'.", f'Add a line: {key} = "..."')
         for key in ("scene", "out", "base", "capture", "model", "images", "region"):
-            if values.get(key) and (key, values[key]) != ("capture", DOME):
-                values[key] = _path(key, values[key], folder)
+            value = values.get(key)
+            if not value or (key, value) == ("capture", DOME):
+                continue
+            if not (key == "region" and isinstance(value, str) and is_text_of_crop(value)):
+                values[key] = _path(key, value, folder)
         job = cls(**values)
         job._check()
         return job
@@ -179,6 +185,8 @@ class Job:
                 f"The method '{self.method}' cannot begin with the splats of another run.",
                 "Leave out 'base', or choose another method.",
             )
+        if is_text_of_crop(self.region):
+            Crop.from_text(self.region)
         if self.capture:
             self._check_capture()
         if self.cells:
@@ -224,6 +232,16 @@ class Job:
         return job
 
     @property
+    def crop(self) -> Crop | None:
+        """What is trained in detail; None for all."""
+        return Crop.from_text(self.region) if is_text_of_crop(self.region) else None
+
+    @property
+    def cell(self) -> str:
+        """The file of the cell that this job trains; "" where it trains none."""
+        return "" if is_text_of_crop(self.region) else self.region
+
+    @property
     def grid(self) -> tuple[int, int]:
         """Columns and rows of ``cells``; (0, 0) where it says none."""
         columns, _, rows = self.cells.lower().partition("x")
@@ -253,7 +271,7 @@ class Job:
             for key in ("base", "capture", "region"):
                 if values[key] != DOME and path.parent in Path(values[key]).parents:
                     values[key] = f"./{Path(values[key]).relative_to(path.parent).as_posix()}"
-            if self.region and Path(self.base).parent == path.parent.parent:  # both are parts of one run
+            if self.cell and Path(self.base).parent == path.parent.parent:  # both are parts of one run
                 values["base"] = f"../{Path(self.base).name}"
         table = values.pop("parameters")
         lines = [_toml_line(name, value) for name, value in values.items()]

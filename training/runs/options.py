@@ -62,7 +62,11 @@ _OPTIONS: dict[str, dict] = {
         "type": _whole,
         "help": "splats in memory, where others can be in a file (tree); 0 is half of the free memory",
     },
-    "region": {"metavar": "FILE", "help": "what of the scene to train on, as the command blocks plans it"},
+    "region": {
+        "metavar": "SHAPE",
+        "help": "what to train in detail, all else coarsely: 'box X Y Z X Y Z' (two opposite corners) or "
+        "'sphere X Y Z RADIUS', in the scene's coordinates",
+    },
     "cells": {
         "metavar": "CxR",
         "help": "train columns x rows of cells on the ground one by one, then put them together",

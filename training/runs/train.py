@@ -220,7 +220,7 @@ class _Run:
                     f"No training view sees a splat of {job.base}.",
                     "Choose splats that were made from these photographs, in the same coordinates.",
                 )
-            region = Region.read(Path(job.region)) if job.region else None
+            region = Region.read(Path(job.cell)) if job.cell else None
             if region is not None:
                 base = self._in_region(base.select(slice(None)), antialias, region)
         method = create(job.method, data, parameters, job.seed, self._backend, base)

@@ -35,6 +35,7 @@ class Camera:
         world_to_camera: (4, 4) float64, rigid, OpenCV axes, COLMAP world.
         image: path of the photograph, or None where there is none.
         mask: path of a picture of the same proportions that is black where the photograph does not count.
+        depth: path of a depth map of the same proportions, see ``depths.read_map``.
     """
 
     name: str
@@ -47,6 +48,7 @@ class Camera:
     world_to_camera: np.ndarray
     image: Path | None = None
     mask: Path | None = None
+    depth: Path | None = None
 
     @property
     def center(self) -> np.ndarray:
@@ -126,7 +128,7 @@ class Camera:
         across, down = round(share * self.width), round(share * self.height)
         return replace(
             self, width=self.width + 2 * across, height=self.height + 2 * down,
-            cx=self.cx + across, cy=self.cy + down, image=None, mask=None,
+            cx=self.cx + across, cy=self.cy + down, image=None, mask=None, depth=None,
         )  # fmt: skip
 
     def within(self, matrix: np.ndarray) -> tuple[Camera, float]:

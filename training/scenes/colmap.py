@@ -25,12 +25,14 @@ from .model import (
     registered,
 )
 from .orientation import up_rotation
-from .photographs import Masks, Photographs, image_folder
+from .photographs import Beside, Photographs, image_folder
 
 ASTRAY = 1000
 """What lies so many times as far from the middle of the cameras as most cameras or points is an error."""
-MASKS = "masks"
-"""Folder beside that of the photographs, or in the scene's where they are that."""
+MASKS, DEPTHS = "masks", "depths"
+"""Folders beside that of the photographs, or in the scene's where they are that."""
+DEPTH_SUFFIXES = ".exr", ".png"
+"""How names of depth maps end."""
 MOST_EYES = 500
 """Cameras, evenly chosen, that tell the median depth."""
 NAMED = 5
@@ -206,8 +208,9 @@ def read_scene(
     images = _absolute(images)
     if not images.is_dir():
         raise LodgsError(f"There is no image folder {images}.", "Choose the folder of the photographs.")
+    beside = folder if images == folder else images.parent
     views = _Views(
-        Photographs(images, folder), Masks((folder if images == folder else images.parent) / MASKS)
+        Photographs(images, folder), Beside(beside / MASKS, ".png"), Beside(beside / DEPTHS, *DEPTH_SUFFIXES)
     )
     for number, pose in enumerate(poses):
         if progress and number % 50 == 0:
@@ -272,14 +275,27 @@ def without(scene: Scene, reasons: dict[str, str]) -> Scene:
     )
 
 
+def observations(scene: Scene, names: Collection[str]) -> dict[str, np.ndarray]:
+    """Which of the scene's points some of its views observe, rows (O,) by the views' names; empty where the
+    model does not tell."""
+    if not len(scene.point_ids):
+        return {}
+    order = np.argsort(scene.point_ids)
+    ordered, found = scene.point_ids[order], {}
+    for name, ids in read_observations(scene.model, names).items():
+        places = np.searchsorted(ordered, ids).clip(max=len(order) - 1)
+        found[name] = order[places[ordered[places] == ids]]
+    return found if any(map(len, found.values())) else {}
+
+
 def observed(scene: Scene, names: Collection[str]) -> np.ndarray:
     """Which of the scene's points some of its views, by name, observe, (P,).
 
     Where the model does not tell, as of points that come from elsewhere, those count that a view could see.
     """
     seen = np.zeros(len(scene.points), bool)
-    if len(scene.point_ids):
-        seen = np.isin(scene.point_ids, read_observations(scene.model, names))
+    for rows in observations(scene, names).values():
+        seen[rows] = True
     if not seen.any():
         for camera in scene.cameras:
             if camera.name in names:
@@ -322,8 +338,8 @@ class _Views:
         left_out: names, and a sentence each.
     """
 
-    def __init__(self, files: Photographs, masks: Masks) -> None:
-        self._files, self._masks = files, masks
+    def __init__(self, files: Photographs, masks: Beside, depths: Beside) -> None:
+        self._files, self._masks, self._depths = files, masks, depths
         self._missing: list[str] = []
         self._reshaped: list[str] = []
         self.cameras: list[Camera] = []
@@ -343,8 +359,10 @@ class _Views:
                 self._missing.append(name)
                 return
             width, height = image_size(image)
-            mask = self._masks.find(name)
-            camera = Camera(name, lens.width, lens.height, *lens.pinhole, pose.world_to_camera, image, mask)
+            beside = self._masks.find(name), self._depths.find(name)
+            camera = Camera(
+                name, lens.width, lens.height, *lens.pinhole, pose.world_to_camera, image, *beside
+            )
             if (width, height) != (lens.width, lens.height):
                 camera = camera.resized(width, height)
             if flaw := camera.flaw:

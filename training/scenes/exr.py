@@ -105,3 +105,19 @@ def _bytes_of(header: dict) -> int:
     low, high = (np.asarray(corner, np.int64) for corner in header["dataWindow"])
     width, height = (max(int(side), 0) for side in high - low + 1)
     return 4 * width * height * len(header["channels"])
+
+
+def write_exr(path: Path, channels: dict[str, np.ndarray]) -> None:
+    """Writes channels (H, W) by name, as float32.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    import OpenEXR
+
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    try:
+        planes = {name: np.ascontiguousarray(plane, np.float32) for name, plane in channels.items()}
+        OpenEXR.File(header, planes).write(str(path))
+    except RuntimeError as error:
+        raise OSError(f"{path} could not be written: {error}") from error

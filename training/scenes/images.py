@@ -44,7 +44,7 @@ def image_size(path: Path) -> tuple[int, int]:
     """
     with open_file(path) as file:
         try:
-            return _checked(path, _size(path, file))
+            return check_size(path, _size(path, file))
         except OSError as error:
             raise LodgsError(
                 f"{path} cannot be read: {error.strerror}.", "Check the image folder."
@@ -70,8 +70,12 @@ def _size(path: Path, file: IO[bytes]) -> tuple[int, int]:
     raise LodgsError(f"{path} is not a JPEG, PNG, TIFF, WebP or EXR image.", "Convert it to one of these.")
 
 
-def _checked(path: Path, size: tuple[int, int]) -> tuple[int, int]:
-    """The size, where it is one that is read."""
+def check_size(path: Path, size: tuple[int, int]) -> tuple[int, int]:
+    """The size, where it is one that is read.
+
+    Raises:
+        LodgsError: it is not.
+    """
     width, height = size
     if width < 1 or height < 1:
         raise LodgsError(f"{path} has no pixels.", "Export the image again.")
@@ -199,7 +203,7 @@ def load_image(path: Path, width: int, height: int, exposure: float = 0.0, alpha
         result = np.empty((height, width, 4 if alpha else 3), np.float32)
         top = 0
         for strip in _strips(source, height):
-            pixels = _area_average(strip, width, 1)
+            pixels = area_average(strip, width, 1)
             if source.linear:
                 light = np.clip(pixels[..., :3] * 2.0**exposure, 0.0, 1.0)
                 pixels = np.concatenate([srgb_from_linear(light), pixels[..., 3:]], axis=-1)
@@ -281,7 +285,7 @@ def _exr(path: Path, alpha: bool) -> _Source:
     (left, above), _ = header["dataWindow"]
     low, high = (np.asarray(corner) for corner in header["displayWindow"])
     across, down = high - low + 1
-    width, height = _checked(path, (int(across), int(down)))
+    width, height = check_size(path, (int(across), int(down)))
     x, y = int(left - low[0]), int(above - low[1])
     names = _rgb_names(channels)
     planes = [channels[name] for name in names]
@@ -300,6 +304,18 @@ def _exr(path: Path, alpha: bool) -> _Source:
     return _Source(width, height, rows, len(planes), linear=True)
 
 
+def exr_light(path: Path) -> np.ndarray:
+    """The light of an EXR over its display window, and alpha, by which it is multiplied: (H, W, 4) float32.
+
+    Raises:
+        LodgsError: the file cannot be read.
+    """
+    with _opened(path, 1, 1, large=_LARGE, alpha=True) as source:
+        if not source.linear:
+            raise LodgsError(f"{path} is no EXR image.", "Export it again.")
+        return source.rows(0, source.height)
+
+
 def _rgb_names(channels) -> list[str]:
     """The colour channels: plain R, G, B, else those of the combined pass or first layer, else luminance."""
     layers = [name[:-1] for name in channels if name.rpartition(".")[2] == "R"]
@@ -311,14 +327,14 @@ def _rgb_names(channels) -> list[str]:
 
 
 def _strips(source: _Source, height: int) -> Iterator[np.ndarray]:
-    """The image at another height, strip by strip: rows as :func:`_area_average` makes them, to the bit."""
+    """The image at another height, strip by strip: rows as :func:`area_average` makes them, to the bit."""
     most, old = max(_STRIP // source.width, 1), source.height
     if old % height == 0:
         each = old // height
         step = max(most // each, 1)
         for top in range(0, height, step):
             bottom = min(top + step, height)
-            yield _area_average(source.rows(top * each, bottom * each), bottom - top, 0)
+            yield area_average(source.rows(top * each, bottom * each), bottom - top, 0)
         return
     below, part = _edges(old, height)
     step = max(most * height // old, 1)
@@ -332,8 +348,9 @@ def _strips(source: _Source, height: int) -> Iterator[np.ndarray]:
         yield _between(total, below[place] - first, part[place]) * (height / old)
 
 
-def _area_average(pixels: np.ndarray, size: int, axis: int) -> np.ndarray:
-    """Resample one axis to `size` cells, each the mean of what it covers: differences of the running sum."""
+def area_average(pixels: np.ndarray, size: int, axis: int) -> np.ndarray:
+    """Resample one axis of (H, W, C) to `size` cells, each the mean of what it covers: differences of the
+    running sum."""
     old = pixels.shape[axis]
     if size == old:
         return pixels

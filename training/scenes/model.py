@@ -142,12 +142,11 @@ def read_poses(model: Path) -> list[Pose]:
     return _read(model, "images", {".bin": _images_bin, ".txt": _images_txt})
 
 
-def read_observations(model: Path, names: Collection[str]) -> np.ndarray:
-    """The ids of the points that some images, by name, observe: (O,) int64, each once, ascending."""
-    seen = _read(
+def read_observations(model: Path, names: Collection[str]) -> dict[str, np.ndarray]:
+    """The ids (O,) int64 of the points that some images observe, by the images' names."""
+    return _read(
         model, "images", {".bin": partial(_seen_bin, names=names), ".txt": partial(_seen_txt, names=names)}
     )
-    return np.unique(np.concatenate([_NO_IDS, *seen]))
 
 
 def read_points(model: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -289,26 +288,26 @@ def _images_txt(data: bytes) -> list[Pose]:
     return poses
 
 
-def _seen_bin(data: bytes, names: Collection[str]) -> list[np.ndarray]:
-    (count,), at, seen = struct.unpack_from("<Q", data), 8, []
+def _seen_bin(data: bytes, names: Collection[str]) -> dict[str, np.ndarray]:
+    (count,), at, seen = struct.unpack_from("<Q", data), 8, {}
     for _ in range(count):
         end = data.index(b"\0", at + 64)
         (points2d,) = struct.unpack_from("<Q", data, end + 1)
-        if _name(data[at + 64 : end]) in names:
-            seen.append(_observed(np.frombuffer(data, _POINT2D, points2d, end + 9)["point"]))
+        if (name := _name(data[at + 64 : end])) in names:
+            seen[name] = _observed(np.frombuffer(data, _POINT2D, points2d, end + 9)["point"])
         at = end + 9 + 24 * points2d
     return seen
 
 
-def _seen_txt(data: bytes, names: Collection[str]) -> list[np.ndarray]:
-    seen, lines = [], iter(data.split(b"\n"))
+def _seen_txt(data: bytes, names: Collection[str]) -> dict[str, np.ndarray]:
+    seen, lines = {}, iter(data.split(b"\n"))
     for line in lines:
         line = line.strip()
         if not line or line.startswith(b"#"):
             continue
         points2d = next(lines, b"")
-        if _name(line.split(maxsplit=9)[9]) in names:
-            seen.append(_observed(np.array(points2d.split()[2::3], np.int64)))
+        if (name := _name(line.split(maxsplit=9)[9])) in names:
+            seen[name] = _observed(np.array(points2d.split()[2::3], np.int64))
     return seen
 
 
@@ -350,8 +349,7 @@ _POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
 _TRACK_AT = 43
 _BLOCK = 1 << 17
-_NO_IDS = np.zeros(0, np.int64)
-_NO_POINTS = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), _NO_IDS
+_NO_POINTS = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.int64)
 _MARK = b"\xef\xbb\xbf"  # Windows' programs begin UTF-8 with it
 
 

@@ -46,24 +46,26 @@ class Photographs:
         return found
 
 
-class Masks:
-    """Pictures that are black where photographs do not count, as COLMAP and nerfstudio name them.
+class Beside:
+    """What belongs to photographs, masks or depth maps, as COLMAP and nerfstudio name it.
 
     Args:
-        folder: of the masks; it need not be there.
+        folder: it need not be there.
+        suffixes: of its files, the first one first.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, *suffixes: str) -> None:
+        self.folder, self._suffixes = folder, suffixes
         self._there = folder.is_dir()
 
     def find(self, name: str) -> Path | None:
         """That of a photograph: of ``a/b.jpg`` ``a/b.jpg.png``, or ``a/b.png``; None where there is none."""
         if not self._there:
             return None
-        for path in (self.folder / f"{name}.png", (self.folder / name).with_suffix(".png")):
-            if path.is_file():
-                return path
+        for suffix in self._suffixes:
+            for path in (self.folder / f"{name}{suffix}", (self.folder / name).with_suffix(suffix)):
+                if path.is_file():
+                    return path
         return None
 
 

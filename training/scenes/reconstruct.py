@@ -26,7 +26,7 @@ from ..files import atomic_write, link_or_copy
 from . import apart
 from .colmap import MASKS, find_models, told
 from .images import SUFFIXES, image_size, load_image, write_png
-from .photographs import Masks
+from .photographs import Beside
 
 PRESETS = {"draft": (1000, 2048), "standard": (1600, 4096)}
 """Pixels of the longer side in which features are looked for, and at most so many of a photograph."""
@@ -277,7 +277,7 @@ def _masks(masks: Path, names: Sequence[str], out: Path) -> Path:
     """A folder of masks as COLMAP names them."""
     there = out / MASKS
     for name in names:
-        found = Masks(masks).find(name)
+        found = Beside(masks, ".png").find(name)
         if found is not None:
             link_or_copy(found, there / f"{name}.png")
     if not there.is_dir():

@@ -9,18 +9,19 @@ folder/  images/view_0001.png   the picture, as photographs are
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import LodgsError
-from .cameras import FARTHEST, read_views
+from .cameras import FARTHEST, Camera, read_views
+from .colmap import DEPTHS
 from .exr import read_parts
 from .images import load_image
 
-IMAGES, DEPTHS, CAMERAS = "images", "depths", "cameras"
+IMAGES, CAMERAS = "images", "cameras"
 """The folders of what was drawn."""
 POINTS = 100_000
 """At most so many points a model gets."""
@@ -52,27 +53,24 @@ def write_model(folder: Path, most: int = POINTS, tell: Tell = lambda number, co
     drawn, _ = read_views(folder / CAMERAS)
     views = [replace(view, name=f"{view.name}.png") for view in drawn]
     files = [folder / DEPTHS / f"{view.name}.exr" for view in drawn]
-    rng, found, depths, colors = np.random.default_rng(0), [], [], []
-    for number, (view, file) in enumerate(zip(views, files, strict=True)):
-        tell(number + 1, len(views))
-        picture = load_image(folder / IMAGES / view.name, view.width, view.height)
-        depth = read_depth(file)
-        if depth.shape != picture.shape[:2]:
-            raise LodgsError(
-                f"{file} is not of its camera's size of {view.width}x{view.height}.", "Render the view again."
-            )
-        y, x = np.nonzero(depth < SKY)
-        some = rng.permutation(len(x))[: most * _LOOKS // len(views) + 1]
-        y, x = y[some], x[some]
-        found.append(view.unproject(np.column_stack([x, y]) + 0.5, depth[y, x]))
-        depths.append(depth[y, x])
-        colors.append(picture[y, x])
-    points, depth, color = map(np.concatenate, (found, depths, colors))
-    kept = spread(points, depth, most, rng)
+
+    def shown() -> Iterator[tuple[Camera, np.ndarray, np.ndarray]]:
+        for number, (view, file) in enumerate(zip(views, files, strict=True)):
+            tell(number + 1, len(views))
+            picture = load_image(folder / IMAGES / view.name, view.width, view.height)
+            depth = read_depth(file)
+            if depth.shape != picture.shape[:2]:
+                raise LodgsError(
+                    f"{file} is not of its camera's size of {view.width}x{view.height}.",
+                    "Render the view again.",
+                )
+            yield view, depth, picture
+
+    points, colors = surface_points(shown(), len(views), most, np.random.default_rng(0))
     beside = folder / ".model.tmp"
     try:
         shutil.rmtree(beside, ignore_errors=True)
-        count = write_seen(beside, views, lambda n: read_depth(files[n]), points[kept], 255 * color[kept])
+        count = write_seen(beside, views, lambda n: read_depth(files[n]), points, 255 * colors)
         shutil.rmtree(folder / "sparse", ignore_errors=True)
         (beside / "sparse").rename(folder / "sparse")
     except OSError as error:
@@ -85,21 +83,44 @@ def write_model(folder: Path, most: int = POINTS, tell: Tell = lambda number, co
     return len(views), count
 
 
+def surface_points(
+    views: Iterable[tuple[Camera, np.ndarray, np.ndarray]], count: int, most: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places (P, 3), at most so many, where random pixels meet surfaces, see :func:`spread`; and the colours
+    (P, 3) there.
+
+    Args:
+        views: each with its depths (H, W), from SKY on where there is nothing, and its picture (H, W, 3).
+        count: how many views there are.
+    """
+    found, depths, colors = [], [], []
+    for view, depth, picture in views:
+        y, x = np.nonzero(depth < SKY)
+        some = rng.permutation(len(x))[: most * _LOOKS // count + 1]
+        y, x = y[some], x[some]
+        found.append(view.unproject(np.column_stack([x, y]) + 0.5, depth[y, x]))
+        depths.append(depth[y, x])
+        colors.append(picture[y, x])
+    points, depth, color = map(np.concatenate, (found, depths, colors))
+    kept = spread(points, depth, most, rng)
+    return points[kept], color[kept]
+
+
 def read_depth(file: Path) -> np.ndarray:
-    """Depths (H, W) float64 of a multilayer EXR, the nearest of its layers; FARTHEST where there is nothing.
+    """Depths (H, W) float64 of an EXR, the nearest of its layers' Depth.Z; FARTHEST where there is nothing.
+
+    Where there is none of that name: of channels that are called Z, depth or V.
 
     Raises:
         LodgsError: it cannot be read, or holds none.
     """
     try:
-        layers = [
-            pixels
-            for _, _, channels in read_parts(file)
-            for name, pixels in channels.items()
-            if name.endswith("Depth.Z")
-        ]
+        channels = [each for _, _, part in read_parts(file) for each in part.items()]
     except (RuntimeError, OSError, ValueError) as error:
         raise LodgsError(f"{file} cannot be read: {error}.", "Render the view again.") from error
+    layers = [pixels for name, pixels in channels if name.endswith("Depth.Z")]
+    if not layers:
+        layers = [pixels for name, pixels in channels if name.lower() in ("z", "depth", "v")]
     if not layers:
         raise LodgsError(f"{file} holds no depth.", "Render with an engine that has the pass Depth.")
     nearest = np.min(layers, axis=0).astype(np.float64)

@@ -17,12 +17,17 @@ import numpy as np
 
 from ..errors import LodgsError
 from . import apart
-from .colmap import MASKS, Scene, read_scene
-from .images import load_image, write_png
+from .cameras import Camera
+from .colmap import DEPTHS, MASKS, Scene, read_scene
+from .depths import read_map
+from .exr import write_exr
+from .images import exr_light, load_image, write_png
 
 CACHE = ".undistorted"
 """Folder in a scene's of what is made of it once, for all runs and for Blender."""
-_VERSION = b"2"  # of what is kept in the cache
+_VERSION = b"3"  # of what is kept in the cache
+_BENT = "bent"
+"""Folder of where in a photograph each pixel of the straight one is, as shares of its sides."""
 _LEFT = 86_400.0
 """Seconds after which what is half done in a cache is nobody's."""
 
@@ -93,6 +98,7 @@ def _key(scene: Scene) -> str:
     files = [(path.name, path) for path in model]
     files += [(camera.name, camera.image) for camera in scene.cameras if camera.image is not None]
     files += [(camera.name, camera.mask) for camera in scene.cameras if camera.mask is not None]
+    files += [(camera.name, camera.depth) for camera in scene.cameras if camera.depth is not None]
     for name, path in files:
         status = path.stat()
         text = f"{name}\0{status.st_size}\0{status.st_mtime_ns}\0"
@@ -113,6 +119,7 @@ def _undistort_into(target: Path, scene: Scene) -> None:
         "model": str(scene.model),
         "images": str(scene.images_folder),
         "sizes": {camera.name: [camera.width, camera.height] for camera in scene.cameras},
+        "here": [camera.name for camera in scene.cameras if camera.depth is not None or _is_foreign(camera)],
     }
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix="undistorting-") as work:
@@ -131,11 +138,58 @@ def _undistort_into(target: Path, scene: Scene) -> None:
                 "Check the trainer's environment and the free space, or give an undistorted scene "
                 "(colmap image_undistorter).",
             )
+        for camera in scene.cameras:
+            places = Path(work) / _BENT / f"{camera.name}.npy"
+            if places.exists():
+                _straighten_here(camera, np.load(places), Path(work) / "undistorted")
         try:
             os.replace(Path(work) / "undistorted", target)
         except OSError:
             if not target.is_dir():  # else another process was quicker, with the same content
                 raise
+
+
+def _is_foreign(camera: Camera) -> bool:
+    """Whether pycolmap does not read a photograph of this kind, or loses its light."""
+    return camera.name.lower().endswith((".webp", ".exr"))
+
+
+def _straighten_here(camera: Camera, places: np.ndarray, out: Path) -> None:
+    """What pycolmap does not straighten of a view: its depth map, by the nearest pixel; a foreign photograph.
+
+    Args:
+        places: where each pixel is in the photograph, (H, W, 2) shares of its sides.
+        out: folder of what is straight.
+    """
+    from scipy.ndimage import map_coordinates  # which Blender lacks
+
+    def at(pixels: np.ndarray, order: int) -> np.ndarray:
+        height, width = pixels.shape
+        x, y = np.moveaxis(places * (width, height) - 0.5, -1, 0)
+        return map_coordinates(pixels, [y, x], order=order, mode="nearest")
+
+    if camera.depth is not None:
+        path = out / DEPTHS / f"{camera.name}.exr"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_exr(path, {"Z": at(np.nan_to_num(read_map(camera.depth)), order=0)})
+    if camera.image is None or not _is_foreign(camera):
+        return
+    path = out / "images" / camera.name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    linear = camera.name.lower().endswith(".exr")
+    pixels = (
+        exr_light(camera.image)
+        if linear
+        else load_image(camera.image, camera.width, camera.height, alpha=True)
+    )
+    planes = [at(plane, order=1) for plane in np.moveaxis(pixels, -1, 0)]
+    if linear:
+        write_exr(path, dict(zip("RGBA", planes, strict=True)))
+    else:  # a PNG, which is told by its content
+        straight = np.stack(
+            [*(plane / np.maximum(planes[3], 1e-6) for plane in planes[:3]), planes[3]], axis=-1
+        )
+        write_png(path, np.rint(255 * straight.clip(0, 1)).astype(np.uint8))
 
 
 def _main() -> None:
@@ -168,6 +222,12 @@ def _main() -> None:
         image_names=list(request["sizes"]),
         jpeg_quality=98,
     )
+    straight = pycolmap.Reconstruction(work / "undistorted" / "sparse") if request["here"] else None
+    for image in straight.images.values() if straight else ():
+        if image.name in request["here"]:
+            file = work / _BENT / f"{image.name}.npy"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            np.save(file, _places(image.camera, model.cameras[image.camera_id]))
     masks = work / MASKS
     if masks.is_dir():  # bent like their photographs, whose names theirs begin with
         for image in model.images.values():
@@ -179,6 +239,14 @@ def _main() -> None:
             output_path=work / "straight", input_path=work / "masked", image_path=masks, image_names=names
         )
         (work / "straight" / "images").rename(work / "undistorted" / MASKS)
+
+
+def _places(straight, bent) -> np.ndarray:
+    """Where in a photograph of a bent lens a straight one's pixels are, (H, W, 2) shares of its sides."""
+    y, x = np.mgrid[: straight.height, : straight.width] + 0.5
+    rays = straight.cam_from_img(np.stack([x, y], axis=-1).reshape(-1, 2))
+    pixels = bent.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
+    return (pixels / (bent.width, bent.height)).reshape(*x.shape, 2).astype(np.float32)
 
 
 if __name__ == "__main__":

@@ -74,18 +74,19 @@ def test_splats_alone_ask_for_views_of_them(bpy, lodgs, root, draw, fake):
     settings.views_from = "CAMERAS"
     assert draw().properties == [*begin, "view_width"] and "0 cameras" in draw().texts
     advanced = draw("LODGS_PT_training_advanced").properties
-    assert "model" not in advanced and "images" not in advanced and "seed" in advanced
+    assert not {"region", "model", "images"} & set(advanced) and "seed" in advanced
 
 
 def test_a_parameter_shows_the_presets_number_until_it_is_set(root, draw):
     settings = root.lodgs.training
-    common = ["seed", "use_test_every", "preset_test_every", "model", "images", "output"]
+    common = ["region", "seed", "use_test_every", "preset_test_every", "model", "images", "output"]
 
     def shown():
         notes = draw("LODGS_PT_training_advanced")
         return [name for name in notes.properties if name not in common]
 
     settings.preset = "standard"
+    assert draw("LODGS_PT_training_advanced").operators == ["lodgs.add_region", "lodgs.open_run"]
     assert shown() == [
         "use_levels", "preset_levels", "use_footprint", "preset_footprint", "use_max_splats",
         "preset_max_splats",

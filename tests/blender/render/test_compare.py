@@ -88,8 +88,8 @@ def measured(bpy, lodgs, tmp_path):
         levels.append(Level(number, splats, {"s_min": s_min}))
     bundle = Bundle("flod", levels, "bands", {})
 
-    def made(index, scale):
-        evaluation = Evaluation(TrainingData(read_scene(GARDEN), scale, 8), backend="cpu")
+    def made(index, scale, folder=GARDEN):
+        evaluation = Evaluation(TrainingData(read_scene(folder), scale, 8), backend="cpu")
         camera = evaluation.cameras[index]
         bundle.controls["gamma"] = 2.4 * scale
         choice, values = Choice(bundle), settings(bundle, {})
@@ -97,7 +97,7 @@ def measured(bpy, lodgs, tmp_path):
         counts = np.unique(np.repeat([1, 2, 3], 300)[weights > 0], return_counts=True)
         assert min(counts[1]) > 20 and len(counts[0]) == 3  # every level has its part
         (psnr,) = evaluation.psnrs([camera], lambda camera: (choice.splats, weights))
-        root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+        root = lodgs("data.scenes").import_colmap(bpy.context, folder, photographs=False)
         lodgs("data.scenes").set_bundle_facts(root, bundle)
         for level in levels:
             lodgs("data.scenes").set_level(root, level)
@@ -120,6 +120,29 @@ def test_by_distance_it_is_what_evaluate_measures(bpy, lodgs, measured, renderer
     assert found.psnr == pytest.approx(psnr, abs=0.01)
     assert (render.resolution_x, render.resolution_y) == rendered
     assert (render.resolution_percentage, render.pixel_aspect_x) == (37, 1.5)
+
+
+def test_what_is_masked_out_or_transparent_counts_as_in_evaluate(bpy, lodgs, measured, renderer, tmp_path):
+    """By the evaluation, and by hand from the pictures that the wipe shows."""
+    from PIL import Image
+
+    (tmp_path / "sparse").symlink_to(GARDEN / "sparse")
+    for folder in ("images", "masks"):
+        (tmp_path / folder).mkdir()
+    pixels = np.random.default_rng(0).integers(0, 256, (320, 480, 4)).astype(np.uint8)
+    counts = np.zeros((320, 480), np.uint8)
+    counts[80:280, 120:360] = 255
+    for file in (GARDEN / "images").iterdir():
+        Image.fromarray(pixels).save(tmp_path / "images" / file.name, "PNG")
+        Image.fromarray(counts).save(tmp_path / "masks" / f"{file.name}.png")
+    root, view, psnr = measured(2, 1.0, tmp_path)
+    found = lodgs("render.compare").compare_view(bpy.context, root, view)
+    over_black = pixels[..., :3] * (pixels[..., 3:] / 255)
+    np.testing.assert_allclose(255 * found.photograph, over_black, atol=1e-3)
+    rendered, truth = (np.rint(255 * np.clip(x, 0, 1)) for x in (found.rendered, found.photograph))
+    apart = (rendered - truth)[80:280, 120:360]
+    assert found.psnr == pytest.approx(20 * np.log10(255) - 10 * np.log10((apart**2).mean()), abs=0.01)
+    assert found.psnr == pytest.approx(psnr, abs=0.01)
 
 
 def test_measuring_all_finds_the_worst(bpy, lodgs, root, renderer):

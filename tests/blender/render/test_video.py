@@ -1,5 +1,6 @@
 """Frames of a video: those that are sharp, as they were drawn."""
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -29,13 +30,12 @@ def drawn() -> list[np.ndarray]:
     return [blurred(frame) if number in BLURRED else frame for number, frame in enumerate(frames)]
 
 
-@pytest.fixture
-def video(bpy, lodgs, drawn, tmp_path) -> Path:
-    """Losslessly coded, by Blender."""
+def coded(bpy, lodgs, drawn: list[np.ndarray], path: Path, kind: str, codec: str) -> Path:
+    """A video of these frames, losslessly coded by Blender."""
     for number, pixels in enumerate(drawn):
-        write_png(tmp_path / f"{number:02d}.png", pixels)
+        write_png(path.parent / f"{number:02d}.png", pixels)
     scene, compat = bpy.data.scenes.new("made"), lodgs("compat")
-    strip = compat.strips(scene).new_image("a", str(tmp_path / "00.png"), channel=1, frame_start=1)
+    strip = compat.strips(scene).new_image("a", str(path.parent / "00.png"), channel=1, frame_start=1)
     for number in range(1, len(drawn)):
         strip.elements.append(f"{number:02d}.png")
     strip.frame_final_duration = len(drawn)
@@ -46,11 +46,34 @@ def video(bpy, lodgs, drawn, tmp_path) -> Path:
     if hasattr(render.image_settings, "media_type"):
         render.image_settings.media_type = "VIDEO"
     render.image_settings.file_format = "FFMPEG"
-    render.ffmpeg.format, render.ffmpeg.codec = "MKV", "FFV1"
-    render.filepath = str(tmp_path / "walk.mkv")
+    render.ffmpeg.format, render.ffmpeg.codec = kind, codec
+    render.ffmpeg.constant_rate_factor = "LOSSLESS"
+    render.filepath = str(path)
     bpy.ops.render.render(animation=True, scene=scene.name)
     bpy.data.scenes.remove(scene)
-    return tmp_path / "walk.mkv"
+    return path
+
+
+@pytest.fixture
+def video(bpy, lodgs, drawn, tmp_path) -> Path:
+    return coded(bpy, lodgs, drawn, tmp_path / "walk.mkv", "MKV", "FFV1")
+
+
+def test_a_phone_that_was_held_upright(bpy, lodgs, drawn, tmp_path):
+    """Its video says by how much it is turned: the matrix of the track's header, ISO/IEC 14496-12."""
+    path = coded(bpy, lodgs, drawn[:3], tmp_path / "phone.mp4", "MPEG4", "H264")
+    data = bytearray(path.read_bytes())
+    place = data.index(b"tkhd") + 44
+    assert struct.unpack_from(">9i", data, place) == (65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30)
+    struct.pack_into(">9i", data, place, 0, -65536, 0, 65536, 0, 0, 0, 0, 1 << 30)  # a quarter to the left
+    path.write_bytes(data)
+    lodgs("render.video").extract_frames(path, tmp_path / "out", 3)
+    for number in range(3):
+        image = bpy.data.images.load(str(tmp_path / "out" / f"frame_{number + 1:06d}.png"))
+        assert tuple(image.size) == (240, 320)
+        pixels = np.array(image.pixels[:]).reshape(320, 240, -1)[::-1, :, :3]
+        bpy.data.images.remove(image)
+        assert np.abs(pixels - np.rot90(drawn[number]) / 255).mean() < 0.05
 
 
 def test_of_each_part_the_sharpest_frame_is_kept(bpy, lodgs, video, drawn, tmp_path):

@@ -99,7 +99,7 @@ def test_a_request_is_what_was_asked(good, camera):
         {"background": [1, 2]}, {"background": [1, 2, 1e30]}, {"background": "red"},
         {"background": [True] * 3},
         {"window": [0, 0, 65, 1]}, {"window": [0, 0, 0, 0]}, {"window": [0.5, 0, 1, 1]}, {"window": 3},
-        {"window": [0, 0, 1, 1], "photograph": "a.png"}, {"holdout": 3}, {"photograph": ["a"]},
+        {"window": [0, 0, 1, 1], "photograph": "a.png"}, {"holdout": 3}, {"photograph": ["a"]}, {"mask": 1},
     ],
 )  # fmt: skip
 def test_impossible_requests_are_a_sentence(good, change):

@@ -13,8 +13,10 @@ import pytest
 from training.__main__ import main
 from training.errors import LodgsError
 from training.scenes.colmap import read_scene
+from training.scenes.depths import Depths, with_points
 from training.scenes.formats import convert, find_export, random_points
 
+from .depth_walls import grey
 from .synthetic import write_image
 
 WIDTH, HEIGHT, FOCAL, CENTER = 96, 72, (80.0, 82.0), (47.0, 37.0)
@@ -160,8 +162,10 @@ def test_polycam(tmp_path):
         (tmp_path / "keyframes" / "corrected_cameras").mkdir(parents=True, exist_ok=True)
         (tmp_path / "keyframes" / "corrected_cameras" / f"{name}.json").write_text(json.dumps(camera))
     photographs(tmp_path / "keyframes" / "corrected_images", (*names, "14.jpg"))
+    grey(tmp_path / "keyframes" / "depth" / "12.png", np.full((HEIGHT, WIDTH), 2000))
     made = convert(tmp_path)
     assert "14.json is left out: it is blurred" in made.warnings[0]
+    assert [camera.depth is not None for camera in read_scene(tmp_path).cameras] == [False, True, False]
     names = [f"keyframes/corrected_images/{name}" for name in names]
     check(tmp_path, [pixels(*seen(pose)) for pose in poses()], names)
 
@@ -314,6 +318,41 @@ def test_masks_come_along(tmp_path):
     convert(tmp_path)
     masks = [camera.mask for camera in read_scene(tmp_path).cameras]
     assert masks == [None, tmp_path / "masks" / "second photo.png.png", None]
+
+
+def test_depth_maps_come_along_and_give_the_points(tmp_path):
+    """Of nerfstudio's, in millimetres: a wall before each camera."""
+
+    def change(document):
+        for number, frame in enumerate(document["frames"]):
+            frame["depth_file_path"] = f"deep/{number}.png"
+
+    write_transforms(tmp_path, change)
+    for number in range(3):
+        grey(tmp_path / "deep" / f"{number}.png", np.full((HEIGHT // 2, WIDTH // 2), 3000 + number))
+    made = convert(tmp_path)
+    assert made.points == 0 and "training takes them from the depth maps" in made.warnings[-1]
+    scene = read_scene(tmp_path)
+    assert [camera.depth for camera in scene.cameras] == [
+        tmp_path / "depths" / f"{name}.png" for name in NAMES
+    ]
+    found = with_points(scene)
+    for number, camera in enumerate(scene.cameras):
+        inverse = Depths(scene, "metric").inverse(camera)
+        np.testing.assert_allclose(inverse, 1 / (3 + 0.001 * number), rtol=1e-5)
+    depths = np.stack([camera.view_space(found.points)[:, 2] for camera in scene.cameras])
+    assert (np.abs(depths - [[3.0], [3.001], [3.002]]).min(axis=0) < 1e-4).all() and len(found.points) > 5000
+
+
+def test_kinds_of_depth_that_are_not_read_are_left(tmp_path):
+    def change(document):
+        for frame in document["frames"]:
+            frame["depth_file_path"] = "depth.npy"
+
+    write_transforms(tmp_path, change)
+    (tmp_path / "depth.npy").write_bytes(b"numbers")
+    assert convert(tmp_path).points == 30_000
+    assert not (tmp_path / "depths").exists()
 
 
 def test_random_points_are_seen_by_two_views(tmp_path):

@@ -91,6 +91,19 @@ def test_other_settings_begin_anew_and_only_features_outside_masks_count(photos,
     assert json.loads((out / "colmap" / "settings.json").read_text())["masks"] == str(masks)
 
 
+@pytest.mark.slow
+def test_folders_of_a_rig_are_a_lens_each(photos, tmp_path):
+    for number in range(6):
+        place = tmp_path / "photos" / ("left" if number % 2 else "right") / f"{number}.png"
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(photos / f"{number}.png", place)
+    found = reconstruct(tmp_path / "photos", tmp_path / "out", lens="folder")
+    assert len(found.placed) == 6
+    cameras = read_scene(found.folder).cameras
+    lenses = {(camera.name.split("/")[0], round(camera.fx, 6)) for camera in cameras}
+    assert {name for name, _ in lenses} == {"left", "right"} and len(lenses) == 2
+
+
 def test_some_that_show_something_else_are_named(photos, tmp_path):
     folder = tmp_path / "photos"
     folder.mkdir()

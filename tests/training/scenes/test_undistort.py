@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pycolmap
 import pytest
 
@@ -16,6 +17,7 @@ from tests.training.scenes import synthetic
 from training.errors import LodgsError
 from training.scenes import apart
 from training.scenes.colmap import read_scene
+from training.scenes.color import linear_from_srgb
 from training.scenes.images import load_image
 from training.scenes.undistort import undistorted
 
@@ -61,6 +63,31 @@ def test_an_ideal_fisheye_is_undone_too(tmp_path):
     shown = load_image(camera.image, camera.width, camera.height)[v, u, 0] * (synthetic.WIDTH - 1) + 0.5
     assert shown == pytest.approx(47 + 80 * np.arctan(tangent), abs=0.35)
     assert abs(80 * (tangent - np.arctan(tangent))) > 1
+
+
+@pytest.mark.parametrize("suffix", ["webp", "exr", "tif"])
+def test_kinds_that_pycolmap_does_not_read_are_straightened_like_a_png(tmp_path, suffix):
+    """In floats and over 1, where they are linear."""
+    synthetic.write_scene(tmp_path, synthetic.camera("OPENCV"), names=["a.png"], pixels=ramps())
+    (plain,) = undistorted(read_scene(tmp_path), tmp_path / "cache").cameras
+    model, path = pycolmap.Reconstruction(tmp_path / "sparse/0"), tmp_path / "images" / f"a.{suffix}"
+    (image,) = model.images.values()
+    image.name = path.name
+    model.write(tmp_path / "sparse/0")
+    if suffix == "exr":
+        light = linear_from_srgb(ramps() / 255) * 4
+        OpenEXR.File({"type": OpenEXR.scanlineimage}, {"RGB": light.astype(np.float32)}).write(str(path))
+    else:  # by another process: Pillow's writing beside pycolmap corrupts memory
+        program = (
+            "import sys; from PIL import Image; Image.open(sys.argv[1]).save(sys.argv[2], lossless=True)"
+        )
+        subprocess.run([sys.executable, "-c", program, tmp_path / "images" / "a.png", path], check=True)
+    (camera,) = undistorted(read_scene(tmp_path), tmp_path / "cache").cameras
+    assert camera.image is not None and plain.image is not None and camera.image.name == path.name
+    assert (camera.width, camera.height, camera.fx) == (plain.width, plain.height, plain.fx)
+    size = camera.width, camera.height
+    found = load_image(camera.image, *size, exposure=-2 if suffix == "exr" else 0)
+    np.testing.assert_allclose(found, load_image(plain.image, *size), atol=3 / 255)
 
 
 def test_names_sizes_and_missing_images(tmp_path):

@@ -211,7 +211,9 @@ class Method(method.Method[NeuralOctreeParameters, Drawing]):
         weights = self.schedule.weights(view.camera, self.model, step, full=view.shrink == 1)
         anchors = self.visible(view.camera, weights)
         decoded = self.decode(view.camera, anchors, view.index)
-        rendering = self.rasterize_decoded(decoded, view.camera, background=self.background(step))
+        rendering = self.rasterize_decoded(
+            decoded, view.camera, background=self.background(step), outputs=self.outputs
+        )
         return [Drawing(rendering, anchors, decoded)]
 
     def loss(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> torch.Tensor:
@@ -304,6 +306,7 @@ class Method(method.Method[NeuralOctreeParameters, Drawing]):
         camera: Camera,
         weights: torch.Tensor | None = None,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        outputs: tuple[str, ...] = (),
     ) -> Rendering:
         """What a camera sees of Gaussians, with weights (M,) on their opacities, over a background."""
         return rasterize(
@@ -313,6 +316,7 @@ class Method(method.Method[NeuralOctreeParameters, Drawing]):
             near=self.data.near,
             antialias=self.parameters.antialias,
             background=background,
+            outputs=outputs,
             backend=self.backend,
         )
 

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
+from ...lod.crop import Crop
 from ...lod.forest import joined_trees, longest_of, shape_of, subtrees_of
 from ...lod.tree import Tree
 from ..density import along_longest_axis
@@ -81,6 +82,7 @@ class Growing:
         unseen_since: and those that no step from this one on has had in its image, counted from 1.
         now: how many steps have been made.
         most: leaves that the tree may have.
+        region: leaves outside of it are not split; None: all may be.
 
     Attributes:
         removed, added: leaves.
@@ -95,6 +97,7 @@ class Growing:
         unseen_since: int,
         now: int,
         most: int,
+        region: Crop | None = None,
     ) -> None:
         self._store, self._now = store, now
         self._longest = longest_of(int(store.shape.counts.sum()))
@@ -105,8 +108,12 @@ class Growing:
         scores, wanted, count, self.removed = [], [], 0, 0
         for records, tree in store.records():
             dead = self._dead(records[: tree.leaves])
-            score = store.layout.split(records[: tree.leaves])["score"].numpy()
-            chosen = np.flatnonzero((score > threshold) & ~dead)
+            leaves = store.layout.split(records[: tree.leaves])
+            score = leaves["score"].numpy()
+            grows = (score > threshold) & ~dead
+            if region is not None:
+                grows &= region.holds(leaves["means"].numpy())
+            chosen = np.flatnonzero(grows)
             scores.append(score[chosen])
             wanted.append(count + chosen)
             count += tree.leaves

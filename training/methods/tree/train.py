@@ -227,6 +227,7 @@ class Method(Refining):
             unseen_since=done + 1 - round(p.unseen_epochs * len(self.data.train)) if p.unseen_epochs else 0,
             now=done + 1,
             most=p.max_splats,
+            region=self.data.region,
         )
         grown = self._new_store(self.store.budget)
         grown.fill_records(growing, lambda: growing.upper)

@@ -18,7 +18,7 @@ import numpy as np
 from ...errors import LodgsError
 from ...files import link_or_copy
 from ..cameras import Camera
-from ..colmap import MASKS, find_models, told
+from ..colmap import DEPTHS, MASKS, find_models, told
 from ..images import image_size
 from ..model import write_model
 from ..photographs import image_folder
@@ -104,7 +104,9 @@ def convert(folder: Path, out: Path | None = None) -> Converted:
         raise LodgsError(f"{path} has no view that can be used.{why}", "Check the photographs beside it.")
     warnings = [*exported.warnings, *told(left_out)]
     points, colors = exported.points, exported.colors
-    if not len(points):
+    if not len(points) and all(view.has_depth for view in views):
+        warnings.append(f"{format_.NAME} tells of no points here: training takes them from the depth maps.")
+    elif not len(points):
         points = random_points([view.camera(str(n)) for n, view in enumerate(views)])
         colors = np.full((len(points), 3), 128, np.uint8)
         warnings.append(
@@ -183,6 +185,9 @@ def _write(scene: Path, views: list[View], points: np.ndarray, colors: np.ndarra
         if view.mask is not None and view.mask.is_file():
             name = view.image.relative_to(images).as_posix()
             link_or_copy(view.mask, scene / MASKS / f"{name}.png")
+        if view.depth is not None and view.has_depth:
+            name = view.image.relative_to(images).as_posix()
+            link_or_copy(view.depth, scene / DEPTHS / f"{name}{view.depth.suffix.lower()}")
     with tempfile.TemporaryDirectory(dir=sparse, prefix=".model-") as work:
         model = Path(work) / "0"
         lenses = [view.lens for view in views]

@@ -28,7 +28,7 @@ def find(folder: Path) -> Path | None:
 
 
 def read(path: Path) -> Exported:
-    """Views; Polycam's points are in depth maps, which are not read.
+    """Views; Polycam's points are in depth maps, of millimetres.
 
     Raises:
         LodgsError: nothing; a camera that cannot be read is left out.
@@ -47,7 +47,8 @@ def read(path: Path) -> Exported:
             )  # fmt: skip
             rows = [[number(told, f"t_{row}{column}") for column in range(4)] for row in range(3)]
             pose = world_to_camera(np.array(rows), opengl=True)
-            views.append(View(find_image(images, file.stem), lens, pose))
+            depth = path.parent / "depth" / f"{file.stem}.png"
+            views.append(View(find_image(images, file.stem), lens, pose, depth=depth))
         except LodgsError as error:
             left_out.append((file.name, error.what))
     return Exported(views, left_out=left_out)

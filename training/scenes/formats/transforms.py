@@ -75,8 +75,9 @@ def _view(folder: Path, told: Mapping[str, Any]) -> View:
     tangential = number(told, "p1", 0), number(told, "p2", 0)
     lens = lens_of(width, height, (fx, fy), center, radial, tangential, fisheye)
     pose = numbers(told.get("transform_matrix"), -1, 4)
-    mask = find_image(folder, told["mask_path"]) if isinstance(told.get("mask_path"), str) else None
-    return View(image, lens, world_to_camera(pose, opengl=True), mask)
+    beside = (told.get(name) for name in ("mask_path", "depth_file_path"))
+    mask, depth = (find_image(folder, name) if isinstance(name, str) else None for name in beside)
+    return View(image, lens, world_to_camera(pose, opengl=True), mask, depth)
 
 
 def _focal(angle: float, size: float) -> float:

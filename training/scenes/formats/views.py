@@ -12,6 +12,7 @@ import numpy as np
 from ...documents import read_json
 from ...errors import LodgsError
 from ..cameras import Camera
+from ..colmap import DEPTH_SUFFIXES
 from ..images import SUFFIXES
 from ..model import Intrinsics, intrinsics
 
@@ -32,12 +33,19 @@ class View:
         lens: as COLMAP has it, for photographs of its size; of no size (0) where the program does not tell.
         world_to_camera: (4, 4), OpenCV axes.
         mask: black where the photograph does not count; None: there is none.
+        depth: a depth map, as ``depths.read_map`` reads it in the scene's unit; None: there is none.
     """
 
     image: Path
     lens: Intrinsics
     world_to_camera: np.ndarray
     mask: Path | None = None
+    depth: Path | None = None
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether there is a depth map of a kind that is read."""
+        return self.depth is not None and self.depth.suffix.lower() in DEPTH_SUFFIXES and self.depth.is_file()
 
     def sized(self, width: int, height: int) -> View:
         """The same with the lens for photographs of that size; focal lengths scale with it."""

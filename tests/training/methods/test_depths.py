@@ -1,0 +1,123 @@
+"""Depth in the loss of every method: its value by hand, its effect, and points where a scene has none."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.training.scenes.depth_walls import FITTED, METRIC, depth_of, put, view, write_walls
+from training.methods import METHODS, create, parameters_of
+from training.methods.data import TrainingData
+from training.rasterize import Gaussians, rasterize
+from training.runs.job import Job
+from training.runs.train import train
+from training.scenes.colmap import read_scene
+from training.scenes.depths import Depths
+from training.scenes.images import write_png
+from training.splats.bundle import read_bundle
+
+
+@pytest.fixture(scope="module")
+def walls(tmp_path_factory):
+    return write_walls(tmp_path_factory.mktemp("walls"))
+
+
+@pytest.fixture(scope="module")
+def scene(walls, tmp_path_factory):
+    return read_scene(put(walls, tmp_path_factory.mktemp("metric"), METRIC["multilayer"]))
+
+
+@pytest.fixture(scope="module")
+def data(scene):
+    return TrainingData(scene, image_scale=0.25, test_every=3, depths=Depths(scene, "metric"))
+
+
+def made(name: str, data: TrainingData, weight: float):
+    return create(name, data, parameters_of(name, "draft", {"depth_weight": weight}), 0, "cpu")
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_method_has_it_in_its_loss(name, data):
+    none, half, whole = (made(name, data, weight).train_step(0)[0] for weight in (0.0, 0.5, 1.0))
+    assert whole - none > 0.01
+    assert half - none == pytest.approx((whole - none) / 2, rel=1e-3)
+
+
+def test_the_loss_by_hand(data):
+    """In float64, from another backend's picture."""
+    method = made("3dgs", data, 0.7)
+    view = method.choose_view(0)
+    drawings = method.draw(view, 0)
+    found = float(method.depth_loss(drawings[0].rendering, view, 0).detach())
+    gaussians = Gaussians(*(tensor.detach().double() for tensor in vars(method.model.gaussians).values()))
+    drawn = rasterize(
+        gaussians, view.camera, near=data.near, outputs=("inverse_depth",), backend="reference"
+    ).inverse_depth
+    camera = data.scene.cameras[[each.name for each in data.scene.cameras].index(view.camera.name)]
+    small = (1 / depth_of(camera.scaled(0.25 / view.shrink))).astype(np.float64)
+    assert drawn is not None and drawn.shape == small.shape
+    expected = 0.7 * data.median_depth * np.abs(drawn.numpy() - small).mean()
+    assert found == pytest.approx(expected, rel=0.02)  # a corner between floor and wall is no plane
+    later = float(method.depth_loss(drawings[0].rendering, view, method.steps).detach())
+    assert later == pytest.approx(found / 100, rel=1e-3)
+
+
+def test_masked_out_and_held_out_depths_do_not_count(scene, data, tmp_path):
+    camera = data.test[0]
+    assert data.photographs.target(camera).inverse_depth is None
+    assert data.target(0).inverse_depth is not None
+    shutil.copytree(scene.folder, tmp_path / "scene")
+    (tmp_path / "scene" / "masks").mkdir()
+    half = np.full((240, 320, 3), 255, np.uint8)
+    half[:, :160] = 0
+    for number in range(6):
+        write_png(tmp_path / "scene" / "masks" / f"{number}.png", half)
+    masked = read_scene(tmp_path / "scene")
+    known = TrainingData(masked, 0.25, 3, depths=Depths(masked, "metric")).target(0).inverse_depth
+    assert known is not None
+    assert known[:, :40].isnan().all() and known[:, 40:].isfinite().all()
+
+
+def without_points(scene: Path) -> None:
+    """Its own copy of the model, without points."""
+    model = scene / "sparse" / "0"
+    there = model.resolve()
+    (scene / "sparse").unlink()
+    shutil.copytree(there, model)
+    (model / "points3D.bin").write_bytes(bytes(8))
+
+
+def depth_error(run: Path) -> float:
+    """Median relative error of the held-out views' depth, where something is drawn."""
+    splats, errors = read_bundle(run / "bundle.ply").levels[-1].splats, []
+    for number in (0, 3):
+        camera = view(number).scaled(0.25)
+        drawn = rasterize(Gaussians.of(splats), camera, near=0.03, outputs=("depth",), backend="cpu")
+        assert drawn.depth is not None
+        truth = depth_of(camera)
+        errors.append(np.abs(drawn.depth.numpy() / truth - 1)[drawn.alpha.numpy() > 0.5])
+    return float(np.median(np.concatenate(errors)))
+
+
+@pytest.mark.slow
+def test_depth_is_better_with_it_and_it_can_begin_without_points(walls, tmp_path, capsys):
+    """On a floor of random squares, from maps whose scale nobody knows; and from maps alone."""
+    found = {}
+    for name, kind, weight in (("off", "inverse", 0.0), ("on", "inverse", 0.3), ("bare", "metric", 0.3)):
+        folder = tmp_path / name
+        folder.mkdir()
+        put(walls, folder, FITTED["inverse"] if kind == "inverse" else METRIC["one layer"])
+        if name == "bare":
+            without_points(folder)
+        keys = {
+            "scene": str(folder), "out": str(tmp_path / f"{name}_run"), "method": "3dgs", "backend": "cpu",
+            "test_every": 3, "image_scale": 0.25,
+            "parameters": {"steps": 150, "max_splats": 3000, "depth": kind, "depth_weight": weight},
+        }  # fmt: skip
+        assert train(Job.from_dict(keys), sys.stdout) == 0
+        found[name] = depth_error(tmp_path / f"{name}_run")
+    assert found["on"] < 0.7 * found["off"] and found["bare"] < 0.7 * found["off"]

@@ -1,0 +1,33 @@
+"""A region that is trained in detail: what it does to every method."""
+
+from __future__ import annotations
+
+import pytest
+
+from training.lod.crop import Crop
+from training.methods import METHODS, create, parameters_of
+from training.methods.data import TrainingData
+from training.scenes.colmap import read_scene
+
+HALF = "box -9 -9 -1.5 0 9 9"  # of what stands around the origin in the tiny scene the half where x < 0
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_outside_nothing_asks_for_more(name, tiny_scene):
+    """Whatever the method counts, from the first step on; inside it does."""
+    region = Crop.from_text(HALF)
+    data = TrainingData(read_scene(tiny_scene), test_every=4, region=region)
+    method = create(name, data, parameters_of(name, "draft", {"free_depth": 0.0}), 0, "cpu")
+    for step in range(30):
+        method.train_step(step)
+        asked = method.model.stats["gradient_sum"].reshape(len(method.model), -1).sum(1).numpy()
+        outside = ~region.holds(method.model["means"].detach().numpy() - [0.3, 0, 0])  # some may wander
+        assert outside.any() and not asked[outside].any()
+    assert asked.any()
+
+
+@pytest.mark.parametrize("name", ["3dgs", "octree"])
+def test_it_resumes_to_the_bit(name, tiny_scene, check_resumed):
+    data = TrainingData(read_scene(tiny_scene), test_every=4, region=Crop.from_text(HALF))
+    parameters = parameters_of(name, "draft", {"steps": 120, "max_splats": 200})
+    check_resumed(lambda: create(name, data, parameters, 0, "cpu"), 77)
