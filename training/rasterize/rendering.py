@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -155,6 +156,38 @@ class Contributions:
     pixels: torch.Tensor
     views: torch.Tensor
     radius: torch.Tensor
+
+
+@dataclass
+class SideOutputs:
+    """What a backend for the CPU's tensors fills in besides what autograd differentiates, see Drawn."""
+
+    radii: torch.Tensor
+    grad2d: torch.Tensor
+    absgrad2d: torch.Tensor | None
+    median: torch.Tensor | None
+    tile_counts: torch.Tensor
+
+    @classmethod
+    def of(cls, count: int, settings: Settings, tile: int) -> SideOutputs:
+        """Those of N splats, to be filled, with tiles of so many pixels a side."""
+        height, width = settings.view.height, settings.view.width
+        return cls(
+            radii=torch.zeros(count),
+            grad2d=torch.zeros(count, 2),
+            absgrad2d=torch.zeros(count, 2) if settings.absolute else None,
+            median=torch.full((height, width), -1, dtype=torch.int32) if settings.median else None,
+            tile_counts=torch.empty(-(-height // tile), -(-width // tile), dtype=torch.int64),
+        )
+
+
+def require_plain(tensors: Iterable[torch.Tensor], backend: str) -> None:
+    """Raises ValueError unless tensors are float32 on the CPU, as a backend by this name takes them."""
+    for tensor in tensors:
+        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
+            raise ValueError(
+                f"the {backend} backend takes float32 on the CPU, not {tensor.dtype} on {tensor.device}"
+            )
 
 
 class Drawn(NamedTuple):

@@ -9,13 +9,13 @@ calls ``torch.set_num_threads(1)``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
 
 from ..gaussians import Gaussians
-from ..rendering import Drawn, Settings, Target, View
+from ..rendering import Drawn, Settings, SideOutputs, Target, View, require_plain
 from .bin import TILE, Pairs, bin_splats
 from .blend import blend_backward, blend_backward_absolute, blend_forward, blend_median, blend_weights
 from .compile import Buffers, f32, in_parallel, serialised
@@ -49,18 +49,8 @@ def rasterize(
     view, limit, count = settings.view, settings.limit, len(gaussians)
     weights = torch.ones(0) if weights is None else weights
     tensors = *vars(gaussians).values(), weights, features
-    for tensor in tensors:
-        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
-            raise ValueError(
-                f"the cpu backend takes float32 on the CPU, not {tensor.dtype} on {tensor.device}"
-            )
-    side = _SideOutputs(
-        radii=torch.zeros(count),
-        grad2d=torch.zeros(count, 2),
-        absgrad2d=torch.zeros(count, 2) if settings.absolute else None,
-        median=torch.full((view.height, view.width), -1, dtype=torch.int32) if settings.median else None,
-        tile_counts=torch.empty(-(-view.height // TILE), -(-view.width // TILE), dtype=torch.int64),
-    )
+    require_plain(tensors, "cpu")
+    side = SideOutputs.of(count, settings, TILE)
     if limit is not None:  # the kernels know no infinity
         limit = limit.to(torch.float32).clamp_max(torch.finfo(torch.float32).max).contiguous()
     behind, most = np.array(settings.background, np.float32), None if limit is None else limit.numpy()
@@ -83,17 +73,6 @@ def _of_kernels(settings: Settings) -> tuple:
     size = view.width, view.height
     antialias = np.atleast_1d(np.asarray(settings.antialias))  # one for all, or one for each
     return *lens_of(view), *size, settings.degree, f32(settings.min_scale), antialias
-
-
-@dataclass
-class _SideOutputs:
-    """What a rendering has besides what autograd differentiates; see ``rendering.Drawn``."""
-
-    radii: torch.Tensor
-    grad2d: torch.Tensor
-    absgrad2d: torch.Tensor | None
-    median: torch.Tensor | None
-    tile_counts: torch.Tensor
 
 
 def _project_and_bin(

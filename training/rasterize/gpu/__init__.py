@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from ..gaussians import Gaussians
-from ..rendering import Drawn, Settings, Target, View
+from ..rendering import Drawn, Settings, SideOutputs, Target, View, require_plain
 from .bin import TILE, Pairs, bin_splats, groups_of
 from .choice import open_chosen
 from .device import Buffer, Device
@@ -41,21 +41,11 @@ def rasterize(
     Raises:
         LodgsError: there is no device, it was lost, or has too little memory.
     """
-    view, count = settings.view, len(gaussians)
+    count = len(gaussians)
     weights = torch.ones(0) if weights is None else weights
     tensors = *vars(gaussians).values(), weights, features
-    for tensor in tensors:
-        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
-            raise ValueError(
-                f"the gpu backend takes float32 on the CPU, not {tensor.dtype} on {tensor.device}"
-            )
-    side = _SideOutputs(
-        radii=torch.zeros(count),
-        grad2d=torch.zeros(count, 2),
-        absgrad2d=torch.zeros(count, 2) if settings.absolute else None,
-        median=torch.empty(view.height, view.width, dtype=torch.int32) if settings.median else None,
-        tile_counts=torch.empty(-(-view.height // TILE), -(-view.width // TILE), dtype=torch.int64),
-    )
+    require_plain(tensors, "gpu")
+    side = SideOutputs.of(count, settings, TILE)
     image, alpha, blended = _Rasterize.apply(*tensors, settings, side)  # type: ignore[misc]
     return Drawn(
         image, alpha, side.radii, side.grad2d, side.tile_counts, side.absgrad2d, blended, side.median
@@ -89,17 +79,6 @@ def contributions(
 def photometric_loss(image: torch.Tensor, target: Target, ssim_weight: float) -> torch.Tensor:
     """See :func:`training.rasterize.photometric_loss`."""
     return _Photometric.apply(image, target, ssim_weight)  # type: ignore[no-any-return]
-
-
-@dataclass
-class _SideOutputs:
-    """What a rendering has besides what autograd differentiates; see ``rendering.Drawn``."""
-
-    radii: torch.Tensor
-    grad2d: torch.Tensor
-    absgrad2d: torch.Tensor | None
-    median: torch.Tensor | None
-    tile_counts: torch.Tensor
 
 
 @dataclass
