@@ -167,7 +167,8 @@ def scale_and_shift(values: np.ndarray, z: np.ndarray, depth: bool) -> tuple[flo
 
 
 def with_points(scene: Scene) -> Scene:
-    """A scene of few points with such as its metric depth maps show, even in space and coloured.
+    """A scene of few points with such as its metric depth maps show, even in space and coloured; with none
+    of them where the maps are not those of the points that there are.
 
     Raises:
         LodgsError: a map or a photograph cannot be read.
@@ -175,6 +176,9 @@ def with_points(scene: Scene) -> Scene:
     views = [camera for camera in scene.cameras if camera.depth is not None]
     if len(scene.points) >= FEW_POINTS or not views:
         return scene
+    depths = Depths(scene, "metric")
+    if not depths:
+        return replace(scene, warnings=[*scene.warnings, *depths.warnings])
 
     def shown() -> Iterator[tuple[Camera, np.ndarray, np.ndarray]]:
         for camera in views:

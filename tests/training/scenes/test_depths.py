@@ -73,6 +73,8 @@ def test_maps_in_another_unit_are_not_used(walls, tmp_path):
     depths = Depths(scene, "metric")
     assert not depths and depths.inverse(scene.cameras[0]) is None
     assert len(depths.warnings) == 1 and "times as large" in depths.warnings[0]
+    begun = with_points(scene)
+    assert begun.points is scene.points and begun.warnings == scene.warnings + depths.warnings
 
 
 def test_maps_that_fit_no_points_are_not_used(walls, tmp_path):
