@@ -34,15 +34,24 @@ def cutting(root: bpy.types.Object) -> list[bpy.types.Object]:
     return [obj for obj in crops_of(root) if obj.lodgs_crop.keep != "ALL"]
 
 
-def new_crop(root: bpy.types.Object, shape: str, matrix: Matrix) -> bpy.types.Object:
+def new_crop(root: bpy.types.Object, shape: str, matrix: Matrix, keep: str = "INSIDE") -> bpy.types.Object:
     """A crop where a matrix of the world puts the box from -1 to 1, or the sphere of radius 1."""
-    obj = bpy.data.objects.new(f"Crop {shape.title()}", None)
+    name = "Region" if keep == "ALL" else "Crop"
+    obj = bpy.data.objects.new(f"{name} {shape.title()}", None)
     obj.empty_display_type, obj.empty_display_size = DRAWN_AS[shape], 1.0
     obj.show_in_front = obj.lodgs_crop.is_crop = True
+    obj.lodgs_crop.keep = keep
     obj.parent = root
     obj.matrix_basis = root.matrix_world.inverted_safe() @ matrix
     root.users_collection[0].objects.link(obj)
     return obj
+
+
+def as_object(root: bpy.types.Object, region: Crop) -> bpy.types.Object:
+    """The object of a job's region, which is in the splats' own space."""
+    bpy.context.view_layer.update()
+    to_own = Matrix((*region.to_own, (0.0, 0.0, 0.0, 1.0)))
+    return new_crop(root, region.shape, axes_of(root).matrix_world @ to_own.inverted_safe(), "ALL")
 
 
 def as_objects_stand(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> tuple[Crop, ...]:

@@ -51,10 +51,7 @@ def add_crop(
     half = (high - low) / (2 if keep == "INSIDE" else 6)
     if shape == "SPHERE":
         half[:] = half.max()
-    obj = crops.new_crop(root, shape, Matrix.LocRotScale((low + high) / 2, None, half))
-    obj.lodgs_crop.keep = keep
-    if keep == "ALL":
-        obj.name = f"Region {shape.title()}"
+    obj = crops.new_crop(root, shape, Matrix.LocRotScale((low + high) / 2, None, half), keep)
     for other in context.selected_objects:
         other.select_set(False)
     obj.select_set(True)

@@ -385,8 +385,10 @@ def _as_typed(value):
 
 def show(settings: TrainingSettings, job: Job) -> None:
     """Set the panel to what a job says, as far as the panel offers it."""
-    for name in {field.name for field in fields(Job)}.intersection(settings.bl_rna.properties.keys()):
+    alike = {field.name for field in fields(Job)} - {"region"}
+    for name in alike.intersection(settings.bl_rna.properties.keys()):
         setattr(settings, name, getattr(job, name))
+    settings.region = crops.as_object(settings.id_data, job.crop) if job.crop else None
     settings.start_from = "FILE" if job.base else "POINTS"
     settings.columns, settings.rows = job.grid if job.cells else (1, 1)
     preset, own = method_info(job.method).preset(job.preset), job.resolved_parameters()

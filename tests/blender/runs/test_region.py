@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,19 @@ def test_what_lies_in_the_box_is_what_the_job_says(bpy, lodgs, root, tmp_path):
     (tmp_path / "run").mkdir()
     job.write(tmp_path / "run" / "job.toml")
     assert again.from_file(tmp_path / "run" / "job.toml").crop == job.crop
+
+
+@pytest.mark.parametrize("region", ["box -1 0 2 1 2 3", "sphere 1 2 3 0.5"])
+def test_the_panel_shows_a_jobs_region(bpy, lodgs, root, tmp_path, region):
+    """As ``blender --command lodgs train --region`` leaves it in the .blend."""
+    job, settings = replace(job_of(lodgs, root, tmp_path), region=region), root.lodgs.training
+    lodgs("runs.jobs").show(settings, job)
+    bpy.context.view_layer.update()
+    found = job_of(lodgs, root, tmp_path).crop
+    assert found.shape == job.crop.shape and settings.region.name.startswith("Region")
+    np.testing.assert_allclose(found.to_own, job.crop.to_own, atol=1e-4)
+    lodgs("runs.jobs").show(settings, replace(job, region=""))
+    assert settings.region is None
 
 
 def test_one_that_is_gone_or_anothers_is_none(bpy, lodgs, root, tmp_path):
