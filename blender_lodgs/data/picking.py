@@ -22,6 +22,7 @@ def scene_at(
     clip: Matrix,
     size: tuple[int, int],
     at: tuple[float, float],
+    before: float = 1.0,
 ) -> bpy.types.Object | None:
     """The root of the splats that are seen at a pixel, or their object where they are in no scene.
 
@@ -32,6 +33,7 @@ def scene_at(
         clip: from the world to clip space.
         size: the viewport's (W, H) in pixels.
         at: the pixel, x from the left and y from below.
+        before: depth in clip space of what hides the splats behind it there.
 
     Returns:
         None where no splats are, or not enough of them to hide half of what is behind.
@@ -43,6 +45,7 @@ def scene_at(
     depths, alphas = (np.concatenate(each) for each in zip(*found, strict=True))
     owners = np.repeat(np.arange(len(found)), [len(each) for each, _ in found])
     order = np.argsort(depths)
+    order = order[depths[order] < before]
     hidden = np.cumprod(1 - alphas[order]) <= DIM
     if not hidden.any():
         return None
