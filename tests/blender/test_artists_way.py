@@ -256,7 +256,9 @@ class Way:
             if name.startswith("web") and not streams:
                 continue
             before = set(self.bpy.data.objects)
-            assert self.bpy.ops.lodgs.import_splats(filepath=str(self.folder / name)) == {"FINISHED"}
+            upright = name == "out.ply"  # which tells how its scene stands; other files cannot
+            done = self.bpy.ops.lodgs.import_splats(filepath=str(self.folder / name), upright=upright)
+            assert done == {"FINISHED"}
             (root,) = [obj for obj in self.bpy.data.objects if obj.lodgs.is_root and obj not in before]
             self.bpy.context.view_layer.update()
             for item, number in zip(root.lodgs.levels, numbers, strict=True):
