@@ -29,9 +29,10 @@ problem = ""
 """What went wrong when a viewport was drawn last; empty where nothing did."""
 
 
-def draws_splats(scene: bpy.types.Scene) -> bool:
-    """Whether viewports draw a Blender scene's splats as Gaussians, by our own shaders."""
-    return scene.lodgs_viewport.splats and not compat.NATIVE_SPLATS
+def draws_splats(scene: bpy.types.Scene, viewport: bpy.types.SpaceView3D) -> bool:
+    """Whether a viewport draws a Blender scene's splats as Gaussians, by our own shaders."""
+    wanted = scene.lodgs_viewport.splats and viewport.shading.type != "WIREFRAME"
+    return wanted and not compat.NATIVE_SPLATS
 
 
 def _draw() -> None:
@@ -52,7 +53,7 @@ def _draw() -> None:
 
 def _draw_view(context: bpy.types.Context) -> None:
     space, region, view = context.space_data, context.region, context.region_data
-    with_splats = draws_splats(context.scene) and space.shading.type != "WIREFRAME"
+    with_splats = draws_splats(context.scene, space)
     eye.on_draw(region, context.scene, view, splats=with_splats)
     if space.shading.type == "SOLID" and space.shading.color_type not in {"OBJECT", "RANDOM", "SINGLE"}:
         points = [

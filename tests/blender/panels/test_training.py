@@ -33,7 +33,7 @@ def watch(lodgs, root, tmp_path):
 
 def test_before_training(root, draw, fake):
     notes = draw()
-    assert (notes.operators, notes.buttons) == (["lodgs.train"], [""])
+    assert (notes.operators, notes.buttons) == (["lodgs.train"], ["Train"])
     assert notes.properties == ["method", "preset", "image_scale"]
     assert "3,762 steps in 5 levels" in notes.texts
     assert NONE_HELD_OUT in notes.texts
