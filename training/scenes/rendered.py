@@ -9,16 +9,17 @@ folder/  images/view_0001.png   the picture, as photographs are
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import LodgsError
-from .cameras import FARTHEST, read_views
+from .cameras import FARTHEST, Camera, read_views
 from .exr import read_parts
 from .images import load_image
+from .visibility import visible_in
 
 IMAGES, DEPTHS, CAMERAS = "images", "depths", "cameras"
 """The folders of what was drawn."""
@@ -83,6 +84,29 @@ def write_model(folder: Path, most: int = POINTS, tell: Tell = lambda number, co
     finally:
         shutil.rmtree(beside, ignore_errors=True)
     return len(views), count
+
+
+def coverage(
+    views: Sequence[Camera], depths: Sequence[np.ndarray], most: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places (N, 3) on what V views show, at most so many, and how many views see each, (N,) from 1 on.
+
+    Args:
+        depths: (H, W) of each view along its z axis; its grid may be another one than the camera's.
+            0 where there is nothing.
+    """
+    found, away = [np.zeros((0, 3))], [np.zeros(0)]
+    for view, depth in zip(views, depths, strict=True):
+        y, x = np.nonzero(depth)
+        pixels = (np.column_stack([x, y]) + 0.5) * (view.width / depth.shape[1])
+        found.append(view.unproject(pixels, depth[y, x]))
+        away.append(depth[y, x])
+    points, distances = np.concatenate(found), np.concatenate(away)
+    points = points[spread(points, distances, most, np.random.default_rng(0))]
+    counts = np.zeros(len(points), np.int64)
+    for view, depth in zip(views, depths, strict=True):
+        counts += visible_in(depth, view, points)[1]
+    return points[counts > 0], counts[counts > 0]
 
 
 def read_depth(file: Path) -> np.ndarray:
