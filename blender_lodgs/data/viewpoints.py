@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import bpy
 import numpy as np
+from mathutils import Matrix
 
 from ...training.errors import LodgsError
 from ...training.runs.job import VIEW_WIDTHS, VIEWS, Job
@@ -26,7 +27,8 @@ UP, LOWEST = (0.0, 0.0, 1.0), 0.0
 """What is up in a Blender scene, and the sine of the elevation at which a dome begins there: things stand on
 the ground."""
 CLIP_START = 0.1
-"""Of cameras along a curve in a Blender scene, in its units: what Blender gives to every new camera."""
+"""Of cameras along a curve in a Blender scene, in its units: what Blender gives to every new camera. A quarter of
+how far they are apart where that is less."""
 _SOLID = {"MESH", "CURVE", "SURFACE", "FONT", "META", "VOLUME", "POINTCLOUD", "CURVES"}
 
 Shot = bpy.types.Object | int | tuple[Camera, float]
@@ -199,7 +201,10 @@ def placed_in_scene(
         case "GRID":
             return above(_corners(context), settings.views, width, height, settings.height)
         case "CURVE":
-            return along(_way(settings.curve), np.array(UP), settings.views, width, height), CLIP_START
+            way = _way(settings.curve)
+            apart = float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()) / settings.views
+            views = along(way, np.array(UP), settings.views, width, height)
+            return views, min(CLIP_START, apart / 4)
     return [], 0.0
 
 
@@ -219,18 +224,37 @@ def _corners(context: bpy.types.Context) -> np.ndarray:
     Raises:
         LodgsError: there is nothing.
     """
-    depsgraph, corners = context.evaluated_depsgraph_get(), []
-    solid = [obj for obj in context.view_layer.objects if obj.type in _SOLID and not obj.hide_render]
-    solid = [obj for obj in solid if root_of(obj) is None]
-    for obj in [obj for obj in solid if obj.select_get()] or solid:
-        matrix = np.array(obj.evaluated_get(depsgraph).matrix_world)
-        box = np.array(obj.evaluated_get(depsgraph).bound_box, np.float64)
-        corners.append(box @ matrix[:3, :3].T + matrix[:3, 3])
+    depsgraph = context.evaluated_depsgraph_get()
+    seen = [obj for obj in context.view_layer.objects if root_of(obj) is None]
+    chosen = [obj for obj in seen if obj.select_get()]
+    corners = list(_boxes(chosen, depsgraph)) or list(_boxes(seen, depsgraph))
     if not corners:
         raise LodgsError(
             "The Blender scene holds nothing to look at.", "Add something, or choose other views."
         )
     return np.concatenate(corners)
+
+
+def _boxes(
+    objects: Iterable[bpy.types.Object], depsgraph: bpy.types.Depsgraph, placed: Matrix | None = None
+) -> Iterator[np.ndarray]:
+    """Corners (8, 3) of each of some objects that render, and of what collections' instances show.
+
+    Args:
+        placed: how they are moved as a whole.
+    """
+    for obj in objects:
+        if obj.hide_render:
+            continue
+        shown = obj.evaluated_get(depsgraph)
+        matrix = placed @ shown.matrix_world if placed else shown.matrix_world
+        if obj.type in _SOLID:
+            turned = np.array(matrix)
+            yield np.array(shown.bound_box, np.float64) @ turned[:3, :3].T + turned[:3, 3]
+        if obj.instance_type == "COLLECTION" and obj.instance_collection is not None:
+            collection = obj.instance_collection
+            moved = matrix @ Matrix.Translation(-collection.instance_offset)
+            yield from _boxes(collection.all_objects, depsgraph, moved)
 
 
 def placed_of(root: bpy.types.Object) -> list[Camera]:

@@ -56,6 +56,8 @@ def render_views(
     there = {file.stem for file in (folder / CAMERAS).glob("*.json")}
     if there - set(names):
         raise _others(folder)
+    if not there and any((folder / kind).exists() for kind in ("sparse", CAMERAS, IMAGES, DEPTHS)):
+        raise LodgsError(f"{folder} holds another scene.", "Choose another folder.")
     _prepare(context.scene, width, height)
     first, last = only or (1, len(shots))
     for number in range(first, min(last, len(shots)) + 1):
