@@ -27,7 +27,7 @@ UP, LOWEST = (0.0, 0.0, 1.0), 0.0
 """What is up in a Blender scene, and the sine of the elevation at which a dome begins there: things stand on
 the ground."""
 CLIP_START = 0.1
-"""Of cameras along a curve in a Blender scene, in its units: what Blender gives to every new camera. A quarter of
+"""Of cameras along a curve in a Blender scene, in its units: as Blender gives to new cameras; a quarter of
 how far they are apart where that is less."""
 _SOLID = {"MESH", "CURVE", "SURFACE", "FONT", "META", "VOLUME", "POINTCLOUD", "CURVES"}
 
