@@ -92,7 +92,7 @@ def draw(scene: bpy.types.Scene) -> None:
     measured = current(scene)
     if measured is None:
         return
-    colors = np.float32(COLORS)[np.minimum(measured.counts, ENOUGH) - 1]
+    colors = np.asarray(COLORS, np.float32)[np.minimum(measured.counts, ENOUGH) - 1]
     content = {"pos": measured.points.astype(np.float32), "color": colors}
     shader = gpu.shader.from_builtin("POINT_FLAT_COLOR")
     batch = batch_for_shader(shader, "POINTS", content)
