@@ -111,6 +111,7 @@ def _parser() -> argparse.ArgumentParser:
     capture.add_argument("--out", type=Path, required=True, help="folder that becomes the COLMAP scene")
     where = capture.add_mutually_exclusive_group()
     where.add_argument("--around", action="store_true", help="views around what is selected, or all")
+    where.add_argument("--above", action="store_true", help="a grid above what is selected, or all")
     where.add_argument("--cameras", action="store_true", help="every camera of the scene")
     where.add_argument("--animation", action="store_true", help="frames of the scene's camera")
     where.add_argument("--curve", metavar="NAME", help="a walk along a curve")
@@ -220,9 +221,9 @@ def _capture(args: argparse.Namespace) -> int:
     _open(args.blend)
     scene = bpy.context.scene
     settings = scene.lodgs_capture
-    for name in ("around", "cameras", "animation", "curve"):
+    for name in ("around", "above", "cameras", "animation", "curve"):
         if getattr(args, name):
-            settings.views_from = {"around": "DOME"}.get(name, name.upper())
+            settings.views_from = {"around": "DOME", "above": "GRID"}.get(name, name.upper())
     if args.curve:
         settings.curve = bpy.data.objects.get(args.curve)
         if settings.curve is None or settings.curve.type != "CURVE":

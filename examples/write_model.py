@@ -20,7 +20,8 @@ import pycolmap
 from PIL import Image
 
 from training.scenes.cameras import Camera, write_camera
-from training.scenes.write_colmap import thinned, visible_in, write_colmap
+from training.scenes.visibility import visible_in
+from training.scenes.write_colmap import thinned, write_colmap
 
 from . import rig
 

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import time
 import traceback
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
 
 import bpy
@@ -58,17 +58,18 @@ def press(operator: str, way: str = "", **settings) -> None:
     part = next(part for part in area.regions if part.type == "WINDOW")
     with bpy.context.temp_override(window=window, area=area, region=part):
         way = way or ("EXEC_DEFAULT" if group == "lodgs" else "INVOKE_DEFAULT")
-        getattr(getattr(bpy.ops, group), name)(way, **settings)
+        getattr(getattr(bpy.ops, group), name)(way, True, **settings)  # True: undoable, as by hand
 
 
 def open_panels(*names: str) -> None:
     """Panels of these modules that begin closed begin open here: the pictures are to show them."""
     for module_ in map(module, names):
-        for panel in module_.CLASSES:
-            if "DEFAULT_CLOSED" in getattr(panel, "bl_options", ()):
-                bpy.utils.unregister_class(panel)
-                panel.bl_options = set()
-                bpy.utils.register_class(panel)
+        panels = [cls for cls in module_.CLASSES if issubclass(cls, bpy.types.Panel)]
+        for panel in reversed(panels):  # a panel's own before it
+            bpy.utils.unregister_class(panel)
+        for panel in panels:
+            panel.bl_options = set(getattr(panel, "bl_options", ())) - {"DEFAULT_CLOSED"}
+            bpy.utils.register_class(panel)
 
 
 def scroll(times: int) -> None:
@@ -86,6 +87,43 @@ def look_at(place: Vector, back: float) -> None:
     """Look at a place in the world from some way off, in the direction in which one looks already."""
     looks = viewport()[1]
     looks.view_location, looks.view_distance = place, back
+
+
+def look_from(eye: Vector, target: Vector) -> None:
+    """Look from one place in the world at another."""
+    looks = viewport()[1]
+    looks.view_perspective, looks.view_rotation = "PERSP", (eye - target).to_track_quat("Z", "Y")
+    looks.view_location, looks.view_distance = target, (eye - target).length
+
+
+def click_at(x: int, y: int) -> Steps:
+    """Click with the left button at a pixel of the window."""
+    yield from drag([(x, y)])
+    yield from settle()
+
+
+def drag(pixels: Sequence[Sequence[int]]) -> Steps:
+    """Press the left button at the first of some pixels of the window, and release it at the last."""
+    window = bpy.context.window_manager.windows[0]
+    for number, (x, y) in enumerate(pixels):
+        window.event_simulate(type="MOUSEMOVE", value="NOTHING", x=int(x), y=int(y))
+        yield 0.3
+        if not number:
+            window.event_simulate(type="LEFTMOUSE", value="PRESS", x=int(x), y=int(y))
+            yield 0.1
+    window.event_simulate(type="LEFTMOUSE", value="RELEASE", x=int(x), y=int(y))
+    yield 0.3
+
+
+def type_in(text: str) -> Steps:
+    """Type letters, Return or Escape."""
+    window = bpy.context.window_manager.windows[0]
+    for letter in text:
+        key = {"\r": "RET", "\x1b": "ESC"}.get(letter, letter.upper())
+        for value in ("PRESS", "RELEASE"):
+            known = {"unicode": letter} if letter.isalpha() and value == "PRESS" else {}
+            window.event_simulate(type=key, value=value, **known)
+        yield 0.2
 
 
 def leave_camera() -> None:
@@ -132,12 +170,13 @@ def press_f12(seconds: float) -> Generator[float, None, str]:
 taken: list[str] = []
 
 
-def take(name: str, fact: str = "") -> np.ndarray:
-    """Photograph the screen; return the picture as (H, W, 3) float32 with rows from the top."""
+def take(name: str, fact: str = "", redrawn: bool = True) -> np.ndarray:
+    """Photograph the screen, drawn anew or as it is; return it as (H, W, 3) float32, rows from the top."""
     taken.append(name)
     title = f"{len(taken):02}-{name}"
     path = OUT / f"{title}.png"
-    redraw()
+    if redrawn:
+        redraw()
     subprocess.run([*PLAN["camera"], str(path)], check=True)
     say(f"{title}: {fact}" if fact else title)
     return pixels(path)
@@ -153,11 +192,15 @@ def pixels(path: Path) -> np.ndarray:
     return values.reshape(height, width, 4)[::-1, :, :3]
 
 
-def changed(before: np.ndarray, after: np.ndarray, by: float = 0.1) -> float:
-    """The share of the viewport's pixels that differ by more than this between two pictures of the screen."""
-    part = region()
-    top = before.shape[0] - part.y - part.height
-    clear = slice(top, top + part.height), slice(part.x, part.x + part.width)
+def changed(before: np.ndarray, after: np.ndarray, by: float = 0.1, part: str = "WINDOW") -> float:
+    """The share of the viewport's pixels, or of the status bar's, that differ by more than this between two
+    pictures of the screen."""
+    if part == "STATUSBAR":
+        clear = slice(before.shape[0] - 20, None), slice(None)
+    else:
+        seen = region(part)
+        top = before.shape[0] - seen.y - seen.height
+        clear = slice(top, top + seen.height), slice(seen.x, seen.x + seen.width)
     return float((np.abs(before[clear] - after[clear]).max(axis=2) > by).mean())
 
 

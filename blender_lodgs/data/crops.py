@@ -1,4 +1,4 @@
-"""Crops of a splat scene: empties under its root that say what is left of every level, before any rule.
+"""Crops of a splat scene: empties under its axes that say what is left of every level, before any rule.
 
 A crop is a box (an empty drawn as a cube) or a sphere, edited as any object: moved, turned, scaled, animated,
 copied, deleted. Every level has one modifier (``nodes.crops``) that follows them all and drops hidden points,
@@ -41,7 +41,8 @@ def new_crop(root: bpy.types.Object, shape: str, matrix: Matrix, keep: str = "IN
     obj.empty_display_type, obj.empty_display_size = DRAWN_AS[shape], 1.0
     obj.show_in_front = obj.lodgs_crop.is_crop = True
     obj.lodgs_crop.keep = keep
-    obj.parent = root
+    obj.parent = axes = axes_of(root)  # it goes along where the scene is laid on its ground, or grows
+    obj.matrix_parent_inverse = axes.matrix_world.inverted_safe() @ root.matrix_world
     obj.matrix_basis = root.matrix_world.inverted_safe() @ matrix
     root.users_collection[0].objects.link(obj)
     return obj

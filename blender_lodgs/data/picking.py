@@ -24,6 +24,7 @@ def scene_at(
     projection: Matrix,
     size: tuple[int, int],
     at: tuple[float, float],
+    before: float = np.inf,
 ) -> bpy.types.Object | None:
     """The root of the splats that are seen at a pixel, or their object where they are in no scene.
 
@@ -34,6 +35,7 @@ def scene_at(
         view, projection: from the world to the camera's space, and on to clip space.
         size: the viewport's (W, H) in pixels.
         at: the pixel, x from the left and y from below.
+        before: depth in the world of what hides the splats behind it there.
 
     Returns:
         None where no splats are, or not enough of them to hide half of what is behind.
@@ -45,6 +47,7 @@ def scene_at(
     depths, alphas = (np.concatenate(each) for each in zip(*found, strict=True))
     owners = np.repeat(np.arange(len(found)), [len(each) for each, _ in found])
     order = np.argsort(depths)
+    order = order[depths[order] < before]
     hidden = np.cumprod(1 - alphas[order]) <= DIM
     if not hidden.any():
         return None

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
 
 import bpy
 import numpy as np
+from mathutils import Matrix
 
 from ...training.errors import LodgsError
 from ...training.runs.job import VIEW_WIDTHS, VIEWS, Job
 from ...training.scenes.cameras import Camera
-from ...training.scenes.viewpoints import DOMES, NEAR, OPAQUE, along, dome_around, walk
+from ...training.scenes.viewpoints import DOMES, NEAR, OPAQUE, above, along, dome_around, opaque, walk
 from ...training.splats.gaussians import Splats
 from .. import attributes
 from . import changes
@@ -25,15 +27,16 @@ UP, LOWEST = (0.0, 0.0, 1.0), 0.0
 """What is up in a Blender scene, and the sine of the elevation at which a dome begins there: things stand on
 the ground."""
 CLIP_START = 0.1
-"""Of cameras along a curve in a Blender scene, in its units: what Blender gives to every new camera."""
+"""Of cameras along a curve in a Blender scene, in its units: as Blender gives to new cameras; a quarter of
+how far they are apart where that is less."""
 _SOLID = {"MESH", "CURVE", "SURFACE", "FONT", "META", "VOLUME", "POINTCLOUD", "CURVES"}
 
 Shot = bpy.types.Object | int | tuple[Camera, float]
 """From where a picture of a Blender scene is rendered: a camera of it, the frame in which its camera looks,
 or a view that is placed in its world, with its near depth."""
 
-_domes: dict[tuple, tuple[list[Camera], tuple[float, float]]] = {}
-"""The last one, by what it depends on."""
+_kept: dict[str, tuple[tuple, Any]] = {}
+"""What viewports ask for at every redraw, with what it depends on: the last of each kind."""
 
 
 def _is_curve(settings: bpy.types.PropertyGroup, obj: bpy.types.Object) -> bool:
@@ -52,6 +55,12 @@ class ViewsSettings:
                 "All Around",
                 "A dome of views around the splats, or around what is selected of a Blender scene: for a "
                 "thing that is seen from outside",
+            ),
+            (
+                "GRID",
+                "Above",
+                "A grid of views above the splats, or above what is selected of a Blender scene, that look "
+                "straight down and from four sides in turn, as a drone does: for grounds and towns",
             ),
             ("CAMERAS", "Cameras", "Every camera of the Blender scene"),
             ("ANIMATION", "Animation", "The scene's camera in frames that are evenly chosen from its range"),
@@ -74,6 +83,14 @@ class ViewsSettings:
         min=VIEW_WIDTHS[0],
         max=VIEW_WIDTHS[1],
         subtype="PIXEL",
+    )
+    height: bpy.props.FloatProperty(
+        name="Height",
+        description="How far views are above the top of what they show; at 0, twice as far as they are apart",
+        default=0.0,
+        min=0.0,
+        soft_max=1000.0,
+        subtype="DISTANCE",
     )
     curve: bpy.props.PointerProperty(
         name="Curve",
@@ -119,6 +136,9 @@ def placed(context: bpy.types.Context, root: bpy.types.Object, splats: Splats) -
             way = _way(settings.curve) @ into[:3, :3].T + into[:3, 3]
             views, near = walk(splats, way, into[:3, 2], settings.views, width, height)
             return [(view, near) for view in views]
+        case "GRID":
+            views, near = _above(root, opaque(splats), settings, width, height)
+            return [(view, near) for view in views]
     return []
 
 
@@ -133,24 +153,59 @@ def of_scene(context: bpy.types.Context, width: int, height: int) -> list[Shot]:
     match settings.views_from:
         case "CAMERAS":
             cameras = _enough([obj for obj in _cameras(scene) if root_of(obj) is None])
-            depsgraph = context.evaluated_depsgraph_get()
-            for camera in cameras:
-                view_of(camera.evaluated_get(depsgraph), depsgraph, width, height)
+            _seen(context, cameras, width, height)
             return list(cameras)
         case "ANIMATION":
             frames = _frames(scene, settings.views)
-            some = frames[0], frames[len(frames) // 2], frames[-1]
-
-            def see(depsgraph: bpy.types.Depsgraph) -> tuple[Camera, float]:
-                return view_of(scene_camera(scene).evaluated_get(depsgraph), depsgraph, width, height)
-
-            _animated(context, some, see)
+            _seen(context, [frames[0], frames[len(frames) // 2], frames[-1]], width, height)
             return list(frames)
-        case "CURVE":
-            views = along(_way(settings.curve), np.array(UP), settings.views, width, height)
-            return [(view, CLIP_START) for view in views]
-    views, near = dome_of_scene(context, width, height)
+    views, near = placed_in_scene(context, width, height)
     return [(view, near) for view in views]
+
+
+def seen_from(context: bpy.types.Context, width: int, height: int) -> list[tuple[Camera, float]]:
+    """What will be seen in each of the shots of :func:`of_scene`, in Blender's world, and its near depth.
+
+    Raises:
+        LodgsError: as there.
+    """
+    return _seen(context, of_scene(context, width, height), width, height)
+
+
+def _seen(
+    context: bpy.types.Context, shots: Sequence[Shot], width: int, height: int
+) -> list[tuple[Camera, float]]:
+    def see(depsgraph: bpy.types.Depsgraph, camera: bpy.types.Object) -> tuple[Camera, float]:
+        return view_of(camera.evaluated_get(depsgraph), depsgraph, width, height)
+
+    scene, frames = context.scene, [shot for shot in shots if isinstance(shot, int)]
+    if frames:
+        return _animated(context, frames, lambda depsgraph: see(depsgraph, scene_camera(scene)))
+    depsgraph = context.evaluated_depsgraph_get()
+    return [shot if isinstance(shot, tuple) else see(depsgraph, shot) for shot in shots]
+
+
+def placed_in_scene(
+    context: bpy.types.Context, width: int = 3, height: int = 2
+) -> tuple[list[Camera], float]:
+    """The views that are placed in a Blender scene, and their near depth: all around or above what is
+    selected, or all of it, or along a curve. None where its own cameras are taken.
+
+    Raises:
+        LodgsError: there is nothing to look at, or no way to walk.
+    """
+    settings = context.scene.lodgs_capture
+    match settings.views_from:
+        case "DOME":
+            return dome_around(_corners(context), settings.views, width, height, UP, LOWEST)
+        case "GRID":
+            return above(_corners(context), settings.views, width, height, settings.height)
+        case "CURVE":
+            way = _way(settings.curve)
+            apart = float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()) / settings.views
+            views = along(way, np.array(UP), settings.views, width, height)
+            return views, min(CLIP_START, apart / 4)
+    return [], 0.0
 
 
 def count_of_scene(scene: bpy.types.Scene) -> int:
@@ -163,24 +218,63 @@ def count_of_scene(scene: bpy.types.Scene) -> int:
     return scene.lodgs_capture.views
 
 
-def dome_of_scene(context: bpy.types.Context, width: int = 3, height: int = 2) -> tuple[list[Camera], float]:
-    """The dome around what is selected of a Blender scene, or around all of it, and its near depth.
+def _corners(context: bpy.types.Context) -> np.ndarray:
+    """Corners (8 N, 3) of the boxes of what is selected of a Blender scene, or of all that renders of it.
 
     Raises:
         LodgsError: there is nothing.
     """
-    depsgraph, corners = context.evaluated_depsgraph_get(), []
-    solid = [obj for obj in context.view_layer.objects if obj.type in _SOLID and not obj.hide_render]
-    solid = [obj for obj in solid if root_of(obj) is None]
-    for obj in [obj for obj in solid if obj.select_get()] or solid:
-        matrix = np.array(obj.evaluated_get(depsgraph).matrix_world)
-        box = np.array(obj.evaluated_get(depsgraph).bound_box, np.float64)
-        corners.append(box @ matrix[:3, :3].T + matrix[:3, 3])
+    depsgraph = context.evaluated_depsgraph_get()
+    seen = [obj for obj in context.view_layer.objects if root_of(obj) is None]
+    chosen = [obj for obj in seen if obj.select_get()]
+    corners = list(_boxes(chosen, depsgraph)) or list(_boxes(seen, depsgraph))
     if not corners:
         raise LodgsError(
             "The Blender scene holds nothing to look at.", "Add something, or choose other views."
         )
-    return dome_around(np.concatenate(corners), context.scene.lodgs_capture.views, width, height, UP, LOWEST)
+    return np.concatenate(corners)
+
+
+def _boxes(
+    objects: Iterable[bpy.types.Object], depsgraph: bpy.types.Depsgraph, placed: Matrix | None = None
+) -> Iterator[np.ndarray]:
+    """Corners (8, 3) of each of some objects that render, and of what collections' instances show.
+
+    Args:
+        placed: how they are moved as a whole.
+    """
+    for obj in objects:
+        if obj.hide_render:
+            continue
+        shown = obj.evaluated_get(depsgraph)
+        matrix = placed @ shown.matrix_world if placed else shown.matrix_world
+        if obj.type in _SOLID:
+            turned = np.array(matrix)
+            yield np.array(shown.bound_box, np.float64) @ turned[:3, :3].T + turned[:3, 3]
+        if obj.instance_type == "COLLECTION" and obj.instance_collection is not None:
+            collection = obj.instance_collection
+            moved = matrix @ Matrix.Translation(-collection.instance_offset)
+            yield from _boxes(collection.all_objects, depsgraph, moved)
+
+
+def placed_of(root: bpy.types.Object) -> list[Camera]:
+    """The views that training will place around or above a root's splats, or along a curve, in their world.
+
+    Raises:
+        LodgsError: there is no opaque splat to look at, or no way to walk.
+    """
+    settings = root.lodgs.training
+    match settings.views_from:
+        case "DOME":
+            return dome_of(root)[0]
+        case "GRID":
+            key = *_cloud_of(root)[1:], settings.views, settings.height, matrix_of(root).tobytes()
+            return _keep("above", key, lambda: _above(root, _sample_of(root), settings)[0])
+        case "CURVE":
+            into = np.linalg.inv(matrix_of(root))
+            way = _way(settings.curve) @ into[:3, :3].T + into[:3, 3]
+            return along(way, into[:3, 2], settings.views, 3, 2)
+    return []
 
 
 def dome_of(root: bpy.types.Object) -> tuple[list[Camera], tuple[float, float]]:
@@ -190,17 +284,44 @@ def dome_of(root: bpy.types.Object) -> tuple[list[Camera], tuple[float, float]]:
     Raises:
         LodgsError: there is no opaque splat to look at.
     """
+    count = root.lodgs.training.views
+    views, near = _keep("dome", (*_cloud_of(root)[1:], count), lambda: dome_around(_sample_of(root), count))
+    return views, (DOMES[0] * near / NEAR, DOMES[1] * near / NEAR)
+
+
+def _cloud_of(root: bpy.types.Object) -> tuple[bpy.types.PointCloud, int, changes.Version]:
+    """The finest splats of a root, and what is another one for others, or after they have changed."""
     cloud = [item for item in root.lodgs.levels if item.exists][-1].object.data
-    key = cloud.session_uid, changes.version(cloud), root.lodgs.training.views
-    if key not in _domes:
-        step = max(len(cloud.points) // SAMPLE, 1)
-        means, base = (attributes.view_attribute(cloud, name) for name in ("position", attributes.BASE))
-        if means is None or base is None:  # as Blender has no points
-            means, base = np.zeros((0, 3)), np.zeros((0, 4))
-        views, near = dome_around(means[base[:, 3] > OPAQUE][::step].astype(np.float64), key[-1])
-        _domes.clear()
-        _domes[key] = views, (DOMES[0] * near / NEAR, DOMES[1] * near / NEAR)
-    return _domes[key]
+    return cloud, cloud.session_uid, changes.version(cloud)
+
+
+def _sample_of(root: bpy.types.Object) -> np.ndarray:
+    """Where some of a root's opaque splats are, (N, 3) float64, in their coordinates."""
+    cloud = _cloud_of(root)[0]
+    step = max(len(cloud.points) // SAMPLE, 1)
+    means, base = (attributes.view_attribute(cloud, name) for name in ("position", attributes.BASE))
+    if means is None or base is None:  # as Blender has no points
+        return np.zeros((0, 3))
+    return means[base[:, 3] > OPAQUE][::step].astype(np.float64)
+
+
+def _above(
+    root: bpy.types.Object, places: np.ndarray, settings: Any, width: int = 3, height: int = 2
+) -> tuple[list[Camera], float]:
+    """Views above places (N, 3) of a root, by Blender's up, and their near depth: in the root's own world."""
+    matrix = matrix_of(root)
+    views, near = above(
+        places @ matrix[:3, :3].T + matrix[:3, 3], settings.views, width, height, settings.height
+    )
+    inside, units = zip(*[view.within(matrix) for view in views], strict=True)
+    return list(inside), near / units[0]
+
+
+def _keep(kind: str, key: tuple, make: Callable[[], Any]) -> Any:
+    """What was made of a kind last, made anew where what it depends on is another."""
+    if kind not in _kept or _kept[kind][0] != key:
+        _kept[kind] = key, make()
+    return _kept[kind][1]
 
 
 def size(scene: bpy.types.Scene, settings: bpy.types.PropertyGroup) -> tuple[int, int]:
@@ -263,14 +384,18 @@ def _way(curve: bpy.types.Object | None) -> np.ndarray:
             f"The curve '{curve.name}' has {len(curve.data.splines)} splines, and a walk takes one.",
             "Choose another curve, or join its splines.",
         )
-    plain = bpy.data.objects.new(curve.name, curve.data.copy())  # without what makes a pipe of it
+    corners = _keep("way", (curve.data.session_uid, changes.version(curve.data)), lambda: _drawn(curve))
+    matrix = np.array(curve.matrix_world, np.float64)
+    return corners @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def _drawn(curve: bpy.types.Object) -> np.ndarray:
+    """The corners (P, 3) of a curve in its own space, without what makes a pipe of it."""
+    plain = bpy.data.objects.new(curve.name, curve.data.copy())
     try:
         plain.data.bevel_depth = plain.data.extrude = 0
         plain.data.bevel_object = plain.data.taper_object = None
         corners = np.array([vertex.co for vertex in plain.to_mesh().vertices], np.float64).reshape(-1, 3)
     finally:
         bpy.data.curves.remove(plain.data)
-    if curve.data.splines[0].use_cyclic_u:
-        corners = np.concatenate([corners, corners[:1]])
-    matrix = np.array(curve.matrix_world, np.float64)
-    return corners @ matrix[:3, :3].T + matrix[:3, 3]
+    return np.concatenate([corners, corners[:1]]) if curve.data.splines[0].use_cyclic_u else corners

@@ -1,11 +1,13 @@
-"""Operators that capture the Blender scene, and stop that."""
+"""Operators that capture the Blender scene, stop that, and show how well its views cover it."""
 
 from __future__ import annotations
 
 import bpy
 
+from .. import extension
 from ..data import scenes
 from ..runs import capturing, processes
+from ..viewport import coverage
 from .parts import report_errors
 
 
@@ -43,6 +45,29 @@ class LODGS_OT_cancel_capture(bpy.types.Operator):
         return {"FINISHED"}
 
 
+class LODGS_OT_show_coverage(bpy.types.Operator):
+    bl_idname = "lodgs.show_coverage"
+    bl_label = "Show Coverage"
+    bl_description = (
+        "Show as dots what the views will see: green where three of them or more do, orange where two, red "
+        "where one alone, and bare where none does. Press again to hide the dots"
+    )
+    bl_options = {"INTERNAL"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return context.area is not None and context.area.type == "VIEW_3D"
+
+    @report_errors
+    def execute(self, context):
+        if coverage.current(context.scene):
+            coverage.clear()
+        else:
+            coverage.measure(context)
+        extension.redraw()
+        return {"FINISHED"}
+
+
 class LODGS_OT_import_capture(bpy.types.Operator):
     bl_idname = "lodgs.import_capture"
     bl_label = "Import What Was Captured"
@@ -62,4 +87,9 @@ class LODGS_OT_import_capture(bpy.types.Operator):
         return {"FINISHED"}
 
 
-CLASSES = (LODGS_OT_capture_scene, LODGS_OT_cancel_capture, LODGS_OT_import_capture)
+CLASSES = (
+    LODGS_OT_capture_scene,
+    LODGS_OT_cancel_capture,
+    LODGS_OT_show_coverage,
+    LODGS_OT_import_capture,
+)

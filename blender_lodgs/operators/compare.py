@@ -27,7 +27,7 @@ class LODGS_OT_measure_views(_OnViews, bpy.types.Operator):
     """Render every view and say how alike it is to its photograph (PSNR); the splats are those shown now"""
 
     bl_idname = "lodgs.measure_views"
-    bl_label = "Measure"
+    bl_label = "Measure Views"
 
     @report_errors
     def execute(self, context):
@@ -43,7 +43,7 @@ class LODGS_OT_cancel_measuring(bpy.types.Operator):
     """Stop measuring; what has been measured stays"""
 
     bl_idname = "lodgs.cancel_measuring"
-    bl_label = "Cancel"
+    bl_label = "Cancel Measuring"
 
     @classmethod
     def poll(cls, context):
@@ -78,7 +78,7 @@ class LODGS_OT_compare_view(_Compare, bpy.types.Operator):
     """Put the photograph of the scene's camera over its rendered picture, with a wipe"""
 
     bl_idname = "lodgs.compare_view"
-    bl_label = "Compare"
+    bl_label = "Compare View With Photograph"
     bl_options = {"REGISTER", "UNDO"}
 
     def view(self, context):
@@ -89,7 +89,7 @@ class LODGS_OT_compare_worst(_Compare, bpy.types.Operator):
     """Compare the view that was least like its photograph when measured"""
 
     bl_idname = "lodgs.compare_worst"
-    bl_label = "Worst"
+    bl_label = "Compare Worst View"
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod

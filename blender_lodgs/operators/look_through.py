@@ -12,7 +12,7 @@ class LODGS_OT_look_through(bpy.types.Operator):
     """Look through a camera of the scene, with its photograph and the render in its size"""
 
     bl_idname = "lodgs.look_through"
-    bl_label = "Look Through"
+    bl_label = "Look Through Photograph"
     bl_options = {"REGISTER", "UNDO"}
 
     step: bpy.props.IntProperty(

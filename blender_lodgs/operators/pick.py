@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import bpy
+import numpy as np
+from bpy_extras import view3d_utils
 
+from .. import viewport
 from ..data import picking
 
 _keymaps: list[tuple[bpy.types.KeyMap, bpy.types.KeyMapItem]] = []
 
 
 class LODGS_OT_select_clicked(bpy.types.Operator):
-    """Select the splat scene that is clicked on, where Blender's own click found nothing"""
+    """Select the splat scene that is clicked on, where Blender's own click found nothing or what is behind"""
 
     bl_idname = "lodgs.select_clicked"
     bl_label = "Select Splat Scene"
@@ -21,28 +24,54 @@ class LODGS_OT_select_clicked(bpy.types.Operator):
         return context.mode == "OBJECT" and context.region_data is not None
 
     def invoke(self, context, event):
-        nothing = {"CANCELLED", "PASS_THROUGH"}
-        if context.selected_objects:  # the press before this click has found them
-            return nothing
-        return {"FINISHED"} if select(context, (event.mouse_region_x, event.mouse_region_y)) else nothing
+        chosen = select(context, (event.mouse_region_x, event.mouse_region_y))
+        return {"FINISHED"} if chosen else {"CANCELLED", "PASS_THROUGH"}
 
 
 def select(context: bpy.types.Context, at: tuple[float, float]) -> bool:
-    """Selects the splat scene that the context's viewport shows at a pixel; returns whether there is one.
+    """Selects the splat scene that the context's viewport shows at a pixel, after Blender's own click there:
+    in place of nothing, or of the one mesh that it found although splats hide it.
 
     Args:
         at: x from the left and y from below.
+
+    Returns:
+        Whether there is such a scene.
     """
-    region, looks = context.region, context.region_data
+    region, looks, before = context.region, context.region_data, np.inf
+    others = context.selected_objects
+    if others:
+        depth = _depth_of_mesh(context, at, others)
+        if depth is None:
+            return False
+        before = depth
     obj = picking.scene_at(
         context.evaluated_depsgraph_get(), context.space_data, looks.view_matrix, looks.window_matrix,
-        (region.width, region.height), at,
+        (region.width, region.height), at, before,
     )  # fmt: skip
     if obj is None or not obj.visible_get(view_layer=context.view_layer):
         return False
+    for other in others:
+        other.select_set(False)
     obj.select_set(True)
     context.view_layer.objects.active = obj
     return True
+
+
+def _depth_of_mesh(
+    context: bpy.types.Context, at: tuple[float, float], selected: list[bpy.types.Object]
+) -> float | None:
+    """Depth in the world of the surface at a pixel; None where it is none of the one selected object, or the
+    viewport draws no splats that could hide it."""
+    if len(selected) > 1 or not viewport.draws_splats(context.scene, context.space_data):
+        return None
+    region, view = context.region, context.region_data
+    eye = view3d_utils.region_2d_to_origin_3d(region, view, at)
+    ahead = view3d_utils.region_2d_to_vector_3d(region, view, at)
+    hit, place, *_, obj, _ = context.scene.ray_cast(context.evaluated_depsgraph_get(), eye, ahead)
+    if not hit or obj != selected[0]:
+        return None
+    return -(view.view_matrix @ place).z
 
 
 CLASSES = (LODGS_OT_select_clicked,)

@@ -13,7 +13,7 @@ class LODGS_OT_remove_scene(OnScene, bpy.types.Operator):
     """Remove the splat scene: its levels, points, cameras and collections. Files and runs stay"""
 
     bl_idname = "lodgs.remove_scene"
-    bl_label = "Remove Scene"
+    bl_label = "Remove Splat Scene"
     bl_options = {"REGISTER", "UNDO"}
 
     def invoke(self, context, event):

@@ -44,7 +44,7 @@ class LODGS_OT_separate_meshes(bpy.types.Operator):
     """Render without the meshes again: remove their scene and the nodes that join both pictures"""
 
     bl_idname = "lodgs.separate_meshes"
-    bl_label = "Remove"
+    bl_label = "Render Without Meshes"
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
@@ -84,7 +84,7 @@ class LODGS_OT_render_quick(FrameByFrame, bpy.types.Operator):
     """Draw what the camera sees as the viewport does, on the graphics card: quick, and without a trainer"""
 
     bl_idname = "lodgs.render_quick"
-    bl_label = "Viewport Quality"
+    bl_label = "Render in Viewport Quality"
 
     @classmethod
     def description(cls, context, properties):

@@ -24,7 +24,7 @@ def _follow(operator: bpy.types.Operator, watch: Watch):
 
 class LODGS_OT_train(OnScene, bpy.types.Operator):
     bl_idname = "lodgs.train"
-    bl_label = "Train"
+    bl_label = "Train Splats"
     bl_description = "Train splats with levels of detail from the scene's photographs, while you work on"
     bl_options = {"UNDO"}
 
@@ -42,7 +42,7 @@ class LODGS_OT_train(OnScene, bpy.types.Operator):
 
 class LODGS_OT_resume_training(OnScene, bpy.types.Operator):
     bl_idname = "lodgs.resume_training"
-    bl_label = "Resume"
+    bl_label = "Resume Training"
     bl_description = "Go on with the run where it stopped, with the settings that it began with"
     bl_options = {"UNDO"}
 
@@ -53,7 +53,7 @@ class LODGS_OT_resume_training(OnScene, bpy.types.Operator):
 
 class LODGS_OT_cancel_training(OnScene, bpy.types.Operator):
     bl_idname = "lodgs.cancel_training"
-    bl_label = "Cancel"
+    bl_label = "Cancel Training"
     bl_description = "Ask the trainer to save and stop, so that it can be resumed; again: end it at once"
 
     @report_errors
@@ -125,7 +125,7 @@ class LODGS_OT_resume_block(_OnBlock, bpy.types.Operator):
 
 class LODGS_OT_open_run(OnScene, bpy.types.Operator):
     bl_idname = "lodgs.open_run"
-    bl_label = "Open Run"
+    bl_label = "Open Training Run"
     bl_description = "Load the levels of a run folder, and follow the run if it is at work"
     bl_options = {"UNDO"}
 
@@ -148,7 +148,7 @@ class LODGS_OT_open_run(OnScene, bpy.types.Operator):
 
 class LODGS_OT_show_log(OnScene, bpy.types.Operator):
     bl_idname = "lodgs.show_log"
-    bl_label = "Show Log"
+    bl_label = "Show Training Log"
     bl_description = "Show the end of the trainer's log; a text block keeps it"
 
     def invoke(self, context, event):

@@ -7,6 +7,7 @@ import bpy
 from ...training.errors import LodgsError
 from ..data import scenes, viewpoints
 from ..runs import capturing, environment
+from ..viewport import coverage
 from .parts import Panel, draw_environment, draw_views, say, split_column
 
 
@@ -51,6 +52,11 @@ def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
     column = split_column(layout)
     draw_views(column, settings, viewpoints.count_of_scene(context.scene))
     width, height = viewpoints.size(context.scene, settings)
+    measured = coverage.current(context.scene)
+    text = f"{measured.enough:.0%} Seen by {coverage.ENOUGH} or More" if measured else "Show Coverage"
+    column.operator(
+        "lodgs.show_coverage", text=text, icon="HIDE_OFF" if measured else "HIDE_ON", depress=bool(measured)
+    )
     say(layout, f"Pictures of {width} × {height}, as the scene's own engine renders them.", "INFO")
     split_column(layout).prop(settings, "folder")
 

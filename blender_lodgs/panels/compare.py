@@ -71,12 +71,12 @@ class LODGS_PT_compare(Panel):
             row.operator("lodgs.cancel_measuring", text="", icon="X")
         else:
             row = layout.row(align=True)
-            row.operator("lodgs.measure_views", icon="DRIVER_DISTANCE")
-            row.operator("lodgs.compare_worst", icon="SORT_ASC")
+            row.operator("lodgs.measure_views", text="Measure", icon="DRIVER_DISTANCE")
+            row.operator("lodgs.compare_worst", text="Worst", icon="SORT_ASC")
             if measurement is not None and measurement.problem:
                 say(layout, measurement.problem, "ERROR")
         _draw_means(layout, root)
-        layout.operator("lodgs.compare_view", icon="IMAGE_ALPHA")
+        layout.operator("lodgs.compare_view", text="Compare", icon="IMAGE_ALPHA")
         comparison = wipe.comparison
         if comparison is not None:
             row = layout.row(align=True)

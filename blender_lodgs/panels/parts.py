@@ -55,12 +55,14 @@ def draw_views(column: bpy.types.UILayout, settings: ViewsSettings, count: int) 
     column.prop(settings, "views_from")
     if settings.views_from == "CURVE":
         column.prop(settings, "curve")
+    if settings.views_from == "GRID":
+        column.prop(settings, "height")
     if settings.views_from == "CAMERAS":
         column.label(text=f"{count} cameras")
     else:
         column.prop(settings, "views")
     column.prop(settings, "view_width")
-    if settings.views_from == "DOME":
+    if settings.views_from not in ("CAMERAS", "ANIMATION"):  # which Blender shows
         column.prop(settings, "show_views")
 
 

@@ -29,9 +29,8 @@ class LODGS_PT_placement(Panel):
         column.operator("lodgs.set_scale", text="Set Scale…", icon="DRIVER_DISTANCE")
         column = layout.column(align=True)
         column.label(text="Moving Camera")
-        row = column.row(align=True)
-        row.operator("lodgs.camera_path", text="Along Photographs", icon="CURVE_PATH")
-        row.operator("lodgs.turntable", text="Turntable", icon="FILE_REFRESH")
+        column.operator("lodgs.camera_path", text="Along Photographs", icon="CURVE_PATH")
+        column.operator("lodgs.turntable", text="Turntable", icon="FILE_REFRESH")
 
 
 class LODGS_MT_placement(bpy.types.Menu):

@@ -114,7 +114,7 @@ def _draw_meshes(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
         split_column(column).prop(meshes.cycles, "samples", text="Samples")
     row = column.row(align=True)
     row.operator("lodgs.combine_with_meshes", text="Update", icon="FILE_REFRESH")
-    row.operator("lodgs.separate_meshes", icon="X")
+    row.operator("lodgs.separate_meshes", text="Remove", icon="X")
 
 
 def _draw_passes(layout: bpy.types.UILayout, scene: bpy.types.Scene, layer: bpy.types.ViewLayer) -> None:

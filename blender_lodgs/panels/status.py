@@ -8,11 +8,12 @@ from dataclasses import dataclass
 
 import bpy
 
+from .. import extension
 from ..runs import capturing, making, preparing
 from ..runs.watch import root_by_uid, watches
 
 NOTICE = 60.0
-"""Seconds for which it is said that something has ended, at least."""
+"""Seconds for which it is said that something has ended."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,9 @@ def shown(now: float) -> list[Work]:
     for work in works():
         if work.running:
             _ended[work.key] = 0.0
-        elif work.key in _ended:
-            _ended[work.key] = _ended[work.key] or now
+        elif _ended.get(work.key) == 0.0:
+            _ended[work.key] = now
+            bpy.app.timers.register(extension.redraw, first_interval=NOTICE, persistent=True)
         if work.running or (work.key in _ended and now - _ended[work.key] < NOTICE):
             found.append(work)
     return found

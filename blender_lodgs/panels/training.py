@@ -40,7 +40,7 @@ class LODGS_PT_training(Panel):
         elif root.lodgs.training.run:
             row = self.layout.row()
             row.label(text="There was a run", icon="FILE_FOLDER")
-            row.operator("lodgs.open_run").directory = root.lodgs.training.run
+            row.operator("lodgs.open_run", text="Open Run").directory = root.lodgs.training.run
         resumable = watch is not None and watch.state != "done"
         choices: bpy.types.UILayout | None = self.layout
         if scenes.root_with_levels(context) is not None and root.lodgs.training.run:  # next are the levels
@@ -134,7 +134,7 @@ def _draw_choices(
     if resumable:
         layout.operator("lodgs.train", text="Train Anew", icon="FILE_REFRESH")
     else:
-        layout.operator("lodgs.train", icon="PLAY")
+        layout.operator("lodgs.train", text="Train", icon="PLAY")
 
 
 def _draw_views(column: bpy.types.UILayout, context: bpy.types.Context, root: bpy.types.Object) -> None:
@@ -220,9 +220,9 @@ def _draw_ended(layout: bpy.types.UILayout, watch: Watch, root: bpy.types.Object
     if watch.state != "done":
         draw_blocks(box, root, watch)
         row = box.row()
-        row.operator("lodgs.resume_training", icon="PLAY")
+        row.operator("lodgs.resume_training", text="Resume", icon="PLAY")
         if watch.problem:
-            row.operator("lodgs.show_log", icon="TEXT")
+            row.operator("lodgs.show_log", text="Show Log", icon="TEXT")
 
 
 CLASSES = (LODGS_PT_training, LODGS_PT_training_advanced)

@@ -23,6 +23,7 @@ from .. import compat, extension
 from ..data import photographs, scenes, viewpoints
 from ..data.cameras import scene_camera, view_of
 from ..runs import environment, processes
+from .engine import LodgsEngine
 
 Tell = Callable[[int, int], object]
 """Is told before each view that is rendered which one it is, from 1 on, and of how many."""
@@ -51,11 +52,14 @@ def render_views(
         LodgsError: as ``viewpoints.of_scene``; the folder holds other views, or cannot be written.
     """
     check_size(width, height)
+    _check(context.scene)
     shots = viewpoints.of_scene(context, width, height)
     names = [f"view_{number:04d}" for number in range(1, len(shots) + 1)]
     there = {file.stem for file in (folder / CAMERAS).glob("*.json")}
     if there - set(names):
         raise _others(folder)
+    if not there and any((folder / kind).exists() for kind in ("sparse", CAMERAS, IMAGES, DEPTHS)):
+        raise LodgsError(f"{folder} holds another scene.", "Choose another folder.")
     _prepare(context.scene, width, height)
     first, last = only or (1, len(shots))
     for number in range(first, min(last, len(shots)) + 1):
@@ -90,6 +94,16 @@ def write_model(folder: Path) -> str:
         last = (done.stderr.strip().splitlines() or ["The trainer has ended without a word."])[-1]
         raise LodgsError(last.removeprefix("error: "))
     return done.stdout.strip()
+
+
+def _check(scene: bpy.types.Scene) -> None:
+    if scene.render.engine == LodgsEngine.bl_idname:
+        raise LodgsError("LODGS renders splats and nothing else.", "Choose Cycles, EEVEE or Workbench.")
+    if not any(layer.use for layer in scene.view_layers):
+        raise LodgsError(
+            "No view layer of the scene is rendered.",
+            "Switch one on in the View Layer tab: Use for Rendering.",
+        )
 
 
 def _others(folder: Path) -> LodgsError:
@@ -160,6 +174,10 @@ def _save(scene: bpy.types.Scene, folder: Path, name: str, size: tuple[int, int]
             compat.png(settings, alpha=scene.render.film_transparent)
         file = folder / kind / f"{name}.{ending}"
         with atomic_write(file) as temporary:
-            result.save_render(str(temporary), scene=scene)
-            if image_size(temporary) != size:
+            try:
+                result.save_render(str(temporary), scene=scene)
+                whole = image_size(temporary) == size
+            except RuntimeError:  # which Blender raises without saying why
+                whole = False
+            if not whole:
                 raise LodgsError(f"{file} is not whole.", "Free some space there, then do it again.")

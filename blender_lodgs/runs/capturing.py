@@ -27,10 +27,10 @@ class Capturing:
         running: whether it is still at work.
     """
 
-    def __init__(self, folder: Path, count: int, process: subprocess.Popen, log: Path) -> None:
+    def __init__(self, folder: Path, count: int, process: subprocess.Popen, log: Path, copy: Path) -> None:
         self.folder, self.message, self.fraction, self.problem = folder, "Opening the scene", 0.0, ""
         self.running = True
-        self._count, self._process, self._log = count, process, log
+        self._count, self._process, self._log, self._copy = count, process, log, copy
         self._cancelled = False
         self._began, self._before = time.monotonic(), self._there()
 
@@ -49,10 +49,19 @@ class Capturing:
         if there == self._count:
             self.message = "Finding points"
         if code is not None:
+            self._copy.unlink(missing_ok=True)
             self.message = "Captured" if code == 0 else f"Stopped after {there} of {self._count} views"
-            self.problem = "" if code == 0 or self._cancelled else processes.problem_of(self._log, code)
+            self.problem = "" if code == 0 or self._cancelled else self._why(code, there)
         extension.redraw()
         return self.running
+
+    def _why(self, code: int, there: int) -> str:
+        if there == self._before and not 0 <= code < 256:  # which only the system gives
+            return (
+                "Blender crashed at the first view. EEVEE and Workbench need graphics, in background too. "
+                f"Where there are none choose Cycles; {self._log} tells more."
+            )
+        return processes.problem_of(self._log, code)
 
     def _there(self) -> int:
         return len(list((self.folder / CAMERAS).glob("*.json")))
@@ -91,12 +100,22 @@ def start(context: bpy.types.Context) -> Capturing:
         folder.mkdir(parents=True, exist_ok=True)
         log.unlink(missing_ok=True)
         bpy.ops.wm.save_as_mainfile(filepath=str(copy), copy=True, check_existing=False)
-        command = [bpy.app.binary_path, "--command", "lodgs", "capture", str(copy), "--out", str(folder)]
+        trusted = [] if bpy.app.autoexec_fail else ["--enable-autoexec"]  # as it is here
+        command = [
+            bpy.app.binary_path,
+            *trusted,
+            "--command",
+            "lodgs",
+            "capture",
+            str(copy),
+            "--out",
+            str(folder),
+        ]
         process = processes.spawn(command, log=log, output=folder / "capture.out")
     except (OSError, RuntimeError) as error:
         why = getattr(error, "strerror", None) or str(error).strip()
         raise LodgsError(f"{folder} cannot be captured to: {why}.", "Choose another folder.") from error
-    current = Capturing(folder, count, process, log)
+    current = Capturing(folder, count, process, log, copy)
     return current
 
 

@@ -4,7 +4,7 @@ Splats are drawn in all shadings but Wireframe where ``Scene.lodgs_viewport.spla
 points like those of COLMAP: discs in Solid shading, Blender's own points elsewhere. Where Blender draws
 splats by itself, it is left to it. ``arranging`` decides which are drawn in which order, ``views`` keeps what
 each viewport shows, ``eye`` follows a viewport's view, ``frusta`` shows where training or a capture will look
-from, and ``cells`` what a large scene is divided into.
+from, ``coverage`` how well that covers a Blender scene, and ``cells`` what a large scene is divided into.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import bpy
 from ...training.lod.colors import level_color
 from .. import compat, extension
 from ..data import scenes
-from . import cells, discs, eye, frusta, splats, views
+from . import cells, coverage, discs, eye, frusta, splats, views
 
 if TYPE_CHECKING:
     from ..data.properties import SplatScene
@@ -29,9 +29,10 @@ problem = ""
 """What went wrong when a viewport was drawn last; empty where nothing did."""
 
 
-def draws_splats(scene: bpy.types.Scene) -> bool:
-    """Whether viewports draw a Blender scene's splats as Gaussians, by our own shaders."""
-    return scene.lodgs_viewport.splats and not compat.NATIVE_SPLATS
+def draws_splats(scene: bpy.types.Scene, viewport: bpy.types.SpaceView3D) -> bool:
+    """Whether a viewport draws a Blender scene's splats as Gaussians, by our own shaders."""
+    wanted = scene.lodgs_viewport.splats and viewport.shading.type != "WIREFRAME"
+    return wanted and not compat.NATIVE_SPLATS
 
 
 def _draw() -> None:
@@ -52,7 +53,7 @@ def _draw() -> None:
 
 def _draw_view(context: bpy.types.Context) -> None:
     space, region, view = context.space_data, context.region, context.region_data
-    with_splats = draws_splats(context.scene) and space.shading.type != "WIREFRAME"
+    with_splats = draws_splats(context.scene, space)
     eye.on_draw(region, context.scene, view, splats=with_splats)
     if space.shading.type == "SOLID" and space.shading.color_type not in {"OBJECT", "RANDOM", "SINGLE"}:
         points = [
@@ -67,6 +68,7 @@ def _draw_view(context: bpy.types.Context) -> None:
     if with_splats:
         views.draw(context)
     if space.overlay.show_overlays:
+        coverage.draw(context.scene)
         frusta.draw(context)
         cells.draw(context.scene)
 
@@ -97,6 +99,7 @@ def _on_file(*_) -> None:
 def _on_load(*_) -> None:
     global problem
     problem = ""
+    coverage.clear()
     discs.clear()
     views.clear()
     eye.clear()

@@ -12,35 +12,31 @@ from mathutils import Matrix
 
 from ...training.errors import LodgsError
 from ...training.scenes.cameras import Camera
-from ...training.scenes.viewpoints import DOMES, NEAR
 from ..data import scenes, viewpoints
 from ..data.placement import axes_of
 
 COLOR = (1.0, 0.75, 0.2, 1.0)
-LENGTH = 0.12
-"""Of a pyramid, as a share of how far the nearer views are from the middle."""
+LENGTH = 0.2
+"""Of a pyramid, as a share of how far views would be apart that lie in a square as wide as theirs."""
 
 
 def draw(context: bpy.types.Context) -> None:
-    """Draws the domes that are to be shown into the active framebuffer, over everything."""
+    """Draws the views that are to be shown into the active framebuffer, over everything."""
     for root in scenes.roots(context.scene):
-        if _shown(root.lodgs.training) and viewpoints.alone(root):
+        if root.lodgs.training.show_views and viewpoints.alone(root):
             with suppress(LodgsError):  # which the panel says
-                views, shells = viewpoints.dome_of(root)
-                _draw(views, shells[0], axes_of(root).matrix_world)
-    if _shown(context.scene.lodgs_capture):
+                _draw(viewpoints.placed_of(root), axes_of(root).matrix_world)
+    if context.scene.lodgs_capture.show_views:
         with suppress(LodgsError):
-            views, near = viewpoints.dome_of_scene(context)
-            _draw(views, DOMES[0] * near / NEAR, Matrix())
+            _draw(viewpoints.placed_in_scene(context)[0], Matrix())
 
 
-def _shown(settings: viewpoints.ViewsSettings) -> bool:
-    return settings.show_views and settings.views_from == "DOME"
-
-
-def _draw(views: list[Camera], away: float, matrix: Matrix) -> None:
+def _draw(views: list[Camera], matrix: Matrix) -> None:
+    if not views:
+        return
+    wide = np.linalg.norm(np.ptp([view.center for view in views], axis=0))
     shader = gpu.shader.from_builtin("UNIFORM_COLOR")
-    batch = batch_for_shader(shader, "LINES", {"pos": lines(views, LENGTH * away)})
+    batch = batch_for_shader(shader, "LINES", {"pos": lines(views, LENGTH * wide / np.sqrt(len(views)))})
     with gpu.matrix.push_pop():  # type: ignore[attr-defined]
         gpu.matrix.multiply_matrix(matrix)
         shader.bind()

@@ -9,7 +9,7 @@ folder/  images/view_0001.png   the picture, as photographs are
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from .cameras import FARTHEST, Camera, read_views
 from .colmap import DEPTHS
 from .exr import read_parts
 from .images import load_image
+from .visibility import visible_in
 
 IMAGES, CAMERAS = "images", "cameras"
 """The folders of what was drawn."""
@@ -104,6 +105,29 @@ def surface_points(
     points, depth, color = map(np.concatenate, (found, depths, colors))
     kept = spread(points, depth, most, rng)
     return points[kept], color[kept]
+
+
+def coverage(
+    views: Sequence[Camera], depths: Sequence[np.ndarray], most: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places (N, 3) on what V views show, at most so many, and how many views see each, (N,) from 1 on.
+
+    Args:
+        depths: (H, W) of each view along its z axis; its grid may be another one than the camera's.
+            0 where there is nothing.
+    """
+    found, away = [np.zeros((0, 3))], [np.zeros(0)]
+    for view, depth in zip(views, depths, strict=True):
+        y, x = np.nonzero(depth)
+        pixels = (np.column_stack([x, y]) + 0.5) * (view.width / depth.shape[1])
+        found.append(view.unproject(pixels, depth[y, x]))
+        away.append(depth[y, x])
+    points, distances = np.concatenate(found), np.concatenate(away)
+    points = points[spread(points, distances, most, np.random.default_rng(0))]
+    counts = np.zeros(len(points), np.int64)
+    for view, depth in zip(views, depths, strict=True):
+        counts += visible_in(depth, view, points)[1]
+    return points[counts > 0], counts[counts > 0]
 
 
 def read_depth(file: Path) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Where to look at splats from that no photograph shows: from all around, or along a way. numpy only."""
+"""Where to look at splats from that no photograph shows: all around, above, or along a way. numpy only."""
 
 from __future__ import annotations
 
@@ -19,6 +19,10 @@ NEAR = 0.01
 """Depth at which drawing begins, as a share of the distance to the splats' middle."""
 FOCAL = 1.2
 """Focal length of the views, in heights of their picture."""
+HEIGHT = 2.0
+"""Height of views above an area, in multiples of how far they are apart."""
+SIDES = ((0, 0), (0, 1), (1, 0), (0, -1), (-1, 0))
+"""From where views above an area look at it, in turn, in heights: straight down, and from four sides."""
 TURNS = (0, 60, -60, 180, 120, -120)
 """Where views along a way look, one after the other, in degrees from ahead: together all around."""
 
@@ -32,7 +36,7 @@ def dome(splats: Splats, count: int, width: int = 960, height: int = 640) -> tup
     Raises:
         LodgsError: there is no opaque splat to look at.
     """
-    return dome_around(_opaque(splats), count, width, height)
+    return dome_around(opaque(splats), count, width, height)
 
 
 def dome_around(
@@ -68,6 +72,44 @@ def dome_around(
     return views, NEAR * fills
 
 
+def above(
+    places: np.ndarray, count: int, width: int = 960, height: int = 640, raised: float = 0.0
+) -> tuple[list[Camera], float]:
+    """Views of an area as a drone takes them: at one height, evenly spread, straight down and from four sides
+    in turn; and the depth at which drawing begins.
+
+    Args:
+        places: (N, 3) float64 of splats, or of things' corners, z up. The few outermost do not count.
+        raised: how far the views are above the top; 0 for HEIGHT times as far as they are apart.
+
+    Raises:
+        LodgsError: there are none, or they have no extent on the ground.
+    """
+    if not len(places):
+        raise _nothing()
+    low, high = np.quantile(places, [(1 - INSIDE) / 2, (1 + INSIDE) / 2], axis=0)
+    sides = high[:2] - low[:2]
+    if not sides.max() > 0:
+        raise LodgsError("What is to be seen from above has no extent.", "Choose something larger.")
+    shape = np.maximum(sides, 1e-3 * sides.max())
+    rows = min(max(round(float(np.sqrt(count * shape[1] / shape[0]))), 1), count)
+    number = np.arange(count)
+    row = number * rows // count
+    first, many = np.searchsorted(row, row), np.bincount(row)[row]
+    column = number - first
+    across = np.stack([(column + 0.5) / many, (row + 0.5) / rows], axis=1)
+    raised = raised or HEIGHT * float(max(sides[0] * rows / count, sides[1] / rows))
+    targets = np.column_stack([low[:2] + across * sides, np.full(count, high[2])])
+    side = np.array(SIDES)[(column + 2 * row) % len(SIDES)]  # each kind evenly spread, too
+    eyes = targets + raised * np.column_stack([side, np.ones(count)])
+    lens = _lens(width, height)
+    views = [
+        Camera(f"above_{n:04d}", *lens, look_at(eye, target, (0.0, 0.0, 1.0)))
+        for n, (eye, target) in enumerate(zip(eyes, targets, strict=True))
+    ]
+    return views, NEAR * raised
+
+
 def walk(
     splats: Splats, way: np.ndarray, up: np.ndarray, count: int, width: int = 960, height: int = 640
 ) -> tuple[list[Camera], float]:
@@ -85,7 +127,7 @@ def walk(
     """
     views = along(way, up, count, width, height)
     eyes = np.array([view.center for view in views])
-    away = np.linalg.norm(_opaque(splats) - np.median(eyes, axis=0), axis=1)
+    away = np.linalg.norm(opaque(splats) - np.median(eyes, axis=0), axis=1)
     return views, NEAR * float(np.median(away))
 
 
@@ -118,8 +160,12 @@ def along(way: np.ndarray, up: np.ndarray, count: int, width: int = 960, height:
     ]
 
 
-def _opaque(splats: Splats) -> np.ndarray:
-    """Where opaque splats are, (N, 3) float64."""
+def opaque(splats: Splats) -> np.ndarray:
+    """Where opaque splats are, (N, 3) float64.
+
+    Raises:
+        LodgsError: there are none.
+    """
     means = splats.means[splats.opacity_logits > np.log(OPAQUE / (1 - OPAQUE))].astype(np.float64)
     if not len(means):
         raise _nothing()

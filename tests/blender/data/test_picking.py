@@ -62,3 +62,36 @@ def test_fog_is_looked_through(scene_of, at):
     assert at(100, 50) is None
     behind = scene_of("behind", 0.9, (0, 0, -2))
     assert at(100, 50) == behind
+
+
+@pytest.fixture
+def window(bpy):
+    """The 3D viewport: the context of its region."""
+    window = bpy.context.window_manager.windows[0]
+    area = next(area for area in window.screen.areas if area.type == "VIEW_3D")
+    region = next(region for region in area.regions if region.type == "WINDOW")
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        yield area.spaces.active
+
+
+@pytest.mark.parametrize("away", [0.4, 0.6])
+def test_a_mesh_is_chosen_where_no_splats_hide_it(bpy, lodgs, scene_of, window, away):
+    """Blender's own click has selected it: a ball before the middle, and splats before or behind."""
+    looks, region = window.region_3d, bpy.context.region
+    eye = looks.view_matrix.inverted().translation
+    bpy.ops.mesh.primitive_uv_sphere_add(radius=1, location=eye.lerp(looks.view_location, 0.5))
+    ball = bpy.context.active_object
+    root = scene_of("splats", 0.9, eye.lerp(looks.view_location, away))
+    bpy.context.view_layer.update()
+    middle = region.width / 2, region.height / 2
+    select, hidden = lodgs("operators.pick").select, away < 0.5
+    assert select(bpy.context, middle) == hidden
+    assert bpy.context.selected_objects == [root if hidden else ball]
+    for obj in (root, ball):  # several: no click has made that alone
+        obj.select_set(True)
+    assert not select(bpy.context, middle)
+    root.select_set(False)
+    window.shading.type = "WIREFRAME"  # no splats are drawn, and nothing hides the ball
+    assert not select(bpy.context, middle) and bpy.context.selected_objects == [ball]
+    ball.select_set(False)
+    assert select(bpy.context, middle) and bpy.context.selected_objects == [root]

@@ -15,13 +15,16 @@ class Notes:
         self.colors: list[tuple[float, ...]] = []
         self.properties: list[str] = []
         self.sliders: list[str] = []
+        self.folded: list[str] = []
 
     def row(self, **_):
         return self
 
     column = box = grid_flow = split = row
 
-    def panel(self, *_, **__):
+    def panel(self, name, default_closed=False):
+        if default_closed:
+            self.folded.append(name)
         return self, self
 
     def label(self, text="", **_):

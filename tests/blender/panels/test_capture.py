@@ -17,15 +17,18 @@ def drawn(bpy, lodgs, draw_panel, monkeypatch, tmp_path):
 def test_it_asks_for_views_and_offers_import_once_there_is_a_model(bpy, drawn, tmp_path):
     settings = bpy.context.scene.lodgs_capture
     notes = drawn()
-    assert notes.operators == ["lodgs.capture_scene"]
+    assert notes.operators == ["lodgs.show_coverage", "lodgs.capture_scene"]
     assert {"views_from", "views", "view_width", "show_views", "folder"} == set(notes.properties)
     settings.views_from = "CURVE"
-    assert "curve" in drawn().properties and "show_views" not in drawn().properties
+    assert {"curve", "show_views"} < set(drawn().properties)
+    settings.views_from = "GRID"
+    assert {"height", "show_views"} < set(drawn().properties)
     settings.views_from = "CAMERAS"
+    assert "show_views" not in drawn().properties
     bpy.context.scene.collection.objects.link(bpy.data.objects.new("C", bpy.data.cameras.new("C")))
     assert "1 cameras" in drawn().texts
     (tmp_path / "out" / "sparse").mkdir(parents=True)
-    assert drawn().operators == ["lodgs.capture_scene", "lodgs.import_capture"]
+    assert drawn().operators == ["lodgs.show_coverage", "lodgs.capture_scene", "lodgs.import_capture"]
     settings.folder = ""
     assert any("not saved yet" in text for text in drawn().texts)
 

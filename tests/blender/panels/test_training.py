@@ -33,7 +33,7 @@ def watch(lodgs, root, tmp_path):
 
 def test_before_training(root, draw, fake):
     notes = draw()
-    assert (notes.operators, notes.buttons) == (["lodgs.train"], [""])
+    assert (notes.operators, notes.buttons) == (["lodgs.train"], ["Train"])
     assert notes.properties == ["method", "preset", "image_scale"]
     assert "3,762 steps in 5 levels" in notes.texts
     assert NONE_HELD_OUT in notes.texts
@@ -70,7 +70,7 @@ def test_splats_alone_ask_for_views_of_them(bpy, lodgs, root, draw, fake):
     assert any("There is no opaque splat to look at" in text for text in draw().texts)
     assert "2,400 steps in 3 levels" in draw().texts  # none of them are the finest level's
     settings.views_from = "CURVE"
-    assert draw().properties == [*begin, "curve", "views", "view_width"]
+    assert draw().properties == [*begin, "curve", "views", "view_width", "show_views"]
     settings.views_from = "CAMERAS"
     assert draw().properties == [*begin, "view_width"] and "0 cameras" in draw().texts
     advanced = draw("LODGS_PT_training_advanced").properties

@@ -19,7 +19,7 @@ ELSEWHERE = {
 }  # fmt: skip
 
 
-def test_every_verb_is_in_a_menu(lodgs):
+def test_every_verb_is_in_a_menu(bpy, lodgs):
     operators = lodgs("operators")
     ours = {
         cls.bl_idname
@@ -30,6 +30,14 @@ def test_every_verb_is_in_a_menu(lodgs):
     listed = [name for group in lodgs("panels.verbs").VERBS for name in group]
     assert len(listed) == len(set(listed)) and not set(listed) & ELSEWHERE
     assert set(listed) | ELSEWHERE == ours
+    labels = [name_of(bpy, name) for name in listed]
+    assert len(labels) == len(set(labels)), "none is called as another"
+    assert all(" " in label for label in labels), "each says what is done to what"
+
+
+def name_of(bpy, operator):
+    group, name = operator.split(".")
+    return getattr(getattr(bpy.ops, group), name).get_rna_type().name
 
 
 class Notes:
@@ -57,12 +65,49 @@ def work(lodgs, monkeypatch):
     return work
 
 
-def test_the_status_bar_tells_of_work_and_for_a_while_of_its_end(lodgs, work, monkeypatch):
-    status = lodgs("panels.status")
+def test_one_step_is_open_at_a_time(bpy, lodgs, draw_panel, tmp_path, fake):
+    """What an artist who begins is not to do yet, or has done, is folded."""
+    panels = [
+        cls
+        for module in lodgs("panels").MODULES
+        for cls in getattr(module, "CLASSES", ())
+        if getattr(cls, "bl_category", "") == "LODGS" and not hasattr(cls, "bl_parent_id")
+    ]
+
+    def begin_open():
+        return {
+            cls.bl_label
+            for cls in panels
+            if "DEFAULT_CLOSED" not in getattr(cls, "bl_options", ())
+            and (not hasattr(cls, "poll") or cls.poll(bpy.context))
+        }
+
+    assert begin_open() == {"Scene"} and draw_panel("scene", "LODGS_PT_scene").folded == []
+    fake()
+    root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+    assert begin_open() == {"Scene", "Training"}
+    assert draw_panel("training", "LODGS_PT_training").folded == []
+    root.lodgs.training.output = str(tmp_path / "runs")
+    assert bpy.ops.lodgs.train() == {"FINISHED"}
+    assert begin_open() == {"Scene", "Training", "Levels", "Detail", "Viewport"}
+    assert draw_panel("training", "LODGS_PT_training").folded == ["LODGS_train_anew"]
+    assert draw_panel("scene", "LODGS_PT_scene").folded == ["LODGS_import_another"]
+
+
+def test_the_status_bar_tells_of_work_and_for_a_while_of_its_end(bpy, lodgs, work, monkeypatch):
+    status, timers = lodgs("panels.status"), []
+    monkeypatch.setattr(
+        bpy.app.timers, "register", lambda do, first_interval, persistent: timers.append((do, first_interval))
+    )
     (now,) = status.shown(100.0)
     assert now.running and (now.text, now.share) == ("Photographs placed: 3 of 6", 0.5)
     work.running, work.message = False, "All 6 photographs found their place."
-    assert [each.text for each in status.shown(110.0)] == [work.message]
+    assert (
+        [each.text for each in status.shown(110.0)]
+        == [work.message]
+        == [each.text for each in status.shown(111.0)]
+    )
+    assert timers == [(status.extension.redraw, status.NOTICE)], "it goes by itself"
     assert status.shown(110.0 + status.NOTICE - 1) and not status.shown(110.0 + status.NOTICE + 1)
     work.running, work.message, work.fraction = True, "Again", 0.1
     monkeypatch.setattr(status.time, "monotonic", lambda: 300.0)

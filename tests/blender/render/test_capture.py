@@ -195,6 +195,57 @@ def test_a_walk_along_a_curve(bpy, scene, capture, tmp_path, capfd):
     assert "has no curve 'Why'" in capfd.readouterr().err
 
 
+def test_near_things_are_seen_where_a_way_is_small(bpy, scene, capture, tmp_path):
+    for radius, near in ((5, 0.1), (0.005, 2 * np.pi * 0.005 / 6 / 4)):
+        bpy.ops.curve.primitive_bezier_circle_add(radius=radius, location=(0, 0, 1.7))
+        bpy.context.object.name = f"Way {radius}"
+        assert capture("--curve", f"Way {radius}", "--views", "6", "--range", "1-2", out=f"out {radius}") == 0
+        assert read_views(tmp_path / f"out {radius}" / "cameras")[1] == pytest.approx(near, rel=0.01)
+
+
+def test_views_above_show_what_is_selected(bpy, scene, capture, tmp_path):
+    select(bpy, "Plane")
+    bpy.context.scene.lodgs_capture.height = 20
+    assert capture("--above", "--views", "10", "--range", "1-10") == 0
+    views, _ = read_views(tmp_path / "out" / "cameras")
+    np.testing.assert_allclose([view.center[2] for view in views], 20, atol=1e-5)
+    seen = [view.sees(np.array([[0.0, 0, 0]])).all() for view in views]
+    assert all(seen), "from 20 m each sees the middle"
+    assert len({tuple(view.world_to_camera[2, :3].round(3)) for view in views}) == 5
+
+
+def test_a_dome_shows_what_a_collections_instance_shows(bpy, scene, capture, tmp_path):
+    cubes = bpy.data.collections.new("Cubes")
+    cubes.instance_offset = (0, 0, 1)
+    for name in ("Plane", "Cube", "Cube.001"):
+        obj = bpy.data.objects[name]
+        scene.collection.objects.unlink(obj)
+        if name == "Cube.001":
+            cubes.objects.link(obj)
+    outer, shown = bpy.data.collections.new("Outer"), bpy.data.objects.new("Shown", None)
+    for obj, instance in ((bpy.data.objects.new("Inner", None), cubes), (shown, outer)):
+        obj.instance_type, obj.instance_collection = "COLLECTION", instance
+        obj.location.x = 10
+    outer.objects.link(bpy.data.objects["Inner"])
+    shown.scale = (2, 2, 2)
+    scene.collection.objects.link(shown)
+    assert capture("--around", "--views", "9", "--range", "1-9") == 0
+    views, _ = read_views(tmp_path / "out" / "cameras")
+    corners = np.array([(x, y, z) for x in (28, 32) for y in (-2, 2) for z in (-2, 2)], float)
+    for view in views:
+        assert view.sees(corners).all()
+
+
+@needs_trainer
+def test_another_scene_is_never_captured_into(bpy, scene, capture, tmp_path, capfd):
+    model = tmp_path / "out" / "sparse" / "0" / "points3D.bin"
+    model.parent.mkdir(parents=True)
+    model.write_bytes(b"precious")
+    assert capture("--around", "--views", "2") == 2
+    assert "holds another scene" in capfd.readouterr().err
+    assert [path for path in (tmp_path / "out").rglob("*") if path.is_file()] == [model]
+
+
 def test_what_is_there_is_not_rendered_again(bpy, scene, capture, tmp_path, capfd):
     assert capture("--around", "--views", "4", "--range", "2-3") == 0
     out = tmp_path / "out"
@@ -258,6 +309,8 @@ def test_transparent_films_give_pictures_with_alpha(bpy, scene, capture, tmp_pat
          ["--cameras"], "is pano"),
         (lambda bpy: [bpy.data.objects.remove(obj) for obj in list(bpy.data.objects)], ["--around"],
          "nothing to look at"),
+        (lambda bpy: setattr(bpy.context.scene.render, "engine", "LODGS"), ["--around"], "renders splats"),
+        (lambda bpy: setattr(bpy.context.view_layer, "use", False), ["--around"], "No view layer"),
         (lambda bpy: None, ["--around", "--views", "1"], "views = 1 is not possible"),
         (lambda bpy: None, ["--around", "--range", "0-3"], "not FIRST-LAST"),
         (lambda bpy: None, ["--around", "--range", "5-3"], "not FIRST-LAST"),
@@ -298,10 +351,42 @@ def test_the_panel_captures_the_scene_as_it_is_now(bpy, lodgs, scene, blender, t
     work = capturing.current
     assert (work.message, work.fraction, work.problem) == ("Captured", 1.0, "")
     assert len(bpy.data.objects) == objects and not bpy.data.filepath, "the artist's file is as it was"
+    assert not (tmp_path / "out" / "capture.blend").exists()
     assert bpy.ops.lodgs.import_capture() == {"FINISHED"}
     (root,) = [obj for obj in scene.objects if obj.lodgs.is_root]
     assert len(root.lodgs.cameras.objects) == 4
     assert [tuple(cam.data.lodgs.width for cam in root.lodgs.cameras.objects)] == [(64,) * 4]
+
+
+@needs_trainer
+def test_python_drivers_run_as_they_do_for_the_artist(bpy, lodgs, scene, blender, tmp_path, monkeypatch):
+    preferences = bpy.context.preferences.filepaths
+    monkeypatch.setattr(preferences, "use_scripts_auto_execute", True)
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    bpy.ops.mesh.primitive_cube_add()
+    scene = bpy.context.scene
+    scene.render.engine, scene.cycles.samples = "CYCLES", 1
+    for name in "ab":
+        new_camera(bpy, (0, -9, 3), (75, 0, 0)).name = name
+    driver = bpy.data.objects["b"].driver_add("location", 0).driver
+    driver.expression = "sum([1, 2]) / 2"  # no simple one
+    settings = scene.lodgs_capture
+    settings.folder, settings.views_from, settings.view_width = str(tmp_path / "out"), "CAMERAS", 64
+    bpy.context.view_layer.update()
+    assert bpy.ops.lodgs.capture_scene() == {"FINISHED"}
+    views, _ = read_views(tmp_path / "out" / "cameras")
+    assert [view.center[0] for view in views] == pytest.approx([0, 1.5], abs=1e-5)
+
+
+def test_a_blender_that_crashes_says_what_to_do(bpy, lodgs, fake, scene, blender, tmp_path):
+    fake()
+    blender.write_text("#!/bin/sh\nkill -SEGV $$\n")
+    scene.lodgs_capture.folder = str(tmp_path / "out")
+    with pytest.raises(RuntimeError, match="EEVEE and Workbench need graphics"):
+        bpy.ops.lodgs.capture_scene()
+    blender.write_text("#!/bin/sh\necho 'error: The disk is full.' >&2\nexit 2\n")
+    with pytest.raises(RuntimeError, match="The disk is full"):
+        bpy.ops.lodgs.capture_scene()
 
 
 def test_a_capture_that_is_stopped_says_so(bpy, lodgs, fake, scene, blender, tmp_path):

@@ -41,7 +41,7 @@ def test_a_sample_of_many_splats_is_enough(lodgs, root, monkeypatch):
     viewpoints = lodgs("data.viewpoints")
     _, shells = viewpoints.dome_of(root)
     monkeypatch.setattr(viewpoints, "SAMPLE", 1000)
-    viewpoints._domes.clear()
+    viewpoints._kept.clear()
     assert np.allclose(viewpoints.dome_of(root)[1], shells, rtol=0.1)
 
 
@@ -74,5 +74,30 @@ def test_they_are_drawn(bpy, lodgs, root, frame):
             lodgs("viewport.frusta").draw(bpy.context)
 
     assert (frame(64, draw)[..., 0] > 0).sum() > 50
+    for other in ("CAMERAS", "ANIMATION"):  # which Blender shows
+        root.lodgs.training.views_from = other
+        assert not frame(64, draw).any()
+    root.lodgs.training.views_from = "GRID"
+    assert (frame(64, draw)[..., 0] > 0).sum() > 50
     root.lodgs.training.show_views = False
     assert not frame(64, draw).any()
+
+
+@pytest.mark.parametrize("views_from", ["GRID", "CURVE"])
+def test_shown_are_those_that_training_takes(bpy, lodgs, root, views_from):
+    root, splats = root
+    viewpoints, settings = lodgs("data.viewpoints"), root.lodgs.training
+    bpy.ops.curve.primitive_bezier_circle_add(radius=5, location=(0, 0, 1.7))
+    settings.views_from, settings.views, settings.curve = views_from, 9, bpy.context.object
+    root.scale, root.location, root.rotation_euler = (2, 2, 2), (1, 2, 3), (0.3, 0.2, 0.1)
+    bpy.context.view_layer.update()
+    for _ in range(2):
+        shown, taken = viewpoints.placed_of(root), viewpoints.placed(bpy.context, root, splats)
+        assert len(shown) == len(taken) == 9
+        for view, (truth, near) in zip(shown, taken, strict=True):
+            np.testing.assert_allclose(view.world_to_camera, truth.world_to_camera, atol=1e-3)
+            assert near > 0
+        settings.curve.data.splines[0].bezier_points[0].co.x -= 3  # it is drawn anew
+        settings.curve.data.update_tag()
+        settings.height = 7
+        bpy.context.view_layer.update()

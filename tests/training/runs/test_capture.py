@@ -17,7 +17,7 @@ from training.runs.folder import RunFolder
 from training.scenes.cameras import read_views, write_camera
 from training.scenes.colmap import read_scene
 from training.scenes.images import load_image
-from training.scenes.viewpoints import dome, walk
+from training.scenes.viewpoints import above, dome, walk
 from training.splats.bundle import read_bundle
 from training.splats.gaussians import Splats
 from training.splats.ply import write_ply
@@ -117,6 +117,31 @@ def test_views_along_a_way_are_level_and_look_all_around(ball):
     for odd in (way[:1], np.array([[0, 0, 0], [0, 5, 0]], float)):
         with pytest.raises(LodgsError, match="no length, or leads straight up"):
             walk(ball, odd, np.array([0.0, -1, 0]), 6)
+
+
+def test_views_above_show_all_of_an_area_from_all_sides():
+    ground = np.array([(x, y, z) for x in (-30, 30) for y in (5, 35) for z in (1, 4)], float)
+    views, near = above(ground, 200, 96, 64)
+    eyes = np.array([view.center for view in views])
+    raised = eyes[0, 2] - 4
+    np.testing.assert_allclose(eyes[:, 2], 4 + raised)
+    assert raised == pytest.approx(2 * 3) and 0 < near < 0.1 * raised, "a grid of 20 x 10: every 3 m a view"
+    looks = np.array([view.world_to_camera[2, :3] for view in views])
+    targets = eyes + looks * (raised / -looks[:, 2:])  # where their middles meet the top
+    for axis, (low, high, many) in enumerate([(-30, 30, 20), (5, 35, 10)]):
+        middles = low + (np.arange(many) + 0.5) / many * (high - low)
+        np.testing.assert_allclose(np.unique(targets[:, axis].round(6)), middles)
+    kinds, counts = np.unique(looks.round(6), axis=0, return_counts=True)
+    assert len(kinds) == 5 and (counts == 40).all()
+    np.testing.assert_allclose(np.abs(looks[:, 2]), np.where(np.abs(looks[:, 2]) > 0.9, 1, np.sqrt(0.5)))
+    places = np.random.default_rng(0).uniform((-30, 5, 1), (30, 35, 4), (300, 3))
+    assert np.sum([view.sees(places) for view in views], axis=0).min() >= 4
+    assert above(ground, 200, raised=11.0)[0][7].center[2] == pytest.approx(15)
+    line, _ = above(np.array([[0, 0, 0], [0, 9, 0]], float), 9)
+    np.testing.assert_allclose(np.ptp([view.center[2] for view in line]), 0, atol=1e-9)
+    for odd, says in ((ground[:0], "no opaque"), (ground[:1], "no extent")):
+        with pytest.raises(LodgsError, match=says):
+            above(odd, 9)
 
 
 @pytest.fixture

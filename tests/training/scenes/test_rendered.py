@@ -10,7 +10,7 @@ from training.__main__ import main
 from training.scenes.cameras import Camera, look_at, write_camera
 from training.scenes.colmap import read_scene
 from training.scenes.images import write_png
-from training.scenes.rendered import SKY, read_depth, spread, write_model
+from training.scenes.rendered import SKY, coverage, read_depth, spread, write_model
 
 WIDTH, HEIGHT, NOTHING = 64, 48, 1e10
 
@@ -74,6 +74,30 @@ def test_points_lie_on_what_is_seen_in_its_colours(tmp_path):
     assert (ball | ground).all() and ball.sum() > 100 and ground.sum() > 100, "and nothing of the sky"
     np.testing.assert_array_equal(scene.point_colors[ball & ~ground], [[200, 0, 0]] * (ball & ~ground).sum())
     np.testing.assert_array_equal(scene.point_colors[ground & ~ball], [[0, 90, 0]] * (ground & ~ball).sum())
+
+
+def test_coverage_counts_the_views_that_see_a_place():
+    cameras = views()
+    depths = [np.where(depth < SKY, depth, 0) for depth, _ in map(seen, cameras)]
+    points, counts = coverage(cameras, depths, 3000)
+    assert 1000 < len(points) <= 3000 and counts.min() >= 1
+    for kind in (np.abs(points[:, 2]) < 1e-6, np.abs(np.linalg.norm(points - [0, 0, 1], axis=1) - 1) < 1e-6):
+        assert kind.sum() > 100
+    least, most = np.zeros(len(points)), np.zeros(len(points))
+    for camera in cameras:  # a ray meets nothing of the ball before it comes to the point
+        eye = camera.center
+        ray = points - eye
+        along = np.clip(((np.array([0, 0, 1]) - eye) * ray).sum(1) / (ray**2).sum(1), 0, 1)
+        passes = np.linalg.norm(eye + along[:, None] * ray - [0, 0, 1], axis=1)
+        faces = ((points - [0, 0, 1]) * (eye - points)).sum(1)
+        on_ball = points[:, 2] > 1e-6
+        slack = np.where(on_ball, faces / 3, passes - 1)  # where that is near 0, it lies at an outline
+        least += camera.sees(points, margin=-0.05) & (slack > 1) & (np.hypot(*points[:, :2].T) < 7)
+        most += camera.sees(points) & (slack > -1)
+    assert (counts <= most).all() and (counts >= least).all()
+    assert least.max() >= 2 and most.min() <= 2, "there is something to tell apart"
+    assert len(coverage(cameras, [np.zeros((4, 6))] * len(cameras), 100)[0]) == 0
+    assert len(coverage([], [], 100)[0]) == 0
 
 
 def test_a_model_is_made_anew_whole(tmp_path):

@@ -1,0 +1,281 @@
+"""From photographs to what is handed on, as artists go: every level alike, the same by one command, and
+undone step by step.
+
+``LODGS_WAY=DIR`` goes it with a COLMAP folder of your own and a whole draft, and prints what is left.
+"""
+
+import os
+import shutil
+import subprocess
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from training.splats.bundle import read_bundle
+from training.splats.formats import PROGRAM
+from training.splats.ply import read_ply
+
+ROOT = Path(__file__).resolve().parents[2]
+OWN = os.environ.get("LODGS_WAY", "")
+SCENE = Path(OWN or ROOT / "examples" / "lantern_garden")
+QUICK = {"levels": 3, "steps": [30, 30, 40], "max_splats": 6000, "densify_until": [0.5] * 3,
+         "densify_interval": [20] * 3, "budget_ratio": 0.35, "footprint": 8.0}  # fmt: skip
+TINT = (0.75, 0.5, 1.0)
+LENGTH = 3.0
+HARMONIC = 0.28209479177387814
+"""Y of degree 0: 1 / (2 sqrt pi)."""
+SHARE = 0.01 if not OWN else 0.001
+"""Of floaters: few steps leave larger ones."""
+
+
+def test_the_way_from_photographs_to_what_is_handed_on(bpy, lodgs, tmp_path, monkeypatch, capfd):
+    python = os.environ.get("LODGS_TRAINER_PYTHON")
+    if not python:
+        pytest.skip("no trainer; set LODGS_TRAINER_PYTHON")
+    monkeypatch.setenv("PATH", f"{ROOT / 'build/interop/node_modules/.bin'}{os.pathsep}{os.environ['PATH']}")
+    streams = shutil.which(PROGRAM) is not None
+    way = Way(bpy, lodgs, tmp_path)
+    bpy.ops.ed.undo_push(message="Start")
+    states = [way.state()]
+    for step in (way.bring_in, way.train, way.crop, way.fit_crop, way.drop_floaters, way.ground, way.mark,
+                 way.scale, way.tint):  # fmt: skip
+        step()
+        states.append(way.state())
+        assert states[-1] != states[-2], step.__name__
+    counts = way.assert_cropped()
+    way.export(streams)
+    way.assert_the_same_by_one_command(python, streams, counts)
+    assert way.state() == states[-1], "exports change nothing"
+
+    undone = [way.back_to(bpy.ops.ed.undo, state) for state in states[-2::-1]]
+    levels = undone.pop(-2)  # each of them, some of them twice, the end, and Train
+    assert undone == [1] * 8 and len(counts) + 2 <= levels <= 2 * len(counts) + 2
+    for state in states[1:]:
+        way.back_to(bpy.ops.ed.redo, state)
+    assert way.assert_cropped() == counts
+    way.assert_comes_back(streams, counts)
+    if OWN:
+        with capfd.disabled():
+            print(
+                f"\n{SCENE.name}:",
+                *(f"level {n}: {left:,} of {there:,} left" for n, (left, there) in counts.items()),
+                sep="\n  ",
+            )
+
+
+class Way:
+    """The artist's steps, each of which Blender can undo."""
+
+    def __init__(self, bpy, lodgs, folder: Path):
+        self.bpy, self.lodgs, self.folder = bpy, lodgs, folder
+        self.sphere = np.zeros(3), 1.0  # in the scene's own space
+        self.factor = 1.0
+
+    @property
+    def root(self):
+        (root,) = [obj for obj in self.bpy.data.objects if obj.lodgs.is_root]
+        return root
+
+    @property
+    def crop_object(self):
+        (crop,) = self.lodgs("data.crops").crops_of(self.root)
+        return crop
+
+    def push(self, message: str):
+        """As the window does for what was dragged or typed."""
+        self.bpy.ops.ed.undo_push(message=message)
+
+    def bring_in(self):
+        assert self.bpy.ops.lodgs.import_colmap("EXEC_DEFAULT", True, directory=str(SCENE)) == {"FINISHED"}
+
+    def train(self):
+        settings = self.root.lodgs.training
+        settings.method, settings.preset, settings.test_every = "flod", "draft", 8
+        if OWN:
+            assert self.bpy.ops.lodgs.train("EXEC_DEFAULT", True, folder=str(self.folder / "run")) == {
+                "FINISHED"
+            }
+            return
+        settings.image_scale = 0.25
+        jobs = self.lodgs("runs.jobs")
+        start = jobs.start
+        jobs.start = lambda root, folder: start(root, folder, QUICK)
+        try:
+            assert self.bpy.ops.lodgs.train("EXEC_DEFAULT", True, folder=str(self.folder / "run")) == {
+                "FINISHED"
+            }
+        finally:
+            jobs.start = start
+
+    def crop(self):
+        assert self.bpy.ops.lodgs.add_crop("EXEC_DEFAULT", True, shape="SPHERE") == {"FINISHED"}
+
+    def fit_crop(self):
+        """Moved to what was photographed, and scaled."""
+        eye, target = self.lodgs("data.photographs").photographed_from(self.root)
+        crop, radius = self.crop_object, 0.5 * (eye - target).length
+        crop.location, crop.scale = target, [radius] * 3
+        self.bpy.context.view_layer.update()
+        to_own = np.linalg.inv(self.to_world())
+        self.sphere = to_own[:3, :3] @ target + to_own[:3, 3], radius
+        self.push("Scale")
+
+    def drop_floaters(self):
+        assert self.bpy.ops.lodgs.hide_splats("EXEC_DEFAULT", True, test="FLOATERS", share=100 * SHARE) == {
+            "FINISHED"
+        }
+
+    def ground(self):
+        assert self.bpy.ops.lodgs.set_ground("EXEC_DEFAULT", True, by="FOUND") == {"FINISHED"}
+
+    def mark(self):
+        """Two empties, 2 apart."""
+        for name, place in (("begin", (0, 0, 0)), ("end", (0, 2, 0))):
+            mark = self.bpy.data.objects.new(name, None)
+            mark.location = place
+            self.bpy.context.scene.collection.objects.link(mark)
+        self.bpy.context.view_layer.update()
+        self.push("Add Empties")
+
+    def scale(self):
+        for obj in self.bpy.context.view_layer.objects:
+            obj.select_set(obj.name in ("begin", "end") or obj == self.root)
+        self.bpy.context.view_layer.objects.active = self.root
+        assert self.bpy.ops.lodgs.set_scale("EXEC_DEFAULT", True, length=LENGTH) == {"FINISHED"}
+        self.factor = LENGTH / 2
+
+    def tint(self):
+        self.root.lodgs_look.tint = TINT
+        self.push("Tint")
+
+    def to_world(self) -> np.ndarray:
+        self.bpy.context.view_layer.update()
+        return np.array(self.root.lodgs.axes.matrix_world, np.float64)
+
+    def state(self) -> dict:
+        """Everything that the steps change, to the bit."""
+        self.bpy.context.view_layer.update()
+        return {
+            obj.name: (
+                obj.parent and obj.parent.name,
+                np.array([obj.matrix_basis, obj.matrix_parent_inverse]).tobytes(),
+                obj.select_get() if obj.name in self.bpy.context.view_layer.objects else None,
+                [modifier.name for modifier in obj.modifiers],
+                tuple(obj.lodgs_look.tint),
+                obj.lodgs_crop.keep,
+                obj.lodgs.training.run,
+                [(item.number, item.exists) for item in obj.lodgs.levels],
+                self.points_of(obj.data) if obj.type == "POINTCLOUD" else None,
+            )
+            for obj in self.bpy.data.objects
+        }
+
+    def points_of(self, cloud) -> dict[str, str]:
+        """A digest of each attribute of a point cloud."""
+        read = self.lodgs("attributes").read_attribute
+        found = {attribute.name: read(cloud, attribute.name) for attribute in cloud.attributes}
+        return {name: sha256(values.tobytes()).hexdigest() for name, values in found.items()}
+
+    def back_to(self, step, state: dict) -> int:
+        """Undo or redo until all is as it was then; how many steps that takes."""
+        for count in range(1, 20):
+            assert step() == {"FINISHED"}
+            if self.state() == state:
+                return count
+        raise AssertionError("It is never again as it was.")
+
+    def assert_cropped(self) -> dict[int, tuple[int, int]]:
+        """What every level shows lies in the sphere, and is not hidden; how many of how many."""
+        cleaning = self.lodgs("data.cleaning")
+        centre, radius = self.sphere
+        graph = self.bpy.context.evaluated_depsgraph_get()
+        counts = cleaning.count_left(self.root, graph)
+        for level, item in zip(self.trained().levels, self.root.lodgs.levels, strict=True):
+            inside = np.linalg.norm(level.splats.means - centre, axis=1) < radius
+            hidden = cleaning.hidden(item.object.data)
+            assert not hidden[~inside].any(), "floaters are looked for among what is left"
+            assert counts[item.number] == (np.count_nonzero(inside & ~hidden), len(inside))
+            assert 0 < counts[item.number][0] < len(inside)
+            self.root.lodgs.mode, self.root.lodgs.single_level = "SINGLE", item.number
+            self.bpy.context.view_layer.update()
+            graph = self.bpy.context.evaluated_depsgraph_get()
+            assert len(item.object.evaluated_get(graph).data.points) == counts[item.number][0]
+        return counts
+
+    def trained(self):
+        return read_bundle(self.folder / "run" / "bundle.ply")
+
+    def export(self, streams: bool):
+        settings = {"placed": True, "looked": True}
+        finest = self.root.lodgs.levels[-1].number
+        operators = self.bpy.ops.lodgs
+        assert operators.export_bundle(filepath=str(self.folder / "out.ply"), **settings) == {"FINISHED"}
+        plain = {"source": "LEVEL", "level": finest, **settings}
+        assert operators.export_plain(filepath=str(self.folder / "plain.ply"), **plain) == {"FINISHED"}
+        if streams:
+            assert operators.export_streamed(directory=str(self.folder / "web"), **settings) == {"FINISHED"}
+
+    def assert_the_same_by_one_command(self, python: str, streams: bool, counts: dict):
+        centre, radius = self.sphere
+        folder = self.folder
+        command = [
+            python, "-m", "training", "edit", folder / "run" / "bundle.ply",
+            "--out", folder / "edited.ply", "--plain", folder / "edited_plain.ply",
+            *(["--streamed", folder / "edited_web"] if streams else []),
+            "--crop-sphere", *centre, radius, "--drop-floaters", "--share", SHARE,
+            "--scene", SCENE, "--ground", "--scale", self.factor, "--tint", *TINT,
+        ]  # fmt: skip
+        said = subprocess.run([str(part) for part in command], cwd=ROOT, capture_output=True, text=True)
+        assert said.returncode == 0, said.stderr
+        for number, (left, there) in counts.items():
+            assert f"level {number}: {left:,} of {there:,} splats" in said.stdout
+        ours, theirs = read_bundle(self.folder / "out.ply"), read_bundle(self.folder / "edited.ply")
+        pairs = [(a.splats, b.splats) for a, b in zip(ours.levels, theirs.levels, strict=True)]
+        pairs.append((read_ply(self.folder / "plain.ply"), read_ply(self.folder / "edited_plain.ply")))
+        for blenders, edited in pairs:
+            for name in ("means", "log_scales", "opacity_logits", "sh"):
+                np.testing.assert_allclose(
+                    getattr(blenders, name), getattr(edited, name), rtol=1e-3, atol=1e-3
+                )
+            dots = np.abs((_unit(blenders.quats) * _unit(edited.quats)).sum(axis=1))
+            assert dots.min() > 1 - 1e-5
+
+    def assert_comes_back(self, streams: bool, counts: dict):
+        """Into Blender: every level where the scene stands, in the colours that it has there."""
+        to_world = self.to_world()
+        trained = self.trained()
+        left = {}
+        for level, item in zip(trained.levels, self.root.lodgs.levels, strict=True):
+            inside = np.linalg.norm(level.splats.means - self.sphere[0], axis=1) < self.sphere[1]
+            hidden = self.lodgs("data.cleaning").hidden(item.object.data)
+            left[level.number] = level.splats.select(inside & ~hidden)
+        files = {"out.ply": list(left), "plain.ply": [max(left)], "web/lod-meta.json": list(left)}
+        for name, numbers in files.items():
+            if name.startswith("web") and not streams:
+                continue
+            before = set(self.bpy.data.objects)
+            upright = name == "out.ply"  # which tells how its scene stands; other files cannot
+            done = self.bpy.ops.lodgs.import_splats(filepath=str(self.folder / name), upright=upright)
+            assert done == {"FINISHED"}
+            (root,) = [obj for obj in self.bpy.data.objects if obj.lodgs.is_root and obj not in before]
+            self.bpy.context.view_layer.update()
+            for item, number in zip(root.lodgs.levels, numbers, strict=True):
+                truth, cloud = left[number], item.object.data
+                assert len(cloud.points) == counts[number][0]
+                matrix, read = np.array(item.object.matrix_world), self.lodgs("attributes").read_attribute
+                places = read(cloud, "position") @ matrix[:3, :3].T + matrix[:3, 3]
+                wanted = truth.means @ to_world[:3, :3].T + to_world[:3, 3]
+                if name.startswith("web"):  # in an order of its own, and in fewer bits
+                    far = np.sort(places, axis=0) - np.sort(wanted, axis=0)
+                    assert abs(far).max() < 0.01 * self.sphere[1] * self.factor
+                    continue
+                np.testing.assert_allclose(places, wanted, atol=1e-3)
+                colours = np.array(TINT) * (0.5 + HARMONIC * truth.sh[:, 0])
+                base = read(cloud, "radiance:base")
+                np.testing.assert_allclose(0.5 + HARMONIC * base[:, :3], colours, atol=1e-4)
+
+
+def _unit(quats: np.ndarray) -> np.ndarray:
+    return quats / np.linalg.norm(quats, axis=1, keepdims=True)
