@@ -21,22 +21,24 @@ class Work:
     """One thing that is done beside Blender.
 
     Attributes:
-        key: tells it from others.
+        source: what does it.
         text: what is done, or how it ended.
         share: how much of it, 0 to 1.
         running: whether it is at work.
         failed: whether it ended with a problem.
     """
 
-    key: int
+    source: object
     text: str
     share: float
     running: bool
     failed: bool
 
 
-_ended: dict[int, float] = {}
-"""When what was seen at work was seen to have ended, by its key; 0 where it is at work."""
+_seen: dict[int, tuple[object, float]] = {}
+"""What was seen at work, by its identity, and when it was seen to have ended: 0 where it is at work.
+
+The source itself is held, as the identity of one that is gone may come back as another's."""
 
 
 def works() -> Iterator[Work]:
@@ -44,22 +46,27 @@ def works() -> Iterator[Work]:
     for uid, watch in watches.items():
         root = root_by_uid(uid)
         name = "Splats" if root is None else root.name
-        yield Work(id(watch), f"{name}: {watch.message}", watch.share, watch.running, bool(watch.problem))
+        yield Work(watch, f"{name}: {watch.message}", watch.share, watch.running, bool(watch.problem))
     for each in (capturing.current, preparing.current, making.current):
         if each is not None:
-            yield Work(id(each), each.message, each.fraction, each.running, bool(each.problem))
+            yield Work(each, each.message, each.fraction, each.running, bool(each.problem))
 
 
 def shown(now: float) -> list[Work]:
     """What the status bar shows: what is at work, and what has ended since it was seen at work."""
-    found = []
-    for work in works():
+    found, all_works = [], list(works())
+    for gone in _seen.keys() - {id(work.source) for work in all_works}:
+        del _seen[gone]
+    for work in all_works:
+        _, ended = _seen.get(id(work.source), (None, None))
         if work.running:
-            _ended[work.key] = 0.0
-        elif _ended.get(work.key) == 0.0:
-            _ended[work.key] = now
+            ended = 0.0
+        elif ended == 0.0:
+            ended = now
             bpy.app.timers.register(extension.redraw, first_interval=NOTICE, persistent=True)
-        if work.running or (work.key in _ended and now - _ended[work.key] < NOTICE):
+        if ended is not None:
+            _seen[id(work.source)] = work.source, ended
+        if work.running or (ended is not None and now - ended < NOTICE):
             found.append(work)
     return found
 

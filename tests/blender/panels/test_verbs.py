@@ -125,6 +125,18 @@ def test_what_ended_before_it_was_seen_is_no_news(lodgs, work):
     assert lodgs("panels.status").shown(0.0) == []
 
 
+def test_another_work_at_the_place_of_one_that_is_gone_is_another(lodgs, work):
+    """An object that is gone leaves its identity to the next."""
+    status, preparing = lodgs("panels.status"), lodgs("runs.preparing")
+    state = {**vars(work), "running": False}
+    for _ in range(20):
+        preparing.current = SimpleNamespace(**{**state, "running": True})
+        assert len(status.shown(0.0)) == 1
+        preparing.current = None
+        preparing.current = SimpleNamespace(**state)
+        assert status.shown(1.0) == []
+
+
 def test_runs_of_a_scene_are_listed_and_opened(bpy, lodgs, tmp_path, fake):
     fake()
     root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
