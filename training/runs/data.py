@@ -17,7 +17,7 @@ from ..scenes.colmap import Scene, read_scene, without
 from ..scenes.depths import Depths, with_points
 from ..scenes.images import check_image
 from ..scenes.regions import Region
-from ..scenes.rendered import spread
+from ..scenes.rendered import even
 from ..scenes.undistort import cache_of, undistorted
 from .capture import capture
 from .folder import RunFolder
@@ -98,7 +98,7 @@ def coarse_outside(scene: Scene, region: Crop, most: int) -> Scene:
     if len(outside) > most:
         points = scene.points[outside]
         away = np.linalg.norm(points - scene.center, axis=1)
-        outside = outside[spread(points, away, most, np.random.default_rng(0))]
+        outside = outside[even(points, away, most, np.random.default_rng(0))]
     rows = np.sort(np.concatenate([np.flatnonzero(inside), outside]))
     return replace(
         scene, points=scene.points[rows], point_colors=scene.point_colors[rows],

@@ -187,7 +187,7 @@ def with_points(scene: Scene) -> Scene:
             depth = _read_map(camera, camera.width, camera.height)
             yield camera, np.where(np.isfinite(depth), depth, FARTHEST), picture
 
-    points, colors = surface_points(shown(), len(views), MOST_POINTS, np.random.default_rng(0))
+    points, colors, _ = surface_points(shown(), len(views), MOST_POINTS, np.random.default_rng(0))
     return replace(
         scene,
         points=np.concatenate([scene.points, points.astype(np.float32)]),

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,10 @@ POINTS = 100_000
 """At most so many points a model gets."""
 SKY = 1e9
 """Depths from here on are of nothing: renderers put 1e10 there."""
+SKY_SHARE = 0.1
+"""At most so many of all points are of the sky."""
+BEYOND, AWAY = 2, 20
+"""How many times as far the sky is as the farthest surface, and at least, as the cameras are apart."""
 _LOOKS = 10
 """Pixels that are looked at for each point, about."""
 _PRIMES = np.array([73856093, 19349663, 83492791, 15485863])
@@ -36,12 +40,34 @@ Tell = Callable[[int, int], object]
 """Is told before each view which one it is, from 1 on, and of how many."""
 
 
-def write_model(folder: Path, most: int = POINTS, tell: Tell = lambda number, count: None) -> tuple[int, int]:
-    """Writes folder/sparse/0/*.bin: the cameras, and points where random pixels meet surfaces.
+@dataclass(frozen=True)
+class Sky:
+    """A sphere around all that views show, for what they show of no surface.
 
-    Points are even in space up to the median depth, and from there on apart by what doubles as depth does;
-    of the sky there are none. Each has its pixel's colour, and a track of views that see it. Depths are read
-    again for the tracks: one view is in memory at a time.
+    Attributes:
+        center: (3,) in the world.
+    """
+
+    center: np.ndarray
+    radius: float
+
+    def behind(self, view: Camera, depth: np.ndarray) -> np.ndarray:
+        """A view's depths (H, W), where there is nothing the sphere's."""
+        y, x = np.nonzero(depth >= SKY)
+        eye = view.center - self.center
+        rays = view.unproject(np.column_stack([x, y]) + 0.5, np.ones(len(x))) - view.center
+        a, b, c = (rays**2).sum(1), rays @ eye, eye @ eye - self.radius**2
+        filled = depth.copy()
+        filled[y, x] = (np.sqrt(b**2 - a * c) - b) / a
+        return filled
+
+
+def write_model(folder: Path, most: int = POINTS, tell: Tell = lambda number, count: None) -> tuple[int, int]:
+    """Writes folder/sparse/0/*.bin: the cameras, and points at random pixels, as close as pixels are.
+
+    Each has its pixel's colour, and a track of views that see it. Those of a sky that pictures show (not
+    where they are transparent) lie on a :class:`Sky`. Depths are read again for the tracks: one view is in
+    memory at a time.
 
     Returns:
         How many views and points there are.
@@ -58,7 +84,7 @@ def write_model(folder: Path, most: int = POINTS, tell: Tell = lambda number, co
     def shown() -> Iterator[tuple[Camera, np.ndarray, np.ndarray]]:
         for number, (view, file) in enumerate(zip(views, files, strict=True)):
             tell(number + 1, len(views))
-            picture = load_image(folder / IMAGES / view.name, view.width, view.height)
+            picture = load_image(folder / IMAGES / view.name, view.width, view.height, alpha=True)
             depth = read_depth(file)
             if depth.shape != picture.shape[:2]:
                 raise LodgsError(
@@ -67,11 +93,16 @@ def write_model(folder: Path, most: int = POINTS, tell: Tell = lambda number, co
                 )
             yield view, depth, picture
 
-    points, colors = surface_points(shown(), len(views), most, np.random.default_rng(0))
+    points, colors, sky = surface_points(shown(), len(views), most, np.random.default_rng(0))
+
+    def depth_of(number: int) -> np.ndarray:
+        depth = read_depth(files[number])
+        return depth if sky is None else sky.behind(views[number], depth)
+
     beside = folder / ".model.tmp"
     try:
         shutil.rmtree(beside, ignore_errors=True)
-        count = write_seen(beside, views, lambda n: read_depth(files[n]), points, 255 * colors)
+        count = write_seen(beside, views, depth_of, points, 255 * colors)
         shutil.rmtree(folder / "sparse", ignore_errors=True)
         (beside / "sparse").rename(folder / "sparse")
     except OSError as error:
@@ -86,25 +117,48 @@ def write_model(folder: Path, most: int = POINTS, tell: Tell = lambda number, co
 
 def surface_points(
     views: Iterable[tuple[Camera, np.ndarray, np.ndarray]], count: int, most: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Places (P, 3), at most so many, where random pixels meet surfaces, see :func:`spread`; and the colours
-    (P, 3) there.
+) -> tuple[np.ndarray, np.ndarray, Sky | None]:
+    """Places (P, 3), at most so many, at random pixels, as close as these are, see :func:`spread`; and the
+    colours (P, 3) there.
 
     Args:
-        views: each with its depths (H, W), from SKY on where there is nothing, and its picture (H, W, 3).
+        views: each with its depths (H, W), from SKY on where there is nothing, and its picture (H, W, 3); or
+            (H, W, 4) over black, with alpha, where the sky is wanted.
         count: how many views there are.
+
+    Returns:
+        The places, surfaces before sky; the colours; and where the sky is, if there is any.
     """
-    found, depths, colors = [], [], []
+    found, sizes, colors, eyes = [], [], [], []
     for view, depth, picture in views:
-        y, x = np.nonzero(depth < SKY)
+        there = depth < SKY
+        if picture.shape[2] == 4:
+            there |= picture[..., 3] > 0.99
+        y, x = np.nonzero(there)
         some = rng.permutation(len(x))[: most * _LOOKS // count + 1]
         y, x = y[some], x[some]
+        color = picture[y, x]
+        if picture.shape[2] == 4:
+            color = color[:, :3] / np.maximum(color[:, 3:], 1e-3)
         found.append(view.unproject(np.column_stack([x, y]) + 0.5, depth[y, x]))
-        depths.append(depth[y, x])
-        colors.append(picture[y, x])
-    points, depth, color = map(np.concatenate, (found, depths, colors))
-    kept = spread(points, depth, most, rng)
-    return points[kept], color[kept]
+        sizes.append(depth[y, x] / view.focal)
+        colors.append(color)
+        eyes.append(view.center)
+    points, size, color = map(np.concatenate, (found, sizes, colors))
+    away = np.linalg.norm(points - (center := np.mean(eyes, axis=0)), axis=1)
+    above = away >= SKY
+    room = round(SKY_SHARE * most)
+    kept = np.flatnonzero(~above)
+    kept = kept[spread(points[kept], size[kept], most - room if above.any() else most, rng)]
+    if not above.any() or not len(kept):
+        return points[kept], color[kept], None
+    apart = np.linalg.norm(eyes - center, axis=1).max()
+    sky = Sky(center, max(BEYOND * float(away[~above].max()), AWAY * float(apart)))
+    high = np.flatnonzero(above)
+    points[high] = center + sky.radius * (points[high] - center) / away[high, None]
+    high = high[spread(points[high], size[high], min(room, round(SKY_SHARE * len(kept))), rng)]
+    kept = np.concatenate([kept, high])
+    return points[kept], color[kept], sky
 
 
 def coverage(
@@ -123,7 +177,7 @@ def coverage(
         found.append(view.unproject(pixels, depth[y, x]))
         away.append(depth[y, x])
     points, distances = np.concatenate(found), np.concatenate(away)
-    points = points[spread(points, distances, most, np.random.default_rng(0))]
+    points = points[even(points, distances, most, np.random.default_rng(0))]
     counts = np.zeros(len(points), np.int64)
     for view, depth in zip(views, depths, strict=True):
         counts += visible_in(depth, view, points)[1]
@@ -151,24 +205,30 @@ def read_depth(file: Path) -> np.ndarray:
     return np.where((nearest > 0) & (nearest < SKY), nearest, FARTHEST)
 
 
-def spread(points: np.ndarray, depths: np.ndarray, most: int, rng: np.random.Generator) -> np.ndarray:
+def even(points: np.ndarray, depths: np.ndarray, most: int, rng: np.random.Generator) -> np.ndarray:
+    """Which of some points (N, 3) to keep, at most so many: even in space up to the median of their depths
+    (N,), and beyond farther apart as they are deeper."""
+    return spread(points, np.maximum(depths, np.median(depths)) if len(depths) else depths, most, rng)
+
+
+def spread(points: np.ndarray, sizes: np.ndarray, most: int, rng: np.random.Generator) -> np.ndarray:
     """Which of some points (N, 3) to keep, at most so many: one in each cube of a grid, at random.
 
-    The cubes are the smallest that are few enough. Their size doubles wherever depths (N,) reach twice the
-    median, four times and so on: there pixels are as much larger.
+    The cubes are the smallest that are few enough. They are as large as sizes (N,) are, those of the pixels
+    that show the points, but in powers of two.
     """
     order = rng.permutation(len(points))
     if len(points) <= most:
         return order
-    middle = float(np.median(depths))
-    octave = np.floor(np.log2(np.maximum(depths / middle, 1))).astype(np.int64)[order]
+    middle = float(np.median(sizes))
+    octave = np.floor(np.log2(sizes / middle)).astype(np.int64)[order]
     places = points[order] / 2.0 ** octave[:, None]
 
     def firsts(side: float) -> np.ndarray:
         cubes = np.column_stack([np.floor(places / side).astype(np.int64), octave])
         return np.unique(cubes @ _PRIMES, return_index=True)[1]
 
-    low, high = np.log2([1e-6 * middle, 1e3 * middle])
+    low, high = np.log2([1e-3 * middle, 1e6 * middle])
     while high - low > 0.05:
         half = (low + high) / 2
         low, high = (low, half) if len(firsts(2.0**half)) <= most else (half, high)

@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import OpenEXR
 import pytest
+from PIL import Image
 
 from training.__main__ import main
 from training.scenes.cameras import Camera, look_at, write_camera
 from training.scenes.colmap import read_scene
 from training.scenes.images import write_png
-from training.scenes.rendered import SKY, coverage, read_depth, spread, write_model
+from training.scenes.rendered import AWAY, SKY, Sky, coverage, even, read_depth, spread, write_model
 
 WIDTH, HEIGHT, NOTHING = 64, 48, 1e10
 
@@ -60,7 +61,7 @@ def draw(folder, cameras, channel="ViewLayer.Depth.Z"):
 
 
 def test_points_lie_on_what_is_seen_in_its_colours(tmp_path):
-    cameras = views()
+    cameras = views(12)
     draw(tmp_path, cameras)
     assert main(["model", str(tmp_path)]) == 0
     scene = read_scene(tmp_path)
@@ -71,7 +72,12 @@ def test_points_lie_on_what_is_seen_in_its_colours(tmp_path):
     points = scene.points
     ball = np.abs(np.linalg.norm(points - [0, 0, 1], axis=1) - 1) < 1e-4
     ground = np.abs(points[:, 2]) < 1e-4
-    assert (ball | ground).all() and ball.sum() > 100 and ground.sum() > 100, "and nothing of the sky"
+    assert ball.sum() > 100 and ground.sum() > 100
+    sky = ~ball & ~ground
+    away = np.linalg.norm(points[sky] - np.mean([camera.center for camera in cameras], axis=0), axis=1)
+    assert away == pytest.approx(AWAY * 5, rel=1e-5), "the sky is a sphere far beyond"
+    assert 0 < sky.mean() <= 0.1 and (scene.point_colors[sky] == 60).all()
+    assert 4 < scene.median_depth() < 7, "which is not what the scene is measured by"
     np.testing.assert_array_equal(scene.point_colors[ball & ~ground], [[200, 0, 0]] * (ball & ~ground).sum())
     np.testing.assert_array_equal(scene.point_colors[ground & ~ball], [[0, 90, 0]] * (ground & ~ball).sum())
 
@@ -109,14 +115,52 @@ def test_a_model_is_made_anew_whole(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"cameras", "depths", "images", "sparse"}
 
 
-def test_points_are_even_in_space_and_as_far_apart_as_pixels_far_away():
+def test_nothing_is_no_sky_where_pictures_are_transparent(tmp_path):
+    cameras = views()
+    draw(tmp_path, cameras)
+    for camera in cameras:
+        depth, color = seen(camera)
+        alpha = np.where(depth < SKY, 255, 0)[..., None].astype(np.uint8)
+        Image.fromarray(np.concatenate([color, alpha], axis=2)).save(
+            tmp_path / "images" / f"{camera.name}.png"
+        )
+    write_model(tmp_path)
+    scene = read_scene(tmp_path)
+    assert len(scene.points) > 1000 and np.abs(scene.points).max() < 9
+    assert set(map(tuple, scene.point_colors)) == {(200, 0, 0), (0, 90, 0)}
+
+
+def test_the_sky_is_behind_all_that_is_seen_in_every_view():
+    rng, view = np.random.default_rng(0), views()[0]
+    sky = Sky(np.array([1.0, 2, 3]), 50.0)
+    depth = np.where(rng.random((HEIGHT, WIDTH)) < 0.5, 3.0, NOTHING)
+    filled = sky.behind(view, depth)
+    np.testing.assert_array_equal(filled[depth < SKY], 3)
+    y, x = np.nonzero(depth > SKY)
+    places = view.unproject(np.column_stack([x, y]) + 0.5, filled[y, x])
+    np.testing.assert_allclose(np.linalg.norm(places - sky.center, axis=1), 50, rtol=1e-9)
+
+
+def test_points_are_as_far_apart_as_pixels_are_large():
+    rng = np.random.default_rng(0)
+    places = rng.uniform(0, 1, (80_000, 3)) * [1, 1, 0]
+    places[40_000:, 0] += 10
+    sizes = np.repeat([0.01, 0.04], 40_000)  # two octaves
+    kept = spread(places, sizes, 3000, rng)
+    near = (kept < 40_000).sum()
+    assert 2000 < len(kept) <= 3000 and near / (len(kept) - near) == pytest.approx(16, rel=0.1)
+    few = spread(places, sizes, 10**6, rng)
+    assert sorted(few) == list(range(80_000))
+
+
+def test_places_are_even_in_space_and_farther_apart_far_away():
     rng = np.random.default_rng(0)
     near = rng.uniform(0, 1, (40_000, 3)) * [1, 1, 0]
     dense = rng.uniform(0, 0.1, (40_000, 3)) * [1, 1, 0]  # looked at more closely
     far = rng.uniform(0, 8, (40_000, 3)) * [1, 1, 0] + [100, 0, 0]
     points = np.concatenate([near, dense, far])
     depths = np.concatenate([np.full(80_000, 1.0), np.full(40_000, 8.5)])  # three octaves beyond
-    kept = spread(points, depths, 2000, rng)
+    kept = even(points, depths, 2000, rng)
     assert 1500 < len(kept) <= 2000 and len(np.unique(kept)) == len(kept)
     here = points[kept[kept < 80_000]]
     corner = (here < 0.1).all(axis=1).sum()
@@ -126,8 +170,6 @@ def test_points_are_even_in_space_and_as_far_apart_as_pixels_far_away():
     assert (kept >= 80_000).sum() == pytest.approx(len(here), rel=0.2), (
         "64 times the area, cubes 8 times as large"
     )
-    few = spread(points, depths, 10**6, rng)
-    assert sorted(few) == list(range(120_000))
 
 
 @pytest.mark.parametrize(
