@@ -16,6 +16,8 @@ _WHOLE_MOST, _MOST = 2**31 - 1, 3.4e38
 _LEAST = 1e-6
 """The smallest number above 0 that Blender shows."""
 
+ALL_OFFER = "depth_weight", "depth"
+"""Parameters that the panel offers of every method."""
 FEW = 40
 """Photographs, or views in their place, below which every one is needed to train on."""
 
@@ -33,10 +35,12 @@ def _affordable(settings: bpy.types.PropertyGroup) -> int:
 
 
 def offered(method: str) -> list[Field]:
-    """The parameters of a method that the panel offers: those that it declares, but for per-level ones."""
+    """The parameters of a method that the panel offers: those that it declares, but for per-level ones, and
+    ALL_OFFER."""
     info = method_info(method)
     known = {f.name: f for f in fields(info.parameters)}
-    return [known[name] for name in info.offered if not isinstance(known[name].default, tuple)]
+    names = (*info.offered, *ALL_OFFER)
+    return [known[name] for name in names if not isinstance(known[name].default, tuple)]
 
 
 def chooses_distances(method: str) -> bool:

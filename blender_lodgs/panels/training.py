@@ -10,7 +10,7 @@ from ...training.lod.rules.cut import RULE as CUT
 from ...training.methods import method_info
 from .. import extension
 from ..data import scenes, viewpoints
-from ..data.training import chooses_distances, hold_out, level_distances, offered
+from ..data.training import ALL_OFFER, chooses_distances, hold_out, level_distances, offered
 from ..runs import environment, jobs
 from ..runs.watch import Watch, watch_of
 from ..runs.words import measured_on, progress_facts, short_level_line
@@ -77,7 +77,8 @@ class LODGS_PT_training_advanced(Panel):
         layout.prop(settings, "seed")
         _draw_parameter(layout, settings, "test_every")
         for f in offered(settings.method):
-            _draw_parameter(layout, settings.parameters, f.name)
+            if f.name not in ALL_OFFER or root.lodgs.scene_folder:
+                _draw_parameter(layout, settings.parameters, f.name)
         if chooses_distances(settings.method):
             _draw_distances(layout, context, root)
         if root.lodgs.scene_folder:

@@ -99,12 +99,14 @@ class Parameters:
         0.0,
         "Weight in the loss, at the start, of how far off the depth of splats is where it is known (see "
         "depth): L1 of inverse depth, in inverse median depths. It falls to a hundredth; 0 for none.",
+        label="Depth Weight",
     )
     depth: str = parameter(
         "metric",
         "What is known of depth: maps in the folder depths, in the scene's unit (metric); maps of depth "
         "(relative) or of inverse depth (inverse) of which scale and shift are found by the scene's points, "
         "view by view; or only these points themselves (points).",
+        label="Depth Is",
         choices=KINDS,
     )
     lr_exposure: float = parameter(

@@ -154,8 +154,10 @@ def amounts(given: list[str]) -> dict[str, float] | None:
 
 
 def _assignment(text: str) -> tuple[str, object]:
-    """``name=value`` with a value as JSON has it: a number, a list of numbers."""
+    """``name=value`` with a value as JSON has it: a number, a list of numbers; or a plain word."""
     name, _, value = text.partition("=")
+    if value.isidentifier() and value not in ("true", "false", "null"):
+        return name.strip(), value
     try:
         return name.strip(), json_object(f'{{"value": {value}}}', "--set")["value"]
     except (LodgsError, KeyError):

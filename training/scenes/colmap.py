@@ -31,7 +31,7 @@ ASTRAY = 1000
 """What lies so many times as far from the middle of the cameras as most cameras or points is an error."""
 MASKS, DEPTHS = "masks", "depths"
 """Folders beside that of the photographs, or in the scene's where they are that."""
-DEPTH_SUFFIXES = ".exr", ".png"
+DEPTH_SUFFIXES = ".exr", ".png", ".npy"
 """How names of depth maps end."""
 MOST_EYES = 500
 """Cameras, evenly chosen, that tell the median depth."""

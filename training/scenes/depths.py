@@ -13,13 +13,13 @@ from .cameras import FARTHEST, Camera, evenly
 from .colmap import Scene, observations
 from .exr import MAGIC
 from .images import area_average, check_size, load_image
-from .rendered import read_depth, surface_points
+from .rendered import SKY, read_depth, surface_points
 
 KINDS = ("metric", "relative", "inverse", "points")
 """What is known: depth in the scene's unit; depth, or inverse depth, of which scale and shift are each view's
 own; or only where the model's points are."""
 UNIT = 1e-3
-"""A step of a 16-bit map in the scene's unit, as nerfstudio and most sensors have it."""
+"""A step of a map of whole numbers in the scene's unit, as nerfstudio and most sensors have it."""
 TRIED = 3
 """Views by which maps are compared with the scene's points."""
 ALIKE = 1.25
@@ -57,7 +57,15 @@ class Depths:
         if kind == "metric":
             asked = evenly(asked, TRIED)
         self._seen = observations(scene, [camera.name for camera in asked]) if asked else {}
-        self._used = bool(self._seen if kind == "points" else self._maps) and self._fits()
+        known = self._seen if kind == "points" else self._maps
+        if not known:
+            self.warnings.append(
+                "Depth is asked for, but the model does not tell which photographs see its points."
+                if kind == "points"
+                else "Depth is asked for, but no photograph has a depth map: put them into the folder depths "
+                "beside the photographs, or take the depth of the scene's points (depth = points)."
+            )
+        self._used = bool(known) and self._fits()
 
     def inverse(self, camera: Camera) -> np.ndarray | None:
         """1 / z of what a view shows, (H, W) float32 of its size, NaN where that is not known; or None.
@@ -200,21 +208,24 @@ def with_points(scene: Scene) -> Scene:
 def read_map(path: Path) -> np.ndarray:
     """The values of a depth map, (H, W) float64, NaN where there are none (0, or the sky of a renderer).
 
-    An EXR's are as they are stored: the nearest of its layers' Depth.Z, or what else is depth there; those of
-    a grey PNG count UNIT each.
+    An EXR's are as they are stored: the nearest of its layers' Depth.Z, or what else is depth there. So are a
+    NPY's of floats; whole numbers, there and in a grey PNG, count UNIT each.
 
     Raises:
         LodgsError: it cannot be read, or holds no depth.
     """
     try:
         with open(path, "rb") as file:
-            if file.read(4) == MAGIC:
-                depth = read_depth(path)
-                return np.where(depth < FARTHEST, depth, np.nan)
+            head = file.read(6)
+        if head[:4] == MAGIC:
+            depth = read_depth(path)
+            return np.where(depth < FARTHEST, depth, np.nan)
+        if head == b"\x93NUMPY":
+            values = _of_numpy(path)
+        else:
             from PIL import Image
 
-            file.seek(0)
-            with Image.open(file, formats=("PNG",)) as image:
+            with Image.open(path, formats=("PNG",)) as image:
                 check_size(path, image.size)
                 if image.mode not in ("I;16", "I", "L"):
                     raise LodgsError(
@@ -228,7 +239,20 @@ def read_map(path: Path) -> np.ndarray:
         raise LodgsError(
             f"{path} cannot be read as a depth map: {error}.", "Write it again, or take it away."
         ) from error
-    return np.where(values > 0, values, np.nan)
+    return np.where((values > 0) & (values < SKY), values, np.nan)
+
+
+def _of_numpy(path: Path) -> np.ndarray:
+    stored = np.load(path, mmap_mode="r", allow_pickle=False)
+    if stored.ndim == 3 and 1 in (stored.shape[0], stored.shape[2]):  # a channel, first or last
+        stored = stored.squeeze(0 if stored.shape[0] == 1 else 2)
+    if stored.ndim != 2 or stored.dtype.kind not in "fiu":
+        raise LodgsError(
+            f"{path} holds {stored.dtype} of shape {stored.shape}, not a depth map.",
+            "Save an array of height x width numbers.",
+        )
+    check_size(path, (stored.shape[1], stored.shape[0]))
+    return np.asarray(stored, np.float64) * (1 if stored.dtype.kind == "f" else UNIT)
 
 
 def averaged(values: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -39,7 +39,15 @@ def test_a_method_that_is_added_brings_its_parameters(made_up):
     names = [name for name in known.keys() if name not in ("rna_type", "name")]  # noqa: SIM118
     assert names == [
         f"{kind}{name}"
-        for name in ("decay", "width", "turns", "fast", "kind")  # one number for each level has no place
+        for name in (  # one number for each level has no place
+            "decay",
+            "width",
+            "turns",
+            "fast",
+            "kind",
+            "depth_weight",
+            "depth",
+        )
         for kind in ("", "use_", "preset_")
     ]
     assert not any(known[name].is_animatable for name in names)

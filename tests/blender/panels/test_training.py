@@ -74,16 +74,29 @@ def test_splats_alone_ask_for_views_of_them(bpy, lodgs, root, draw, fake):
     settings.views_from = "CAMERAS"
     assert draw().properties == [*begin, "view_width"] and "0 cameras" in draw().texts
     advanced = draw("LODGS_PT_training_advanced").properties
-    assert not {"region", "model", "images"} & set(advanced) and "seed" in advanced
+    without = {"region", "model", "images", "use_depth_weight", "use_depth"}
+    assert not without & set(advanced) and "seed" in advanced
+
+
+def test_depth_in_the_loss_is_set_as_any_parameter(lodgs, root):
+    jobs, settings = lodgs("runs.jobs"), root.lodgs.training
+    for settings.method in ("flod", "3dgs", "tree"):
+        assert not jobs.changes(settings)
+        settings.parameters.use_depth_weight = True
+        settings.parameters.depth_weight, settings.parameters.depth = 0.3, "points"
+        assert jobs.changes(settings) == {"depth_weight": 0.3, "depth": "points"}
+        assert jobs.parameters(settings).depth_weight == 0.3
 
 
 def test_a_parameter_shows_the_presets_number_until_it_is_set(root, draw):
     settings = root.lodgs.training
     common = ["region", "seed", "use_test_every", "preset_test_every", "model", "images", "output"]
+    depth = ["use_depth_weight", "preset_depth_weight", "use_depth", "preset_depth"]
 
     def shown():
-        notes = draw("LODGS_PT_training_advanced")
-        return [name for name in notes.properties if name not in common]
+        names = draw("LODGS_PT_training_advanced").properties
+        assert [name for name in names if name in depth] == depth
+        return [name for name in names if name not in common + depth]
 
     settings.preset = "standard"
     assert draw("LODGS_PT_training_advanced").operators == ["lodgs.add_region", "lodgs.open_run"]

@@ -65,13 +65,23 @@ def test_a_job_is_what_its_options_say(given):
     assert job("--scene", "/x", *options_of(given, but=("scene",))) == replace(given, scene="/x")
 
 
+def test_a_word_needs_no_quotation_marks():
+    for value in ("points", '"points"'):
+        parameters = job("--scene", "a", "--out", "b", "--set", f"depth={value}").resolved_parameters()
+        assert parameters.depth == "points"
+    flags = job("--scene", "a", "--out", "b", "--set", "antialias=true").resolved_parameters()
+    assert flags.antialias is True
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         ([], "not said what to train"),
         (["--scene", "a"], "--out RUN"),
         (["--scene", "a", "--out", "b", "--set", "rho"], "--set rho is not NAME=VALUE"),
-        (["--scene", "a", "--out", "b", "--set", "rho=four"], "--set rho=four is not NAME=VALUE"),
+        (["--scene", "a", "--out", "b", "--set", "rho=4 5"], "--set rho=4 5 is not NAME=VALUE"),
+        (["--scene", "a", "--out", "b", "--set", "rho=four"], "rho = 'four'"),
+        (["--scene", "a", "--out", "b", "--set", "depth=deep"], "depth = 'deep'"),
         (["--scene", "a", "--out", "b", "--set", "wings=2"], "unknown parameter 'wings'"),
         (["--scene", "a", "--out", "b", "--image-scale", "7"], "image_scale = 7.0 is not possible"),
         (["--scene", "a", "--out", "b", "--test-every", "1"], "test_every = 1 is not possible"),

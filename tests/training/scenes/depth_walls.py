@@ -82,6 +82,11 @@ def grey(path: Path, values: np.ndarray) -> None:
     )
 
 
+def npy(path: Path, values: np.ndarray) -> None:
+    with open(path, "wb") as file:  # whatever the name
+        np.save(file, values)
+
+
 def multilayer(folder, number, depth):
     colors = {f"L.Combined.{each}": np.ones_like(depth, np.float16) for each in "RGBA"}
     normals = {f"L.Normal.{each}": np.ones_like(depth, np.float32) for each in "XYZ"}
@@ -94,6 +99,10 @@ METRIC = {
     "half": lambda folder, number, depth: OpenEXR.File(
         {"type": OpenEXR.scanlineimage}, {"V": depth.astype(np.float16)}
     ).write(str(folder / f"{number}.exr")),
+    "numbers": lambda folder, number, depth: npy(folder / f"{number}.png.npy", depth.astype(np.float32)),
+    "whole numbers": lambda folder, number, depth: npy(
+        folder / f"{number}.npy", np.rint(1000 * depth[..., None]).astype(np.uint16)
+    ),
     "millimetres": lambda folder, number, depth: grey(folder / f"{number}.png", 1000 * depth),
 }
 FITTED = {

@@ -18,7 +18,7 @@ from training.scenes.images import load_image, write_png
 from training.scenes.undistort import undistorted
 
 from . import synthetic
-from .depth_walls import FITTED, METRIC, depth_of, exr, grey, put, write_walls
+from .depth_walls import FITTED, METRIC, depth_of, exr, grey, npy, put, write_walls
 from .walls import HEIGHT, WIDTH, photograph
 
 ONES = np.ones((HEIGHT, WIDTH), np.float32)
@@ -87,8 +87,9 @@ def test_maps_that_fit_no_points_are_not_used(walls, tmp_path):
 
 
 def test_without_maps_nothing_is_known(walls):
-    depths = Depths(read_scene(walls), "metric")
-    assert not depths and not depths.warnings
+    for kind in ("metric", "relative", "inverse"):
+        depths = Depths(read_scene(walls), kind)
+        assert not depths and "no photograph has a depth map" in " ".join(depths.warnings)
 
 
 def test_what_is_not_known_stays_so(walls, tmp_path):
@@ -118,7 +119,8 @@ def test_the_models_points_are_known_where_they_are(walls):
     np.testing.assert_allclose(found[y, x], 1 / z, rtol=0.2)  # two in one pixel: the nearer one
     np.testing.assert_allclose(found[known], 1 / depth_of(camera)[known], rtol=0.02)
     bare = replace(scene, point_ids=scene.point_ids[:0])  # nobody says who sees them
-    assert not Depths(bare, "points")
+    depths = Depths(bare, "points")
+    assert not depths and "does not tell which photographs see its points" in " ".join(depths.warnings)
 
 
 def test_points_come_from_maps_where_there_are_few(walls, tmp_path):
@@ -161,8 +163,14 @@ def test_they_are_straightened_like_their_photographs(tmp_path, lens):
         (lambda path: path.write_bytes(b"dear diary"), "cannot be read as a depth map"),
         (lambda path: exr(path, ONES, "Combined.R"), "no depth"),
         (lambda path: exr(path, ONES, "R", G=ONES), "no depth"),
+        (lambda path: npy(path, np.ones((HEIGHT, WIDTH, 3))), "of shape"),
+        (lambda path: npy(path, np.full((HEIGHT, WIDTH), "a")), "not a depth map"),
+        (lambda path: npy(path, np.full((HEIGHT, WIDTH), None)), "cannot be read as a depth map"),
+        (lambda path: npy(path, np.zeros((0, WIDTH))), "no pixels"),
+        (lambda path: path.write_bytes(b"\x93NUMPY\1\0v\0{'descr'"), "cannot be read as a depth map"),
     ],
-    ids=["colours", "proportions", "text", "one channel", "two channels"],
+    ids=["colours", "proportions", "text", "one channel", "two channels", "channels of numbers", "words",
+         "objects", "nothing", "cut short"],
 )  # fmt: skip
 def test_what_is_no_depth_map_is_a_sentence(walls, tmp_path, write, words):
     scene = read_scene(put(walls, tmp_path, lambda folder, n, depth: write(folder / f"{n}.png")))

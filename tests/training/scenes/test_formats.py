@@ -347,10 +347,10 @@ def test_depth_maps_come_along_and_give_the_points(tmp_path):
 def test_kinds_of_depth_that_are_not_read_are_left(tmp_path):
     def change(document):
         for frame in document["frames"]:
-            frame["depth_file_path"] = "depth.npy"
+            frame["depth_file_path"] = "depth.npz"
 
     write_transforms(tmp_path, change)
-    (tmp_path / "depth.npy").write_bytes(b"numbers")
+    (tmp_path / "depth.npz").write_bytes(b"numbers")
     assert convert(tmp_path).points == 30_000
     assert not (tmp_path / "depths").exists()
 

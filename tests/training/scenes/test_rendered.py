@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import OpenEXR
 import pytest
-from PIL import Image
 
 from training.__main__ import main
 from training.scenes.cameras import Camera, look_at, write_camera
@@ -121,9 +120,7 @@ def test_nothing_is_no_sky_where_pictures_are_transparent(tmp_path):
     for camera in cameras:
         depth, color = seen(camera)
         alpha = np.where(depth < SKY, 255, 0)[..., None].astype(np.uint8)
-        Image.fromarray(np.concatenate([color, alpha], axis=2)).save(
-            tmp_path / "images" / f"{camera.name}.png"
-        )
+        write_png(tmp_path / "images" / f"{camera.name}.png", np.concatenate([color, alpha], axis=2))
     write_model(tmp_path)
     scene = read_scene(tmp_path)
     assert len(scene.points) > 1000 and np.abs(scene.points).max() < 9
