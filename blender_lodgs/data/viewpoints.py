@@ -218,6 +218,18 @@ def count_of_scene(scene: bpy.types.Scene) -> int:
     return scene.lodgs_capture.views
 
 
+def chosen(context: bpy.types.Context) -> list[bpy.types.Object]:
+    """What is selected of a Blender scene, of that which views can be placed around."""
+    return [
+        obj
+        for obj in context.view_layer.objects
+        if obj.select_get()
+        and root_of(obj) is None
+        and not obj.hide_render
+        and (obj.type in _SOLID or obj.instance_type == "COLLECTION")
+    ]
+
+
 def _corners(context: bpy.types.Context) -> np.ndarray:
     """Corners (8 N, 3) of the boxes of what is selected of a Blender scene, or of all that renders of it.
 
@@ -226,8 +238,7 @@ def _corners(context: bpy.types.Context) -> np.ndarray:
     """
     depsgraph = context.evaluated_depsgraph_get()
     seen = [obj for obj in context.view_layer.objects if root_of(obj) is None]
-    chosen = [obj for obj in seen if obj.select_get()]
-    corners = list(_boxes(chosen, depsgraph)) or list(_boxes(seen, depsgraph))
+    corners = list(_boxes(chosen(context), depsgraph)) or list(_boxes(seen, depsgraph))
     if not corners:
         raise LodgsError(
             "The Blender scene holds nothing to look at.", "Add something, or choose other views."

@@ -51,6 +51,7 @@ class LODGS_OT_import_colmap(bpy.types.Operator):
             photographs=self.photographs,
             warn=warn,
         )
+        preparing.forget()
         preparing.straighten(root, warn)
         if first:  # otherwise the artist is looking at something
             photographs.look_at_scene(context, root, warn)

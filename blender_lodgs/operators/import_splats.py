@@ -9,6 +9,7 @@ import bpy
 
 from ...training.splats.formats import READABLE
 from ..data import photographs, scenes
+from ..runs import preparing
 from .frames import BesideBlender
 
 
@@ -74,6 +75,7 @@ class LODGS_OT_import_splats(BesideBlender, bpy.types.Operator):
                 if first:  # otherwise the artist is looking at something
                     photographs.look_at_scene(context, root, warn)
                     first = False
+                preparing.forget()
                 self._placed.append(f"'{root.name}': {scenes.contents(root)}")
         finally:
             reader.shutdown(wait=False, cancel_futures=True)

@@ -51,6 +51,10 @@ def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
     settings = context.scene.lodgs_capture
     column = split_column(layout)
     draw_views(column, settings, viewpoints.count_of_scene(context.scene))
+    if settings.views_from in ("DOME", "GRID"):
+        count = len(viewpoints.chosen(context))
+        selected = f"Of what is selected: {count} object{'' if count == 1 else 's'}."
+        say(column, selected if count else "Of everything: nothing is selected.", "INFO")
     width, height = viewpoints.size(context.scene, settings)
     measured = coverage.current(context.scene)
     text = f"{measured.enough:.0%} Seen by {coverage.ENOUGH} or More" if measured else "Show Coverage"

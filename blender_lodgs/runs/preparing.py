@@ -179,6 +179,13 @@ def _start(
     return current
 
 
+def forget() -> None:
+    """How the last work went is told no longer: another scene is looked at."""
+    global current
+    if current is not None and not current.running:
+        current = None
+
+
 def unregister() -> None:
     """It ends with Blender: another one goes on with it."""
     if current is not None and current.running:

@@ -33,6 +33,19 @@ def test_it_asks_for_views_and_offers_import_once_there_is_a_model(bpy, drawn, t
     assert any("not saved yet" in text for text in drawn().texts)
 
 
+def test_it_tells_what_views_are_placed_around(bpy, drawn):
+    settings = bpy.context.scene.lodgs_capture
+    bpy.ops.mesh.primitive_cube_add()
+    bpy.ops.object.light_add(type="SUN")  # nothing to look at, and alone selected
+    for settings.views_from in ("DOME", "GRID"):
+        assert "Of everything: nothing is selected." in drawn().texts
+    for obj in bpy.context.scene.objects:
+        obj.select_set(True)
+    assert "Of what is selected: 1 object." in drawn().texts
+    settings.views_from = "CAMERAS"
+    assert not any("selected" in text for text in drawn().texts)
+
+
 def test_it_tells_how_far_a_capture_is_and_how_it_ended(bpy, lodgs, drawn, monkeypatch):
     work = SimpleNamespace(running=True, message="View 3 of 9", fraction=0.2, problem="")
     monkeypatch.setattr(lodgs("runs.capturing"), "current", work)

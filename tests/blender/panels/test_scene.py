@@ -1,6 +1,7 @@
 """What the panels of the scene, of comparing, of the viewport and of rendering say and offer."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -37,6 +38,21 @@ def test_held_out_views_have_a_mean_of_their_own(bpy, lodgs, root, draw_panel):
     texts = draw_panel("compare", "LODGS_PT_compare").texts
     assert f"Held out: 20.0 dB ({len(views) - len(trained)} views)" in texts
     assert f"Trained on: {np.mean(trained):.1f} dB ({len(trained)} views)" in texts
+
+
+def test_how_an_import_went_is_told_until_there_is_another(bpy, lodgs, draw_panel, monkeypatch, tmp_path):
+    preparing = lodgs("runs.preparing")
+    write_bundle(tmp_path / "splats.ply", Bundle("flod", [Level(1, splats(5), {})], "bands"))
+    imports = (
+        lambda: bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "splats.ply")),
+        lambda: bpy.ops.lodgs.import_colmap(directory=str(GARDEN), photographs=False),
+    )
+    for again in imports:
+        work = SimpleNamespace(running=False, message="All 9 found their place", problem="", root=None)
+        monkeypatch.setattr(preparing, "current", work)
+        assert "All 9 found their place" in draw_panel("scene", "LODGS_PT_scene").texts
+        assert again() == {"FINISHED"}
+        assert "All 9 found their place" not in draw_panel("scene", "LODGS_PT_scene").texts
 
 
 def test_colours_have_a_legend(root, draw_panel):
