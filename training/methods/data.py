@@ -18,7 +18,7 @@ from ..rasterize import Target
 from ..scenes.cameras import Camera, evenly
 from ..scenes.colmap import Scene
 from ..scenes.depths import Depths
-from ..scenes.images import load_image
+from ..scenes.images import load_image, load_mask
 from .memory import TARGET_BYTES
 from .support import Support
 from .targets import Targets, default_budget
@@ -207,7 +207,7 @@ class TrainingData:
         size, alpha = (camera.width, camera.height), self.transparent
         image = load_image(camera.image, *size, exposure=self.exposure, alpha=alpha)
         planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))
-        mask = None if camera.mask is None else load_image(camera.mask, *size)[..., 0]
+        mask = None if camera.mask is None else load_mask(camera.mask, *size)
         known = self.depths.inverse(camera) if self.depths and camera.name in self._trained else None
         if known is not None and mask is not None:
             known[mask <= 0.5] = np.nan

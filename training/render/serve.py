@@ -49,7 +49,7 @@ from ..lod.paging import TreeFile
 from ..rasterize import resolve, why_cpu
 from ..runs.events import event_line
 from ..scenes.cameras import camera_as_dict
-from ..scenes.images import load_image
+from ..scenes.images import load_image, load_mask
 from ..splats.dialects import drawable
 from ..splats.placing import similarity
 from . import wire
@@ -162,7 +162,7 @@ class _Server:
             size = camera.width, camera.height
             photograph = load_image(request.photograph, *size, alpha=True)[..., :3]
             passes |= {f"Photograph.{channel}": photograph[..., i] for i, channel in enumerate("RGB")}
-            mask = torch.from_numpy(load_image(request.mask, *size)[..., 0]) if request.mask else None
+            mask = torch.from_numpy(load_mask(request.mask, *size)) if request.mask else None
             measured["psnr"] = psnr(torch.from_numpy(picture.image), torch.from_numpy(photograph), mask)
         wire.write_planes(self._folder / request.out, list(passes.values()))
         self.say(

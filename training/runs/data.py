@@ -15,7 +15,7 @@ from ..methods.data import TrainingData
 from ..scenes.cameras import Camera
 from ..scenes.colmap import Scene, read_scene, without
 from ..scenes.depths import Depths, with_points
-from ..scenes.images import check_image
+from ..scenes.images import check_image, check_mask
 from ..scenes.regions import Region
 from ..scenes.rendered import even
 from ..scenes.undistort import cache_of, undistorted
@@ -50,6 +50,9 @@ def training_data(
     scene = whole if region is None else region.views_of(whole)
     if pixels:
         scene = without(scene, _undecodable(scene.cameras))
+        for camera in scene.cameras:
+            if camera.mask is not None:
+                check_mask(camera.mask, camera.width, camera.height)
     warnings = list(scene.warnings)
     if scene.distorted:
         if tell:

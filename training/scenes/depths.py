@@ -12,7 +12,7 @@ from ..errors import LodgsError
 from .cameras import FARTHEST, Camera, evenly
 from .colmap import Scene, observations
 from .exr import MAGIC
-from .images import area_average, check_size, load_image
+from .images import alike, area_average, check_size, load_image
 from .rendered import SKY, read_depth, surface_points
 
 KINDS = ("metric", "relative", "inverse", "points")
@@ -270,8 +270,7 @@ def _read_map(camera: Camera, width: int = 0, height: int = 0) -> np.ndarray:
     assert camera.depth is not None
     values = read_map(camera.depth)
     high, wide = values.shape
-    least = min(wide, high, camera.width, camera.height)  # sides are whole pixels
-    if abs(np.log(wide * camera.height / (high * camera.width))) > 0.01 + 1 / least:
+    if not alike(wide, high, camera.width, camera.height):
         raise LodgsError(
             f"{camera.depth} is {wide}x{high}, of other proportions than its photograph.",
             "Write it again, or take it away.",

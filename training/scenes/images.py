@@ -212,6 +212,36 @@ def load_image(path: Path, width: int, height: int, exposure: float = 0.0, alpha
         return result
 
 
+def load_mask(path: Path, width: int, height: int) -> np.ndarray:
+    """A photograph's mask at the given size, (height, width) float32: 0 where the photograph does not count.
+
+    Raises:
+        LodgsError: the file cannot be read, or has other proportions.
+    """
+    check_mask(path, width, height)
+    return load_image(path, width, height)[..., 0]
+
+
+def check_mask(path: Path, width: int, height: int) -> None:
+    """Looks at the head of a mask of a photograph of a size.
+
+    Raises:
+        LodgsError: it is no image, or has other proportions.
+    """
+    wide, high = image_size(path)
+    if not alike(wide, high, width, height):
+        raise LodgsError(
+            f"The mask {path} is {wide}x{high}, of other proportions than its photograph.",
+            "Write it again, or take it away.",
+        )
+
+
+def alike(wide: int, high: int, width: int, height: int) -> bool:
+    """Whether two sizes are of the same proportions; sides are whole pixels."""
+    least = min(wide, high, width, height)
+    return bool(abs(np.log(wide * height / (high * width))) <= 0.01 + 1 / least)
+
+
 def check_image(path: Path) -> None:
     """Decodes an image, as small as its kind lets it, and forgets it.
 

@@ -25,7 +25,7 @@ from ..errors import LodgsError
 from ..files import atomic_write, link_or_copy
 from . import apart
 from .colmap import MASKS, find_models, told
-from .images import SUFFIXES, image_size, load_image, write_png
+from .images import SUFFIXES, check_mask, image_size, load_image, write_png
 from .photographs import Beside
 
 PRESETS = {"draft": (1000, 2048), "standard": (1600, 4096)}
@@ -140,7 +140,7 @@ def reconstruct(
             names = [_taken_over(photos, name, images) for name in names]
         asked = settings | {
             "photos": str(images), "names": names, "ordered": ordered, "work": str(work),
-            "masks": str(_masks(masks, names, out)) if masks else "",
+            "masks": str(_masks(masks, photos, names, out)) if masks else "",
         }  # fmt: skip
         with progress:
             problem = apart.run_apart("sfm", asked, work, hear)
@@ -273,12 +273,13 @@ def _begin(work: Path, settings: Mapping[str, object]) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def _masks(masks: Path, names: Sequence[str], out: Path) -> Path:
-    """A folder of masks as COLMAP names them."""
+def _masks(masks: Path, photos: Path, names: Sequence[str], out: Path) -> Path:
+    """A folder of masks of photographs as COLMAP names them."""
     there = out / MASKS
     for name in names:
         found = Beside(masks, ".png").find(name)
         if found is not None:
+            check_mask(found, *image_size(photos / name))
             link_or_copy(found, there / f"{name}.png")
     if not there.is_dir():
         raise LodgsError(

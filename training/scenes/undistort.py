@@ -21,7 +21,7 @@ from .cameras import Camera
 from .colmap import DEPTHS, MASKS, Scene, read_scene
 from .depths import read_map
 from .exr import write_exr
-from .images import exr_light, load_image, write_png
+from .images import exr_light, load_image, load_mask, write_png
 
 CACHE = ".undistorted"
 """Folder in a scene's of what is made of it once, for all runs and for Blender."""
@@ -127,10 +127,10 @@ def _undistort_into(target: Path, scene: Scene) -> None:
         masks = Path(work) / MASKS
         for camera in scene.cameras:
             if camera.mask is not None:
-                light = load_image(camera.mask, camera.width, camera.height)
+                light = load_mask(camera.mask, camera.width, camera.height)
                 path = masks / f"{camera.name}.png"
                 path.parent.mkdir(parents=True, exist_ok=True)
-                write_png(path, np.rint(255 * light).astype(np.uint8))
+                write_png(path, np.repeat(np.rint(255 * light).astype(np.uint8)[..., None], 3, axis=2))
         problem = apart.run_apart("undistort", request, Path(work))
         if problem:
             raise LodgsError(
