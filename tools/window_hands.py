@@ -106,6 +106,7 @@ def drag(pixels: Sequence[Sequence[int]]) -> Steps:
     """Press the left button at the first of some pixels of the window, and release it at the last."""
     window = bpy.context.window_manager.windows[0]
     for number, (x, y) in enumerate(pixels):
+        assert (covering := covered(int(x), int(y))) is None, f"{covering} lies over the scene at {x}, {y}."
         window.event_simulate(type="MOUSEMOVE", value="NOTHING", x=int(x), y=int(y))
         yield 0.3
         if not number:
@@ -113,6 +114,15 @@ def drag(pixels: Sequence[Sequence[int]]) -> Steps:
             yield 0.1
     window.event_simulate(type="LEFTMOUSE", value="RELEASE", x=int(x), y=int(y))
     yield 0.3
+
+
+def covered(x: int, y: int) -> str | None:
+    """What of the viewport lies over the scene at a pixel of the window, such as its sidebar."""
+    for part in viewport()[0].regions:
+        inside = 0 <= x - part.x < part.width and 0 <= y - part.y < part.height
+        if part.type != "WINDOW" and min(part.width, part.height) > 1 and inside:
+            return part.type
+    return None
 
 
 def type_in(text: str) -> Steps:

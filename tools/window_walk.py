@@ -203,10 +203,12 @@ def left() -> str:
 def click() -> Steps:
     """A click on nothing deselects; one on the splats selects their scene, also before a mesh; one on a mesh
     before them the mesh."""
+    look_from(place_of(-1.0, -4.5, 2.2), place_of(0.3, 0.1, 0.7))
+    yield from settle()
     press("mesh.primitive_cube_add", way="EXEC_DEFAULT", size=0.2, location=place_of(0.0, 0.9, 0.8))
     behind = bpy.context.active_object
     away = pixel_of(*LANTERN)
-    nothing = region().x + 90, region().y + 15
+    nothing = region().x + 120, region().y + 3 * region().height // 5  # left of what is left of the scene
     for place, chosen in ((nothing, None), (away, scene_root())):
         yield from click_at(*place)
         selected = bpy.context.view_layer.objects.selected[:]

@@ -51,7 +51,10 @@ def test_the_way_from_photographs_to_what_is_handed_on(bpy, lodgs, tmp_path, mon
 
     undone = [way.back_to(bpy.ops.ed.undo, state) for state in states[-2::-1]]
     levels = undone.pop(-2)  # each of them, some of them twice, the end, and Train
-    assert undone == [1] * 8 and len(counts) + 2 <= levels <= 2 * len(counts) + 2
+    picks = (
+        [1] * 3 + [1 if way.ground_found else 2] + [1] * 4
+    )  # each step is one, picked ground has its empties
+    assert undone == picks and len(counts) + 2 <= levels <= 2 * len(counts) + 2
     for state in states[1:]:
         way.back_to(bpy.ops.ed.redo, state)
     assert way.assert_cropped() == counts
@@ -72,6 +75,7 @@ class Way:
         self.bpy, self.lodgs, self.folder = bpy, lodgs, folder
         self.sphere = np.zeros(3), 1.0  # in the scene's own space
         self.factor = 1.0
+        self.ground_found = True
 
     @property
     def root(self):
@@ -128,21 +132,45 @@ class Way:
         }
 
     def ground(self):
-        assert self.bpy.ops.lodgs.set_ground("EXEC_DEFAULT", True, by="FOUND") == {"FINISHED"}
+        """Found; or where photographs show none, picked: level, under what is left."""
+        try:
+            assert self.bpy.ops.lodgs.set_ground("EXEC_DEFAULT", True, by="FOUND") == {"FINISHED"}
+            return
+        except RuntimeError as error:
+            assert OWN and "No plane lies under this scene" in str(error)
+        self.ground_found = False
+        finest = self.trained().levels[-1].splats.means
+        inside = finest[np.linalg.norm(finest - self.sphere[0], axis=1) < self.sphere[1]]
+        to_world = self.to_world()
+        lowest = np.percentile(inside @ to_world[2, :3] + to_world[2, 3], 1)
+        middle = to_world[:3, :3] @ self.sphere[0] + to_world[:3, 3]
+        for x, y in ((0, 0), (1, 0), (0, 1)):
+            self.add_mark("ground", (middle[0] + x, middle[1] + y, lowest))
+        self.select("ground")
+        self.push("Add Empties")
+        assert self.bpy.ops.lodgs.set_ground("EXEC_DEFAULT", True, by="SELECTION") == {"FINISHED"}
+        assert abs(self.to_world() @ [*self.sphere[0], 1] - [*middle[:2], middle[2] - lowest, 1]).max() < 1e-4
 
     def mark(self):
         """Two empties, 2 apart."""
-        for name, place in (("begin", (0, 0, 0)), ("end", (0, 2, 0))):
-            mark = self.bpy.data.objects.new(name, None)
-            mark.location = place
-            self.bpy.context.scene.collection.objects.link(mark)
-        self.bpy.context.view_layer.update()
+        self.add_mark("begin", (0, 0, 0))
+        self.add_mark("end", (0, 2, 0))
         self.push("Add Empties")
 
-    def scale(self):
+    def add_mark(self, name: str, place):
+        mark = self.bpy.data.objects.new(name, None)
+        mark.location = place
+        self.bpy.context.scene.collection.objects.link(mark)
+        self.bpy.context.view_layer.update()
+
+    def select(self, *names: str):
+        """Objects of these names, and the root, which becomes the active one."""
         for obj in self.bpy.context.view_layer.objects:
-            obj.select_set(obj.name in ("begin", "end") or obj == self.root)
+            obj.select_set(obj.name.split(".")[0] in names or obj == self.root)
         self.bpy.context.view_layer.objects.active = self.root
+
+    def scale(self):
+        self.select("begin", "end")
         assert self.bpy.ops.lodgs.set_scale("EXEC_DEFAULT", True, length=LENGTH) == {"FINISHED"}
         self.factor = LENGTH / 2
 
@@ -220,12 +248,15 @@ class Way:
     def assert_the_same_by_one_command(self, python: str, streams: bool, counts: dict):
         centre, radius = self.sphere
         folder = self.folder
+        placed = ["--ground", "--scale", self.factor]
+        if not self.ground_found:
+            placed = ["--matrix=" + ",".join(map(str, self.to_world().ravel()))]
         command = [
             python, "-m", "training", "edit", folder / "run" / "bundle.ply",
             "--out", folder / "edited.ply", "--plain", folder / "edited_plain.ply",
             *(["--streamed", folder / "edited_web"] if streams else []),
             "--crop-sphere", *centre, radius, "--drop-floaters", "--share", SHARE,
-            "--scene", SCENE, "--ground", "--scale", self.factor, "--tint", *TINT,
+            "--scene", SCENE, *placed, "--tint", *TINT,
         ]  # fmt: skip
         said = subprocess.run([str(part) for part in command], cwd=ROOT, capture_output=True, text=True)
         assert said.returncode == 0, said.stderr
