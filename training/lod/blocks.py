@@ -101,6 +101,12 @@ class Blocks:
         least, most = self.distances(eye)
         return (most * (1 + ROUNDING) >= near) & (least * (1 - ROUNDING) < far)
 
+    def within(self, eye: np.ndarray, near: float | np.ndarray, far: float | np.ndarray) -> np.ndarray:
+        """(B,) bool, True only where every mean of a block is at a distance near <= d < far from an eye (3,),
+        in single precision, too. Arguments as of :meth:`between`."""
+        least, most = self.distances(eye)
+        return (least * (1 - ROUNDING) >= near) & (most * (1 + ROUNDING) < far)
+
     def rows(self, which: np.ndarray) -> np.ndarray:
         """The rows (M,) int32 of the blocks that are True in (B,), ascending."""
         begins = np.flatnonzero(which).astype(np.int32) * SIZE

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ..scenes.cameras import Camera
-from .blocks import Blocks
+from .blocks import SIZE, Blocks
 from .crop import Crop, kept
 from .rule import EVERYTHING, HIDDEN, OPACITY, Region, Rule, Tables, every_column, rules
 
@@ -200,18 +200,24 @@ class Chooser:
         if blocks is None:
             weights = weigh(means, columns)
         else:
-            seen = np.ones(len(blocks.low), bool)
+            seen, whole = np.ones(len(blocks.low), bool), np.full(len(blocks.low), choice is None)
             if choice is not None and rule is not None and rule.apart and not in_region:
-                eye = np.array(choice.eye, np.float32)  # as weights take it
-                seen &= blocks.between(eye, *choice.band(part.highest(rule)))
+                eye, band = np.array(choice.eye, np.float32), choice.band(part.highest(rule))
+                seen &= blocks.between(eye, *band)
+                if rule.flat and choice.crops is None:
+                    whole = blocks.within(eye, *band)
             if camera is not None and seen.any():
                 seen &= blocks.in_view(camera, near)
-            if rule is None or rule.apart:
-                columns = {name: blocks.of_rows(seen, column) for name, column in columns.items()}
-                weights = weigh(blocks.of_rows(seen, means), columns)
-            else:
-                weights = blocks.of_rows(seen, weigh(means, columns))
             rows = blocks.rows(seen) if rows is None else blocks.of_rows(seen, rows)
+            if rule is not None and not rule.apart:
+                weights = blocks.of_rows(seen, weigh(means, columns))
+            else:
+                asked, weights = seen & ~whole, np.ones(len(rows), np.float32)
+                if not asked.any():
+                    return rows, weights
+                columns = {name: blocks.of_rows(asked, column) for name, column in columns.items()}
+                found = weigh(blocks.of_rows(asked, means), columns)
+                weights[np.repeat(asked[seen], SIZE)[: len(rows)]] = found
         some = np.flatnonzero(weights > 0)
         found = some.astype(np.int32) if rows is None else rows[some]
         return found, weights[some].astype(np.float32)

@@ -111,6 +111,7 @@ class Rule(ABC):
         always: whether its weights belong to the picture at full detail, too: without them a level is not
             what was trained.
         apart: whether the weight of a splat does not depend on other splats, so that a few can be asked for.
+        flat: whether every splat within its level's :meth:`band` has the weight 1.
         complete: whether each level, with the coarser ones where levels add up, is a scene by itself;
             otherwise only the finest is, and coarser ones are there to choose from.
         sweep: a control, and values of it that a report measures one by one; None: it needs no such curve.
@@ -128,6 +129,7 @@ class Rule(ABC):
     related: ClassVar[bool] = False
     always: ClassVar[bool] = False
     apart: ClassVar[bool] = True
+    flat: ClassVar[bool] = False
     complete: ClassVar[bool] = True
     sweep: ClassVar[tuple[str, tuple[float, ...]] | None] = None
 

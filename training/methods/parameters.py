@@ -91,7 +91,7 @@ class Parameters:
         high=2,
     )
     antialias: bool = parameter(
-        False,
+        True,
         "Whether splats are drawn through Mip-Splatting's 2D filter, which keeps the light of those that are "
         "smaller than a pixel, instead of 3DGS's dilation. Where a run begins with a base, the base decides.",
     )
@@ -209,8 +209,9 @@ AS_PUBLISHED: dict[str, Any] = {
     "largest": 0.0,
     "random_background": False,
     "margin": 0.0,
+    "antialias": False,
 }
-"""What presets *paper* leave out, whatever the method: it is in none of the papers."""
+"""What presets *paper* leave out, whatever the method: it is in none of the papers (but LODGE's has the filter)."""
 PAPER: dict[str, Any] = AS_PUBLISHED | {
     "first_resolution": 1.0,
     "long_axis": False,

@@ -55,7 +55,12 @@ def test_the_loss_by_hand(data):
     found = float(method.depth_loss(drawings[0].rendering, view, 0).detach())
     gaussians = Gaussians(*(tensor.detach().double() for tensor in vars(method.model.gaussians).values()))
     drawn = rasterize(
-        gaussians, view.camera, near=data.near, outputs=("inverse_depth",), backend="reference"
+        gaussians,
+        view.camera,
+        near=data.near,
+        antialias=True,
+        outputs=("inverse_depth",),
+        backend="reference",
     ).inverse_depth
     camera = data.scene.cameras[[each.name for each in data.scene.cameras].index(view.camera.name)]
     small = (1 / depth_of(camera.scaled(0.25 / view.shrink))).astype(np.float64)

@@ -9,7 +9,8 @@ import torch
 from training.errors import LodgsError
 from training.lod import sight
 from training.lod.blocks import SIZE, spatial_order
-from training.lod.rule import rules
+from training.lod.choice import Choice, Chooser
+from training.lod.rule import HIDDEN, rules
 from training.lod.rules.chunks import member_columns
 from training.lod.selection import complete, select, settings
 from training.lod.streaming import BLOCKS, table_of_blocks
@@ -216,3 +217,35 @@ def test_nothing_with_a_weight_is_passed_over(rule):
             assert not (alone.radii > 0).any()
             passed += len(left_out)
     assert passed
+
+
+def test_within_a_band_nothing_is_asked_and_the_same_is_chosen(monkeypatch):
+    """Of blocks that a band holds whole; what is hidden or cropped is looked at all the same."""
+    shown, asked = bundle("bands"), []
+    one = shown.levels[1].splats
+    one = one.select(spatial_order(one.means))
+    rule = rules()["bands"]
+    real = type(rule).weights
+
+    def counting(self, means, *rest):
+        asked.append(len(means))
+        return real(self, means, *rest)
+
+    monkeypatch.setattr(type(rule), "weights", counting)
+    chooser = Chooser(one.means, {}, one.log_scales)
+    away = np.linalg.norm(one.means, axis=1)
+    counts = []
+    for s_min, coarser in ((0.0, 1e6), (0.0, 0.23), (0.02, 0.1), (0.3, 0.4)):
+        facts = {"level": 2, "levels": 3, "finer": 3, "coarser": 1, "s_min": s_min, "coarser_s_min": coarser}
+        values = {"gamma": 1.0, "first": 1, "last": 3}
+        choice = Choice("bands", (0.0, 0.0, 0.0), 60.0, tuple(facts.items()), tuple(values.items()))
+        expected = np.flatnonzero((away >= np.float32(60 * s_min)) & (away < np.float32(60 * coarser)))
+        asked.clear()
+        rows, weights = chooser.chosen(choice)
+        np.testing.assert_array_equal(rows, expected)
+        assert rows.dtype == np.int32 and (weights == 1).all() and weights.dtype == np.float32
+        counts.append((sum(asked), len(expected)))
+        hidden = Chooser(one.means, {HIDDEN: (one.means[:, 0] > 0).astype(np.float32)}, one.log_scales)
+        rows, _ = hidden.chosen(replace(choice, crops=()))
+        np.testing.assert_array_equal(rows, expected[one.means[expected, 0] <= 0])
+    assert counts[0] == (0, len(one)) and 0 < counts[1][0] < 0.8 * counts[1][1] and counts[3] == (0, 0)

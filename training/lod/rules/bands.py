@@ -35,6 +35,7 @@ class Bands(Rule):
     name = "bands"
     level_facts = ("s_min",)
     lengths = level_facts
+    flat = True
     controls = (
         Control(
             "gamma", 1.0, 0.01, 1000.0, "Screen Size",

@@ -104,8 +104,7 @@ _DRAFT = LodgeParameters()
 _STANDARD = replace(_DRAFT, **STANDARD, steps=30_000, densify_interval=100, tune_steps=1000)
 _PAPER = replace(
     _STANDARD,
-    **PAPER,
-    antialias=True,
+    **PAPER | {"antialias": True},
     densify_interval=300,
     densify_from=600,
     densify_by="max",

@@ -75,6 +75,7 @@ _DRAFT = NeuralOctreeParameters(
     full_share=0.1,
     least_weight=0.03,
     volume_weight=0.01,
+    antialias=False,
     lr_means=4e-4,
     lr_sh=5e-3,
 )

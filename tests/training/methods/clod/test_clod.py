@@ -93,7 +93,9 @@ def test_decays_begin_by_importance(data):
     clod = make(data, tau=0.004)
     trained(clod, 12)
     before, p = clod.model["opacity_logits"].detach().sigmoid(), clod.parameters
-    found = contributions(clod.model.gaussians.detach(), data.train, near=data.near, backend="cpu")
+    found = contributions(
+        clod.model.gaussians.detach(), data.train, near=data.near, antialias=True, backend="cpu"
+    )
     means = clod.model["means"].detach().numpy().copy()
     clod.begin_decay()
     # those that give most to the pixels of a view stay, as many as views draw 74 % of what they drew

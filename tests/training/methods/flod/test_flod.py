@@ -225,7 +225,9 @@ def test_levels_of_fine_detail_begin_anew_as_what_shows_most_of_the_finest(data)
     finest, (*coarser, last) = handed[-1].splats, finish.levels_of(flod.model, flod.s_min)
     assert_same(last.splats, finest)
     wide = [camera.widened(0.25) for camera in data.train]
-    shares = contributions(Gaussians.of(finest), wide, near=data.near, backend="reference").largest.numpy()
+    shares = contributions(
+        Gaussians.of(finest), wide, near=data.near, antialias=True, backend="reference"
+    ).largest.numpy()
     assert [level.number for level in coarser] == [1, 2]
     for level in coarser:
         places = {tuple(mean): row for row, mean in enumerate(finest.means.tolist())}
@@ -272,8 +274,9 @@ def test_finishing_steps_draw_what_the_rule_chooses(data, alone):
         with torch.no_grad():
             drawn = flod.draw(view, step)[0].rendering.image
             expected = rasterize(
-                Gaussians.of(splats), view.camera, near=data.near, sh_degree=flod.sh_degree(step)
-            )
+                Gaussians.of(splats), view.camera, near=data.near, sh_degree=flod.sh_degree(step),
+                antialias=True,
+            )  # fmt: skip
         assert weights is None and 0 < len(splats) < sum(len(level.splats) for level in handed)
         torch.testing.assert_close(drawn, expected.image)
     assert len(seen) == 9 and nearest == ({1, 2, 3} if alone else {3})
