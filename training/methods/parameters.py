@@ -211,7 +211,7 @@ AS_PUBLISHED: dict[str, Any] = {
     "margin": 0.0,
     "antialias": False,
 }
-"""What presets *paper* leave out, whatever the method: it is in none of the papers (but LODGE's has the filter)."""
+"""What presets *paper* leave out, whatever the method: it is in no paper, but for the filter, in LODGE's."""
 PAPER: dict[str, Any] = AS_PUBLISHED | {
     "first_resolution": 1.0,
     "long_axis": False,

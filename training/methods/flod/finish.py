@@ -82,7 +82,9 @@ def begun_anew(
         gamma: the screen size that levels are chosen with.
 
     Returns:
-        Their splats, in spatial order, none smaller than its level allows.
+        Their splats, in spatial order, none smaller than its level allows. With Mip-Splatting's filter, which
+        shows of splats smaller than a pixel as little as they are, those that are raised to that size become
+        as much fainter as they cover more.
     """
     p, (coarsest, *_, finest) = parameters, levels
     order = torch.from_numpy(spatial_order(levels[finest]["means"].cpu().numpy()))
@@ -111,11 +113,27 @@ def begun_anew(
     for number in numbers:
         kept = first[number] >= least
         wider = log_scales + room_taken_over(log_scales, shares, kept)[:, None]
-        sizes = torch.from_numpy(np.maximum(wider, np.float32(np.log(s_min[number - 1]))))
-        level = tensors | {"log_scales": sizes.to(tensors["log_scales"])}
+        sizes = np.maximum(wider, np.float32(np.log(s_min[number - 1])))
+        level = tensors | {"log_scales": torch.from_numpy(sizes).to(tensors["log_scales"])}
+        if p.antialias:
+            share = torch.from_numpy(np.exp(covered_log(wider) - covered_log(sizes)))
+            level["opacity_logits"] = fainter(tensors["opacity_logits"], share)
         rows = torch.from_numpy(kept)
         anew[number] = {name: tensor[rows.to(tensor.device)] for name, tensor in level.items()}
     return anew
+
+
+def covered_log(log_scales: np.ndarray) -> np.ndarray:
+    """Logarithm of the areas (N,) that ellipsoids (N, 3) cover, but for a factor: root mean square over all
+    sides to see them from."""
+    squares = np.exp(2 * log_scales.astype(np.float64))
+    return np.log((squares * np.roll(squares, 1, axis=1)).sum(1)) / 2
+
+
+def fainter(logits: torch.Tensor, share: torch.Tensor) -> torch.Tensor:
+    """Opacities (N,), as logits, times shares (N,) in (0, 1]."""
+    share = share.to(logits)
+    return torch.where(share < 1, torch.logit((logits.sigmoid() * share).clamp_min(1e-6)), logits)
 
 
 def rates(parameters: FlodParameters, extent: float, share: float) -> dict[str, LearningRate]:

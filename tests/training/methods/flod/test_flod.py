@@ -1,11 +1,13 @@
 """FLoD as published: constraint, level rise, overlap pruning, schedule."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from training.errors import LodgsError
-from training.lod.blocks import SIZE
+from training.lod.blocks import SIZE, spatial_order
 from training.lod.rule import every_control
 from training.lod.selection import select, settings
 from training.methods.data import TrainingData
@@ -13,6 +15,7 @@ from training.methods.flod import METHOD, finish
 from training.methods.flod.train import Method, apart
 from training.methods.model import NAMES
 from training.methods.parameters import override
+from training.methods.start import from_splats
 from training.rasterize import Gaussians, contributions, rasterize
 from training.scenes.colmap import read_scene
 from training.splats.bundle import Bundle, Level
@@ -219,6 +222,13 @@ def test_finishing_begins_with_the_levels_as_they_were_handed_over(data):
             np.testing.assert_array_equal(getattr(before.splats, name), getattr(after.splats, name))
 
 
+def seen_area(scales: np.ndarray) -> np.ndarray:
+    """Root mean square area (N,) of ellipsoids (N, 3) on planes of all directions, by projecting them."""
+    bases, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(1000, 3, 2)))
+    squares = [np.linalg.det(np.einsum("mki,k,mkj->mij", bases, one**2, bases)).mean() for one in scales]
+    return np.sqrt(squares)
+
+
 def test_levels_of_fine_detail_begin_anew_as_what_shows_most_of_the_finest(data):
     """Blending weights by the reference; in views as wide as photographs are continued."""
     flod, handed = finishing(data, footprint=1.0, drawn=0.6, margin=0.25)
@@ -245,6 +255,30 @@ def test_levels_of_fine_detail_begin_anew_as_what_shows_most_of_the_finest(data)
         assert len(np.unique(larger.round(3))) <= -(-len(finest) // SIZE)
     one, two = (len(level.splats) for level in coarser)
     assert one == pytest.approx(0.8 * two, abs=1)
+
+
+def test_what_is_raised_to_a_levels_size_is_as_much_fainter_as_it_covers_more(data):
+    """With the filter; without it splats smaller than a pixel were drawn nearly as large before."""
+    flod, handed = finishing(data, footprint=1.0, drawn=0.6)
+    levels = {level.number: from_splats(level.splats, 3, torch.device("cpu")) for level in handed}
+    finest = levels[3]
+    finest["log_scales"] -= torch.tensor([6.0, 5.0, 7.0])
+    for antialias in (True, False):
+        p = replace(flod.parameters, antialias=antialias)
+        anew = finish.begun_anew(levels, [1, 2], flod.s_min, data, p, flod.controls()["gamma"], "cpu")[2]
+        places = {tuple(mean): row for row, mean in enumerate(finest["means"].tolist())}
+        rows = [places[tuple(mean)] for mean in anew["means"].tolist()]
+        own, raised = finest["log_scales"][rows].exp().numpy(), anew["log_scales"].exp().numpy()
+        ratio = (anew["opacity_logits"].sigmoid() / finest["opacity_logits"][rows].sigmoid()).numpy()
+        if not antialias:
+            np.testing.assert_array_equal(ratio, 1)
+            continue
+        expected = seen_area(own) / seen_area(raised)
+        assert np.median(expected) < 0.1
+        # but for what a block takes over of the room of those that went, at most four times the area
+        taken, block = ratio / expected, np.argsort(spatial_order(finest["means"].numpy()))[rows] // SIZE
+        for number in set(block):
+            assert np.ptp(taken[block == number]) < 0.05 * taken[block == number].max() <= 0.25
 
 
 @pytest.mark.parametrize("drawn", [0.5, 0.8])
