@@ -15,7 +15,8 @@ import bpy
 from ..training.errors import LodgsError
 from ..training.evaluate.words import summary_lines
 from ..training.lod.describe import describe
-from ..training.lod.selection import complete
+from ..training.lod.edit import Joined, finish
+from ..training.lod.unfiltered import without_filter
 from ..training.methods.describe import describe_method, describe_methods
 from ..training.runs.folder import RunFolder
 from ..training.runs.job import Job, check_views
@@ -212,8 +213,8 @@ def _export(args: argparse.Namespace) -> int:
     if format_of(args.bundle) is PLY:
         write_bundle(args.bundle, bundle)
     else:
-        for _ in write_splats(args.bundle, complete(bundle, bundle.levels[-1]), bundle.meta):
-            pass
+        form = bundle if format_of(args.bundle).antialiased else without_filter(bundle)
+        finish(write_splats(args.bundle, Joined.upto(form, form.levels[-1].number), form.meta))
     return DONE
 
 

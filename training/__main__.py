@@ -246,6 +246,11 @@ def _parser() -> argparse.ArgumentParser:
         help="folder of levels to write as browsers load them",
     )
     edit.add_argument(
+        "--antialiased", action="store_true",
+        help="--plain and --streamed are for programs that know Mip-Splatting's filter: opacities stay as "
+        "they were trained",
+    )  # fmt: skip
+    edit.add_argument(
         "--crop-box", type=float, nargs=6, action="append", default=[], metavar="N",
         help="two opposite corners of a box, X Y Z X Y Z; of several boxes and spheres any one counts",
     )  # fmt: skip
@@ -634,6 +639,7 @@ def _edit(chosen: argparse.Namespace) -> int:
                 placement=_placement(chosen), upright=chosen.upright, ground=chosen.ground, points=points,
                 looks=[(place, look) for place in places] if parts else (),
                 plain=chosen.plain, folder=chosen.folder, streamed=chosen.streamed,
+                antialiased=chosen.antialiased,
             )
         )  # fmt: skip
     return 0

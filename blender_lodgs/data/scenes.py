@@ -27,7 +27,8 @@ from ...training.scenes.cameras import Camera, extent_of
 from ...training.scenes.colmap import Scene, read_scene
 from ...training.scenes.formats import colmap_scene
 from ...training.scenes.undistort import already_undistorted
-from ...training.scenes.views import tables_of, views_in
+from ...training.scenes.views import VIEWS, tables_of, views_in
+from ...training.scenes.views import placed as placed_views
 from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder, read_head
 from ...training.splats.formats import STREAMED, as_ply, is_ply
 from ...training.splats.gaussians import Splats
@@ -419,7 +420,7 @@ def read_levels(root: bpy.types.Object, placed: bool = False, looked: bool = Fal
     facts, meta = selection.read_facts(settings.facts), selection.read_json(settings.meta)
     bundle = Bundle(
         settings.method, levels, settings.rule, facts, _set_controls(root), settings.cumulative, meta,
-        tables.read_tables(root) | _views_of(root),
+        tables.read_tables(root) | view_tables(root),
     )  # fmt: skip
     bundle = cleaning.left(root, bundle, bpy.context.evaluated_depsgraph_get())
     if looked:
@@ -430,8 +431,12 @@ def read_levels(root: bpy.types.Object, placed: bool = False, looked: bool = Fal
     return bundle
 
 
-def _views_of(root: bpy.types.Object) -> dict[str, dict[str, np.ndarray]]:
-    """A scene's views as tables of its bundle, in the order in which they came."""
+def view_tables(root: bpy.types.Object, placed: bool = False) -> dict[str, dict[str, np.ndarray]]:
+    """A scene's views as tables of its bundle, in the order in which they came.
+
+    Args:
+        placed: see :func:`read_levels`.
+    """
     found = sorted(
         (view for view in views(root) if view.data.lodgs.width), key=lambda view: view.data.lodgs.place
     )
@@ -439,7 +444,10 @@ def _views_of(root: bpy.types.Object) -> dict[str, dict[str, np.ndarray]]:
     axes = axes_of(root)
     unit = 1.0 if axes == root else axes.matrix_basis.to_scale().x  # ``ground.scale`` takes clips along
     unseen = {view.name for view in found if is_held_out(root, view)}
-    return tables_of([camera_of(view) for view in found], near / unit, unseen)
+    made = tables_of([camera_of(view) for view in found], near / unit, unseen)
+    if placed and VIEWS in made:
+        made[VIEWS] = placed_views(made[VIEWS], placement_of(root))
+    return made
 
 
 def delete_left_out(root: bpy.types.Object) -> int:

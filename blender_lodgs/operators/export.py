@@ -11,7 +11,8 @@ from bpy_extras.io_utils import ExportHelper
 from ...training.errors import LodgsError
 from ...training.lod.paging import is_tree
 from ...training.lod.tree import complete_levels
-from ...training.splats.bundle import Bundle, write_bundle, write_folder
+from ...training.lod.unfiltered import without_filter
+from ...training.splats.bundle import Bundle, Level, write_bundle, write_folder
 from ...training.splats.formats import FORMATS, PLY, STREAMED, Format, format_of, write_splats, write_streamed
 from ..data import scenes, selection
 from ..data.objects import megabytes, sh_degree
@@ -60,6 +61,18 @@ class _AsShown(OnLevels):
         description="Write the splats in the colours and opacities that the Look panel gives them. Otherwise "
         "as they were trained",
         default=True,
+    )
+
+
+class _ForOthers(_AsShown):
+    """What exports for other programs can be told."""
+
+    antialiased: bpy.props.BoolProperty(
+        name="Antialiased",
+        description="For programs that draw splats with Mip-Splatting's filter, as LODGS does: leave "
+        "opacities as they were trained. Otherwise small splats are as faint as the photographs' views show "
+        "them, so that other programs do not draw them too bold. SPZ says which it is, and needs no choice",
+        default=False,
     )
 
 
@@ -138,7 +151,7 @@ class LODGS_OT_export_bundle(_Export, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LODGS_OT_export_plain(_Export, _Converting, bpy.types.Operator):
+class LODGS_OT_export_plain(_ForOthers, _Export, _Converting, bpy.types.Operator):
     """Export one level, or the splats that are shown now, as a plain file of splats for other programs"""
 
     bl_idname = "lodgs.export_plain"
@@ -186,6 +199,10 @@ class LODGS_OT_export_plain(_Export, _Converting, bpy.types.Operator):
             layout.prop(self, "level")
         layout.prop(self, "placed")
         layout.prop(self, "looked")
+        row = layout.row()
+        told = format_of(Path(f"splats{self.kind}")).antialiased
+        row.active = scenes.active_root(context).lodgs.antialias and not told
+        row.prop(self, "antialiased")
         layout.label(text="Format, and about how large:")
         column = layout.column(align=True)
         column.use_property_split = False
@@ -199,8 +216,11 @@ class LODGS_OT_export_plain(_Export, _Converting, bpy.types.Operator):
             splats = scenes.read_level(root, self.level, self.placed, self.looked)
         else:
             splats = scenes.shown_splats(context, root, self.placed, self.looked)
-        meta = selection.read_json(root.lodgs.meta)
-        yield from self.told(write_splats(self._path(), splats, meta))
+        meta, path = selection.read_json(root.lodgs.meta), self._path()
+        form = Bundle("", [Level(1, splats)], meta=meta, tables=scenes.view_tables(root, self.placed))
+        if not (self.antialiased or format_of(path).antialiased):
+            form = without_filter(form)
+        yield from self.told(write_splats(path, form.levels[0].rows, form.meta))
         self.written = f"{len(splats):,} splats written to {self._path()}"
 
 
@@ -222,7 +242,7 @@ class _IntoFolder(_AsShown):
 
     def draw(self, context):
         self.layout.use_property_split = True
-        for name in ("placed", "looked", "replace"):
+        for name in ("placed", "looked", "antialiased", "replace"):
             if name in self.bl_rna.properties:
                 self.layout.prop(self, name)
         self.layout.label(text=f"About {_size(context, self.kind, -1)} in all")
@@ -257,7 +277,7 @@ class LODGS_OT_export_folder(_IntoFolder, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LODGS_OT_export_streamed(_IntoFolder, _Converting, bpy.types.Operator):
+class LODGS_OT_export_streamed(_ForOthers, _IntoFolder, _Converting, bpy.types.Operator):
     """Export levels for the web, where PlayCanvas and SuperSplat load them piece by piece, by distance"""
 
     bl_idname = "lodgs.export_streamed"
@@ -266,6 +286,7 @@ class LODGS_OT_export_streamed(_IntoFolder, _Converting, bpy.types.Operator):
 
     def work(self, context):
         bundle = self._bundle(context)
+        bundle = bundle if self.antialiased else without_filter(bundle)
         yield from self.told(write_streamed(self._folder(), bundle))
         self.written = f"{len(bundle.levels)} levels written: {self._folder() / STREAMED}"
 

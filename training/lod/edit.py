@@ -21,6 +21,7 @@ from .paging import is_tree
 from .placing import placed, standing
 from .selection import known_rule
 from .tree import complete_levels
+from .unfiltered import without_filter
 
 
 def edit(
@@ -37,6 +38,7 @@ def edit(
     plain: Sequence[Path] = (),
     folder: Path | None = None,
     streamed: Path | None = None,
+    antialiased: bool = False,
 ) -> str:
     """Writes what a cleaning leaves of a bundle, a folder of levels or any 3DGS PLY, placed elsewhere.
 
@@ -52,6 +54,8 @@ def edit(
         plain: files of the finest level alone, each the kind that its name asks for.
         folder: receives a folder of levels.
         streamed: folder that receives levels as browsers load them.
+        antialiased: ``plain`` and ``streamed`` are for programs that know Mip-Splatting's filter; otherwise
+            see :func:`.unfiltered.without_filter`, but for kinds of files that say that it is to be used.
 
     Returns:
         How many splats of each level stay, as a few lines of text.
@@ -90,16 +94,15 @@ def edit(
         f"level {before.number}: {len(after.rows):,} of {len(before.rows):,} splats"
         for before, after in zip(bundle.levels, found.levels, strict=True)
     ]
-    finest = found.levels[-1]
     for path in plain:
-        rows = [level.rows for level in found.upto(finest.number)]
-        finish(write_splats(path, Joined(rows), found.meta))
+        form = found if antialiased or format_of(path).antialiased else without_filter(found)
+        finish(write_splats(path, Joined.upto(form, form.levels[-1].number), form.meta))
     if folder is not None or streamed is not None:
         levels = complete_levels(_in_memory(found)) if is_tree(found) else found
         if folder is not None:
             write_folder(folder, levels)
         if streamed is not None:
-            finish(write_streamed(streamed, levels))
+            finish(write_streamed(streamed, levels if antialiased else without_filter(levels)))
     paths = [path for path in (out, *plain, folder, streamed) if path is not None]
     return "\n".join([*lines, *(f"{path}: written" for path in paths)])
 
@@ -115,6 +118,11 @@ class Joined:
     """Splats of several sets, one after the other, as they are read: where levels add up, a whole scene."""
 
     sets: Sequence[SplatRows]
+
+    @classmethod
+    def upto(cls, bundle: Bundle, number: int) -> Joined:
+        """All that is drawn at a level."""
+        return cls([level.rows for level in bundle.upto(number)])
 
     def __len__(self) -> int:
         return sum(map(len, self.sets))

@@ -52,6 +52,7 @@ class Format(NamedTuple):
         degree: the highest degree of spherical harmonics that it holds.
         shared: where splats share coefficients of spherical harmonics: how many sets of them there are at
             most, else a power of two.
+        antialiased: whether it says that splats are drawn with Mip-Splatting's filter, to programs for it.
     """
 
     suffix: str
@@ -60,6 +61,7 @@ class Format(NamedTuple):
     bytes_of: tuple[float, ...]
     degree: int
     shared: int = 0
+    antialiased: bool = False
 
     def size(self, count: int, degree: int) -> float:
         """About how many bytes so many splats take."""
@@ -89,7 +91,7 @@ FORMATS = (
     ),
     Format(
         ".spz", "SPZ", "Niantic's kind, for phones, Cesium and glTF: a twelfth of a PLY",
-        (17.0, 18.0, 18.0, 18.0), 3,
+        (17.0, 18.0, 18.0, 18.0), 3, antialiased=True,
     ),
     Format(
         ".sog", "SOG", "PlayCanvas' kind for the web, the smallest. Takes minutes without a graphics card",

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.blender.fake_trainer import splats
+from training.lod.unfiltered import without_filter
 from training.scenes.cameras import Camera, look_at
 from training.scenes.colmap import read_scene
 from training.scenes.views import tables_of, views_in
@@ -36,7 +37,7 @@ def views(count=6):
 @pytest.fixture
 def root(bpy, lodgs, tmp_path):
     bundle = Bundle("made", [Level(1, splats(30))], tables=tables_of(views(), 0.02, {"v2.jpg"}))
-    bundle.meta["held_out"] = [2, 9]
+    bundle.meta |= {"held_out": [2, 9], "focal_px": 12.5}  # trained at a fortieth of the size
     write_bundle(tmp_path / "in.ply", bundle)
     return lodgs("data.scenes").import_splats(bpy.context, tmp_path / "in.ply")
 
@@ -96,3 +97,29 @@ def test_a_trained_scene_takes_its_photographs_views_along(bpy, lodgs):
     scene = read_scene(GARDEN)
     check(cameras, scene.cameras)
     assert near == pytest.approx(scene.near())
+
+
+@pytest.mark.parametrize("source", ["SHOWN", "LEVEL"])
+def test_files_for_other_programs_are_as_opaque_as_the_views_show_them(bpy, root, tmp_path, source):
+    """Where the scene stands, too: it is twice as large, and so far away."""
+    root.lodgs.antialias = True
+    root.location, root.scale = (1, 2, 3), (2, 2, 2)
+    bpy.context.view_layer.update()
+
+    def exported(**how):
+        path = str(tmp_path / "out.ply")
+        bpy.ops.lodgs.export_plain(filepath=path, source=source, level=1, **how)
+        found = read_bundle(path)
+        return found.antialias, found.levels[0].splats.opacity_logits
+
+    assert bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "own.ply")) == {"FINISHED"}
+    bundle = read_bundle(tmp_path / "own.ply")
+    own, expected = bundle.levels[0].splats, without_filter(bundle).levels[0].rows.select(slice(None))
+    filtered, kept = exported(antialiased=True)
+    assert bundle.antialias and filtered
+    np.testing.assert_array_equal(kept, own.opacity_logits)
+    for placed in (False, True):
+        filtered, found = exported(placed=placed)
+        assert not filtered
+        np.testing.assert_allclose(found, expected.opacity_logits, atol=2e-3)
+    assert (expected.opacity_logits < own.opacity_logits - 0.1).all()
