@@ -239,7 +239,12 @@ def _capture(args: argparse.Namespace) -> int:
     def tell(number: int, count: int) -> None:
         _print(f"View {number} of {count}")
 
-    folder = args.out.resolve()
+    folder, engine = args.out.resolve(), scene.render.engine
+    if engine.startswith(("BLENDER_EEVEE", "BLENDER_WORKBENCH")):
+        name = "Workbench" if "WORKBENCH" in engine else "EEVEE"
+        _print(
+            f"{name} needs graphics, in background too. If Blender crashes now, there are none: take Cycles."
+        )
     try:
         with _interrupts():
             count = render_views(bpy.context, folder, width, height, args.range, tell)

@@ -263,6 +263,9 @@ def test_what_is_there_is_not_rendered_again(bpy, scene, capture, tmp_path, capf
     assert sorted(file.name for file in out.rglob("*") if file.is_file()) == sorted(
         f"view_000{number}.{ending}" for number in (1, 2, 3, 4) for ending in ("exr", "json", "png")
     )
+    bpy.context.scene.render.engine = "BLENDER_WORKBENCH"
+    assert capture("--around", "--views", "4", "--range", "1-4") == 0, "nothing is left to render"
+    assert "Workbench needs graphics, in background too" in capfd.readouterr().err
     for other in (["--views", "5"], ["--views", "3"]):
         assert capture("--around", *other, "--range", "1-5") == 2
         assert "holds other views" in capfd.readouterr().err
