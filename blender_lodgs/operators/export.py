@@ -278,7 +278,7 @@ class LODGS_OT_export_folder(_IntoFolder, bpy.types.Operator):
 
 
 class LODGS_OT_export_streamed(_ForOthers, _IntoFolder, _Converting, bpy.types.Operator):
-    """Export levels for the web, where PlayCanvas and SuperSplat load them piece by piece, by distance"""
+    """Export levels that web viewers load piece by piece, by distance. Slow without a graphics card"""
 
     bl_idname = "lodgs.export_streamed"
     bl_label = "Export for the Web"

@@ -119,12 +119,21 @@ class Way:
     def fit_crop(self):
         """Moved to what was photographed, and scaled."""
         eye, target = self.lodgs("data.photographs").photographed_from(self.root)
-        crop, radius = self.crop_object, 0.5 * (eye - target).length
-        crop.location, crop.scale = target, [radius] * 3
-        self.bpy.context.view_layer.update()
         to_own = np.linalg.inv(self.to_world())
-        self.sphere = to_own[:3, :3] @ target + to_own[:3, 3], radius
+        centre = to_own[:3, :3] @ target + to_own[:3, 3]
+        radius = self.between_splats(centre, 0.5 * (eye - target).length)
+        self.crop_object.location, self.crop_object.scale = target, [radius] * 3
+        self.bpy.context.view_layer.update()
+        self.sphere = centre, radius
         self.push("Scale")
+
+    def between_splats(self, centre, radius: float) -> float:
+        """A radius about as large whose sphere no splat is on: rounding would say on which side that is."""
+        means = np.concatenate([level.splats.means for level in self.trained().levels])
+        away = np.sort(np.linalg.norm(means - centre, axis=1))
+        away = away[np.abs(away - radius) < 0.02 * radius]
+        widest = np.diff(away).argmax()
+        return float(away[widest : widest + 2].mean())
 
     def drop_floaters(self):
         assert self.bpy.ops.lodgs.hide_splats("EXEC_DEFAULT", True, test="FLOATERS", share=100 * SHARE) == {

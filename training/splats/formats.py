@@ -37,6 +37,9 @@ INSTALL = (
 _FOLDERS = ("/opt/homebrew/bin", "/usr/local/bin")
 _LOOK = 0.05
 """Seconds between two looks at a program at work."""
+_ROUNDS = 3
+"""Of clustering harmonics, where the processor does it (10 otherwise): a round takes as long as another, and
+of 3,000 splats of degree 3 of a trained scene the colours were 0.3 % farther off after 3 than after 10."""
 STREAMED = "lod-meta.json"
 """The file that streamed levels begin with, in a folder of their own."""
 
@@ -229,7 +232,7 @@ def transformed(arguments: Sequence[str]) -> Iterator[str]:
     """
     command, said = program(), ""
     environment = os.environ | {"PATH": _path()}
-    for device in ((), ("-g", "cpu")):
+    for device in ((), ("-g", "cpu", "-i", str(_ROUNDS))):
         with tempfile.TemporaryDirectory(prefix="lodgs-") as folder:
             log = Path(folder, "log")
             with open(log, "wb") as told:

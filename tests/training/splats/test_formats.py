@@ -18,6 +18,7 @@ from training.splats.formats import (
     as_ply,
     format_of,
     read_splat,
+    run,
     write_splat,
     write_splats,
     write_streamed,
@@ -174,6 +175,17 @@ def test_without_the_program_it_is_said_how_to_get_it(tmp_path, monkeypatch):
     finish(write_splats(tmp_path / "a.splat", splats_of(3), {}))
     finish(write_splats(tmp_path / "a.ply", splats_of(3), {}))
     assert {path.name for path in tmp_path.iterdir()} == {"a.splat", "a.ply"}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="the program that stands in is a shell script")
+def test_a_processor_clusters_colours_in_fewer_rounds(tmp_path, monkeypatch):
+    program = tmp_path / PROGRAM
+    program.write_text('#!/bin/sh\necho "$*" >> "$0.said"\ncase "$*" in *"-g cpu"*) ;; *) exit 1;; esac\n')
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    run(["a.ply", "a.sog"])
+    first, second = Path(f"{program}.said").read_text().splitlines()
+    assert " -i " not in first and "-g cpu -i 3 a.ply a.sog" in second
 
 
 def test_kinds_are_known_by_name():
