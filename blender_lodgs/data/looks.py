@@ -147,7 +147,7 @@ def attach(root: bpy.types.Object) -> None:
         if item.exists and wanted:
             _attach(item.object, root, regions)
         elif item.exists:
-            _detach(item.object)
+            detach(item.object)
 
 
 def modifier_of(obj: bpy.types.Object) -> bpy.types.NodesModifier | None:
@@ -185,7 +185,7 @@ def _attach(obj: bpy.types.Object, root: bpy.types.Object, regions: list[bpy.typ
         and crops.followed_by(obj, groups.COUNT) == regions
     ):
         return
-    _detach(obj)
+    detach(obj)
     modifier = switched(
         obj, groups.look_group(len(regions)),
         show_viewport="lodgs_viewport.points", show_render="lodgs_render.draws_points",
@@ -207,7 +207,8 @@ def _attach(obj: bpy.types.Object, root: bpy.types.Object, regions: list[bpy.typ
         crops.read_from(driver, source, "lodgs_look.opacity", 1.0)
 
 
-def _detach(obj: bpy.types.Object) -> None:
+def detach(obj: bpy.types.Object) -> None:
+    """Takes the modifier that shows looks off a level."""
     modifier = modifier_of(obj)
     if modifier is not None:
         take_away(obj, modifier)

@@ -773,9 +773,37 @@ def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
             selection.update_inputs(root)
 
 
+@bpy.app.handlers.persistent
+def _before_undo(*_) -> None:
+    for root in _all_editable():
+        selection.let_go(root)
+
+
+@bpy.app.handlers.persistent
+def _after_undo(*_) -> None:
+    for root in _all_editable():
+        selection.follow_crops(root)
+
+
+def _all_editable() -> list[bpy.types.Object]:
+    return [obj for obj in bpy.data.objects if obj.lodgs.is_root and obj.is_editable]
+
+
+def _handlers():
+    """Lists of Blender's handlers, and ours for each."""
+    handlers = bpy.app.handlers
+    yield handlers.depsgraph_update_post, _on_update
+    for before in (handlers.undo_pre, handlers.redo_pre):
+        yield before, _before_undo
+    for after in (handlers.undo_post, handlers.redo_post):
+        yield after, _after_undo
+
+
 def register() -> None:
-    bpy.app.handlers.depsgraph_update_post.append(_on_update)
+    for handlers, ours in _handlers():
+        handlers.append(ours)
 
 
 def unregister() -> None:
-    bpy.app.handlers.depsgraph_update_post.remove(_on_update)
+    for handlers, ours in _handlers():
+        handlers.remove(ours)

@@ -9,7 +9,7 @@ modifier gives the rule's arguments back: :func:`choice`.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import bpy
@@ -194,6 +194,26 @@ def outdated(root: bpy.types.Object) -> bool:
 
 def update_inputs(root: bpy.types.Object) -> None:
     """Hands on to the modifiers what cannot be driven: the chosen eye, tables, a level's material."""
+    for modifier, name, value in _given(root):
+        _set(modifier, name, value, lambda there, value: there == value)
+
+
+def let_go(root: bpy.types.Object) -> None:
+    """Has the levels point at nothing of their scene, until :func:`follow_crops` gives it to them again.
+
+    Before an undo: Blender keeps in memory every object that its two steps hold alike. Levels are given crops
+    and all else after a step is made, so that such a one may point at an object that goes: a crash.
+    """
+    for modifier, name, _ in list(_given(root)):
+        _set(modifier, name, None, lambda there, _: there is None)
+    for item in root.lodgs.levels:
+        if item.exists:
+            crops.detach(item.object)
+            looks.detach(item.object)
+
+
+def _given(root: bpy.types.Object) -> Iterator[tuple[bpy.types.NodesModifier, str, bpy.types.ID | None]]:
+    """The inputs of the levels' modifiers that cannot be driven, by name, and what they are to be."""
     tables = {
         groups.table_socket(item.name): item.object if item.exists else None for item in root.lodgs.tables
     }
@@ -205,7 +225,7 @@ def update_inputs(root: bpy.types.Object) -> None:
         eye = {groups.EYE_OBJECT: root.lodgs.eye_object}
         for each, given in ((modifier, eye | tables | material), (cropping, material)):
             for name, value in given.items() if each else ():
-                _set(each, name, value, lambda there, value: there == value)
+                yield each, name, value
 
 
 def _set(modifier: bpy.types.NodesModifier, name: str, value, same: Callable[[Any, Any], bool]) -> None:

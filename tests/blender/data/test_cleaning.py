@@ -420,3 +420,44 @@ def test_an_older_files_crops_are_given_this_versions_group(bpy, lodgs, scene_of
     bpy.context.view_layer.update()
     assert not crops.outdated(root)
     assert {crops.modifier_of(obj).node_group[version] for obj in levels} == {now}
+
+
+def test_levels_point_at_nothing_that_an_undo_may_take_away(bpy, lodgs, scene_of):
+    """Blender keeps what two steps hold alike, with what it was given since, which may be gone."""
+    root, _ = scene_of(bundle_of("bands", np.random.default_rng(1)))
+    name, material, seen = root.name, bpy.data.materials.new("Mine"), []
+    crops, names = lodgs("data.crops"), [item.object.name for item in root.lodgs.levels]
+
+    def pointed_at():
+        mine = [obj for obj in bpy.data.objects if obj.lodgs_crop.is_crop or obj.name == "Eye"]
+        users = bpy.data.user_map(subset=[*mine, *bpy.data.materials])
+        levels = {bpy.data.objects[each] for each in names}
+        return {key.name for key, found in users.items() if found & levels}
+
+    def look(*_):
+        seen.append(pointed_at())
+
+    root.lodgs.eye_object = eye = bpy.data.objects.new("Eye", None)
+    bpy.context.scene.collection.objects.link(eye)
+    for each in names:
+        bpy.data.objects[each].data.materials.append(material)
+    root.lodgs.eye = "OBJECT"
+    bpy.ops.ed.undo_push(message="start")
+    for keep in ("INSIDE", "ALL"):
+        assert bpy.ops.lodgs.add_crop("EXEC_DEFAULT", True, shape="SPHERE", keep=keep) == {"FINISHED"}
+        bpy.context.view_layer.update()
+    there = pointed_at()
+    assert there >= {"Crop Sphere", "Region Sphere", "Eye"}
+    for handlers in (bpy.app.handlers.undo_pre, bpy.app.handlers.redo_pre):
+        handlers.append(look)
+    try:
+        bpy.ops.ed.undo()
+        bpy.ops.ed.undo()
+        assert crops.crops_of(bpy.data.objects[name]) == []
+        bpy.ops.ed.redo()
+        bpy.ops.ed.redo()
+    finally:
+        for handlers in (bpy.app.handlers.undo_pre, bpy.app.handlers.redo_pre):
+            handlers.remove(look)
+    assert len(seen) == 4 and all(each <= {"Mine"} for each in seen), seen  # a level's own, in its slot
+    assert pointed_at() == there
