@@ -247,6 +247,7 @@ def clean_up(bpy, count: int) -> None:
     everywhere = least(lambda: cleaning.find_floaters(bpy.context, root, 0.0, 0.001))
     found = cleaning.find_floaters(bpy.context, root, 0.0, 0.001)
     strokes, depsgraph = load("blender_lodgs.viewport.strokes"), bpy.context.evaluated_depsgraph_get()
+    brushed = load("training.lod.brush").brushed
     look, size = np.eye(4), (1280, 800)
     look[2, 3] = -15.0
     clip = np.array([[2, 0, 0, 0], [0, 3.2, 0, 0], [0, 0, -1, -0.1], [0, 0, -1, 0]], float)
@@ -256,13 +257,14 @@ def clean_up(bpy, count: int) -> None:
         return strokes.Picture(root, depsgraph, look, clip, size)
 
     picture = begin()
-    begins, covers = least(begin), least(lambda: picture.brush(path, 50))
-    selects = least(lambda: cleaning.select_also(root, picture.brush(path, 50)))
+    begins, covers = least(begin), least(lambda: picture.hits(brushed(path, 50, size)))
+    selects = least(lambda: cleaning.select_also(root, picture.hits(brushed(path, 50, size))))
     painting, step = load("blender_lodgs.data.painting"), path[:1] * 2
     before = painting.read(root)
 
     def paint(along):
-        return painting.over(before, picture.brush(along, 50, hardness=0.5), (0.8, 0.1, 0.1))
+        hit = picture.hits(brushed(along, 50, size, hardness=0.5), footprints=True)
+        return painting.over(before, hit, (0.8, 0.1, 0.1))
 
     follows = least(lambda: painting.show(root, paint(step)))
     painting.show(root, {})

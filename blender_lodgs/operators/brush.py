@@ -13,6 +13,7 @@ from gpu_extras.batch import batch_for_shader
 from gpu_extras.presets import draw_circle_2d
 
 from ...training.errors import LodgsError
+from ...training.lod.brush import brushed, lassoed
 from .. import extension
 from ..data import cleaning, painting, scenes
 from ..viewport.strokes import Picture
@@ -40,6 +41,8 @@ class OnStroke(OnOwnLevels):
     """What a stroke that is drawn takes from ``Scene.lodgs_brush``, unless it is given."""
     shape = "BRUSH"
     hardness = 1.0
+    footprints = False
+    """Whether splats are hit as far as a brush covers them, not by their means."""
 
     def prepare(self, root: bpy.types.Object) -> None:
         """Reads what the stroke changes, before it does."""
@@ -62,7 +65,8 @@ class OnStroke(OnOwnLevels):
         root = scenes.active_root(context)
         self.prepare(root)
         path = np.array([point.loc for point in self.path])
-        return self._finish(root, self._hit(picture_of(context, root), path))
+        picture = picture_of(context, root)
+        return self._finish(root, self._hit(picture, self._covered(picture, path)))
 
     def invoke(self, context, event):
         return self._begin(context, event)
@@ -88,6 +92,7 @@ class OnStroke(OnOwnLevels):
         self.prepare(root)
         counts = {item.number: len(item.object.data.points) for item in cleaning.levels(root)}
         self._found = {number: np.zeros(count, np.float32) for number, count in counts.items()}
+        self._drawn = np.zeros(self._picture.size[::-1], np.float32)
         self._line = None
         if self.shape == "LASSO":
             self._line = context.space_data.draw_handler_add(_draw_path, (self.path,), "WINDOW", "POST_PIXEL")
@@ -102,7 +107,8 @@ class OnStroke(OnOwnLevels):
         elif event.type == "LEFTMOUSE" and event.value == "RELEASE":
             root = self._same_root(context)
             if self.shape == "LASSO":
-                self._found = self._hit(self._picture, np.array([point.loc for point in self.path]))
+                path = np.array([point.loc for point in self.path])
+                self._found = self._hit(self._picture, self._covered(self._picture, path))
             return self._finish(root, self._found)
         elif event.type in {"ESC", "RIGHTMOUSE"} and event.value == "PRESS":
             return {"CANCELLED"}
@@ -118,7 +124,10 @@ class OnStroke(OnOwnLevels):
         context.region.tag_redraw()
         if self.shape == "BRUSH":
             root = self._same_root(context)
-            for number, hit in self._hit(self._picture, np.array([last, here])).items():
+            covered = self._covered(self._picture, np.array([last, here]))
+            if self.footprints:  # of which one part of the stroke covers less than all of it
+                covered = np.maximum(self._drawn, covered, out=self._drawn)
+            for number, hit in self._hit(self._picture, covered).items():
                 np.maximum(self._found[number], hit, out=self._found[number])
             self.show(root, self._found)
 
@@ -130,11 +139,14 @@ class OnStroke(OnOwnLevels):
             raise LodgsError("The levels have been renewed during the stroke.", "Draw it again.")
         return root
 
-    def _hit(self, picture: Picture, path: np.ndarray) -> dict[int, np.ndarray]:
+    def _covered(self, picture: Picture, path: np.ndarray) -> np.ndarray:
         path = np.reshape(path, (-1, 2))
         if self.shape == "LASSO":
-            return picture.lasso(path, self.through)
-        return picture.brush(path, self.radius, self.through, self.hardness)
+            return lassoed(path, picture.size)
+        return brushed(path, self.radius, picture.size, self.hardness)
+
+    def _hit(self, picture: Picture, covered: np.ndarray) -> dict[int, np.ndarray]:
+        return picture.hits(covered, self.through, self.footprints)
 
     def _finish(self, root, hit):
         self.report({"INFO"}, self.apply(root, hit))
@@ -241,6 +253,7 @@ class LODGS_OT_paint_splats(OnStroke, bpy.types.Operator):
     )  # fmt: skip
 
     as_set = ("radius", "through", "color", "strength", "hardness")
+    footprints = True
 
     def draw(self, context):
         layout = self.layout

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
-from ...training.lod.brush import Front, Projection, brushed, hits, lassoed
+from ...training.lod.brush import Front, Projection, hits, middle
 from ...training.lod.choice import Chooser
 from ...training.lod.crop import kept
 from ...training.lod.rule import HIDDEN, OPACITY
@@ -48,32 +48,26 @@ class Picture:
             means, scales = (cleaning.view_of(cloud, name) for name in ("position", attributes.SCALE))
             placed = projected.place(means)
             there = kept(cropped, means) & ~cleaning.hidden(cloud)
-            self._levels[item.number] = placed, 2 * scales.max(axis=1, initial=0), there
+            self._levels[item.number] = placed, 2 * scales.max(axis=1, initial=0), there, middle(scales)
             if (instance := instances.get(obj)) is not None:
                 choice = views.choice_of_view(instance, depsgraph)
                 parts.append((placed, scales, _drawn(cloud, means, choice)))
         self._front = Front(parts)
 
-    def brush(
-        self, path: np.ndarray, radius: float, through: bool = False, hardness: float = 1.0
+    def hits(
+        self, covered: np.ndarray, through: bool = False, footprints: bool = False
     ) -> dict[int, np.ndarray]:
-        """How strongly a brush hits each level, (N,) float32 by its number: see ``brush.brushed``.
+        """How strongly a stroke hits each level, (N,) by its number: see ``brush.hits``.
 
         Args:
-            path: (P, 2) in the region's pixels.
+            covered: (H, W) the stroke, of the region's pixels (``brush.brushed``, ``brush.lassoed``).
             through: hit what is hidden by other splats as well.
+            footprints: hit each splat as far as its footprint is covered, instead of by its mean.
         """
-        return self._hits(brushed(path, radius, self.size, hardness), through)
-
-    def lasso(self, path: np.ndarray, through: bool = False) -> dict[int, np.ndarray]:
-        """What a lasso hits of each level, (N,) bool by its number: see ``brush.lassoed``."""
-        return self._hits(lassoed(path, self.size), through)
-
-    def _hits(self, covered: np.ndarray, through: bool) -> dict[int, np.ndarray]:
         front = None if through else self._front
         return {
-            number: hits(covered, placed, reach, front) * there
-            for number, (placed, reach, there) in self._levels.items()
+            number: hits(covered, placed, reach, front, sigma if footprints else None) * there
+            for number, (placed, reach, there, sigma) in self._levels.items()
         }
 
 

@@ -1,7 +1,8 @@
 """Which splats a stroke over a picture hits, a brush's or a lasso's: those that are seen there, or all.
 
-A stroke is how strongly it covers each pixel, and hits splats whose means are projected there: the same test
-for every level. What is seen is told from the splats that a picture shows, a cell of pixels at a time.
+A stroke is how strongly it covers each pixel. It hits splats whose means are projected there, or each as far
+as it covers its footprint: the same test for every level. What is seen is told from the splats that a picture
+shows, a cell of pixels at a time.
 
 numpy only.
 """
@@ -18,6 +19,8 @@ SIDES = (4, 8, 16, 32, 64, 128, 256)
 standard deviations."""
 DARK = float(np.log(2))
 """Optical thickness behind which nothing counts as seen: half of the light."""
+_REACH = 6.0
+"""Standard deviations beyond which nothing counts in the mean of a footprint."""
 _NOWHERE = np.float32(-1e9)
 
 
@@ -69,6 +72,12 @@ def lassoed(path: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     crossed = np.zeros((height, width + 1), np.int32)
     np.add.at(crossed, (row, np.ceil(cross - 0.5).astype(int).clip(0, width)), 1)
     return np.cumsum(crossed, axis=1)[:, :width] % 2 == 1
+
+
+def middle(scales: np.ndarray) -> np.ndarray:
+    """(N,) the middle ones of three standard deviations (N, 3): of a flat splat's face, the shorter."""
+    a, b, c = scales.T
+    return np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
 
 
 @dataclass(frozen=True)
@@ -141,8 +150,8 @@ class Front:
         found: list[list[tuple[np.ndarray, ...]]] = [[] for _ in SIDES]
         for splats, scales, opacities in parts:
             shown = np.flatnonzero((splats.x > -SIDES[-1]) & (splats.y > -SIDES[-1]) & (opacities > 0))
-            pixel, (a, b, c) = splats.pixel[shown], scales[shown].T
-            sigma = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c)) / pixel
+            pixel = splats.pixel[shown]
+            sigma = middle(scales[shown]) / pixel
             kind = np.searchsorted(np.array(SIDES[:-1], np.float32), 3 * sigma)
             for number, side in enumerate(SIDES):
                 some = np.flatnonzero(kind == number)
@@ -171,31 +180,88 @@ class Front:
 
 
 def hits(
-    covered: np.ndarray, splats: Placed, reach: np.ndarray | None = None, front: Front | None = None
+    covered: np.ndarray,
+    splats: Placed,
+    reach: np.ndarray | None = None,
+    front: Front | None = None,
+    sigma: np.ndarray | None = None,
 ) -> np.ndarray:
     """(N,) how strongly a stroke hits splats; what it does not is 0, or False.
 
     Args:
         covered: (H, W) the stroke, see :func:`brushed` and :func:`lassoed`.
+        sigma: (N,) standard deviations of splats in their units: each is hit as the stroke is in the mean of
+            its round footprint, however small the one is beside the other. None: as it is at its mean.
         reach: (N,) how far splats reach, in their units, where only what is seen is to be hit.
         front: of the same picture; who reaches before its depth is seen.
     """
-    found = np.zeros(len(splats.x), covered.dtype)
+    found = np.zeros(len(splats.x), covered.dtype if sigma is None else np.float32)
     rows, columns = np.flatnonzero(covered.any(axis=1)), np.flatnonzero(covered.any(axis=0))
     if not len(rows):
         return found
-    near = (splats.x >= columns[0]) & (splats.x < columns[-1] + 1)
-    near &= (splats.y >= rows[0]) & (splats.y < rows[-1] + 1)
+    wide = None if sigma is None else sigma / splats.pixel
+    beyond = 0.0 if wide is None else _REACH * wide
+    near = (splats.x >= columns[0] - beyond) & (splats.x < columns[-1] + 1 + beyond)
+    near &= (splats.y >= rows[0] - beyond) & (splats.y < rows[-1] + 1 + beyond) & (splats.x > _NOWHERE)
     some = np.flatnonzero(near)
     x, y = splats.x[some], splats.y[some]
-    hit = covered[y.astype(np.int32), x.astype(np.int32)]
+    if wide is None:
+        hit = covered[y.astype(np.int32), x.astype(np.int32)]
+    else:
+        hit = _mean_around(covered, x, y, wide[some])
     on = hit > 0
     some, x, y, hit = some[on], x[on], y[on], hit[on]
     if front is not None and reach is not None:
-        seen = splats.depth[some] - reach[some] <= front.depth(x, y)
+        height, width = covered.shape
+        seen = splats.depth[some] - reach[some] <= front.depth(x.clip(0, width - 1), y.clip(0, height - 1))
         some, hit = some[seen], hit[seen]
     found[some] = hit
     return found
+
+
+def _mean_around(image: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """(M,) float32, means of an image (H, W), which is 0 around, weighted by round Gaussians.
+
+    As textures are filtered: between cells and between sizes of cells of a pyramid. Between cells of a width,
+    weights have half of it as standard deviation.
+
+    Args:
+        x, y, sigma: (M,) pixels.
+    """
+    found = np.zeros(len(x), np.float32)
+    scale = np.log2(np.maximum(2 * sigma, 1))
+    cells, number = image.astype(np.float32), 0
+    while True:
+        last = max(cells.shape) == 1
+        weight = np.maximum(1 - np.abs(scale - number), 0)
+        some = np.flatnonzero((weight > 0) | (last & (scale > number)))
+        weight[some] = np.where(last & (scale[some] > number), 1, weight[some])
+        found[some] += weight[some] * _between(cells, x[some] / 2**number, y[some] / 2**number, number > 0)
+        if last:
+            return found
+        height, width = (side + side % 2 for side in cells.shape)
+        even = np.zeros((height, width), np.float32)
+        even[: cells.shape[0], : cells.shape[1]] = cells
+        cells = even.reshape(height // 2, 2, width // 2, 2).mean(axis=(1, 3))
+        number += 1
+
+
+def _between(cells: np.ndarray, x: np.ndarray, y: np.ndarray, linear: bool) -> np.ndarray:
+    """(M,) what cells (H, W), 0 around, are at places counted in them: of the nearest, or between four."""
+    height, width = cells.shape
+    framed = np.zeros((height + 2, width + 2), np.float32)
+    framed[1:-1, 1:-1] = cells
+
+    def at(column: np.ndarray, row: np.ndarray) -> np.ndarray:
+        columns, rows = ((each + 1).clip(0, end + 1) for each, end in ((column, width), (row, height)))
+        return framed[rows.astype(np.int32), columns.astype(np.int32)]
+
+    if not linear:
+        return at(np.floor(x), np.floor(y))
+    left, low = np.floor(x - 0.5), np.floor(y - 0.5)
+    right, up = x - 0.5 - left, y - 0.5 - low
+    lower = (1 - right) * at(left, low) + right * at(left + 1, low)
+    return (1 - up) * lower + up * ((1 - right) * at(left, low + 1) + right * at(left + 1, low + 1))
 
 
 def _darkened(

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from training.lod.brush import Front, Projection, brushed, hits, lassoed
+from training.lod.brush import Front, Placed, Projection, brushed, hits, lassoed
 from training.scenes.cameras import Camera, look_at
 
 SIZE = (96, 64)
@@ -67,6 +67,39 @@ def test_a_soft_brush_falls_off_towards_its_edge_and_splats_are_hit_so_strongly(
     found = hits(covered, placed)
     np.testing.assert_array_equal(found[inside], covered[y[inside], x[inside]])
     assert not found[~inside].any() and 20 < np.count_nonzero(found) < 480
+
+
+@pytest.mark.parametrize("radius", [2.5, 13.7])
+def test_a_splat_is_hit_as_far_as_its_footprint_is_covered(radius):
+    """However small the stroke is: against the mean of the stroke's pixels, weighted by the splat."""
+    covered = brushed([(30.2, 20.7), (60.1, 40.3)], radius, SIZE, 0.4)
+    rng = np.random.default_rng(4)
+    count = 400
+    x, y = rng.uniform(0, SIZE[0], count), rng.uniform(0, SIZE[1], count)
+    sigma = np.exp2(rng.uniform(-1, 4, count))
+    pixel = rng.uniform(0.01, 0.1, count)
+    placed = Placed(*(each.astype(np.float32) for each in (x, y, np.ones(count), pixel)))
+    found = hits(covered, placed, sigma=(sigma * pixel).astype(np.float32))
+    across, down = np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5
+    wanted = np.array([
+        np.exp(-np.square(down - b) / 2 / s**2) @ covered @ np.exp(-np.square(across - a) / 2 / s**2)
+        for a, b, s in zip(x, y, sigma, strict=True)
+    ]) / (2 * np.pi * sigma**2)  # fmt: skip
+    assert np.abs(found - wanted).max() < 0.2 and np.sqrt(np.square(found - wanted).mean()) < 0.03
+    wide = sigma > 4
+    assert found[wide].sum() == pytest.approx(wanted[wide].sum(), rel=0.05) and wanted[wide].max() > 0.05
+    assert found[wanted < 1e-4].max() < 0.01
+
+
+def test_a_dab_between_coarse_splats_paints_them_in_part():
+    covered = brushed([(48.0, 32.0)], 6.0, SIZE)
+    x, y = (each.ravel().astype(np.float32) for each in np.meshgrid([28.0, 68.0], [12.0, 52.0]))
+    placed = Placed(x, y, np.ones(4, np.float32), np.ones(4, np.float32))
+    assert not hits(covered, placed).any(), "their means are beside it"
+    found = hits(covered, placed, sigma=np.full(4, 16.0, np.float32))
+    np.testing.assert_allclose(
+        found, covered.sum() / (2 * np.pi * 16**2) * np.exp(-(20**2) / 16**2), rtol=0.3
+    )
 
 
 @pytest.mark.parametrize(
