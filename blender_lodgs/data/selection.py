@@ -218,14 +218,14 @@ def _given(root: bpy.types.Object) -> Iterator[tuple[bpy.types.NodesModifier, st
         groups.table_socket(item.name): item.object if item.exists else None for item in root.lodgs.tables
     }
     for item in root.lodgs.levels:
-        modifier = item.exists and _modifier(item.object)
+        modifier = _modifier(item.object) if item.exists else None
         slots = item.object.material_slots if item.exists else ()
         material = {groups.MATERIAL: slots[0].material if slots else None}
-        cropping = item.exists and crops.modifier_of(item.object)
+        cropping = crops.modifier_of(item.object) if item.exists else None
         eye = {groups.EYE_OBJECT: root.lodgs.eye_object}
         for each, given in ((modifier, eye | tables | material), (cropping, material)):
-            for name, value in given.items() if each else ():
-                yield each, name, value
+            if each is not None:
+                yield from ((each, name, value) for name, value in given.items())
 
 
 def _set(modifier: bpy.types.NodesModifier, name: str, value, same: Callable[[Any, Any], bool]) -> None:
