@@ -22,6 +22,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import numpy as np
 import torch
 
+from training.lod.blocks import spatial_order
+from training.lod.choice import Choice, Chooser
+from training.lod.rule import facts_of
+from training.lod.rules.bands import RULE as BANDS
 from training.rasterize import Adam, Gaussians, Target, cpu, photometric_loss, rasterize, render, resolve
 from training.rasterize.cpu import adam
 from training.rasterize.cpu.bin import LOG2_ALPHA_MIN
@@ -291,6 +295,8 @@ def further(seconds: float) -> dict:
     turns = [[least(drawn, 1e-3) for drawn in (some, removed)] for _ in range(40)]  # noise hits both alike
     found["weights_by_removed"] = float(np.divide(*np.median(turns, axis=0)))
 
+    found["choosing_ms"], found["asking_each_ms"] = choosing(splats, camera, seconds)
+
     step, before = Step(50_000, 640, 480), threads()
     by_threads, peaks = {}, {}
     try:
@@ -323,6 +329,10 @@ def further(seconds: float) -> dict:
         print(f"training step on the GPU, 200k splats at 960x540: {found['cuda_step_ms']:.1f} ms")
     print(f"forward only, 200k splats at 960x540: {found['forward_ms']:.1f} ms")
     print(f"70 % of the weights zero, against those splats removed: {found['weights_by_removed']:.3f}")
+    print(
+        f"choosing by distance, two levels of 200k splats: {found['choosing_ms']:.2f} ms, "
+        f"splat by splat {found['asking_each_ms']:.2f} ms"
+    )
     gains = (
         f"{n}: {ms:.1f} ms ({by_threads[1] / ms:.2f}x, multiply-adds {peaks[n] / peaks[1]:.2f}x)"
         for n, ms in by_threads.items()
@@ -330,6 +340,24 @@ def further(seconds: float) -> dict:
     print("step by threads, and what the machine itself gains: " + ", ".join(gains))
     print(f"first compilation: {found['cold_s']:.1f} s, from the cache: {found['cached_s']:.2f} s")
     return found
+
+
+def choosing(splats: Gaussians, camera: Camera, seconds: float) -> tuple[float, float]:
+    """Milliseconds to choose what FLoD's rule shows a view of two levels of the same splats, which meet in
+    their middle: in blocks, of which only those at the border are looked at, and splat by splat."""
+    order = spatial_order(splats.means.numpy())
+    means, log_scales = splats.means.numpy()[order], splats.log_scales.numpy()[order]
+    chooser, values = Chooser(means, {}, log_scales), (("gamma", 1.0), ("first", 1), ("last", 2))
+    border = float(np.median(np.linalg.norm(means, axis=1))) / camera.focal
+    levels = [(1, {"s_min": border}), (2, {"s_min": 0.0})]
+    choices = [
+        Choice("bands", (0.0, 0.0, 0.0), camera.focal, tuple(facts.items()), values)
+        for facts in (facts_of(BANDS, {}, levels, number) for number, _ in levels)
+    ]
+    return (
+        least(lambda: [chooser.chosen(choice, camera, 0.01) for choice in choices], seconds),
+        least(lambda: [np.flatnonzero(choice.weights(means, {})) for choice in choices], seconds),
+    )
 
 
 def plot(cases: list[dict], path: Path) -> None:
