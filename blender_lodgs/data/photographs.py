@@ -10,11 +10,12 @@ import numpy as np
 from mathutils import Matrix, Vector
 
 from ...training.errors import LodgsError
+from ...training.lod.crop import kept
 from ...training.scenes.cameras import Camera
 from ...training.scenes.colmap import Scene
 from ...training.splats.dialects import Warn, silent
-from ..attributes import read_attribute
-from . import selection
+from ..attributes import HIDDEN, read_attribute
+from . import crops, selection
 from .objects import root_of
 from .placement import in_parent
 
@@ -186,8 +187,8 @@ def look_at_scene(context: bpy.types.Context, root: bpy.types.Object, warn: Warn
 
 
 def frame(context: bpy.types.Context, root: bpy.types.Object) -> None:
-    """Has most of a splat scene in sight of the window's viewports, from the side that they look from: far
-    outliers do not count."""
+    """Has most of what is left of a splat scene in sight of the window's viewports, from the side that they
+    look from: far outliers do not count."""
     if (bounds := bounds_of_most(root)) is not None:
         for looks in _viewports(context, root):
             looks.view_location, size = bounds
@@ -240,9 +241,9 @@ def photographed_from(root: bpy.types.Object) -> tuple[Vector, Vector] | None:
 
 
 def bounds_of_most(root: bpy.types.Object) -> tuple[Vector, float] | None:
-    """Middle and diagonal, in the root's parent, of a box around nine tenths of the finest level along each
-    axis, or of the points without splats: far outliers, which both always have, are left out. None without
-    either."""
+    """Middle and diagonal, in the root's parent, of a box around nine tenths of what is left of the finest
+    level along each axis, or of the points without splats: far outliers, which both always have, are not
+    in it. None without either."""
     places = _most_places(root)
     if not len(places):
         return None
@@ -262,9 +263,16 @@ def _reach(root: bpy.types.Object) -> float:
 
 
 def _most_places(root: bpy.types.Object) -> np.ndarray:
-    """(N, 3) places of the finest level, or without levels of the points, in the scene's own space."""
+    """(N, 3) places of the finest level, or without levels of the points, in the scene's own space; those
+    that crops and hiding leave, if they leave some."""
     levels = [item.object for item in root.lodgs.levels if item.exists]
-    return _positions(levels[-1] if levels else root.lodgs.points)
+    if not levels:
+        return _positions(root.lodgs.points)
+    places, hidden = _positions(levels[-1]), read_attribute(levels[-1].data, HIDDEN)
+    left = kept(crops.as_objects_stand(root, bpy.context.evaluated_depsgraph_get()), places)
+    if hidden is not None:
+        left &= ~hidden.astype(bool)
+    return places[left] if left.any() else places
 
 
 def _positions(obj: bpy.types.Object | None) -> np.ndarray:

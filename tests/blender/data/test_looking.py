@@ -39,6 +39,26 @@ def test_outliers_do_not_count_for_what_is_looked_at(bpy, lodgs, tmp_path):
     assert lodgs("data.photographs").bounds_of_most(empty) is None
 
 
+def test_what_is_cropped_away_or_hidden_does_not_count_either(bpy, lodgs, tmp_path):
+    from mathutils import Matrix
+
+    write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, ball(2000, 40))]))
+    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "b.ply", upright=False)
+    bounds, cleaning = lodgs("data.photographs").bounds_of_most, lodgs("data.cleaning")
+    corner = Matrix.Translation((9.5, 19.5, 29.5)) @ Matrix.Diagonal((0.5, 0.5, 0.5, 1))
+    crop = lodgs("data.crops").new_crop(root, "BOX", corner)
+    bpy.context.view_layer.update()
+    middle, size = bounds(root)
+    np.testing.assert_allclose(middle, (9.5, 19.5, 29.5), atol=0.1)
+    assert size == pytest.approx(0.9 * 3**0.5, rel=0.1)
+    means = ball(2000, 40).means
+    cleaning.hide(root, {1: means[:, 0] < 9.5})
+    np.testing.assert_allclose(bounds(root)[0], (9.75, 19.5, 29.5), atol=0.1)
+    crop.location.x += 1e4
+    bpy.context.view_layer.update()
+    assert bounds(root)[1] == pytest.approx(2 * 0.9 * 3**0.5, rel=0.1), "of nothing left all counts"
+
+
 def test_photographs_are_looked_at_from_the_view_in_the_middle(bpy, lodgs):
     root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
     root.location = (1, 2, 3)
