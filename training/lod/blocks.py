@@ -88,24 +88,23 @@ class Blocks:
         below, above = self.low.astype(np.float64) - eye, eye - self.high.astype(np.float64)
         nearest = np.maximum(np.maximum(below, above), 0)
         farthest = np.maximum(np.abs(below), np.abs(above))
-        return np.linalg.norm(nearest, axis=1), np.linalg.norm(farthest, axis=1)
+        return np.sqrt((nearest * nearest).sum(1)), np.sqrt((farthest * farthest).sum(1))
 
-    def between(self, eye: np.ndarray, near: float | np.ndarray, far: float | np.ndarray) -> np.ndarray:
-        """(B,) bool, False where no mean of a block is at a distance near <= d < far from an eye (3,).
+    def between(
+        self, eye: np.ndarray, near: float | np.ndarray, far: float | np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Two times (B,) bool: False where no mean of a block is at a distance near <= d < far from an eye
+        (3,); and True only where every one is, in single precision, too.
 
         Args:
             near, far: for all blocks, or (B,) of each.
         """
         if isinstance(far, float) and (near, far) in ((0.0, np.inf), (np.inf, np.inf)):
-            return np.full(len(self.low), near == 0)
+            found = np.full(len(self.low), near == 0)
+            return found, found
         least, most = self.distances(eye)
-        return (most * (1 + ROUNDING) >= near) & (least * (1 - ROUNDING) < far)
-
-    def within(self, eye: np.ndarray, near: float | np.ndarray, far: float | np.ndarray) -> np.ndarray:
-        """(B,) bool, True only where every mean of a block is at a distance near <= d < far from an eye (3,),
-        in single precision, too. Arguments as of :meth:`between`."""
-        least, most = self.distances(eye)
-        return (least * (1 - ROUNDING) >= near) & (most * (1 + ROUNDING) < far)
+        some = (most * (1 + ROUNDING) >= near) & (least * (1 - ROUNDING) < far)
+        return some, (least * (1 - ROUNDING) >= near) & (most * (1 + ROUNDING) < far)
 
     def rows(self, which: np.ndarray) -> np.ndarray:
         """The rows (M,) int32 of the blocks that are True in (B,), ascending."""

@@ -203,21 +203,25 @@ class Chooser:
             seen, whole = np.ones(len(blocks.low), bool), np.full(len(blocks.low), choice is None)
             if choice is not None and rule is not None and rule.apart and not in_region:
                 eye, band = np.array(choice.eye, np.float32), choice.band(part.highest(rule))
-                seen &= blocks.between(eye, *band)
+                seen, inside = blocks.between(eye, *band)
                 if rule.flat and choice.crops is None:
-                    whole = blocks.within(eye, *band)
+                    whole = inside
             if camera is not None and seen.any():
-                seen &= blocks.in_view(camera, near)
+                seen = seen & blocks.in_view(camera, near)
+            if not seen.any():
+                return np.zeros(0, np.int32), np.zeros(0, np.float32)
             rows = blocks.rows(seen) if rows is None else blocks.of_rows(seen, rows)
             if rule is not None and not rule.apart:
                 weights = blocks.of_rows(seen, weigh(means, columns))
             else:
-                asked, weights = seen & ~whole, np.ones(len(rows), np.float32)
+                asked = seen & ~whole
                 if not asked.any():
-                    return rows, weights
+                    return rows, np.ones(len(rows), np.float32)
                 columns = {name: blocks.of_rows(asked, column) for name, column in columns.items()}
-                found = weigh(blocks.of_rows(asked, means), columns)
-                weights[np.repeat(asked[seen], SIZE)[: len(rows)]] = found
+                weights = weigh(blocks.of_rows(asked, means), columns)
+                if (seen & whole).any():
+                    found, weights = weights, np.ones(len(rows), np.float32)
+                    weights[np.repeat(asked[seen], SIZE)[: len(rows)]] = found
         some = np.flatnonzero(weights > 0)
         found = some.astype(np.int32) if rows is None else rows[some]
         return found, weights[some].astype(np.float32)
