@@ -27,7 +27,7 @@ AS_BLENDER = ROOT / "tests" / "blender" / "as_blender.py"
 SEEN = "view_20.jpg"
 """The view of the example that is shown; not one that is held out."""
 HELD_OUT = "view_24.jpg"
-STEPS = 1200
+STEPS = 500
 WIDE = 360
 """Pixels across each part of a picture."""
 LENS = 0.25, 0.05
@@ -52,7 +52,7 @@ scene = bpy.context.scene
 scene.world = bpy.data.worlds.new("World")
 scene.world.use_nodes = True
 scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (0.8, 0.8, 0.8, 1)
-scene.render.engine, scene.cycles.samples, scene.render.film_transparent = "CYCLES", 32, True
+scene.render.engine, scene.cycles.samples, scene.render.film_transparent = "CYCLES", 16, True
 bpy.ops.wm.save_as_mainfile(filepath=sys.argv[1])
 """
 
@@ -64,10 +64,10 @@ def lodgs(*words: object) -> None:
     subprocess.run([sys.executable, "-m", "training", *map(str, words)], cwd=ROOT, check=True)
 
 
-def train(scene: Path, run: Path, *words: object, scale: float = 0.75) -> Path:
+def train(scene: Path, run: Path, *words: object, scale: float = 0.5) -> Path:
     shutil.rmtree(run, ignore_errors=True)
     lodgs("train", "--scene", scene, "--out", run, "--method", "3dgs", "--image-scale", scale,
-          "--set", f"steps={STEPS}", "--set", "max_splats=30000", *words)  # fmt: skip
+          "--set", f"steps={STEPS}", "--set", "max_splats=20000", *words)  # fmt: skip
     return run
 
 
@@ -126,7 +126,7 @@ def alone(folder: Path) -> list[Tile]:
     subprocess.run([sys.executable, "-c", MONKEY, str(blend)], check=True)
     subprocess.run(
         [sys.executable, str(AS_BLENDER), "--command", "lodgs", "capture", str(blend), "--out", str(scene),
-         "--around", "--views", "40", "--size", "360x240"],
+         "--around", "--views", "24", "--size", "300x200"],
         check=True, stdout=subprocess.DEVNULL, env=os.environ | {"LODGS_TRAINER_PYTHON": sys.executable},
     )  # fmt: skip
     run = train(scene, folder / "monkey_run", scale=1)
