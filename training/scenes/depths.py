@@ -175,8 +175,8 @@ def scale_and_shift(values: np.ndarray, z: np.ndarray, depth: bool) -> tuple[flo
 
 
 def with_points(scene: Scene) -> Scene:
-    """A scene of few points with such as its metric depth maps show, even in space and coloured; with none
-    of them where the maps are not those of the points that there are.
+    """A scene of few points with such as its metric depth maps show, as close as pixels are and
+    coloured; with none of them where the maps are not those of the points that there are.
 
     Raises:
         LodgsError: a map or a photograph cannot be read.
