@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -43,6 +43,19 @@ class Optimizer(Protocol):
 
     def zero_grad(self) -> None:
         """Forgets these gradients."""
+
+
+class Made(NamedTuple):
+    """What a step tells of itself, until the next one.
+
+    Attributes:
+        image: gives its (first) picture (H, W, 3), as it is over black; of a device it is read then.
+        target: the photograph.
+    """
+
+    loss: float
+    image: Callable[[], torch.Tensor]
+    target: Target
 
 
 P = TypeVar("P", bound=Parameters)
@@ -138,13 +151,20 @@ class Method(ABC, Generic[P, D]):
 
     # -- a step ----------------------------------------------------------------------------------------
 
-    def train_step(self, step: int) -> tuple[float, torch.Tensor, Target]:
-        """Makes one step; the first has number 0.
-
-        Returns:
-            The loss, the (first) image (H, W, 3) and its target.
-        """
+    def train_step(self, step: int) -> Made:
+        """Makes one step; the first has number 0."""
         view = self.choose_view(step)
+        made = self.step_there(view, step) or self.step_here(view, step)
+        self.control_density(step)
+        if self.parameters.margin and not self.data.transparent and self.continues_margins(step):
+            self.continue_margins(step)
+        if due(INTERVAL, step + 1) or self.ends_level(step):
+            self.exposure.center()
+            self.keep_supported(step)
+        return made
+
+    def step_here(self, view: TrainingView, step: int) -> Made:
+        """Draws, and moves what is trained by its gradients."""
         drawings = self.draw(view, step)
         loss = self.loss(drawings, view, step)
         loss.backward()
@@ -155,13 +175,44 @@ class Method(ABC, Generic[P, D]):
         for optimizer in (*self.optimizers(), *self.exposure.optimizers(step / self.steps)):
             optimizer.step()
             optimizer.zero_grad()
-        self.control_density(step)
-        if self.parameters.margin and not self.data.transparent and self.continues_margins(step):
-            self.continue_margins(step)
-        if due(INTERVAL, step + 1) or self.ends_level(step):
-            self.exposure.center()
-            self.keep_supported(step)
-        return float(loss.detach()), self.over_black(drawings[0].rendering, step), view.target
+        seen = drawings[0].rendering
+        picture = self.over_black(seen.image, seen.alpha, step)
+        return Made(float(loss.detach()), lambda: picture, view.target)
+
+    def step_there(self, view: TrainingView, step: int) -> Made | None:
+        """The same where the backend can make the whole step by itself; None where it cannot."""
+        p, target = self.parameters, view.target
+        plain = self.is_plain(step) and not (p.lr_exposure or self.outputs or self.data.region)
+        if not plain or target.mask is not None or target.alpha is not None:
+            return None
+        twin = self.model.twin(self.backend, p.antialias)
+        if twin is None:
+            return None
+        weights, min_scale = self.shown(view, step)
+        self.set_learning_rates(step)
+        loss = twin.step(
+            view.camera,
+            target,
+            near=self.data.near,
+            sh_degree=self.sh_degree(step),
+            background=self.background(step),
+            ssim_weight=p.ssim_weight,
+            weights=weights,
+            min_scale=min_scale,
+            shrink=view.shrink if self.counts(view, step) else None,
+        )
+        return Made(loss, lambda: self.over_black(*twin.picture(), step), target)
+
+    def is_plain(self, step: int) -> bool:
+        """Whether a step has one picture, of all the model's splats as :meth:`shown`, and this class's loss.
+
+        Such a step may be made without ``draw`` and all that follows until ``control_density``.
+        """
+        return False
+
+    def shown(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
+        """Weights (N,) and smallest standard deviation with which a plain step draws; see ``rasterize``."""
+        return None, 0.0
 
     def choose_view(self, step: int) -> TrainingView:
         """The photograph of a step."""
@@ -221,9 +272,14 @@ class Method(ABC, Generic[P, D]):
         """What pictures of steps show besides colours, as ``rasterize`` takes it."""
         return ("inverse_depth",) if self.data.depths and self.parameters.depth_weight else ()
 
-    @abstractmethod
+    def counts(self, view: TrainingView, step: int) -> bool:
+        """Whether :meth:`control_density` decides by what a step sees."""
+        return True
+
     def accumulate_stats(self, drawings: Sequence[D], view: TrainingView, step: int) -> None:
         """After ``backward``: what :meth:`control_density` decides by is added up (``model.stats``)."""
+        if self.counts(view, step):
+            self.model.accumulate_stats(drawings[0].rendering, view.shrink)
 
     def grow_inside(self, step: int) -> None:
         """After :meth:`accumulate_stats`: outside of a job's region nothing asks for more splats."""
@@ -348,10 +404,10 @@ class Method(ABC, Generic[P, D]):
         return red, green, blue
 
     @torch.no_grad()
-    def over_black(self, rendering: Rendering, step: int) -> torch.Tensor:
+    def over_black(self, image: torch.Tensor, alpha: torch.Tensor, step: int) -> torch.Tensor:
         """A step's picture (H, W, 3) as it is over black, which pictures have behind them."""
-        background = torch.tensor(self.background(step)).to(rendering.image)
-        return rendering.image - (1 - rendering.alpha[..., None]) * background
+        background = torch.tensor(self.background(step)).to(image)
+        return image - (1 - alpha[..., None]) * background
 
     # -- what lasts ------------------------------------------------------------------------------------
 

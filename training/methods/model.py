@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 
-from ..rasterize import Adam, Gaussians, Rendering
+from ..rasterize import Adam, Gaussians, Rendering, Twin, twin_of
 from ..rasterize.adam import LearningRate
 from ..splats.gaussians import Splats
 from .parameters import Parameters
@@ -30,8 +30,12 @@ HELD = "held"
 class Model:
     """N splats (or anchors of splats) under optimisation.
 
+    Plain splats may be trained by the backend itself (:meth:`twin`). Whoever asks for the optimizer, a tensor
+    or statistics has them brought home before.
+
     Attributes:
         adam: the optimizer, which holds the trained tensors by name and their moments; ``means`` is one.
+        lr: its learning rates by name.
         columns: what else is kept of every row and not trained, by name: zero for rows that come without it.
         stats: what is added up of every row between two resets, by name. ``gradient_sum`` and ``seen`` are
             always there.
@@ -52,7 +56,8 @@ class Model:
         stats: Mapping[str, torch.Tensor] | None = None,
         peaks: bool = False,
     ) -> None:
-        self.adam = Adam({name: tensor.requires_grad_(True) for name, tensor in tensors.items()}, lr=lr)
+        self._twin: Twin | None = None
+        self._adam = Adam({name: tensor.requires_grad_(True) for name, tensor in tensors.items()}, lr=lr)
         self.columns = dict(columns or {})
         blank = self["means"].detach().new_zeros(len(self))
         self.stats = {"gradient_sum": blank, "seen": blank.clone(), **(stats or {})}
@@ -60,10 +65,49 @@ class Model:
             self.stats |= {name: blank.clone() for name in PEAKS}
 
     def __len__(self) -> int:
-        return len(self["means"])
+        return len(self._adam.tensors["means"])
 
     def __getitem__(self, name: str) -> torch.Tensor:
         return self.adam.tensors[name]
+
+    @property
+    def adam(self) -> Adam:
+        self._come_home()
+        return self._adam
+
+    @property
+    def stats(self) -> dict[str, torch.Tensor]:
+        self._come_home()
+        return self._stats
+
+    @stats.setter
+    def stats(self, stats: dict[str, torch.Tensor]) -> None:
+        self._come_home()
+        self._stats = stats
+
+    @property
+    def lr(self) -> dict[str, LearningRate]:
+        return self._adam.lr
+
+    @lr.setter
+    def lr(self, rates: dict[str, LearningRate]) -> None:
+        self._adam.lr = rates
+
+    def twin(self, backend: str, antialias: bool) -> Twin | None:
+        """What a backend trains in the model's place, until somebody asks for what it is; see ``twin_of``."""
+        if self._twin is None and HELD not in self.columns:
+            self._twin = twin_of(backend, self._adam, self._stats, antialias=antialias)
+        return self._twin
+
+    def look(self, name: str) -> torch.Tensor:
+        """A trained tensor's values as they are now, to read only: what is trained elsewhere stays there."""
+        twin = self._twin
+        return self._adam.tensors[name].detach() if twin is None else twin.look(name)
+
+    def _come_home(self) -> None:
+        twin, self._twin = self._twin, None
+        if twin is not None:
+            twin.bring_home()
 
     @property
     def gaussians(self) -> Gaussians:
@@ -106,6 +150,14 @@ class Model:
     def assign(self, name: str, values: torch.Tensor) -> None:
         """Gives a trained tensor new values and zero moments."""
         self._replace(name, values, torch.zeros_like(values), torch.zeros_like(values))
+
+    @torch.no_grad()
+    def keep_above(self, least: torch.Tensor) -> None:
+        """No log-scale of a splat is below its least one (N,) from here."""
+        if self._twin is None:
+            self["log_scales"].copy_(torch.maximum(self["log_scales"], least[:, None]))
+        else:
+            self._twin.keep_above(least)
 
     def hold(self, rows: torch.Tensor) -> None:
         """From now on these rows, (N,) bool, stay as they are."""

@@ -9,11 +9,11 @@ reference's signatures, imported when it is first used.
 from __future__ import annotations
 
 import gc
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -28,9 +28,9 @@ from .gaussians import Gaussians
 from .rendering import OUTPUTS, Contributions, Rendering, Settings, Target, View
 
 __all__ = [
-    "BACKENDS", "OUTPUTS", "Adam", "Contributions", "Gaussians", "Rendering", "Target",
-    "contributions", "device_of", "photometric_loss", "rasterize", "render", "resolve", "strips", "warm_up",
-    "why_cpu",
+    "BACKENDS", "OUTPUTS", "Adam", "Contributions", "Gaussians", "Rendering", "Target", "Twin",
+    "contributions", "device_of", "photometric_loss", "rasterize", "render", "resolve", "strips", "twin_of",
+    "warm_up", "why_cpu",
 ]  # fmt: skip
 
 BACKENDS = ("cpu", "cuda", "gpu", "reference")
@@ -276,6 +276,66 @@ def photometric_loss(
         truth = target.image.to(image)
         image = truth + target.mask[..., None].to(image) * (image - truth)
     return _backend(backend, image).photometric_loss(image, target, float(ssim_weight))
+
+
+class Twin(Protocol):
+    """Splats that a backend trains where it draws them: what is here in the meantime is what they were."""
+
+    def step(
+        self,
+        camera: Camera,
+        target: Target,
+        *,
+        near: float,
+        sh_degree: int,
+        background: tuple[float, float, float],
+        ssim_weight: float,
+        weights: torch.Tensor | None = None,
+        min_scale: float = 0.0,
+        shrink: float | None = None,
+    ) -> float:
+        """One step of Adam by :func:`photometric_loss` of one picture; its loss.
+
+        Args:
+            target: opaque, and without a mask.
+            shrink: the statistics are added up, of a photograph so many times smaller; None: they are not.
+            camera, near, sh_degree, background, weights, min_scale: as of :func:`rasterize`.
+
+        Raises:
+            LodgsError: the device was lost, or has too little memory. The splats are lost with it.
+        """
+        ...
+
+    def picture(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """The last step's picture (H, W, 3), and its alpha (H, W)."""
+        ...
+
+    def look(self, name: str) -> torch.Tensor:
+        """A tensor's values as they are now; all others stay where they are."""
+        ...
+
+    def keep_above(self, least: torch.Tensor) -> None:
+        """No log-scale of a splat is below its least one (N,) from here."""
+
+    def bring_home(self) -> None:
+        """Makes what is here what has become of it, in place."""
+
+
+def twin_of(
+    backend: str, adam: Adam, stats: Mapping[str, torch.Tensor], *, antialias: bool = False
+) -> Twin | None:
+    """What a model trains, where a backend can train it by itself; None where it cannot.
+
+    Args:
+        adam: of means, quats, log_scales, opacity_logits and sh; what else it has stays as it is.
+        stats: (N,) statistics of density control, by name (``methods.model``).
+        antialias: as of :func:`rasterize`.
+
+    Raises:
+        LodgsError: the device was lost, or has too little memory.
+    """
+    make = getattr(_backend(backend, adam.tensors["means"]), "twin_of", None)
+    return make and make(adam, stats, antialias)
 
 
 def resolve(backend: str) -> str:

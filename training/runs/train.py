@@ -264,7 +264,7 @@ class _Run:
             now = time.monotonic()
             pause = min(max(PROGRESS_SECONDS[0], (now - self._started) / 1000), PROGRESS_SECONDS[1])
             if now - last_progress >= pause or self.step == method.steps:
-                quality = psnr(image.cpu(), target.image.cpu(), target.mask)
+                quality = psnr(image().cpu(), target.image.cpu(), target.mask)
                 self._tell_progress(level, loss, quality)
                 last_progress = now
             del image, target  # which the next step's photograph may need the room of

@@ -138,7 +138,7 @@ def test_a_step_of_two_drawings_trains_weights_and_keeps_a_column_of_ones_own(ti
     method = methods.create("tiny", data, tiny.preset("draft"), seed=0, backend="cpu")
     before, count = method.model["decay"].detach().clone(), len(method.model)
     loss, image, target = method.train_step(0)
-    assert loss > 0 and image.shape == target.image.shape
+    assert loss > 0 and image().shape == target.image.shape
     learned = (method.model["decay"].detach() - before).abs()
     assert (learned > 0).sum() > count / 2
     assert learned.max() == pytest.approx(0.1, rel=1e-3)  # Adam's first step is the rate

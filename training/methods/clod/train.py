@@ -123,19 +123,22 @@ class Method(threedgs_train.Method):
 
     # -- a step ----------------------------------------------------------------------------------------
 
-    def draw(self, view: TrainingView, step: int) -> Sequence[Drawing]:
+    def draw(self, view: TrainingView, step: int) -> list[Drawing]:
         if step < self.begins:
             return super().draw(view, step)
         if step == self.begins:
             self.begin_decay()
         means = self.model["means"].detach().cpu().numpy()
         inside = torch.from_numpy(view.camera.sees(means, near=self.data.near)).to(self.device)
-        drawings = []
+        drawings: list[Drawing] = []
         for s_v in (1.0, self.random_scale(step)):
             falloff, opacities, shown = self.attenuated(view.camera, s_v)
             rendering = self.rasterize_model(view.camera, step, weights=falloff * shown)
             drawings.append(ClodDrawing(rendering, s_v, opacities, shown, inside))
         return drawings
+
+    def is_plain(self, step: int) -> bool:
+        return step < self.begins
 
     def random_scale(self, step: int) -> float:
         """A virtual distance scale from 1 to ``s_v_most``."""

@@ -156,17 +156,16 @@ def weights(model: Model, s_min: Sequence[float], camera: Camera, values: Values
     Args:
         s_min: of every level of the run, coarse to fine.
     """
-    means = model["means"].detach().cpu().numpy()
+    means = model.look("means").cpu().numpy()
     found = [_weights(means[rows], number, s_min, camera, values) for number, rows in _rows(model).items()]
-    return torch.from_numpy(np.concatenate(found)).to(model["means"].device)
+    return torch.from_numpy(np.concatenate(found)).to(model.columns[LEVEL].device)
 
 
-@torch.no_grad()
 def keep_sizes(model: Model, s_min: Sequence[float]) -> None:
     """No splat becomes smaller than its level allows."""
-    for number, rows in _rows(model).items():
-        if s_min[number - 1] > 0:
-            model["log_scales"][rows].clamp_(min=float(np.log(s_min[number - 1])))
+    with np.errstate(divide="ignore"):
+        least = torch.from_numpy(np.log(np.asarray(s_min, np.float64))).to(model.columns[LEVEL].device)
+    model.keep_above(least.float()[model.columns[LEVEL].long() - 1])
 
 
 def levels_of(model: Model, s_min: Sequence[float]) -> list[Level]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import accumulate
 
@@ -110,25 +110,29 @@ class Method(method.Method[FlodParameters, Drawing]):
         return super().sh_degree(self._before + step)
 
     def draw(self, view: TrainingView, step: int) -> list[Drawing]:
-        if self.finishing(step):
-            weights = finish.weights(self.model, self.s_min, view.camera, self._finishing_values(step))
-            return [Drawing(self.rasterize_model(view.camera, step, weights=weights))]
-        min_scale = self.s_min[self.level_at(step) - 1]
-        return [Drawing(self.rasterize_model(view.camera, step, min_scale=min_scale))]
+        return [Drawing(self.rasterize_model(view.camera, step, *self.shown(view, step)))]
 
-    def accumulate_stats(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> None:
-        if not self.finishing(step) and self._local(step) < self._densify_until(step):
-            self.model.accumulate_stats(drawings[0].rendering, view.shrink)
+    def is_plain(self, step: int) -> bool:
+        return True
+
+    def shown(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
+        if self.finishing(step):
+            values = self._finishing_values(step)
+            return finish.weights(self.model, self.s_min, view.camera, values), 0.0
+        return None, self.s_min[self.level_at(step) - 1]
+
+    def counts(self, view: TrainingView, step: int) -> bool:
+        return not self.finishing(step) and self._local(step) < self._densify_until(step)
 
     def set_learning_rates(self, step: int) -> None:
         p = self.parameters
         if self.finishing(step):
             share = (step - self._ends[-1]) / p.finish_steps
-            self.model.adam.lr = finish.rates(p, self.data.extent, share)
+            self.model.lr = finish.rates(p, self.data.extent, share)
             return
         share = self._local(step) / (p.lr_means_steps or p.steps[self.level_at(step) - 1])
         rate = log_linear(p.lr_means, p.lr_means_final, share) * self.data.extent
-        self.model.adam.lr["means"] = rate
+        self.model.lr["means"] = rate
 
     def control_density(self, step: int) -> None:
         if self.finishing(step):

@@ -14,14 +14,14 @@ from ...errors import LodgsError
 from ...lod.blocks import Blocks, block_quantiles, spatial_order
 from ...lod.rules.chunks import RULE, TABLE, member_columns
 from ...lod.streaming import BLOCKS, table_of_blocks
-from ...rasterize import Gaussians, Target, photometric_loss
+from ...rasterize import Gaussians, photometric_loss
 from ...scenes.cameras import evenly
 from ...splats.bundle import Level
 from ...splats.gaussians import Splats
 from ...splats.ply import Columns
 from ..data import TrainingView
 from ..density import require_rows
-from ..method import Drawing
+from ..method import Drawing, Made
 from ..model import NAMES
 from ..pruning import least_importance, room_taken_over
 from ..threedgs.refining import Refining
@@ -140,7 +140,7 @@ class Method(Refining):
     def planned(self, step: int) -> tuple[int, float] | None:
         return super().planned(step) if step < self.tuned_steps else None
 
-    def train_step(self, step: int) -> tuple[float, torch.Tensor, Target]:
+    def train_step(self, step: int) -> Made:
         return super().train_step(step) if step < self.tuned_steps else self._chunk_step(step)
 
     def draw(self, view: TrainingView, step: int) -> list[Drawing]:
@@ -280,7 +280,7 @@ class Method(Refining):
             self.centres, self.radii = chunks.place_chunks(centers, wanted, self.seed)
 
     @torch.no_grad()
-    def _chunk_step(self, step: int) -> tuple[float, torch.Tensor, Target]:
+    def _chunk_step(self, step: int) -> Made:
         """One chunk's set; what is told of the step is how a photograph in it looks by the set alone."""
         p, data, number = self.parameters, self.data, step - self.tuned_steps
         if number == 0:
@@ -300,7 +300,7 @@ class Method(Refining):
         view = data.view(data.train.index(nearest))
         drawn = self.rasterize_model(view.camera, step, gaussians=together(levels, rows))
         loss = photometric_loss(drawn.image, view.target, p.ssim_weight, backend=self.backend)
-        return float(loss), drawn.image, view.target
+        return Made(float(loss), lambda: drawn.image, view.target)
 
     # -- levels ----------------------------------------------------------------------------------------
 

@@ -78,7 +78,7 @@ class Schedule:
 
     def wanted(self, camera: Camera, model: Model) -> torch.Tensor:
         """The level (N,) that a view wants at every anchor, not rounded."""
-        means = model["means"].detach()
+        means = model.look("means")
         distances = (means - torch.as_tensor(camera.center).to(means)).norm(dim=1)
         distances *= self.tree.focal_px / camera.focal
         return wanted_at(distances, model.columns["bias"], self.tree.d_max, self.tree.levels)

@@ -77,8 +77,16 @@ class Method(method.Method[OctreeParameters, Drawing]):
         return self.schedule.shrink(step)
 
     def draw(self, view: TrainingView, step: int) -> list[Drawing]:
-        weights = self.schedule.weights(view.camera, self.model, step, full=view.shrink == 1)
-        return [Drawing(self.rasterize_model(view.camera, step, weights))]
+        return [Drawing(self.rasterize_model(view.camera, step, *self.shown(view, step)))]
+
+    def shown(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
+        return self.schedule.weights(view.camera, self.model, step, full=view.shrink == 1), 0.0
+
+    def is_plain(self, step: int) -> bool:
+        return not self.parameters.volume_weight
+
+    def counts(self, view: TrainingView, step: int) -> bool:
+        return self.schedule.counts(view, step)
 
     def loss(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> torch.Tensor:
         """With the volume of what is drawn (Octree-GS, Sec. 7.1)."""
@@ -90,17 +98,16 @@ class Method(method.Method[OctreeParameters, Drawing]):
         return loss + self.parameters.volume_weight * scales.prod(1).mean()
 
     def accumulate_stats(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> None:
-        if not self.schedule.counts(view, step):
-            return
-        rendering = drawings[0].rendering
-        self.model.accumulate_stats(rendering, view.shrink)
-        opacity = self.model["opacity_logits"].detach().sigmoid()
-        self.model.stats["opacity_sum"] += torch.where(rendering.radii > 0, opacity, 0)
+        super().accumulate_stats(drawings, view, step)
+        if self.counts(view, step):
+            opacity = self.model["opacity_logits"].detach().sigmoid()
+            drawn = drawings[0].rendering.radii > 0
+            self.model.stats["opacity_sum"] += torch.where(drawn, opacity, 0)
 
     def set_learning_rates(self, step: int) -> None:
         p, lr = self.parameters, self.schedule.learning_rates(self._rates, step)
         lr["means"] = log_linear(p.lr_means, p.lr_means_final, step / p.steps) * self.data.extent
-        self.model.adam.lr = lr
+        self.model.lr = lr
 
     def control_density(self, step: int) -> None:
         if self.schedule.grows_after(step):

@@ -11,7 +11,7 @@ from ...lod.blocks import spatial_order
 from ...rasterize import Adam, Gaussians
 from ...splats.gaussians import Splats
 from ..data import TrainingView
-from ..method import Drawing, Optimizer
+from ..method import Optimizer
 from ..start import from_splats
 from . import train as threedgs_train
 
@@ -77,13 +77,15 @@ class Refining(threedgs_train.Method):
     def sh_degree(self, step: int) -> int:
         return self.parameters.sh_degree if self.refines(step) else super().sh_degree(step)
 
-    def accumulate_stats(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> None:
-        if not self.refines(step):
-            super().accumulate_stats(drawings, view, step)
+    def is_plain(self, step: int) -> bool:
+        return not self.refines(step)
+
+    def counts(self, view: TrainingView, step: int) -> bool:
+        return not self.refines(step) and super().counts(view, step)
 
     def set_learning_rates(self, step: int) -> None:
         if self.refines(step):  # a finished model's
-            self.model.adam.lr["means"] = self.parameters.lr_means_final * self.data.extent
+            self.model.lr["means"] = self.parameters.lr_means_final * self.data.extent
         else:
             super().set_learning_rates(step)
 

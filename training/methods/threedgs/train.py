@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -62,14 +62,16 @@ class Method(method.Method[ThreedgsParameters, Drawing]):
     def draw(self, view: TrainingView, step: int) -> list[Drawing]:
         return [Drawing(self.rasterize_model(view.camera, step))]
 
-    def accumulate_stats(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> None:
-        if step < self._densify_until:
-            self.model.accumulate_stats(drawings[0].rendering, view.shrink)
+    def is_plain(self, step: int) -> bool:
+        return True
+
+    def counts(self, view: TrainingView, step: int) -> bool:
+        return step < self._densify_until
 
     def set_learning_rates(self, step: int) -> None:
         p = self.parameters
         rate = log_linear(p.lr_means, p.lr_means_final, step / (p.lr_means_steps or self.scheduled_steps))
-        self.model.adam.lr["means"] = rate * self.data.extent
+        self.model.lr["means"] = rate * self.data.extent
 
     def control_density(self, step: int) -> None:
         p, model, done = self.parameters, self.model, step + 1

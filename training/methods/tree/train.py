@@ -11,7 +11,7 @@ Density control (Sec. 4.2) makes a new store of the old one (``density``).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import torch
@@ -19,13 +19,13 @@ import torch
 from ...lod.forest import levels_of
 from ...lod.streaming import BLOCKS
 from ...lod.tree import LEAVES, treeless_columns
-from ...rasterize import Gaussians, Rendering, Target, records
+from ...rasterize import Gaussians, Rendering, records
 from ...rasterize.adam import LearningRate
 from ...splats.bundle import Level
 from ...splats.gaussians import SplatRows
 from ...splats.ply import Columns
 from ..data import TrainingView
-from ..method import Drawing
+from ..method import Drawing, Made
 from ..schedules import due
 from ..start import from_splats
 from ..threedgs import train as threedgs_train
@@ -171,7 +171,7 @@ class Method(Refining):
             return super().view_index(step)
         return self._walk(step - self.finest_steps)
 
-    def train_step(self, step: int) -> tuple[float, torch.Tensor, Target]:
+    def train_step(self, step: int) -> Made:
         if step == self.finest_steps:
             return self._build_step(step)
         if step < self.finest_steps:
@@ -207,7 +207,7 @@ class Method(Refining):
                 "would have room for these."
             )
         shares, number = self._shares(places, step), step + 1 - self.finest_steps
-        self._optimizer = SeenRecords(self.store, places, self.model.adam.lr, shares, number)
+        self._optimizer = SeenRecords(self.store, places, self.model.lr, shares, number)
         return self._optimizer.gaussians
 
     def accumulate_stats(self, drawings: Sequence[Drawing], view: TrainingView, step: int) -> None:
@@ -235,7 +235,7 @@ class Method(Refining):
         self.store = grown
 
     @torch.no_grad()
-    def _build_step(self, step: int) -> tuple[float, torch.Tensor, Target]:
+    def _build_step(self, step: int) -> Made:
         """Builds the tree; what is told of the step is how a view looks by it."""
         self.store = self._new_store()
         if self._base is not None:
@@ -247,9 +247,9 @@ class Method(Refining):
             self.store.fill(GrowingForest(leaves))
         view = self.choose_view(step)
         gaussians = self._take(view, step, self.parameters.pixels)
-        drawing = Drawing(self.rasterize_model(view.camera, step, gaussians=gaussians))
-        loss = self.loss([drawing], view, step)
-        return float(loss), self.over_black(drawing.rendering, step), view.target
+        seen = self.rasterize_model(view.camera, step, gaussians=gaussians)
+        loss = self.loss([Drawing(seen)], view, step)
+        return Made(float(loss), partial(self.over_black, seen.image, seen.alpha, step), view.target)
 
     def _new_store(self, budget: int | None = None) -> Store:
         budget = self.data.splat_memory or budget or default_budget(self.device)

@@ -4,33 +4,27 @@ As the cpu backend: ``project`` makes ellipses of splats, ``bin`` sorts them int
 pixels of them, and gradients are summed in a row of their own for each pair of splat and tile, then in a
 fixed order for each splat. So nothing is added by atomics, and a device gives the same bits every time.
 
-Tensors live on the CPU. What a step needs is copied to the device, and what comes of it back.
+Tensors live on the CPU. What a picture needs is copied to the device, and what comes of it back. In training,
+plain splats can stay there (``twin``).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
 
+from ..adam import Adam
 from ..gaussians import Gaussians
-from ..rendering import Drawn, Settings, SideOutputs, Target, View, require_plain
-from .bin import TILE, Pairs, bin_splats, groups_of
+from ..rendering import Drawn, Settings, SideOutputs, Target, require_plain
+from .bin import TILE, groups_of
 from .choice import open_chosen
 from .device import Buffer, Device
 from .loss import loss_and_gradient, moments_of
-
-ROW = 12
-"""Numbers of a projected splat (``Row`` in common.wgsl)."""
-SPLAT, BY_SPLAT = 13, 16
-"""Numbers of a splat on the device, and of its gradient (project.wgsl)."""
-SUMS, PAIR_SUMS = 8, 11
-"""Numbers that blending's backward pass sums up for a splat, and for a pair (common.wgsl)."""
-GEOMETRY = 6
-"""Those of a splat without the absolute gradients, in which features have no part."""
-TILES = 1024
-"""That a device blends at a time, so that it gets to other work in between."""
+from .scene import BY_SPLAT, GEOMETRY, PAIR_SUMS, SUMS, Scene
+from .twin import COLUMNS, STATS, Twin, packed
 
 
 def rasterize(
@@ -61,98 +55,31 @@ def contributions(
     gaussians = replace(gaussians, sh=gaussians.means.new_zeros(count, 1, 3))
     weights = torch.ones(0) if weights is None else weights
     with device.lock:
-        scene = _Scene.of(device, [*vars(gaussians).values(), weights], settings)
+        scene, some = _scene_of(device, [*vars(gaussians).values(), weights], settings)
         pairs = scene.pairs
         shares = device.empty(np.float32, pairs.count, 3)
-        found = device.empty(np.float32, len(scene.some), 3)
+        found = device.empty(np.float32, scene.count, 3)
         scene.blend("weigh", ranges=pairs.ranges, sorted_pairs=pairs.sorted_pairs, pair_weights=shares)
         device.run(
-            "gather", "contributions", groups_of(len(scene.some)), (len(scene.some),),
+            "gather", "contributions", groups_of(scene.count), (scene.count,),
             spans=pairs.spans, pair_weights=shares, weights=found,
         )  # fmt: skip
-        everywhere, radii = np.zeros((count, 3), np.float32), scene.radii(count)
-        everywhere[scene.some] = device.read(found)
+        everywhere, radii = np.zeros((count, 3), np.float32), np.zeros(count, np.float32)
+        everywhere[some], radii[some] = device.read(found), device.read(scene.radii)
     largest, total, pixels = torch.from_numpy(everywhere).unbind(1)
     return largest, total, pixels.long(), torch.from_numpy(radii)
+
+
+def twin_of(adam: Adam, stats: Mapping[str, torch.Tensor], antialias: bool) -> Twin | None:
+    """See :func:`training.rasterize.twin_of`."""
+    if not {*COLUMNS, "sh"} <= set(adam.tensors) or not set(stats) <= set(STATS):
+        return None
+    return Twin(open_chosen(), adam, stats, antialias) if len(adam.tensors["means"]) else None
 
 
 def photometric_loss(image: torch.Tensor, target: Target, ssim_weight: float) -> torch.Tensor:
     """See :func:`training.rasterize.photometric_loss`."""
     return _Photometric.apply(image, target, ssim_weight)  # type: ignore[no-any-return]
-
-
-@dataclass
-class _Scene:
-    """The M splats that have a weight, on a device, projected and binned.
-
-    Attributes:
-        some: (M,) which of the N they are.
-        lens: what project.wgsl knows of the view.
-        splats, sh: (M, SPLAT) and (M, coefficients in use, 3), copies.
-        rows, colours, projected_radii: (M, ROW), (M, 4) and (M,), projected.
-        pairs: with the tiles that they touch.
-    """
-
-    device: Device
-    view: View
-    some: np.ndarray
-    lens: tuple
-    splats: Buffer
-    sh: Buffer
-    rows: Buffer
-    colours: Buffer
-    projected_radii: Buffer
-    pairs: Pairs
-
-    @classmethod
-    def of(cls, device: Device, tensors: list[torch.Tensor], settings: Settings) -> _Scene:
-        """Of means, quats, log-scales, logits, coefficients and weights; the last are empty for ones."""
-        arrays = [tensor.detach().numpy() for tensor in tensors]
-        means, weights, view = arrays[0], arrays[-1], settings.view
-        some = np.arange(len(means)) if settings.rows is None else settings.rows.numpy()
-        some = some[weights[some] > 0] if len(weights) else some
-        means, quats, log_scales, logits = (array[some] for array in arrays[:4])
-        sh = arrays[4][some, : (settings.degree + 1) ** 2]
-        filtered = np.broadcast_to(np.asarray(settings.antialias, np.float32), len(arrays[0]))[some]
-        ones = np.ones(len(some), np.float32)
-        columns = logits, quats, log_scales, weights[some] if len(weights) else ones, filtered
-        packed = np.column_stack([means, *columns]).astype(np.float32, copy=False)
-        count = len(some)
-        lens = (_lens_of(view), settings.min_scale, count, settings.degree, sh.shape[1])
-        splats, coefficients = device.upload(packed), device.upload(sh)
-        rows, colours = device.empty(np.float32, count, ROW), device.empty(np.float32, count, 4)
-        depths, radii = device.empty(np.uint32, count), device.empty(np.float32, count)
-        device.run(
-            "project", "forward", groups_of(count), lens, splats=splats, sh=coefficients, rows=rows,
-            colours=colours, depths=depths, radii=radii,
-        )  # fmt: skip
-        pairs = bin_splats(device, rows, depths, view.width, view.height)
-        return cls(device, view, some, lens, splats, coefficients, rows, colours, radii, pairs)
-
-    @property
-    def tiles(self) -> int:
-        """How many the image has."""
-        return self.pairs.ranges.shape[0]
-
-    def radii(self, count: int) -> np.ndarray:
-        """(count,) of all splats, as ``Rendering.radii``."""
-        radii = np.zeros(count, np.float32)
-        radii[self.some] = self.device.read(self.projected_radii)
-        return radii
-
-    def blend(
-        self,
-        entry: str,
-        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        limited: bool = False,
-        absolute: bool = False,
-        **buffers: Buffer,
-    ) -> None:
-        """Record a function of blend.wgsl for every tile."""
-        size = self.view.width, self.view.height, -(-self.view.width // TILE)
-        numbers = (*background, 0.0, *size, int(limited), int(absolute))
-        rows, owners = self.rows, self.pairs.owners
-        self.device.run("blend", entry, self.tiles, numbers, TILES, rows=rows, owners=owners, **buffers)
 
 
 class _Rasterize(torch.autograd.Function):
@@ -162,14 +89,14 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx, means, quats, log_scales, logits, sh, weights, features, settings, side):
         tensors, device, view = [means, quats, log_scales, logits, sh, weights], open_chosen(), settings.view
         with device.lock:
-            scene = _Scene.of(device, tensors, settings)
+            scene, some = _scene_of(device, tensors, settings)
             pairs, limit = scene.pairs, np.zeros(1, np.float32)
             if settings.limit is not None:  # not every device knows an infinity
                 most = torch.finfo(torch.float32).max
                 limit = settings.limit.to(torch.float32).clamp_max(most).numpy()
             limit, walked = device.upload(limit), device.empty(np.uint32, scene.tiles, 2)
             median = device.empty(np.int32, view.height, view.width)
-            shades = [scene.colours, *_as_colours(device, features.detach().numpy()[scene.some])]
+            shades = [scene.colours, *_as_colours(device, features.detach().numpy()[some])]
             pictures = [device.empty(np.float32, view.height, view.width, 4) for _ in shades]
             for k, (shade, picture) in enumerate(zip(shades, pictures, strict=True)):
                 scene.blend(
@@ -178,22 +105,22 @@ class _Rasterize(torch.autograd.Function):
                     median=median,
                 )  # fmt: skip
             drawn, *blended = (torch.from_numpy(device.read(picture)) for picture in pictures)
-            side.radii.numpy()[:] = scene.radii(len(means))
+            side.radii.numpy()[some] = device.read(scene.radii)
             begin, end = device.read(pairs.ranges).astype(np.int64).T
             side.tile_counts.numpy()[:] = (end - begin).reshape(side.tile_counts.shape)
             if side.median is not None:
                 found = device.read(median)
-                side.median.numpy()[:] = np.append(scene.some, -1)[found]
+                side.median.numpy()[:] = np.append(some, -1)[found]
         ctx.save_for_backward(*tensors)
-        ctx.rest = scene, shades, pictures, walked, settings, side
+        ctx.rest = scene, some, shades, pictures, walked, settings, side
         blended = [drawn[..., :0], *(each[..., :3] for each in blended)]
         features = torch.cat(blended, 2)[..., : features.shape[1]]
         return drawn[..., :3].contiguous(), 1 - drawn[..., 3], features.contiguous()
 
     @staticmethod
     def backward(ctx, by_image, by_alpha, by_features):
-        scene, shades, pictures, walked, settings, side = ctx.rest
-        device, pairs, count = scene.device, scene.pairs, len(scene.some)
+        scene, some, shades, pictures, walked, settings, side = ctx.rest
+        device, pairs, count = scene.device, scene.pairs, scene.count
         sums = device.empty(np.float32, count, SUMS)
         pair_sums = device.empty(np.float32, pairs.count, PAIR_SUMS)
         by_shades = [device.empty(np.float32, count, 3) for _ in shades]
@@ -210,22 +137,14 @@ class _Rasterize(torch.autograd.Function):
                     sorted_pairs=pairs.sorted_pairs, picture=picture, by_picture=device.upload(by_picture),
                     pair_sums=pair_sums,
                 )  # fmt: skip
-                device.run(
-                    "gather", "gradients", groups_of(count), (count, GEOMETRY if k else SUMS),
-                    spans=pairs.spans, pair_sums=pair_sums, sums=sums, by_colours=by_shade,
-                )  # fmt: skip
+                scene.gather(GEOMETRY if k else SUMS, pair_sums=pair_sums, sums=sums, by_colours=by_shade)
             by_splats = device.empty(np.float32, count, BY_SPLAT)
             by_sh = device.empty(np.float32, *scene.sh.shape)
-            device.run(
-                "project", "backward", groups_of(count), scene.lens, splats=scene.splats, sh=scene.sh,
-                projected=scene.rows, seen_colours=scene.colours, sums=sums, by_colours=by_shades[0],
-                by_splats=by_splats, by_sh=by_sh,
-            )  # fmt: skip
+            scene.backward(sums, by_shades[0], by_splats, by_sh)
             found, of_sh = device.read(by_splats), device.read(by_sh)
             of_features = [device.read(by_shade) for by_shade in by_shades[1:]]
         gradients = [torch.zeros_like(tensor, requires_grad=False) for tensor in ctx.saved_tensors]
         parts = [slice(0, 3), slice(4, 8), slice(8, 11), 3]
-        some = scene.some
         for gradient, part in zip(gradients, parts, strict=False):
             gradient.numpy()[some] = found[:, part]
         gradients[4].numpy()[some, : of_sh.shape[1]] = of_sh
@@ -260,6 +179,23 @@ class _Photometric(torch.autograd.Function):
         return (ctx.gradient if by_loss == 1 else ctx.gradient * by_loss), None, None
 
 
+def _scene_of(device: Device, tensors: list[torch.Tensor], settings: Settings) -> tuple[Scene, np.ndarray]:
+    """Those splats that have a weight and are looked at, copied to a device, and which (M,) they are.
+
+    Args:
+        tensors: means, quats, log-scales, logits, coefficients and weights; the last are empty for ones.
+    """
+    arrays = [tensor.detach().numpy() for tensor in tensors]
+    weights = arrays[-1]
+    some = np.arange(len(arrays[0])) if settings.rows is None else settings.rows.numpy()
+    some = some[weights[some] > 0] if len(weights) else some
+    filtered = np.broadcast_to(np.asarray(settings.antialias), len(arrays[0]))[some]
+    weights = weights[some] if len(weights) else 1
+    splats = packed(*(array[some] for array in arrays[:4]), weights=weights, filtered=filtered)
+    sh = device.upload(arrays[4][some, : (settings.degree + 1) ** 2])
+    return Scene.of(device, device.upload(splats), sh, settings), some
+
+
 def _as_colours(device: Device, features: np.ndarray) -> list[Buffer]:
     """Features (M, F) as colours (M, 4), three at a time, zeros where they run out."""
     found = []
@@ -267,11 +203,3 @@ def _as_colours(device: Device, features: np.ndarray) -> list[Buffer]:
         three = features[:, first : first + 3]
         found.append(device.upload(np.pad(three, ((0, 0), (0, 4 - three.shape[1])))))
     return found
-
-
-def _lens_of(view: View) -> np.ndarray:
-    """The view as project.wgsl takes it, as far as ``near``."""
-    pose = np.column_stack([view.rotation, view.translation])
-    limits = np.array([view.x_limits, view.y_limits]).T
-    numbers = 0, view.fx, view.fy, view.cx, view.cy, *limits.flat, view.width, view.height, view.near
-    return np.concatenate([pose.flat, view.eye, numbers], dtype=np.float32)

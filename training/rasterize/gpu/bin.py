@@ -82,9 +82,10 @@ def bin_splats(device: Device, rows: Buffer, depths: Buffer, width: int, height:
     """
     count, across, down = rows.shape[0], -(-width // TILE), -(-height // TILE)
     ranges, spans = device.empty(np.uint32, across * down, 2), device.empty(np.uint32, count, 2)
-    _, order = sort(device, depths, device.upload(np.arange(count, dtype=np.uint32)), DEPTH_BITS)
-    starts = device.empty(np.uint32, count + 1)
+    starts, order = device.empty(np.uint32, count + 1), device.empty(np.uint32, count)
     numbers = count, across, down
+    device.run("bin", "number", groups_of(count), numbers, pairs=order)
+    _, order = sort(device, depths, order, DEPTH_BITS)
     device.run("bin", "count", groups_of(count), numbers, rows=rows, order=order, counts=starts)
     sum_up(device, starts)
     total = int(device.read(starts, count)[0])

@@ -23,6 +23,20 @@ def loss_and_gradient(
     device: Device, image: Buffer, truth: Buffer, moments: Buffer, ssim_weight: float
 ) -> tuple[float, Buffer]:
     """(1 − ssim_weight) L1 + ssim_weight (1 − SSIM) of images (H, W, 3), and its gradient by the first."""
+    *sums, gradient = sums_and_gradient(device, image, truth, moments, ssim_weight)
+    l1, ssim = (device.read(each).sum(dtype=np.float64) for each in sums)
+    return loss_of(l1, ssim, int(np.prod(image.shape)), ssim_weight), gradient
+
+
+def loss_of(l1: float, ssim: float, size: int, ssim_weight: float) -> float:
+    """The loss from what L1 and SSIM add up to over so many values."""
+    return (1 - ssim_weight) * float(l1) / size + ssim_weight * (1 - float(ssim) / size)
+
+
+def sums_and_gradient(
+    device: Device, image: Buffer, truth: Buffer, moments: Buffer, ssim_weight: float
+) -> tuple[Buffer, Buffer, Buffer]:
+    """Sums of L1 and of SSIM over each EACH values of images (H, W, 3), and the loss's gradient."""
     size = int(np.prod(image.shape))
     groups, numbers = _launch(image, (1 - ssim_weight) / size, ssim_weight / size)
     lines, slopes = (device.empty(np.float32, 3, *image.shape) for _ in range(2))
@@ -36,12 +50,10 @@ def loss_and_gradient(
         "loss", "finish", groups, numbers, across=lines, image=image, truth=truth, gradient=gradient,
         different=different,
     )  # fmt: skip
-    blocks = -(-size // EACH)
-    totals = [device.empty(np.float32, blocks) for _ in range(2)]
-    for values, total in zip((similar, different), totals, strict=True):
-        device.run("loss", "add", -(-blocks // LANES), numbers, values=values, totals=total)
-    ssim, l1 = (device.read(total).sum(dtype=np.float64) / size for total in totals)
-    return (1 - ssim_weight) * float(l1) + ssim_weight * (1 - float(ssim)), gradient
+    l1, ssim = (device.empty(np.float32, -(-size // EACH)) for _ in range(2))
+    for values, totals in ((different, l1), (similar, ssim)):
+        device.run("loss", "add", -(-totals.shape[0] // LANES), numbers, values=values, totals=totals)
+    return l1, ssim, gradient
 
 
 def _launch(image: Buffer, l1_weight: float, ssim_weight: float) -> tuple[int, tuple]:

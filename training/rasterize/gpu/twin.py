@@ -1,0 +1,256 @@
+"""Splats that are trained where they are drawn: a step moves a few numbers between computer and device.
+
+A twin has the parameters of a model of splats, their moments and the statistics of density control on the
+device. Photographs stay there too, with eight bits a value, as long as their ``Target`` is kept here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+
+from ...scenes.cameras import Camera
+from ..adam import Adam
+from ..rendering import Settings, Target, View
+from .bin import groups_of
+from .device import Buffer, Device
+from .loss import loss_of, moments_of, sums_and_gradient
+from .scene import BY_SPLAT, PAIR_SUMS, SPLAT, SUMS, Scene
+
+COLUMNS = {
+    "means": slice(0, 3),
+    "opacity_logits": slice(3, 4),
+    "quats": slice(4, 8),
+    "log_scales": slice(8, 11),
+}
+"""Where a splat's numbers stand (project.wgsl)."""
+TRAINED = 11
+"""So many of them are trained; the weight and the filter follow."""
+STATS = ("gradient_sum", "seen", "gradient_max", "radius_max", "opacity_sum")
+"""The statistics that a device adds up (train.wgsl)."""
+
+
+def packed(
+    means: np.ndarray,
+    quats: np.ndarray,
+    log_scales: np.ndarray,
+    logits: np.ndarray,
+    weights: np.ndarray | float,
+    filtered: np.ndarray | bool,
+) -> np.ndarray:
+    """(M, SPLAT) of arrays (M, ...) or, of the last two, of one number for all: as shaders take splats."""
+    found = np.empty((len(means), SPLAT), np.float32)
+    for column, array in zip(COLUMNS.values(), (means, logits[:, None], quats, log_scales), strict=True):
+        found[:, column] = array
+    found[:, TRAINED], found[:, TRAINED + 1] = weights, filtered
+    return found
+
+
+class Twin:
+    """N splats on a device. What is here in the meantime is what they were; see :meth:`bring_home`.
+
+    Args:
+        adam: of what is trained, of which ``COLUMNS`` and ``sh`` go along.
+        stats: (N,) of each splat, by names of STATS.
+        antialias: as of ``rasterize``.
+
+    Raises:
+        LodgsError: the device was lost, or has too little memory. Then what is here is still whole.
+    """
+
+    def __init__(
+        self, device: Device, adam: Adam, stats: Mapping[str, torch.Tensor], antialias: bool
+    ) -> None:
+        self.device, self._adam, self._stats, self._antialias = device, adam, stats, antialias
+        arrays = {name: tensor.detach().numpy() for name, tensor in adam.tensors.items()}
+        moments = {name: [m.numpy() for m in state] for name, state in adam.state.items()}
+        self._count, self._weighted = len(arrays["means"]), False
+        of_splats = np.empty((self._count, TRAINED, 2), np.float32)
+        for name, column in COLUMNS.items():
+            for k, moment in enumerate(moments[name]):
+                of_splats[:, column, k] = moment.reshape(self._count, -1)
+        counted = np.zeros((self._count, len(STATS)), np.float32)
+        for name, values in stats.items():
+            counted[:, STATS.index(name)] = values.numpy()
+        geometry = (arrays[name] for name in ("means", "quats", "log_scales", "opacity_logits"))
+        with device.lock:
+            self._splats = device.upload(packed(*geometry, weights=1, filtered=antialias))
+            self._sh = device.upload(arrays["sh"])
+            self._splat_moments = device.upload(of_splats)
+            self._sh_moments = device.upload(np.stack(moments["sh"], -1))
+            self._counted = device.upload(counted)
+            self._by_splats = device.empty(np.float32, self._count, BY_SPLAT)
+            self._by_sh = device.empty(np.float32, *self._sh.shape)
+        self.drawn = device.empty(np.float32, 0, 0, 4)
+
+    def step(
+        self,
+        camera: Camera,
+        target: Target,
+        *,
+        near: float,
+        sh_degree: int,
+        background: tuple[float, float, float],
+        ssim_weight: float,
+        weights: torch.Tensor | None = None,
+        min_scale: float = 0.0,
+        shrink: float | None = None,
+    ) -> float:
+        """One step by the photometric loss, which it returns.
+
+        Args:
+            target: opaque and without a mask.
+            shrink: the statistics are added up, of a photograph that is so many times smaller; None: they
+                stay as they are.
+            others: as of ``rasterize`` and ``photometric_loss``.
+
+        Raises:
+            LodgsError: the device was lost, or has too little memory. The splats are lost with it.
+        """
+        device, count = self.device, self._count
+        settings = Settings(View.of(camera, near), min_scale, self._antialias, background, sh_degree)
+        with device.lock:
+            self._weigh(weights)
+            scene = Scene.of(device, self._splats, self._sh, settings)
+            pairs, size = scene.pairs, (camera.height, camera.width)
+            self.drawn, walked = device.empty(np.float32, *size, 4), device.empty(np.uint32, scene.tiles, 2)
+            scene.blend(
+                "forward", background, colours=scene.colours, ranges=pairs.ranges, walked=walked,
+                drawn=self.drawn, limit=device.empty(np.float32, 1), median=device.empty(np.int32, *size),
+            )  # fmt: skip
+            told, by_picture = self._loss(target, ssim_weight)
+            pair_sums = device.empty(np.float32, pairs.count, PAIR_SUMS)
+            scene.blend(
+                "backward", colours=scene.colours, ranges=walked, sorted_pairs=pairs.sorted_pairs,
+                picture=self.drawn, by_picture=by_picture, pair_sums=pair_sums,
+            )  # fmt: skip
+            sums, by_colours = device.empty(np.float32, count, SUMS), device.empty(np.float32, count, 3)
+            scene.gather(SUMS, pair_sums=pair_sums, sums=sums, by_colours=by_colours)
+            scene.backward(sums, by_colours, self._by_splats, self._by_sh)
+            if shrink is not None:
+                device.run(
+                    "train", "count", groups_of(count),
+                    (count, 0, SPLAT, BY_SPLAT, 0, 0, 0.0, 0.0, 0.0, float(shrink)),
+                    radii=scene.radii, by_rows=self._by_splats, stats=self._counted, values=self._splats,
+                )  # fmt: skip
+            self._move(scene.radii, 3 * (sh_degree + 1) ** 2)
+            l1, ssim = device.read(told)
+        return loss_of(l1, ssim, 3 * size[0] * size[1], ssim_weight)
+
+    def picture(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """The last step's (H, W, 3), and its alpha (H, W)."""
+        drawn = torch.from_numpy(self.device.read(self.drawn))
+        return drawn[..., :3], 1 - drawn[..., 3]
+
+    def look(self, name: str) -> torch.Tensor:
+        """A tensor's values as they are now, a copy."""
+        device, like = self.device, self._adam.tensors[name]
+        with device.lock:
+            if name == "sh":
+                return torch.from_numpy(device.read(self._sh))
+            column = COLUMNS[name]
+            width = _width(column)
+            found = device.empty(np.float32, *like.shape)
+            device.run(
+                "train", "look", groups_of(self._count * width),
+                (self._count * width, width, SPLAT, 0, 0, column.start, 0.0, 0.0, 0.0, 0.0),
+                values=self._splats, totals=found,
+            )  # fmt: skip
+            return torch.from_numpy(device.read(found))
+
+    def keep_above(self, least: torch.Tensor) -> None:
+        """No log-scale of a splat is below its least one (N,) from here."""
+        lowest = least.numpy().clip(np.finfo(np.float32).min)  # not every device knows an infinity
+        with self.device.lock:
+            self.device.run(
+                "train", "widen", groups_of(self._count),
+                (self._count, 0, SPLAT, 0, 0, 0, 0.0, 0.0, 0.0, 0.0),
+                parts=self.device.upload(lowest), values=self._splats,
+            )  # fmt: skip
+
+    def bring_home(self) -> None:
+        """Makes tensors, moments and statistics here what they are on the device, in place."""
+        with self.device.lock:
+            splats, sh, of_splats, of_sh, counted = map(
+                self.device.read,
+                (self._splats, self._sh, self._splat_moments, self._sh_moments, self._counted),
+            )
+        found = {
+            name: (splats[:, at], of_splats[:, at, 0], of_splats[:, at, 1]) for name, at in COLUMNS.items()
+        }
+        found["sh"] = sh, of_sh[..., 0], of_sh[..., 1]
+        for name, arrays in found.items():
+            here = self._adam.tensors[name].detach(), *self._adam.state[name]
+            for tensor, array in zip(here, arrays, strict=True):
+                tensor.numpy()[:] = array.reshape(tensor.shape)
+        for name, values in self._stats.items():
+            values.numpy()[:] = counted[:, STATS.index(name)]
+
+    def _weigh(self, weights: torch.Tensor | None) -> None:
+        """Gives splats their weights; None: ones."""
+        if weights is None and not self._weighted:
+            return
+        ones = np.ones(self._count, np.float32)
+        given = ones if weights is None else weights.numpy().astype(np.float32, copy=False)
+        self._weighted = weights is not None
+        self.device.run(
+            "train", "weigh", groups_of(self._count), (self._count, 0, SPLAT, 0, 0, 0, 0.0, 0.0, 0.0, 0.0),
+            parts=self.device.upload(given), values=self._splats,
+        )  # fmt: skip
+
+    def _loss(self, target: Target, ssim_weight: float) -> tuple[Buffer, Buffer]:
+        """What L1 and SSIM add up to (2,), and the gradient (H, W, 4) by the picture."""
+        device, (height, width, _) = self.device, self.drawn.shape
+        image, truth = (device.empty(np.float32, height, width, 3) for _ in range(2))
+        numbers = (height * width, 0, 0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0)
+        groups = groups_of(height * width)
+        device.run(
+            "train", "unpack", groups, numbers, photograph=_photograph(device, target), drawn=self.drawn,
+            image=image, truth=truth,
+        )  # fmt: skip
+        *sums, gradient = sums_and_gradient(device, image, truth, moments_of(device, truth), ssim_weight)
+        by_picture, told = device.empty(np.float32, height, width, 4), device.empty(np.float32, 2)
+        device.run("train", "pack", groups, numbers, gradient=gradient, by_picture=by_picture)
+        for slot, each in enumerate(sums):
+            device.run(
+                "train", "total", 1, (each.shape[0], 0, 0, 0, 0, slot, 0.0, 0.0, 0.0, 0.0),
+                parts=each, totals=told,
+            )  # fmt: skip
+        return told, by_picture
+
+    def _move(self, radii: Buffer, harmonics: int) -> None:
+        """Adam's step, of so many numbers of each splat's harmonics."""
+        adam, coefficients = self._adam, self._sh.shape[1]
+        rates = {}
+        for name in (*COLUMNS, "sh"):
+            adam.steps[name] += 1
+            first, second = (1 - beta ** adam.steps[name] for beta in adam.betas)
+            shape = (coefficients, 3) if name == "sh" else (_width(COLUMNS[name]),)
+            rate = np.broadcast_to(np.asarray(adam.lr[name], np.float32) / np.float32(first), shape)
+            rates[name] = np.stack([rate.ravel(), np.full(rate.size, 1 / second, np.float32)], 1)
+        of_splats = np.concatenate([rates[name] for name in COLUMNS])
+        for values, moments, gradient, stride, by_stride, trained, rate in (
+            (self._splats, self._splat_moments, self._by_splats, SPLAT, BY_SPLAT, TRAINED, of_splats),
+            (self._sh, self._sh_moments, self._by_sh, *[3 * coefficients] * 2, harmonics, rates["sh"]),
+        ):
+            width = len(rate)
+            numbers = self._count * width, width, stride, by_stride, trained, 0, *adam.betas, adam.eps, 1.0
+            self.device.run(
+                "train", "adam", groups_of(self._count * width), numbers, radii=radii, by_rows=gradient,
+                values=values, moments=moments, rates=self.device.upload(rate),
+            )  # fmt: skip
+
+
+def _width(columns: slice) -> int:
+    return columns.stop - columns.start
+
+
+def _photograph(device: Device, target: Target) -> Buffer:
+    """A photograph (H, W) with a byte for each colour, which stays as long as its target."""
+    if target.cache.get("twin", (None,))[0] is not device:
+        bytes_ = np.zeros((*target.image.shape[:2], 4), np.uint8)
+        bytes_[..., :3] = np.rint(255 * target.image.numpy())
+        target.cache["twin"] = device, device.upload(bytes_.view("<u4")[..., 0])
+    return target.cache["twin"][1]
