@@ -145,6 +145,7 @@ class Device:
         limits: by wgpu's names, all that the adapter has.
         most_bytes: the largest buffer.
         most_groups: workgroups that are submitted at a time.
+        moved: bytes that went to the device and came from it.
         lost: it answers no more; :func:`open_device` opens another.
         lock: held by who records, so that two threads do not mix their dispatches.
     """
@@ -158,6 +159,7 @@ class Device:
             raise LodgsError(f"{adapter.name} cannot be opened: {_reason(error)}.", REMEDY) from error
         self.most_bytes = min(self.limits["max-storage-buffer-binding-size"], self.limits["max-buffer-size"])
         self.most_groups = self.limits["max-compute-workgroups-per-dimension"]
+        self.moved = 0
         self._firsts: dict[int, Any] = {}
         self._pipelines: dict[tuple[str, str], tuple[Any, Any, dict[str, int]]] = {}
         self._encoder: Any = None
@@ -187,6 +189,7 @@ class Device:
         array = np.ascontiguousarray(array)
         buffer = self.empty(array.dtype.type, *array.shape)
         if array.size:
+            self.moved += array.nbytes
             with self._said():
                 self._device.queue.write_buffer(buffer.handle, 0, array.reshape(-1))
         return buffer
@@ -249,6 +252,7 @@ class Device:
         size, row_size = (int(np.prod(each, dtype=np.int64)) * buffer.kind.itemsize for each in (shape, row))
         if not size:
             return np.zeros(shape, buffer.kind)
+        self.moved += size
         with self._said():
             data = self._device.queue.read_buffer(buffer.handle, begin * row_size, size)
         return np.frombuffer(data, buffer.kind).reshape(shape)
@@ -265,6 +269,7 @@ class Device:
     def _uniform(self, *numbers: Any) -> Any:
         words = np.concatenate([_as_words(number) for number in numbers])
         words = np.pad(words, (0, -len(words) % 4))
+        self.moved += words.nbytes
         return self._device.create_buffer_with_data(data=words, usage=_wgpu().BufferUsage.UNIFORM)
 
     def _pipeline(self, shader: str, entry: str) -> tuple[Any, Any, dict[str, int]]:
