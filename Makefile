@@ -73,6 +73,7 @@ tables: setup
 
 bench: setup
 	$(VENV) tools/bench.py $(if $(BASE),--base $(BASE))
+	$(VENV) tools/bench_gpu.py
 	$(VENV) tools/bench_blender.py
 	@if [ -x $(BLENDER_5_2) ]; then set -x; $(BLENDER_5_2) tools/bench_blender.py; fi
 

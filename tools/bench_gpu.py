@@ -1,0 +1,203 @@
+"""How fast the gpu backend is on the device that is chosen, or that ``LODGS_GPU`` names: part of ``make bench``.
+
+A training step that stays on the device, its stages, the same through copies, and on the cpu, in one run; what
+share that is of multiply-adds and copies as the device itself makes them; bytes moved in a step. Saves
+build/bench/gpu.json. On software that stands for a card these are sanity checks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from tools.bench import (  # noqa: E402
+    BACKWARD_FLOPS,
+    FORWARD_FLOPS,
+    Step,
+    synthetic_camera,
+    synthetic_splats,
+    work,
+)
+from training.errors import LodgsError  # noqa: E402
+from training.rasterize import (  # noqa: E402
+    Adam,
+    Gaussians,
+    Target,
+    photometric_loss,
+    rasterize,
+    resolve,
+    twin_of,
+    warm_up,
+)
+from training.rasterize.gpu import scene  # noqa: E402
+from training.rasterize.gpu.choice import open_chosen  # noqa: E402
+from training.rasterize.gpu.device import LANES, Device  # noqa: E402
+
+CASES = [(50_000, 640, 426), (200_000, 960, 540), (1_000_000, 1920, 1080)]
+"""Splats, width and height; on software the first one alone."""
+STAGES = {
+    "project forward": "project", "project backward": "project_backward", "blend forward": "blend",
+    "blend backward": "blend_backward", "gather gradients": "gather", "train adam": "adam",
+    "train count": "statistics",
+}  # fmt: skip
+"""Stages by shader and function; of other shaders by the shader."""
+SHADERS = {"sort": "sort", "scan": "sort", "bin": "bin", "loss": "loss", "train": "loss"}
+WORDS, ROUNDS, GROUPS = 1 << 24, 4096, 1024
+"""Of the measurements of copies and of multiply-adds."""
+MULTIPLY_ADDS = 4
+"""Vectors of four in each round."""
+BYTES_A_NUMBER = 24
+"""That Adam moves: a value and two moments, there and back; and a gradient of which most are not read."""
+
+
+class Fastest:
+    """Seconds of the fastest of some calls."""
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+
+    def __call__(self, call: Callable[[], object]) -> float:
+        call()
+        found, end = [], time.perf_counter() + self._seconds
+        while not found or time.perf_counter() < end:
+            begin = time.perf_counter()
+            call()
+            found.append(time.perf_counter() - begin)
+        return min(found)
+
+
+def peaks(device: Device, fastest: Fastest) -> tuple[float, float]:
+    """GFLOP/s of dependent multiply-adds, and GB/s of a copy, read and written."""
+    source, goal = (device.empty(np.float32, WORDS) for _ in range(2))
+
+    def run(entry: str, groups: int, numbers: tuple) -> None:
+        device.run("calibrate", entry, groups, numbers, source=source, goal=goal)
+        device.read(goal, WORDS - 1)
+
+    adds = fastest(lambda: run("multiply_add", GROUPS, (GROUPS * LANES, ROUNDS)))
+    copies = fastest(lambda: run("copy", WORDS // LANES // 4, (WORDS // 4, 1)))
+    return GROUPS * LANES * ROUNDS * MULTIPLY_ADDS * 8 / adds / 1e9, 8 * WORDS / copies / 1e9
+
+
+class Case:
+    """A scene's training steps."""
+
+    def __init__(self, count: int, width: int, height: int) -> None:
+        self.camera, self.size = synthetic_camera(width, height), (count, width, height)
+        photograph = np.random.default_rng(1).integers(0, 256, (height, width, 3)) / np.float32(255)
+        self.target = Target(photograph)
+        splats = synthetic_splats(count).map(lambda tensor: tensor.requires_grad_())
+        self.adam = Adam(vars(splats), dict.fromkeys(vars(splats), 1e-7))
+        self.stats = {name: torch.zeros(count) for name in ("gradient_sum", "seen")}
+
+    def through_torch(self, backend: str) -> None:
+        self.adam.zero_grad()
+        drawn = rasterize(Gaussians(**self.adam.tensors), self.camera, backend=backend)
+        photometric_loss(drawn.image, self.target, backend=backend).backward()
+        self.adam.step()
+
+    def there(self) -> Callable[[], object]:
+        """A step that stays on the device."""
+        twin = twin_of("gpu", self.adam, self.stats)
+        assert twin is not None
+        options = {"near": 0.01, "sh_degree": 3, "background": (0.0, 0.0, 0.0), "ssim_weight": 0.2}
+        return lambda: twin.step(self.camera, self.target, shrink=1, **options)
+
+
+def moved(device: Device, step: Callable[[], object]) -> int:
+    """Bytes of a step between device and computer."""
+    step()
+    before = device.moved
+    step()
+    return device.moved - before
+
+
+def stages_of(device: Device, step: Callable[[], object]) -> dict[str, float]:
+    """Milliseconds of the stages of a step, with the device waited for after each dispatch."""
+    run, spent, wait = device.run, defaultdict(float), device.empty(np.float32, 1)
+
+    def timed(shader: str, entry: str, *arguments, **buffers) -> None:
+        device.read(wait)
+        begin = time.perf_counter()
+        run(shader, entry, *arguments, **buffers)
+        device.read(wait)
+        stage = STAGES.get(f"{shader} {entry}") or SHADERS[shader]
+        spent[stage] += 1e3 * (time.perf_counter() - begin)
+
+    device.run = timed  # type: ignore[method-assign]
+    try:
+        step()
+    finally:
+        del device.run
+    return {stage: round(ms, 2) for stage, ms in spent.items()}
+
+
+def bench(seconds: float) -> dict:
+    device, fastest = open_chosen(), Fastest(seconds)
+    warm_up("gpu")
+    flops, bandwidth = peaks(device, fastest)
+    print(f"{device.adapter.name}: {flops:.0f} GFLOP/s of multiply-adds, copies {bandwidth:.1f} GB/s")
+    cases = []
+    for size in CASES[: 1 if device.adapter.software else None]:
+        case = Case(*size)
+        copied = fastest(lambda case=case: case.through_torch("gpu"))
+        cpu = fastest(lambda case=case: case.through_torch("cpu"))
+        copied_bytes = moved(device, lambda case=case: case.through_torch("gpu"))
+        step = case.there()
+        there, bytes_moved = fastest(step), moved(device, step)
+        stages = stages_of(device, step)
+        numbers = size[0] * (scene.SPLAT - 2 + 48)
+        adam_bandwidth = BYTES_A_NUMBER * numbers / (stages["adam"] / 1e3) / 1e9
+        lanes, _ = work(Step(*size))
+        blending = (stages["blend"] + stages["blend_backward"]) / 1e3
+        blended = lanes * (FORWARD_FLOPS + BACKWARD_FLOPS) / 1e9 / blending
+        found = {
+            "splats": size[0], "width": size[1], "height": size[2],
+            "step_ms": round(1e3 * there, 2), "copied_step_ms": round(1e3 * copied, 2),
+            "cpu_step_ms": round(1e3 * cpu, 2), "over_cpu": round(there / cpu, 2), "stages_ms": stages,
+            "bytes_moved": bytes_moved, "copied_bytes_moved": copied_bytes,
+            "blending_share_of_peak": round(blended / flops, 3),
+            "adam_share_of_copies": round(adam_bandwidth / bandwidth, 3),
+        }  # fmt: skip
+        print(json.dumps(found))
+        cases.append(found)
+    adapter = device.adapter._asdict()
+    return {
+        "device": adapter,
+        "peak_gflops": round(flops, 1),
+        "copy_gb_s": round(bandwidth, 1),
+        "cases": cases,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=3.0, help="time for each measurement")
+    parser.add_argument("--out", type=Path, default=Path("build/bench/gpu.json"))
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    try:
+        if resolve("gpu") != "gpu":
+            raise LodgsError("The graphics device does not draw what the reference draws.")
+        result = bench(options.seconds)
+    except LodgsError as problem:
+        print(f"No figures of a graphics device: {problem}")
+        return
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    options.out.write_text(json.dumps(result, indent=1) + "\n")
+    print(f"saved {options.out}")
+
+
+if __name__ == "__main__":
+    main()
