@@ -1,8 +1,8 @@
-"""How fast the gpu backend is on the device that is chosen, or that ``LODGS_GPU`` names: part of ``make bench``.
+"""Measure the gpu backend on the device that is chosen, or that LODGS_GPU names: part of ``make bench``.
 
-A training step that stays on the device, its stages, the same through copies, and on the cpu, in one run; what
-share that is of multiply-adds and copies as the device itself makes them; bytes moved in a step. Saves
-build/bench/gpu.json. On software that stands for a card these are sanity checks.
+A training step that stays on the device, its stages, the same through copies, and on the cpu, in one run; the
+share that it has of the multiply-adds and the copies that the device makes by itself; bytes moved in a step.
+Saves build/bench/gpu.json. On software that stands for a card these are sanity checks.
 """
 
 from __future__ import annotations
