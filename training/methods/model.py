@@ -72,11 +72,13 @@ class Model:
 
     @property
     def adam(self) -> Adam:
+        """The optimizer, with what is trained at home."""
         self._come_home()
         return self._adam
 
     @property
     def stats(self) -> dict[str, torch.Tensor]:
+        """What is added up, by name, at home."""
         self._come_home()
         return self._stats
 
@@ -87,6 +89,7 @@ class Model:
 
     @property
     def lr(self) -> dict[str, LearningRate]:
+        """The optimizer's learning rates; what is trained stays where it is."""
         return self._adam.lr
 
     @lr.setter
