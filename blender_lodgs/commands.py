@@ -26,7 +26,7 @@ from ..training.splats.dialects import Warn
 from ..training.splats.formats import PLY, format_of, write_splats
 from . import extension
 from .data import scenes, viewpoints
-from .render.capture import render_views, write_model
+from .render.capture import noise, render_views, write_model
 from .render.video import MOST_FRAMES, extract_frames
 from .runs import environment, jobs, preparing
 from .runs.watch import Watch
@@ -245,6 +245,8 @@ def _capture(args: argparse.Namespace) -> int:
         _print(
             f"{name} needs graphics, in background too. If Blender crashes now, there are none: take Cycles."
         )
+    if noisy := noise(scene):
+        _print(f"warning: {noisy}")
     try:
         with _interrupts():
             count = render_views(bpy.context, folder, width, height, args.range, tell)

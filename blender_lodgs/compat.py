@@ -10,6 +10,18 @@ WIDE_TYPE = (
 """Attribute type for four plain floats: FLOAT4 from Blender 5.2 on, the equally exact FLOAT_COLOR before."""
 
 
+def _denoises() -> bool:
+    try:
+        import _cycles  # type: ignore[import-not-found]
+    except ImportError:
+        return False
+    return getattr(_cycles, "with_openimagedenoise", True)
+
+
+DENOISES = _denoises()
+"""Whether Cycles was built with Open Image Denoise: that of some Linux distributions was not."""
+
+
 def _native_splats() -> tuple[str, str] | None:
     for name, kind in bpy.types.PointCloud.bl_rna.properties.items():
         if isinstance(kind, bpy.types.EnumProperty) and not kind.is_readonly:

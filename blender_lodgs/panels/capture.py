@@ -6,6 +6,7 @@ import bpy
 
 from ...training.errors import LodgsError
 from ..data import scenes, viewpoints
+from ..render.capture import noise
 from ..runs import capturing, environment
 from ..viewport import coverage
 from .parts import Panel, draw_environment, draw_views, say, split_column
@@ -62,6 +63,8 @@ def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
         "lodgs.show_coverage", text=text, icon="HIDE_OFF" if measured else "HIDE_ON", depress=bool(measured)
     )
     say(layout, f"Pictures of {width} × {height}, as the scene's own engine renders them.", "INFO")
+    if noisy := noise(context.scene):
+        say(layout, noisy, "ERROR")
     split_column(layout).prop(settings, "folder")
 
 

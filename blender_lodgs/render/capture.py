@@ -27,6 +27,8 @@ from .engine import LodgsEngine
 
 Tell = Callable[[int, int], object]
 """Is told before each view that is rendered which one it is, from 1 on, and of how many."""
+CLEAN = 256
+"""Samples of a pixel from which on Cycles leaves little noise without a denoiser."""
 
 
 def render_views(
@@ -76,6 +78,19 @@ def render_views(
         _save(context.scene, folder, name, (width, height))
         write_camera(file, camera, near)  # the last: where it is, the view is whole
     return len(shots)
+
+
+def noise(scene: bpy.types.Scene) -> str | None:
+    """What to know of the noise of a scene's renders, which splats learn; None where there is little."""
+    if scene.render.engine != "CYCLES" or scene.cycles.samples >= CLEAN:
+        return None
+    count = scene.cycles.samples
+    left = f"{count} {'sample leaves' if count == 1 else 'samples leave'} noise, and splats learn it"
+    if not scene.cycles.use_denoising:
+        return f"Without a denoiser {left}. Switch on Denoise in Render > Sampling, or take {CLEAN} samples."
+    if not compat.DENOISES and scene.cycles.denoiser != "OPTIX":
+        return f"This Blender has no denoiser: {left}. Take blender.org's Blender, or {CLEAN} samples."
+    return None
 
 
 def write_model(folder: Path) -> str:

@@ -46,6 +46,26 @@ def test_it_tells_what_views_are_placed_around(bpy, drawn):
     assert not any("selected" in text for text in drawn().texts)
 
 
+def test_it_says_where_renders_will_be_noisy(bpy, lodgs, drawn, monkeypatch):
+    scene, compat = bpy.context.scene, lodgs("compat")
+
+    def said():
+        return [text for text in drawn().texts if "noise" in text]
+
+    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 16, False
+    assert "Without a denoiser 16 samples leave noise" in " ".join(said())
+    scene.cycles.use_denoising = True
+    monkeypatch.setattr(compat, "DENOISES", False)
+    assert "This Blender has no denoiser" in " ".join(said())
+    scene.cycles.samples = 256
+    assert not said()
+    scene.cycles.samples = 16
+    monkeypatch.setattr(compat, "DENOISES", True)
+    assert not said()
+    scene.render.engine, scene.cycles.use_denoising = "BLENDER_WORKBENCH", False
+    assert not said()
+
+
 def test_it_tells_how_far_a_capture_is_and_how_it_ended(bpy, lodgs, drawn, monkeypatch):
     work = SimpleNamespace(running=True, message="View 3 of 9", fraction=0.2, problem="")
     monkeypatch.setattr(lodgs("runs.capturing"), "current", work)
