@@ -82,7 +82,9 @@ class LODGS_OT_set_scale(OnScene, bpy.types.Operator):
         root = scenes.active_root(context)
         factor = self.length / ground.measured(ground.picked(context))
         ground.scale(root, factor)
-        self.report({"INFO"}, f"'{root.name}' is {factor:.4g} times as large")
+        same = abs(factor - 1) < 1e-4
+        size = "as large as it was" if same else f"{factor:.4g} times as large"
+        self.report({"INFO"}, f"'{root.name}' is {size}")
         return {"FINISHED"}
 
 
