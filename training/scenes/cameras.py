@@ -36,6 +36,7 @@ class Camera:
         image: path of the photograph, or None where there is none.
         mask: path of a picture of the same proportions that is black where the photograph does not count.
         depth: path of a depth map of the same proportions, see ``depths.read_map``.
+        turns: quarter turns clockwise that stand the photograph upright, see ``images.quarter_turns``.
     """
 
     name: str
@@ -49,6 +50,7 @@ class Camera:
     image: Path | None = None
     mask: Path | None = None
     depth: Path | None = None
+    turns: int = 0
 
     @property
     def center(self) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import LodgsError, printable
 from .cameras import FARTHEST, Camera, evenly, extent_of
-from .images import image_size
+from .images import image_size, quarter_turns
 from .model import (
     DAMAGED,
     Intrinsics,
@@ -361,8 +361,9 @@ class _Views:
             width, height = image_size(image)
             beside = self._masks.find(name), self._depths.find(name)
             camera = Camera(
-                name, lens.width, lens.height, *lens.pinhole, pose.world_to_camera, image, *beside
-            )
+                name, lens.width, lens.height, *lens.pinhole, pose.world_to_camera, image, *beside,
+                turns=quarter_turns(image),
+            )  # fmt: skip
             if (width, height) != (lens.width, lens.height):
                 camera = camera.resized(width, height)
             if flaw := camera.flaw:

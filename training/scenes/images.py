@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -30,6 +31,12 @@ _STRIP = 1 << 20
 
 # JPEG markers that carry the size: every start of frame, which excludes DHT (C4), JPG (C8) and DAC (CC).
 _START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_EXIF, _TIFF = b"Exif\0\0", (b"II*\0", b"MM\0*")
+_WIDTH, _HEIGHT, _ORIENTATION = 256, 257, 274
+_TURNS = {3: 2, 4: 2, 5: 1, 6: 1, 7: 3, 8: 3}
+"""By EXIF's orientation, which tells mirrored ones apart as well."""
+_TURNED = {2: 0, 3: 3, 4: 1, 5: 5, 6: 2, 7: 6, 8: 4}
+"""By the same: what undoes it, as ``Image.Transpose`` counts."""
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -63,8 +70,9 @@ def _size(path: Path, file: IO[bytes]) -> tuple[int, int]:
         return _png_size(file)
     if head[:4] == MAGIC:
         return exr_size(file)
-    if head[:4] in (b"II*\0", b"MM\0*"):
-        return _tiff_size(file, "<" if head[:2] == b"II" else ">")
+    if head[:4] in _TIFF:
+        tags = _tiff_tags(file)
+        return tags[_WIDTH], tags[_HEIGHT]
     if head[:4] == b"RIFF":
         return _webp_size(file)
     raise LodgsError(f"{path} is not a JPEG, PNG, TIFF, WebP or EXR image.", "Convert it to one of these.")
@@ -86,9 +94,47 @@ def check_size(path: Path, size: tuple[int, int]) -> tuple[int, int]:
     return size
 
 
-def _jpeg_size(file) -> tuple[int, int]:
-    """Walk the segments to the frame header, then make sure that the end marker follows the first scan."""
+def quarter_turns(path: Path) -> int:
+    """How many quarter turns clockwise stand a photograph upright, by its EXIF; 0 where that does not tell.
+
+    Phones and cameras write what the sensor sees, and how they were held.
+    """
+    try:
+        with open_file(path) as file:
+            if (head := file.read(4))[:2] == b"\xff\xd8":
+                return _TURNS.get(_tiff_tags(io.BytesIO(_exif(file))).get(_ORIENTATION, 1), 0)
+            return _TURNS.get(_tiff_tags(file).get(_ORIENTATION, 1), 0) if head in _TIFF else 0
+    except (LodgsError, OSError, struct.error, IndexError, KeyError, ValueError, Truncated):
+        return 0
+
+
+def _exif(file: IO[bytes]) -> bytes:
+    """A JPEG's EXIF, which is a TIFF."""
+    for marker, length in _jpeg_segments(file):
+        if marker == 0xE1 and (content := file.read(length)).startswith(_EXIF):
+            return content.removeprefix(_EXIF)
+        if marker == 0xDA:
+            break
+    return b""
+
+
+def _jpeg_size(file: IO[bytes]) -> tuple[int, int]:
+    """From the frame header, once it is sure that the end marker follows the first scan."""
     size = None
+    for marker, _ in _jpeg_segments(file):
+        if marker == 0xDA:
+            _expect_end(file, b"\xff\xd9")
+            break
+        if marker in _START_OF_FRAME:
+            height, width = struct.unpack(">xHH", file.read(5))
+            size = width, height
+    if size is None:
+        raise Truncated
+    return size
+
+
+def _jpeg_segments(file: IO[bytes]) -> Iterator[tuple[int, int]]:
+    """The marker and the length of each segment, at whose content the file stands meanwhile."""
     file.seek(2)
     while True:
         if file.read(1) != b"\xff":
@@ -101,16 +147,9 @@ def _jpeg_size(file) -> tuple[int, int]:
         if marker == 0xD9:
             raise Truncated
         (length,) = struct.unpack(">H", file.read(2))
-        if marker == 0xDA:
-            _expect_end(file, b"\xff\xd9")
-            if size is None:
-                raise Truncated
-            return size
-        segment = file.tell()
-        if marker in _START_OF_FRAME:
-            height, width = struct.unpack(">xHH", file.read(5))
-            size = width, height
-        file.seek(segment + length - 2)
+        content = file.tell()
+        yield marker, length - 2
+        file.seek(content + length - 2)
 
 
 def _png_size(file) -> tuple[int, int]:
@@ -121,18 +160,19 @@ def _png_size(file) -> tuple[int, int]:
     return width, height
 
 
-def _tiff_size(file, order: str) -> tuple[int, int]:
-    """From the first directory; 16-bit tags 256 and 257, whose values are of 16 or 32 bits (TIFF 6.0)."""
-    file.seek(4)
+def _tiff_tags(file: IO[bytes]) -> dict[int, int]:
+    """Width, height and orientation by their tags, from the first directory (TIFF 6.0)."""
+    file.seek(0)
+    order = "<" if file.read(4)[:2] == b"II" else ">"
     (directory,) = struct.unpack(order + "I", file.read(4))
     file.seek(directory)
     (count,) = struct.unpack(order + "H", file.read(2))
     found = {}
     for _ in range(count):
         tag, kind, _, value = struct.unpack(order + "HHI4s", file.read(12))
-        if tag in (256, 257):
+        if tag in (_WIDTH, _HEIGHT, _ORIENTATION):  # values are of 16 or 32 bits
             found[tag] = struct.unpack(order + ("H2x" if kind == 3 else "I"), value)[0]
-    return found[256], found[257]
+    return found
 
 
 def _webp_size(file) -> tuple[int, int]:
@@ -269,6 +309,11 @@ def _opened(path: Path, width: int, height: int, large: int, alpha: bool = False
 
             file.seek(0)
             with Image.open(file, formats=("JPEG", "PNG", "TIFF", "WEBP")) as image:
+                if image.format == "TIFF":  # which Pillow, unlike all others, turns by its orientation
+                    turned = image.getexif().get(_ORIENTATION, 1)
+                    image.load()
+                    if turned in _TURNED:
+                        image = image.transpose(Image.Transpose(_TURNED[turned]))
                 if image.width * image.height > large:
                     image.draft(None, (2 * width, 2 * height))
                     times = min(image.width // (2 * width), image.height // (2 * height))
@@ -302,6 +347,8 @@ def _pillow_rows(image, top: int, bottom: int, alpha: bool) -> np.ndarray:
     if rows.mode.startswith("I"):  # 16-bit grey, which convert("RGB") would clip
         grey = np.asarray(rows, np.float32) / 65535
         return np.repeat(grey[..., None], 3, axis=2)
+    if rows.mode == "F":  # grey from 0 to 1, which convert("RGB") would take for 0 to 255
+        return np.repeat(np.nan_to_num(np.asarray(rows, np.float32))[..., None], 3, axis=2)
     return np.asarray(rows.convert("RGB"), np.float32) / 255
 
 

@@ -15,25 +15,29 @@ _AGREE = 0.5
 def up_rotation(cameras: Sequence[Camera]) -> np.ndarray:
     """Rotation from COLMAP's world to a z-up world, (3, 3) float64.
 
-    Up is the mean of the cameras' up directions (-y). Where these cancel out and the cameras look one way,
-    they look straight down, as drones do: up is then the normal of the plane that they fly in, or without
-    such a plane the opposite of the mean view. The mean view, where it has a horizontal part, turns to +y, so
-    that Blender's front view sees what the cameras see; otherwise the top of the first image does.
+    Up is the mean of the cameras' up directions: -y, or where EXIF turns the photograph what is then above.
+    Where these cancel out and the cameras look one way, they look straight down, as drones do: up is then the
+    normal of the plane that they fly in, or without such a plane the opposite of the mean view. The mean
+    view, where it has a horizontal part, turns to +y, so that Blender's front view sees what the cameras
+    see; otherwise the top of the first image does.
 
     No cameras give the identity.
     """
     if not cameras:
         return np.eye(3)
     axes = np.stack([camera.world_to_camera[:3, :3] for camera in cameras])
-    view, image_up = axes[:, 2].mean(axis=0), -axes[:, 1].mean(axis=0)
+    turns = np.array([camera.turns for camera in cameras])
+    tops = np.array([[0, -1, 0], [-1, 0, 0], [0, 1, 0], [1, 0, 0]])[turns]
+    ups = np.einsum("ni,nij->nj", tops, axes)
+    view, image_up = axes[:, 2].mean(axis=0), ups.mean(axis=0)
     up = image_up
     if np.linalg.norm(image_up) < _AGREE <= np.linalg.norm(view):
         up = _flight_normal(np.stack([camera.center for camera in cameras]), -view)
     if not np.any(up):
-        up = -axes[0, 1]
+        up = ups[0]
     up = up / np.linalg.norm(up)
     # The last cannot fail: two axes of one camera are not both vertical.
-    for front in (view, -axes[0, 1], axes[0, 0]):
+    for front in (view, ups[0], np.cross(axes[0, 2], ups[0])):
         front = front - up * (front @ up)
         if np.linalg.norm(front) > 0.3:
             break

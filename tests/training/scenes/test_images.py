@@ -112,6 +112,25 @@ def test_tiff(tmp_path, pixels, mode, options):
     np.testing.assert_allclose(load_image(tmp_path / "a.tif", 44, 30), expected / 255, atol=1e-6)
 
 
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("ending", ["jpg", "tif"])
+def test_pixels_are_as_they_are_stored_however_a_viewer_turns_them(tmp_path, pixels, orientation, ending):
+    """As COLMAP reads them."""
+    for tag, name in ((1, "straight"), (orientation, "turned")):
+        exif = Image.Exif()
+        exif[274] = tag
+        Image.fromarray(pixels).save(tmp_path / f"{name}.{ending}", exif=exif)
+    straight, turned = (tmp_path / f"{name}.{ending}" for name in ("straight", "turned"))
+    assert image_size(turned) == (44, 30)
+    np.testing.assert_array_equal(load_image(turned, 44, 30), load_image(straight, 44, 30))
+
+
+def test_tiff_of_grey_floats(tmp_path, pixels):
+    grey = (pixels[..., 0] / 255).astype(np.float32)
+    Image.fromarray(grey).save(tmp_path / "a.tif")
+    np.testing.assert_array_equal(load_image(tmp_path / "a.tif", 44, 30), np.stack([grey] * 3, axis=-1))
+
+
 def test_tiff_of_the_other_byte_order(tmp_path):
     """By hand, as TIFF 6.0 has it: 5x3 grey, one strip, big-endian; width of 32 bits, height of 16."""
     tags = [(256, 4, 5), (257, 3, 3 << 16), (258, 3, 8 << 16), (259, 3, 1 << 16), (262, 3, 1 << 16),

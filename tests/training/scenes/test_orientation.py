@@ -1,10 +1,14 @@
 """Which way is up, on cameras placed by hand and in the real scenes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from PIL import Image
 
 from training.scenes.cameras import Camera
 from training.scenes.colmap import read_scene
+from training.scenes.images import quarter_turns
 from training.scenes.orientation import up_rotation
 
 
@@ -52,6 +56,23 @@ def nadir(headings, tilt: float) -> list[Camera]:
         aim = (x + random.normal() * 5 * tilt, y + random.normal() * 5 * tilt, 0)
         cameras.append(look_at((x, y, 5), aim, (np.cos(heading), np.sin(heading), 0)))
     return cameras
+
+
+@pytest.mark.parametrize(("turns", "orientation"), [(0, 1), (1, 6), (2, 3), (3, 8)])
+@pytest.mark.parametrize("ending", ["jpg", "tif"])
+def test_photographs_of_a_camera_that_was_held_upright(tmp_path, turns, orientation, ending):
+    path = tmp_path / f"a.{ending}"
+    exif = Image.Exif()
+    exif[274] = orientation
+    Image.new("RGB", (6, 4)).save(path, exif=exif)
+    assert quarter_turns(path) == turns
+    held = [replace(look_at((3, y, 1), (0, 0, 0), (0, 0, 1)), turns=turns) for y in (-1, 0, 1)]
+    sensor = np.eye(4)  # turned against the clock, so that its picture has to be turned with it
+    angle_ = np.pi / 2 * turns
+    sensor[:2, :2] = [[np.cos(angle_), np.sin(angle_)], [-np.sin(angle_), np.cos(angle_)]]
+    held = [replace(camera, world_to_camera=sensor @ camera.world_to_camera) for camera in held]
+    straight = up_rotation([look_at((3, y, 1), (0, 0, 0), (0, 0, 1)) for y in (-1, 0, 1)])
+    np.testing.assert_allclose(up_rotation(held), straight, atol=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(4))
