@@ -15,6 +15,7 @@ from training.errors import LodgsError
 from training.scenes.colmap import read_scene
 from training.scenes.depths import Depths, with_points
 from training.scenes.formats import convert, find_export, random_points
+from training.scenes.model import rotation_of
 
 from .depth_walls import grey
 from .synthetic import write_image
@@ -184,6 +185,20 @@ def test_record3d(tmp_path):
     check(tmp_path, [pixels(*seen(pose)) for pose in poses()], names)
 
 
+def test_record3d_without_some_of_its_photographs(tmp_path):
+    """A photograph is its number's, not that of its place among those that are left."""
+    photographs(tmp_path / "rgb", ("1.jpg", "2.jpg"))
+    rows = [[*pycolmap.Rotation3d(pose[:3, :3]).quat, *pose[:3, 3]] for pose in poses()]
+    told = {"poses": rows, "K": [FOCAL[0], 0, 0, 0, FOCAL[1], 0, *CENTER, 1], "w": WIDTH, "h": HEIGHT}
+    (tmp_path / "metadata").write_text(json.dumps(told))
+    assert convert(tmp_path).warnings[0] == "frame 0 is left out: it has no photograph."
+    check(tmp_path, [pixels(*seen(pose)) for pose in poses()[1:]], ("1.jpg", "2.jpg"))
+    (tmp_path / "sparse").rename(tmp_path / "before")
+    (tmp_path / "rgb" / "1.jpg").rename(tmp_path / "rgb" / "one.jpg")
+    with pytest.raises(LodgsError, match=r"tells of 3 photographs, and .* holds 2"):
+        convert(tmp_path)
+
+
 def test_metashape(tmp_path):
     """Its own formula, with P1 and P2 the other way round than OpenCV's, in metres of the chunk's scale."""
     photographs(tmp_path / "images")
@@ -222,10 +237,96 @@ def test_metashape(tmp_path):
     check(tmp_path, expected)
 
 
+def similarity(seed: int, scale: float) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    found = np.eye(4)
+    found[:3, :3], found[:3, 3] = scale * rotation_of(rng.normal(size=4)), rng.normal(size=3)
+    return found
+
+
+def written(matrix: np.ndarray) -> str:
+    return " ".join(map(repr, matrix.ravel().tolist()))
+
+
+def write_metashape(folder: Path, cameras: str, components: str = "", kind="frame", lens="<f>80</f>") -> None:
+    size = f'<resolution width="{WIDTH}" height="{HEIGHT}"/>'
+    (folder / "cameras.xml").write_text(f"""<?xml version="1.0" encoding="UTF-8"?>
+<document version="2.0.0"><chunk label="Chunk 1"><sensors><sensor id="0" type="{kind}">{size}
+<calibration type="{kind}" class="adjusted">{size}{lens}</calibration></sensor></sensors>
+<components>{components}</components><cameras>{cameras}</cameras></chunk></document>""")
+
+
+def metashape_camera(name: str, pose: np.ndarray, more: str = "") -> str:
+    """Of a pose (4, 4) in the component, OpenGL axes."""
+    transform = written(pose @ np.diag([1, -1, -1, 1]))
+    return f'<camera sensor_id="0" label="{name}" {more}><transform>{transform}</transform></camera>'
+
+
+def test_metashape_places_components_and_leaves_disabled_cameras_out(tmp_path):
+    """Each component has its own axes; the largest one's are ours, in metres."""
+    photographs(tmp_path / "images", [*NAMES, "off.png", "apart.png"])
+    first, second = similarity(1, 2.5), similarity(2, 0.7)
+    components = "".join(
+        f'<component id="{number}"><transform><rotation>{written(its[:3, :3] / scale)}</rotation>'
+        f"<translation>{written(its[:3, 3])}</translation><scale>{scale}</scale></transform></component>"
+        for number, (its, scale) in enumerate([(first, 2.5), (second, 0.7)])
+    )
+    world = first @ np.diag([1 / 2.5, 1 / 2.5, 1 / 2.5, 1])  # of the first component's axes in metres
+    cameras = ""
+    for name, pose, number in zip(NAMES, poses(), (0, 1, 0), strict=True):
+        within = np.linalg.inv((first, second)[number]) @ world @ pose
+        within[:3, :3] /= np.cbrt(np.linalg.det(within[:3, :3]))
+        cameras += metashape_camera(name, within, f'component_id="{number}"')
+    cameras += metashape_camera("off.png", poses()[0], 'component_id="0" enabled="false"')
+    cameras += metashape_camera("apart.png", poses()[0], 'component_id="2"')
+    write_metashape(tmp_path, cameras, components + '<component id="2"/>')
+    made = convert(tmp_path)
+    assert made.warnings[:2] == [
+        "off.png is left out: it is disabled in Metashape.",
+        "apart.png is left out: Metashape has not aligned it together with most of the others.",
+    ]
+    check(tmp_path, [pixels(*seen(pose), (80, 80), (WIDTH / 2, HEIGHT / 2)) for pose in poses()])
+
+
+def test_metashape_photographs_in_folders_of_their_groups(tmp_path):
+    names = "left/0001.png", "right/0001.png", "right/0002.png"
+    photographs(tmp_path / "images", names)
+    one, two, three = (metashape_camera(name[-8:-4], pose) for name, pose in zip(names, poses(), strict=True))
+    write_metashape(tmp_path, f'<group label="left">{one}</group><group label="right">{two}{three}</group>')
+    convert(tmp_path)
+    expected = [pixels(*seen(pose), (80, 80), (WIDTH / 2, HEIGHT / 2)) for pose in poses()]
+    check(tmp_path, expected, names)
+    write_metashape(tmp_path, one + two + three)
+    (tmp_path / "sparse").rename(tmp_path / "before")
+    assert "0001 is left out: several photographs are called so" in convert(tmp_path).warnings[0]
+
+
+@pytest.mark.parametrize(("p1", "p2"), [(0.0, 0.0), (0.004, -0.003)])
+def test_metashape_fisheye(tmp_path, p1, p2):
+    """Its own formula: a frame camera's, of a place as far from the middle as the angle to the axis is."""
+    photographs(tmp_path / "images")
+    k = 0.03, -0.01, 0.004, -0.001
+    told = "".join(f"<k{n}>{value}</k{n}>" for n, value in enumerate(k, 1)) + f"<p1>{p1}</p1><p2>{p2}</p2>"
+    cameras = "".join(metashape_camera(name, pose) for name, pose in zip(NAMES, poses(), strict=True))
+    write_metashape(tmp_path, cameras, kind="fisheye", lens=f"<f>80</f><cx>1.5</cx>{told}")
+    convert(tmp_path)
+    expected = []
+    for pose in poses():
+        x, y = seen(pose)
+        away = np.hypot(x, y)
+        x, y = x * np.arctan(away) / away, y * np.arctan(away) / away
+        r = x * x + y * y
+        radial = 1 + sum(value * r**n for n, value in enumerate(k, 1))
+        bent_x = x * radial + p1 * (r + 2 * x * x) + 2 * p2 * x * y
+        bent_y = y * radial + p2 * (r + 2 * y * y) + 2 * p1 * x * y
+        expected.append(pixels(bent_x, bent_y, (80, 80), (WIDTH / 2 + 1.5, HEIGHT / 2)))
+    check(tmp_path, expected)
+
+
 def test_bundler(tmp_path):
-    names = "a.jpg", "b.jpg", "c.jpg"
+    names = "a.jpg", "b 2.jpg", "c.jpg"
     photographs(tmp_path, names)
-    (tmp_path / "list.txt").write_text("./a.jpg\n./b.jpg 0 80.0\nc.jpg\n")
+    (tmp_path / "list.txt").write_text("./a.jpg\n./b 2.jpg 0 80.0\nc.jpg\n")
     lines = ["# Bundle file v0.3", f"3 {len(POINTS)}"]
     for pose in poses():
         inverse = np.linalg.inv(pose)
@@ -372,7 +473,6 @@ def test_random_points_are_seen_by_two_views(tmp_path):
         (lambda d: d.pop("fl_x"), "no number 'camera_angle_x'"),
         (lambda d: [f.update(transform_matrix=[[1, 2], [3]]) for f in d["frames"]], "where -1x4 numbers"),
         (lambda d: [f.update(transform_matrix=[[0, 0, 0, 0]] * 4) for f in d["frames"]], "no rotation"),
-        (lambda d: d.update(ply_file_path="nowhere.ply"), "nowhere.ply could not be read"),
         (lambda d: d.update(k4=0.3), "its k4"),
         (lambda d: [f.update(file_path="../secret") for f in d["frames"]], "could not be read"),
     ],
@@ -382,6 +482,31 @@ def test_what_is_wrong_is_said_and_nothing_is_written(tmp_path, spoil, says, cap
     assert main(["scene", "--from", str(tmp_path)]) == 2
     assert says in capsys.readouterr().err
     assert not list(tmp_path.glob("sparse/*"))
+
+
+def test_photographs_that_were_turned_are_left_out(tmp_path):
+    """Their lens would be of another shape."""
+    write_transforms(tmp_path)
+    write_image(tmp_path / "images" / NAMES[0], np.full((WIDTH, HEIGHT, 3), 90, np.uint8))
+    made = convert(tmp_path)
+    assert made.views == 2
+    assert made.warnings[0] == (
+        f"{NAMES[0]} is left out: it is 72x96, and its camera's pictures are 96x72: it was turned or cropped."
+    )
+
+
+def test_what_is_named_but_missing_is_told(tmp_path):
+    def spoil(document):
+        document.update(ply_file_path="nowhere.ply", camera_model=None)
+        document["frames"][1].update(mask_path="masks/nowhere.png", k1=None)
+        document["frames"][2]["file_path"] = "images/third.JPG"  # which is a PNG
+
+    write_transforms(tmp_path, spoil)
+    made = convert(tmp_path)
+    assert made.views == 3 and len(made.warnings) == 3
+    assert "nowhere.ply could not be read" in made.warnings[0]
+    assert made.warnings[1].startswith("1 masks are missing, such as")
+    check(tmp_path, [pixels(*seen(pose)) for pose in poses()])
 
 
 def test_one_wrong_frame_is_left_out(tmp_path):

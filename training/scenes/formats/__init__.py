@@ -19,7 +19,7 @@ from ...errors import LodgsError
 from ...files import link_or_copy
 from ..cameras import Camera
 from ..colmap import DEPTHS, MASKS, find_models, told
-from ..images import image_size
+from ..images import alike, image_size
 from ..model import write_model
 from ..photographs import image_folder
 from . import bundler, metashape, openmvg, polycam, record3d, transforms
@@ -103,6 +103,8 @@ def convert(folder: Path, out: Path | None = None) -> Converted:
         why = f" {left_out[0][0]}: {left_out[0][1]}" if left_out else ""
         raise LodgsError(f"{path} has no view that can be used.{why}", "Check the photographs beside it.")
     warnings = [*exported.warnings, *told(left_out)]
+    if unmasked := [view.mask for view in views if view.mask is not None and not view.mask.is_file()]:
+        warnings.append(f"{len(unmasked)} masks are missing, such as {unmasked[0]}: nothing is masked there.")
     points, colors = exported.points, exported.colors
     if not len(points) and all(view.has_depth for view in views):
         warnings.append(f"{format_.NAME} tells of no points here: training takes them from the depth maps.")
@@ -163,6 +165,11 @@ def _usable(exported: Exported) -> tuple[list[View], list[tuple[str, str]]]:
             size = image_size(view.image)
         except LodgsError as error:
             left_out.append((name, error.what))
+            continue
+        lens = view.lens
+        if not alike(*size, lens.width, lens.height):
+            shape = f"{lens.width}x{lens.height}: it was turned or cropped."
+            left_out.append((name, f"it is {size[0]}x{size[1]}, and its camera's pictures are {shape}"))
             continue
         view = view.sized(*size)
         if flaw := view.camera(name).flaw:

@@ -6,6 +6,7 @@ Facts: the manual of Bundler v0.4 (https://www.cs.cornell.edu/~snavely/bundler/)
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,6 +21,8 @@ from .views import OPENGL, Exported, View, find_image, world_to_camera
 NAME = "Bundler"
 MOST_BYTES = 1 << 28
 """Of a file that is read."""
+_LINE = re.compile(r"(\s+0)?(\s+[-+.\deE]+)?$")
+"""What may follow the name in a list: a 0 and the focal length that was known before."""
 _LISTS = "list.txt", "bundle.out.list.txt", "image_list.txt"
 
 
@@ -93,4 +96,4 @@ def _names(path: Path) -> list[str]:
         raise LodgsError(f"Beside {path} is no list of photographs.", f"Put {_LISTS[0]} there.")
     with open_file(there) as file:
         text = file.read(MOST_BYTES).decode("utf-8", "replace")
-    return [line.split()[0] for line in text.splitlines() if line.strip()]
+    return [_LINE.sub("", line.strip()) for line in text.splitlines() if line.strip()]

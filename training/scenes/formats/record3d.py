@@ -24,10 +24,10 @@ def find(folder: Path) -> Path | None:
 
 
 def read(path: Path) -> Exported:
-    """Views: the n-th photograph by number has the n-th pose.
+    """Views: the n-th photograph by number has the n-th pose; if some are missing, the one of the number n.
 
     Raises:
-        LodgsError: the file is damaged.
+        LodgsError: the file is damaged, or it is not told which photographs are missing.
     """
     told = read_document(path)
     try:
@@ -38,15 +38,24 @@ def read(path: Path) -> Exported:
         raise LodgsError(f"{path} is damaged: {error.what}", "Export it again.") from error
     files = [file for file in (path.parent / "rgb").iterdir() if file.suffix.lower() in SUFFIXES]
     files.sort(key=lambda file: (len(file.stem), file.stem))
+    by_number = dict(enumerate(files))
+    if len(files) != len(poses):
+        if not all(file.stem.isdecimal() for file in files):
+            raise LodgsError(
+                f"{path} tells of {len(poses)} photographs, and {path.parent / 'rgb'} holds {len(files)}.",
+                "Export it again, or give them their numbers as names, from 0.jpg on.",
+            )
+        by_number = {int(file.stem): file for file in files}
     views, left_out = [], []
     for place, pose in enumerate(poses):
-        if place >= len(files):
+        file = by_number.get(place)
+        if file is None:
             left_out.append((f"frame {place}", "it has no photograph."))
             continue
         try:
-            views.append(View(files[place], lens, world_to_camera(_matrix(pose), opengl=True)))
+            views.append(View(file, lens, world_to_camera(_matrix(pose), opengl=True)))
         except LodgsError as error:
-            left_out.append((files[place].name, error.what))
+            left_out.append((file.name, error.what))
     return Exported(views, left_out=left_out)
 
 

@@ -41,14 +41,18 @@ def read(path: Path) -> Exported:
     views, left_out = [], []
     for place, frame in enumerate(frames, 1):
         told = common | (frame if isinstance(frame, dict) else {})
+        told = {name: value for name, value in told.items() if value is not None}
         try:
             views.append(_view(path.parent, told))
         except LodgsError as error:
             left_out.append((str(told.get("file_path", f"frame {place}")), error.what))
     cloud = document.get("ply_file_path")
-    if not isinstance(cloud, str):
-        return Exported(views, left_out=left_out)
-    return Exported(views, *read_points(find_image(path.parent, cloud)), left_out)
+    if isinstance(cloud, str):
+        try:
+            return Exported(views, *read_points(find_image(path.parent, cloud)), left_out)
+        except LodgsError as error:
+            return Exported(views, left_out=left_out, warnings=[error.what])
+    return Exported(views, left_out=left_out)
 
 
 def _view(folder: Path, told: Mapping[str, Any]) -> View:
@@ -72,7 +76,7 @@ def _view(folder: Path, told: Mapping[str, Any]) -> View:
     radial = tuple(number(told, f"k{n}", 0) for n in range(1, 7))
     if not fisheye and radial[3] and not any(radial[4:]):
         raise LodgsError("its k4 is of a lens that COLMAP does not have.")
-    tangential = number(told, "p1", 0), number(told, "p2", 0)
+    tangential = (0.0, 0.0) if fisheye else (number(told, "p1", 0), number(told, "p2", 0))
     lens = lens_of(width, height, (fx, fy), center, radial, tangential, fisheye)
     pose = numbers(told.get("transform_matrix"), -1, 4)
     beside = (told.get(name) for name in ("mask_path", "depth_file_path"))

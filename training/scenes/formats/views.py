@@ -20,7 +20,7 @@ MOST_JSON = 1 << 26
 """Bytes of a JSON file that is read: of 5,000 views it has some 4 million."""
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """From OpenCV's camera axes to OpenGL's (x right, y up, looking along -z), or back."""
-_ENDINGS = *SUFFIXES, ".exr", *(suffix.upper() for suffix in SUFFIXES)
+_ENDINGS = *SUFFIXES, ".exr", *(suffix.upper() for suffix in SUFFIXES), ".EXR"
 _NO_POINTS = np.zeros((0, 3))
 
 
@@ -124,13 +124,15 @@ def lens_of(
     Args:
         radial: OpenCV's k1, k2, k3, k4, ...: the first three are polynomial; k4 to k6 the rational model's
             denominator, or k1 to k4 the fisheye's polynomial.
-        tangential: OpenCV's p1, p2.
+        tangential: OpenCV's p1, p2; of a fisheye what they are of its angles.
 
     Raises:
         LodgsError: there is no such lens.
     """
     k = [*radial, *[0.0] * 6][: max(6, len(radial))]
-    if fisheye:
+    if fisheye and any(tangential):
+        name, distortion = "THIN_PRISM_FISHEYE", [*k[:2], *tangential, *k[2:4], 0.0, 0.0]
+    elif fisheye:
         name, distortion = "OPENCV_FISHEYE", k[:4]
     elif any(k[2:]):
         name, distortion = "FULL_OPENCV", [*k[:2], *tangential, *k[2:6]]
@@ -162,8 +164,8 @@ def world_to_camera(camera_to_world: np.ndarray, opengl: bool = False) -> np.nda
 
 
 def find_image(folder: Path, name: str) -> Path:
-    """A photograph by the name that a program gives it: with or without an ending, perhaps of another
-    computer's folder.
+    """A photograph by the name that a program gives it: with or without an ending or with another one,
+    perhaps of another computer's folder.
 
     Returns:
         A file in the folder or below; where there is none, the place where it should be.
@@ -171,7 +173,8 @@ def find_image(folder: Path, name: str) -> Path:
     parts = [part for part in name.replace("\\", "/").split("/") if part not in ("", ".", "..")]
     there = [folder.joinpath(*parts[start:]) for start in range(len(parts))] or [folder]
     for place in there:
-        for each in (place, *(place.with_name(place.name + ending) for ending in _ENDINGS)):
+        bare = place.stem if place.suffix in _ENDINGS else place.name
+        for each in (place, *(place.with_name(bare + ending) for ending in _ENDINGS)):
             if each.is_file():
                 return each
     return there[0]
