@@ -49,6 +49,7 @@ def path(context: bpy.types.Context, root: bpy.types.Object) -> bpy.types.Object
         camera.location, camera.rotation_quaternion = place, turn
         for name in ("location", "rotation_quaternion"):
             camera.keyframe_insert(name, frame=begin + float(time) * (end - begin))
+    camera.update_tag(refresh={"TIME"})  # setting keys has left it at the last
     context.scene.camera = camera
     return camera
 

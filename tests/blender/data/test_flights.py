@@ -50,6 +50,16 @@ def test_a_turntable_looks_at_the_middle_all_around_evenly(bpy, lodgs, root):
 
 
 @pytest.mark.parametrize("verb", ["camera_path", "turntable"])
+def test_it_stands_at_once_where_the_frame_has_it(bpy, lodgs, root, verb):
+    bpy.context.scene.frame_set(20)
+    getattr(bpy.ops.lodgs, verb)()
+    camera = bpy.context.scene.camera
+    bpy.context.view_layer.update()
+    made = np.array(camera.matrix_world)
+    np.testing.assert_allclose(made, seen_from(bpy, camera, [21, 20])[1], atol=1e-5)
+
+
+@pytest.mark.parametrize("verb", ["camera_path", "turntable"])
 def test_a_scene_of_nothing_is_refused_and_nothing_is_left(bpy, lodgs, root, verb):
     bpy.data.batch_remove([*root.lodgs.cameras.objects, root.lodgs.points])
     before = len(bpy.data.objects), len(bpy.data.cameras)
