@@ -16,6 +16,9 @@ from typing import BinaryIO
 
 from .errors import LodgsError
 
+FULL = {errno.ENOSPC, errno.EDQUOT}
+"""What systems say of a disk that is full."""
+
 
 def cache_folder() -> Path:
     """Where this user's programs may keep what they can make again."""
@@ -54,7 +57,9 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
             raise
         raise LodgsError(
             f"{path} could not be written: {error.strerror or error}.",
-            "Free some space there or choose another folder.",
+            "Free some space there or choose another folder."
+            if error.errno in FULL
+            else "Choose another name or folder.",
         ) from error
     finally:
         with suppress(OSError):

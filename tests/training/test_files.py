@@ -31,7 +31,7 @@ def test_a_failure_keeps_the_old_file(tmp_path):
 
 def test_a_full_disk_is_one_sentence(tmp_path):
     with (
-        pytest.raises(LodgsError, match=r"a\.txt could not be written: No space left"),
+        pytest.raises(LodgsError, match=r"a\.txt could not be written: No space left.* Free some space"),
         atomic_write(tmp_path / "a.txt"),
     ):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -42,6 +42,16 @@ def test_a_place_that_is_a_file_is_one_sentence(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(LodgsError, match="could not be written"), atomic_write(tmp_path / "file" / "a.txt"):
         pass
+
+
+def test_space_does_not_help_where_a_folder_has_the_name(tmp_path):
+    (tmp_path / "a.ply").mkdir()
+    with (
+        pytest.raises(LodgsError, match=r"Is a directory\. Choose another name or folder"),
+        atomic_write(tmp_path / "a.ply") as temporary,
+    ):
+        temporary.write_text("new")
+    assert os.listdir(tmp_path) == ["a.ply"]
 
 
 def test_an_error_about_another_file_passes_through(tmp_path):

@@ -46,9 +46,11 @@ class Crop:
         """A box between two opposite corners (3,), along the axes.
 
         Raises:
-            LodgsError: there is nothing between them.
+            LodgsError: there is nothing between them, or no end.
         """
         low, high = np.minimum(one, other), np.maximum(one, other)
+        if not np.isfinite([low, high]).all():
+            raise LodgsError(f"The box from {one} to {other} has no end.", "Give two opposite corners.")
         if not (high > low).all():
             raise LodgsError(f"The box from {one} to {other} is flat.", "Give two opposite corners.")
         matrix = np.diag([*(high - low) / 2, 1])
@@ -60,8 +62,12 @@ class Crop:
         """A sphere around a centre (3,).
 
         Raises:
-            LodgsError: it has no radius.
+            LodgsError: it has no radius, or no end.
         """
+        if not np.isfinite([*centre, radius]).all():
+            raise LodgsError(
+                f"The sphere of radius {radius:g} around {centre} has no end.", "Give four finite numbers."
+            )
         if not radius > 0:
             raise LodgsError(f"A sphere of radius {radius:g} holds nothing.", "Give a radius above 0.")
         matrix = np.diag([radius, radius, radius, 1.0])

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import errno
-
 from ..errors import LodgsError, out_of_memory
+from ..files import FULL
 
 DONE, CRASHED, BAD_INPUT, CANCELLED = 0, 1, 2, 3
 """Exit codes of ``python -m training train``."""
-
-_FULL = {errno.ENOSPC, errno.EDQUOT}
 
 
 def in_words(error: BaseException) -> tuple[str, str, int]:
@@ -20,7 +17,7 @@ def in_words(error: BaseException) -> tuple[str, str, int]:
         remedy = "Lower max_splats or image_scale, or close other programs; then resume the run."
         return "There is not enough memory; training stopped.", remedy, BAD_INPUT
     if isinstance(error, OSError):
-        if error.errno in _FULL:
+        if error.errno in FULL:
             return "The disk is full; training stopped.", "Free some space and resume the run.", BAD_INPUT
         about = f" ({error.filename})" if error.filename else ""
         return (

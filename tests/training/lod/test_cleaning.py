@@ -107,6 +107,15 @@ def naive_floaters(means, gap, most):
     return found
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_what_has_no_end_is_no_crop(value):
+    """It would hold nothing, and leave nothing."""
+    for shape, *told in ((Crop.box, (0, 0, -1), (1, value, 1)), (Crop.sphere, (value, 0, 0), 1),
+                         (Crop.sphere, (0, 0, 0), value)):  # fmt: skip
+        with pytest.raises(LodgsError, match="no end"):
+            shape(*told)
+
+
 def test_floaters_are_those_that_were_planted():
     rng = np.random.default_rng(1)
     ground = rng.uniform(-5, 5, (20_000, 3)) * (1, 1, 0.01)
