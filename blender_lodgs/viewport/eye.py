@@ -50,6 +50,29 @@ def place(view: Matrix, projection: Matrix, width: int, distance: float) -> tupl
     return eye, focal
 
 
+def looked_through(context: bpy.types.Context) -> bpy.types.Object | None:
+    """The camera that the viewport looks through; None for a view of its own."""
+    camera = context.space_data.camera or context.scene.camera
+    is_it = (
+        context.region_data.view_perspective == "CAMERA" and camera is not None and camera.type == "CAMERA"
+    )
+    return camera if is_it else None
+
+
+def frame(
+    camera: bpy.types.Object, scene: bpy.types.Scene, projection: Matrix
+) -> tuple[float, float, float, float]:
+    """Where in a view a camera's picture lies: left, bottom, right, top in clip space.
+
+    Args:
+        projection: from the world to clip space.
+    """
+    to_clip = projection @ camera.matrix_world.normalized()
+    corners = [to_clip @ corner.to_4d() for corner in camera.data.view_frame(scene=scene)]  # type: ignore[union-attr]
+    xs, ys = ([corner[axis] / corner.w for corner in corners] for axis in (0, 1))
+    return min(xs), min(ys), max(xs), max(ys)
+
+
 def on_draw(
     region: bpy.types.Region, scene: bpy.types.Scene, view: bpy.types.RegionView3D, *, splats: bool = False
 ) -> None:

@@ -33,6 +33,10 @@ DILATION, MIP_FILTER = (0.3, 0.0), (0.1, 1.0)
 """Variance added to projected splats, in square pixels, and whether their opacity pays for it: 3DGS's, and
 Mip-Splatting's 2D filter."""
 
+Frame = tuple[float, float, float, float]
+WHOLE: Frame = (-1.0, -1.0, 1.0, 1.0)
+"""Left, bottom, right and top of all that is drawn, in clip space."""
+
 _FETCH = """
 vec4 texel(sampler2D data, int i) { return texelFetch(data, ivec2(i % WIDTH, i / WIDTH), 0); }
 """
@@ -139,7 +143,8 @@ void main()
 
   // The projection's derivative (in pixels) times half the covariance: rotation, then scales.
   vec3 ndc = clip.xyz / clip.w;
-  vec2 held = clamp(ndc.xy, -1.3, 1.3);
+  vec2 centre = 0.5 * (frame.xy + frame.zw), most = 1.3 * (frame.zw - centre);
+  vec2 held = clamp(ndc.xy, centre - most, centre + most);
   mat4 rows = transpose(projection);
   vec3 by_x = (rows[0].xyz - held.x * rows[3].xyz) * (0.5 * size.x / clip.w);
   vec3 by_y = (rows[1].xyz - held.y * rows[3].xyz) * (0.5 * size.y / clip.w);
@@ -365,6 +370,7 @@ def draw(
     looks: Sequence[Looks] = (),
     resolution: float = 1.0,
     under_overlays: bool = True,
+    frame: Frame = WHOLE,
 ) -> None:
     """Draws splats into the active framebuffer, tested against its depth.
 
@@ -379,14 +385,16 @@ def draw(
         resolution: of the splats, over that of the framebuffer.
         under_overlays: leave what the framebuffer shows already on top, where it has alpha; it is coded in
             sRGB, as a viewport's is.
+        frame: left, bottom, right, top in clip space of the picture that is looked at. How splats beside it
+            are stretched depends on how far, so that those that reach into it are as a render has them.
     """
-    frame = gpu.state.active_framebuffer_get()
+    target = gpu.state.active_framebuffer_get()
     _, _, width, height = gpu.state.viewport_get()
-    depth = gpu.types.GPUTexture((width, height), format="R32F", data=frame.read_depth(0, 0, width, height))
+    depth = gpu.types.GPUTexture((width, height), format="R32F", data=target.read_depth(0, 0, width, height))
     overlay = _once("nothing", _nothing)
     if under_overlays:
         overlay = gpu.types.GPUTexture(
-            (width, height), format="RGBA8", data=frame.read_color(0, 0, width, height, 4, 0, "FLOAT")
+            (width, height), format="RGBA8", data=target.read_color(0, 0, width, height, 4, 0, "FLOAT")
         )
     flags = antialias or [False] * len(worlds)
     looks = looks or [()] * len(worlds)
@@ -420,6 +428,7 @@ def draw(
         shader.uniform_sampler("palette", _palette())
         shader.uniform_float("projection", projection)
         shader.uniform_float("size", size)
+        shader.uniform_float("frame", frame)
         shader.uniform_int("degree", round((higher + 1) ** 0.5) - 1)
         shader.uniform_int("texels", -(-(14 + 3 * higher) // 4))
         shader.uniform_int("part_size", part)
@@ -541,6 +550,7 @@ def _splat_shader() -> gpu.types.GPUShader:
     info.define("FACE", repr(FACE))
     info.define("SELECTED", f"vec3{SELECTED}")
     info.push_constant("MAT4", "projection")
+    info.push_constant("VEC4", "frame")
     info.push_constant("VEC2", "size")
     info.push_constant("INT", "degree")
     info.push_constant("INT", "texels")

@@ -128,10 +128,12 @@ def draw(context: bpy.types.Context) -> None:
     settings = context.scene.lodgs_viewport
     view.resolution = settings.moving / 100 if now - view.moved < STILL else 1.0
     view.tells_selected = space.overlay.show_overlays
+    camera = eye.looked_through(context)
     draw_splats(
         view, instances, context.evaluated_depsgraph_get(),
         region_data.view_matrix, region_data.window_matrix, settings.budget, moving=True,
-        under_overlays=space.overlay.show_overlays and not _shows_photograph(context),
+        under_overlays=space.overlay.show_overlays and not _shows_photograph(camera),
+        frame=splats.WHOLE if camera is None else eye.frame(camera, context.scene, matrix),
     )  # fmt: skip
     if _unfinished(view) or view.pending is not None or view.resolution < 1 or _busy():
         _wake_later()
@@ -149,13 +151,10 @@ def _forget_closed() -> None:
         _all.discard(_views.pop(key))
 
 
-def _shows_photograph(context: bpy.types.Context) -> bool:
+def _shows_photograph(camera: bpy.types.Object | None) -> bool:
     """Whether a camera's picture fills the view: it lies among the overlays, and would cover the splats."""
-    camera = context.space_data.camera or context.scene.camera
     return (
-        context.region_data.view_perspective == "CAMERA"
-        and camera is not None
-        and camera.type == "CAMERA"
+        camera is not None
         and camera.data.show_background_images
         and any(picture.show_background_image for picture in camera.data.background_images)
     )
@@ -170,6 +169,7 @@ def draw_splats(
     budget: int,
     *,
     under_overlays: bool = True,
+    frame: splats.Frame = splats.WHOLE,
     wait: bool = False,
     moving: bool = False,
 ) -> None:
@@ -179,7 +179,7 @@ def draw_splats(
         view: what was drawn there last; changed.
         view_matrix, projection: from the world to the camera's space, and on to clip space.
         budget, wait, moving: see :func:`prepare`.
-        under_overlays: see ``splats.draw``.
+        under_overlays, frame: see ``splats.draw``.
     """
     request = prepare(view, instances, depsgraph, view_matrix, budget, wait, moving)
     if view.arrangement is None or view.store is None or view.instances is None or not view.count:
@@ -192,7 +192,7 @@ def draw_splats(
         [placement.world for placement in placements], view_matrix, projection, view.canvas,
         antialias=[placement.antialias for placement in placements],
         looks=[placement.looks for placement in placements], resolution=view.resolution,
-        under_overlays=under_overlays,
+        under_overlays=under_overlays, frame=frame,
     )  # fmt: skip
 
 

@@ -8,10 +8,10 @@ from typing import Any
 import bpy
 import gpu
 import numpy as np
-from bpy_extras.view3d_utils import location_3d_to_region_2d
 from gpu_extras.batch import batch_for_shader
 
 from ..data import scenes
+from . import eye
 
 _VERTEX = """
 void main()
@@ -124,22 +124,14 @@ def _draw() -> None:
     context = bpy.context
     scene, region, view = context.scene, context.region, context.region_data
     camera = scene.camera
-    if view.view_perspective != "CAMERA" or not shown(context):
+    if camera is None or eye.looked_through(context) != camera or not shown(context):
         return
     assert comparison is not None
-    pose = camera.matrix_world.normalized()
-    frame = [
-        location_3d_to_region_2d(region, view, pose @ corner)
-        for corner in camera.data.view_frame(scene=scene)
-    ]
-    if any(point is None for point in frame):
-        return
-    xs, ys = ([point[axis] for point in frame] for axis in (0, 1))
-    corners = [
-        (2 * x / region.width - 1, 2 * y / region.height - 1)
-        for x, y in ((min(xs), min(ys)), (max(xs), max(ys)))
-    ]
-    draw(comparison, scene.lodgs_render.wipe, corners, 0.75 / max(max(xs) - min(xs), 1))
+    left, bottom, right, top = eye.frame(camera, scene, view.window_matrix @ view.view_matrix)
+    width = region.width * (right - left) / 2
+    draw(
+        comparison, scene.lodgs_render.wipe, [(left, bottom), (right, top)], 0.75 / max(width, 1)
+    )  # fmt: skip
 
 
 def shown(context: bpy.types.Context) -> bool:

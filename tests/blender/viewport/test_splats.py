@@ -64,23 +64,28 @@ def picture(bpy, lodgs, frame, camera):
     """``picture(**options)``: what the camera sees of all splats, (SIZE, SIZE, 4) linear, row 0 above.
 
     ``before`` is called to draw into the framebuffer first; ``view`` is what a viewport keeps; ``coded`` is
-    what the framebuffer holds before.
+    what the framebuffer holds before; with ``zoom`` the camera's picture fills that share of what is seen.
     """
+    from mathutils import Matrix
+
     views = lodgs("viewport.views")
     views.clear()
 
-    def drawn(before=None, view=None, budget=10**6, under_overlays=False, wait=True, coded=None):
+    def drawn(before=None, view=None, budget=10**6, under_overlays=False, wait=True, coded=None, zoom=None):
         depsgraph = bpy.context.evaluated_depsgraph_get()
         matrix = camera.matrix_world.inverted()
         projection = camera.calc_matrix_camera(depsgraph, x=SIZE, y=SIZE)
-        sets = lodgs("data.shown").splat_instances(depsgraph)
+        sets, given = lodgs("data.shown").splat_instances(depsgraph), {}
+        if zoom is not None:
+            projection = Matrix.Diagonal((zoom, zoom, 1, 1)) @ projection
+            given["frame"] = lodgs("viewport.eye").frame(camera, bpy.context.scene, projection @ matrix)
 
         def draw():
             if before is not None:
                 before(projection @ matrix)
             views.draw_splats(
                 view or views.ViewState(), sets, depsgraph, matrix, projection, budget,
-                under_overlays=under_overlays, wait=wait,
+                under_overlays=under_overlays, wait=wait, **given,
             )  # fmt: skip
 
         return frame(SIZE, draw, coded)[::-1]
@@ -102,14 +107,14 @@ def psnr(one, other):
 def truth(bpy, camera, tmp_path):
     """``truth([(splats, matrix), ...])``: the trainer's picture of splats in the world, (SIZE, SIZE, 3).
 
-    ``antialias`` says of each set whether it is.
+    ``antialias`` says of each set whether it is. ``size`` is another one in pixels.
     """
     python = os.environ.get("LODGS_TRAINER_PYTHON")
     if not python:
         pytest.skip("LODGS_TRAINER_PYTHON names no Python that has the trainer")
 
-    def rendered(sets, keep=None, antialias=()):
-        projection = camera.calc_matrix_camera(bpy.context.evaluated_depsgraph_get(), x=SIZE, y=SIZE)
+    def rendered(sets, keep=None, antialias=(), size=SIZE):
+        projection = camera.calc_matrix_camera(bpy.context.evaluated_depsgraph_get(), x=size, y=size)
         flip = np.diag([1.0, -1.0, -1.0, 1.0])
         world_to_camera = flip @ np.linalg.inv(np.array(camera.matrix_world, float))
         parts = [_in_world(splats, np.array(matrix, float), world_to_camera) for splats, matrix in sets]
@@ -119,11 +124,11 @@ def truth(bpy, camera, tmp_path):
         if antialias:
             arrays["antialias"] = np.repeat(antialias, [len(splats) for splats, _ in sets])
         intrinsics = (
-            projection[0][0] * SIZE / 2, projection[1][1] * SIZE / 2,
-            SIZE / 2 * (1 - projection[0][2]), SIZE / 2 * (1 + projection[1][2]),
+            projection[0][0] * size / 2, projection[1][1] * size / 2,
+            size / 2 * (1 - projection[0][2]), size / 2 * (1 + projection[1][2]),
         )  # fmt: skip
         np.savez(
-            tmp_path / "in.npz", **arrays, size=(SIZE, SIZE), intrinsics=intrinsics,
+            tmp_path / "in.npz", **arrays, size=(size, size), intrinsics=intrinsics,
             world_to_camera=world_to_camera, near=0.01,
         )  # fmt: skip
         program = Path(__file__).parents[1] / "render_splats.py"
@@ -197,6 +202,25 @@ def test_two_overlapping_sets_turned_scaled_and_stretched(bpy, lodgs, add, pictu
         sets.append((splats, matrix))
 
     assert psnr(displayed(picture()), truth(sets)) > 45
+
+
+@pytest.mark.parametrize("zoom", [0.5, 1.5])
+def test_what_is_beside_a_cameras_picture_reaches_into_it_as_in_a_render(lodgs, add, picture, truth, zoom):
+    """Looking through a camera there is more to be seen than its picture, or less."""
+    from mathutils import Matrix
+
+    splats, matrix = make_splats(lodgs, size=-1.5), Matrix.Diagonal((3, 3, 3, 1))
+    add(splats, matrix)
+    size = round(SIZE * zoom)
+    expected = truth([(splats, matrix)], size=size)
+    both = min(size, SIZE)
+    seen, expected = (_middle(image, both) for image in (displayed(picture(zoom=zoom)), expected))
+    assert psnr(seen, expected) > 45
+
+
+def _middle(image, size):
+    border = (len(image) - size) // 2
+    return image[border : border + size, border : border + size]
 
 
 def test_antialiased_splats_beside_others(bpy, lodgs, picture, truth):
