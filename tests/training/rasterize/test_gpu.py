@@ -93,10 +93,38 @@ def test_software_comes_last_and_a_part_of_a_name_is_enough(graphics):
         open_device("Voodoo 2")
 
 
-def test_what_is_too_large_for_a_device_is_said(graphics, monkeypatch):
-    monkeypatch.setattr(graphics, "most_bytes", 1 << 20)
-    with pytest.raises(LodgsError, match=r"takes 1 MB at a time, and this scene needs 4 MB"):
-        graphics.empty(np.float32, 1 << 20)
+def test_a_device_that_binds_little_draws_the_same(graphics, make_splats, odd_camera, monkeypatch):
+    """2600 splats touch 20 tiles, and a device takes 140 KB: 3258 pairs and the harmonics of 704."""
+    found, bands = [], []
+    run = graphics.run
+
+    def spied(shader, entry, groups, *arguments, **buffers):
+        if (shader, entry) == ("blend", "forward"):
+            bands.append(groups)
+        run(shader, entry, groups, *arguments, **buffers)
+
+    monkeypatch.setattr(graphics, "run", spied)
+    for most in (graphics.most_bytes, 140 << 10):
+        monkeypatch.setattr(graphics, "most_bytes", most)
+        drawn = drawn_and_differentiated("crowd", make_splats, odd_camera, "gpu", torch.float32)
+        share, _ = contributed("crowd", make_splats, odd_camera, "gpu", torch.float32)
+        found.append(drawn | share)
+    assert bands[0] == 20 and min(bands) < 4, bands
+    for name, one in found[0].items():
+        assert torch.equal(one, found[1][name]), name
+    truth = drawn_and_differentiated("crowd", make_splats, odd_camera, "cpu", torch.float32)
+    for name, expected in truth.items():
+        assert (found[1][name] - expected).norm() <= 5e-4 * expected.norm(), name
+
+
+def test_what_is_too_large_for_a_device_is_said(graphics, make_splats, odd_camera, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(graphics, "largest", 1 << 20)
+        with pytest.raises(LodgsError, match=r"takes 1 MB at a time, and this scene needs 4 MB"):
+            graphics.empty(np.float32, 1 << 20)
+    monkeypatch.setattr(graphics, "most_bytes", 1 << 16)
+    with pytest.raises(LodgsError, match=r"takes 0 MB at a time, and .* 1 MB\. .* cpu backend, fewer splats"):
+        drawn_and_differentiated("crowd", make_splats, odd_camera, "gpu", torch.float32)
 
 
 @pytest.mark.parametrize(

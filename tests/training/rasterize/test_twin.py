@@ -78,6 +78,30 @@ def test_steps_are_those_through_torch(graphics, make_splats, odd_camera, photog
         assert (values - ours[name]).norm() < 1e-3 * values.norm(), name
 
 
+def test_a_device_that_binds_little_trains_the_same(
+    graphics, make_splats, odd_camera, photograph, monkeypatch
+):
+    """Of 1000 splats it takes the moments of 384 at a time, and their 8000 pairs in some bands of tiles."""
+    found = []
+    for most in (graphics.most_bytes, 160 << 10):
+        monkeypatch.setattr(graphics, "most_bytes", most)
+        adam, stats = adam_of(make_splats(1000)), blank(1000)
+        twin = twin_of("gpu", adam, stats)
+        assert twin is not None
+        weights = torch.linspace(0, 1, 1000)
+        told = [
+            twin.step(odd_camera, photograph, ssim_weight=0.2, weights=w, shrink=1, **VIEW)
+            for w in (None, weights)
+        ]
+        twin.keep_above(torch.linspace(-4, -2, 1000))
+        seen = twin.look("quats")
+        twin.bring_home()
+        moments = [moment for state in adam.state.values() for moment in state]
+        tensors = [tensor.detach() for tensor in adam.tensors.values()]
+        found.append([*tensors, *moments, *stats.values(), seen, torch.tensor(told)])
+    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
+
+
 def test_what_is_not_asked_for_stays(graphics, make_splats, odd_camera, photograph):
     """Statistics where they are not wanted; harmonics of higher degrees; what is out of sight."""
     adam, stats = adam_of(make_splats(50)), blank(50)

@@ -19,11 +19,11 @@ import torch
 from ..adam import Adam
 from ..gaussians import Gaussians
 from ..rendering import Drawn, Settings, SideOutputs, Target, require_plain
-from .bin import TILE, groups_of
+from .bin import TILE
 from .choice import open_chosen
 from .device import Buffer, Device
 from .loss import loss_and_gradient, moments_of
-from .scene import BY_SPLAT, GEOMETRY, PAIR_SUMS, SUMS, Scene
+from .scene import BY_SPLAT, GEOMETRY, SUMS, Scene
 from .twin import COLUMNS, STATS, Twin, packed
 
 
@@ -56,16 +56,8 @@ def contributions(
     weights = torch.ones(0) if weights is None else weights
     with device.lock:
         scene, some = _scene_of(device, [*vars(gaussians).values(), weights], settings)
-        pairs = scene.pairs
-        shares = device.empty(np.float32, pairs.count, 3)
-        found = device.empty(np.float32, scene.count, 3)
-        scene.blend("weigh", ranges=pairs.ranges, sorted_pairs=pairs.sorted_pairs, pair_weights=shares)
-        device.run(
-            "gather", "contributions", groups_of(scene.count), (scene.count,),
-            spans=pairs.spans, pair_weights=shares, weights=found,
-        )  # fmt: skip
         everywhere, radii = np.zeros((count, 3), np.float32), np.zeros(count, np.float32)
-        everywhere[some], radii[some] = device.read(found), device.read(scene.radii)
+        everywhere[some], radii[some] = device.read(scene.weigh()), device.read(scene.radii)
     largest, total, pixels = torch.from_numpy(everywhere).unbind(1)
     return largest, total, pixels.long(), torch.from_numpy(radii)
 
@@ -90,23 +82,22 @@ class _Rasterize(torch.autograd.Function):
         tensors, device, view = [means, quats, log_scales, logits, sh, weights], open_chosen(), settings.view
         with device.lock:
             scene, some = _scene_of(device, tensors, settings)
-            pairs, limit = scene.pairs, np.zeros(1, np.float32)
+            limit = np.zeros(1, np.float32)
             if settings.limit is not None:  # not every device knows an infinity
                 most = torch.finfo(torch.float32).max
                 limit = settings.limit.to(torch.float32).clamp_max(most).numpy()
-            limit, walked = device.upload(limit), device.empty(np.uint32, scene.tiles, 2)
+            limit, walked = device.upload(limit), device.empty(np.uint32, *scene.ranges.shape)
             median = device.empty(np.int32, view.height, view.width)
             shades = [scene.colours, *_as_colours(device, features.detach().numpy()[some])]
             pictures = [device.empty(np.float32, view.height, view.width, 4) for _ in shades]
             for k, (shade, picture) in enumerate(zip(shades, pictures, strict=True)):
-                scene.blend(
-                    "forward", (0.0, 0.0, 0.0) if k else settings.background, settings.limit is not None,
-                    colours=shade, ranges=pairs.ranges, limit=limit, drawn=picture, walked=walked,
-                    median=median,
+                scene.draw(
+                    (0.0, 0.0, 0.0) if k else settings.background, settings.limit is not None,
+                    colours=shade, limit=limit, drawn=picture, walked=walked, median=median,
                 )  # fmt: skip
             drawn, *blended = (torch.from_numpy(device.read(picture)) for picture in pictures)
             side.radii.numpy()[some] = device.read(scene.radii)
-            begin, end = device.read(pairs.ranges).astype(np.int64).T
+            begin, end = device.read(scene.ranges).astype(np.int64).T
             side.tile_counts.numpy()[:] = (end - begin).reshape(side.tile_counts.shape)
             if side.median is not None:
                 found = device.read(median)
@@ -120,9 +111,8 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def backward(ctx, by_image, by_alpha, by_features):
         scene, some, shades, pictures, walked, settings, side = ctx.rest
-        device, pairs, count = scene.device, scene.pairs, scene.count
+        device, count = scene.device, scene.count
         sums = device.empty(np.float32, count, SUMS)
-        pair_sums = device.empty(np.float32, pairs.count, PAIR_SUMS)
         by_shades = [device.empty(np.float32, count, 3) for _ in shades]
         with device.lock:
             for k, (shade, picture, by_shade) in enumerate(zip(shades, pictures, by_shades, strict=True)):
@@ -132,12 +122,10 @@ class _Rasterize(torch.autograd.Function):
                     by_picture[..., : three.shape[2]] = three
                 else:
                     by_picture[..., :3], by_picture[..., 3] = by_image, by_alpha
-                scene.blend(
-                    "backward", absolute=settings.absolute and k == 0, colours=shade, ranges=walked,
-                    sorted_pairs=pairs.sorted_pairs, picture=picture, by_picture=device.upload(by_picture),
-                    pair_sums=pair_sums,
+                scene.differentiate(
+                    GEOMETRY if k else SUMS, settings.absolute and k == 0, sums, by_shade, walked,
+                    colours=shade, picture=picture, by_picture=device.upload(by_picture),
                 )  # fmt: skip
-                scene.gather(GEOMETRY if k else SUMS, pair_sums=pair_sums, sums=sums, by_colours=by_shade)
             by_splats = device.empty(np.float32, count, BY_SPLAT)
             by_sh = device.empty(np.float32, *scene.sh.shape)
             scene.backward(sums, by_shades[0], by_splats, by_sh)

@@ -18,22 +18,22 @@ DEPTH_BITS = 32
 
 
 @dataclass
-class Pairs:
-    """Pairs of splats and tiles.
+class Band:
+    """Pairs of splats with tiles that follow each other, row by row.
 
     Attributes:
-        count: how many, P.
+        tiles: which.
+        count: how many pairs, P.
         spans: (M, 2) each splat's first pair and the number of its pairs.
         sorted_pairs: (P,) pairs tile by tile, front to back in each.
         owners: (P,) the splats of these.
-        ranges: (tiles, 2) where each tile's begin and end; tiles go row by row.
     """
 
+    tiles: range
     count: int
     spans: Buffer
     sorted_pairs: Buffer
     owners: Buffer
-    ranges: Buffer
 
 
 def groups_of(count: int, each: int = LANES) -> int:
@@ -72,32 +72,45 @@ def sort(device: Device, keys: Buffer, values: Buffer, bits: int) -> tuple[Buffe
     return keys, values
 
 
-def bin_splats(device: Device, rows: Buffer, depths: Buffer, width: int, height: int) -> Pairs:
+def bin_splats(
+    device: Device, rows: Buffer, depths: Buffer, width: int, height: int, most: int
+) -> tuple[list[Band], Buffer]:
     """Bins projected splats.
 
     Args:
         rows: (M, 12), projected.
         depths: (M,) uint32, the bits of their depths, which order as these do; the largest for those that are
             not drawn. Overwritten.
+        most: pairs that a band may have, where it has more than one tile.
+
+    Returns:
+        The bands of all tiles, as few as halving finds, and (tiles, 2) where the pairs of each tile begin and
+        end in its band.
     """
     count, across, down = rows.shape[0], -(-width // TILE), -(-height // TILE)
-    ranges, spans = device.empty(np.uint32, across * down, 2), device.empty(np.uint32, count, 2)
-    starts, order = device.empty(np.uint32, count + 1), device.empty(np.uint32, count)
-    numbers = count, across, down
-    device.run("bin", "number", groups_of(count), numbers, pairs=order)
+    order, ranges = device.empty(np.uint32, count), device.empty(np.uint32, across * down, 2)
+    device.run("bin", "number", groups_of(count), (count, across, 0, 0), pairs=order)
     _, order = sort(device, depths, order, DEPTH_BITS)
-    device.run("bin", "count", groups_of(count), numbers, rows=rows, order=order, counts=starts)
-    sum_up(device, starts)
-    total = int(device.read(starts, count)[0])
-    owners, tiles, pairs = (device.empty(np.uint32, total) for _ in range(3))
-    device.run(
-        "bin", "make_pairs", groups_of(count), numbers, rows=rows, order=order, starts=starts, spans=spans,
-        owners=owners, tiles=tiles, pairs=pairs,
-    )  # fmt: skip
-    sorted_tiles, sorted_pairs = sort(device, tiles, pairs, int(across * down).bit_length())
-    sorted_owners = device.empty(np.uint32, total)
-    device.run(
-        "bin", "find_ranges", groups_of(total), (total, across, down), sorted_tiles=sorted_tiles,
-        sorted_pairs=sorted_pairs, owner_of=owners, sorted_owners=sorted_owners, ranges=ranges,
-    )  # fmt: skip
-    return Pairs(total, spans, sorted_pairs, sorted_owners, ranges)
+
+    def bands(tiles: range) -> list[Band]:
+        numbers = count, across, tiles.start, tiles.stop
+        starts = device.empty(np.uint32, count + 1)
+        device.run("bin", "count", groups_of(count), numbers, rows=rows, order=order, counts=starts)
+        sum_up(device, starts)
+        total, middle = int(device.read(starts, count)[0]), len(tiles) // 2
+        if total > most and middle:
+            return bands(tiles[:middle]) + bands(tiles[middle:])
+        spans = device.empty(np.uint32, count, 2)
+        owners, tile_of, pairs, sorted_owners = (device.empty(np.uint32, total) for _ in range(4))
+        device.run(
+            "bin", "make_pairs", groups_of(count), numbers, rows=rows, order=order, starts=starts,
+            spans=spans, owners=owners, tiles=tile_of, pairs=pairs,
+        )  # fmt: skip
+        sorted_tiles, sorted_pairs = sort(device, tile_of, pairs, tiles.stop.bit_length())
+        device.run(
+            "bin", "find_ranges", groups_of(total), (total, *numbers[1:]), sorted_tiles=sorted_tiles,
+            sorted_pairs=sorted_pairs, owner_of=owners, sorted_owners=sorted_owners, ranges=ranges,
+        )  # fmt: skip
+        return [Band(tiles, total, spans, sorted_pairs, sorted_owners)]
+
+    return bands(range(across * down)), ranges

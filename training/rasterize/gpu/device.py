@@ -11,7 +11,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
 from typing import Any, NamedTuple
@@ -27,6 +27,8 @@ LANES = 64
 """Invocations of a workgroup, in every shader."""
 SMALLEST = 64
 """Bytes of a buffer of nothing: one element of whatever a shader takes it for."""
+ALIGNED = 64
+"""Rows after which a binding may begin: of 4 bytes and more, as no device asks for more than 256 bytes."""
 BINDING = re.compile(r"@group\(0\) @binding\((\d+)\) var<(uniform|storage)[^>]*> (\w+)")
 REMEDY = "Train on the CPU (Train On in Blender, backend = cpu in a job), or install the device's driver."
 
@@ -54,11 +56,22 @@ class Adapter(NamedTuple):
 
 @dataclass(frozen=True)
 class Buffer:
-    """An array of 4-byte numbers on a device."""
+    """An array of 4-byte numbers on a device; ``offset``: the bytes of the handle that lie before it."""
 
     handle: Any
     shape: tuple[int, ...]
     kind: np.dtype
+    offset: int = 0
+
+    @property
+    def size(self) -> int:
+        """Bytes that are bound for it."""
+        return 4 * int(np.prod(self.shape, dtype=np.int64)) or SMALLEST
+
+    def part(self, begin: int, end: int) -> Buffer:
+        """Some of its rows."""
+        before = self.offset + begin * replace(self, shape=self.shape[1:]).size
+        return replace(self, shape=(end - begin, *self.shape[1:]), offset=before)
 
 
 def adapters() -> list[Adapter]:
@@ -143,7 +156,8 @@ class Device:
     Attributes:
         adapter: what it is.
         limits: by wgpu's names, all that the adapter has.
-        most_bytes: the largest buffer.
+        most_bytes: that a shader sees of a buffer at a time.
+        largest: bytes of the largest buffer.
         most_groups: workgroups that are submitted at a time.
         moved: bytes that went to the device and came from it.
         lost: it answers no more; :func:`open_device` opens another.
@@ -157,7 +171,8 @@ class Device:
             self._device = handle.request_device_sync(required_limits=self.limits)
         except Exception as error:  # of the driver
             raise LodgsError(f"{adapter.name} cannot be opened: {_reason(error)}.", REMEDY) from error
-        self.most_bytes = min(self.limits["max-storage-buffer-binding-size"], self.limits["max-buffer-size"])
+        self.largest = self.limits["max-buffer-size"]
+        self.most_bytes = min(self.limits["max-storage-buffer-binding-size"], self.largest)
         self.most_groups = self.limits["max-compute-workgroups-per-dimension"]
         self.moved = 0
         self._firsts: dict[int, Any] = {}
@@ -169,17 +184,12 @@ class Device:
         """A buffer of zeros: of np.float32, np.uint32 or np.int32.
 
         Raises:
-            LodgsError: it is larger than the device binds, or than its memory.
+            LodgsError: it is larger than the device's largest, or than its memory.
         """
         flags = _wgpu().BufferUsage
         usage = flags.STORAGE | flags.COPY_SRC | flags.COPY_DST
         size = max(int(np.prod(shape, dtype=np.int64)) * 4, SMALLEST)
-        if size > self.most_bytes:
-            raise LodgsError(
-                f"{self.adapter.name} takes {self.most_bytes >> 20} MB at a time, "
-                f"and this scene needs {-(-size >> 20)} MB.",
-                "Choose the cpu backend, fewer splats or smaller images.",
-            )
+        self._require(size, self.largest)
         with self._said():
             handle = self._device.create_buffer(size=size, usage=usage)
         return Buffer(handle, shape, np.dtype(kind))
@@ -194,6 +204,15 @@ class Device:
                 self._device.queue.write_buffer(buffer.handle, 0, array.reshape(-1))
         return buffer
 
+    def parts(self, **buffers: Buffer) -> Iterator[dict[str, Buffer]]:
+        """The rows of buffers that have the same number of them, as many at a time as the device binds."""
+        (count,) = {buffer.shape[0] for buffer in buffers.values()}
+        widest = max(buffer.part(0, 1).size for buffer in buffers.values())
+        at_once = max(self.most_bytes // widest // ALIGNED, 1) * ALIGNED
+        for begin in range(0, count, at_once):
+            end = min(begin + at_once, count)
+            yield {name: buffer.part(begin, end) for name, buffer in buffers.items()}
+
     def run(
         self,
         shader: str,
@@ -201,42 +220,45 @@ class Device:
         groups: int,
         numbers: tuple = (),
         at_once: int = 1 << 30,
+        begin: int = 0,
+        /,
         **buffers: Buffer,
     ) -> None:
         """Record a dispatch; it has run when something is read.
 
         Args:
             shader, entry: name of a file in ``shaders/`` without its ending, and of a function in it.
-            groups: workgroups; each learns from ``group_of`` which one it is.
+            groups: workgroups; each learns from ``group_of`` which one it is, counted from ``begin``.
             numbers: what the shader's uniform holds, in order: integers, floats or arrays of them.
             at_once: workgroups that are submitted at a time, at most: between them the device can do other
                 things, such as draw windows.
             buffers: those that the function uses, by the shader's names.
 
         Raises:
-            LodgsError: the device was lost.
+            LodgsError: the device was lost, or does not bind so large a buffer.
         """
+        self._require(max(buffer.size for buffer in buffers.values()), self.most_bytes)
         with self._said():
             pipeline, layout, bindings = self._pipeline(shader, entry)
-            bound = {bindings[name]: buffer.handle for name, buffer in buffers.items()}
+            bound = {
+                bindings[name]: {"buffer": buffer.handle, "offset": buffer.offset, "size": buffer.size}
+                for name, buffer in buffers.items()
+            }
             if numbers:
-                bound[bindings["u"]] = self._uniform(*numbers)
+                bound[bindings["u"]] = {"buffer": self._uniform(*numbers)}
             at_once = min(at_once, self.most_groups)
-            for first in range(0, groups, at_once):
+            for first in range(begin, begin + groups, at_once):
                 if first not in self._firsts:
                     self._firsts[first] = self._uniform(first)
-                bound[bindings["first_group"]] = self._firsts[first]
-                entries = [
-                    {"binding": at, "resource": {"buffer": handle, "offset": 0, "size": handle.size}}
-                    for at, handle in bound.items()
-                ]
+                bound[bindings["first_group"]] = {"buffer": self._firsts[first]}
+                entries = [{"binding": at, "resource": resource} for at, resource in bound.items()]
                 group = self._device.create_bind_group(layout=layout, entries=entries)
                 if self._pass is None:
                     self._encoder = self._device.create_command_encoder()
                     self._pass = self._encoder.begin_compute_pass()
                 self._pass.set_pipeline(pipeline)
                 self._pass.set_bind_group(0, group)
-                self._pass.dispatch_workgroups(min(at_once, groups - first))
+                self._pass.dispatch_workgroups(min(at_once, begin + groups - first))
                 if groups > at_once:
                     self.submit()
 
@@ -254,7 +276,7 @@ class Device:
             return np.zeros(shape, buffer.kind)
         self.moved += size
         with self._said():
-            data = self._device.queue.read_buffer(buffer.handle, begin * row_size, size)
+            data = self._device.queue.read_buffer(buffer.handle, buffer.offset + begin * row_size, size)
         return np.frombuffer(data, buffer.kind).reshape(shape)
 
     def submit(self) -> None:
@@ -265,6 +287,15 @@ class Device:
             recorded, encoder, self._pass, self._encoder = self._pass, self._encoder, None, None
             recorded.end()
             self._device.queue.submit([encoder.finish()])
+
+    def _require(self, size: int, most: int) -> None:
+        """LodgsError where a scene needs more bytes in one piece than the device has so."""
+        if size > most:
+            raise LodgsError(
+                f"{self.adapter.name} takes {most >> 20} MB at a time, "
+                f"and this scene needs {-(-size >> 20)} MB.",
+                "Choose the cpu backend, fewer splats or smaller images.",
+            )
 
     def _uniform(self, *numbers: Any) -> Any:
         words = np.concatenate([_as_words(number) for number in numbers])

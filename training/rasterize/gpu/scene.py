@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..rendering import Settings, View
-from .bin import TILE, Pairs, bin_splats, groups_of
+from .bin import TILE, Band, bin_splats, groups_of
 from .device import Buffer, Device
 
 ROW = 12
@@ -21,6 +21,9 @@ GEOMETRY = 6
 TILES = 1024
 """That a device blends at a time, so that it gets to other work in between."""
 
+BLACK = 0.0, 0.0, 0.0
+"""The background where none is meant."""
+
 
 @dataclass
 class Scene:
@@ -28,70 +31,116 @@ class Scene:
 
     Attributes:
         count: M.
-        lens: what project.wgsl knows of the view.
+        lens, degree: what project.wgsl knows of the view, and of harmonics.
         splats, sh: (M, SPLAT) and (M, coefficients, 3).
         rows, colours, radii: (M, ROW), (M, 4) and (M,), projected.
-        pairs: with the tiles that they touch.
+        bands: with the tiles that they touch; no more than a device takes gradients of at a time.
+        ranges: (tiles, 2) where the pairs of each tile begin and end in its band.
     """
 
     device: Device
     view: View
     count: int
-    lens: tuple
+    lens: np.ndarray
+    degree: int
     splats: Buffer
     sh: Buffer
     rows: Buffer
     colours: Buffer
     radii: Buffer
-    pairs: Pairs
+    bands: list[Band]
+    ranges: Buffer
 
     @classmethod
     def of(cls, device: Device, splats: Buffer, sh: Buffer, settings: Settings) -> Scene:
         """Projects and bins; LodgsError where the device was lost, or has too little memory."""
         view, count = settings.view, splats.shape[0]
-        lens = (_lens_of(view), settings.min_scale, count, settings.degree, sh.shape[1])
+        lens = np.append(_lens_of(view), np.float32(settings.min_scale))
         rows, colours = device.empty(np.float32, count, ROW), device.empty(np.float32, count, 4)
         depths, radii = device.empty(np.uint32, count), device.empty(np.float32, count)
-        device.run(
-            "project", "forward", groups_of(count), lens, splats=splats, sh=sh, rows=rows, colours=colours,
+        _project(
+            device, "forward", lens, settings.degree, splats=splats, sh=sh, rows=rows, colours=colours,
             depths=depths, radii=radii,
         )  # fmt: skip
-        pairs = bin_splats(device, rows, depths, view.width, view.height)
-        return cls(device, view, count, lens, splats, sh, rows, colours, radii, pairs)
+        most = device.most_bytes // (4 * PAIR_SUMS)
+        bands, ranges = bin_splats(device, rows, depths, view.width, view.height, most)
+        return cls(
+            device, view, count, lens, settings.degree, splats, sh, rows, colours, radii, bands, ranges
+        )
 
-    @property
-    def tiles(self) -> int:
-        """How many the image has."""
-        return self.pairs.ranges.shape[0]
+    def draw(
+        self, background: tuple[float, float, float], limited: bool, colours: Buffer, **buffers: Buffer
+    ) -> None:
+        """Record ``forward`` of blend.wgsl."""
+        for band in self.bands:
+            self._blend("forward", band, background, limited, colours=colours, ranges=self.ranges, **buffers)
 
-    def blend(
+    def weigh(self) -> Buffer:
+        """Record how much each splat shows, (M, 3): its largest weight, their sum, and how many pixels."""
+        found = self.device.empty(np.float32, self.count, 3)
+        for band in self.bands:
+            shares = self.device.empty(np.float32, band.count, 3)
+            self._blend(
+                "weigh", band, ranges=self.ranges, sorted_pairs=band.sorted_pairs, pair_weights=shares
+            )
+            self.device.run(
+                "gather", "contributions", groups_of(self.count), (self.count, 0), spans=band.spans,
+                pair_weights=shares, weights=found,
+            )  # fmt: skip
+        return found
+
+    def differentiate(
         self,
-        entry: str,
-        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        limited: bool = False,
-        absolute: bool = False,
+        columns: int,
+        absolute: bool,
+        sums: Buffer,
+        by_colours: Buffer,
+        walked: Buffer,
         **buffers: Buffer,
     ) -> None:
-        """Record a function of blend.wgsl for every tile."""
-        size = self.view.width, self.view.height, -(-self.view.width // TILE)
-        numbers = (*background, 0.0, *size, int(limited), int(absolute))
-        rows, owners = self.rows, self.pairs.owners
-        self.device.run("blend", entry, self.tiles, numbers, TILES, rows=rows, owners=owners, **buffers)
-
-    def gather(self, columns: int, pair_sums: Buffer, sums: Buffer, by_colours: Buffer) -> None:
-        """Record that pairs' sums are added up for each splat, of so many columns of them."""
-        self.device.run(
-            "gather", "gradients", groups_of(self.count), (self.count, columns), spans=self.pairs.spans,
-            pair_sums=pair_sums, sums=sums, by_colours=by_colours,
-        )  # fmt: skip
+        """Record ``backward`` of blend.wgsl, and that sums get so many columns of what it finds for pairs."""
+        for band in self.bands:
+            pair_sums = self.device.empty(np.float32, band.count, PAIR_SUMS)
+            self._blend(
+                "backward", band, BLACK, False, absolute, ranges=walked, sorted_pairs=band.sorted_pairs,
+                pair_sums=pair_sums, **buffers,
+            )  # fmt: skip
+            self.device.run(
+                "gather", "gradients", groups_of(self.count), (self.count, columns), spans=band.spans,
+                pair_sums=pair_sums, sums=sums, by_colours=by_colours,
+            )  # fmt: skip
 
     def backward(self, sums: Buffer, by_colours: Buffer, by_splats: Buffer, by_sh: Buffer) -> None:
-        """Record how what :meth:`gather` has found reaches splats that were drawn: these rows are written."""
-        self.device.run(
-            "project", "backward", groups_of(self.count), self.lens, splats=self.splats, sh=self.sh,
+        """Record how sums of :meth:`differentiate` reach splats that were drawn: these rows are written."""
+        _project(
+            self.device, "backward", self.lens, self.degree, splats=self.splats, sh=self.sh,
             projected=self.rows, seen_colours=self.colours, sums=sums, by_colours=by_colours,
             by_splats=by_splats, by_sh=by_sh,
         )  # fmt: skip
+
+    def _blend(
+        self,
+        entry: str,
+        band: Band,
+        background: tuple[float, float, float] = BLACK,
+        limited: bool = False,
+        absolute: bool = False,
+        /,
+        **buffers: Buffer,
+    ) -> None:
+        size = self.view.width, self.view.height, -(-self.view.width // TILE)
+        numbers = (*background, 0.0, *size, int(limited), int(absolute))
+        self.device.run(
+            "blend", entry, len(band.tiles), numbers, TILES, band.tiles.start, rows=self.rows,
+            owners=band.owners, **buffers,
+        )  # fmt: skip
+
+
+def _project(device: Device, entry: str, lens: np.ndarray, degree: int, **buffers: Buffer) -> None:
+    """Record a function of project.wgsl, for all splats."""
+    for part in device.parts(**buffers):
+        count, terms, _ = part["sh"].shape
+        device.run("project", entry, groups_of(count), (lens, count, degree, terms), **part)
 
 
 def _lens_of(view: View) -> np.ndarray:

@@ -17,7 +17,7 @@ from ..rendering import Settings, Target, View
 from .bin import groups_of
 from .device import Buffer, Device
 from .loss import loss_of, moments_of, sums_and_gradient
-from .scene import BY_SPLAT, PAIR_SUMS, SPLAT, SUMS, Scene
+from .scene import BY_SPLAT, SPLAT, SUMS, Scene
 
 COLUMNS = {
     "means": slice(0, 3),
@@ -114,26 +114,25 @@ class Twin:
         with device.lock:
             self._weigh(weights)
             scene = Scene.of(device, self._splats, self._sh, settings)
-            pairs, size = scene.pairs, (camera.height, camera.width)
-            self.drawn, walked = device.empty(np.float32, *size, 4), device.empty(np.uint32, scene.tiles, 2)
-            scene.blend(
-                "forward", background, colours=scene.colours, ranges=pairs.ranges, walked=walked,
-                drawn=self.drawn, limit=device.empty(np.float32, 1), median=device.empty(np.int32, *size),
+            size = camera.height, camera.width
+            self.drawn, walked = (
+                device.empty(np.float32, *size, 4), device.empty(np.uint32, *scene.ranges.shape),
+            )  # fmt: skip
+            scene.draw(
+                background, False, colours=scene.colours, walked=walked, drawn=self.drawn,
+                limit=device.empty(np.float32, 1), median=device.empty(np.int32, *size),
             )  # fmt: skip
             told, by_picture = self._loss(target, ssim_weight)
-            pair_sums = device.empty(np.float32, pairs.count, PAIR_SUMS)
-            scene.blend(
-                "backward", colours=scene.colours, ranges=walked, sorted_pairs=pairs.sorted_pairs,
-                picture=self.drawn, by_picture=by_picture, pair_sums=pair_sums,
-            )  # fmt: skip
             sums, by_colours = device.empty(np.float32, count, SUMS), device.empty(np.float32, count, 3)
-            scene.gather(SUMS, pair_sums=pair_sums, sums=sums, by_colours=by_colours)
+            scene.differentiate(
+                SUMS, False, sums, by_colours, walked, colours=scene.colours, picture=self.drawn,
+                by_picture=by_picture,
+            )  # fmt: skip
             scene.backward(sums, by_colours, self._by_splats, self._by_sh)
             if shrink is not None:
-                device.run(
-                    "train", "count", groups_of(count),
-                    (count, 0, SPLAT, BY_SPLAT, 0, 0, 0.0, 0.0, 0.0, float(shrink)),
-                    radii=scene.radii, by_rows=self._by_splats, stats=self._counted, values=self._splats,
+                self._run(
+                    "count", {"shrink": shrink}, radii=scene.radii, by_rows=self._by_splats,
+                    stats=self._counted, values=self._splats,
                 )  # fmt: skip
             self._move(scene.radii, 3 * (sh_degree + 1) ** 2)
             l1, ssim = device.read(told)
@@ -153,22 +152,14 @@ class Twin:
             column = COLUMNS[name]
             width = _width(column)
             found = device.empty(np.float32, *like.shape)
-            device.run(
-                "train", "look", groups_of(self._count * width),
-                (self._count * width, width, SPLAT, 0, 0, column.start, 0.0, 0.0, 0.0, 0.0),
-                values=self._splats, totals=found,
-            )  # fmt: skip
+            self._run("look", {"width": width, "slot": column.start}, values=self._splats, totals=found)
             return torch.from_numpy(device.read(found))
 
     def keep_above(self, least: torch.Tensor) -> None:
         """No log-scale of a splat is below its least one (N,) from here."""
         lowest = least.numpy().clip(np.finfo(np.float32).min)  # not every device knows an infinity
         with self.device.lock:
-            self.device.run(
-                "train", "widen", groups_of(self._count),
-                (self._count, 0, SPLAT, 0, 0, 0, 0.0, 0.0, 0.0, 0.0),
-                parts=self.device.upload(lowest), values=self._splats,
-            )  # fmt: skip
+            self._run("widen", {}, parts=self.device.upload(lowest), values=self._splats)
 
     def bring_home(self) -> None:
         """Makes tensors, moments and statistics here what they are on the device, in place."""
@@ -195,17 +186,13 @@ class Twin:
         ones = np.ones(self._count, np.float32)
         given = ones if weights is None else weights.numpy().astype(np.float32, copy=False)
         self._weighted = weights is not None
-        self.device.run(
-            "train", "weigh", groups_of(self._count), (self._count, 0, SPLAT, 0, 0, 0, 0.0, 0.0, 0.0, 0.0),
-            parts=self.device.upload(given), values=self._splats,
-        )  # fmt: skip
+        self._run("weigh", {}, parts=self.device.upload(given), values=self._splats)
 
     def _loss(self, target: Target, ssim_weight: float) -> tuple[Buffer, Buffer]:
         """What L1 and SSIM add up to (2,), and the gradient (H, W, 4) by the picture."""
         device, (height, width, _) = self.device, self.drawn.shape
         image, truth = (device.empty(np.float32, height, width, 3) for _ in range(2))
-        numbers = (height * width, 0, 0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0)
-        groups = groups_of(height * width)
+        groups, numbers = groups_of(height * width), _numbers(height * width)
         device.run(
             "train", "unpack", groups, numbers, photograph=_photograph(device, target), drawn=self.drawn,
             image=image, truth=truth,
@@ -214,10 +201,7 @@ class Twin:
         by_picture, told = device.empty(np.float32, height, width, 4), device.empty(np.float32, 2)
         device.run("train", "pack", groups, numbers, gradient=gradient, by_picture=by_picture)
         for slot, each in enumerate(sums):
-            device.run(
-                "train", "total", 1, (each.shape[0], 0, 0, 0, 0, slot, 0.0, 0.0, 0.0, 0.0),
-                parts=each, totals=told,
-            )  # fmt: skip
+            device.run("train", "total", 1, _numbers(each.shape[0], slot=slot), parts=each, totals=told)
         return told, by_picture
 
     def _move(self, radii: Buffer, harmonics: int) -> None:
@@ -235,12 +219,35 @@ class Twin:
             (self._splats, self._splat_moments, self._by_splats, SPLAT, BY_SPLAT, TRAINED, of_splats),
             (self._sh, self._sh_moments, self._by_sh, *[3 * coefficients] * 2, harmonics, rates["sh"]),
         ):
-            width = len(rate)
-            numbers = self._count * width, width, stride, by_stride, trained, 0, *adam.betas, adam.eps, 1.0
-            self.device.run(
-                "train", "adam", groups_of(self._count * width), numbers, radii=radii, by_rows=gradient,
-                values=values, moments=moments, rates=self.device.upload(rate),
-            )  # fmt: skip
+            numbers = {
+                "width": len(rate), "stride": stride, "by_stride": by_stride, "trained": trained,
+                "adam": (*adam.betas, adam.eps),
+            }  # fmt: skip
+            shared = {"rates": self.device.upload(rate)}
+            self._run("adam", numbers, shared, radii=radii, by_rows=gradient, values=values, moments=moments)
+
+    def _run(
+        self, entry: str, numbers: Mapping, shared: Mapping[str, Buffer] | None = None, **rows: Buffer
+    ) -> None:
+        """Record a function of train.wgsl, for all rows of buffers that have one for each splat."""
+        for part in self.device.parts(**rows):
+            count = numbers.get("width", 1) * next(iter(part.values())).shape[0]
+            given = {**part, **(shared or {})}
+            self.device.run("train", entry, groups_of(count), _numbers(count, **numbers), **given)
+
+
+def _numbers(
+    count: int,
+    width: int = 1,
+    stride: int = SPLAT,
+    by_stride: int = BY_SPLAT,
+    trained: int = 0,
+    slot: int = 0,
+    adam: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    shrink: float = 1.0,
+) -> tuple:
+    """What train.wgsl is told."""
+    return count, width, stride, by_stride, trained, slot, *adam, float(shrink)
 
 
 def _width(columns: slice) -> int:

@@ -1,11 +1,12 @@
 // Which splats touch which tile. Splats are in the order of their depths by now; each makes its pairs with tiles
-// in this order, and a stable sort by tile then leaves every tile with its splats front to back.
+// in this order, and a stable sort by tile then leaves every tile with its splats front to back. Tiles go row by row;
+// those of a band, from the first to the end, are binned at a time.
 
-struct Parameters { count: u32, across: u32, down: u32 }
+struct Parameters { count: u32, across: u32, first: u32, end: u32 }
 @group(0) @binding(0) var<uniform> u: Parameters;
 @group(0) @binding(1) var<storage, read> rows: array<Row>;
 @group(0) @binding(2) var<storage, read> order: array<u32>;  // splats by depth
-@group(0) @binding(3) var<storage, read_write> counts: array<u32>;  // of tiles, by depth
+@group(0) @binding(3) var<storage, read_write> counts: array<u32>;  // of the band's tiles, by depth
 @group(0) @binding(4) var<storage, read> starts: array<u32>;  // where the pairs of each begin, and the end
 @group(0) @binding(5) var<storage, read_write> spans: array<vec2u>;  // of each splat, its first pair and their number
 @group(0) @binding(6) var<storage, read_write> owners: array<u32>;  // of each pair, the splat
@@ -27,8 +28,16 @@ fn tile_range(middle: f32, reach: f32, tiles: u32) -> vec2u {
     return min(range, vec2u(tiles));  // what is no number may become any whole one
 }
 
+// The band's rows of tiles within reach.
+fn lines_of(row: Row) -> vec2u {
+    let down = (u.end + u.across - 1u) / u.across;
+    return max(tile_range(row.mean.y, row.half_size.y, down), vec2u(u.first / u.across));
+}
+
 fn touches_tile(row: Row, x: u32, y: u32) -> bool {
-    return touches(row, vec2f(f32(x * TILE), f32(y * TILE)) + 0.5, vec2f(SPAN));
+    let tile = y * u.across + x;
+    return tile >= u.first && tile < u.end
+        && touches(row, vec2f(f32(x * TILE), f32(y * TILE)) + 0.5, vec2f(SPAN));
 }
 
 // The numbers from 0 on.
@@ -46,7 +55,7 @@ fn count(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) l
     var found = 0u;
     if (row.radius > 0.0) {
         let columns = tile_range(row.mean.x, row.half_size.x, u.across);
-        let lines = tile_range(row.mean.y, row.half_size.y, u.down);
+        let lines = lines_of(row);
         for (var y = lines.x; y < lines.y; y++) {
             for (var x = columns.x; x < columns.y; x++) { found += u32(touches_tile(row, x, y)); }
         }
@@ -55,7 +64,7 @@ fn count(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) l
 }
 
 // A driver may compile the test above otherwise than in `count`: so no more pairs are made than were counted, and
-// one that is missing goes to a tile that does not exist.
+// one that is missing goes to a tile that is not the band's.
 @compute @workgroup_size(LANES)
 fn make_pairs(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let k = group_of(group) * LANES + lane;
@@ -67,7 +76,7 @@ fn make_pairs(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_ind
     let row = rows[splat];
     if (row.radius > 0.0) {
         let columns = tile_range(row.mean.x, row.half_size.x, u.across);
-        let lines = tile_range(row.mean.y, row.half_size.y, u.down);
+        let lines = lines_of(row);
         for (var y = lines.x; y < lines.y; y++) {
             for (var x = columns.x; x < columns.y; x++) {
                 if (at < end && touches_tile(row, x, y)) {
@@ -81,7 +90,7 @@ fn make_pairs(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_ind
     }
     for (; at < end; at++) {
         owners[at] = splat;
-        tiles[at] = u.across * u.down;
+        tiles[at] = u.end;
         pairs[at] = at;
     }
 }
@@ -93,7 +102,7 @@ fn find_ranges(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_in
     if (at >= u.count) { return; }
     sorted_owners[at] = owner_of[sorted_pairs[at]];
     let tile = sorted_tiles[at];
-    if (tile == u.across * u.down) { return; }
+    if (tile == u.end) { return; }
     if (at == 0u || sorted_tiles[at - 1u] != tile) { ranges[tile].x = at; }
     if (at + 1u == u.count || sorted_tiles[at + 1u] != tile) { ranges[tile].y = at + 1u; }
 }

@@ -1,27 +1,30 @@
-// What a splat's pairs hold, added up in the order in which the splat met its tiles: the same bits every time.
+// What a splat's pairs hold, added up in the order in which the splat met its tiles: the same bits every time, however
+// many bands the tiles are in.
 
 struct Parameters {
     count: u32,
-    columns: u32,  // of sums, that are added to: features have no part in the absolute gradients
+    columns: u32,  // of sums that are meant: features have no part in the absolute gradients
 }
 @group(0) @binding(0) var<uniform> u: Parameters;
 @group(0) @binding(1) var<storage, read> spans: array<vec2u>;
 @group(0) @binding(2) var<storage, read> pair_sums: array<f32>;  // (P, PAIR_SUMS)
-@group(0) @binding(3) var<storage, read_write> sums: array<f32>;  // (M, SUMS): added to
-@group(0) @binding(4) var<storage, read_write> by_colours: array<f32>;  // (M, 3)
+@group(0) @binding(3) var<storage, read_write> sums: array<f32>;  // (M, SUMS), added to
+@group(0) @binding(4) var<storage, read_write> by_colours: array<f32>;  // (M, 3), added to
 @group(0) @binding(5) var<storage, read> pair_weights: array<f32>;  // (P, 3)
-@group(0) @binding(6) var<storage, read_write> weights: array<f32>;  // (M, 3): largest, sum, pixels
+@group(0) @binding(6) var<storage, read_write> weights: array<f32>;  // (M, 3): largest, sum, pixels so far
 
 @compute @workgroup_size(LANES)
 fn gradients(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let i = group_of(group) * LANES + lane;
     if (i >= u.count) { return; }
     var found: array<f32, PAIR_SUMS>;
+    for (var k = 0u; k < u.columns; k++) { found[k] = sums[i * SUMS + k]; }
+    for (var k = 0u; k < 3u; k++) { found[RED + k] = by_colours[i * 3u + k]; }
     let end = spans[i].x + spans[i].y;
     for (var pair = spans[i].x; pair < end; pair++) {
         for (var k = 0u; k < PAIR_SUMS; k++) { found[k] += pair_sums[pair * PAIR_SUMS + k]; }
     }
-    for (var k = 0u; k < u.columns; k++) { sums[i * SUMS + k] += found[k]; }
+    for (var k = 0u; k < u.columns; k++) { sums[i * SUMS + k] = found[k]; }
     for (var k = 0u; k < 3u; k++) { by_colours[i * 3u + k] = found[RED + k]; }
 }
 
@@ -29,7 +32,7 @@ fn gradients(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_inde
 fn contributions(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let i = group_of(group) * LANES + lane;
     if (i >= u.count) { return; }
-    var found = vec3f(0.0);
+    var found = vec3f(weights[i * 3u], weights[i * 3u + 1u], weights[i * 3u + 2u]);
     let end = spans[i].x + spans[i].y;
     for (var pair = spans[i].x; pair < end; pair++) {
         let at = pair * 3u;
