@@ -94,6 +94,15 @@ def link_or_copy(source: Path, target: Path) -> None:
             beside.unlink(missing_ok=True)
 
 
+def check_folder(folder: Path, remedy: str) -> None:
+    """Raises LodgsError, with that remedy, where there is no such folder."""
+    if folder.is_file():
+        packed = folder.suffix.lower() in (".zip", ".r3d", ".7z", ".rar", ".tar", ".gz")
+        raise LodgsError(f"{folder} is a file, not a folder.", "Unpack it first." if packed else remedy)
+    if not folder.is_dir():
+        raise LodgsError(f"There is no folder {folder}.", remedy)
+
+
 def open_regular(path: str | Path) -> BinaryIO:
     """Opens a file for reading; unlike ``open`` it never waits for a pipe's other end, or reads a device.
 

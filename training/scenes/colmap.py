@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LodgsError, printable
+from ..files import check_folder
 from .cameras import FARTHEST, Camera, evenly, extent_of
 from .images import image_size, quarter_turns
 from .model import (
@@ -139,8 +140,7 @@ def find_models(folder: Path) -> list[Path]:
         LodgsError: there is no such folder.
     """
     folder = _absolute(folder)
-    if not folder.is_dir():
-        raise LodgsError(f"There is no folder {folder}.", "Choose the folder of a COLMAP scene.")
+    check_folder(folder, "Choose the folder of a COLMAP scene.")
     found, level, seen = [], [folder], {os.path.realpath(folder)}
     around = [str(parent) for parent in Path(os.path.realpath(folder)).parents]
     seen.update(around)  # a link upwards leads out of the scene

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LodgsError
-from ..files import atomic_write, link_or_copy
+from ..files import atomic_write, check_folder, link_or_copy
 from . import apart
 from .colmap import MASKS, find_models, told
 from .images import SUFFIXES, check_mask, image_size, load_image, write_png
@@ -44,6 +44,11 @@ STAGES = {
 }
 
 _WEBP = ".webp"
+_UNREAD = (
+    ".heic", ".heif", ".avif", ".jxl", ".jp2", ".bmp", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf",
+    ".rw2", ".pef",
+)  # fmt: skip
+"""How names of photographs end that are not read, in lower case."""
 _TABLES = {"features": "descriptors", "pairs": "two_view_geometries"}
 """Of COLMAP's database, which have a row for each that is done."""
 _LOOKS = 0.5
@@ -151,7 +156,8 @@ def reconstruct(
         with atomic_write(work / "pairs.png") as temporary:
             write_png(temporary, pairs_picture(names, found["pairs"], found["placed"]))
         if len(found["placed"]) < FEWEST:
-            raise LodgsError(*_nothing(names, found, work))
+            what, remedy = _nothing(names, found, work)
+            raise LodgsError(" ".join([what, *told(left_out)]), remedy)
         (out / "sparse").mkdir(exist_ok=True)
         shutil.rmtree(out / "sparse" / "0", ignore_errors=True)
         os.replace(work / "model", out / "sparse" / "0")
@@ -229,13 +235,23 @@ def _photographs(
     photos: Path, masks: Path | None
 ) -> tuple[list[str], list[tuple[str, str]], set[tuple[int, int]]]:
     """Names of what can be read, by name; other pictures and why not; and the sizes that there are."""
-    if not photos.is_dir():
-        raise LodgsError(f"There is no folder {photos}.", "Choose the folder of the photographs.")
+    remedy = "Choose the folder of the photographs; of a video make one: blender --command lodgs frames."
+    check_folder(photos, remedy)
     names, left_out, sizes = [], [], set()
-    for path in sorted(photos.rglob("*")):
-        hidden = any(part.startswith(".") for part in path.relative_to(photos).parts)
-        if hidden or path.suffix.lower() not in SUFFIXES or (masks and path.is_relative_to(masks)):
-            continue
+    files = [
+        path
+        for path in sorted(photos.rglob("*"))
+        if not any(part.startswith(".") for part in path.relative_to(photos).parts)
+        and not (masks and path.is_relative_to(masks))
+    ]
+    taken = [path for path in files if path.suffix.lower() in SUFFIXES]
+    taken = taken or [path for path in files if path.suffix.lower() == ".exr"]  # else they are depth maps
+    known = {path.with_suffix("") for path in taken}
+    for path in files:
+        if path.suffix.lower() in _UNREAD and path.with_suffix("") not in known:
+            kind = path.suffix[1:].upper()
+            left_out.append((path.relative_to(photos).as_posix(), f"{kind} is not read. Make JPEGs of them."))
+    for path in taken:
         name = path.relative_to(photos).as_posix()
         try:
             sizes.add(image_size(path))

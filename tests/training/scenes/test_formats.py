@@ -530,6 +530,18 @@ def test_damaged_xml(tmp_path, text):
         convert(tmp_path)
 
 
+def test_an_export_in_a_folder_of_its_own(tmp_path):
+    """As unpacking leaves it."""
+    write_transforms(tmp_path / "scan" / "scan")
+    made = convert(tmp_path / "scan")
+    assert made.views == 3
+    names = [f"scan/images/{name}" for name in NAMES]
+    check(tmp_path / "scan", [pixels(*seen(pose)) for pose in poses()], names)
+    write_transforms(tmp_path / "two" / "a")
+    write_transforms(tmp_path / "two" / "b")
+    assert find_export(tmp_path / "two") is None
+
+
 def test_what_is_no_export(tmp_path):
     assert find_export(tmp_path) is None
     with pytest.raises(LodgsError, match="is no export that is known"):

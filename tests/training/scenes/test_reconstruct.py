@@ -14,7 +14,8 @@ from training.__main__ import main
 from training.errors import LodgsError
 from training.scenes.cameras import look_at
 from training.scenes.colmap import read_scene
-from training.scenes.images import write_png
+from training.scenes.exr import write_exr
+from training.scenes.images import load_image, write_png
 from training.scenes.reconstruct import pairs_picture, reconstruct
 
 from .synthetic import noise, write_image
@@ -146,7 +147,33 @@ def test_unrelated_photographs_end_in_a_sentence(tmp_path, capsys):
     assert not (tmp_path / "out" / "sparse").exists()
 
 
+def test_linear_light_alone_is_photographs(photos, tmp_path):
+    for path in photos.iterdir():
+        codes = load_image(path, WIDTH, HEIGHT)
+        light = np.where(codes < 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
+        (tmp_path / "exr").mkdir(exist_ok=True)
+        write_exr(
+            tmp_path / "exr" / f"{path.stem}.exr", dict(zip("RGB", np.moveaxis(light, 2, 0), strict=True))
+        )
+    found = reconstruct(tmp_path / "exr", tmp_path / "out", lens="one")
+    assert found.placed == sorted(f"{path.stem}.exr" for path in photos.iterdir())
+
+
+def test_what_is_not_read_is_named(tmp_path, capsys):
+    for number in range(4):
+        write_png(tmp_path / f"{number}.png", np.full((100, 100, 3), 90, np.uint8))
+    for name in ("0.CR2", "5.HEIC", "6.png"):  # a raw beside its picture is nothing that is missing
+        (tmp_path / name).write_bytes(b"other")
+    assert main(["scene", "--photos", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert "5.HEIC is left out: HEIC is not read. Make JPEGs of them." in said
+    assert "6.png is left out" in said and "0.CR2" not in said
+
+
 def test_what_cannot_be(photos, tmp_path):
+    (tmp_path / "photos.zip").write_bytes(b"PK")
+    with pytest.raises(LodgsError, match=r"photos.zip is a file, not a folder\. Unpack it first\."):
+        reconstruct(tmp_path / "photos.zip", tmp_path / "out")
     with pytest.raises(LodgsError, match="There is no folder"):
         reconstruct(tmp_path / "nowhere", tmp_path / "out")
     write_image(tmp_path / "few" / "a.png", noise())

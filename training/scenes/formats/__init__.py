@@ -16,7 +16,7 @@ from types import ModuleType
 import numpy as np
 
 from ...errors import LodgsError
-from ...files import link_or_copy
+from ...files import check_folder, link_or_copy
 from ..cameras import Camera
 from ..colmap import DEPTHS, MASKS, find_models, told
 from ..images import alike, image_size
@@ -51,15 +51,21 @@ class Converted:
 
 
 def find_export(folder: Path) -> tuple[ModuleType, Path] | None:
-    """The format that a folder is of, and the file or folder that it is read from; or None.
+    """The format that a folder is of, or one of the folders in it, and what it is read from; or None.
 
     Only names are looked at, and of small files their begin.
     """
     for each in FORMATS:
-        path = each.find(folder)
-        if path is not None:
+        if path := each.find(folder):
             return each, path
-    return None
+    try:
+        below = [path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != "."]
+    except OSError:
+        return None
+    # what was packed as a folder is unpacked into another
+    found = [[(each, path) for each in FORMATS if (path := each.find(place))] for place in below]
+    found = [formats[0] for formats in found if formats]
+    return found[0] if len(found) == 1 else None
 
 
 def colmap_scene(folder: Path, warn: Callable[[str], object]) -> Path:
@@ -84,8 +90,7 @@ def convert(folder: Path, out: Path | None = None) -> Converted:
     Raises:
         LodgsError: it is of no known format, damaged, or the scene cannot be written.
     """
-    if not folder.is_dir():
-        raise LodgsError(f"There is no folder {folder}.", "Choose the folder that a program has exported.")
+    check_folder(folder, "Choose the folder that a program has exported.")
     found = find_export(folder)
     if found is None:
         is_scene = bool(find_models(folder))
