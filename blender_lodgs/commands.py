@@ -250,8 +250,10 @@ def _capture(args: argparse.Namespace) -> int:
     try:
         with _interrupts():
             count = render_views(bpy.context, folder, width, height, args.range, tell)
-            rendered = f"{folder}: {min(args.range[1], count)} of {count}" if args.range else ""
-            _print(rendered or write_model(folder))
+            if args.range:
+                _print(f"{folder}: views {args.range[0]} to {min(args.range[1], count)} of {count}")
+            else:
+                _print(write_model(folder))
     except KeyboardInterrupt:
         _print("Cancelled. The same command goes on from here.")
         return CANCELLED
@@ -283,7 +285,10 @@ def _range(text: str) -> tuple[int, int]:
 def _open(blend: Path) -> None:
     if not blend.is_file():
         raise LodgsError(f"There is no file {blend}.")
-    bpy.ops.wm.open_mainfile(filepath=str(blend.resolve()))
+    try:
+        bpy.ops.wm.open_mainfile(filepath=str(blend.resolve()))
+    except RuntimeError as error:
+        raise LodgsError(f"{blend} cannot be opened.", "Choose a .blend, not of a newer Blender.") from error
 
 
 def _info(args: argparse.Namespace) -> int:

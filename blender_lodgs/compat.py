@@ -153,6 +153,13 @@ def compositor_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
     return tree
 
 
+def composites(scene: bpy.types.Scene) -> bool:
+    """Whether a render's picture is what a compositor makes of it."""
+    if hasattr(scene, "compositing_node_group"):
+        return scene.render.use_compositing and scene.compositing_node_group is not None
+    return scene.render.use_compositing and scene.use_nodes and scene.node_tree is not None
+
+
 def reset_compositor(scene: bpy.types.Scene) -> None:
     """Makes the compositor of a scene what it is before anybody has worked on it."""
     if hasattr(scene, "compositing_node_group"):

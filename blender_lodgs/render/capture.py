@@ -143,8 +143,11 @@ def _prepare(scene: bpy.types.Scene, width: int, height: int) -> None:
     render.use_border = render.use_multiview = render.use_sequencer = render.use_motion_blur = False
     render.use_stamp = False
     render.use_persistent_data = True
-    for layer in scene.view_layers:
+    used = [layer for layer in scene.view_layers if layer.use]
+    for layer in used:
         layer.use_pass_z = True
+        # a picture that nobody composes is the first one's, and depths are to be of what it shows
+        layer.use = layer == used[0] or compat.composites(scene)
     trees = [getattr(scene, "node_tree", None), *bpy.data.node_groups]
     for tree in filter(None, trees):
         for node in tree.nodes:

@@ -132,6 +132,31 @@ def test_depths_are_where_rays_through_pixels_meet_surfaces(bpy, scene, capture,
 
 
 @needs_trainer
+def test_depths_are_of_the_view_layers_that_pictures_show(bpy, lodgs, scene, capture, tmp_path):
+    """Blender's picture is the first layer's, or what a compositor makes of all."""
+    apart = bpy.data.collections.new("Apart")
+    scene.collection.children.link(apart)
+    cube = bpy.data.objects["Cube"]
+    cube.users_collection[0].objects.unlink(cube)
+    apart.objects.link(cube)
+    scene.view_layers.new("Second")
+    scene.view_layers[0].layer_collection.children["Apart"].exclude = True
+    new_camera(bpy, (2.5, 1.5, 9), (0, 0, 0))
+    new_camera(bpy, (2.5, 1.6, 9), (0, 0, 0))
+    assert capture("--cameras", "--range", "1-1") == 0
+    assert depth_of(tmp_path / "out", "view_0001")[24, 32] == pytest.approx(9, abs=1e-3)
+    scene = bpy.context.scene
+    for layer in scene.view_layers:
+        layer.use = True
+    tree = lodgs("compat").compositor_tree(scene)
+    tree.nodes.clear()
+    picture = lodgs("compat").compositor_output(tree)
+    tree.links.new(tree.nodes.new("CompositorNodeRLayers").outputs["Image"], picture)
+    assert capture("--cameras", "--range", "1-1", out="both") == 0
+    assert depth_of(tmp_path / "both", "view_0001")[24, 32] == pytest.approx(7, abs=1e-3)
+
+
+@needs_trainer
 def test_the_model_imports_with_points_on_the_scenes_surfaces(bpy, scene, capture, tmp_path):
     assert capture("--around", "--views", "8") == 0
     assert not (tmp_path / "out" / ".model.tmp").exists()
