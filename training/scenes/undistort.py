@@ -25,7 +25,7 @@ from .images import exr_light, load_image, load_mask, write_png
 
 CACHE = ".undistorted"
 """Folder in a scene's of what is made of it once, for all runs and for Blender."""
-_VERSION = b"3"  # of what is kept in the cache
+_VERSION = b"4"  # of what is kept in the cache
 _BENT = "bent"
 """Folder of where in a photograph each pixel of the straight one is, as shares of its sides."""
 _LEFT = 86_400.0
@@ -88,7 +88,9 @@ def _read(target: Path, scene: Scene) -> Scene:
     result = read_scene(target, model=target / "sparse", images=target / "images")
     missing = {camera.name for camera in scene.cameras} - {camera.name for camera in result.cameras}
     lost = [f"{name} is left out: its lens distortion could not be undone." for name in sorted(missing)]
-    return replace(result, warnings=[*scene.warnings, *lost])
+    turns = {camera.name: camera.turns for camera in scene.cameras}
+    cameras = [replace(camera, turns=turns[camera.name]) for camera in result.cameras]
+    return replace(result, cameras=cameras, warnings=[*scene.warnings, *lost])
 
 
 def _key(scene: Scene) -> str:
@@ -150,8 +152,8 @@ def _undistort_into(target: Path, scene: Scene) -> None:
 
 
 def _is_foreign(camera: Camera) -> bool:
-    """Whether pycolmap does not read a photograph of this kind, or loses its light."""
-    return camera.name.lower().endswith((".webp", ".exr"))
+    """Whether pycolmap does not read a photograph of this kind, loses its light, or writes what few read."""
+    return camera.name.lower().endswith((".webp", ".exr", ".tif", ".tiff"))
 
 
 def _straighten_here(camera: Camera, places: np.ndarray, out: Path) -> None:

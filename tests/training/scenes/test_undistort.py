@@ -65,10 +65,13 @@ def test_an_ideal_fisheye_is_undone_too(tmp_path):
     assert abs(80 * (tangent - np.arctan(tangent))) > 1
 
 
-@pytest.mark.parametrize("suffix", ["webp", "exr", "tif"])
+@pytest.mark.parametrize("suffix", ["webp", "exr", "tif", "tiff"])
 def test_kinds_that_pycolmap_does_not_read_are_straightened_like_a_png(tmp_path, suffix):
-    """In floats and over 1, where they are linear."""
-    synthetic.write_scene(tmp_path, synthetic.camera("OPENCV"), names=["a.png"], pixels=ramps())
+    """In floats and over 1, where they are linear; a TIFF of grey floats as the grey PNG."""
+    grey = np.repeat(ramps()[..., :1], 3, axis=2)
+    synthetic.write_scene(
+        tmp_path, synthetic.camera("OPENCV"), names=["a.png"], pixels=grey if suffix == "tiff" else ramps()
+    )
     (plain,) = undistorted(read_scene(tmp_path), tmp_path / "cache").cameras
     model, path = pycolmap.Reconstruction(tmp_path / "sparse/0"), tmp_path / "images" / f"a.{suffix}"
     (image,) = model.images.values()
@@ -78,8 +81,12 @@ def test_kinds_that_pycolmap_does_not_read_are_straightened_like_a_png(tmp_path,
         light = linear_from_srgb(ramps() / 255) * 4
         OpenEXR.File({"type": OpenEXR.scanlineimage}, {"RGB": light.astype(np.float32)}).write(str(path))
     else:  # by another process: Pillow's writing beside pycolmap corrupts memory
+        change = (
+            "convert('F').point(lambda code: code * (1 / 255) + 0)" if suffix == "tiff" else "convert('RGB')"
+        )
         program = (
-            "import sys; from PIL import Image; Image.open(sys.argv[1]).save(sys.argv[2], lossless=True)"
+            "import sys; from PIL import Image; "
+            f"Image.open(sys.argv[1]).{change}.save(sys.argv[2], lossless=True, tiffinfo={{274: 6}})"
         )
         subprocess.run([sys.executable, "-c", program, tmp_path / "images" / "a.png", path], check=True)
     (camera,) = undistorted(read_scene(tmp_path), tmp_path / "cache").cameras
@@ -88,6 +95,7 @@ def test_kinds_that_pycolmap_does_not_read_are_straightened_like_a_png(tmp_path,
     size = camera.width, camera.height
     found = load_image(camera.image, *size, exposure=-2 if suffix == "exr" else 0)
     np.testing.assert_allclose(found, load_image(plain.image, *size), atol=3 / 255)
+    assert camera.turns == ("tif" in suffix)
 
 
 def test_names_sizes_and_missing_images(tmp_path):
