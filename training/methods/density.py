@@ -32,8 +32,8 @@ def peak_scores(model: Model) -> torch.Tensor:
 
     LODGE, Eq. 6, after H3DGS: gradients in 3DGS units, radii of three standard deviations in pixels.
     """
-    gradient, radius = (model.stats[name] for name in PEAKS)
-    return gradient * radius * model["opacity_logits"].detach().sigmoid() ** 0.2
+    gradient, radius, logits = (model.look(name) for name in (*PEAKS, "opacity_logits"))
+    return gradient * radius * logits.sigmoid() ** 0.2
 
 
 @torch.no_grad()
@@ -71,14 +71,15 @@ def densify(
         chosen = chosen[order[:room]].sort().values
     if len(chosen) == 0:
         return 0
-    scales = model["log_scales"][chosen].exp() + min_scale
+    rows = model.rows(chosen)
+    scales = rows["log_scales"].exp() + min_scale
     cloned = scales.amax(1) <= (-torch.inf if clone_below is None else clone_below)
-    clones = model.rows(chosen[cloned])
+    clones = {name: row[cloned] for name, row in rows.items()}
     parents, scales = chosen[~cloned], scales[~cloned]
+    children = {name: torch.cat([row[~cloned]] * 2) for name, row in rows.items()}
     if clone_below is None:
-        children, scales = along_longest_axis(model.rows(parents.repeat(2)), scales)
+        children, scales = along_longest_axis(children, scales)
     else:
-        children = model.rows(parents.repeat(2))
         children["means"] += sample_inside(children["quats"], scales.repeat(2, 1), rng)
         scales = (scales / 1.6).repeat(2, 1)
     children["log_scales"] = constrained_log(scales, min_scale)
@@ -113,13 +114,13 @@ def along_longest_axis(
 
 def prune(model: Model, min_opacity: float) -> None:
     """Removes splats below an opacity."""
-    model.keep(model["opacity_logits"].detach().sigmoid() >= min_opacity)
+    model.keep(model.look("opacity_logits").sigmoid() >= min_opacity)
 
 
 def reset_opacities(model: Model) -> None:
     """Opacities fall to RESET_OPACITY at most, from where only splats that are needed rise again."""
     most = float(np.log(RESET_OPACITY / (1 - RESET_OPACITY)))
-    model.assign("opacity_logits", model["opacity_logits"].detach().clamp_max(most))
+    model.assign("opacity_logits", model.look("opacity_logits").clamp_max(most))
 
 
 def require_rows(model: Model, step: int, limit: str) -> None:

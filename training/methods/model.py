@@ -31,7 +31,8 @@ class Model:
     """N splats (or anchors of splats) under optimisation.
 
     Plain splats may be trained by the backend itself (:meth:`twin`). Whoever asks for the optimizer, a tensor
-    or statistics has them brought home before.
+    or ``stats`` has them brought home before; all else (:meth:`look`, :meth:`rows`, :meth:`keep`, ...) leaves
+    them there.
 
     Attributes:
         adam: the optimizer, which holds the trained tensors by name and their moments; ``means`` is one.
@@ -65,7 +66,7 @@ class Model:
             self.stats |= {name: blank.clone() for name in PEAKS}
 
     def __len__(self) -> int:
-        return len(self._adam.tensors["means"])
+        return len(self._adam.tensors["means"] if self._twin is None else self._twin)
 
     def __getitem__(self, name: str) -> torch.Tensor:
         return self.adam.tensors[name]
@@ -103,9 +104,20 @@ class Model:
         return self._twin
 
     def look(self, name: str) -> torch.Tensor:
-        """A trained tensor's values as they are now, to read only: what is trained elsewhere stays there."""
-        twin = self._twin
-        return self._adam.tensors[name].detach() if twin is None else twin.look(name)
+        """A trained tensor's or a statistic's values, to read only: what is trained elsewhere stays there."""
+        if self._twin is not None and (name in NAMES or name in self._stats):
+            return self._twin.look(name)
+        return self._stats[name] if name in self._stats else self._adam.tensors[name].detach()
+
+    @property
+    def _here(self) -> list[str]:
+        """The trained tensors that are at home."""
+        return [name for name in self._adam.tensors if self._twin is None or name not in NAMES]
+
+    @property
+    def _columns_here(self) -> list[dict[str, torch.Tensor]]:
+        """What is kept of every row at home beside them."""
+        return [self.columns, self._stats] if self._twin is None else [self.columns]
 
     def _come_home(self) -> None:
         twin, self._twin = self._twin, None
@@ -119,32 +131,39 @@ class Model:
 
     def rows(self, index: torch.Tensor) -> dict[str, torch.Tensor]:
         """A copy of the trained tensors at indices (M,), by name."""
-        return {name: tensor.detach()[index] for name, tensor in self.adam.tensors.items()}
+        here = {name: self._adam.tensors[name].detach()[index] for name in self._here}
+        return here if self._twin is None else here | self._twin.rows(index)
 
     @torch.no_grad()
     def keep(self, mask: torch.Tensor) -> None:
         """Removes the rows where ``mask`` (N,), on any device, is False."""
-        mask = mask.to(self["means"].device)
-        for name in list(self.adam.tensors):
-            first, second = self.adam.state[name]
-            self._replace(name, self[name][mask], first[mask], second[mask])
-        for kept in (self.columns, self.stats):
+        mask = mask.to(self._adam.tensors["means"].device)
+        if not mask.any():
+            self._come_home()
+        if self._twin is not None and not mask.all():
+            self._twin.keep(torch.nonzero(mask).squeeze(1))
+        for name in self._here:
+            first, second = self._adam.state[name]
+            self._replace(name, self._adam.tensors[name][mask], first[mask], second[mask])
+        for kept in self._columns_here:
             kept.update({name: column[mask] for name, column in kept.items()})
 
     @torch.no_grad()
     def append(self, rows: Mapping[str, torch.Tensor]) -> None:
         """Adds rows at the end: every trained tensor's, and columns. Moments start at zero, as in 3DGS."""
         added = len(rows["means"])
-        for kept in (self.columns, self.stats):
+        if self._twin is not None and added:
+            self._twin.append({name: rows[name] for name in NAMES})
+        for kept in self._columns_here:
             for name, column in kept.items():
                 blank = column.new_zeros(added, *column.shape[1:])
                 kept[name] = torch.cat([column, rows.get(name, blank)])
-        for name in list(self.adam.tensors):
-            first, second = self.adam.state[name]
+        for name in self._here:
+            first, second = self._adam.state[name]
             blank = torch.zeros_like(rows[name])
             self._replace(
                 name,
-                torch.cat([self[name], rows[name]]),
+                torch.cat([self._adam.tensors[name], rows[name]]),
                 torch.cat([first, blank]),
                 torch.cat([second, blank]),
             )
@@ -152,7 +171,10 @@ class Model:
     @torch.no_grad()
     def assign(self, name: str, values: torch.Tensor) -> None:
         """Gives a trained tensor new values and zero moments."""
-        self._replace(name, values, torch.zeros_like(values), torch.zeros_like(values))
+        if self._twin is not None and name in NAMES:
+            self._twin.assign(name, values)
+        else:
+            self._replace(name, values, torch.zeros_like(values), torch.zeros_like(values))
 
     @torch.no_grad()
     def keep_above(self, least: torch.Tensor) -> None:
@@ -192,15 +214,18 @@ class Model:
 
     def reset_stats(self) -> None:
         """Begins anew with what is added up."""
+        if self._twin is not None:
+            self._twin.reset_stats()
+            return
         for name, column in self.stats.items():
             self.stats[name] = torch.zeros_like(column)
 
     def mean_gradient(self) -> torch.Tensor:
         """Mean norm of the image-plane gradient over the views that drew each splat; as ``gradient_sum``."""
-        return self.stats["gradient_sum"] / self.stats["seen"].clamp_min(1)
+        return self.look("gradient_sum") / self.look("seen").clamp_min(1)
 
     def _replace(self, name: str, tensor: torch.Tensor, first: torch.Tensor, second: torch.Tensor) -> None:
-        self.adam.replace(name, tensor.requires_grad_(True), first, second)
+        self._adam.replace(name, tensor.requires_grad_(True), first, second)
 
     def state_dict(self) -> dict:
         """Tensors and numbers, as ``torch.load(weights_only=True)`` reads them."""

@@ -9,7 +9,7 @@ reference's signatures, imported when it is first used.
 from __future__ import annotations
 
 import gc
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
@@ -281,6 +281,8 @@ def photometric_loss(
 class Twin(Protocol):
     """Splats that a backend trains where it draws them: what is here in the meantime is what they were."""
 
+    def __len__(self) -> int: ...
+
     def step(
         self,
         camera: Camera,
@@ -311,18 +313,34 @@ class Twin(Protocol):
         ...
 
     def look(self, name: str) -> torch.Tensor:
-        """A tensor's values as they are now; all others stay where they are."""
+        """A tensor's values, or a statistic's, as they are now; all others stay where they are."""
         ...
+
+    def rows(self, index: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Tensors' values at indices (M,), by name."""
+        ...
+
+    def keep(self, index: torch.Tensor) -> None:
+        """Only the splats at indices (M,), at least one, stay, in this order."""
+
+    def append(self, rows: Mapping[str, torch.Tensor]) -> None:
+        """Adds splats at the end, at least one, with moments and statistics of zero."""
+
+    def assign(self, name: str, values: torch.Tensor) -> None:
+        """Gives a tensor new values and zero moments."""
+
+    def reset_stats(self) -> None:
+        """Begins anew with what is added up."""
 
     def keep_above(self, least: torch.Tensor) -> None:
         """No log-scale of a splat is below its least one (N,) from here."""
 
     def bring_home(self) -> None:
-        """Makes what is here what has become of it, in place."""
+        """Makes of what is here what has become of it: other tensors in the same places."""
 
 
 def twin_of(
-    backend: str, adam: Adam, stats: Mapping[str, torch.Tensor], *, antialias: bool = False
+    backend: str, adam: Adam, stats: MutableMapping[str, torch.Tensor], *, antialias: bool = False
 ) -> Twin | None:
     """What a model trains, where a backend can train it by itself; None where it cannot.
 

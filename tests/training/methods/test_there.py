@@ -2,12 +2,17 @@
 
 import io
 
+import numpy as np
 import pytest
 import torch
 
 from training.methods import METHODS, create
+from training.methods.density import densify, prune, reset_opacities
 from training.methods.model import Model
 from training.methods.parameters import override
+from training.methods.start import from_points
+from training.rasterize import Target
+from training.scenes.cameras import Camera
 
 COMMON = {"margin": 0.0, "grad_threshold": 1e-6, "max_splats": 90}
 CASES = {
@@ -59,6 +64,64 @@ def test_methods_do_there_what_they_do_here(name, data, there):
     assert losses == pytest.approx(expected, rel=2e-2)
     assert losses[0] == pytest.approx(expected[0], rel=5e-4)  # photographs there have eight bits
     assert len(method.model) == pytest.approx(len(other.model), rel=0.05)
+
+
+def trained(count: int) -> Model:
+    """Splats after two steps on the device, which have columns here, one of them trained."""
+    rng = np.random.default_rng(0)
+    points, colors = rng.uniform((-1, -1, 2), (1, 1, 4), (count, 3)), rng.integers(0, 255, (count, 3))
+    tensors = from_points(points, colors, sh_degree=3) | {"decay": torch.arange(float(count))}
+    tensors["opacity_logits"] = torch.linspace(-8, 4, count)
+    rates = dict.fromkeys(tensors, 1e-3)
+    model = Model(tensors, rates, columns={"level": torch.arange(float(count))}, peaks=True)
+    twin, camera = model.twin("gpu", False), Camera("", 75, 50, 60.0, 60.0, 37.5, 25.0, np.eye(4))
+    assert twin is not None
+    target = Target(rng.integers(0, 256, (50, 75, 3)) / np.float32(255))
+    for _ in range(2):
+        twin.step(camera, target, near=0.2, sh_degree=3, background=(0, 0, 0), ssim_weight=0.2, shrink=1)
+    return model
+
+
+def control_density(model: Model) -> None:
+    """As 3DGS does: a tenth of the splats become two, faint ones go, opacities fall."""
+    gradients, rng = model.mean_gradient(), np.random.default_rng(0)
+    threshold = float(gradients.quantile(0.9))
+    assert densify(model, gradients, threshold=threshold, clone_below=0.1, max_splats=10**6, rng=rng) > 50
+    prune(model, 0.005)
+    model.reset_stats()
+    reset_opacities(model)
+
+
+@pytest.mark.parametrize("most", [1 << 27, 160 << 10])
+def test_splats_come_and_go_there_as_they_do_here(graphics, monkeypatch, most):
+    """To the bit, also on a device that takes the moments of 384 at a time."""
+    monkeypatch.setattr(graphics, "most_bytes", most)
+    one, other = trained(1000), trained(1000)
+    other.adam.zero_grad()  # which brings it home
+    for model in (one, other):
+        control_density(model)
+        model.append({name: row[:0] for name, row in model.rows(torch.arange(3)).items()})
+        model.append(model.rows(torch.tensor([7, 7, 3])) | {"level": torch.ones(3)})
+        model.keep(torch.arange(len(model)) != 5)
+        model.assign("sh", 2 * model.look("sh"))
+    assert one._twin is not None and other._twin is None
+    for part, theirs in zip(_flat(one.state_dict()), _flat(other.state_dict()), strict=True):
+        assert torch.equal(part, theirs)
+    one.keep(torch.zeros(len(one), dtype=torch.bool))
+    assert len(one) == 0 and one._twin is None
+
+
+def test_density_control_moves_a_few_numbers_of_a_splat(graphics):
+    """Of which there are 750 bytes: those that it decides by, and the rows that come."""
+    model, before = trained(4000), graphics.moved
+    control_density(model)
+    assert model.twin("gpu", False) is not None and graphics.moved - before < 100 * 4000
+
+
+def _flat(state) -> list[torch.Tensor]:
+    if not isinstance(state, dict):
+        return [torch.as_tensor(state)]
+    return [part for name in sorted(state) for part in _flat(state[name])]
 
 
 def test_a_run_goes_on_elsewhere(data, there):

@@ -156,7 +156,7 @@ class Method(method.Method[FlodParameters, Drawing]):
         if due(p.prune_interval, local):
             prune(model, p.min_opacity)
         if due(p.overlap_interval, local) and level < p.levels:
-            model.keep(apart(model["means"].detach().cpu(), s_min / 2))
+            model.keep(apart(model.look("means").cpu(), s_min / 2))
         if due(p.opacity_reset_interval, local):
             reset_opacities(model)
         if before and not len(model):

@@ -115,7 +115,7 @@ def _free(schedule: Schedule, model: Model, means: torch.Tensor, level: torch.Te
         return schedule.tree.keys(means.detach().double().cpu().numpy(), level.long().cpu().numpy())
 
     proposed = keys(means, level)
-    taken = keys(model["means"], model.columns["level"])
+    taken = keys(model.look("means"), model.columns["level"])
     _, first = np.unique(proposed, return_index=True)
     free = np.sort(first[~np.isin(proposed[first], taken)])
     wanted = wanted_by_views(schedule, means[free].double().cpu().numpy(), level[free].cpu().numpy())
@@ -138,7 +138,7 @@ def unseen(
     Returns:
         Booleans in the shape of ``seen``.
     """
-    largest = torch.zeros_like(model.stats["seen"])
+    largest = torch.zeros_like(model.look("seen"))
     for view in range(len(schedule.data.train)):
         for shrink in schedule.shrinks():
             camera = schedule.data.camera(view, shrink)

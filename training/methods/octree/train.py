@@ -145,8 +145,8 @@ class Method(method.Method[OctreeParameters, Drawing]):
         rows |= {"level": level, "bias": model.columns["bias"][source]}
         rows = growing.with_room(self.schedule, model, rows, step, self.growth_limit(step))
 
-        opacity, stats = model["opacity_logits"].detach().sigmoid(), model.stats
-        faint = stats["opacity_sum"] < p.min_opacity * stats["seen"]
+        opacity = model.look("opacity_logits").sigmoid()
+        faint = model.look("opacity_sum") < p.min_opacity * model.look("seen")
         model.keep(~(faint | (opacity < min(p.min_opacity, ALPHA_MIN))))
         model.append(rows)
         model.reset_stats()
@@ -167,5 +167,5 @@ class Method(method.Method[OctreeParameters, Drawing]):
     def reassign_levels(self, step: int) -> None:
         """Splats that have become too wide or too narrow for their level move to one that they fit."""
         columns, newest = self.model.columns, self.level_at(step)
-        means, log_scales = self.model["means"].detach(), self.model["log_scales"].detach()
+        means, log_scales = self.model.look("means"), self.model.look("log_scales")
         columns["level"] = growing.fitting_levels(self.schedule, columns["level"], means, log_scales, newest)

@@ -10,7 +10,7 @@ plain splats can stay there (``twin``).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import MutableMapping
 from dataclasses import replace
 
 import numpy as np
@@ -62,7 +62,7 @@ def contributions(
     return largest, total, pixels.long(), torch.from_numpy(radii)
 
 
-def twin_of(adam: Adam, stats: Mapping[str, torch.Tensor], antialias: bool) -> Twin | None:
+def twin_of(adam: Adam, stats: MutableMapping[str, torch.Tensor], antialias: bool) -> Twin | None:
     """See :func:`training.rasterize.twin_of`."""
     if not {*COLUMNS, "sh"} <= set(adam.tensors) or not set(stats) <= set(STATS):
         return None

@@ -204,6 +204,20 @@ class Device:
                 self._device.queue.write_buffer(buffer.handle, 0, array.reshape(-1))
         return buffer
 
+    def extended(self, buffer: Buffer, count: int, rows: np.ndarray | None = None) -> Buffer:
+        """A copy with so many rows more at its end: zeros, or these; LodgsError as :meth:`empty`."""
+        before, *row = buffer.shape
+        found = self.empty(buffer.kind.type, before + count, *row)
+        self.submit()
+        with self._said():
+            encoder = self._device.create_command_encoder()
+            encoder.copy_buffer_to_buffer(buffer.handle, buffer.offset, found.handle, 0, buffer.size)
+            self._device.queue.submit([encoder.finish()])
+            if rows is not None:
+                self.moved += rows.nbytes
+                self._device.queue.write_buffer(found.handle, buffer.size, np.ascontiguousarray(rows))
+        return found
+
     def parts(self, **buffers: Buffer) -> Iterator[dict[str, Buffer]]:
         """The rows of buffers that have the same number of them, as many at a time as the device binds."""
         (count,) = {buffer.shape[0] for buffer in buffers.values()}
@@ -278,6 +292,10 @@ class Device:
         with self._said():
             data = self._device.queue.read_buffer(buffer.handle, buffer.offset + begin * row_size, size)
         return np.frombuffer(data, buffer.kind).reshape(shape)
+
+    def wait(self) -> None:
+        """Until what was recorded has run, and what it alone needed is free; LodgsError as :meth:`read`."""
+        self.read(self.empty(np.uint32, 1))
 
     def submit(self) -> None:
         """Let what was recorded begin; LodgsError: the device was lost."""

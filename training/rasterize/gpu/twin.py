@@ -6,7 +6,7 @@ device. Photographs stay there too, with eight bits a value, as long as their ``
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, MutableMapping
 
 import numpy as np
 import torch
@@ -30,6 +30,8 @@ TRAINED = 11
 """So many of them are trained; the weight and the filter follow."""
 STATS = ("gradient_sum", "seen", "gradient_max", "radius_max", "opacity_sum")
 """The statistics that a device adds up (train.wgsl)."""
+STATE = ("_splats", "_sh", "_splat_moments", "_sh_moments", "_counted")
+"""A twin's buffers of what lasts from step to step."""
 
 
 def packed(
@@ -53,7 +55,7 @@ class Twin:
 
     Args:
         adam: of what is trained, of which ``COLUMNS`` and ``sh`` go along.
-        stats: (N,) of each splat, by names of STATS.
+        stats: (N,) of each splat, by names of STATS; those that are brought home take their places.
         antialias: as of ``rasterize``.
 
     Raises:
@@ -61,17 +63,17 @@ class Twin:
     """
 
     def __init__(
-        self, device: Device, adam: Adam, stats: Mapping[str, torch.Tensor], antialias: bool
+        self, device: Device, adam: Adam, stats: MutableMapping[str, torch.Tensor], antialias: bool
     ) -> None:
         self.device, self._adam, self._stats, self._antialias = device, adam, stats, antialias
         arrays = {name: tensor.detach().numpy() for name, tensor in adam.tensors.items()}
         moments = {name: [m.numpy() for m in state] for name, state in adam.state.items()}
-        self._count, self._weighted = len(arrays["means"]), False
-        of_splats = np.empty((self._count, TRAINED, 2), np.float32)
+        count, self._weighted = len(arrays["means"]), False
+        of_splats = np.empty((count, TRAINED, 2), np.float32)
         for name, column in COLUMNS.items():
             for k, moment in enumerate(moments[name]):
-                of_splats[:, column, k] = moment.reshape(self._count, -1)
-        counted = np.zeros((self._count, len(STATS)), np.float32)
+                of_splats[:, column, k] = moment.reshape(count, -1)
+        counted = np.zeros((count, len(STATS)), np.float32)
         for name, values in stats.items():
             counted[:, STATS.index(name)] = values.numpy()
         geometry = (arrays[name] for name in ("means", "quats", "log_scales", "opacity_logits"))
@@ -81,9 +83,11 @@ class Twin:
             self._splat_moments = device.upload(of_splats)
             self._sh_moments = device.upload(np.stack(moments["sh"], -1))
             self._counted = device.upload(counted)
-            self._by_splats = device.empty(np.float32, self._count, BY_SPLAT)
-            self._by_sh = device.empty(np.float32, *self._sh.shape)
+            self._make_room()
         self.drawn = device.empty(np.float32, 0, 0, 4)
+
+    def __len__(self) -> int:
+        return self._splats.shape[0]
 
     def step(
         self,
@@ -109,7 +113,7 @@ class Twin:
         Raises:
             LodgsError: the device was lost, or has too little memory. The splats are lost with it.
         """
-        device, count = self.device, self._count
+        device, count = self.device, len(self)
         settings = Settings(View.of(camera, near), min_scale, self._antialias, background, sh_degree)
         with device.lock:
             self._weigh(weights)
@@ -144,16 +148,59 @@ class Twin:
         return drawn[..., :3], 1 - drawn[..., 3]
 
     def look(self, name: str) -> torch.Tensor:
-        """A tensor's values as they are now, a copy."""
-        device, like = self.device, self._adam.tensors[name]
+        """A tensor's values, or a statistic's, as they are now, a copy."""
+        device = self.device
         with device.lock:
             if name == "sh":
                 return torch.from_numpy(device.read(self._sh))
-            column = COLUMNS[name]
-            width = _width(column)
-            found = device.empty(np.float32, *like.shape)
-            self._run("look", {"width": width, "slot": column.start}, values=self._splats, totals=found)
-            return torch.from_numpy(device.read(found))
+            values, at = self._splats, COLUMNS.get(name)
+            if at is None:
+                values, at = self._counted, slice(STATS.index(name), STATS.index(name) + 1)
+            found = device.empty(np.float32, len(self), _width(at))
+            numbers = {"width": _width(at), "stride": values.shape[1], "slot": at.start}
+            self._run("look", numbers, values=values, totals=found)
+            return _as_trained(device.read(found))
+
+    def rows(self, index: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Tensors' values at indices (M,), by name, a copy."""
+        with self.device.lock:
+            wanted = self.device.upload(index.numpy().astype(np.uint32))
+            splats, sh = (self.device.read(self._taken(each, wanted)) for each in (self._splats, self._sh))
+        found = {name: _as_trained(splats[:, at]) for name, at in COLUMNS.items()}
+        return found | {"sh": torch.from_numpy(sh)}
+
+    def keep(self, index: torch.Tensor) -> None:
+        """Only the splats at indices (M,), at least one, stay, in this order."""
+        with self.device.lock:
+            wanted = self.device.upload(index.numpy().astype(np.uint32))
+            self._change(lambda name, buffer: self._taken(buffer, wanted))
+
+    def append(self, rows: Mapping[str, torch.Tensor]) -> None:
+        """Adds splats at the end, at least one, with moments and statistics of zero."""
+        arrays = {name: tensor.detach().numpy() for name, tensor in rows.items()}
+        geometry = (arrays[name] for name in ("means", "quats", "log_scales", "opacity_logits"))
+        added = {"_splats": packed(*geometry, weights=1, filtered=self._antialias), "_sh": arrays["sh"]}
+        count = len(arrays["means"])
+        with self.device.lock:
+            self._change(lambda name, buffer: self.device.extended(buffer, count, added.get(name)))
+
+    def assign(self, name: str, values: torch.Tensor) -> None:
+        """Gives a tensor new values and zero moments."""
+        device = self.device
+        with device.lock:
+            given = device.upload(values.numpy())
+            if name == "sh":
+                self._sh, self._sh_moments = given, device.empty(np.float32, *self._sh_moments.shape)
+                return
+            at = COLUMNS[name]
+            self._run("put", {"width": _width(at), "slot": at.start}, parts=given, values=self._splats)
+            numbers = {"width": 2 * _width(at), "stride": 2 * TRAINED, "slot": 2 * at.start}
+            blank = device.empty(np.float32, len(self), numbers["width"])
+            self._run("put", numbers, parts=blank, values=self._splat_moments)
+
+    def reset_stats(self) -> None:
+        """Begins anew with what is added up."""
+        self._counted = self.device.empty(np.float32, *self._counted.shape)
 
     def keep_above(self, least: torch.Tensor) -> None:
         """No log-scale of a splat is below its least one (N,) from here."""
@@ -162,7 +209,7 @@ class Twin:
             self._run("widen", {}, parts=self.device.upload(lowest), values=self._splats)
 
     def bring_home(self) -> None:
-        """Makes tensors, moments and statistics here what they are on the device, in place."""
+        """Makes tensors, moments and statistics here what they are on the device."""
         with self.device.lock:
             splats, sh, of_splats, of_sh, counted = map(
                 self.device.read,
@@ -171,22 +218,47 @@ class Twin:
         found = {
             name: (splats[:, at], of_splats[:, at, 0], of_splats[:, at, 1]) for name, at in COLUMNS.items()
         }
-        found["sh"] = sh, of_sh[..., 0], of_sh[..., 1]
         for name, arrays in found.items():
-            here = self._adam.tensors[name].detach(), *self._adam.state[name]
-            for tensor, array in zip(here, arrays, strict=True):
-                tensor.numpy()[:] = array.reshape(tensor.shape)
-        for name, values in self._stats.items():
-            values.numpy()[:] = counted[:, STATS.index(name)]
+            values, *moments = map(_as_trained, arrays)
+            self._adam.replace(name, values.requires_grad_(), *moments)
+        first, second = (torch.from_numpy(of_sh[..., k].copy()) for k in range(2))
+        self._adam.replace("sh", torch.from_numpy(sh).requires_grad_(), first, second)
+        for name in self._stats:
+            self._stats[name] = torch.from_numpy(counted[:, STATS.index(name)].copy())
+
+    def _make_room(self) -> None:
+        """For gradients of as many splats as there are."""
+        self._by_splats = self.device.empty(np.float32, len(self), BY_SPLAT)
+        self._by_sh = self.device.empty(np.float32, *self._sh.shape)
+
+    def _change(self, make: Callable[[str, Buffer], Buffer]) -> None:
+        """Puts others in the places of the buffers of STATE, one after the other: so few are there twice."""
+        del self._by_splats, self._by_sh
+        for name in STATE:
+            setattr(self, name, make(name, getattr(self, name)))
+            self.device.wait()
+        self._make_room()
+
+    def _taken(self, buffer: Buffer, index: Buffer) -> Buffer:
+        """The rows of a buffer at indices (M,)."""
+        device, row = self.device, buffer.shape[1:]
+        found, width = device.empty(np.float32, *index.shape, *row), int(np.prod(row))
+        for given in device.parts(source=buffer):
+            first = (given["source"].offset - buffer.offset) // (4 * width)
+            end = first + given["source"].shape[0]
+            for part in device.parts(index=index, taken=found):
+                count = width * part["index"].shape[0]
+                device.run("gather", "take", groups_of(count), (count, width, first, end), **given, **part)
+        return found
 
     def _weigh(self, weights: torch.Tensor | None) -> None:
         """Gives splats their weights; None: ones."""
         if weights is None and not self._weighted:
             return
-        ones = np.ones(self._count, np.float32)
+        ones = np.ones(len(self), np.float32)
         given = ones if weights is None else weights.numpy().astype(np.float32, copy=False)
         self._weighted = weights is not None
-        self._run("weigh", {}, parts=self.device.upload(given), values=self._splats)
+        self._run("put", {"slot": TRAINED}, parts=self.device.upload(given), values=self._splats)
 
     def _loss(self, target: Target, ssim_weight: float) -> tuple[Buffer, Buffer]:
         """What L1 and SSIM add up to (2,), and the gradient (H, W, 4) by the picture."""
@@ -248,6 +320,11 @@ def _numbers(
 ) -> tuple:
     """What train.wgsl is told."""
     return count, width, stride, by_stride, trained, slot, *adam, float(shrink)
+
+
+def _as_trained(values: np.ndarray) -> torch.Tensor:
+    """Columns (M, C) of splats as a tensor of its own, (M,) where there is but one."""
+    return torch.from_numpy(np.ascontiguousarray(values[:, 0] if values.shape[1] == 1 else values))
 
 
 def _width(columns: slice) -> int:

@@ -1,9 +1,11 @@
-// What a splat's pairs hold, added up in the order in which the splat met its tiles: the same bits every time, however
+// Rows brought together: those that are wanted of a buffer, and what a splat's pairs hold, added up in the order in which the splat met its tiles: the same bits every time, however
 // many bands the tiles are in.
 
 struct Parameters {
     count: u32,
-    columns: u32,  // of sums that are meant: features have no part in the absolute gradients
+    columns: u32,  // of sums that are meant: features have no part in the absolute gradients; or of rows
+    first: u32,  // row of all that the source begins with
+    end: u32,
 }
 @group(0) @binding(0) var<uniform> u: Parameters;
 @group(0) @binding(1) var<storage, read> spans: array<vec2u>;
@@ -12,6 +14,17 @@ struct Parameters {
 @group(0) @binding(4) var<storage, read_write> by_colours: array<f32>;  // (M, 3), added to
 @group(0) @binding(5) var<storage, read> pair_weights: array<f32>;  // (P, 3)
 @group(0) @binding(6) var<storage, read_write> weights: array<f32>;  // (M, 3): largest, sum, pixels so far
+@group(0) @binding(7) var<storage, read> index: array<u32>;  // rows that are wanted
+@group(0) @binding(8) var<storage, read> source: array<u32>;  // rows of whatever numbers
+@group(0) @binding(9) var<storage, read_write> taken: array<u32>;
+
+@compute @workgroup_size(LANES)
+fn take(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let k = group_of(group) * LANES + lane;
+    if (k >= u.count) { return; }
+    let row = index[k / u.columns];
+    if (row >= u.first && row < u.end) { taken[k] = source[(row - u.first) * u.columns + k % u.columns]; }
+}
 
 @compute @workgroup_size(LANES)
 fn gradients(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {

@@ -39,7 +39,6 @@ const STATS: u32 = 5;
 // Columns of splats and of their gradients (project.wgsl).
 const LOGIT: u32 = 3;
 const LOG_SCALES: u32 = 8;
-const WEIGHT: u32 = 11;
 const BY_MEAN2D: u32 = 12;
 // Moments below these are cut off, as on the processor.
 const M_TINY: f32 = 1e-30;
@@ -82,11 +81,11 @@ fn total(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) l
     }
 }
 
-// Weights of splats, one in each of parts.
+// Some columns of values, from the slot on, become what is in parts.
 @compute @workgroup_size(LANES)
-fn weigh(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
-    let i = group_of(group) * LANES + lane;
-    if (i < u.count) { values[i * u.stride + WEIGHT] = parts[i]; }
+fn put(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let k = group_of(group) * LANES + lane;
+    if (k < u.count) { values[k / u.width * u.stride + u.slot + k % u.width] = parts[k]; }
 }
 
 // Log-scales rise to the least one of each splat, in parts.
