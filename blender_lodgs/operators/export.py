@@ -147,7 +147,7 @@ class LODGS_OT_export_bundle(_Export, bpy.types.Operator):
             )
         bundle = scenes.read_levels(root, self.placed, self.looked)
         write_bundle(self._path(), bundle, self.order)
-        self.report({"INFO"}, f"{len(bundle.levels)} levels written to {self._path()}")
+        self.report({"INFO"}, f"{_levels(bundle)} written to {self._path()}")
         return {"FINISHED"}
 
 
@@ -273,7 +273,7 @@ class LODGS_OT_export_folder(_IntoFolder, bpy.types.Operator):
             raise LodgsError(f"{folder} already holds levels.", "Choose another folder, or tick Replace.")
         bundle = self._bundle(context)
         write_folder(folder, bundle)
-        self.report({"INFO"}, f"{len(bundle.levels)} levels written to {folder}")
+        self.report({"INFO"}, f"{_levels(bundle)} written to {folder}")
         return {"FINISHED"}
 
 
@@ -288,7 +288,12 @@ class LODGS_OT_export_streamed(_ForOthers, _IntoFolder, _Converting, bpy.types.O
         bundle = self._bundle(context)
         bundle = bundle if self.antialiased else without_filter(bundle)
         yield from self.told(write_streamed(self._folder(), bundle))
-        self.written = f"{len(bundle.levels)} levels written: {self._folder() / STREAMED}"
+        self.written = f"{_levels(bundle)} written: {self._folder() / STREAMED}"
+
+
+def _levels(bundle: Bundle) -> str:
+    count = len(bundle.levels)
+    return f"{count} level{'s' * (count != 1)}"
 
 
 def _menu(self, context):

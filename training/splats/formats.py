@@ -217,13 +217,13 @@ def as_ply(path: Path) -> Iterator[Path]:
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Has splat-transform do something, and waits for it; raises as :func:`transformed`."""
+    """Has splat-transform write a file, and waits for it; raises as :func:`transformed`."""
     for _ in transformed(arguments):
         pass
 
 
 def transformed(arguments: Sequence[str]) -> Iterator[str]:
-    """Has splat-transform do something, and yields what it says last while it is at it.
+    """Has splat-transform write a file, its last argument, and yields what it says last while it is at it.
 
     What wants a graphics card is done on the processor where that fails. Closed early, the program ends.
 
@@ -250,12 +250,13 @@ def transformed(arguments: Sequence[str]) -> Iterator[str]:
                 if process.poll() is None:
                     process.kill()
                     process.wait()
-            if process.returncode == 0:
+            if process.returncode == 0 and Path(arguments[-1]).exists():
                 return
             said = log.read_text("utf-8", "replace")
     errors = [line.split("Error:")[-1] for line in said.splitlines() if "Error:" in line]
+    how = f"ended with {process.returncode}: {(errors or [said[-200:]])[-1].strip()}"
     raise LodgsError(
-        f"{PROGRAM} ended with {process.returncode}: {(errors or [said[-200:]])[-1].strip()}.",
+        f"{PROGRAM} {how if process.returncode else 'wrote no file'}.",
         "Look whether its version is 3 or newer, and Node.js' 22 or newer.",
     )
 

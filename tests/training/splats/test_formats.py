@@ -177,15 +177,35 @@ def test_without_the_program_it_is_said_how_to_get_it(tmp_path, monkeypatch):
     assert {path.name for path in tmp_path.iterdir()} == {"a.splat", "a.ply"}
 
 
-@pytest.mark.skipif(os.name == "nt", reason="the program that stands in is a shell script")
-def test_a_processor_clusters_colours_in_fewer_rounds(tmp_path, monkeypatch):
-    program = tmp_path / PROGRAM
-    program.write_text('#!/bin/sh\necho "$*" >> "$0.said"\ncase "$*" in *"-g cpu"*) ;; *) exit 1;; esac\n')
-    program.chmod(0o755)
+@pytest.fixture
+def stand_in(tmp_path, monkeypatch):
+    """``stand_in(lines)``: a shell script in the program's place, in the current folder; its path."""
+    if os.name == "nt":
+        pytest.skip("the program that stands in is a shell script")
+
+    def made(lines):
+        program = tmp_path / PROGRAM
+        program.write_text(f"#!/bin/sh\n{lines}\n")
+        program.chmod(0o755)
+        return program
+
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    return made
+
+
+def test_a_processor_clusters_colours_in_fewer_rounds(stand_in):
+    program = stand_in('echo "$*" >> "$0.said"\ncase "$*" in *"-g cpu"*) touch a.sog;; *) exit 1;; esac')
     run(["a.ply", "a.sog"])
     first, second = Path(f"{program}.said").read_text().splitlines()
     assert " -i " not in first and "-g cpu -i 3 a.ply a.sog" in second
+
+
+def test_a_program_that_writes_nothing_has_failed_whatever_it_returns(stand_in):
+    """Older versions of it take some options to mean something else."""
+    stand_in("echo No adapters found")
+    with pytest.raises(LodgsError, match=r"wrote no file\. Look whether its version is 3"):
+        run(["-L", "0", "lod-meta.json", "lod0.ply"])
 
 
 def test_kinds_are_known_by_name():
