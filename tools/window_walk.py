@@ -226,6 +226,14 @@ def click() -> Steps:
     yield from settle()
     yield from click_at(*away)
     assert bpy.context.view_layer.objects.selected[:] == [behind], "The mesh before it is not selected."
+    behind.location = eye.lerp(place_of(*LANTERN), 1.1)
+    for tool in ("builtin.select", "builtin.move", "builtin.select_box"):
+        behind.select_set(True)
+        press("wm.tool_set_by_id", way="EXEC_DEFAULT", name=tool)
+        yield from settle()
+        yield from click_at(*away)
+        selected = bpy.context.view_layer.objects.selected[:]
+        assert selected == [scene_root()], f"With {tool} a click on splats selects {selected}."
     bpy.data.objects.remove(behind)
 
 

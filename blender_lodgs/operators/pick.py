@@ -8,24 +8,57 @@ from bpy_extras import view3d_utils
 
 from .. import viewport
 from ..data import picking
+from ..data.shown import is_splats
 
+_PRESSED = "3D View Tool: Tweak", "3D View Tool: Tweak (fallback)"
+"""Keymaps of tools in which Blender selects when the button is pressed: no click comes where that changes
+something. In all others it does so by a click, and a keymap of an extension's is asked before."""
 _keymaps: list[tuple[bpy.types.KeyMap, bpy.types.KeyMapItem]] = []
 
 
 class LODGS_OT_select_clicked(bpy.types.Operator):
-    """Select the splat scene that is clicked on, where Blender's own click found nothing or what is behind"""
+    """Select what is clicked on, splat scenes too"""
 
     bl_idname = "lodgs.select_clicked"
-    bl_label = "Select Splat Scene"
+    bl_label = "Select"
     bl_options = {"UNDO", "INTERNAL"}
+
+    pressed: bpy.props.BoolProperty(
+        name="Pressed",
+        description="Blender has selected what is there when the button was pressed; otherwise it does now",
+        options={"SKIP_SAVE"},
+    )
 
     @classmethod
     def poll(cls, context):
-        return context.mode == "OBJECT" and context.region_data is not None
+        there = any(map(is_splats, bpy.data.pointclouds))  # without splats all is Blender's
+        return there and context.mode == "OBJECT" and context.region_data is not None
 
     def invoke(self, context, event):
-        chosen = select(context, (event.mouse_region_x, event.mouse_region_y))
-        return {"FINISHED"} if chosen else {"CANCELLED", "PASS_THROUGH"}
+        at = event.mouse_region_x, event.mouse_region_y
+        if self.pressed:
+            clicked = not _dragged(context, event) and select(context, at)
+            return {"FINISHED"} if clicked else {"CANCELLED", "PASS_THROUGH"}
+        if not _selects_by_left(context):
+            return {"CANCELLED", "PASS_THROUGH"}
+        changed = _blenders_own(at)
+        return {"FINISHED"} if select(context, at) or changed else {"CANCELLED"}
+
+
+def _blenders_own(at: tuple[int, int]) -> bool:
+    """What Blender's own click does; whether that changes what is selected."""
+    return "FINISHED" in bpy.ops.view3d.select(deselect_all=True, location=at)
+
+
+def _dragged(context: bpy.types.Context, event: bpy.types.Event) -> bool:
+    """Whether the mouse has moved since its button was pressed."""
+    ways = event.mouse_x - event.mouse_prev_press_x, event.mouse_y - event.mouse_prev_press_y
+    return max(map(abs, ways)) > context.preferences.inputs.drag_threshold_mouse
+
+
+def _selects_by_left(context: bpy.types.Context) -> bool:
+    settings = context.window_manager.keyconfigs.active.preferences
+    return getattr(settings, "select_mouse", "LEFT") == "LEFT"
 
 
 def select(context: bpy.types.Context, at: tuple[float, float]) -> bool:
@@ -80,9 +113,14 @@ CLASSES = (LODGS_OT_select_clicked,)
 def register() -> None:
     keyconfig = bpy.context.window_manager.keyconfigs.addon
     if keyconfig is not None:  # not in background
+        verb = LODGS_OT_select_clicked.bl_idname
         keymap = keyconfig.keymaps.new(name="Object Mode")
-        item = keymap.keymap_items.new(LODGS_OT_select_clicked.bl_idname, "LEFTMOUSE", "CLICK")
-        _keymaps.append((keymap, item))
+        _keymaps.append((keymap, keymap.keymap_items.new(verb, "LEFTMOUSE", "CLICK")))
+        for name in _PRESSED:
+            keymap = keyconfig.keymaps.new(name=name, space_type="VIEW_3D", region_type="WINDOW", tool=True)
+            item = keymap.keymap_items.new(verb, "LEFTMOUSE", "RELEASE")
+            item.properties.pressed = True
+            _keymaps.append((keymap, item))
 
 
 def unregister() -> None:

@@ -1,5 +1,7 @@
 """Which splat scene is at a pixel, against where two scenes were put."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -95,3 +97,31 @@ def test_a_mesh_is_chosen_where_no_splats_hide_it(bpy, lodgs, scene_of, window, 
     assert not select(bpy.context, middle) and bpy.context.selected_objects == [ball]
     ball.select_set(False)
     assert select(bpy.context, middle) and bpy.context.selected_objects == [root]
+
+
+@pytest.mark.parametrize("tool", ["selects by a click", "selects where it is pressed", "was dragged"])
+def test_a_click_on_splats_selects_them_whatever_was_selected(
+    bpy, lodgs, scene_of, window, monkeypatch, tool
+):
+    pick, region = lodgs("operators.pick"), bpy.context.region
+    other, root = scene_of("other", 0.9, (50, 0, 0)), scene_of("splats", 0.9, window.region_3d.view_location)
+    bpy.context.view_layer.update()
+
+    def blenders_own(at):  # draws, which takes a window
+        bpy.ops.object.select_all(action="DESELECT")
+        return True
+
+    monkeypatch.setattr(pick, "_blenders_own", blenders_own)
+    bpy.ops.object.select_all(action="DESELECT")
+    if tool == "selects by a click":
+        other.select_set(True)
+    at = region.width // 2, region.height // 2
+    verb = SimpleNamespace(pressed=tool != "selects by a click")
+    x, y = at
+    event = SimpleNamespace(
+        mouse_region_x=x, mouse_region_y=y, mouse_x=x, mouse_y=y,
+        mouse_prev_press_x=x - 40 * (tool == "was dragged"), mouse_prev_press_y=y,
+    )  # fmt: skip
+    done = pick.LODGS_OT_select_clicked.invoke(verb, bpy.context, event)
+    assert done == ({"CANCELLED", "PASS_THROUGH"} if tool == "was dragged" else {"FINISHED"})
+    assert bpy.context.selected_objects == ([] if tool == "was dragged" else [root])
