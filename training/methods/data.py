@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -18,6 +18,7 @@ from ..rasterize import Target
 from ..scenes.cameras import Camera, evenly
 from ..scenes.colmap import Scene
 from ..scenes.depths import Depths
+from ..scenes.exposures import evened
 from ..scenes.images import load_image, load_mask
 from .memory import TARGET_BYTES
 from .support import Support
@@ -63,6 +64,7 @@ class TrainingData:
         scratch: where such methods make files, which a checkpoint tells of; None: in a temporary folder.
         depths: what is known of the depth in training views; None: nothing.
         region: where splats are added, in the scene's coordinates; None: everywhere.
+        gains: of photographs by name what they are evened by, see ``scenes.exposures``; None: none is.
 
     Attributes:
         scene: what is trained on.
@@ -85,6 +87,7 @@ class TrainingData:
         whole: Scene | None = None,
         depths: Depths | None = None,
         region: Crop | None = None,
+        gains: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         if len(scene.points) == 0:
             raise LodgsError(
@@ -100,7 +103,7 @@ class TrainingData:
                 "Check that the image folder holds the photographs that the model names.",
             )
         self.scene, self.exposure, self.depths, self.region = scene, exposure, depths, region
-        self._trained = {camera.name for camera in train}
+        self._trained, self._gains = {camera.name for camera in train}, gains or {}
         self.whole_train = [camera.scaled(image_scale) for camera in all_train]
         self.train = [camera.scaled(image_scale) for camera in train]
         self.test = [camera.scaled(image_scale) for camera in test]
@@ -206,6 +209,8 @@ class TrainingData:
         assert camera.image is not None
         size, alpha = (camera.width, camera.height), self.transparent
         image = load_image(camera.image, *size, exposure=self.exposure, alpha=alpha)
+        if camera.name in self._gains:
+            image[..., :3] = evened(image[..., :3], self._gains[camera.name])
         planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))
         mask = None if camera.mask is None else load_mask(camera.mask, *size)
         known = self.depths.inverse(camera) if self.depths and camera.name in self._trained else None

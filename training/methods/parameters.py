@@ -109,6 +109,11 @@ class Parameters:
         label="Depth Is",
         choices=KINDS,
     )
+    match_exposure: bool = parameter(
+        True,
+        "Whether photographs that are exposed or balanced otherwise than those beside them are evened first, "
+        "by the points that they share. What changes smoothly from one to the next stays.",
+    )
     lr_exposure: float = parameter(
         0.0,
         "Learning rate of each photograph's own gain and offset of colours, which pictures do not have; for "
@@ -210,6 +215,7 @@ AS_PUBLISHED: dict[str, Any] = {
     "random_background": False,
     "margin": 0.0,
     "antialias": False,
+    "match_exposure": False,
 }
 """What presets *paper* leave out, whatever the method: it is in no paper, but for the filter, in LODGE's."""
 PAPER: dict[str, Any] = AS_PUBLISHED | {

@@ -15,6 +15,7 @@ from ..methods.data import TrainingData
 from ..scenes.cameras import Camera
 from ..scenes.colmap import Scene, read_scene, without
 from ..scenes.depths import Depths, with_points
+from ..scenes.exposures import own_gains
 from ..scenes.images import check_image, check_mask
 from ..scenes.regions import Region
 from ..scenes.rendered import even
@@ -65,6 +66,15 @@ def training_data(
     if pixels and parameters.depth_weight:
         depths = Depths(scene, parameters.depth)
         scene = replace(scene, warnings=[*scene.warnings, *depths.warnings])
+    gains = None
+    if pixels and parameters.match_exposure:
+        if tell:
+            tell("status", message="Comparing the photographs' exposure")
+        trained = {camera.name for camera in whole.split(job.test_every, job.validation)[0]}
+        gains = own_gains(scene, [each for each in scene.cameras if each.name in trained], job.exposure)
+        if gains and tell:
+            most = max(abs(np.log(gain)).max() for gain in gains.values())
+            tell("status", message=f"Photographs differ in exposure by up to {np.expm1(most):.0%}: evened")
     if job.crop is not None:
         scene = coarse_outside(scene, job.crop, int(OUTSIDE * parameters.max_splats))
     warnings += [warning for warning in scene.warnings if warning not in warnings]
@@ -82,6 +92,7 @@ def training_data(
         whole=whole,
         depths=depths,
         region=job.crop,
+        gains=gains,
     )  # fmt: skip
 
 

@@ -22,7 +22,7 @@ def read(scene, run, **options):
     data = training_data(
         Job(str(scene), str(run), image_scale=1.0),
         RunFolder(run),
-        lambda kind, **values: told.append(values),
+        lambda kind, **values: told.append(values) if kind == "warning" else None,
         **options,
     )
     return data, [values["message"] for values in told]
