@@ -107,10 +107,10 @@ def write(root: bpy.types.Object, painted: Mapping[int, np.ndarray]) -> int:
 
 
 def keep(root: bpy.types.Object) -> None:
-    """Remembers the paint of the finest level, for those that come in the place of all."""
-    if not is_painted(root):
+    """Remembers the paint of the finest level, for those that come in the place of all; until there is other
+    paint, for all that come after these, or it would spread from one to the next."""
+    if root.lodgs.painted is not None or not is_painted(root):
         return
-    _forget(root)
     root.lodgs.painted = kept = levels(root)[-1].object.data.copy()
     kept.name = f"{root.name} paint"
     for name in [each.name for each in kept.attributes if not each.is_required]:

@@ -16,7 +16,7 @@ from tests.training.lod.trees import random_leaves, tree_of, write_in_pages
 from training.lod.look import Look
 from training.lod.paint import COLUMNS
 from training.scenes.color import linear_from_srgb
-from training.splats.bundle import read_bundle
+from training.splats.bundle import Level, read_bundle
 from training.splats.gaussians import SH_C0
 from training.splats.ply import read_ply
 
@@ -201,6 +201,25 @@ def test_levels_that_are_trained_anew_take_paint_over_by_position(bpy, lodgs, sc
     assert (root.lodgs.painted is not None) == anew
     bpy.ops.lodgs.remove_paint()
     assert root.lodgs.painted is None and not any(" paint" in cloud.name for cloud in bpy.data.pointclouds)
+
+
+def test_paint_does_not_spread_from_run_to_run(bpy, lodgs, scene_of):  # noqa: F811
+    """Coarse levels in between, and the fine ones come back as they were painted."""
+    scenes, painting = lodgs("data.scenes"), lodgs("data.painting")
+    root, bundle = scene_of(bundle_of("bands", np.random.default_rng(4)))
+    half = {level.number: (level.splats.means[:, 0] > 0).astype(np.float32) for level in bundle.levels}
+    painting.write(root, painting.over(painting.read(root), half, RED))
+    before, some = painting.read(root)[3], bundle.levels[2].splats.select(slice(0, 5))
+    for levels in ([Level(1, some)], bundle.levels):
+        scenes.make_room(root, 1)
+        for level in levels:
+            level.splats.extras = {k: v for k, v in level.splats.extras.items() if k not in COLUMNS}
+            scenes.set_level(root, level)
+    np.testing.assert_array_equal(painting.read(root)[3], before)
+    painting.write(root, painting.over(painting.read(root), half, BLUE))
+    scenes.make_room(root, 1)
+    blue = painting.paint_of(root.lodgs.painted)[half[3] > 0, :3]
+    np.testing.assert_allclose(blue, np.broadcast_to(BLUE, blue.shape), atol=1e-6)
 
 
 def test_a_tree_is_painted_node_by_node_and_half_a_tree_is_not(bpy, lodgs, painted, tmp_path, viewport):  # noqa: F811
