@@ -405,6 +405,9 @@ class _Views:
                     f"{len(names):,} views are left out: {folder} has no files of their names "
                     f"({', '.join(map(_shown, names[:NAMED]))}{more})."
                 )
+        for what, beside in ("mask", self._masks), ("depth", self._depths):
+            if all(getattr(camera, what) is None for camera in self.cameras):
+                found += filter(None, [beside.misnamed(_shown(self.cameras[0].name))])
         found += self._reshaped[:NAMED]
         if len(self._reshaped) > NAMED:
             found.append(f"{len(self._reshaped) - NAMED:,} more photographs have other proportions.")

@@ -36,6 +36,8 @@ FEW_POINTS = 1000
 """Scenes with fewer points get some from their depth maps,"""
 MOST_POINTS = 100_000
 """at most so many."""
+STEPS = 0.3, 1000
+"""What is shown is so many times as far away as the next photograph, or maps are in another unit."""
 
 
 class Depths:
@@ -188,21 +190,39 @@ def with_points(scene: Scene) -> Scene:
     if not depths:
         return replace(scene, warnings=[*scene.warnings, *depths.warnings])
 
+    medians = []
+
     def shown() -> Iterator[tuple[Camera, np.ndarray, np.ndarray]]:
         for camera in views:
             assert camera.image is not None
             picture = load_image(camera.image, camera.width, camera.height)
             depth = _read_map(camera, camera.width, camera.height)
+            medians.append(np.median(depth[np.isfinite(depth)]) if np.isfinite(depth).any() else np.nan)
             yield camera, np.where(np.isfinite(depth), depth, FARTHEST), picture
 
     points, colors, _ = surface_points(shown(), len(views), MOST_POINTS, np.random.default_rng(0))
+    told = [f"{len(points):,} points to begin with are taken from the depth maps."]
+    times = float(np.nanmedian(medians)) / _apart(views) if len(points) else np.nan
+    if times < STEPS[0] or times > STEPS[1]:
+        told.append(
+            f"The depth maps show what is {times:.3g} times as far away as the next photograph: make sure "
+            "that they are in the scene's unit."
+        )
     return replace(
         scene,
         points=np.concatenate([scene.points, points.astype(np.float32)]),
         point_colors=np.concatenate([scene.point_colors, np.rint(255 * colors).astype(np.uint8)]),
         point_ids=scene.point_ids[:0],
-        warnings=[*scene.warnings, f"{len(points):,} points to begin with are taken from the depth maps."],
+        warnings=[*scene.warnings, *told],
     )
+
+
+def _apart(views: list[Camera]) -> float:
+    """How far views are from the next one, by the median; NaN where all stand in one place."""
+    eyes = np.array([camera.center for camera in evenly(views, 500)])
+    apart = np.linalg.norm(eyes[:, None] - np.array([camera.center for camera in views]), axis=2)
+    nearest = np.where(apart > 0, apart, np.inf).min(axis=1)
+    return float(np.median(nearest)) if np.isfinite(nearest).all() else np.nan
 
 
 def read_map(path: Path) -> np.ndarray:

@@ -68,6 +68,13 @@ class Beside:
                     return path
         return None
 
+    def misnamed(self, name: str) -> str:
+        """A sentence of files that belong to no photograph, of which this is one; "" where there are none."""
+        if not (self._there and any(path.is_file() for path in self.folder.rglob("*"))):
+            return ""
+        file = name + self._suffixes[0]
+        return f"{self.folder} holds nothing for these photographs: of {name} it would be {file}."
+
 
 def inside(name: str) -> PurePosixPath:
     """An image's name as a path in the folder of the images, on every system.

@@ -137,6 +137,17 @@ def test_points_come_from_maps_where_there_are_few(walls, tmp_path):
     assert with_points(read_scene(walls)).points is not None
 
 
+@pytest.mark.parametrize(("unit", "odd"), [(1, False), (1000, True), (0.001, True)])
+def test_points_from_maps_in_another_unit_are_warned_of(walls, tmp_path, unit, odd):
+    def write(folder, number, depth):
+        npy(folder / f"{number}.npy", (unit * depth).astype(np.float32))
+
+    scene = read_scene(put(walls, tmp_path, write))
+    nothing = replace(scene, points=scene.points[:0], point_ids=scene.point_ids[:0])
+    said = "".join(with_points(nothing).warnings)
+    assert "are taken from the depth maps" in said and ("they are in the scene's unit" in said) == odd
+
+
 @pytest.mark.parametrize("lens", ["OPENCV", "OPENCV_FISHEYE"])
 def test_they_are_straightened_like_their_photographs(tmp_path, lens):
     """A photograph that is its own depth map still is; the map has another size."""

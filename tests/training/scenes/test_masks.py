@@ -44,6 +44,18 @@ def test_both_ways_of_naming_them(tmp_path, name):
     np.testing.assert_array_equal(masks[0], expected)
 
 
+@pytest.mark.parametrize(("folder", "ending"), [("masks", "png"), ("depths", "exr")])
+def test_files_of_other_names_are_told(tmp_path, folder, ending):
+    synthetic.write_scene(tmp_path)
+    assert read_scene(tmp_path).warnings == []
+    (tmp_path / folder / "left").mkdir(parents=True)
+    assert read_scene(tmp_path).warnings == []
+    write_png(tmp_path / folder / "left" / "mask_a.png", halves())
+    (told,) = read_scene(tmp_path).warnings
+    whose = f"of a.png it would be a.png.{ending}"
+    assert told == f"{tmp_path / folder} holds nothing for these photographs: {whose}."
+
+
 def test_they_are_straightened_like_their_photographs(tmp_path):
     """A photograph that is its own mask still is."""
     synthetic.write_scene(tmp_path, synthetic.camera("OPENCV"), pixels=halves())
