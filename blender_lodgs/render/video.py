@@ -42,17 +42,22 @@ def extract_frames(
     with _reading(video) as (scene, frames):
         count = min(most, frames)
         edges = np.linspace(0, frames, count + 1).astype(int)
-        folder.mkdir(parents=True, exist_ok=True)
-        there = [int(found[1]) for path in folder.iterdir() if (found := _NAME.fullmatch(path.name))]
-        for number, (first, end) in enumerate(pairwise(edges), 1):
-            tell(number, count)
-            if any(first < frame <= end for frame in there):
-                continue
-            tried = np.unique(np.linspace(first + 1, end, CANDIDATES, dtype=int))
-            with tempfile.TemporaryDirectory(dir=folder, prefix=".frames-") as work:
-                pictures = [_render(scene, int(frame), Path(work)) for frame in tried]
-                best = max(pictures, key=lambda picture: sharpness(_light(picture)))
-                os.replace(best, folder / best.name)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            there = [int(found[1]) for path in folder.iterdir() if (found := _NAME.fullmatch(path.name))]
+            for number, (first, end) in enumerate(pairwise(edges), 1):
+                tell(number, count)
+                if any(first < frame <= end for frame in there):
+                    continue
+                tried = np.unique(np.linspace(first + 1, end, CANDIDATES, dtype=int))
+                with tempfile.TemporaryDirectory(dir=folder, prefix=".frames-") as work:
+                    pictures = [_render(scene, int(frame), Path(work)) for frame in tried]
+                    best = max(pictures, key=lambda picture: sharpness(_light(picture)))
+                    os.replace(best, folder / best.name)
+        except OSError as error:
+            raise LodgsError(
+                f"{folder} could not be written: {error.strerror or error}.", "Choose another folder."
+            ) from error
     return count
 
 

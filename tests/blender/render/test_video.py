@@ -119,6 +119,12 @@ def test_what_is_no_video(lodgs, tmp_path, content, capfd):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_folder_that_cannot_be_written(lodgs, video, tmp_path, capfd):
+    (tmp_path / "out").write_text("no folder")
+    assert lodgs("commands").main(["frames", str(video), "--out", str(tmp_path / "out")]) == 2
+    assert "out could not be written: File exists. Choose another folder." in capfd.readouterr().err
+
+
 def test_a_video_becomes_a_scene(bpy, lodgs, video, blender, tmp_path):
     assert bpy.ops.lodgs.find_cameras(filepath=str(video)) == {"FINISHED"}
     work = lodgs("runs.preparing").current
