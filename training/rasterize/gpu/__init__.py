@@ -22,7 +22,7 @@ from ..rendering import Drawn, Settings, SideOutputs, Target, require_plain
 from .bin import TILE
 from .choice import open_chosen
 from .device import Buffer, Device
-from .loss import loss_and_gradient, moments_of
+from .loss import loss_and_gradient
 from .scene import BY_SPLAT, GEOMETRY, SUMS, Scene
 from .twin import COLUMNS, STATS, Twin, packed
 
@@ -153,11 +153,10 @@ class _Photometric(torch.autograd.Function):
         device = open_chosen()
         with device.lock:
             if target.cache.get("gpu", (None,))[0] is not device:
-                truth = device.upload(target.image.float().numpy())
-                target.cache["gpu"] = device, truth, moments_of(device, truth)
-            _, truth, moments = target.cache["gpu"]
+                target.cache["gpu"] = device, device.upload(target.image.float().numpy())
+            _, truth = target.cache["gpu"]
             loss, gradient = loss_and_gradient(
-                device, device.upload(image.detach().numpy()), truth, moments, ssim_weight
+                device, device.upload(image.detach().numpy()), truth, ssim_weight
             )
             ctx.gradient = torch.from_numpy(device.read(gradient))
         return torch.tensor(loss, dtype=torch.float32)

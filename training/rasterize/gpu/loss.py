@@ -4,26 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from .device import LANES, Buffer, Device
+from .bin import groups_of
+from .device import Buffer, Device
 
 EACH = 256
 """Values that one invocation adds up."""
 
 
-def moments_of(device: Device, truth: Buffer) -> Buffer:
-    """What :func:`loss_and_gradient` wants to know about a photograph (H, W, 3): (2, H, W, 3)."""
-    groups, numbers = _launch(truth, 0.0, 0.0)
-    lines, moments = device.empty(np.float32, 3, *truth.shape), device.empty(np.float32, 2, *truth.shape)
-    device.run("loss", "products", groups, numbers, image=truth, truth=truth, lines=lines)
-    device.run("loss", "moments", groups, numbers, across=lines, of_truth=moments)
-    return moments
-
-
 def loss_and_gradient(
-    device: Device, image: Buffer, truth: Buffer, moments: Buffer, ssim_weight: float
+    device: Device, image: Buffer, truth: Buffer, ssim_weight: float
 ) -> tuple[float, Buffer]:
     """(1 − ssim_weight) L1 + ssim_weight (1 − SSIM) of images (H, W, 3), and its gradient by the first."""
-    *sums, gradient = sums_and_gradient(device, image, truth, moments, ssim_weight)
+    *sums, gradient = sums_and_gradient(device, image, truth, ssim_weight)
     l1, ssim = (device.read(each).sum(dtype=np.float64) for each in sums)
     return loss_of(l1, ssim, int(np.prod(image.shape)), ssim_weight), gradient
 
@@ -34,28 +26,22 @@ def loss_of(l1: float, ssim: float, size: int, ssim_weight: float) -> float:
 
 
 def sums_and_gradient(
-    device: Device, image: Buffer, truth: Buffer, moments: Buffer, ssim_weight: float
+    device: Device, image: Buffer, truth: Buffer, ssim_weight: float
 ) -> tuple[Buffer, Buffer, Buffer]:
     """Sums of L1 and of SSIM over each EACH values of images (H, W, 3), and the loss's gradient."""
-    size = int(np.prod(image.shape))
-    groups, numbers = _launch(image, (1 - ssim_weight) / size, ssim_weight / size)
-    lines, slopes = (device.empty(np.float32, 3, *image.shape) for _ in range(2))
+    height, width, channels = image.shape
+    size = height * width * channels
+    groups, numbers = groups_of(size), ((1 - ssim_weight) / size, ssim_weight / size, width, height)
+    lines, slopes = (device.empty(np.float32, *image.shape, 4) for _ in range(2))
     similar, different, gradient = (device.empty(np.float32, *image.shape) for _ in range(3))
     device.run("loss", "products", groups, numbers, image=image, truth=truth, lines=lines)
-    device.run(
-        "loss", "similarity", groups, numbers, across=lines, truths=moments, by_means=slopes, similar=similar
-    )
+    device.run("loss", "similarity", groups, numbers, across=lines, by_means=slopes, similar=similar)
     device.run("loss", "slopes_across", groups, numbers, slopes=slopes, lines=lines)
     device.run(
         "loss", "finish", groups, numbers, across=lines, image=image, truth=truth, gradient=gradient,
         different=different,
     )  # fmt: skip
-    l1, ssim = (device.empty(np.float32, -(-size // EACH)) for _ in range(2))
+    l1, ssim = (device.empty(np.float32, groups_of(size, EACH)) for _ in range(2))
     for values, totals in ((different, l1), (similar, ssim)):
-        device.run("loss", "add", -(-totals.shape[0] // LANES), numbers, values=values, totals=totals)
+        device.run("loss", "add", groups_of(totals.shape[0]), numbers, values=values, totals=totals)
     return l1, ssim, gradient
-
-
-def _launch(image: Buffer, l1_weight: float, ssim_weight: float) -> tuple[int, tuple]:
-    height, width, channels = image.shape
-    return -(-height * width * channels // LANES), (l1_weight, ssim_weight, width, height)

@@ -16,7 +16,7 @@ from ..adam import Adam
 from ..rendering import Settings, Target, View
 from .bin import groups_of
 from .device import Buffer, Device
-from .loss import loss_of, moments_of, sums_and_gradient
+from .loss import loss_of, sums_and_gradient
 from .scene import BY_SPLAT, SPLAT, SUMS, Scene
 
 COLUMNS = {
@@ -269,7 +269,7 @@ class Twin:
             "train", "unpack", groups, numbers, photograph=_photograph(device, target), drawn=self.drawn,
             image=image, truth=truth,
         )  # fmt: skip
-        *sums, gradient = sums_and_gradient(device, image, truth, moments_of(device, truth), ssim_weight)
+        *sums, gradient = sums_and_gradient(device, image, truth, ssim_weight)
         by_picture, told = device.empty(np.float32, height, width, 4), device.empty(np.float32, 2)
         device.run("train", "pack", groups, numbers, gradient=gradient, by_picture=by_picture)
         for slot, each in enumerate(sums):
