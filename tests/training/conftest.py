@@ -76,8 +76,8 @@ def tiny_scene(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def graphics():
-    """A graphics device for the gpu backend: this computer's own, or the software that stands for one."""
+def tried_graphics() -> None:
+    """A device for the gpu backend is there, this computer's own or the software that stands for one."""
     from training.errors import LodgsError
     from training.rasterize import trial
     from training.rasterize.gpu import choice
@@ -89,7 +89,14 @@ def graphics():
     except LodgsError as problem:
         pytest.skip(f"no graphics device: {problem}")
     assert trial.try_out(device.adapter) == "", "or the cpu would stand for it in these tests"
-    return device
+
+
+@pytest.fixture
+def graphics(tried_graphics):
+    """The device that the gpu backend uses: another one after a test that has lost it."""
+    from training.rasterize.gpu import choice
+
+    return choice.open_chosen()
 
 
 @pytest.fixture

@@ -92,9 +92,9 @@ def control_density(model: Model) -> None:
     reset_opacities(model)
 
 
-@pytest.mark.parametrize("most", [1 << 27, 160 << 10])
+@pytest.mark.parametrize("most", [1 << 27, 200 << 10])
 def test_splats_come_and_go_there_as_they_do_here(graphics, monkeypatch, most):
-    """To the bit, also on a device that takes the moments of 384 at a time."""
+    """To the bit, also on a device that takes the moments of 512 at a time."""
     monkeypatch.setattr(graphics, "most_bytes", most)
     one, other = trained(1000), trained(1000)
     other.adam.zero_grad()  # which brings it home
