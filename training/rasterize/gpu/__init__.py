@@ -153,12 +153,11 @@ class _Photometric(torch.autograd.Function):
         device = open_chosen()
         with device.lock:
             if target.cache.get("gpu", (None,))[0] is not device:
-                target.cache["gpu"] = device, device.upload(target.image.float().numpy())
+                target.cache["gpu"] = device, device.upload(_planes(target.image.float()))
             _, truth = target.cache["gpu"]
-            loss, gradient = loss_and_gradient(
-                device, device.upload(image.detach().numpy()), truth, ssim_weight
-            )
-            ctx.gradient = torch.from_numpy(device.read(gradient))
+            shown = device.upload(_planes(image.detach()))
+            loss, gradient = loss_and_gradient(device, shown, truth, ssim_weight)
+            ctx.gradient = torch.from_numpy(device.read(gradient)).permute(1, 2, 0).contiguous()
         return torch.tensor(loss, dtype=torch.float32)
 
     @staticmethod
@@ -181,6 +180,11 @@ def _scene_of(device: Device, tensors: list[torch.Tensor], settings: Settings) -
     splats = packed(*(array[some] for array in arrays[:4]), weights=weights, filtered=filtered)
     sh = device.upload(arrays[4][some, : (settings.degree + 1) ** 2])
     return Scene.of(device, device.upload(splats), sh, settings), some
+
+
+def _planes(image: torch.Tensor) -> np.ndarray:
+    """(3, H, W) of an image (H, W, 3)."""
+    return image.permute(2, 0, 1).numpy()
 
 
 def _as_colours(device: Device, features: np.ndarray) -> list[Buffer]:

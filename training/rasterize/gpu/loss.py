@@ -14,7 +14,7 @@ EACH = 256
 def loss_and_gradient(
     device: Device, image: Buffer, truth: Buffer, ssim_weight: float
 ) -> tuple[float, Buffer]:
-    """(1 − ssim_weight) L1 + ssim_weight (1 − SSIM) of images (H, W, 3), and its gradient by the first."""
+    """(1 − ssim_weight) L1 + ssim_weight (1 − SSIM) of images (3, H, W), and its gradient by the first."""
     *sums, gradient = sums_and_gradient(device, image, truth, ssim_weight)
     l1, ssim = (device.read(each).sum(dtype=np.float64) for each in sums)
     return loss_of(l1, ssim, int(np.prod(image.shape)), ssim_weight), gradient
@@ -28,20 +28,23 @@ def loss_of(l1: float, ssim: float, size: int, ssim_weight: float) -> float:
 def sums_and_gradient(
     device: Device, image: Buffer, truth: Buffer, ssim_weight: float
 ) -> tuple[Buffer, Buffer, Buffer]:
-    """Sums of L1 and of SSIM over each EACH values of images (H, W, 3), and the loss's gradient."""
-    height, width, channels = image.shape
-    size = height * width * channels
-    groups, numbers = groups_of(size), ((1 - ssim_weight) / size, ssim_weight / size, width, height)
-    lines, slopes = (device.empty(np.float32, *image.shape, 4) for _ in range(2))
+    """Sums of L1 and of SSIM over each EACH values of images (3, H, W), and the loss's gradient."""
+    channels, height, width = image.shape
+    size = channels * height * width
+    lines, slopes = (device.empty(np.float32, height, width, 4) for _ in range(2))
     similar, different, gradient = (device.empty(np.float32, *image.shape) for _ in range(3))
-    device.run("loss", "products", groups, numbers, image=image, truth=truth, lines=lines)
-    device.run("loss", "similarity", groups, numbers, across=lines, by_means=slopes, similar=similar)
-    device.run("loss", "slopes_across", groups, numbers, slopes=slopes, lines=lines)
-    device.run(
-        "loss", "finish", groups, numbers, across=lines, image=image, truth=truth, gradient=gradient,
-        different=different,
-    )  # fmt: skip
+    weights = (1 - ssim_weight) / size, ssim_weight / size
+    for channel in range(channels):
+        launch = groups_of(height * width), (*weights, width, height, channel)
+        device.run("loss", "products", *launch, image=image, truth=truth, lines=lines)
+        device.run("loss", "similarity", *launch, across=lines, by_means=slopes, similar=similar)
+        device.run("loss", "slopes_across", *launch, slopes=slopes, lines=lines)
+        device.run(
+            "loss", "finish", *launch, across=lines, image=image, truth=truth, gradient=gradient,
+            different=different,
+        )  # fmt: skip
     l1, ssim = (device.empty(np.float32, groups_of(size, EACH)) for _ in range(2))
     for values, totals in ((different, l1), (similar, ssim)):
+        numbers = *weights, width, height, 0
         device.run("loss", "add", groups_of(totals.shape[0]), numbers, values=values, totals=totals)
     return l1, ssim, gradient

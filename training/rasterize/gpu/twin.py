@@ -263,7 +263,7 @@ class Twin:
     def _loss(self, target: Target, ssim_weight: float) -> tuple[Buffer, Buffer]:
         """What L1 and SSIM add up to (2,), and the gradient (H, W, 4) by the picture."""
         device, (height, width, _) = self.device, self.drawn.shape
-        image, truth = (device.empty(np.float32, height, width, 3) for _ in range(2))
+        image, truth = (device.empty(np.float32, 3, height, width) for _ in range(2))
         groups, numbers = groups_of(height * width), _numbers(height * width)
         device.run(
             "train", "unpack", groups, numbers, photograph=_photograph(device, target), drawn=self.drawn,

@@ -1,11 +1,12 @@
-// L1 and structural similarity with their gradient. Images are (H, W, 3); an invocation takes one of their values.
+// L1 and structural similarity with their gradient. Images are (3, H, W), and a channel is compared at a time; an
+// invocation takes one of its values.
 //
 // SSIM = n1 n2 / (d1 d2) with n1 = 2 mx my + C1, n2 = 2 (mxy - mx my) + C2, d1 = mx^2 + my^2 + C1 and
 // d2 = (mxx - mx^2) + (myy - my^2) + C2 (Wang et al. 2004, Eq. 13), m the means in an 11x11 Gaussian window of
 // sigma 1.5, with zeros outside the image. mxx and myy appear in their sum alone. Windows are taken along x, then along
 // y, in loops of fixed length, which compilers unroll: the weights become constants.
 
-struct Parameters { l1_weight: f32, ssim_weight: f32, width: u32, height: u32 }
+struct Parameters { l1_weight: f32, ssim_weight: f32, width: u32, height: u32, channel: u32 }
 @group(0) @binding(0) var<uniform> u: Parameters;
 @group(0) @binding(1) var<storage, read> image: array<f32>;
 @group(0) @binding(2) var<storage, read> truth: array<f32>;
@@ -32,8 +33,12 @@ struct Place { index: u32, x: i32, y: i32, inside: bool }
 
 fn place_of(group: u32, lane: u32) -> Place {
     let index = group * LANES + lane;
-    let pixel = index / 3u;
-    return Place(index, i32(pixel % u.width), i32(pixel / u.width), pixel < u.width * u.height);
+    return Place(index, i32(index % u.width), i32(index / u.width), index < u.width * u.height);
+}
+
+// Where images have a value.
+fn value_of(at: Place) -> u32 {
+    return u.channel * u.width * u.height + at.index;
 }
 
 // The windowed mean along y of `across`.
@@ -41,7 +46,7 @@ fn mean_down(at: Place) -> vec4f {
     var sum = vec4f(0.0);
     for (var d = -REACH; d <= REACH; d++) {
         if (at.y + d < 0 || at.y + d >= i32(u.height)) { continue; }
-        sum += window(d) * across[i32(at.index) + d * 3 * i32(u.width)];
+        sum += window(d) * across[i32(at.index) + d * i32(u.width)];
     }
     return sum;
 }
@@ -53,8 +58,8 @@ fn products(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index
     var sum = vec4f(0.0);
     for (var d = -REACH; d <= REACH; d++) {
         if (at.x + d < 0 || at.x + d >= i32(u.width)) { continue; }
-        let x = image[i32(at.index) + d * 3];
-        let y = truth[i32(at.index) + d * 3];
+        let x = image[i32(value_of(at)) + d];
+        let y = truth[i32(value_of(at)) + d];
         sum += window(d) * vec4f(x, y, x * x + y * y, x * y);
     }
     lines[at.index] = sum;
@@ -75,7 +80,7 @@ fn similarity(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_ind
     let by_xx = -value / d2;
     let by_xy = 2.0 * n1 / (d1 * d2);
     let by_x = 2.0 * my * n2 / (d1 * d2) - 2.0 * mx * value / d1 - 2.0 * mx * by_xx - my * by_xy;
-    similar[at.index] = value;
+    similar[value_of(at)] = value;
     by_means[at.index] = vec4f(by_x, by_xx, by_xy, 0.0);
 }
 
@@ -86,7 +91,7 @@ fn slopes_across(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_
     var sum = vec4f(0.0);
     for (var d = -REACH; d <= REACH; d++) {
         if (at.x + d < 0 || at.x + d >= i32(u.width)) { continue; }
-        sum += window(d) * slopes[i32(at.index) + d * 3];
+        sum += window(d) * slopes[i32(at.index) + d];
     }
     lines[at.index] = sum;
 }
@@ -97,11 +102,12 @@ fn slopes_across(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_
 fn finish(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let at = place_of(group_of(group), lane);
     if (!at.inside) { return; }
-    let x = image[at.index];
-    let y = truth[at.index];
+    let value = value_of(at);
+    let x = image[value];
+    let y = truth[value];
     let through_ssim = dot(mean_down(at).xyz, vec3f(1.0, 2.0 * x, y));
-    gradient[at.index] = u.l1_weight * sign(x - y) - u.ssim_weight * through_ssim;
-    different[at.index] = abs(x - y);
+    gradient[value] = u.l1_weight * sign(x - y) - u.ssim_weight * through_ssim;
+    different[value] = abs(x - y);
 }
 
 @compute @workgroup_size(LANES)

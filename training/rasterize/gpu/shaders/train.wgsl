@@ -16,9 +16,9 @@ struct Parameters {
 @group(0) @binding(0) var<uniform> u: Parameters;
 @group(0) @binding(1) var<storage, read> photograph: array<u32>;  // (H, W) of four bytes
 @group(0) @binding(2) var<storage, read> drawn: array<vec4f>;  // (H, W)
-@group(0) @binding(3) var<storage, read_write> image: array<f32>;  // (H, W, 3)
-@group(0) @binding(4) var<storage, read_write> truth: array<f32>;  // (H, W, 3)
-@group(0) @binding(5) var<storage, read> gradient: array<f32>;  // (H, W, 3)
+@group(0) @binding(3) var<storage, read_write> image: array<f32>;  // (3, H, W)
+@group(0) @binding(4) var<storage, read_write> truth: array<f32>;  // (3, H, W)
+@group(0) @binding(5) var<storage, read> gradient: array<f32>;  // (3, H, W)
 @group(0) @binding(6) var<storage, read_write> by_picture: array<vec4f>;  // (H, W)
 @group(0) @binding(7) var<storage, read> parts: array<f32>;
 @group(0) @binding(8) var<storage, read_write> totals: array<f32>;
@@ -54,8 +54,8 @@ fn unpack(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) 
     let seen = drawn[at];
     let photographed = unpack4x8unorm(photograph[at]);
     for (var k = 0u; k < 3u; k++) {
-        image[3u * at + k] = seen[k];
-        truth[3u * at + k] = photographed[k];
+        image[k * u.count + at] = seen[k];
+        truth[k * u.count + at] = photographed[k];
     }
 }
 
@@ -64,7 +64,7 @@ fn unpack(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) 
 fn pack(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
     let at = group_of(group) * LANES + lane;
     if (at >= u.count) { return; }
-    by_picture[at] = vec4f(gradient[3u * at], gradient[3u * at + 1u], gradient[3u * at + 2u], 0.0);
+    by_picture[at] = vec4f(gradient[at], gradient[u.count + at], gradient[2u * u.count + at], 0.0);
 }
 
 // The sum of all parts, by one workgroup.
