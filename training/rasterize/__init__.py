@@ -281,8 +281,8 @@ def photometric_loss(
 class Twin(Protocol):
     """Splats that a backend trains where it draws them: what is here in the meantime is what they were.
 
-    Whatever is asked of it raises LodgsError where the device was lost, or has too little memory. Where that would
-    have changed splats, they are lost with it: the run goes on from its last checkpoint.
+    Whatever is asked of it raises LodgsError where the device was lost, or has too little memory. Where that
+    would have changed splats, they are lost with it: the run goes on from its last checkpoint.
     """
 
     def __len__(self) -> int: ...

@@ -59,8 +59,8 @@ class Twin:
         antialias: as of ``rasterize``.
 
     Raises:
-        LodgsError: the device was lost, or has too little memory. Then what is here is still whole. Methods raise
-            it as the ``Twin`` of :mod:`training.rasterize` says.
+        LodgsError: the device was lost, or has too little memory. Then what is here is still whole. Methods
+            raise it as the ``Twin`` of :mod:`training.rasterize` says.
     """
 
     def __init__(
