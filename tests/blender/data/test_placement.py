@@ -240,9 +240,10 @@ def test_a_bundle_as_placed_stands_there_when_it_is_imported(bpy, lodgs, root, t
         lodgs("data.placement").placement_of(root).matrix))  # fmt: skip
     assert found.meta["up_rotation"] == np.eye(3).tolist()
     np.testing.assert_allclose(found.meta["camera_center"], wanted.meta["camera_center"])
-    assert [level.facts for level in found.levels] == [level.facts for level in wanted.levels]
+    for one, level in zip(found.levels, wanted.levels, strict=True):  # processors differ in the last bits
+        assert one.facts == pytest.approx(level.facts, rel=1e-12)
     for column in ("x", "radius"):
-        np.testing.assert_array_equal(found.tables["chunks"][column], wanted.tables["chunks"][column])
+        np.testing.assert_allclose(found.tables["chunks"][column], wanted.tables["chunks"][column], rtol=1e-6)
     again = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "out.ply")
     bpy.context.view_layer.update()
     np.testing.assert_allclose(world(again), np.eye(4), atol=1e-6)
