@@ -1,13 +1,21 @@
 """What a job trains on: photographs that can be decoded, and what is said of the others."""
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 
 from tests.training.conftest import write_tiny_scene
 from tests.training.scenes import synthetic
+from tools.jitter import jittered
 from training.errors import LodgsError
+from training.methods.data import TrainingData
 from training.runs.data import training_data
 from training.runs.folder import RunFolder
 from training.runs.job import Job
+from training.scenes.colmap import read_scene
+
+GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
 
 
 def torn(path) -> None:
@@ -55,3 +63,20 @@ def test_where_none_can_be_decoded(tmp_path):
         torn(path)
     with pytest.raises(LodgsError, match="No view of"):
         read(scene, tmp_path / "run")
+
+
+def test_photographs_of_differing_exposure_are_evened_unless_that_is_switched_off(tmp_path):
+    scene = tmp_path / "copy"
+    jittered(GARDEN, scene, 0.7, 0, 8)
+
+    def apart(**parameters):
+        job = Job(str(scene), str(tmp_path / "run"), image_scale=0.25, parameters=parameters)
+        told = []
+        data = training_data(job, RunFolder(tmp_path / "run"), lambda kind, **values: told.append(values))
+        original = TrainingData(read_scene(GARDEN), 0.25)
+        pairs = [(data.target(view).image, original.target(view).image) for view in range(len(data.train))]
+        evened = any("evened" in values["message"] for values in told)
+        return float(np.mean([(one - other).abs().mean() for one, other in pairs])), evened
+
+    (before, untold), (after, told) = apart(match_exposure=False), apart()
+    assert after < before / 2 and told and not untold

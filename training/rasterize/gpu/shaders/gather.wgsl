@@ -1,5 +1,5 @@
-// Rows brought together: those that are wanted of a buffer, and what a splat's pairs hold, added up in the order in which the splat met its tiles: the same bits every time, however
-// many bands the tiles are in.
+// Rows brought together: those that are wanted of a buffer, and what a splat's pairs hold, added up in the order in
+// which the splat met its tiles: the same bits every time, however many bands the tiles are in.
 
 struct Parameters {
     count: u32,
