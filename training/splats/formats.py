@@ -15,6 +15,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -160,12 +161,17 @@ def write_splats(path: Path, splats: SplatRows, meta: dict) -> Iterator[str]:
 def write_streamed(folder: Path, bundle: Bundle) -> Iterator[str]:
     """Writes levels as browsers load them by distance: ``lod-meta.json`` and the files that it names.
 
-    What an earlier export has left there is replaced once all is made. Yields as :func:`write_splats`.
+    Levels that show no splats, as crops may leave coarse ones, are left out: splat-transform takes none. What
+    an earlier export has left there is replaced once all is made. Yields as :func:`write_splats`.
 
     Raises:
-        LodgsError: as :func:`write_splats`; or the folder holds something else.
+        LodgsError: as :func:`write_splats`; the folder holds something else, or no level has a splat.
     """
     there = folder / STREAMED
+    shown = [level for level in bundle.levels if any(len(each.rows) for each in bundle.upto(level.number))]
+    if not shown:
+        raise LodgsError("There are no splats to write.", "Show some of them.")
+    bundle = replace(bundle, levels=shown)
     if folder.is_dir() and any(folder.iterdir()) and not there.exists():
         raise LodgsError(f"{folder} holds other files.", "Choose an empty folder, or a new one.")
     program()

@@ -146,6 +146,17 @@ def test_streamed_levels_come_back_with_all_splats(tmp_path, theirs):
     assert {path.name for path in tmp_path.iterdir()} == {"web"}
 
 
+def test_a_level_that_a_crop_has_emptied_is_not_streamed(tmp_path, theirs):
+    levels = [Level(1, splats_of(0)), Level(2, splats_of(200, seed=2)), Level(3, splats_of(300, seed=3))]
+    finish(write_streamed(tmp_path / "web", Bundle("flod", levels)))
+    with as_ply(tmp_path / "web") as there:
+        found = read_folder(there)
+    for level, before in zip(found.levels, levels[1:], strict=True):
+        alike(level.splats, before.splats)
+    with pytest.raises(LodgsError, match="no splats"):
+        finish(write_streamed(tmp_path / "none", Bundle("flod", levels[:1])))
+
+
 def test_streamed_levels_replace_nothing_else(tmp_path, theirs):
     (tmp_path / "web").mkdir()
     (tmp_path / "web" / "thesis.txt").touch()
