@@ -62,33 +62,38 @@ class Blocks:
         Args:
             near: depth at which drawing begins, in world units.
         """
-        middle, radius = self._spheres
-        x, y, z = camera.view_space(middle).T
-        seen = z + radius > near
-        far = np.maximum(z + radius, 0)
-        for at, focal, least, most in (
-            (x, camera.fx, -camera.cx, camera.width - camera.cx),
-            (y, camera.fy, -camera.cy, camera.height - camera.cy),
-        ):
-            for side, border in ((at, most / focal), (-at, -least / focal)):
-                spread = self.reach * np.hypot(1, SLANT * border)
-                room = radius * np.hypot(1, border) + spread + PIXELS / focal * far
-                seen &= side - z * border <= room
-        return seen
+        x, y, z = camera.world_to_camera[:3]
+        focals = np.array([camera.fx, camera.fx, camera.fy, camera.fy])
+        right, below = camera.width - camera.cx, camera.height - camera.cy
+        borders = np.array([right, camera.cx, below, camera.cy]) / focals
+        # what the depth, and the distance beyond each side of the image, take of what _spheres has
+        planes = np.zeros((5, 6))
+        planes[0, :4], planes[1:, :4] = z, np.array([x, -x, y, -y]) - borders[:, None] * z
+        planes[:, 4] = 1, *-np.hypot(1, borders)
+        planes[1:, 5] = -np.hypot(1, SLANT * borders)
+        found = planes @ self._spheres
+        deepest, beyond = found[0], found[1:]
+        return (deepest > near) & (beyond <= (PIXELS / focals)[:, None] * np.maximum(deepest, 0)).all(0)
 
     @cached_property
-    def _spheres(self) -> tuple[np.ndarray, np.ndarray]:
-        """Middles (B, 3) and radii (B,), float64, of spheres about the bounds."""
-        low, high = self.low.astype(np.float64), self.high.astype(np.float64)
-        return (low + high) / 2, np.linalg.norm(high - low, axis=1) / 2
+    def _spheres(self) -> np.ndarray:
+        """(6, B) float64: of spheres about the bounds x, y, z of the middle, 1, the radius; and the reach."""
+        middle, half = self._boxes
+        radius = np.sqrt((half * half).sum(0))
+        return np.stack([*middle, np.ones_like(radius), radius, self.reach])
+
+    @cached_property
+    def _boxes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Middles of the bounds and halves of their sides, (3, B) float64 each."""
+        low, high = self.low.T.astype(np.float64), self.high.T.astype(np.float64)
+        return (low + high) / 2, (high - low) / 2
 
     def distances(self, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The least and the greatest distance, (B,) float64 each, of a block's means from an eye (3,)."""
-        eye = np.asarray(eye, np.float64)
-        below, above = self.low.astype(np.float64) - eye, eye - self.high.astype(np.float64)
-        nearest = np.maximum(np.maximum(below, above), 0)
-        farthest = np.maximum(np.abs(below), np.abs(above))
-        return np.sqrt((nearest * nearest).sum(1)), np.sqrt((farthest * farthest).sum(1))
+        middle, half = self._boxes
+        away = np.abs(middle - np.asarray(eye, np.float64)[:, None])
+        nearest, farthest = np.maximum(away - half, 0), away + half
+        return np.sqrt((nearest * nearest).sum(0)), np.sqrt((farthest * farthest).sum(0))
 
     def between(
         self, eye: np.ndarray, near: float | np.ndarray, far: float | np.ndarray

@@ -219,9 +219,11 @@ class Chooser:
                     return rows, np.ones(len(rows), np.float32)
                 columns = {name: blocks.of_rows(asked, column) for name, column in columns.items()}
                 weights = weigh(blocks.of_rows(asked, means), columns)
-                if (seen & whole).any():
-                    found, weights = weights, np.ones(len(rows), np.float32)
-                    weights[np.repeat(asked[seen], SIZE)[: len(rows)]] = found
+                if (seen & whole).any():  # which is of flat rules: their weights are 0 or 1
+                    kept = np.ones(len(rows), bool)
+                    kept[np.repeat(asked[seen], SIZE)[: len(rows)]] = weights > 0
+                    rows = rows[kept]
+                    return rows, np.ones(len(rows), np.float32)
         some = np.flatnonzero(weights > 0)
         found = some.astype(np.int32) if rows is None else rows[some]
         return found, weights[some].astype(np.float32)

@@ -174,7 +174,7 @@ class SideOutputs:
         height, width = settings.view.height, settings.view.width
         return cls(
             radii=torch.zeros(count),
-            grad2d=torch.zeros(count, 2),
+            grad2d=torch.zeros(count, 2) if torch.is_grad_enabled() else torch.zeros(1, 2).expand(count, 2),
             absgrad2d=torch.zeros(count, 2) if settings.absolute else None,
             median=torch.full((height, width), -1, dtype=torch.int32) if settings.median else None,
             tile_counts=torch.empty(-(-height // tile), -(-width // tile), dtype=torch.int64),

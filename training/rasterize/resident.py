@@ -160,24 +160,27 @@ class Chosen(NamedTuple):
 
 def looked_at(
     sets: Sequence[Chosen], camera: Camera, near: float
-) -> tuple[Gaussians, torch.Tensor, torch.Tensor]:
+) -> tuple[Gaussians, torch.Tensor, torch.Tensor | None]:
     """Of sets that stand together all splats, N, which of them to look at, and weights: for ``rasterize``.
 
     Args:
         camera, near: in the sets' coordinates.
 
     Returns:
-        The splats; rows (M,) int32; weights (N,), which count in these rows only.
+        The splats; rows (M,) int32; weights (N,), which count in these rows only, or None: all are 1.
     """
-    gaussians, begin = sets[0].splats.joined([one.splats for one in sets[1:]]), 0
-    rows, weights = [], np.zeros(len(gaussians), np.float32)
-    for splats, choice in sets:
-        some, found = splats.chosen(choice, camera, near)
-        rows.append(some + np.int32(begin))
-        weights[begin : begin + len(splats)][some] = found
-        begin += len(splats)
+    gaussians = sets[0].splats.joined([one.splats for one in sets[1:]])
     device = gaussians.means.device
-    return gaussians, torch.from_numpy(np.concatenate(rows)).to(device), torch.from_numpy(weights).to(device)
+    chosen = [splats.chosen(choice, camera, near) for splats, choice in sets]
+    begins = np.cumsum([0, *(len(one.splats) for one in sets)], dtype=np.int32)
+    rows = np.concatenate([some + begin for begin, (some, _) in zip(begins, chosen, strict=False)])
+    found = np.concatenate([weights for _, weights in chosen])
+    rows_there = torch.from_numpy(rows).to(device)
+    if (found == 1).all():
+        return gaussians, rows_there, None
+    weights = np.zeros(len(gaussians), np.float32)
+    weights[rows] = found
+    return gaussians, rows_there, torch.from_numpy(weights).to(device)
 
 
 def draw(

@@ -100,7 +100,7 @@ def draw(
         if not instances:
             return picture
         gaussians, rows, weights, counts, camera, near, unit = _in_one_frame(instances, camera, near)
-        each = torch.tensor(counts, device=weights.device)
+        each = torch.tensor(counts, device=gaussians.means.device)
         features = _membership(instances, each, picture) if levels else None
         for top, drawn in strips(
             gaussians, camera, rows=rows, weights=weights, background=behind, near=near,
@@ -135,10 +135,10 @@ def draw(
 
 def _in_one_frame(
     instances: list[Instance], camera: Camera, near: float
-) -> tuple[Gaussians, torch.Tensor | None, torch.Tensor, list[int], Camera, float, float]:
-    """Splats of all sets in one frame, which rows of them to look at (None: all), their weights, and how
-    many are of each set; the camera and its near depth in that frame, and how many units of the world one of
-    its units is."""
+) -> tuple[Gaussians, torch.Tensor | None, torch.Tensor | None, list[int], Camera, float, float]:
+    """Splats of all sets in one frame, which rows of them to look at (None: all), their weights (None: all
+    1), and how many are of each set; the camera and its near depth in that frame, and how many units of the
+    world one of its units is."""
     first = instances[0].matrix
     if similarity(first) and all(np.array_equal(one.matrix, first) for one in instances):
         camera, unit = camera.within(first)

@@ -78,16 +78,13 @@ def _of_kernels(settings: Settings) -> tuple:
 def _project_and_bin(
     splats: list, rows: np.ndarray | None, settings: tuple, view: View, radii: torch.Tensor, buffers: Buffers
 ) -> tuple[np.ndarray, np.ndarray, Pairs]:
-    """The M splats that have a weight; these projected, (M, COLUMNS); and their pairs with tiles.
-
-    Where there are ``rows``, the M are of these. All that follows counts only these M. Fills the radii,
-    which are zeros. The last two live in ``buffers``.
+    """The M splats that have a weight, or the ``rows`` given; these projected, (M, COLUMNS); and their pairs
+    with tiles. All that follows counts only these M. Fills the radii, which are zeros. The last two live in
+    ``buffers``.
     """
-    weights = splats[-1]
-    if rows is None:
+    weights, some = splats[-1], rows
+    if some is None:
         some = (np.flatnonzero(weights > 0) if len(weights) else np.arange(len(radii))).astype(np.int32)
-    else:
-        some = rows[weights[rows] > 0] if len(weights) else rows
     projected = buffers.take("projected", np.float32, len(some), COLUMNS)
     depths = np.empty(len(some), np.float32)
     in_parallel(project_forward, len(some), GRAIN, *splats, *settings, some, depths, projected, radii.numpy())
@@ -115,7 +112,8 @@ class _Rasterize(torch.autograd.Function):
         transmittance = buffers.take("transmittance", np.float32, view.height, view.width)
         walked = np.empty(counts.size, np.int64)
         reached = buffers.take("reached", np.uint8, len(pairs.splat), 2)
-        passes = [projected, *_as_colours(features.detach().numpy()[some], projected)]
+        further = features.detach().numpy()
+        passes = [projected, *(_as_colours(further[some], projected) if further.shape[1] else [])]
         images = np.empty((len(passes), 3, view.height, view.width), np.float32)
         for coloured, image in zip(passes, images, strict=True):
             behind = background if coloured is projected else np.zeros_like(background)
