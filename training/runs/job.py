@@ -109,7 +109,13 @@ class Job:
             LodgsError: if the file cannot be read, or a key or value in it is not possible.
         """
         path = Path(path)
-        read = read_json if path.suffix.lower() == ".json" else read_toml
+        kind = path.suffix.lower()
+        if kind not in (".toml", ".json") and path.exists():
+            raise LodgsError(
+                f"{path} is neither a job file (.toml or .json) nor the folder of a scene.",
+                "Name one of these; unpack an archive first.",
+            )
+        read = read_json if kind == ".json" else read_toml
         values = read(path, f"The job file {path}")
         method, parameters = values.get("method", cls.method), values.get("parameters")
         if isinstance(method, str) and method in METHODS and isinstance(parameters, dict):

@@ -157,6 +157,11 @@ def test_a_missing_file_is_named(tmp_path):
         Job.from_file(tmp_path / "absent.toml")
 
 
+def test_what_is_no_job_file_is_not_read_as_one(tmp_path):
+    with pytest.raises(LodgsError, match=r"scene\.zip is neither a job file .* nor the folder"):
+        Job.from_file(write(tmp_path / "scene.zip", 'scene = "x"'))
+
+
 OLD_3DGS = """
 scene = "/s"
 out = "/o"
