@@ -185,7 +185,7 @@ def test_training_draws_what_the_bundle_shows(data, base):
             other = rasterize(
                 gaussians, camera, weights=torch.from_numpy(weights), near=data.near,
                 background=tree.background(0), sh_degree=tree.sh_degree(0), antialias=True,
-                backend="reference",
+                backend="cpu",  # its own, as another rounds an alpha across its threshold
             ).image  # fmt: skip
             assert len(rows) <= (weights > 0).sum()
             torch.testing.assert_close(one.detach(), other, atol=2e-5, rtol=1e-4)
