@@ -26,6 +26,10 @@ from .support import INTERVAL
 
 DEPTH_FALL = 0.01
 """What is left of the weight of depths at the end."""
+MANY_VIEWS = 40
+"""With so many training views no splats are left out of steps."""
+ALL_FROM = 7 / 8
+"""From this share of the steps on none are, however few views there are."""
 
 
 @dataclass
@@ -213,6 +217,22 @@ class Method(ABC, Generic[P, D]):
     def shown(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
         """Weights (N,) and smallest standard deviation with which a plain step draws; see ``rasterize``."""
         return None, 0.0
+
+    def left_out(self, step: int, share: float) -> torch.Tensor | None:
+        """Weights (N,) that leave some splats out of a step, at random; None: it draws all.
+
+        The others become as much more opaque (DropGaussian, Park et al. 2025, Sec. 3.2). The fewer photographs
+        see a place, the more its splats come to serve one of them alone; where some are missing others have to
+        stand in for them.
+
+        Args:
+            share: of the schedule's steps that were made before.
+        """
+        rate = self.parameters.dropout * (1 - len(self.data.train) / MANY_VIEWS)
+        if rate <= 0 or share >= ALL_FROM:
+            return None
+        draws = np.random.default_rng([self.seed, step, 13]).random(len(self.model), np.float32)
+        return torch.from_numpy((draws >= rate) / np.float32(1 - rate)).to(self.device)
 
     def choose_view(self, step: int) -> TrainingView:
         """The photograph of a step."""

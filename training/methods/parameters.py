@@ -95,6 +95,12 @@ class Parameters:
         "Whether splats are drawn through Mip-Splatting's 2D filter, which keeps the light of those that are "
         "smaller than a pixel, instead of 3DGS's dilation. Where a run begins with a base, the base decides.",
     )
+    dropout: float = parameter(
+        0.2,
+        "Where photographs are few, a step leaves out splats at random, so that none serves one photograph "
+        "alone: this share of them with one, less with more, none from 40 on, nor in the last eighth of steps.",
+        high=0.5,
+    )
     depth_weight: float = parameter(
         0.0,
         "Weight in the loss, at the start, of how far off the depth of splats is where it is known (see "
@@ -216,6 +222,7 @@ AS_PUBLISHED: dict[str, Any] = {
     "margin": 0.0,
     "antialias": False,
     "match_exposure": False,
+    "dropout": 0.0,
 }
 """What presets *paper* leave out, whatever the method: it is in no paper, but for the filter, in LODGE's."""
 PAPER: dict[str, Any] = AS_PUBLISHED | {

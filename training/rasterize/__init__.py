@@ -65,7 +65,7 @@ def rasterize(
     Args:
         gaussians: in the world.
         camera: the view; any pinhole, any principal point.
-        weights: (N,) in [0, 1] on the opacities, or None for ones. A splat of weight 0 is dropped before
+        weights: (N,) at least 0 on the opacities, or None for ones. A splat of weight 0 is dropped before
             projection.
         background: colour behind everything.
         sh_degree: use the coefficients up to this degree only (the others get a gradient of zero); None: all.

@@ -37,7 +37,7 @@ def data(scene):
 
 
 def made(name: str, data: TrainingData, weight: float):
-    return create(name, data, parameters_of(name, "draft", {"depth_weight": weight}), 0, "cpu")
+    return create(name, data, parameters_of(name, "draft", {"depth_weight": weight, "dropout": 0.0}), 0, "cpu")
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -121,7 +121,9 @@ def test_depth_is_better_with_it_and_it_can_begin_without_points(walls, tmp_path
         keys = {
             "scene": str(folder), "out": str(tmp_path / f"{name}_run"), "method": "3dgs", "backend": "cpu",
             "test_every": 3, "image_scale": 0.25,
-            "parameters": {"steps": 150, "max_splats": 3000, "depth": kind, "depth_weight": weight},
+            "parameters": {
+                "steps": 150, "max_splats": 3000, "depth": kind, "depth_weight": weight, "dropout": 0.0,
+            },
         }  # fmt: skip
         assert train(Job.from_dict(keys), sys.stdout) == 0
         found[name] = depth_error(tmp_path / f"{name}_run")

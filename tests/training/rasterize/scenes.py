@@ -49,7 +49,7 @@ def drawn_and_differentiated(name, make_splats, camera, backend, kind, device="c
     """Every output of ``rasterize``, and the gradients of a loss that all of them have a part in."""
     splats, options = scene(name, make_splats)
     random = torch.Generator().manual_seed(1)
-    weights = torch.rand(len(splats), generator=random).double()
+    weights = 1.25 * torch.rand(len(splats), generator=random).double()  # some make opacities more than 1
     weights[3::7] = 0
     shade = torch.rand(50, 75, 3, generator=random).double().to(device, kind)
     tensors = (*vars(splats).values(), weights)

@@ -37,7 +37,7 @@ class FlodParameters(DensityParameters):
         0.0, "Level 1's smallest size in scene units (FLoD: lambda); 0 takes it from 'footprint'."
     )
     steps: tuple[int, ...] = parameter(
-        (250, 400, 500, 900, 1250), "Training steps of each level.", above=0, unit="steps"
+        (250, 400, 500, 750, 1250), "Training steps of each level.", above=0, unit="steps"
     )
     densify_until: tuple[float, ...] = parameter(
         (0.5,) * 5, "Share of a level's steps after which splats are no longer added or removed.", high=1
@@ -69,7 +69,7 @@ class FlodParameters(DensityParameters):
     )
     last_level: int = parameter(0, "Level that training ends with; 0 for the finest.")
     finish_share: float = parameter(
-        0.14,
+        0.2,
         "Further steps at the end, as a share of all levels', that fit the three finest levels to how they "
         "are drawn together by distance; of the two coarser ones those of fine detail begin anew with the "
         "finest level's most important splats. Not in the paper.",

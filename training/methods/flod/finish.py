@@ -40,8 +40,10 @@ COARSER = 0.8
 """Of two neighbouring levels that begin anew the coarser one has so many times the other's splats."""
 LEAST_SHARE = 0.25
 """At least this share of what views draw of a level stays, whatever the others have drawn."""
-SPREAD = 2.0
+SPREAD = 1.3
 """The largest factor on the run's screen size, up or down."""
+FINEST = 2.0
+"""The finest level is drawn alone so many times as often as each other one."""
 MEANS = 3.0
 """Positions begin with so many times the rate that a level ends with."""
 FALL = 0.1
@@ -145,7 +147,8 @@ def rates(parameters: FlodParameters, extent: float, share: float) -> dict[str, 
 def random_values(rng: np.random.Generator, gamma: float, model: Model, alone: float) -> Values:
     """Controls of the rule for a step: a level alone with a chance of ``alone``, else all levels."""
     numbers = list(_rows(model))
-    factor, level = SPREAD ** rng.uniform(-1, 1), int(rng.choice(numbers))
+    often = np.array([1.0] * (len(numbers) - 1) + [FINEST])
+    factor, level = SPREAD ** rng.uniform(-1, 1), int(rng.choice(numbers, p=often / often.sum()))
     first, last = (level, level) if rng.uniform() < alone else (numbers[0], numbers[-1])
     return {"gamma": gamma * factor, "first": first, "last": last}
 

@@ -103,8 +103,7 @@ class Method(method.Method[FlodParameters, Drawing]):
 
     def shrink(self, step: int) -> float:
         p = self.parameters
-        share = (self._before + step) / p.all_steps
-        return shrink_at(share, p.first_resolution, p.full_resolution)
+        return shrink_at(self._share(step), p.first_resolution, p.full_resolution)
 
     def sh_degree(self, step: int) -> int:
         return super().sh_degree(self._before + step)
@@ -119,7 +118,7 @@ class Method(method.Method[FlodParameters, Drawing]):
         if self.finishing(step):
             values = self._finishing_values(step)
             return finish.weights(self.model, self.s_min, view.camera, values), 0.0
-        return None, self.s_min[self.level_at(step) - 1]
+        return self.left_out(step, self._share(step)), self.s_min[self.level_at(step) - 1]
 
     def counts(self, view: TrainingView, step: int) -> bool:
         return not self.finishing(step) and self._local(step) < self._densify_until(step)
@@ -184,6 +183,10 @@ class Method(method.Method[FlodParameters, Drawing]):
         """What a finishing step draws."""
         rng = np.random.default_rng([self.seed, step, 3])
         return finish.random_values(rng, self.controls()["gamma"], self.model, self.parameters.finish_alone)
+
+    def _share(self, step: int) -> float:
+        """What share of a run of all levels a step comes after."""
+        return (self._before + step) / self.parameters.all_steps
 
     def _local(self, step: int) -> int:
         """Steps that the level of a step has seen before it."""

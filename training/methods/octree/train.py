@@ -80,7 +80,9 @@ class Method(method.Method[OctreeParameters, Drawing]):
         return [Drawing(self.rasterize_model(view.camera, step, *self.shown(view, step)))]
 
     def shown(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
-        return self.schedule.weights(view.camera, self.model, step, full=view.shrink == 1), 0.0
+        weights = self.schedule.weights(view.camera, self.model, step, full=view.shrink == 1)
+        left = self.left_out(step, step / self.parameters.steps)
+        return (weights if left is None else weights * left), 0.0
 
     def is_plain(self, step: int) -> bool:
         return not self.parameters.volume_weight

@@ -10,8 +10,8 @@ from ..parameters import AS_PUBLISHED, parameter
 
 @dataclass(frozen=True)
 class NeuralOctreeParameters(OctreeParameters):
-    """Harmonics are those of baking. Without use here: ``candidates``, ``sh_interval`` and the learning rates
-    of means, quaternions, opacities and harmonics.
+    """Harmonics are those of baking. Without use here: ``candidates``, ``sh_interval``, ``dropout`` and the
+    learning rates of means, quaternions, opacities and harmonics.
     """
 
     max_splats: int = parameter(180_000, "Most Gaussians of all levels together, which add up.", above=0)
@@ -76,6 +76,7 @@ _DRAFT = NeuralOctreeParameters(
     least_weight=0.03,
     volume_weight=0.01,
     antialias=False,
+    dropout=0.0,
     lr_means=4e-4,
     lr_sh=5e-3,
 )

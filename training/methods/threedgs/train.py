@@ -60,10 +60,13 @@ class Method(method.Method[ThreedgsParameters, Drawing]):
         return self.parameters.sh_degree if self._from_base else super().sh_degree(step)
 
     def draw(self, view: TrainingView, step: int) -> list[Drawing]:
-        return [Drawing(self.rasterize_model(view.camera, step))]
+        return [Drawing(self.rasterize_model(view.camera, step, *self.shown(view, step)))]
 
     def is_plain(self, step: int) -> bool:
         return True
+
+    def shown(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
+        return self.left_out(step, step / self.scheduled_steps), 0.0
 
     def counts(self, view: TrainingView, step: int) -> bool:
         return step < self._densify_until
