@@ -221,8 +221,8 @@ class Method(ABC, Generic[P, D]):
     def left_out(self, step: int, share: float) -> torch.Tensor | None:
         """Weights (N,) that leave some splats out of a step, at random; None: it draws all.
 
-        The others become as much more opaque (DropGaussian, Park et al. 2025, Sec. 3.2). The fewer photographs
-        see a place, the more its splats come to serve one of them alone; where some are missing others have to
+        The others become as much more opaque (DropGaussian, Park et al. 2025). The fewer photographs see a
+        place, the more its splats come to serve one of them alone; where some are missing, others have to
         stand in for them.
 
         Args:

@@ -98,7 +98,8 @@ class Parameters:
     dropout: float = parameter(
         0.2,
         "Where photographs are few, a step leaves out splats at random, so that none serves one photograph "
-        "alone: this share of them with one, less with more, none from 40 on, nor in the last eighth of steps.",
+        "alone: this share of them with one photograph, less with more, none from 40 on, nor in the last "
+        "eighth of the steps. Not in the papers.",
         high=0.5,
     )
     depth_weight: float = parameter(

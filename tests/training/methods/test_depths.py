@@ -37,7 +37,9 @@ def data(scene):
 
 
 def made(name: str, data: TrainingData, weight: float):
-    return create(name, data, parameters_of(name, "draft", {"depth_weight": weight, "dropout": 0.0}), 0, "cpu")
+    return create(
+        name, data, parameters_of(name, "draft", {"depth_weight": weight, "dropout": 0.0}), 0, "cpu"
+    )
 
 
 @pytest.mark.parametrize("name", METHODS)

@@ -326,11 +326,11 @@ def test_alone_the_finest_level_is_drawn_twice_as_often_as_each_other(data):
 
 
 def test_finished_levels_keep_their_sizes_and_their_number_of_splats(data):
-    flod, handed = finishing(data, finish_alone=0.5)
-    for step in range(18, 27):
+    flod, handed = finishing(data, finish_alone=1.0, finish_share=1.0)
+    for step in range(18, 36):
         flod.train_step(step)
         final = flod.levels_after(step)
-        assert bool(final) == (step == 26) and flod.level_at(step) == 3
+        assert bool(final) == (step == 35) and flod.level_at(step) == 3
     for before, after in zip(handed, final, strict=True):
         assert (before.number, len(before.splats), before.facts) == (
             after.number,
