@@ -35,7 +35,7 @@ def test_before_training(root, draw, fake):
     notes = draw()
     assert (notes.operators, notes.buttons) == (["lodgs.train"], ["Train"])
     assert notes.properties == ["method", "preset", "image_scale"]
-    assert "3,762 steps in 5 levels" in notes.texts
+    assert "3,780 steps in 5 levels" in notes.texts
     assert NONE_HELD_OUT in notes.texts
     root.lodgs.training.test_every = 8
     assert NONE_HELD_OUT not in draw().texts
