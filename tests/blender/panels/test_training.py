@@ -40,7 +40,7 @@ def test_before_training(root, draw, fake):
     root.lodgs.training.test_every = 8
     assert NONE_HELD_OUT not in draw().texts
     root.lodgs.training.parameters.levels = 3
-    assert "3,021 steps in 3 levels" in draw().texts
+    assert "3,000 steps in 3 levels" in draw().texts
     root.lodgs.training.method = "3dgs"  # which has no levels
     assert "3,000 steps" in draw().texts
 
