@@ -182,13 +182,19 @@ def test_training_draws_what_the_bundle_shows(data, base):
             one = tree.rasterize_model(camera, 0, gaussians=gaussians).image
             weights = choice.weights(camera.center, camera.focal, settings(bundle, {"pixels": pixels}))
             gaussians = Gaussians.of(choice.splats)
-            other = rasterize(
-                gaussians, camera, weights=torch.from_numpy(weights), near=data.near,
-                background=tree.background(0), sh_degree=tree.sh_degree(0), antialias=True,
-                backend="cpu",  # its own, as another rounds an alpha across its threshold
-            ).image  # fmt: skip
+            own, reference = (
+                rasterize(
+                    gaussians, camera, weights=torch.from_numpy(weights), near=data.near,
+                    background=tree.background(0), sh_degree=tree.sh_degree(0), antialias=True,
+                    backend=backend,
+                ).image
+                for backend in ("cpu", "reference")
+            )  # fmt: skip
             assert len(rows) <= (weights > 0).sum()
-            torch.testing.assert_close(one.detach(), other, atol=2e-5, rtol=1e-4)
+            torch.testing.assert_close(one.detach(), own, atol=2e-5, rtol=1e-4)
+            # two backends may round a splat's alpha across its threshold in a pixel, which is worth a 255th
+            off = ~torch.isclose(one.detach(), reference, atol=2e-5, rtol=1e-4).all(-1)
+            assert off.sum() <= 2 and (one.detach() - reference).abs().max() < 1 / 255
 
 
 def test_a_bundle_tells_which_blocks_an_eye_needs(data, base):
