@@ -375,13 +375,13 @@ class Method(ABC, Generic[P, D]):
             return
         support = self.data.support
         means = model["means"].detach().cpu().numpy()
-        distances = support.distances(means)
+        distances, places = support.nearest_places(means)
         if p.largest:
             sizes = np.maximum(p.largest * distances, np.finfo(np.float32).tiny)
             most = torch.from_numpy(np.log(sizes)).to(model["log_scales"])
             model["log_scales"].clamp_max_(most[:, None])
         if p.free_depth:
-            model.keep(torch.from_numpy(~support.intruding(means, distances, p.free_depth)))
+            model.keep(torch.from_numpy(~support.intruding(means, distances, places, p.free_depth)))
             require_rows(model, step, "free_depth")
 
     # -- what methods draw with ------------------------------------------------------------------------

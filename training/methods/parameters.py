@@ -71,7 +71,8 @@ class Parameters:
     free_depth: float = parameter(
         0.5,
         "Nothing stands before a training view, or one halfway between two, that is nearer than this share "
-        "of the nearest points in it; 0 lets splats stand anywhere.",
+        "of the nearest points in it, nor as near beside or behind its eye what fewer than two photographs "
+        "see; 0 lets splats stand anywhere.",
         high=1,
     )
     largest: float = parameter(

@@ -20,6 +20,8 @@ MARGIN = 0.1
 """What a view is widened by on every side, as a share of its image."""
 POINTS = 20_000
 """Most points that are looked at."""
+SEEN = 2
+"""So many photographs have to see what is near to a place but not before it."""
 
 
 def halfway(cameras: Sequence[Camera]) -> list[Camera]:
@@ -42,6 +44,8 @@ class Support:
     """The room that whoever took the photographs stood in and walked through.
 
     Nothing is near before a camera, or before a place halfway between two, but what the scene's points show.
+    Nor is anything as near beside or behind one but what two photographs see: what only one of them sees may
+    be at any depth along its rays, and whoever turns around there has it before his eyes.
 
     Args:
         cameras: the training views.
@@ -50,32 +54,43 @@ class Support:
 
     def __init__(self, cameras: Sequence[Camera], points: np.ndarray) -> None:
         points = points[:: -(-len(points) // POINTS)].astype(np.float64)
+        self._cameras = cameras
         self._views = [*cameras, *halfway(cameras)]
         depths = (view.view_space(points)[view.sees(points), 2] for view in self._views)
-        self._nearest = [float(np.quantile(seen, NEAREST)) if len(seen) else 0.0 for seen in depths]
+        self._nearest = np.array([np.quantile(seen, NEAREST) if len(seen) else 0.0 for seen in depths])
         self._eyes = KDTree(np.array([view.center for view in self._views]))
         sides = [max(view.width / view.fx, view.height / view.fy) for view in self._views]
         self._slant = float(np.sqrt(1 + 2 * ((1 + MARGIN) * max(sides)) ** 2))
         """A point in a view lies at most this many times as far as it is deep, wherever its center is."""
 
-    def distances(self, means: np.ndarray) -> np.ndarray:
-        """From points (N, 3) to the nearest of the places, (N,) in scene units."""
-        return self._eyes.query(means, workers=-1)[0]
+    def nearest_places(self, means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The nearest of the places to each of the points (N, 3): how far it is, in scene units, and which.
 
-    def intruding(self, means: np.ndarray, distances: np.ndarray, share: float) -> np.ndarray:
-        """Which points (N, 3) stand in the way: in a view, nearer than a share of what is nearest in it.
+        Returns:
+            (N,) float64 and (N,) int.
+        """
+        distances, places = self._eyes.query(means, workers=-1)
+        return np.asarray(distances), np.asarray(places)
+
+    def intruding(
+        self, means: np.ndarray, distances: np.ndarray, places: np.ndarray, share: float
+    ) -> np.ndarray:
+        """Which points (N, 3) stand in the way: nearer than a share of what is nearest in a place's view.
 
         Args:
-            distances: as :meth:`distances` gives them.
+            distances, places: as :meth:`nearest_places` gives them.
 
         Returns:
             (N,) bool.
         """
         found = np.zeros(len(means), bool)
-        near = np.flatnonzero(distances < share * self._slant * max(self._nearest))
+        near = np.flatnonzero(distances < share * self._slant * self._nearest.max())
         points = means[near].astype(np.float64)
         for view, nearest in zip(self._views, self._nearest, strict=True):
             before = view.view_space(points)[:, 2] < share * nearest
             before[before] = view.sees(points[before], margin=MARGIN)
             found[near] |= before
+        beside = distances[near] < share * self._nearest[places[near]]
+        seen = np.sum([camera.sees(points[beside]) for camera in self._cameras], axis=0)
+        found[near[beside]] |= seen < SEEN
         return found

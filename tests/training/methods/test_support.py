@@ -15,6 +15,19 @@ def camera(x: float, width: int = 100) -> Camera:
     return Camera(f"{x:g}", width, width, width / 2, width / 2, width / 2, width / 2, pose)
 
 
+def from_the_side(y: float, z: float) -> Camera:
+    """A camera at (3, y, z) that looks along -x, 90 degrees wide."""
+    pose = np.eye(4)
+    pose[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
+    pose[:3, 3] = -pose[:3, :3] @ [3, y, z]
+    return Camera(f"{y:g}", 100, 100, 50, 50, 50, 50, pose)
+
+
+def intruding(support: Support, means, share: float = 0.5) -> list[bool]:
+    means = np.array(means, np.float32)
+    return support.intruding(means, *support.nearest_places(means), share).tolist()
+
+
 @pytest.fixture
 def support() -> Support:
     """Two cameras 2 apart before a wall at depth 10, with one stray point in 200 at depth 1."""
@@ -25,37 +38,45 @@ def support() -> Support:
 
 
 def test_what_stands_nearer_than_a_share_of_the_nearest_points_intrudes(support):
-    depths = np.array([0.05, 1.0, 4.9, 5.1, 9.0], np.float32)
-    means = np.stack([np.full(5, -1.0), np.zeros(5), depths], 1).astype(np.float32)
-    found = support.intruding(means, support.distances(means), share=0.5)
-    assert found.tolist() == [True, True, True, False, False]  # half of 10, whatever the stray point says
-    assert not support.intruding(means, support.distances(means), share=0.0).any()
+    means = [(-1, 0, depth) for depth in (0.05, 1.0, 4.9, 5.1, 9.0)]
+    assert intruding(support, means) == [True, True, True, False, False]  # half of 10, not of 1
+    assert not any(intruding(support, means, share=0.0))
 
 
-def test_only_what_is_in_a_view_intrudes(support):
-    behind, beside, at_the_edge = (-1, 0, -0.5), (-1, 3, 2), (-1, 2.3, 2)
-    means = np.array([behind, beside, at_the_edge], np.float32)
-    # the image ends where |y| = z; widened by a tenth of its height on either side at |y| = 1.2 z
-    assert support.intruding(means, support.distances(means), 0.5).tolist() == [False, False, True]
+def test_what_is_farther_away_intrudes_only_in_a_view(support):
+    # 5.1 away at least; the image ends where |y| = z, a tenth of its height wider on either side at 1.2 z
+    beside, at_the_edge, in_the_image = (-1, 5, 4), (-1, 4.7, 4), (-1, 3.9, 4)
+    assert intruding(support, [beside, at_the_edge, in_the_image]) == [False, True, True]
 
 
-def test_places_between_cameras_are_kept_free(support):
-    means = np.array([(0, 0, 0.5)], np.float32)  # 45 degrees wide, the two cameras see it from z = 1 on
-    alone = Support([camera(-1), camera(1)], np.array([[0, 0, 10.0]], np.float32))
-    alone._views, alone._nearest = alone._views[:2], alone._nearest[:2]
-    assert support.intruding(means, support.distances(means), 0.5).all()
-    assert not alone.intruding(means, alone.distances(means), 0.5).any()
+def test_what_is_beside_or_behind_a_camera_intrudes_unless_two_photographs_see_it():
+    far, thing = (0, 0, 10.0), (0, 0, -2.0)
+    beside, behind, away = (0, -4, 0), thing, (0, 0, -5.1)  # half of 10 around the eye has to be free
+    for others, stays in (((), False), ((0,), False), ((0, 1), True)):
+        cameras = [camera(0), camera(0.001), *(from_the_side(y, -2.0) for y in others)]
+        alone = Support(cameras, np.array([far, thing], np.float32))
+        assert intruding(alone, [beside, behind, away]) == [True, not stays, False]
+
+
+def test_places_between_cameras_are_kept_free():
+    # 90 degrees wide, the two cameras see x = 0 from z = 1 on: a share of 0.09 leaves 0.9 of 10 free
+    means = [(0, 0, 0.5)]
+    support = Support([camera(-1), camera(1)], np.array([[0, 0, 10.0]], np.float32))
+    assert intruding(support, means, 0.09) == [True]
+    alone = Support([camera(-1)], np.array([[0, 0, 10.0]], np.float32))
+    assert intruding(alone, means, 0.09) == [False]
 
 
 def test_a_view_without_points_forbids_nothing():
     empty = Support([camera(-1), camera(1)], np.array([[0, 0, -10.0]], np.float32))
-    means = np.array([(0, 0, 0.01)], np.float32)
-    assert not empty.intruding(means, empty.distances(means), 0.5).any()
+    assert intruding(empty, [(0, 0, 0.01), (-1, 0, -0.01)]) == [False, False]
 
 
-def test_distances_are_to_the_nearest_place(support):
+def test_the_nearest_place_of_a_point(support):
     means = np.array([(1, 0, 2), (0, 0, 3), (-4, 4, 0)], np.float32)
-    assert support.distances(means) == pytest.approx([2, 3, 5])
+    distances, places = support.nearest_places(means)
+    assert distances == pytest.approx([2, 3, 5])
+    assert places[[0, 2]].tolist() == [1, 0] and places[1] >= 2  # cameras come first, then what lies between
 
 
 def test_training_leaves_nothing_in_the_way_and_nothing_too_large(data):
@@ -73,5 +94,5 @@ def test_training_leaves_nothing_in_the_way_and_nothing_too_large(data):
     method.keep_supported(0)
     assert len(method.model) == before + 1
     largest = method.model["log_scales"].detach().exp().amax(1).numpy()
-    allowed = p.largest * data.support.distances(method.model["means"].detach().numpy())
+    allowed = p.largest * data.support.nearest_places(method.model["means"].detach().numpy())[0]
     assert (largest <= allowed * 1.0001).all() and largest[-1] == pytest.approx(allowed[-1], rel=1e-4)
