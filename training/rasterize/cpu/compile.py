@@ -137,7 +137,8 @@ def compile_in_two_processes(step: Callable[[], Any]) -> None:
 
     Numba compiles in Python and holds the GIL, so threads would not help. Nothing is done where there is a
     cache already, where only one thread is to be used, or where a process cannot be forked (macOS's own
-    libraries do not bear it): a fresh one would import torch first, and the main program as well.
+    libraries do not bear it): a fresh one would import torch first, and the main program as well. The forked
+    one does not make the step: where torch has a GPU, gradients cannot be taken there.
 
     Args:
         step: is content with kernels that do nothing.
@@ -145,31 +146,36 @@ def compile_in_two_processes(step: Callable[[], Any]) -> None:
     cached = any(Path(numba.config.CACHE_DIR).rglob("*.nbi"))  # type: ignore[attr-defined]
     if cached or threads() == 1 or not sys.platform.startswith("linux"):
         return
+    noted = _kernels_of(step)
     with tempfile.TemporaryDirectory(prefix="lodgs-") as taken:
         fork = multiprocessing.get_context("fork")
-        other = fork.Process(target=_compile_share, args=(step, taken, -1), daemon=True)
+        other = fork.Process(target=_compile_share, args=(noted, taken, -1), daemon=True)
         other.start()
         try:
-            _compile_share(step, taken, 1)
+            _compile_share(noted, taken, 1)
             other.join()
         finally:
             other.kill()
             other.join()
 
 
-def _compile_share(step: Callable[[], Any], taken: str, direction: int) -> None:
-    """Compile those kernels of a step that nobody has taken yet, by a file in the folder ``taken``.
-
-    One process begins with the first module and one with the last, as kernels of a module share helpers.
-    """
+def _kernels_of(step: Callable[[], Any]) -> dict[Any, tuple]:
+    """The kernels that a step calls, with arguments that make little work."""
     global _noted
     _noted = {}
     try:
         with np.errstate(all="ignore"):  # it reckons with whatever the memory held
             step()
-        noted = _noted
+        return _noted
     finally:
         _noted = None
+
+
+def _compile_share(noted: dict[Any, tuple], taken: str, direction: int) -> None:
+    """Compile those kernels that nobody has taken yet, by a file in the folder ``taken``.
+
+    One process begins with the first module and one with the last, as kernels of a module share helpers.
+    """
     by_module = sorted(noted, key=lambda kernel: (kernel.py_func.__module__, kernel.py_func.__name__))
     for kernel in by_module[::direction]:
         try:

@@ -6,6 +6,7 @@ bound by the names that the shader gives them.
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 import threading
@@ -25,6 +26,8 @@ KINDS = {"DiscreteGPU": "discrete", "IntegratedGPU": "integrated", "CPU": "softw
 """wgpu's kinds of adapters as ours; others are "other"."""
 LANES = 64
 """Invocations of a workgroup, in every shader."""
+UNIFORMS = 1 << 16
+"""Bytes of the numbers that dispatches read, of as many as are submitted together."""
 SMALLEST = 64
 """Bytes of a buffer of nothing: one element of whatever a shader takes it for."""
 ALIGNED = 64
@@ -66,7 +69,7 @@ class Buffer:
     @property
     def size(self) -> int:
         """Bytes that are bound for it."""
-        return 4 * int(np.prod(self.shape, dtype=np.int64)) or SMALLEST
+        return 4 * math.prod(self.shape) or SMALLEST
 
     def part(self, begin: int, end: int) -> Buffer:
         """Some of its rows."""
@@ -176,6 +179,9 @@ class Device:
         self.most_groups = self.limits["max-compute-workgroups-per-dimension"]
         self.moved = 0
         self._firsts: dict[int, Any] = {}
+        flags = _wgpu().BufferUsage
+        self._uniforms = self._device.create_buffer(size=UNIFORMS, usage=flags.UNIFORM | flags.COPY_DST)
+        self._numbers, self._told = np.zeros(UNIFORMS // 4, np.uint32), 0
         self._pipelines: dict[tuple[str, str], tuple[Any, Any, dict[str, int]]] = {}
         self._encoder: Any = None
         self._pass: Any = None
@@ -258,12 +264,12 @@ class Device:
                 bindings[name]: {"buffer": buffer.handle, "offset": buffer.offset, "size": buffer.size}
                 for name, buffer in buffers.items()
             }
-            if numbers:
-                bound[bindings["u"]] = {"buffer": self._uniform(*numbers)}
             at_once = min(at_once, self.most_groups)
             for first in range(begin, begin + groups, at_once):
+                if numbers:
+                    bound[bindings["u"]] = self._uniform(*numbers)
                 if first not in self._firsts:
-                    self._firsts[first] = self._uniform(first)
+                    self._firsts[first] = self._constant(first)
                 bound[bindings["first_group"]] = {"buffer": self._firsts[first]}
                 entries = [{"binding": at, "resource": resource} for at, resource in bound.items()]
                 group = self._device.create_bind_group(layout=layout, entries=entries)
@@ -304,6 +310,10 @@ class Device:
         with self._said():
             recorded, encoder, self._pass, self._encoder = self._pass, self._encoder, None, None
             recorded.end()
+            told, self._told = self._numbers[: self._told], 0
+            if len(told):
+                self.moved += told.nbytes
+                self._device.queue.write_buffer(self._uniforms, 0, told)
             self._device.queue.submit([encoder.finish()])
 
     def _require(self, size: int, most: int) -> None:
@@ -315,9 +325,20 @@ class Device:
                 "Choose the cpu backend, fewer splats or smaller images.",
             )
 
-    def _uniform(self, *numbers: Any) -> Any:
-        words = np.concatenate([_as_words(number) for number in numbers])
-        words = np.pad(words, (0, -len(words) % 4))
+    def _uniform(self, *numbers: Any) -> dict[str, Any]:
+        """What a dispatch binds to read these numbers; they go to the device with what is recorded."""
+        words = _words(numbers)
+        aligned = self.limits["min-uniform-buffer-offset-alignment"] // 4
+        if self._told + len(words) > len(self._numbers):
+            self.submit()
+        begin = self._told
+        self._numbers[begin : begin + len(words)] = words
+        self._told = begin + -(-len(words) // aligned) * aligned
+        return {"buffer": self._uniforms, "offset": 4 * begin, "size": words.nbytes}
+
+    def _constant(self, *numbers: Any) -> Any:
+        """A buffer of numbers that stay."""
+        words = _words(numbers)
         self.moved += words.nbytes
         return self._device.create_buffer_with_data(data=words, usage=_wgpu().BufferUsage.UNIFORM)
 
@@ -340,6 +361,7 @@ class Device:
             yield
         except (RuntimeError, MemoryError, _wgpu().GPUError) as error:
             self._pass = self._encoder = None
+            self._told = 0
             name, said = self.adapter.name, str(error).lower()
             if "lost" not in said and (isinstance(error, MemoryError) or "memory" in said):
                 raise LodgsError(
@@ -354,6 +376,15 @@ class Device:
                 f"{name} does not answer any more: {_reason(error)}.",
                 "Resume the run, on this device or on the cpu; a newer driver may help.",
             ) from error
+
+
+def _words(numbers: tuple) -> np.ndarray:
+    """As a uniform has them: whole vectors of four."""
+    parts = [_as_words(number) for number in numbers]
+    count = sum(map(len, parts))
+    words = np.zeros(-(-count // 4) * 4, np.uint32)
+    np.concatenate(parts, out=words[:count])
+    return words
 
 
 def _as_words(number: Any) -> np.ndarray:
