@@ -91,6 +91,8 @@ class Support:
             before[before] = view.sees(points[before], margin=MARGIN)
             found[near] |= before
         beside = distances[near] < share * self._nearest[places[near]]
-        seen = np.sum([camera.sees(points[beside]) for camera in self._cameras], axis=0)
+        seen = np.zeros(int(beside.sum()), np.int64)
+        for camera in self._cameras:
+            seen += camera.sees(points[beside])
         found[near[beside]] |= seen < SEEN
         return found

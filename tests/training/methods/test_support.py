@@ -59,12 +59,12 @@ def test_what_is_beside_or_behind_a_camera_intrudes_unless_two_photographs_see_i
 
 
 def test_places_between_cameras_are_kept_free():
-    # 90 degrees wide, the two cameras see x = 0 from z = 1 on: a share of 0.09 leaves 0.9 of 10 free
-    means = [(0, 0, 0.5)]
+    # 90 degrees wide, the two cameras see x = 0 from z = 1 on: a share of 0.1 leaves 1 of 10 free
+    around, before = (0, 0, 0.5), (0, 0.9, 0.8)  # 0.5 and 1.2 from between the two, 1.1 and 1.6 from them
     support = Support([camera(-1), camera(1)], np.array([[0, 0, 10.0]], np.float32))
-    assert intruding(support, means, 0.09) == [True]
+    assert intruding(support, [around, before], 0.1) == [True, True]
     alone = Support([camera(-1)], np.array([[0, 0, 10.0]], np.float32))
-    assert intruding(alone, means, 0.09) == [False]
+    assert intruding(alone, [around, before], 0.1) == [False, False]
 
 
 def test_a_view_without_points_forbids_nothing():

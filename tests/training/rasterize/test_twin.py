@@ -143,6 +143,24 @@ def test_a_step_moves_a_few_numbers(graphics, make_splats, odd_camera, photograp
     assert max(moved) < 20_000
 
 
+def test_a_step_is_the_same_however_often_its_numbers_fill_their_buffer(
+    graphics, make_splats, odd_camera, photograph, monkeypatch
+):
+    def trained() -> torch.Tensor:
+        twin = twin_of("gpu", adam_of(make_splats(300)), blank(300))
+        assert twin is not None
+        for _ in range(2):
+            twin.step(odd_camera, photograph, ssim_weight=0.2, shrink=1, **VIEW)
+        return torch.cat([twin.look(name).reshape(300, -1) for name in ("means", "sh", "gradient_sum")], 1)
+
+    submit, submitted = graphics.submit, []
+    monkeypatch.setattr(graphics, "submit", lambda: (submitted.append(1), submit()))
+    at_once, few = trained(), len(submitted)
+    monkeypatch.setattr(graphics, "_numbers", graphics._numbers[:256])
+    assert torch.equal(trained(), at_once)
+    assert len(submitted) - few > few  # it was full in between
+
+
 def test_only_splats_that_a_device_can_count_go_there(graphics, make_splats):
     adam = adam_of(make_splats(5))
     assert twin_of("cpu", adam, {}) is None

@@ -269,7 +269,10 @@ class Device:
                 if numbers:
                     bound[bindings["u"]] = self._uniform(*numbers)
                 if first not in self._firsts:
-                    self._firsts[first] = self._constant(first)
+                    usage = _wgpu().BufferUsage.UNIFORM
+                    self._firsts[first] = self._device.create_buffer_with_data(
+                        data=_words((first,)), usage=usage
+                    )
                 bound[bindings["first_group"]] = {"buffer": self._firsts[first]}
                 entries = [{"binding": at, "resource": resource} for at, resource in bound.items()]
                 group = self._device.create_bind_group(layout=layout, entries=entries)
@@ -326,7 +329,10 @@ class Device:
             )
 
     def _uniform(self, *numbers: Any) -> dict[str, Any]:
-        """What a dispatch binds to read these numbers; they go to the device with what is recorded."""
+        """What a dispatch binds to read these numbers; they go to the device with what is recorded.
+
+        Where there is no room for more, what was recorded begins first.
+        """
         words = _words(numbers)
         aligned = self.limits["min-uniform-buffer-offset-alignment"] // 4
         if self._told + len(words) > len(self._numbers):
@@ -335,12 +341,6 @@ class Device:
         self._numbers[begin : begin + len(words)] = words
         self._told = begin + -(-len(words) // aligned) * aligned
         return {"buffer": self._uniforms, "offset": 4 * begin, "size": words.nbytes}
-
-    def _constant(self, *numbers: Any) -> Any:
-        """A buffer of numbers that stay."""
-        words = _words(numbers)
-        self.moved += words.nbytes
-        return self._device.create_buffer_with_data(data=words, usage=_wgpu().BufferUsage.UNIFORM)
 
     def _pipeline(self, shader: str, entry: str) -> tuple[Any, Any, dict[str, int]]:
         """Compiled when it is first used: the pipeline, its layout, and the bindings by name."""
