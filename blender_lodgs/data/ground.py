@@ -16,13 +16,16 @@ APART = 1e-6
 """Of two places, over the size of the scene: nearer ones are one."""
 
 
-def lay_on_ground(root: bpy.types.Object, places: np.ndarray | None = None, flip: bool = False) -> None:
+def lay_on_ground(root: bpy.types.Object, places: np.ndarray | None = None, flip: bool = False) -> float:
     """Has z = 0 of Blender's world where a splat scene's ground is, its normal up.
 
     Args:
         places: (P, 3) of the ground, in Blender's world: three or more; None finds the plane that lies under
             the scene.
         flip: the other side of the ground is up.
+
+    Returns:
+        By how many degrees the scene was turned.
 
     Raises:
         LodgsError: the places make no plane, or none is found; the root is stretched.
@@ -33,7 +36,9 @@ def lay_on_ground(root: bpy.types.Object, places: np.ndarray | None = None, flip
     else:
         normal, middle = plane_through(places, up)
     _leave_edit_mode()
-    move(root, level_at_zero(-normal if flip else normal, middle))
+    up = -normal if flip else normal
+    move(root, level_at_zero(up, middle))
+    return float(np.degrees(np.arccos(np.clip(up[2], -1, 1))))
 
 
 def scale(root: bpy.types.Object, factor: float) -> None:

@@ -45,7 +45,8 @@ class LODGS_OT_set_ground(OnScene, bpy.types.Operator):
     def execute(self, context):
         root = scenes.active_root(context)
         places = ground.picked(context) if self.by == "SELECTION" else None
-        ground.lay_on_ground(root, places, self.flip)
+        degrees = ground.lay_on_ground(root, places, self.flip)
+        self.report({"INFO"}, f"Its ground is at Z = 0 now: '{root.name}' was turned by {degrees:.1f}°")
         return {"FINISHED"}
 
 

@@ -1,5 +1,6 @@
 """Where scenes stand: the root is the artist's, the axes carry what turns, grounds and scales the scene."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -164,12 +165,15 @@ def test_the_ground_through_points_that_are_selected_in_edit_mode(bpy, lodgs):
     assert np.square(apart).sum() < np.square(np.linalg.svd(there[some] - there[some].mean(0))[1][2]) + 1e-6
 
 
-def test_the_ground_is_found(bpy, lodgs):
+def test_the_ground_is_found(bpy, lodgs, capfd):
     """The example's, which is z = 0 in its own coordinates; the root has been turned and moved away."""
     root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
     root.rotation_euler, root.location = (0.2, -0.1, 1.0), (0, 0, 5)
     bpy.context.view_layer.update()
+    up = lodgs("data.placement").placement_of(root).rotation[:, 2]
     bpy.ops.lodgs.set_ground(by="FOUND")
+    told = re.search(r"turned by ([\d.]+)°", capfd.readouterr().out)
+    assert told and float(told[1]) == pytest.approx(np.degrees(np.arccos(up[2])), abs=0.6)
     bpy.context.view_layer.update()
     placement = lodgs("data.placement").placement_of(root)
     np.testing.assert_allclose(placement.rotation[2], (0, 0, 1), atol=0.01)  # in which z is up already
