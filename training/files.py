@@ -8,11 +8,12 @@ import re
 import shutil
 import stat
 import sys
+import time
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, BinaryIO
 
 from .errors import LodgsError
 
@@ -114,6 +115,41 @@ def open_regular(path: str | Path) -> BinaryIO:
         os.close(descriptor)
         raise OSError(errno.EINVAL, "not a file", str(path))
     return open(descriptor, "rb")
+
+
+def try_lock(file: IO[bytes]) -> bool:
+    """Locks the open file for this process if nobody else has; released when it is closed."""
+    try:
+        if os.name == "nt":
+            import msvcrt
+
+            file.seek(1 << 30)  # what is locked cannot be read there, and the beginning says who holds it
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
+
+
+@contextmanager
+def one_at_a_time(name: str) -> Iterator[None]:
+    """Waits while another of this user's processes is in a block of this name.
+
+    Where the cache folder cannot be written, nobody waits.
+    """
+    try:
+        cache_folder().mkdir(parents=True, exist_ok=True)
+        lock = (cache_folder() / f"{name}.lock").open("a+b", buffering=0)
+    except OSError:
+        yield
+        return
+    with lock:
+        while not try_lock(lock):
+            time.sleep(0.1)
+        yield
 
 
 def _sync_folder(folder: Path) -> None:

@@ -1,10 +1,12 @@
-"""Atomic writes: the old file or the new one, never a part."""
+"""Atomic writes: the old file or the new one, never a part. Blocks that are entered one after the other."""
 
 import errno
 import os
+from threading import Thread
 
 import pytest
 
+from training import files
 from training.errors import LodgsError
 from training.files import atomic_write
 
@@ -57,3 +59,27 @@ def test_space_does_not_help_where_a_folder_has_the_name(tmp_path):
 def test_an_error_about_another_file_passes_through(tmp_path):
     with pytest.raises(FileNotFoundError), atomic_write(tmp_path / "a.txt"):
         (tmp_path / "elsewhere" / "missing.txt").read_bytes()
+
+
+def test_blocks_of_a_name_are_entered_one_after_the_other(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "cache_folder", lambda: tmp_path / "cache")
+    done = []
+
+    def second():
+        with files.one_at_a_time("work"):
+            done.append("second")
+
+    with files.one_at_a_time("work"):
+        other = Thread(target=second)
+        other.start()
+        other.join(0.3)
+        done.append("first")
+    other.join(10)
+    assert done == ["first", "second"]
+
+
+def test_nobody_waits_where_nothing_can_be_written(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(files, "cache_folder", lambda: tmp_path / "file")
+    with files.one_at_a_time("work"), files.one_at_a_time("work"):
+        pass

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import torch
 
 from ..errors import LodgsError
+from ..files import one_at_a_time
 from .gaussians import Gaussians
 from .reference import ellipses, loss_to, meets_tile, moments, squared_reach
 from .rendering import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Drawn, Settings, Target, View
@@ -43,7 +44,9 @@ def problem() -> LodgsError | None:
             "and a torch built for CUDA.",
         )
     try:
-        with redirect_stdout(sys.stderr):  # it talks; the trainer's standard output is for events
+        # it talks, and the trainer's standard output is for events; processes that compile at once undo each
+        # other's work
+        with redirect_stdout(sys.stderr), one_at_a_time("gsplat"):
             gsplat = _gsplat()
             one = torch.ones(1, 3, device=DEVICE)
             gsplat.spherical_harmonics(0, one, one[None]).cpu()
@@ -59,7 +62,7 @@ def problem() -> LodgsError | None:
         )
     except Exception as error:  # of the compiler, the loader or the card
         return LodgsError(
-            f"gsplat's kernels do not work here: {str(error).partition(chr(10))[0]}.",
+            f"gsplat's kernels do not work here: {str(error).partition(chr(10))[0].partition(': [')[0]}.",
             "Look at the log and at gsplat's installation page; or choose cpu.",
         )
     return None

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import IO
 
 from ..errors import LodgsError
-from ..files import open_regular, remove_temporaries
+from ..files import open_regular, remove_temporaries, try_lock
 from . import processes
 from .events import read_events
 
@@ -152,7 +152,7 @@ class RunFolder:
         """Whether a trainer is at work here."""
         try:
             with open_regular(self._lock) as file:
-                return not _try_lock(file)
+                return not try_lock(file)
         except OSError:
             return False
 
@@ -226,7 +226,7 @@ class RunFolder:
         """
         with self._lock.open("a+b", buffering=0) as file:
             for _ in range(10):  # somebody who asks for the state holds the lock for an instant
-                if _try_lock(file):
+                if try_lock(file):
                     break
                 time.sleep(0.1)
             else:
@@ -283,22 +283,5 @@ def _take(request: Path) -> bool:
     try:
         request.unlink()
     except FileNotFoundError:
-        return False
-    return True
-
-
-def _try_lock(file: IO[bytes]) -> bool:
-    """Locks the open file for this process if nobody else has; released when it is closed."""
-    try:
-        if os.name == "nt":
-            import msvcrt
-
-            file.seek(1 << 30)  # what is locked cannot be read there, and the beginning says who holds it
-            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-        else:
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
         return False
     return True

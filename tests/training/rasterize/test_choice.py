@@ -5,7 +5,7 @@ import torch
 
 from training import __main__ as command
 from training.errors import LodgsError
-from training.rasterize import cpu, gpu, resolve, trial, why_cpu
+from training.rasterize import cpu, cuda, gpu, resolve, trial, why_cpu
 from training.rasterize.devices import Devices, describe
 from training.rasterize.gpu import choice
 from training.rasterize.gpu.device import Adapter
@@ -18,7 +18,10 @@ SOFTWARE = Adapter("llvmpipe (LLVM 15)", "software", "Vulkan", "Mesa")
 
 @pytest.fixture
 def there(monkeypatch, tmp_path):
-    """A computer with these devices, which draw as the cpu backend does, and an empty cache folder."""
+    """A computer with these devices, which draw as the cpu backend does, and an empty cache folder.
+
+    None of them is one that torch sees.
+    """
 
     def are(*found: Adapter) -> None:
         def adapters() -> list[Adapter]:
@@ -37,9 +40,12 @@ def there(monkeypatch, tmp_path):
     monkeypatch.setattr("training.rasterize.devices.open_device", lambda name: Opened())
     for name in ("rasterize", "contributions", "photometric_loss"):
         monkeypatch.setattr(gpu, name, getattr(cpu, name), raising=False)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     trial.difference.cache_clear()
+    cuda.problem.cache_clear()
     yield are
     trial.difference.cache_clear()
+    cuda.problem.cache_clear()
 
 
 @pytest.fixture

@@ -119,7 +119,10 @@ def test_a_device_that_draws_otherwise_is_a_warning_and_the_processor_trains(gra
 
 @pytest.mark.slow
 def test_levels_are_as_good_as_the_processors(graphics, keys, tmp_path):
-    """Density control, finishing and all: PSNR of each level within 0.1 dB, and about as many splats."""
+    """Density control, finishing and all: PSNR of each level within 0.25 dB, and about as many splats.
+
+    On the cpu itself lr_means larger by two parts in 100,000 makes level 2 worse by 0.2 dB.
+    """
     keys["parameters"] |= {"steps": [20, 25, 30], "finish_share": 0.2}
     levels = []
     for backend in ("cpu", "gpu"):
@@ -128,6 +131,6 @@ def test_levels_are_as_good_as_the_processors(graphics, keys, tmp_path):
         levels.append({level["level"]: level for level in RunFolder(out).levels()})
     assert levels[0].keys() == levels[1].keys() == {1, 2, 3}
     for number, level in levels[0].items():
-        assert levels[1][number]["psnr"] == pytest.approx(level["psnr"], abs=0.1), number
+        assert levels[1][number]["psnr"] == pytest.approx(level["psnr"], abs=0.25), number
         assert levels[1][number]["splats"] == pytest.approx(level["splats"], rel=0.05), number
     assert levels[0][3]["psnr"] > 12
