@@ -198,4 +198,5 @@ def _save(scene: bpy.types.Scene, folder: Path, name: str, size: tuple[int, int]
             except RuntimeError:  # which Blender raises without saying why
                 whole = False
             if not whole:
-                raise LodgsError(f"{file} is not whole.", "Free some space there, then do it again.")
+                also = ", or connect the compositor's output" if compat.composites(scene) else ""
+                raise LodgsError(f"{file} is not whole.", f"Free some space there{also}, then do it again.")

@@ -363,6 +363,15 @@ def test_a_folder_that_cannot_be_written(bpy, scene, capture, tmp_path, capfd):
     assert "could not be written" in capfd.readouterr().err
 
 
+def test_a_compositor_without_an_output_is_named(bpy, scene, capture, tmp_path, capfd):
+    if not hasattr(scene, "compositing_node_group"):
+        pytest.skip("a scene's own compositor tree without an output leaves the picture as it is")
+    scene.compositing_node_group = bpy.data.node_groups.new("Compositor", "CompositorNodeTree")
+    assert capture("--around", "--views", "2", "--range", "1-2") == 2
+    assert "connect the compositor's output" in capfd.readouterr().err
+    assert not [*(tmp_path / "out").glob("cameras/*")]
+
+
 def test_without_a_trainer_nothing_is_rendered(bpy, scene, capture, tmp_path, capfd, monkeypatch):
     monkeypatch.delenv("LODGS_TRAINER_PYTHON", raising=False)
     assert capture("--around", "--views", "2") == 2
