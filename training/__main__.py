@@ -356,7 +356,7 @@ def _add_controls(parser: argparse.ArgumentParser) -> None:
 
     group = parser.add_argument_group("levels by distance, as their method's rule has it")
     for control in every_control().values():
-        default = "" if control.follows else f" (default {control.default:g})"
+        default = "" if control.follows else f" (default {control.default:g}, or what the file records)"
         group.add_argument(
             f"--{control.name.replace('_', '-')}", type=int if control.whole else float, metavar="N",
             help=control.about.replace("%", "%%") + default,
@@ -491,7 +491,7 @@ def _methods(chosen: argparse.Namespace) -> int:
 def _evaluate(chosen: argparse.Namespace) -> int:
     from .runs.measure import evaluate_run, table
 
-    print(table(evaluate_run(chosen.run, _controls(chosen), chosen.picture, chosen.far)))
+    print(table(evaluate_run(chosen.run, _controls(chosen), chosen.picture, chosen.far, _warn)))
     return 0
 
 

@@ -70,7 +70,7 @@ def plan_cells(job: Job, splats: int = 0, memory: int = 0) -> CellPlan:
     if len(planned) == 1:
         job = replace(job, cells="")
     regions = [each.region for each in planned]
-    place_of = {camera.name: place for place, camera in enumerate(scene.cameras)}
+    place_of = {name: place for place, name in enumerate(scene.names)}
     places = [[place_of[name] for name in region.views] for region in regions]
     return CellPlan(job, planned, outlines(scene, regions), places)
 

@@ -68,7 +68,7 @@ def show_undistorted(
     """Gives a scene's views the photographs without their lens's distortion, and cameras that fit these.
 
     Args:
-        names: of the model's views, in order.
+        names: of all views of the model, in order.
         scene: see ``undistort.undistorted``.
     """
     found = {camera.name: camera for camera in scene.cameras}
@@ -136,9 +136,12 @@ def held_out(root: bpy.types.Object) -> list[bpy.types.Object]:
 
 def is_held_out(root: bpy.types.Object, view: bpy.types.Object) -> bool:
     """Whether the run of the scene's levels did not train on a view; False where it does not say so."""
+    facts = view.data.lodgs
+    if facts.is_property_set("held_out"):
+        return facts.held_out
     match selection.read_json(root.lodgs.meta).get("held_out"):
-        case [int(first), int(every)] if every > 0:
-            return view.data.lodgs.place >= first and (view.data.lodgs.place - first) % every == 0
+        case [*rests, int(every)] if every > 0:
+            return facts.place % every in rests
     return False
 
 

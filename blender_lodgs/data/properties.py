@@ -464,6 +464,9 @@ class ViewSettings(bpy.types.PropertyGroup):
     place: bpy.props.IntProperty(
         name="Place", description="Place by name among the views of the COLMAP model, from 0", default=-1
     )
+    held_out: bpy.props.BoolProperty(
+        name="Held Out", description="The splats that it came with were not trained on it"
+    )
     psnr: bpy.props.FloatProperty(
         name="PSNR",
         description="How alike the splats and the photograph were when last measured, in dB; 0 before",

@@ -142,7 +142,8 @@ def import_colmap(
         root.lodgs.training.images = str(scene.images_folder) if images else ""
 
         seen = [shown.get(camera.name, camera) for camera in scene.cameras]
-        _add_views(context, root, seen, extent, near, photographs, set(scene.distorted) - shown.keys())
+        distorted = set(scene.distorted) - shown.keys()
+        _add_views(context, root, seen, extent, near, photographs, distorted, scene.names)
         if len(scene.points):
             points = objects.new_points(
                 f"{root.name} points", scene.points, scene.point_colors, radius=extent / 400
@@ -161,13 +162,19 @@ def _add_views(
     near: float,
     photographs: bool = False,
     distorted: Collection[str] = (),
+    names: Sequence[str] = (),
 ) -> None:
-    """Gives a scene a camera object for each view; see :func:`new_camera`."""
+    """Gives a scene a camera object for each view; see :func:`new_camera`.
+
+    Args:
+        names: of all views of the model, in order; none: there are no others.
+    """
     root.lodgs.cameras = bpy.data.collections.new(f"{root.name} cameras")
     _collection(root).children.link(root.lodgs.cameras)
-    for place, camera in enumerate(cameras):
+    place_of = {name: place for place, name in enumerate(names or [camera.name for camera in cameras])}
+    for camera in cameras:
         view = new_camera(camera, extent, near, photograph=photographs, distorted=camera.name in distorted)
-        view.parent, view.data.lodgs.place = axes_of(root), place
+        view.parent, view.data.lodgs.place = axes_of(root), place_of[camera.name]
         root.lodgs.cameras.objects.link(view)
     if context.scene.camera is None and cameras:
         context.scene.camera = root.lodgs.cameras.objects[0]
@@ -263,7 +270,7 @@ def place_splats(
     for message in file.warnings:
         warn(message)
     bundle, made = file.bundle, []
-    cameras, near, _ = views_in(bundle.tables)
+    cameras, near, unseen = views_in(bundle.tables)
     try:
         for level in bundle.levels:
             made.append(objects.new_splats(f"{file.path.stem} {level.number}", level.splats))
@@ -274,6 +281,8 @@ def place_splats(
             _fill(root, file, made)
             if cameras:
                 _add_views(context, root, cameras, extent_of(cameras) or 1.0, near)
+                for facts in (view.data.lodgs for view in views(root)):
+                    facts.held_out = cameras[facts.place].name in unseen
             root.lodgs.training.method = next(info.name for info in METHODS.values() if info.for_splats)
     except BaseException:
         bpy.data.batch_remove([obj.data for obj in made])  # which takes the objects along
@@ -318,6 +327,8 @@ def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
         settings.mode = "SELECTIVE"
     settings.method, settings.rule, settings.cumulative = bundle.method, bundle.rule, bundle.cumulative
     settings.facts, settings.meta = json.dumps(bundle.facts), json.dumps(bundle.meta)
+    for view in views(root):
+        view.data.lodgs.property_unset("held_out")
     _begin_controls(root, bundle.controls)
     facts = {level.number: level.facts for level in bundle.levels}
     for item in settings.levels:

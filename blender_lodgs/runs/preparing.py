@@ -135,7 +135,7 @@ def straighten(root: bpy.types.Object, warn: Warn) -> None:
         whole = _read(root)
         found = already_undistorted(whole)
         if found is not None:
-            photographs.show_undistorted(bpy.context, root, [c.name for c in whole.cameras], found)
+            photographs.show_undistorted(bpy.context, root, whole.names, found)
         work.message = f"{len(bent)} photographs were straightened"
 
     try:

@@ -19,14 +19,14 @@ class Exposure:
     Their means over the photographs are kept at 1 and 0: splats have the exposure of all of them together.
 
     Args:
-        views: V, how many photographs there are.
+        names: of the V photographs.
         lr: learning rate; with 0 pictures are left as they are.
     """
 
-    def __init__(self, views: int, lr: float, device: torch.device | str = "cpu") -> None:
+    def __init__(self, names: Sequence[str], lr: float, device: torch.device | str = "cpu") -> None:
         start = torch.tensor([[1.0] * 3, [0.0] * 3], device=device)
         # a tensor each: what a step does not see keeps its place and its moments
-        self._names = [str(view) for view in range(views)] if lr else []
+        self._names = list(names) if lr else []
         tensors = {name: start.clone().requires_grad_(True) for name in self._names}
         self._lr, self._adam = lr, Adam(tensors, dict.fromkeys(tensors, lr))
 
@@ -39,7 +39,7 @@ class Exposure:
         """A picture (H, W, 3) as the photograph of a view would show it: what is over 1 is lost there."""
         if not self._lr:
             return image
-        gain, offset = self._adam.tensors[str(view)]
+        gain, offset = self._adam.tensors[self._names[view]]
         return (image * gain + offset).clamp_max(1.0)
 
     def optimizers(self, share: float) -> Sequence[Adam]:
@@ -66,7 +66,10 @@ class Exposure:
         return {"tensors": tensors, "adam": self._adam.state_dict()}
 
     def load_state_dict(self, state: dict) -> None:
-        """Becomes what ``state_dict`` gave."""
-        for name, tensor in state["tensors"].items():
-            self._adam.replace(name, tensor.requires_grad_(True))
-        self._adam.load_state_dict(state["adam"])
+        """Becomes what ``state_dict`` gave, as far as that had the same photographs; others begin anew."""
+        adam = self._adam.state_dict()
+        for name in set(self._names) & set(state["tensors"]):
+            self._adam.replace(name, state["tensors"][name].requires_grad_(True))
+            for part, values in adam.items():
+                values[name] = state["adam"][part][name]
+        self._adam.load_state_dict(adam)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 from ..errors import LodgsError
 from ..evaluate.aside import veil
@@ -21,6 +22,7 @@ from ..methods import create
 from ..rasterize.resident import Resident
 from ..scenes.aside import read_aside
 from ..splats.bundle import read_bundle
+from ..splats.dialects import Warn, silent
 from .arrays import damaged, read_arrays
 from .data import training_data
 from .folder import RunFolder
@@ -28,7 +30,11 @@ from .job import Job
 
 
 def evaluate_run(
-    run: Path, given: Values | None = None, picture: Path | None = None, far: bool = False
+    run: Path,
+    given: Values | None = None,
+    picture: Path | None = None,
+    far: bool = False,
+    warn: Warn = silent,
 ) -> dict:
     """Measures a finished run and writes its ``metrics.json``.
 
@@ -37,6 +43,7 @@ def evaluate_run(
         given: controls of the run's rule by name (``lod.rule``); the others are the rule's own.
         picture: a PNG to write, with the levels side by side as the middle held-out view sees them.
         far: measure also how levels do from farther away (``evaluate.distance``).
+        warn: told what is odd about the scene: photographs that are gone, first of all.
 
     Returns:
         Of all levels, but those that are no scene by themselves, ``levels``: coarse to fine, ``level``, its
@@ -62,9 +69,22 @@ def evaluate_run(
     folder = RunFolder(run)
     folder.require_own_files()
     if not folder.bundle.exists():
-        raise LodgsError(f"{run} holds no finished run (no bundle.ply).", "Train it to the end first.")
+        raise LodgsError(
+            f"{run} is not the folder of a finished run (it has no bundle.ply).",
+            "Name the run's folder, and train it to the end first.",
+        )
     job = Job.from_file(folder.job)
-    data = training_data(job, folder)
+    if not job.capture and not Path(job.scene).is_dir():
+        raise LodgsError(
+            f"The scene that {run} was trained on is gone: {job.scene}.",
+            f"Put it back, or write where it is now into {folder.job} (scene = ...).",
+        )
+
+    def tell(kind: str, **values: Any) -> None:
+        if kind == "warning":
+            warn(values["message"])
+
+    data = training_data(job, folder, tell)
     bundle = open_if_large(folder.bundle) or read_bundle(folder.bundle)
     evaluation = Evaluation(data, job.backend, bundle.antialias)
     rule = find_rule(bundle.rule)

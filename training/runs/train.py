@@ -281,7 +281,8 @@ class _Run:
         up = up_rotation(self.data.whole.cameras).round(6)
         meta = {**self.method.meta(), "up_rotation": up, "seed": self.job.seed}
         if self.job.test_every:
-            meta["held_out"] = [self.job.test_every // 2 if self.job.validation else 0, self.job.test_every]
+            middle = [self.job.test_every // 2] if self.job.validation else []
+            meta["held_out"] = [0, *middle, self.job.test_every]
         bundle = replace(
             self._without_splats(), levels=levels, meta=meta, tables=self.method.tables() | self._views()
         )

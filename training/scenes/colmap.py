@@ -57,6 +57,7 @@ class Scene:
         distorted: names of views whose lens distorts; their cameras are the pinhole part of the lens.
         warnings: one sentence for each thing that was left out or is odd.
         point_ids: (P,) int64, the model's own; none where the points come from elsewhere.
+        names: of all views of the model, sorted, with and without a photograph; by default the cameras'.
     """
 
     folder: Path
@@ -68,9 +69,12 @@ class Scene:
     distorted: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     point_ids: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    names: Sequence[str] = ()
 
     def split(self, test_every: int, validation: bool = False) -> tuple[list[Camera], list[Camera]]:
         """Training and held-out cameras: of every `test_every` by name the first is held out; 0: none is.
+
+        Views without a photograph are counted: where one gets lost, the others stay what they were.
 
         Args:
             validation: leave those out altogether, and hold out the one in the middle between two of them.
@@ -78,8 +82,10 @@ class Scene:
         if test_every <= 0:
             return list(self.cameras), []
         middle = test_every // 2 if validation else 0
-        train = [camera for i, camera in enumerate(self.cameras) if i % test_every not in (0, middle)]
-        return train, self.cameras[middle::test_every]
+        names = self.names or [camera.name for camera in self.cameras]
+        rest = {name: number % test_every for number, name in enumerate(names)}
+        train = [camera for camera in self.cameras if rest[camera.name] not in (0, middle)]
+        return train, [camera for camera in self.cameras if rest[camera.name] == middle]
 
     @property
     def center(self) -> np.ndarray:
@@ -245,6 +251,7 @@ def read_scene(
         points=points[possible],
         point_colors=colors[possible],
         point_ids=ids[possible],
+        names=list(dict.fromkeys(pose.name.replace("\\", "/") for pose in poses)),
         distorted=views.distorted,
         warnings=[*warnings, *views.warnings(images)],
     )

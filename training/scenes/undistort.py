@@ -90,7 +90,7 @@ def _read(target: Path, scene: Scene) -> Scene:
     lost = [f"{name} is left out: its lens distortion could not be undone." for name in sorted(missing)]
     turns = {camera.name: camera.turns for camera in scene.cameras}
     cameras = [replace(camera, turns=turns[camera.name]) for camera in result.cameras]
-    return replace(result, cameras=cameras, warnings=[*scene.warnings, *lost])
+    return replace(result, cameras=cameras, names=scene.names, warnings=[*scene.warnings, *lost])
 
 
 def _key(scene: Scene) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -251,17 +252,28 @@ def test_the_wipe_goes_with_its_panel(bpy, lodgs, root):
     assert not wipe.shown(bpy.context)
 
 
-@pytest.mark.parametrize(("validation", "first"), [(False, 0), (True, 4)])
-def test_held_out_views_are_those_of_the_run(bpy, lodgs, root, validation, first):
-    """As the trainer splits the scene, also where the artist has deleted a view."""
+@pytest.mark.parametrize(("validation", "rests"), [(False, [0]), (True, [0, 4])])
+def test_held_out_views_are_those_of_the_run(bpy, lodgs, root, validation, rests):
+    """Those that the trainer did not train on, also where the artist has deleted a view."""
     photographs, scene = lodgs("data.photographs"), read_scene(GARDEN)
     assert photographs.held_out(root) == []
-    record = Bundle("flod", [], meta={"held_out": [first, 8]})
+    record = Bundle("flod", [], meta={"held_out": [*rests, 8]})
     lodgs("data.scenes").set_bundle_facts(root, record)
-    truth = [camera.name for camera in scene.split(8, validation)[1]]
+    trained = {camera.name for camera in scene.split(8, validation)[0]}
+    truth = [camera.name for camera in scene.cameras if camera.name not in trained]
     assert [view.name for view in photographs.held_out(root)] == truth
     bpy.data.objects.remove(photographs.views(root)[1])
     assert [view.name for view in photographs.held_out(root)] == [n for n in truth if n in bpy.data.objects]
+
+
+def test_views_without_a_photograph_are_counted_among_those_held_out(bpy, lodgs, tmp_path):
+    names = [camera.name for camera in read_scene(GARDEN).cameras]
+    scene = shutil.copytree(GARDEN, tmp_path / "scene")
+    (scene / "images" / names[3]).unlink()
+    root = lodgs("data.scenes").import_colmap(bpy.context, scene, warn=lambda message: None)
+    lodgs("data.scenes").set_bundle_facts(root, Bundle("flod", [], meta={"held_out": [0, 8]}))
+    held_out = [view.name.split(".jpg")[0] for view in lodgs("data.photographs").held_out(root)]
+    assert held_out == [name.removesuffix(".jpg") for name in names[::8]]
 
 
 def test_what_cannot_be_compared_is_reported(bpy, lodgs, root, renderer):

@@ -153,8 +153,21 @@ def test_views_off_the_path_are_measured_where_the_scene_has_some(finished, scen
     shutil.rmtree(folder)
 
 
+def test_photographs_that_are_gone_since_are_told_and_no_other_views_are_held_out(finished, scene, tmp_path):
+    copy = shutil.copytree(scene, tmp_path / "scene")
+    run = finished(test_every=4, scene=str(copy))
+    before, warned = evaluate_run(run)["test_views"], []
+    (copy / "images" / before[0]).unlink()
+    (copy / "images" / "01.jpg").write_bytes(b"nothing")
+    assert evaluate_run(run, warn=warned.append)["test_views"] == before[1:]
+    assert len(warned) == 2 and before[0] in "".join(warned) and "01.jpg" in "".join(warned)
+    shutil.rmtree(copy)
+    with pytest.raises(LodgsError, match=r"is gone.*job\.toml"):
+        evaluate_run(run)
+
+
 def test_a_run_that_is_not_finished_is_refused_in_a_sentence(tmp_path):
-    with pytest.raises(LodgsError, match=r"holds no finished run.*Train it to the end"):
+    with pytest.raises(LodgsError, match=r"not the folder of a finished run.*train it to the end"):
         evaluate_run(tmp_path)
 
 

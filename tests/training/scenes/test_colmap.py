@@ -14,7 +14,8 @@ from tests.training.scenes import synthetic
 from training.errors import LodgsError
 from training.scenes import colmap
 from training.scenes import model as model_files
-from training.scenes.colmap import find_models, read_scene
+from training.scenes.colmap import find_models, read_scene, without
+from training.scenes.undistort import undistorted
 
 SCENES = ("fox", "saharov", "caliterra")
 VARIANTS = (
@@ -374,6 +375,22 @@ def test_split_extent_and_depth(tmp_path):
     train, held = scene.split(8, validation=True)  # 0 and 8 have no part in it
     assert [camera.name for camera in held] == ["4.png"]
     assert [camera.name for camera in train] == [f"{i}.png" for i in (1, 2, 3, 5, 6, 7)]
+
+
+@pytest.mark.parametrize("lens", ["PINHOLE", "SIMPLE_RADIAL"])
+def test_a_photograph_that_gets_lost_moves_no_other_one_in_or_out_of_training(tmp_path, lens):
+    synthetic.write_scene(tmp_path, lens=synthetic.camera(lens), names=[f"{i}.png" for i in range(9)])
+    (tmp_path / "images" / "1.png").unlink()
+    scene = read_scene(tmp_path)
+    scene = undistorted(scene, tmp_path / "cache") if scene.distorted else scene
+    found = scene, without(scene, {"4.png": "it is damaged."})
+    for one in found:
+        train, test = one.split(4)
+        names = [camera.name for camera in test]
+        assert names == [
+            name for name in ("0.png", "4.png", "8.png") if name in {c.name for c in one.cameras}
+        ]
+        assert [camera.name for camera in train] == [f"{i}.png" for i in (2, 3, 5, 6, 7)]
 
 
 def test_no_points_have_no_depth(tmp_path):
