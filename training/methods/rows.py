@@ -95,6 +95,7 @@ class FileRows:
         self._free = np.zeros(0, np.int32)  # slots that nobody needs
         self._retiring: list[np.ndarray] = []  # slots of the last checkpoint that have been replaced since
         self._retired: deque[np.ndarray] = deque()  # the same of the checkpoints before it, oldest first
+        self._named: deque[str] = deque(maxlen=KEPT + 1)  # files that these and the last one tell of
 
     def __len__(self) -> int:
         return self._count
@@ -187,10 +188,13 @@ class FileRows:
         self._retiring = []
         while len(self._retired) > KEPT:
             self._free = np.sort(np.append(self._free, self._retired.popleft()))
-            self._remove_others()
         self._fresh[:] = False
+        self._named.append(self._file_name)
+        if len(self._named) > KEPT:
+            self._remove_others()
         return {
-            "file": "" if self._file is None else Path(str(self._file.name)).name,
+            "file": self._file_name,
+            "named": list(self._named),
             "count": self._count,
             "block": self._block,
             "shapes": {name: list(shape) for name, shape in self.layout.shapes.items()},
@@ -212,6 +216,7 @@ class FileRows:
         self._count = state["count"]
         self._slots, self._checks = (state[name].cpu().numpy().copy() for name in ("slots", "checks"))
         self._retired = deque(slots.cpu().numpy().copy() for slots in state["retired"])
+        self._named.extend(state.get("named", ()))  # older checkpoints do not have it
         self._fresh = np.zeros(len(self._slots), bool)
         if not (0 <= self._count <= len(self._slots) * self._block and len(self._slots) == len(self._checks)):
             raise ValueError("its table of rows is damaged")
@@ -232,10 +237,15 @@ class FileRows:
             self._file.close()
             self._file = None
 
+    def supersede(self, other: FileRows) -> None:
+        """Takes the place of other rows of the same folder, whose file goes once no checkpoint has it."""
+        self._named.extend(other._named)
+        other.discard()
+
     def discard(self) -> None:
         """Forgets all rows; a file that no checkpoint tells of is removed."""
         if self._file is not None:
-            path, unknown = Path(str(self._file.name)), not self._retired
+            path, unknown = Path(str(self._file.name)), self._file_name not in self._named
             self.close()
             if unknown:
                 path.unlink(missing_ok=True)
@@ -255,10 +265,9 @@ class FileRows:
                 raise ValueError("its file of rows is damaged")
 
     def _remove_others(self) -> None:
-        """Removes files that earlier lives of the run have left."""
-        ours = "" if self._file is None else Path(str(self._file.name)).name
+        """Removes files that no checkpoint tells of any more, of earlier lives of the run as well."""
         for path in self._folder.glob(f"{self._name}_*.bin"):
-            if self._may_be(path.name) and path.name != ours:
+            if self._may_be(path.name) and path.name not in self._named:
                 with suppress(OSError):
                     path.unlink()
 
@@ -347,6 +356,10 @@ class FileRows:
         self._file = file = open(path, "x+b" if new else "r+b", buffering=0)  # noqa: SIM115
         self._size = max(self._size, os.fstat(file.fileno()).st_size // self._block_bytes)
         return file
+
+    @property
+    def _file_name(self) -> str:
+        return "" if self._file is None else Path(str(self._file.name)).name
 
     @property
     def _block_bytes(self) -> int:

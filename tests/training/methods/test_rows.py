@@ -80,6 +80,17 @@ class AsInMemory(RuleBasedStateMachine):
     @rule()
     def checkpoint(self):
         self.taken = [*self.taken[-2:], (self.rows.state_dict(), self.truth.copy())]
+        if len(self.taken) == 3:
+            named = {state["file"] for state, _ in self.taken} - {""}
+            assert {path.name for path in self.folder.iterdir()} == named
+
+    @rule()
+    def write_anew(self):
+        """All rows to a file of their own, as density control does."""
+        grown = self.opened()
+        grown.append(self.rows.read(np.arange(len(self.rows))))
+        grown.supersede(self.rows)
+        self.rows = grown
 
     @precondition(lambda self: self.taken)
     @rule(back=st.integers(0, 2), began=st.booleans())

@@ -78,7 +78,7 @@ class Method(method.Method[ThreedgsParameters, Drawing]):
 
     def control_density(self, step: int) -> None:
         p, model, done = self.parameters, self.model, step + 1
-        if p.least_weight and done in (round(share * self.scheduled_steps) for share in WEIGHED_AT):
+        if p.least_weight and done in (round(share * p.steps) for share in WEIGHED_AT):
             self.prune_unimportant(step)
         if done > self._densify_until:
             return

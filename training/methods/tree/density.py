@@ -11,6 +11,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
+from scipy.special import logit
 
 from ...lod.crop import Crop
 from ...lod.forest import joined_trees, longest_of, shape_of, subtrees_of
@@ -101,7 +102,7 @@ class Growing:
     ) -> None:
         self._store, self._now = store, now
         self._longest = longest_of(int(store.shape.counts.sum()))
-        self._least_logit = float(np.log(min_opacity / (1 - min_opacity))) if min_opacity > 0 else -np.inf
+        self._least_logit = float(logit(min_opacity))
         self._unseen_since = unseen_since
         self._upper: RecordPiece | None = None
         store.rest()

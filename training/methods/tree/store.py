@@ -345,6 +345,11 @@ class Store:
 
     # -- what lasts ------------------------------------------------------------------------------------
 
+    def supersede(self, other: Store) -> None:
+        """Takes the place of another store of the same run, see ``FileRows.supersede``."""
+        self.rows.supersede(other.rows)
+        self._lists.supersede(other._lists)
+
     def close(self) -> None:
         """Closes the files."""
         self.rows.close()

@@ -231,7 +231,7 @@ class Method(Refining):
         )
         grown = self._new_store(self.store.budget)
         grown.fill_records(growing, lambda: growing.upper)
-        self.store.close()
+        grown.supersede(self.store)
         self.store = grown
 
     @torch.no_grad()

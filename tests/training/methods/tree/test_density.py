@@ -176,3 +176,8 @@ def test_a_subtree_that_grew_is_divided_and_the_tree_stays_one(store):
         assert sorted(below(tree, len(tree) - 1)) == list(range(tree.leaves))
         sizes = tree.sizes(splats.means, splats.log_scales)
         assert (sizes[tree.parents[:-1]] >= sizes[:-1]).all()
+
+
+def test_of_leaves_that_are_all_too_faint_each_pair_keeps_one(store):
+    growing, after = grown(store, min_opacity=1.0)
+    assert growing.removed == len(joined(store)[1].children) - len(joined(after)[1].children) > 0

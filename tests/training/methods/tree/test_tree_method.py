@@ -296,3 +296,11 @@ def test_that_views_are_coarsened_for_the_budget_is_said_once(data, monkeypatch)
         trained(tree)
         assert len(told) == many and all("coarser" in each and "MB as splat_memory" in each for each in told)
         assert (tree.store.coarsened > 1) == bool(many)
+
+
+def test_leaves_that_hardly_show_go_while_leaves_are_trained(data, monkeypatch):
+    tree, gone = make(data, steps=30, tune_steps=60, least_weight=0.1), []
+    monkeypatch.setattr(tree, "prune_unimportant", gone.append)
+    for step in range(tree.finest_steps):
+        tree.control_density(step)
+    assert gone == [7, 15, 23]
