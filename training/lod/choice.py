@@ -180,7 +180,7 @@ class Chooser:
         if self._near is None or self._near[:2] != (choice.rule, region):
             rows = np.flatnonzero(choice.loaded(every.columns)).astype(np.int32)
             if len(rows) < len(every.means):
-                columns = {name: every.columns[name][rows] for name in choice.columns}
+                columns = {name: every.columns[name][rows] for name in (*choice.how.columns, HIDDEN)}
                 log_scales = None if self._log_scales is None else self._log_scales[rows]
                 every = _Part.of(rows, every.means[rows], columns, log_scales)
             self._near = choice.rule, region, every

@@ -66,7 +66,10 @@ class SplatSet:
             splats, weights = splats.select(order), None if weights is None else weights[order]
         self.gaussians = Gaussians.of(splats, device)
         self._weights = None if weights is None else np.asarray(weights, np.float32)
+        # opacities as they were trained, by which rules choose whatever looks make of them
         self._columns = {name: splats.extras[name] for name in every_column() if name in splats.extras}
+        with np.errstate(over="ignore"):
+            self._columns[OPACITY] = 1 / (1 + np.exp(-splats.opacity_logits))
         self._chooser: Chooser | None = None
         self._in_world: tuple[bytes, Gaussians] | None = None
         self._joined: tuple[list[SplatSet], Gaussians] | None = None
@@ -145,10 +148,7 @@ class SplatSet:
 
     def _make_chooser(self) -> Chooser:
         own = self.gaussians
-        means, log_scales, logits = (x.cpu().numpy() for x in (own.means, own.log_scales, own.opacity_logits))
-        with np.errstate(over="ignore"):
-            opacities = 1 / (1 + np.exp(-logits))
-        return Chooser(means, self._columns | {OPACITY: opacities}, log_scales)
+        return Chooser(own.means.cpu().numpy(), self._columns, own.log_scales.cpu().numpy())
 
 
 class Chosen(NamedTuple):

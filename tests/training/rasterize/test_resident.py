@@ -10,13 +10,14 @@ from training.errors import LodgsError
 from training.lod import sight
 from training.lod.blocks import SIZE, spatial_order
 from training.lod.choice import Choice, Chooser
+from training.lod.look import Look
 from training.lod.rule import HIDDEN, rules
 from training.lod.rules.chunks import member_columns
 from training.lod.selection import complete, select, settings
 from training.lod.streaming import BLOCKS, table_of_blocks
 from training.methods.tree.build import build
 from training.rasterize import Gaussians, rasterize
-from training.rasterize.resident import MANY, Resident
+from training.rasterize.resident import MANY, Resident, SplatSet
 from training.scenes.cameras import Camera, look_at
 from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
 from training.splats.gaussians import Splats
@@ -249,3 +250,25 @@ def test_within_a_band_nothing_is_asked_and_the_same_is_chosen(monkeypatch):
         rows, _ = hidden.chosen(replace(choice, crops=()))
         np.testing.assert_array_equal(rows, expected[one.means[expected, 0] <= 0])
     assert counts[0] == (0, len(one)) and 0 < counts[1][0] < 0.8 * counts[1][1] and counts[3] == (0, 0)
+
+
+def test_a_crop_may_come_while_the_eye_stays_in_its_region():
+    shown, camera = bundle("chunks"), next(views())
+    everything = Resident(shown, "cpu").by_distance(camera, settings(shown, {}))
+    for splats, choice in everything.values():
+        before = splats.chosen(choice)[0]
+        np.testing.assert_array_equal(splats.chosen(replace(choice, crops=()))[0], before)
+
+
+@pytest.mark.parametrize("looked_first", [True, False])
+def test_looks_change_what_is_seen_and_not_what_is_chosen(looked_first):
+    shown = bundle("decay")
+    own = shown.levels[0].splats
+    camera, looks = next(views()), ((None, Look(opacity=0.2)),)
+    _, choice = Resident(shown, "cpu").by_distance(camera, settings(shown, {}))[1]
+    trained = {"opacity": 1 / (1 + np.exp(-own.opacity_logits)), **own.extras}
+    truth = np.flatnonzero(choice.weights(own.means, trained) > 0)
+    splats = SplatSet(own, backend="cpu", ordered=True)
+    for one in (splats.looked(looks), splats) if looked_first else (splats, splats.looked(looks)):
+        np.testing.assert_array_equal(one.chosen(choice)[0], truth)
+    assert 0 < len(truth) < len(own)
