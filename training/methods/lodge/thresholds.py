@@ -50,19 +50,20 @@ class Thresholds:
 
     @torch.no_grad()
     def next(
-        self, levels: Mapping[int, IndexedLevel], d_l: Mapping[int, float]
+        self, levels: Mapping[int, IndexedLevel], d_l: Mapping[int, float], most: float = np.inf
     ) -> tuple[float, dict[str, Any]]:
         """The distance of the next coarser level.
 
         Args:
             levels: the levels that there are, by number, finest first.
             d_l: their distances, in scene units.
+            most: none beyond this is tried.
 
         Returns:
             The distance; and for a report the ``distances`` that were tried with the ``costs`` of each, and
             the cost ``before``, without the level; in few digits, because the bundle's head has little room.
         """
-        tried = self._candidates(next(iter(levels.values())), STANDING_APART * max(d_l.values()))
+        tried = self._candidates(next(iter(levels.values())), STANDING_APART * max(d_l.values()), most)
         costs = [_short(self.cost(levels, d_l, distance)) for distance in tried]
         alone = [(camera, rows_seen(levels, d_l, camera, self._near)) for camera in self._cameras]
         before = _short(self._mean_in_tiles(Stack(levels, self._antialias), alone))
@@ -95,15 +96,15 @@ class Thresholds:
             tiles.append(drawn.tile_counts.double().mean())
         return float(torch.stack(tiles).mean())
 
-    def _candidates(self, finest: IndexedLevel, least: float) -> list[float]:
-        """Distances to try, of at least ``least``, in scene units."""
+    def _candidates(self, finest: IndexedLevel, least: float, most: float) -> list[float]:
+        """Distances to try, of at least ``least`` where ``most`` leaves room for that, in scene units."""
         seen = []
         for camera in self._cameras:
             means = finest.means[finest.in_view(camera, self._near)]
             seen.append(np.linalg.norm(means[camera.sees(means, self._near)] - camera.center, axis=1))
         seen = [distances for distances in seen if len(distances)] or [np.array([least])]
-        near = max(min(float(np.quantile(distances, NEAREST)) for distances in seen), least)
-        far = float(np.quantile(np.concatenate(seen), FARTHEST))
+        near = min(max(min(float(np.quantile(distances, NEAREST)) for distances in seen), least), most)
+        far = min(float(np.quantile(np.concatenate(seen), FARTHEST)), most)
         return [_short(d) for d in np.geomspace(near, max(far, near), TRIED)]
 
 

@@ -34,7 +34,7 @@ from .composite import (
     seen_from_afar,
     together,
 )  # fmt: skip
-from .thresholds import MOST_CURVES, Thresholds
+from .thresholds import MOST_CURVES, STANDING_APART, Thresholds
 
 VIEWS_COUNTED = 24
 """In so many training views it is counted what they draw."""
@@ -210,6 +210,15 @@ class Method(Refining):
         most = max(share * finest - others, views.sum() / 4)
         return least_importance(importance.numpy(), views, most)
 
+    def _most_distance(self, number: int) -> float:
+        """What leaves room for others before the next coarser level that has a distance, if there is one."""
+        coarser = self.parameters.distances[number - 1 :: -1]
+        steps = next((steps for steps, distance in enumerate(coarser) if distance), None)
+        if steps is None:
+            return np.inf
+        end, begin = coarser[steps] * self.data.median_depth, max(self.d_l.values())
+        return max(end / STANDING_APART**steps, (begin * end) ** 0.5)
+
     def _begin_level(self, number: int) -> None:
         p, data = self.parameters, self.data
         self._finish(number + 1)
@@ -221,7 +230,8 @@ class Method(Refining):
             thresholds = Thresholds(
                 data.train, data.near, self.backend, p.prune_weight, self._std, p.antialias
             )
-            self.d_l[number], costs = thresholds.next(self.finished, self.d_l)
+            most = self._most_distance(number)
+            self.d_l[number], costs = thresholds.next(self.finished, self.d_l, most)
             self.costs.append({"level": number, **costs})
         if number == self.levels - 1:
             self._place_chunks()

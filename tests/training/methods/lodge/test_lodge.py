@@ -1,6 +1,7 @@
 """LODGE: levels are the rule's and no finer than their filter, the finest stays, runs go on to the bit."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -104,6 +105,15 @@ def test_distances_that_are_given_are_taken(data, base):
     d_l = {level.number: level.facts["d_l"] for level in trained(lodge)}
     assert d_l == pytest.approx({3: 0.0, 2: 0.5 * data.median_depth, 1: 3.0 * data.median_depth})
     assert lodge.costs == []
+
+
+@pytest.mark.parametrize("given", [[0.7, 0.0, 0.0], [0.7, 0.0, 0.0, 0.0], [0.7, 0.0, 0.6, 0.0]])
+def test_what_training_finds_is_nearer_than_what_is_given_for_a_coarser_level(data, base, given):
+    lodge = make(data, base, levels=len(given), distances=given)
+    trained(lodge)
+    found = [lodge.d_l[number] / data.median_depth for number in range(1, len(given) + 1)]
+    assert found[0] == pytest.approx(0.7) and found[-1] == 0
+    assert all(coarser > finer for coarser, finer in pairwise(found))
 
 
 def test_training_draws_what_the_bundle_shows(data, base):
