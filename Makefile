@@ -25,7 +25,7 @@ help:
 	@echo "make docs       build/api: the trainer's functions and classes, from their docstrings"
 	@echo "make tables     docs/parameters.md and controls.md, from what methods and rules declare"
 	@echo "make bench      how fast it is, as ratios from one run"
-	@echo "make bench-quality  PSNR and veil against seconds, all methods (SCENES=\"DIR ...\", BASE=another checkout)"
+	@echo "make bench-quality  PSNR and veil against seconds, all methods (SCENES=\"DIR ...\", METHODS=\"flod ...\", BASE=another checkout)"
 	@echo "make bench-lod  levels and chunks on a town of 3 million splats (over an hour the first time; STAGES=\"town lodge others table\")"
 	@echo "make bench-tree cuts of trees of up to 10 million nodes, and training them in 400 MB (an hour and 10 GB the first time)"
 	@echo "make bench-blocks  what giving blocks out costs, and the plot for 1 to 64 workers (half an hour alone)"
@@ -78,7 +78,7 @@ bench: setup
 	@if [ -x $(BLENDER_5_2) ]; then set -x; $(BLENDER_5_2) tools/bench_blender.py; fi
 
 bench-quality: setup
-	$(VENV) tools/bench_quality.py $(if $(BASE),--report --base $(BASE)) $(SCENES)
+	$(VENV) tools/bench_quality.py $(SCENES) $(if $(BASE),--report --base $(BASE)) $(if $(METHODS),--methods $(METHODS))
 
 bench-lod: setup
 	$(VENV) tools/bench_lod.py $(STAGES)

@@ -53,24 +53,48 @@ def train(checkout: Path, out: Path, scene: Path, method: str, share: float, see
     """Trains in a checkout of the project, unless that was done before.
 
     Raises:
-        LodgsError: the trainer says what is wrong.
+        LodgsError: the trainer says what is wrong, or what was done before is another run.
     """
-    if (out / "bundle.ply").exists():
-        return
-    steps = METHODS[method].preset(args.preset).steps
-    scaled = [max(round(share * each), 1) for each in (steps if isinstance(steps, tuple) else (steps,))]
+    preset = METHODS[method].preset(args.preset)
+    scaled = [
+        f"--set={name}={json.dumps(_scaled(getattr(preset, name), share))}"
+        for name in ("steps", "tune_steps")
+        if hasattr(preset, name)
+    ]
     command = [
         sys.executable, "-m", "training", "train", "--scene", str(scene), "--out", str(out),
         "--method", method, "--preset", args.preset, "--seed", str(seed),
         "--image-scale", str(args.image_scale),
-        "--set", f"steps={json.dumps(scaled if len(scaled) > 1 else scaled[0])}",
-        *(f"--set={each}" for each in args.set), *([] if args.report else ["--validation"]),
+        *scaled, *(f"--set={each}" for each in args.set), *([] if args.report else ["--validation"]),
     ]  # fmt: skip
+    asked = json.dumps([_version(checkout), *command[2:]])
+    record = out.with_name(f".{out.name}.json")
+    if (out / "bundle.ply").exists():
+        if not record.exists() or record.read_text(encoding="utf-8") != asked:
+            raise LodgsError(
+                f"{out} was trained with other options, or by another version.",
+                "Name another folder: --out DIR.",
+            )
+        return
+    out.parent.mkdir(parents=True, exist_ok=True)
+    record.write_text(asked, encoding="utf-8")
     environment = os.environ | {"PYTHONPATH": "", "OMP_NUM_THREADS": "1"}
     ran = subprocess.run(command, cwd=checkout, env=environment, capture_output=True, text=True)
     if ran.returncode:
         last = ran.stdout.strip().splitlines()[-1:] or [ran.stderr]
         raise LodgsError(f"{method} on {scene.name} in {checkout}: {last[0]}")
+
+
+def _version(checkout: Path) -> str:
+    """What a checkout holds, as far as git knows."""
+    command = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=40"]
+    return subprocess.run(command, capture_output=True, text=True).stdout.strip()
+
+
+def _scaled(steps: int | tuple[int, ...], share: float) -> int | list[int]:
+    if isinstance(steps, int):
+        return max(round(share * steps), 1)
+    return [max(round(share * each), 1) for each in steps]
 
 
 def measured(out: Path, **run) -> Point:
@@ -136,7 +160,7 @@ def main() -> int:
     parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
     parser.add_argument("--base", type=Path, help="another checkout to train with as well; needs --report")
     parser.add_argument("--report", action="store_true", help="measure on test views instead")
-    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=["3dgs", "flod", "octree"])
+    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
     parser.add_argument("--preset", default="draft")
     parser.add_argument("--shares", nargs="+", type=float, default=[0.25, 0.5, 1.0], help="of the steps")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
@@ -147,6 +171,10 @@ def main() -> int:
     if args.base and not args.report:
         parser.error("--base needs --report: an older version may not know validation views")
     versions = {"this": HERE} | ({"base": args.base.resolve()} if args.base else {})
+    if args.base and not (args.base / "training").is_dir():
+        parser.error(f"--base {args.base} is no checkout of the project")
+    if not all(0 < share <= 10 for share in args.shares):
+        parser.error("--shares are of a preset's steps, above 0 and at most 10")
     args.out = args.out.resolve()
     points = []
     try:
@@ -162,7 +190,7 @@ def main() -> int:
                             points.append(measured(out, **run))
                             print(table(points[-1:]).splitlines()[-1], flush=True)
     except LodgsError as error:
-        print(error.what, file=sys.stderr)
+        print(error.what, error.remedy, file=sys.stderr)
         return 2
     (args.out / "quality.md").write_text(table(points) + "\n", encoding="utf-8")
     (args.out / "quality.json").write_text(

@@ -26,6 +26,8 @@ from training.errors import LodgsError  # noqa: E402
 from training.scenes.colmap import read_scene  # noqa: E402
 from training.scenes.color import linear_from_srgb, srgb_from_linear  # noqa: E402
 
+MOST_STOPS = 10.0
+
 
 def exposed(pixels: np.ndarray, stops: float) -> np.ndarray:
     """A photograph (H, W, 3) uint8 with 2^stops as much light; what is over white is lost."""
@@ -46,6 +48,8 @@ def jittered(scene: Path, copy: Path, stops: float, seed: int, test_every: int) 
     Raises:
         LodgsError: the scene cannot be read, or the copy exists.
     """
+    if not 0 <= stops <= MOST_STOPS:
+        raise LodgsError(f"Stops of {stops} are not possible.", f"Give 0 to {MOST_STOPS}.")
     if copy.exists():
         raise LodgsError(f"{copy} exists.", "Choose another folder.")
     train, _ = read_scene(scene).split(test_every)

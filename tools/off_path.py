@@ -83,6 +83,8 @@ def report(run: Path, rendered: Path) -> Iterator[str]:
     Raises:
         LodgsError: the run or the scene cannot be read.
     """
+    if not rendered.is_dir():
+        raise LodgsError(f"There is no folder {rendered}.", "Fill it by examples/build_scene.py.")
     folder = RunFolder(run)
     job, bundle = Job.from_file(folder.job), read_bundle(folder.bundle)
     evaluation = Evaluation(training_data(job, folder), job.backend, bundle.antialias)

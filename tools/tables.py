@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable
-from dataclasses import Field, fields
+from dataclasses import Field
 from inspect import getdoc, getmodule
 from math import inf
 from pathlib import Path
@@ -37,7 +37,7 @@ def parameters_page() -> str:
         rows = [
             [f"`{f.name}`", f.metadata["about"], _possible(f), f.metadata["unit"] or "",
              *(_value(getattr(method.preset(preset), f.name)) for preset in PRESETS)]
-            for f in fields(method.parameters)
+            for f in method.fields
         ]  # fmt: skip
         parts.append(_table(["parameter", "what", "possible", "unit", *PRESETS], rows))
     return "\n\n".join(parts) + "\n"
@@ -49,7 +49,8 @@ def controls_page() -> str:
         "# Controls",
         _WRITTEN.format("training/lod/rules/")
         + "\nWhat decides the detail that an eye sees: sliders in Blender (**By Distance**), options of "
-        "`render` and `evaluate`, numbers in a bundle. Each method has one rule, and options that the rule "
+        "`render` and `evaluate`, numbers in a bundle. What a bundle records of them is its own default, as "
+        "FLoD's `gamma` is. Each method has one rule, and options that the rule "
         "does not have are refused. [The bundle](bundle.md#choosing-by-distance) has the formulas.",
     ]
     for rule in rules().values():

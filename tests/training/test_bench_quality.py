@@ -4,8 +4,12 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+
+from tools import bench_quality
+from training.methods import METHODS
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -45,3 +49,22 @@ def test_another_version_is_not_asked_for_views_that_it_may_not_know(tiny_scene,
 def test_what_the_trainer_says_is_passed_on(tmp_path):
     refused = bench(tmp_path / "nothing", "--methods", "3dgs", "--shares", "0.001", "--out", tmp_path)
     assert refused.returncode == 2 and "Traceback" not in refused.stderr and "nothing" in refused.stderr
+
+
+def test_a_share_is_of_all_steps(monkeypatch, tmp_path):
+    said = []
+
+    def run(command, **options):
+        said.extend(each for each in command if each.startswith("--set="))
+        return subprocess.CompletedProcess(command, 0, "", "")
+
+    monkeypatch.setattr(subprocess, "run", run)
+    args = SimpleNamespace(preset="draft", image_scale=1.0, set=[], report=True)
+    for method in ("lodge", "flod"):
+        bench_quality.train(tmp_path, tmp_path / "out", tmp_path, method, 0.5, 0, args)
+    lodge, flod = (METHODS[name].preset("draft") for name in ("lodge", "flod"))
+    assert said == [
+        f"--set=steps={lodge.steps // 2}",
+        f"--set=tune_steps={lodge.tune_steps // 2}",
+        f"--set=steps={[each // 2 for each in flod.steps]}",
+    ]

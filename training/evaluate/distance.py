@@ -63,7 +63,8 @@ def jumps(evaluation: Evaluation, bundle: Bundle, values: Values, camera: Camera
     """How much more neighbouring frames differ on the way out than with all splats in all frames.
 
     The camera is pulled back from 1 to 8 times its distance in FRAMES equal factors. A jump is the mean
-    absolute difference of two neighbouring frames over that of the same two at full detail.
+    absolute difference of two neighbouring frames over that of the same two at full detail, where these
+    differ at all.
 
     Returns:
         The largest jump, by what it is of: ``by distance``; where the rule's levels fade, ``faded`` and
@@ -83,7 +84,8 @@ def jumps(evaluation: Evaluation, bundle: Bundle, values: Values, camera: Camera
     def largest(values: Values) -> float:
         drawn = (resident.draw(view, values, near=evaluation.data.near) for view in views)
         pictures = (rendering.image.cpu().numpy() for rendering in drawn)
-        return round(float((differences(pictures) / still).max()), 3)
+        moved = still > 0
+        return round(float((differences(pictures)[moved] / still[moved]).max(initial=0)), 3)
 
     def full(view: Camera) -> np.ndarray:
         splats = shown(view)[0] if bundle.elsewhere else everything

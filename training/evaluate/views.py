@@ -145,13 +145,12 @@ class Evaluation:
 
         def picture(camera: Camera) -> torch.Tensor:
             rendering = render(camera)
-            drawn.append(rendering.radii)
+            drawn.append(int((rendering.radii > 0).sum()))
             return rendering.image.cpu()
 
         quality = self.measure_pictures(picture)
-        counts = [int((radii > 0).sum()) for radii in drawn]
         splats = np.mean([count(camera) for camera in self.cameras])
-        return {"splats": round(float(splats)), "drawn": round(float(np.mean(counts))), **quality}
+        return {"splats": round(float(splats)), "drawn": round(float(np.mean(drawn))), **quality}
 
     def measure_pictures(self, picture: Callable[[Camera], torch.Tensor]) -> dict:
         """Quality and ``frame_s`` as :meth:`measure`, of pictures however they are made."""

@@ -25,10 +25,20 @@ from ..scenes.cameras import Camera
 from ..splats.bundle import Bundle, Level, Rows, open_bundle
 from ..splats.dialects import drawable
 from ..splats.gaussians import Splats
-from .blocks import SIZE, Blocks, places_on_curve
+from .blocks import ROUNDING, SIZE, Blocks, places_on_curve
 from .choice import Choice
 from .rule import distances_by_axes
-from .rules.cut import ABOVE_ROOT, K_LEAST, NODE_SIZE, PARENT, PARENT_SIZE, RULE, detail_of, hashed
+from .rules.cut import (
+    ABOVE_ROOT,
+    K_LEAST,
+    NODE_SIZE,
+    PARENT,
+    PARENT_SIZE,
+    RULE,
+    detail_of,
+    hashed,
+    identities,
+)
 from .streaming import BLOCKS
 
 BOUNDS = tuple(f"{end}_{axis}" for end in ("low", "high") for axis in "xyz")
@@ -36,8 +46,6 @@ BOUNDS = tuple(f"{end}_{axis}" for end in ("low", "high") for axis in "xyz")
 COLUMNS = (NODE_SIZE, PARENT_SIZE, *PARENT)
 AT_ONCE = 256
 """Pages that come in between two looks at where the eye is."""
-ROUNDING = 1e-4
-"""Share of a distance that single precision may get wrong."""
 SIGHT = np.radians(50.0)
 """An angle that images reach from where their eye looks."""
 BEHIND = 2.0
@@ -353,8 +361,7 @@ class Standing:
 
     def _family(self, places: np.ndarray, size: str, axes: Sequence[str]) -> np.ndarray:
         """(M, 4) by which children and parents know each other."""
-        columns = [self._columns[name][places] for name in (size, *axes)]
-        return np.stack(columns, axis=1) + np.float32(0)  # no zero below zero
+        return identities(*(self._columns[name][places] for name in (size, *axes)))
 
 
 def read_within(

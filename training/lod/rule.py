@@ -22,6 +22,9 @@ from ..errors import LodgsError
 from ..splats.placing import Place
 from ..splats.ply import Columns
 
+STEP = 1.25
+"""Factor by which a viewer's budget raises a control at a time."""
+
 NO_FINER = 1 << 30
 """What the fact ``finer`` of the finest level is."""
 
@@ -242,6 +245,12 @@ class Rule(ABC):
             levels: numbers of the levels that there are, ascending.
         """
         return None
+
+    def raised(self, values: Values, name: str) -> Values | None:
+        """The values with one control STEP times as large; None where that is beyond its range."""
+        value = values[name] * STEP
+        high = next(control.high for control in self.controls if control.name == name)
+        return {**values, name: value} if value <= high else None
 
     def defaults(self, levels: Sequence[int]) -> dict[str, float]:
         """The value of every control that pictures and figures are made with where nothing else is said.

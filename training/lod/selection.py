@@ -70,7 +70,7 @@ def rule_of(bundle: Bundle) -> Rule:
 def unknown_rule(name: str) -> tuple[str, str]:
     """What to say, and what to do about it, where there is no such rule."""
     if not name:
-        return "These levels are not made for distances.", "Show one of them with --level, or the finest."
+        return "These levels are not made for distances.", "Leave out the options that choose by distance."
     return (
         f"These levels are chosen by the rule '{name}', which this version does not know.",
         "Update LODGS; until then the finest level is shown.",

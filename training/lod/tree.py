@@ -20,6 +20,7 @@ from .rules.cut import (
     PARENT_SIZE,
     RULE,
     hashed,
+    identities,
     least_size,
     rounded_up,
 )
@@ -135,7 +136,7 @@ class Apart:
         """Those of ``Tree.sizes``; larger in the last places where a node has them that was here before."""
         sizes = tree.sizes(means, log_scales, of_leaves)
         some = np.flatnonzero(sizes[tree.leaves :]) + tree.leaves
-        keys = _identities(sizes[some], means[some])
+        keys = hashed(identities(sizes[some], *means[some].T))
         if self._free(keys).all():
             self._take(keys)
             return sizes
@@ -144,7 +145,7 @@ class Apart:
     def _apart(self, sizes: np.ndarray, means: np.ndarray) -> np.ndarray:
         sizes, waiting, most = sizes.copy(), np.flatnonzero(sizes), 1
         while len(waiting):
-            keys = _identities(sizes[waiting], means[waiting])
+            keys = hashed(identities(sizes[waiting], *means[waiting].T))
             free = self._free(keys)
             self._take(keys[free])
             waiting = waiting[~free]
@@ -167,11 +168,6 @@ class Apart:
             keys = np.concatenate([self._taken.pop(), keys])
         if len(keys):
             self._taken.append(np.sort(keys))
-
-
-def _identities(sizes: np.ndarray, means: np.ndarray) -> np.ndarray:
-    """(N,) uint64 of sizes (N,) and means (N, 3) float32: of equal ones equal, and hardly of any others."""
-    return hashed(np.concatenate([sizes[:, None], means], axis=1) + np.float32(0))  # no zero below zero
 
 
 def size_of(log_scales: np.ndarray) -> np.ndarray:

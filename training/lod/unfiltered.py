@@ -18,8 +18,9 @@ from ..scenes.views import views_in
 from ..splats.bundle import NO_SPLATS, Bundle, Level
 from ..splats.gaussians import SplatRows, Splats
 
-VARIANCE = 0.1
-"""What the filter adds to a splat's variance on the image, in square pixels."""
+MIP_VARIANCE = 0.1
+"""Added to a splat's variance on the image, in square pixels, about a pixel's own extent (Yu et al. 2024,
+Eq. 10)."""
 MOST_VIEWS = 24
 """In so many views opacities are looked up."""
 MARGIN = 0.5
@@ -109,4 +110,4 @@ def _kept(means: np.ndarray, shapes: np.ndarray, view: Camera) -> np.ndarray:
     first, second = ((axis[:, None] @ shapes)[:, 0] for axis in (across, along))
     a, b, c = ((u * v).sum(1) for u, v in ((first, first), (first, second), (second, second)))
     before = np.maximum(a * c - b * b, 0)
-    return np.sqrt(before / ((a + VARIANCE) * (c + VARIANCE) - b * b))
+    return np.sqrt(before / ((a + MIP_VARIANCE) * (c + MIP_VARIANCE) - b * b))

@@ -53,7 +53,10 @@ def parameters_of(method: str, preset: str, changes: dict) -> Parameters:
     Raises:
         LodgsError: there is no such method or preset, or a change is not possible.
     """
-    return override(method_info(method).preset(preset), changes)
+    info = method_info(method)
+    if idle := sorted(set(changes) & set(info.retired)):
+        raise LodgsError(f"{info.label} has no use for '{idle[0]}'.", "Leave it out.")
+    return override(info.preset(preset), changes)
 
 
 def create(

@@ -26,6 +26,8 @@ from .targets import Targets, default_budget
 
 TRIED = 3
 """Photographs that are looked at for whether they are transparent."""
+SMALLEST = 11
+"""Pixels of a photograph's shorter side: SSIM compares windows of so many."""
 DEPTH_BYTES = 4
 """Bytes a pixel that depth takes beside a photograph."""
 OPAQUE = 0.99
@@ -97,16 +99,35 @@ class TrainingData:
         self.whole = scene if whole is None else whole
         all_train, all_test = self.whole.split(test_every, validation)
         train, test = (_among(scene.cameras, each) for each in (all_train, all_test))
+        if len(scene.cameras) < 2:
+            raise LodgsError(
+                f"The scene {scene.folder} has {len(scene.cameras)} usable view(s); 2 are needed.",
+                "Check that the image folder holds the photographs that the model names.",
+            )
         if len(train) < 2:
             raise LodgsError(
-                f"The scene {scene.folder} has {len(train)} usable view(s) to train on; 2 are needed.",
-                "Check that the image folder holds the photographs that the model names.",
+                f"Of the {len(scene.cameras)} usable views in {scene.folder} {len(train)} would be trained "
+                "on and the others held out; 2 are needed.",
+                "Hold out none (test_every = 0), or one of more.",
+            )
+        if validation and not all_test:
+            raise LodgsError(
+                f"Of the {len(self.whole.cameras)} usable views in {scene.folder} validation leaves some out "
+                f"and measures none, with one of every {test_every} held out.",
+                "Give a smaller test_every, or train without validation.",
             )
         self.scene, self.exposure, self.depths, self.region = scene, exposure, depths, region
         self._trained, self._gains = {camera.name for camera in train}, gains or {}
         self.whole_train = [camera.scaled(image_scale) for camera in all_train]
         self.train = [camera.scaled(image_scale) for camera in train]
         self.test = [camera.scaled(image_scale) for camera in test]
+        for camera in (*self.train, *self.test):
+            if min(camera.width, camera.height) < SMALLEST:
+                raise LodgsError(
+                    f"{camera.name} would be trained on at {camera.width} x {camera.height} pixels; "
+                    f"{SMALLEST} are needed.",
+                    "Give a larger image_scale.",
+                )
         budget = default_budget() if photo_memory is None else photo_memory
         if depths:
             budget = budget * TARGET_BYTES // (TARGET_BYTES + DEPTH_BYTES)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import fields
 from textwrap import fill
 
 from . import METHODS, PRESETS, method_info
@@ -27,7 +26,7 @@ def describe_method(name: str) -> str:
     method = method_info(name)
     lines = [f"{method.label}: {method.about}.", f"Begins with points{' or a base' * method.from_base}.", ""]
     lines += [f"  {preset:<9} {text}" for preset, text in PRESETS.items()]
-    for field in fields(method.parameters):
+    for field in method.fields:
         unit = f" ({field.metadata['unit']})" if field.metadata["unit"] else ""
         each = ", for each level" if isinstance(field.default, tuple) else ""
         values = {preset: json.dumps(getattr(method.preset(preset), field.name)) for preset in PRESETS}

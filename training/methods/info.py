@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import Field, dataclass, field, fields
 from typing import Any
 
 from ..documents import shown
@@ -45,7 +45,8 @@ class MethodInfo:
             whose splats, put together, are then its base; "" where cells cannot be put together.
         divided: of the parameters of a scene in cells, those of a run of all of it that makes the coarser
             levels once, and those of the cells' runs, which go on from them; None: cells make all levels.
-        retired: names of parameters that earlier versions wrote into job files without any effect.
+        retired: names of parameters without a use here, inherited or not, which earlier versions wrote into
+            job files.
         package: the folder as a module, set where the method is found.
     """
 
@@ -65,6 +66,11 @@ class MethodInfo:
     captured: Mapping[str, Any] = field(default_factory=dict)
     retired: tuple[str, ...] = ()
     package: str = ""
+
+    @property
+    def fields(self) -> list[Field]:
+        """The parameters that can be set."""
+        return [each for each in fields(self.parameters) if each.name not in self.retired]
 
     def preset(self, name: str) -> Parameters:
         """The parameters of a preset.

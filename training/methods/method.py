@@ -90,7 +90,7 @@ class Method(ABC, Generic[P, D]):
         self.warn: Callable[[str], None] = lambda message: None
         self.data, self.parameters, self.seed, self.backend = data, parameters, seed, backend
         self.device = device_of(backend)
-        self.exposure = Exposure(len(data.train), parameters.lr_exposure, self.device)
+        self.exposure = Exposure([view.name for view in data.train], parameters.lr_exposure, self.device)
         self.setup(base)
 
     @abstractmethod
@@ -147,7 +147,6 @@ class Method(ABC, Generic[P, D]):
             "camera_center": data.mean_camera.tolist(),
             "view": [middle.center.tolist(), ahead.tolist()],
             "focal_px": data.focal,
-            "focal_width": data.whole_train[0].width,
             "scene_extent": data.extent,
             "median_depth": data.median_depth,
             **({"antialias": True} if self.parameters.antialias else {}),

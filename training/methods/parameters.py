@@ -196,7 +196,8 @@ class DensityParameters(Parameters):
     )
     clone_extent: float = parameter(
         0.01,
-        "Splats larger than this multiple of the scene extent are split at random, smaller ones cloned.",
+        "Splats larger than this multiple of the scene extent are split at random, smaller ones cloned, "
+        "where 'long_axis' is false.",
     )
     prune_interval: int = parameter(
         100, "Steps between two removals of transparent splats; 0 never removes.", unit="steps"

@@ -35,7 +35,8 @@ class Targets:
     """Photographs by their views: those that are needed soonest stay, and are read before they are needed.
 
     What is kept, and when it is read, changes how long a step takes and nothing else: a plan may be wrong.
-    Every photograph counts with all that losses keep beside it. No more than the budget is held, besides a
+    Every photograph counts with the moments that losses keep beside it, but without its mask and its alpha,
+    which take 4 bytes a pixel each. No more than the budget is held, besides a
     photograph that has no room in it and is in use. For one thread to ask; others only read.
 
     Args:

@@ -71,9 +71,9 @@ def rasterize(
         sh_degree: use the coefficients up to this degree only (the others get a gradient of zero); None: all.
         min_scale: added to every standard deviation, and so its lower bound, in world units (FLoD, Eq. 4).
         near: a splat is drawn where its mean lies deeper than this, in world units.
-        antialias: instead of 3DGS's dilation, filter with :data:`.rendering.MIP_VARIANCE` and give what a
-            splat gains in area back in opacity, sqrt(det before / det after) (Mip-Splatting, Yu et al. 2024,
-            Eq. 10). Or (N,) bool, for each splat whether it is so.
+        antialias: instead of 3DGS's dilation, filter with :data:`..lod.unfiltered.MIP_VARIANCE` and give what
+            a splat gains in area back in opacity, sqrt(det before / det after) (Mip-Splatting, Yu et al.
+            2024, Eq. 10). Or (N,) bool, for each splat whether it is so.
         outputs: of :data:`OUTPUTS`, what :class:`Rendering` shall have besides; differentiable, too.
         features: (N, F) further values of each splat, blended as colours are over zero.
         limit: (H, W), for each pixel a depth along the camera's z axis, in world units: splats whose means

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import torch
 from torch.nn.functional import conv2d, normalize
 
+from ..lod.unfiltered import MIP_VARIANCE
 from ..splats import sh as harmonics
 from .features import rotation_matrices
 from .gaussians import Gaussians
@@ -19,7 +20,6 @@ from .rendering import (
     ALPHA_MAX,
     ALPHA_MIN,
     DILATION,
-    MIP_VARIANCE,
     TRANSMITTANCE_MIN,
     Drawn,
     Settings,

@@ -13,8 +13,6 @@ from ..scenes.cameras import Camera
 
 DILATION = 0.3
 """Added to the variance of each projected splat, in square pixels (3DGS's low-pass filter)."""
-MIP_VARIANCE = 0.1
-"""The same of Mip-Splatting's 2D filter, about a pixel's own extent (Yu et al. 2024, Eq. 10)."""
 OUTPUTS = ("depth", "inverse_depth", "median_depth", "normals", "absgrad2d")
 """What can be asked for besides the image and its alpha."""
 ALPHA_MAX = 0.99

@@ -264,7 +264,8 @@ class Job:
 
     def resolved(self) -> Job:
         """The same job with every parameter written out, so that a later version repeats it unchanged."""
-        values = asdict(self.resolved_parameters())
+        told, known = self.resolved_parameters(), method_info(self.method).fields
+        values = {each.name: getattr(told, each.name) for each in known}
         return replace(
             self, parameters={k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
         )

@@ -92,3 +92,9 @@ def test_fewer_splats_are_drawn_from_farther_away(bundle, evaluation):
 def test_fading_takes_the_jumps_away(bundle, evaluation, camera):
     found = jumps(evaluation, bundle, settings(bundle, {}), camera)
     assert found["faded"] < found["hard"]
+
+
+def test_where_nothing_is_seen_nothing_jumps(bundle, evaluation, camera):
+    for level in bundle.levels:
+        level.splats.opacity_logits[:] = -20
+    assert jumps(evaluation, bundle, settings(bundle, {}), camera) == {"faded": 0, "hard": 0}

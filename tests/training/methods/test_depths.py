@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.training.scenes.depth_walls import FITTED, METRIC, depth_of, put, view, write_walls
-from training.methods import METHODS, create, parameters_of
+from training.methods import METHODS, create
 from training.methods.data import TrainingData
 from training.rasterize import Gaussians, rasterize
 from training.runs.job import Job
@@ -37,9 +38,8 @@ def data(scene):
 
 
 def made(name: str, data: TrainingData, weight: float):
-    return create(
-        name, data, parameters_of(name, "draft", {"depth_weight": weight, "dropout": 0.0}), 0, "cpu"
-    )
+    parameters = replace(METHODS[name].preset("draft"), depth_weight=weight, dropout=0.0)
+    return create(name, data, parameters, 0, "cpu")
 
 
 @pytest.mark.parametrize("name", METHODS)

@@ -258,7 +258,7 @@ def test_a_method_that_forgets_something_cannot_be_made(data, tiny):
 def test_what_all_methods_record_of_a_scene(data, tiny):
     method = methods.create("tiny", data, tiny.preset("draft"), seed=0, backend="cpu")
     meta = method.meta()
-    assert meta["focal_px"] == 60 and meta["focal_width"] == 64
+    assert meta["focal_px"] == 60
     eye, target = np.array(meta["view"])
     middle = np.argmin(
         np.linalg.norm([c.center - np.array(meta["camera_center"]) for c in data.train], axis=1)

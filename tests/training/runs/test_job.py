@@ -187,5 +187,13 @@ def test_a_3dgs_run_of_0_1_0_is_the_same_job_and_no_new_one_may_name_what_had_no
     """Version 0.1.0 trained 3DGS as FLoD with one level, and wrote all of FLoD's parameters."""
     parameters = Job.from_file(write(tmp_path / "job.toml", OLD_3DGS)).resolved_parameters()
     assert (parameters.total_steps, parameters.max_splats) == (4300, 4321)
-    with pytest.raises(LodgsError, match="unknown parameter 'rho'"):
+    with pytest.raises(LodgsError, match="no use for 'rho'"):
         Job.from_dict({"scene": "/s", "out": "/o", "method": "3dgs", "parameters": {"rho": 4.0}})
+
+
+def test_what_a_method_inherits_without_a_use_is_refused_but_in_files_of_earlier_versions(tmp_path):
+    values = {"scene": "/s", "out": "/o", "method": "octree_neural", "parameters": {"dropout": 0.1}}
+    with pytest.raises(LodgsError, match="neural has no use for 'dropout'"):
+        Job.from_dict(values)
+    text = 'scene = "/s"\nout = "/o"\nmethod = "octree_neural"\n[parameters]\ndropout = 0.1\n'
+    assert "dropout" not in Job.from_file(write(tmp_path / "job.toml", text)).resolved().parameters

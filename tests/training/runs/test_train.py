@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import shutil
 import signal
 import struct
 import subprocess
@@ -16,9 +17,11 @@ import numpy as np
 import pytest
 import torch
 
+from training.errors import LodgsError
 from training.lod import sight
 from training.methods import METHODS
 from training.runs import train as training_loop
+from training.runs.data import training_data
 from training.runs.events import Events
 from training.runs.folder import RunFolder
 from training.runs.job import Job
@@ -495,6 +498,26 @@ def test_an_unexpected_error_is_an_event_and_its_details_go_to_the_log(
     assert "Traceback" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("views", "keys", "said"),
+    [
+        (2, {}, "Of the 2 usable views in .* 1 would be trained on"),
+        (4, {"test_every": 2, "validation": True}, "Of the 4 usable views in .* 0 would be"),
+        (4, {"validation": True}, "validation leaves some out and measures none"),
+        (4, {"test_every": 0, "image_scale": 0.15}, "at 9 x 7 pixels; 11 are needed"),
+    ],
+)
+def test_too_little_to_train_on_and_measure_says_what_would_be_enough(
+    tiny_scene, tmp_path, views, keys, said
+):
+    scene = shutil.copytree(tiny_scene, tmp_path / "scene")
+    for photograph in sorted((scene / "images").iterdir())[views:]:
+        photograph.unlink()
+    job = Job.from_dict({"scene": str(scene), "out": str(tmp_path / "run"), **keys})
+    with pytest.raises(LodgsError, match=said):
+        training_data(job, RunFolder(tmp_path / "run"))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "change, said",
@@ -506,8 +529,6 @@ def test_an_unexpected_error_is_an_event_and_its_details_go_to_the_log(
     ],
 )
 def test_scenes_that_cannot_be_trained_on_say_why(tiny_scene, tmp_path, change, said):
-    import shutil
-
     scene = tmp_path / "scene"
     shutil.copytree(tiny_scene, scene)
     change(scene)

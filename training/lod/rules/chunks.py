@@ -10,9 +10,6 @@ import numpy as np
 from ...splats.dialects import FARTHEST
 from ..rule import NO_COLUMNS, NO_FINER, NO_TABLES, Control, Region, Rule, Tables, Values, distances
 
-STEP = 1.25
-"""Factor by which a viewer's budget raises the distance scale at a time."""
-
 COLUMNS = ("x", "y", "z", "radius")
 """Of the table of chunks."""
 BITS, MOST_CHUNKS = 24, 96
@@ -171,8 +168,7 @@ class Chunks(Rule):
     def coarser(self, values: Values, levels: Sequence[int]) -> Values | None:
         if values["chunks"]:
             return {**values, "chunks": 0}
-        scale = values["distance_scale"] * STEP
-        return {**values, "distance_scale": scale} if scale <= self.controls[0].high else None
+        return self.raised(values, "distance_scale")
 
 
 def _rows(tables: Tables) -> int:

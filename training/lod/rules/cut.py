@@ -21,8 +21,6 @@ K_LEAST = 8.0
 ROUNDING = 2.0**-20
 """Share by which a parent's size is larger still: 16 units in float32's last place, of which comparing a
 distance with k size, for parent and child, can get 9 wrong."""
-STEP = 1.25
-"""Factor by which a viewer's budget raises the granularity at a time."""
 _BLOCK = 1 << 14
 """Splats that are looked at together, which stay in the processor's cache."""
 OCTAVES = len(LEVEL_COLORS) - 1
@@ -133,9 +131,9 @@ class Cut(Rule):
         They are what scaling makes of them, or larger in the last places.
         """
         inside = (before[PARENT_SIZE] > 0) & (before[PARENT_SIZE] < ABOVE_ROOT)
-        above = hashed(_identities(before, PARENT_SIZE, PARENT)[inside])
+        above = hashed(identities(*(before[name] for name in (PARENT_SIZE, *PARENT)))[inside])
         keys, first, family = np.unique(above, return_index=True, return_inverse=True)
-        own = hashed(_identities(before, NODE_SIZE, "xyz"))
+        own = hashed(identities(*(before[name] for name in (NODE_SIZE, *"xyz"))))
         heads = np.searchsorted(keys, own).clip(max=max(len(keys) - 1, 0))
         is_head = before[NODE_SIZE] > 0
         if len(keys):
@@ -168,13 +166,12 @@ class Cut(Rule):
         return _octave(distances(means, eye) / np.float32(detail_of(focal_px, values["pixels"])))
 
     def coarser(self, values: Values, levels: Sequence[int]) -> Values | None:
-        pixels = values["pixels"] * STEP
-        return {**values, "pixels": pixels} if pixels <= self.controls[0].high else None
+        return self.raised(values, "pixels")
 
 
-def _identities(columns: Columns, size: str, axes: Sequence[str]) -> np.ndarray:
-    """(N, 4) by which children and parents know each other."""
-    return np.stack([columns[name] for name in (size, *axes)], axis=1) + np.float32(0)  # no zero below zero
+def identities(sizes: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """(N, 4) float32 by which children and parents know each other, of sizes and places (N,) float32."""
+    return np.stack([sizes, x, y, z], axis=1) + np.float32(0)  # no zero below zero
 
 
 def _octave(sizes: np.ndarray) -> np.ndarray:

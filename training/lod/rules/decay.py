@@ -1,4 +1,4 @@
-"""CLoD-GS's rule (Anonymous 2025, Sec. 3.2): opacity decays with distance, splat by splat, without levels."""
+"""CLoD-GS's rule (arXiv 2510.09997, Sec. 3.2): opacity decays with distance, splat by splat."""
 
 from __future__ import annotations
 
@@ -17,8 +17,6 @@ CLEAR = 1e-5
 rounding does not bring that one back."""
 NEWTON_STEPS = 6
 """Steps of :func:`last_seen_at`, of which each doubles the digits."""
-STEP = 1.25
-"""Factor by which a viewer's budget raises the virtual scale at a time."""
 
 
 def attenuation(normalized, sigma, s_v: float):
@@ -103,8 +101,7 @@ class Decay(Rule):
         return np.where(columns[OPACITY] * weight > tau * s_v, weight, np.float32(0))
 
     def coarser(self, values: Values, levels: Sequence[int]) -> Values | None:
-        s_v = values["s_v"] * STEP
-        return {**values, "s_v": s_v} if s_v <= self.controls[0].high else None
+        return self.raised(values, "s_v")
 
 
 RULE = Decay()

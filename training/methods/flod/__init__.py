@@ -23,7 +23,7 @@ class FlodParameters(DensityParameters):
 
     levels: int = parameter(5, "Number of levels (FLoD: L_max).", low=1, high=MOST_LEVELS)
     rho: float = parameter(
-        4.0, "Factor between the smallest sizes of two neighbouring levels (FLoD: rho).", above=0
+        4.0, "Factor between the smallest sizes of two neighbouring levels (FLoD: rho).", above=1
     )
     footprint: float = parameter(
         16.0,

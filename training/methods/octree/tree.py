@@ -13,8 +13,11 @@ from math import floor, log2
 import numpy as np
 
 from ...errors import LodgsError
-from ...scenes.cameras import Camera
+from ...scenes.cameras import Camera, evenly
 from ...splats.bundle import MOST_LEVELS
+
+POINTS, VIEWS = 50_000, 500
+"""About so many points and views tell how far views see."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +76,7 @@ def build(
     levels: int = 0,
     coarser: int = 0,
 ) -> Octree:
-    """The octree of a scene's points (P, 3) and views.
+    """The octree of a scene's points (P, 3) and views, of which POINTS and VIEWS tell how far they see.
 
     Args:
         focal_px: focal length in pixels to which distances are scaled.
@@ -85,7 +88,8 @@ def build(
     Raises:
         LodgsError: if no view sees a point.
     """
-    distances = np.concatenate(view_distances(points, cameras, focal_px))
+    some = points[:: max(1, len(points) // POINTS)], evenly(cameras, VIEWS)
+    distances = np.concatenate(view_distances(*some, focal_px))
     if not len(distances):
         raise LodgsError(
             "No training view sees any of the scene's points.", "Check that both are of one model."

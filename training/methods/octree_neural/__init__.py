@@ -10,9 +10,7 @@ from ..parameters import AS_PUBLISHED, parameter
 
 @dataclass(frozen=True)
 class NeuralOctreeParameters(OctreeParameters):
-    """Harmonics are those of baking. Without use here: ``candidates``, ``sh_interval``, ``dropout`` and the
-    learning rates of means, quaternions, opacities and harmonics.
-    """
+    """Harmonics are those of baking."""
 
     max_splats: int = parameter(180_000, "Most Gaussians of all levels together, which add up.", above=0)
     min_opacity: float = parameter(
@@ -57,7 +55,7 @@ class NeuralOctreeParameters(OctreeParameters):
         high=1,
     )
     lr_appearance: float = parameter(5e-2, "Learning rate of the views' appearances.")
-    bake_ridge: float = parameter(0.001, "How firmly baking holds the higher harmonics to zero.")
+    bake_ridge: float = parameter(0.001, "How firmly baking holds the higher harmonics to zero.", above=0)
 
     def check(self) -> None:
         super().check()
@@ -77,8 +75,6 @@ _DRAFT = NeuralOctreeParameters(
     volume_weight=0.01,
     antialias=False,
     dropout=0.0,
-    lr_means=4e-4,
-    lr_sh=5e-3,
 )
 _STANDARD = replace(_DRAFT, steps=30_000, max_splats=2_000_000, offsets=10, grow_interval=100)
 _PAPER = replace(
@@ -110,4 +106,14 @@ METHOD = MethodInfo(
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     rule="octree",
     offered=("levels", "max_splats"),
+    retired=(
+        "candidates",
+        "sh_interval",
+        "dropout",
+        "lr_means",
+        "lr_means_final",
+        "lr_quats",
+        "lr_opacities",
+        "lr_sh",
+    ),
 )

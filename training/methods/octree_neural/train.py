@@ -107,7 +107,7 @@ class Method(method.Method[NeuralOctreeParameters, Drawing]):
         places = np.random.default_rng(seed).uniform(-0.5, 0.5, (p.offsets, 3))
         self._spread = torch.from_numpy(places).float()
         """Where in their voxel new anchors' Gaussians begin if they have looks of their own."""
-        self._most = p.max_splats // p.offsets
+        self._most = self.growth_limit(0) // p.offsets
         self.schedule, points, colors, level = growing.plant(self.data, p, seed, self._most)
         self._rates: dict[str, LearningRate] = {
             "means": 0.0,

@@ -11,8 +11,9 @@ import math
 
 import numpy as np
 
+from ...lod.unfiltered import MIP_VARIANCE
 from ...splats import sh as harmonics
-from ..rendering import ALPHA_MIN, DILATION, MIP_VARIANCE, View
+from ..rendering import ALPHA_MIN, DILATION, View
 from .compile import FAST, f32, inlined, kernel
 from .fastmath import fetch_ahead
 

@@ -10,8 +10,6 @@ from .adam import moved
 from .compile import STRICT, f32, in_parallel, inlined, kernel, serialised
 
 _GRAIN = 1 << 12
-_EXTENTS = 3, 4, 3, 1
-"""Numbers of means, quaternions, log-scales and opacity logits; the harmonics follow."""
 
 
 @kernel(STRICT)

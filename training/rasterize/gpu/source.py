@@ -11,8 +11,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from ...lod.unfiltered import MIP_VARIANCE
 from ...splats import sh as harmonics
-from ..rendering import ALPHA_MAX, ALPHA_MIN, DILATION, MIP_VARIANCE, TRANSMITTANCE_MIN
+from ..rendering import ALPHA_MAX, ALPHA_MIN, DILATION, TRANSMITTANCE_MIN
 
 SHADERS = Path(__file__).parent / "shaders"
 CONSTANTS = {
