@@ -119,8 +119,12 @@ def _draw_choices(
         begun = alone or (info.from_base and settings.start_from != "POINTS")
         steps = parameters.base_steps if begun else parameters.total_steps
         column.label(text=f"{steps:,} steps{text}")
-        if not hold_out(root) and not alone:
-            say(layout, "No photographs are held out: quality will be of training views.", "INFO")
+        match hold_out(root):
+            case 0 if not alone:
+                say(layout, "No photographs are held out: quality will be of training views.", "INFO")
+            case 1:
+                say(layout, "All photographs would be held out: give 0, or at least 2.", "ERROR")
+                return
     except LodgsError as error:
         say(layout, str(error), "ERROR")
         return

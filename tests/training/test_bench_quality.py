@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from tools import bench_quality
+from training.errors import LodgsError
 from training.methods import METHODS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -49,6 +50,30 @@ def test_another_version_is_not_asked_for_views_that_it_may_not_know(tiny_scene,
 def test_what_the_trainer_says_is_passed_on(tmp_path):
     refused = bench(tmp_path / "nothing", "--methods", "3dgs", "--shares", "0.001", "--out", tmp_path)
     assert refused.returncode == 2 and "Traceback" not in refused.stderr and "nothing" in refused.stderr
+
+
+def test_what_was_trained_otherwise_is_not_shown(monkeypatch, tmp_path):
+    def run(command, **options):
+        if command[0] != "git":
+            (tmp_path / "out" / "bundle.ply").touch()
+        return subprocess.CompletedProcess(command, 0, "made by this", "")
+
+    monkeypatch.setattr(subprocess, "run", run)
+    (tmp_path / "out").mkdir()
+    args = SimpleNamespace(preset="draft", image_scale=1.0, set=[], report=True)
+    for _ in range(2):
+        bench_quality.train(tmp_path, tmp_path / "out", tmp_path, "3dgs", 0.5, 0, args)
+    args.image_scale = 0.5
+    with pytest.raises(LodgsError, match="other options"):
+        bench_quality.train(tmp_path, tmp_path / "out", tmp_path, "3dgs", 0.5, 0, args)
+
+
+@pytest.mark.parametrize(
+    "given", [["--shares", "nan"], ["--shares", "0"], ["--report", "--base", "/nowhere"]]
+)
+def test_impossible_options_are_refused_in_a_sentence(given, tmp_path):
+    refused = bench(tmp_path, *given)
+    assert refused.returncode == 2 and "Traceback" not in refused.stderr
 
 
 def test_a_share_is_of_all_steps(monkeypatch, tmp_path):

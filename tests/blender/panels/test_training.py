@@ -39,6 +39,9 @@ def test_before_training(root, draw, fake):
     assert NONE_HELD_OUT in notes.texts
     root.lodgs.training.test_every = 8
     assert NONE_HELD_OUT not in draw().texts
+    root.lodgs.training.test_every = 1
+    assert "All photographs would be held out: give 0, or at least 2." in draw().texts and not draw().buttons
+    root.lodgs.training.test_every = 8
     root.lodgs.training.parameters.levels = 3
     assert "3,000 steps in 3 levels" in draw().texts
     root.lodgs.training.method = "3dgs"  # which has no levels
