@@ -11,7 +11,7 @@ PAPER_FOOTPRINT = 40.0
 """Pixels that the paper's lambda, 0.2 COLMAP units, covers at the median depth of its scenes, about."""
 TOGETHER = 3
 """So many levels are drawn together by default (``Bands.defaults``), and finished."""
-FINE = 2
+CELL_LEVELS = 2
 """So many of the finest levels of a scene in cells are trained cell by cell."""
 PAPER_REACH = PAPER_FOOTPRINT / 4**3
 """How far the paper's finest level of five reaches by distance (Eq. 8, gamma 1), in median depths: 5/8."""
@@ -127,7 +127,7 @@ class FlodParameters(DensityParameters):
 
 def divided(parameters: FlodParameters) -> tuple[FlodParameters, FlodParameters] | None:
     """For a scene in cells: all but the two finest levels of the whole, and these two of each cell."""
-    coarse = parameters.levels - FINE
+    coarse = parameters.levels - CELL_LEVELS
     if coarse < 1:
         return None
     return replace(parameters, last_level=coarse), replace(parameters, first_level=coarse + 1)

@@ -31,7 +31,7 @@ from . import FlodParameters
 
 LEVEL = "level"
 """Column of the number of each row's level; levels follow each other, coarse to fine."""
-FINE = 1.5
+FINE_PIXELS = 1.5
 """A level begins anew where its smallest size covers at most so many pixels at the median depth. What is
 coarser was trained with fewer and larger splats than the finest level's, and keeps them."""
 VIEWS_COUNTED = 24
@@ -42,7 +42,7 @@ LEAST_SHARE = 0.25
 """At least this share of what views draw of a level stays, whatever the others have drawn."""
 SPREAD = 1.3
 """The largest factor on the run's screen size, up or down."""
-FINEST = 2.0
+FINEST_WEIGHT = 2.0
 """The finest level is drawn alone so many times as often as each other one."""
 MEANS = 3.0
 """Positions begin with so many times the rate that a level ends with."""
@@ -147,7 +147,7 @@ def rates(parameters: FlodParameters, extent: float, share: float) -> dict[str, 
 def random_values(rng: np.random.Generator, gamma: float, model: Model, alone: float) -> Values:
     """Controls of the rule for a step: a level alone with a chance of ``alone``, else all levels."""
     numbers = list(_rows(model))
-    often = np.array([1.0] * (len(numbers) - 1) + [FINEST])
+    often = np.array([1.0] * (len(numbers) - 1) + [FINEST_WEIGHT])
     factor, level = SPREAD ** rng.uniform(-1, 1), int(rng.choice(numbers, p=often / often.sum()))
     first, last = (level, level) if rng.uniform() < alone else (numbers[0], numbers[-1])
     return {"gamma": gamma * factor, "first": first, "last": last}

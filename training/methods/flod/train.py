@@ -239,7 +239,7 @@ class Method(method.Method[FlodParameters, Drawing]):
     def begin_finishing(self) -> None:
         """The levels that finishing steps train, as one model; those of fine detail begin anew."""
         p, data, levels = self.parameters, self.data, self.kept
-        most = finish.FINE * data.median_depth / data.focal
+        most = finish.FINE_PIXELS * data.median_depth / data.focal
         fine = [number for number in levels if 0 < self.s_min[number - 1] <= most]
         if fine:
             gamma = self.controls()["gamma"]

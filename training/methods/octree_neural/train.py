@@ -421,13 +421,15 @@ class Method(method.Method[NeuralOctreeParameters, Drawing]):
         def zeros(*shape: int) -> torch.Tensor:
             return torch.zeros(count, *shape, device=self.device)
 
-        distances = torch.stack([zeros()] * len(self.data.train)) + torch.nan
+        distances = torch.full((len(self.data.train), count), torch.nan, device=self.device)
         for view, camera in enumerate(self.data.train):
             drawn = self.drawn_by(camera)
             eye = torch.as_tensor(camera.center).to(places)
             distances[view, drawn] = (places[drawn] - eye).norm(dim=1)
-        middle = distances.nanmedian(0).values
-        median_view = (distances - middle).abs().nan_to_num(torch.inf).argmin(0)
+        median_view = torch.cat([
+            (some - some.nanmedian(0).values).abs().nan_to_num(torch.inf).argmin(0)
+            for some in distances.split(SOLVED_AT_ONCE, 1)
+        ])  # fmt: skip
 
         means, quats, scales = zeros(p.offsets, 3), zeros(p.offsets, 4), zeros(p.offsets, 3)
         opacities = zeros(p.offsets)
