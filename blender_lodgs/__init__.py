@@ -8,7 +8,7 @@ unregistered in reverse.
 import bpy
 
 from . import commands, operators, panels, viewport
-from .data import changes, loaded, looks, older_files, properties, removal, scenes, updates
+from .data import changes, loaded, looks, older_files, paths, properties, removal, scenes, updates
 from .nodes import building
 from .render import compare, engine, renderer
 from .runs import capturing, jobs, preparing
@@ -26,6 +26,7 @@ MODULES = (
     scenes,
     loaded,
     removal,
+    paths,
     viewport,
     renderer,
     engine,

@@ -227,7 +227,10 @@ def cameras(context: bpy.types.Context, root: bpy.types.Object) -> list[Camera]:
     width, height = (context.scene.render.resolution_x, context.scene.render.resolution_y)
     depsgraph = context.evaluated_depsgraph_get()
     found = [
-        view_from(root, depsgraph, view.data.lodgs.width or width, view.data.lodgs.height or height, view)[0]
+        # where views are hidden, Blender does not know where they stand
+        photographs.camera_of(view)
+        if view.data.lodgs.width
+        else view_from(root, depsgraph, width, height, view)[0]
         for view in views or [obj for obj in context.scene.objects if obj.type == "CAMERA"]
     ]
     if not found:

@@ -231,7 +231,7 @@ def _in_colors(name: str, cloud: bpy.types.PointCloud, colors: np.ndarray) -> bp
 def _material() -> bpy.types.Material:
     """The one material that shows every point in its display colour, unlit."""
     name = "LODGS Points"
-    material = bpy.data.materials.get(name)
+    material = bpy.data.materials.get((name, None))
     if material is None:
         material = bpy.data.materials.new(name)
         if material.node_tree is None:

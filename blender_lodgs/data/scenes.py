@@ -32,6 +32,7 @@ from ...training.scenes.views import placed as placed_views
 from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder, read_head
 from ...training.splats.formats import STREAMED, as_ply, is_ply
 from ...training.splats.gaussians import Splats
+from .. import extension
 from ..nodes import ellipsoids
 from . import cleaning, crops, looks, objects, painting, selection, streams, tables
 from .objects import root_of
@@ -727,6 +728,9 @@ def _put_level(
     elif item.exists:
         # The object stays, with all that artists have hung on it; only its splats change.
         old, obj = item.object.data, item.object
+        if obj.mode != "OBJECT":  # where Blender gives it no other splats
+            with extension.in_window():
+                bpy.ops.object.mode_set(mode="OBJECT")
         item.lost = int(cleaning.hidden(old).sum())
         obj.data, obj.color = fresh.data, fresh.color
         bpy.data.objects.remove(fresh)

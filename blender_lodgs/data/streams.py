@@ -7,6 +7,7 @@ for both together.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,8 +52,10 @@ def begin(root: bpy.types.Object, path: Path, budget: int, total: int) -> None:
     """Has a scene that has just been given the top of a tree read the rest from its file from now on."""
     stream = root.lodgs.stream
     absolute = str(path.absolute())
-    relative = bpy.data.filepath and bpy.context.preferences.filepaths.use_relative_paths
-    stream.file = bpy.path.relpath(absolute) if relative else absolute
+    stream.file = absolute
+    if bpy.data.filepath and bpy.context.preferences.filepaths.use_relative_paths:
+        with suppress(ValueError):  # on another drive
+            stream.file = bpy.path.relpath(absolute)
     stream.budget, stream.total, stream.here = budget, total, _held(root)
     stream.begun += 1
 

@@ -199,7 +199,7 @@ def group(name: str, version: int, build: Callable[[Nodes], None]) -> bpy.types.
             of that name is renamed: sockets of the new one may differ, so its users are to be given it anew.
             One of this version that somebody has changed (:func:`edited`) stays what it is.
     """
-    there = bpy.data.node_groups.get(name)
+    there = bpy.data.node_groups.get((name, None))  # of this file, not of a library
     if isinstance(there, bpy.types.GeometryNodeTree) and there.get(VERSION) == version:
         return there
     if there is not None:

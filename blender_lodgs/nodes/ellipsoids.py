@@ -89,7 +89,7 @@ def falloff() -> bpy.types.Material:
     p passes the centre in a distance of sqrt(1 - (p·v)²). It counts where it enters; if it began inside,
     where it leaves, as long as the centre was before it.
     """
-    material = bpy.data.materials.get(MATERIAL)
+    material = bpy.data.materials.get((MATERIAL, None))
     if material is not None:
         return material
     material = bpy.data.materials.new(MATERIAL)

@@ -47,11 +47,13 @@ class PieceByPiece:
         return {"RUNNING_MODAL"}
 
     def modal(self, context, event):
-        if event.type == "ESC":
-            return self._finish(context, {"CANCELLED"}, f"Stopped. {self.done(self._done)}")
-        if event.type == "TIMER":
-            return self._next(context)
-        return {"RUNNING_MODAL"}
+        try:
+            if event.type == "ESC":
+                return self._finish(context, {"CANCELLED"}, f"Stopped. {self.done(self._done)}")
+            return self._next(context) if event.type == "TIMER" else {"RUNNING_MODAL"}
+        except Exception:
+            self._finish(context, {"CANCELLED"}, "")
+            raise
 
     def _next(self, context):
         result = self._one(context)

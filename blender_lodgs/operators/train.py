@@ -68,6 +68,8 @@ class LODGS_OT_plan_cells(OnScene, PieceByPiece, bpy.types.Operator):
     bl_description = "Say what each cell will be trained on, and what that takes, before anything runs"
     bl_options = {"UNDO"}
 
+    _found: cells.CellPlan | None = None
+
     def invoke(self, context, event):
         return self.execute(context) if bpy.app.background else self.begin(context)
 
@@ -90,6 +92,8 @@ class LODGS_OT_plan_cells(OnScene, PieceByPiece, bpy.types.Operator):
         return "Planning cells; Esc stops"
 
     def done(self, count):
+        if self._found is None:
+            return "Nothing is planned"
         views = [each.views for each in self._found.planned]
         return f"{len(views)} cells of {min(views)} to {max(views)} views"
 

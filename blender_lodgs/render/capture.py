@@ -155,6 +155,7 @@ def _prepare(scene: bpy.types.Scene, width: int, height: int) -> None:
                 node.mute = True
     for root in scenes.roots(scene):
         for obj in root.children_recursive:
+            obj.driver_remove("hide_render")  # by which a level is shown alone
             obj.hide_render = True
 
 

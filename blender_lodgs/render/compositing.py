@@ -188,11 +188,28 @@ def _match(scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:
             there.unlink(part)
         for part in set(here) - set(there):
             there.link(part)
-    splats = {collection for root in scenes.roots(scene) for collection in root.users_collection}
+    meshes.timeline_markers.clear()
+    for marker in scene.timeline_markers:
+        if marker.camera is not None:
+            meshes.timeline_markers.new(marker.name, frame=marker.frame).camera = marker.camera
+    left_out = {
+        collection
+        for root in scenes.roots(scene)
+        for obj in (root, *(item.object for item in root.lodgs.levels if item.exists))
+        for collection in obj.users_collection
+    }
+    shown = {part.collection: part for part in _parts(scene.view_layers[0].layer_collection)}
     for layer in meshes.view_layers:
         layer.update()  # a new scene's has no parts yet
-        while parts := [part for part in _parts(layer.layer_collection) if part.collection in splats]:
+        while parts := [
+            part
+            for part in _parts(layer.layer_collection)
+            if part.collection in left_out or part.collection not in shown
+        ]:
             parts[0].exclude = True  # which makes all the parts anew
+        for part in _parts(layer.layer_collection):
+            like = shown[part.collection]
+            part.holdout, part.indirect_only = like.holdout, like.indirect_only
 
 
 def _parts(part: bpy.types.LayerCollection):

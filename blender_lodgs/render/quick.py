@@ -65,6 +65,10 @@ def render_animation(context: bpy.types.Context, frames: Iterable[int]) -> Itera
         LodgsError: as :func:`render`, or a file cannot be written.
     """
     scene, before = context.scene, context.scene.frame_current
+    if scene.render.is_movie_format:
+        raise LodgsError(
+            "Pictures of Viewport Quality are saved one by one.", "Choose an image format under Output."
+        )
     try:
         for frame in frames:
             scene.frame_set(frame)

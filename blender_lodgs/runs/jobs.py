@@ -69,7 +69,9 @@ def start(root: bpy.types.Object, folder: str = "", parameters: dict | None = No
 
 
 def _begin(root: bpy.types.Object, run: RunFolder, job: Job) -> Watch:
-    state = _state(run)
+    watch, state = watch_of(root), _state(run)
+    if watch is not None and watch.running:
+        raise LodgsError(f"'{root.name}' is being trained already.", "Wait for that, or cancel it.")
     if state == "running":
         raise LodgsError(
             f"Another training is already at work in {run.path}.",
@@ -519,7 +521,7 @@ def _far(folder: str) -> bool:
 
 def reattach() -> None:
     """Attach to the run of every scene root that has one and is not watched: after loading, undo and redo."""
-    for root in [obj for obj in bpy.data.objects if obj.lodgs.training.run]:
+    for root in [obj for obj in bpy.data.objects if obj.lodgs.training.run and obj.is_editable]:
         if watch_of(root) is None and not _far(bpy.path.abspath(root.lodgs.training.run)):
             with suppress(LodgsError):  # the folder is gone: the panel says so
                 watch = attach(root, root.lodgs.training.run, again=False)

@@ -19,6 +19,7 @@ from ...training.splats.dialects import Warn
 from .. import extension
 from ..data import photographs, scenes
 from . import environment, processes
+from .watch import root_by_uid
 
 _TOLD = re.compile(r"(.*?) (\d+) of (\d+)$")
 
@@ -125,13 +126,16 @@ def straighten(root: bpy.types.Object, warn: Warn) -> None:
     bent = [view for view in photographs.views(root) if view.data.lodgs.distorted]
     if not bent:
         return
-    told = root.lodgs.training
+    uid, told = root.session_uid, root.lodgs.training
     scene = Path(bpy.path.abspath(root.lodgs.scene_folder))
     given = {"--model": told.model, "--images": told.images}
     options = [part for name, path in given.items() if path for part in (name, path)]
     log = extension.user_folder("logs") / "undistort.log"
 
     def finish(work: Preparing) -> None:
+        root = root_by_uid(uid)
+        if root is None:  # another file is open by now
+            return
         whole = _read(root)
         found = already_undistorted(whole)
         if found is not None:

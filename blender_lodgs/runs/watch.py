@@ -176,6 +176,7 @@ class Watch:
             case "status":
                 self.message, self.share = event["message"], _share(event)
             case "progress":
+                event = _with_blocks(event, self.blocks)
                 self.progress, self.message = event, event.get("stage", "").capitalize()
                 self.share = _share(event)
                 if "blocks" in event:
@@ -282,11 +283,17 @@ def watch_of(root: bpy.types.Object | None) -> Watch | None:
     return None if root is None else watches.get(root.session_uid)
 
 
+def _with_blocks(event: dict, blocks: list[dict]) -> dict:
+    """A ``progress`` event with how each part of a scene in cells was last, where it leaves that out."""
+    return {"blocks": blocks, **event} if blocks else event
+
+
 def begin(watch: Watch) -> Watch:
     """Follows a run from now on, with what is known of it already."""
     for event in watch.folder.events()[0]:
         if event["event"] == "progress":
-            watch.progress, watch.blocks = event, event.get("blocks", watch.blocks)
+            watch.progress = _with_blocks(event, watch.blocks)
+            watch.blocks = watch.progress.get("blocks", watch.blocks)
         elif event["event"] == "level":
             watch.levels[event["level"]] = event
         elif event["event"] == "done":

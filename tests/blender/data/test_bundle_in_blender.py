@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from tests.blender.fake_trainer import splats
+
 
 @pytest.fixture
 def bundle(lodgs):
@@ -59,3 +61,19 @@ def check(positions, values, splats):
     np.testing.assert_array_equal(values("rot_3"), splats.quats[:, 3])
     np.testing.assert_array_equal(values("f_rest_16"), splats.sh[:, 2, 1])
     np.testing.assert_array_equal(values("opacity"), splats.opacity_logits)
+
+
+def test_a_level_that_comes_while_its_object_is_edited_takes_its_place(bpy, lodgs):
+    scenes, bundles = lodgs("data.scenes"), lodgs("training.splats.bundle")
+    root = scenes.import_colmap(bpy.context, "examples/lantern_walk", photographs=False)
+
+    def level(count):
+        names = ("means", "quats", "log_scales", "opacity_logits", "sh")
+        made = {name: getattr(splats(count), name) for name in names}
+        return bundles.Level(1, lodgs("training.splats.gaussians").Splats(**made))
+
+    obj = scenes.set_level(root, level(5)) or root.lodgs.levels[0].object
+    bpy.context.view_layer.objects.active = obj
+    bpy.ops.object.mode_set(mode="EDIT")
+    scenes.set_level(root, level(9))
+    assert root.lodgs.levels[0].object == obj and len(obj.data.points) == 9 and obj.mode == "OBJECT"

@@ -461,3 +461,14 @@ def test_levels_point_at_nothing_that_an_undo_may_take_away(bpy, lodgs, scene_of
             handlers.remove(look)
     assert len(seen) == 4 and all(each <= {"Mine"} for each in seen), seen  # a level's own, in its slot
     assert pointed_at() == there
+
+
+def test_hidden_views_are_where_they_stand(bpy, lodgs):
+    """Blender does not follow hidden objects: the scene was made larger meanwhile."""
+    root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+    before = [camera.center for camera in lodgs("data.cleaning").cameras(bpy.context, root)]
+    root.lodgs.cameras.hide_viewport = True
+    root.scale, root.location = (3, 3, 3), (1, 2, 3)
+    bpy.context.view_layer.update()
+    after = [camera.center for camera in lodgs("data.cleaning").cameras(bpy.context, root)]
+    np.testing.assert_allclose(after, before, atol=1e-4)

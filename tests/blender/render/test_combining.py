@@ -68,3 +68,50 @@ def test_after_the_meshes_scene_is_deleted_it_combines_anew(bpy, lodgs, scene):
         n for n in lodgs("compat").compositor_tree(scene).nodes if n.bl_idname == "CompositorNodeRLayers"
     ]
     assert {node.scene for node in layers} == {scene, scene.lodgs_render.meshes}
+
+
+def test_the_meshes_scene_has_the_cameras_of_markers_and_no_collection_that_is_left_out(bpy, lodgs, scene):
+    cameras = [bpy.data.objects.new(name, bpy.data.cameras.new(name)) for name in "AB"]
+    hidden, aside = (bpy.data.collections.new(name) for name in ("hidden", "aside"))
+    for each in (hidden, aside):
+        scene.collection.children.link(each)
+    for frame, camera in zip((1, 10), cameras, strict=True):
+        scene.collection.objects.link(camera)
+        scene.timeline_markers.new(camera.name, frame=frame).camera = camera
+    layer = scene.view_layers[0].layer_collection.children
+    layer["hidden"].exclude, layer["aside"].indirect_only = True, True
+    bpy.ops.lodgs.combine_with_meshes()
+    meshes = scene.lodgs_render.meshes
+    assert {marker.frame: marker.camera for marker in meshes.timeline_markers} == {
+        1: cameras[0],
+        10: cameras[1],
+    }
+    there = meshes.view_layers[0].layer_collection.children
+    assert there["hidden"].exclude and there["aside"].indirect_only and not there["aside"].exclude
+
+
+def test_splats_are_left_out_of_the_meshes_where_their_root_has_moved(bpy, lodgs, scene):
+    [root] = lodgs("data.scenes").roots(scene)
+    [collection] = root.users_collection
+    scene.collection.objects.link(root)
+    collection.objects.unlink(root)
+    bpy.ops.lodgs.combine_with_meshes()
+    there = scene.lodgs_render.meshes.view_layers[0].layer_collection.children
+    assert there[collection.name].exclude
+
+
+def test_frames_of_viewport_quality_are_no_movie(bpy, lodgs, scene):
+    compat = scene.render.image_settings
+    if hasattr(compat, "media_type"):
+        compat.media_type = "VIDEO"
+    scene.render.image_settings.file_format = "FFMPEG"
+    with pytest.raises(lodgs("training.errors").LodgsError, match="image format"):
+        next(lodgs("render.quick").render_animation(bpy.context, range(1, 2)))
+
+
+def test_captures_leave_splats_out_whichever_level_is_shown(bpy, lodgs, scene):
+    [root] = lodgs("data.scenes").roots(scene)
+    assert [level.object.hide_render for level in root.lodgs.levels] == [False]
+    lodgs("render.capture")._prepare(scene, 64, 48)
+    bpy.context.view_layer.update()  # when drivers have their say
+    assert [level.object.hide_render for level in root.lodgs.levels] == [True]

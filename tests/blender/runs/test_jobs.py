@@ -551,15 +551,24 @@ def test_levels_of_two_runs_never_stand_together(bpy, lodgs, jobs, fake, root, t
     assert [level.number for level in lodgs("data.scenes").read_levels(root).levels] == [1]
 
 
-def test_run_folders_do_not_collide(bpy, jobs, watch_of, fake, root, tmp_path):
+def test_run_folders_do_not_collide(lodgs, jobs, fake, root, tmp_path):
     fake()
-    first, second = jobs.start(root), jobs.start(root)  # not saved: at home
-    assert first.folder.path == tmp_path / "home" / "lodgs_runs" / "tiny"
-    assert second.folder.path == tmp_path / "home" / "lodgs_runs" / "tiny-2"
-    root.lodgs.training.output = str(tmp_path / "mine")
-    assert jobs.start(root).folder.path == tmp_path / "mine" / "tiny"
-    for watch in (first, second, watch_of(root)):
+
+    def started():
+        watch = jobs.start(root)
+        with pytest.raises(
+            lodgs("training.errors").LodgsError, match="is being trained already"
+        ):  # which another one would hide
+            jobs.start(root)
         watch.process.wait(20)
+        while watch.step():
+            pass
+        return watch.folder.path
+
+    assert started() == tmp_path / "home" / "lodgs_runs" / "tiny"  # not saved: at home
+    assert started() == tmp_path / "home" / "lodgs_runs" / "tiny-2"
+    root.lodgs.training.output = str(tmp_path / "mine")
+    assert started() == tmp_path / "mine" / "tiny"
 
 
 def test_mistakes_are_sentences(bpy, jobs, fake, root, tmp_path, monkeypatch):

@@ -1,0 +1,38 @@
+"""What scenes know of files stays true when the .blend is saved in another folder."""
+
+import os
+
+import pytest
+
+
+@pytest.fixture
+def saved(bpy, lodgs, tmp_path):
+    root = lodgs("data.scenes").import_colmap(bpy.context, "examples/lantern_walk", photographs=False)
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a" / "file.blend"))
+    root.lodgs.training.run, root.lodgs.training.output = "//runs/one", "/elsewhere"
+    bpy.context.scene.lodgs_render.holdout = "//depth/####.exr"
+    return root
+
+
+def told(bpy, root):
+    run, holdout = root.lodgs.training.run, bpy.context.scene.lodgs_render.holdout
+    return [os.path.normpath(bpy.path.abspath(path)) for path in (run, holdout)]
+
+
+def test_saved_in_another_folder_paths_lead_where_they_led(bpy, saved, tmp_path):
+    before, name = told(bpy, saved), saved.name
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "b" / "file.blend"))
+    assert told(bpy, saved) == before and saved.lodgs.training.run.startswith("//")
+    assert saved.lodgs.training.output == "/elsewhere"
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "b" / "file.blend"))
+    assert told(bpy, bpy.data.objects[name]) == before
+
+
+def test_a_copy_elsewhere_has_them_too_and_leaves_the_open_file_as_it_was(bpy, saved, tmp_path):
+    before, name, run = told(bpy, saved), saved.name, saved.lodgs.training.run
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "b" / "copy.blend"), copy=True)
+    assert saved.lodgs.training.run == run and told(bpy, saved) == before
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "b" / "copy.blend"))
+    assert told(bpy, bpy.data.objects[name]) == before
