@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import os
 import re
@@ -36,6 +37,9 @@ def main(arguments: list[str] | None = None) -> int:
     Returns:
         An exit code: 0 done, 1 crash, 2 bad input, 3 cancelled. Mistakes are told in a sentence.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # what is read by programs is UTF-8, whatever a console has
+            stream.reconfigure(encoding=None if stream.isatty() else "utf-8", errors="backslashreplace")
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments == ["check"]:  # answers in any Python of this version, with the standard library alone
         return _check()

@@ -104,21 +104,27 @@ def check_folder(folder: Path, remedy: str) -> None:
         raise LodgsError(f"There is no folder {folder}.", remedy)
 
 
-def open_regular(path: str | Path) -> BinaryIO:
-    """Opens a file for reading; unlike ``open`` it never waits for a pipe's other end, or reads a device.
+def open_regular(path: str | Path, writing: bool = False) -> BinaryIO:
+    """Opens a file for reading, or for writing as well; unlike ``open`` it never waits for a pipe's other
+    end, or reads a device.
 
     Raises:
         OSError: it cannot be read, or is no file.
     """
-    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    how = os.O_RDWR if writing else os.O_RDONLY
+    descriptor = os.open(path, how | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise OSError(errno.EINVAL, "not a file", str(path))
-    return open(descriptor, "rb")
+    return open(descriptor, "r+b" if writing else "rb")
 
 
 def try_lock(file: IO[bytes]) -> bool:
-    """Locks the open file for this process if nobody else has; released when it is closed."""
+    """Locks the file, open for writing, for this process if nobody else has; released when it is closed.
+
+    Raises:
+        OSError: it is open for reading alone, where that is not enough (NFS).
+    """
     try:
         if os.name == "nt":
             import msvcrt
@@ -129,7 +135,9 @@ def try_lock(file: IO[bytes]) -> bool:
             import fcntl
 
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+    except OSError as error:
+        if error.errno == errno.EBADF:  # on NFS a lock is a write: nobody knows whether it is locked
+            raise
         return False
     return True
 

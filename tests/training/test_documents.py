@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -104,3 +107,14 @@ def test_an_error_can_be_printed_whatever_it_quotes():
     assert str(error).encode() and "\0" not in str(error)
     assert error.what.startswith(r"a\xdce9\x00b(((") and error.what.endswith("end")
     assert len(error.what) < 1100 and error.remedy == r"Do\x00 it."
+
+
+def test_what_is_printed_into_a_pipe_is_utf_8_whatever_the_console_has():
+    environment = os.environ | {"PYTHONIOENCODING": "cp1252"}
+    done = subprocess.run(
+        [sys.executable, "-m", "training", "methods", "tree"],
+        env=environment,
+        capture_output=True,
+        cwd=Path(__file__).parents[2],
+    )
+    assert done.returncode == 0 and "⁴" in done.stdout.decode("utf-8")

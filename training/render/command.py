@@ -73,12 +73,12 @@ class Source:
         if scene is not None:
             cameras = read_scene(scene)
             there, near = cameras.cameras, cameras.near()
-        elif self.run is not None:
-            data = training_data(Job.from_file(self.run.job), self.run, pixels=False)
-            there, near = data.scene.cameras, data.near
         else:
             tables = self.levels.tables if isinstance(self.levels, Bundle) else read_tables(self.levels)
             there, near, _ = views_in(tables)
+        if not there and self.run is not None:
+            data = training_data(Job.from_file(self.run.job), self.run, pixels=False)
+            there, near = data.scene.cameras, data.near
         if not there:
             raise LodgsError(
                 "This file does not know the photographs that it was trained from.",

@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import LodgsError
 from ..files import atomic_write
 from ..scenes.color import linear_from_srgb
-from ..scenes.exr import read_parts
+from ..scenes.exr import read_parts, write_exr
 from ..scenes.images import write_png
 
 NOTHING = 1e10
@@ -185,9 +185,4 @@ def read_depth(path: Path, width: int, height: int, window: tuple[int, int, int,
 
 
 def _write_exr(path: Path, picture: Picture) -> None:
-    import OpenEXR
-
-    planes = {f"LODGS.{name}": np.ascontiguousarray(plane) for name, plane in picture.passes().items()}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with OpenEXR.File(header, planes) as file:
-        file.write(str(path))
+    write_exr(path, {f"LODGS.{name}": plane for name, plane in picture.passes().items()})

@@ -186,7 +186,8 @@ class _Server:
                 ]
                 continue
             if one.file not in kept:
-                kept[one.file] = self._sets.get(one.file) or self._read_set(frame, one)
+                there = self._sets.get(one.file)  # which may be empty
+                kept[one.file] = self._read_set(frame, one) if there is None else there
             place = one.matrix, one.level, one.antialias, one.choice, one.looks
             instances.append(Instance(kept[one.file], *place))
         self._sets = kept

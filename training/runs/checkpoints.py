@@ -15,7 +15,7 @@ from typing import IO, Any
 import torch
 
 from .. import VERSION
-from ..errors import LodgsError
+from ..errors import LodgsError, out_of_memory
 from ..files import atomic_write, open_regular
 from .folder import RunFolder
 
@@ -65,8 +65,9 @@ def read_newest(
 
     Raises:
         LodgsError: none of those that are there can be read, or another version of LODGS wrote them.
+        MemoryError, RuntimeError: there is no memory for one (``errors.out_of_memory``).
     """
-    paths = _newest_first(folder)
+    paths, damaged = _newest_first(folder), list[Path]()
     for path in paths:
         try:
             state = read_checkpoint(path, device)
@@ -76,8 +77,13 @@ def read_newest(
         except OtherVersion:
             raise
         except Exception as error:
+            if out_of_memory(error):
+                raise
             warn(f"The checkpoint {path.name} cannot be read ({error}); what it held is trained again.")
+            damaged += [] if isinstance(error, OSError) else [path]
             continue
+        for spoilt in damaged:  # which would stand in the place of one that can be read
+            spoilt.unlink(missing_ok=True)
         return state["step"], state["levels"]
     if paths:
         raise LodgsError(

@@ -151,7 +151,11 @@ class RunFolder:
     def running(self) -> bool:
         """Whether a trainer is at work here."""
         try:
-            with open_regular(self._lock) as file:
+            try:
+                file = open_regular(self._lock, writing=True)
+            except OSError:  # somebody else's
+                file = open_regular(self._lock)
+            with file:
                 return not try_lock(file)
         except OSError:
             return False

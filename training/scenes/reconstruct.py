@@ -107,7 +107,10 @@ def reconstruct(
     """
     photos, out = Path(os.path.abspath(photos)), Path(os.path.abspath(out))
     masks = None if masks is None else Path(os.path.abspath(masks))
-    names, left_out, sizes = _photographs(photos, masks)
+    ours = [out / "colmap", out / "sparse", out / MASKS]
+    if not photos.is_relative_to(out):
+        ours.append(out / "images")
+    names, left_out, sizes = _photographs(photos, [*ours, *([masks] if masks else [])])
     if len(names) < FEWEST:
         raise LodgsError(
             f"{photos} holds {len(names)} photographs that can be read; a scene takes {FEWEST}."
@@ -138,14 +141,14 @@ def reconstruct(
 
     try:
         _begin(work, settings)
-        images = out / "images"
+        images, given = out / "images", names
         if photos.is_relative_to(out):
             images = photos
         else:
-            names = [_taken_over(photos, name, images) for name in names]
+            names = [_taken_over(photos, name, images) for name in given]
         asked = settings | {
             "photos": str(images), "names": names, "ordered": ordered, "work": str(work),
-            "masks": str(_masks(masks, photos, names, out)) if masks else "",
+            "masks": str(_masks(masks, photos, dict(zip(given, names, strict=True)), out)) if masks else "",
         }  # fmt: skip
         with progress:
             problem = apart.run_apart("sfm", asked, work, hear)
@@ -232,9 +235,13 @@ class _Progress:
 
 
 def _photographs(
-    photos: Path, masks: Path | None
+    photos: Path, others: Sequence[Path]
 ) -> tuple[list[str], list[tuple[str, str]], set[tuple[int, int]]]:
-    """Names of what can be read, by name; other pictures and why not; and the sizes that there are."""
+    """Names of what can be read, by name; other pictures and why not; and the sizes that there are.
+
+    Args:
+        others: folders of pictures that are no photographs.
+    """
     remedy = "Choose the folder of the photographs; of a video make one: blender --command lodgs frames."
     check_folder(photos, remedy)
     names, left_out, sizes = [], [], set()
@@ -242,7 +249,7 @@ def _photographs(
         path
         for path in sorted(photos.rglob("*"))
         if not any(part.startswith(".") for part in path.relative_to(photos).parts)
-        and not (masks and path.is_relative_to(masks))
+        and not any(path.is_relative_to(other) for other in others)
     ]
     taken = [path for path in files if path.suffix.lower() in SUFFIXES]
     taken = taken or [path for path in files if path.suffix.lower() == ".exr"]  # else they are depth maps
@@ -289,18 +296,17 @@ def _begin(work: Path, settings: Mapping[str, object]) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def _masks(masks: Path, photos: Path, names: Sequence[str], out: Path) -> Path:
-    """A folder of masks of photographs as COLMAP names them."""
+def _masks(masks: Path, photos: Path, names: Mapping[str, str], out: Path) -> Path:
+    """A folder of masks of photographs as COLMAP names them, whose names there are by those that they had."""
     there = out / MASKS
-    for name in names:
-        found = Beside(masks, ".png").find(name)
+    for given, name in names.items():
+        found = Beside(masks, ".png").find(given)
         if found is not None:
-            check_mask(found, *image_size(photos / name))
+            check_mask(found, *image_size(photos / given))
             link_or_copy(found, there / f"{name}.png")
     if not there.is_dir():
-        raise LodgsError(
-            f"{masks} holds no mask of these photographs.", f"That of {names[0]} is {names[0]}.png."
-        )
+        first = next(iter(names))
+        raise LodgsError(f"{masks} holds no mask of these photographs.", f"That of {first} is {first}.png.")
     return there
 
 

@@ -218,3 +218,13 @@ def test_it_ends_with_the_program_that_started_it(client, make_splats, camera):
     assert client.process.wait(timeout=10) == 0
     assert time.monotonic() - started < 5
     assert not client.folder.exists()
+
+
+def test_a_set_without_splats_is_read_once_too(client, make_splats, camera):
+    client.hear("hello")
+    wire.write_set(client.folder / "none", wire.packed(make_splats(0), None))
+    sets = [{"file": "none", "count": 0, "matrix": np.eye(4).tolist(), "level": 1}]
+    for frame in (1, 2):
+        client.say(**request(camera, sets, frame))
+        assert client.hear("frame", "error")["event"] == "frame"
+        (client.folder / "none").unlink(missing_ok=True)

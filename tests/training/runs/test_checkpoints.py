@@ -93,3 +93,22 @@ def test_a_full_disk_is_said_to_be_full(run, monkeypatch):
 def test_what_a_computer_lacks_is_a_sentence(error, says):
     what, remedy, code = in_words(error)
     assert says in what and remedy and code == 2
+
+
+def test_a_spoilt_checkpoint_does_not_push_out_one_that_can_be_read(run):
+    spoilt, warned = run.checkpoints / "step_0000002.pt", []
+    spoilt.write_bytes(b"nothing")
+    assert read_newest(run, "cpu", lambda state: None, warned.append) == (1, [])
+    assert len(warned) == 1 and not spoilt.exists()
+    write_checkpoint(run, 2, [], {})
+    assert read_newest(run, "cpu", lambda state: None, pytest.fail) == (2, [])
+    assert (run.checkpoints / "step_0000001.pt").exists()
+
+
+def test_too_little_memory_is_no_spoilt_checkpoint(run):
+    def take(state):
+        raise MemoryError
+
+    with pytest.raises(MemoryError):
+        read_newest(run, "cpu", take, pytest.fail)
+    assert len(list(run.checkpoints.glob("step_*.pt"))) == 2

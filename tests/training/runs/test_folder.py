@@ -1,5 +1,7 @@
 """A run's folder: whose it is, what is written where, and which process is at work in it."""
 
+import errno
+import fcntl
 import json
 import os
 import subprocess
@@ -145,3 +147,19 @@ def test_a_link_among_exports_is_followed(tmp_path):
         temporary.write_text("new")
     assert (tmp_path / "link.txt").is_symlink() and (tmp_path / "real.txt").read_text() == "new"
     assert sorted(os.listdir(tmp_path)) == ["link.txt", "real.txt"]
+
+
+def test_where_locks_are_writes_a_run_that_has_ended_is_not_running(tmp_path, monkeypatch):
+    """As NFS has it: a lock takes a file that is open for writing."""
+    run, real = RunFolder(tmp_path), fcntl.flock
+
+    def flock(file, how):
+        if fcntl.fcntl(file, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
+            raise OSError(errno.EBADF, "Bad file descriptor")
+        real(file, how)
+
+    run.make()
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with run.hold():
+        assert run.running
+    assert not run.running

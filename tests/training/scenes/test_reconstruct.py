@@ -16,7 +16,7 @@ from training.scenes.cameras import look_at
 from training.scenes.colmap import read_scene
 from training.scenes.exr import write_exr
 from training.scenes.images import load_image, write_png
-from training.scenes.reconstruct import pairs_picture, reconstruct
+from training.scenes.reconstruct import _masks, pairs_picture, reconstruct
 
 from .synthetic import noise, write_image
 from .walls import EYES, HEIGHT, WIDTH, photograph
@@ -90,6 +90,27 @@ def test_other_settings_begin_anew_and_only_features_outside_masks_count(photos,
         places = np.frombuffer(data, np.float32).reshape(count, columns)
         assert count > 20 and places[:, 0].min() > WIDTH // 2 - 2
     assert json.loads((out / "colmap" / "settings.json").read_text())["masks"] == str(masks)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", ["", "scene"])
+def test_it_goes_on_where_the_scene_is_among_its_photographs(photos, tmp_path, where):
+    given = shutil.copytree(photos, tmp_path / "given")
+    first = reconstruct(given, given / where)
+    settings = (given / where / "colmap" / "settings.json").read_bytes()
+    again = reconstruct(given, given / where)
+    assert (given / where / "colmap" / "settings.json").read_bytes() == settings
+    assert again.placed == first.placed == [f"{number}.png" for number in range(6)] and again.photographs == 6
+
+
+def test_masks_of_webp_photographs_have_the_names_that_these_had(tmp_path):
+    Image.fromarray(noise(40, 30)).save(tmp_path / "b.webp")
+    for name in ("b.png", "b.webp.png"):
+        masks = tmp_path / name.replace(".", "-")
+        masks.mkdir()
+        write_png(masks / name, np.zeros((30, 40, 3), np.uint8))
+        there = _masks(masks, tmp_path, {"b.webp": "b.webp.png"}, masks / "out")
+        assert [path.name for path in there.iterdir()] == ["b.webp.png.png"]
 
 
 @pytest.mark.slow

@@ -80,12 +80,18 @@ def _train_stage(
     try:
         for each in stage:
             each.begin(submit)
-        started = told = time.monotonic()
+        started = told = each_told = time.monotonic()
+        states: list[str] = []
         while not all([each.look(submit) for each in stage]):
             now = time.monotonic()
             if now - told >= min(max((now - started) / 1000, LOOKS), SILENT):
-                tell("progress", **_progress(everything))
-                told = now
+                values, told = _progress(everything), now
+                changed = states != (states := [each.state for each in everything])
+                if changed or now - each_told >= (now - started) / 30:  # many parts are long lines
+                    each_told = now
+                else:
+                    del values["blocks"]
+                tell("progress", **values)
             time.sleep(LOOKS)
     except BaseException:
         _stop_stage(stage)

@@ -117,7 +117,7 @@ def workers(on: str = HERE, resources: dict[str, float] | None = None) -> Iterat
         )  # fmt: skip
     try:
         client = distributed.Client(made, timeout=ANSWERS)
-    except OSError as error:
+    except (OSError, ValueError) as error:
         raise LodgsError(
             f"No Dask scheduler answers at {on}.", "Start it, or correct the address."
         ) from error

@@ -90,6 +90,7 @@ def convert(folder: Path, out: Path | None = None) -> Converted:
     Raises:
         LodgsError: it is of no known format, damaged, or the scene cannot be written.
     """
+    folder = folder.absolute()
     check_folder(folder, "Choose the folder that a program has exported.")
     found = find_export(folder)
     if found is None:
@@ -186,7 +187,11 @@ def _usable(exported: Exported) -> tuple[list[View], list[tuple[str, str]]]:
 
 def _write(scene: Path, views: list[View], points: np.ndarray, colors: np.ndarray) -> None:
     """The model whole or not at all; photographs first, where the scene is another folder than theirs."""
-    images, sparse = Path(os.path.commonpath([view.image.parent for view in views])), scene / "sparse"
+    sparse = scene / "sparse"
+    try:
+        images = Path(os.path.commonpath([view.image.parent for view in views]))
+    except ValueError as error:  # on Windows
+        raise LodgsError("The photographs lie on several drives.", "Bring them to one.") from error
     if not images.is_relative_to(scene):
         for view in views:
             link_or_copy(view.image, scene / "images" / view.image.relative_to(images))

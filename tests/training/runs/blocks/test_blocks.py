@@ -1,5 +1,6 @@
 """Blocks: what a plan asks of them, how they are put together, and whatever befalls them on the way."""
 
+import itertools
 import json
 import os
 import shutil
@@ -12,6 +13,7 @@ from concurrent.futures import CancelledError, Future
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,7 +27,7 @@ from training.runs.blocks.merge import merge
 from training.runs.blocks.plan import Block, Division, cells_within, plan, read_plan, write_plan
 from training.runs.blocks.train import BlocksStopped, train_blocks
 from training.runs.data import training_data
-from training.runs.events import event_line
+from training.runs.events import MOST_BYTES, event_line
 from training.runs.folder import RunFolder
 from training.runs.job import POLISH, Job
 from training.scenes.cameras import Camera
@@ -591,3 +593,35 @@ def test_trainers_killed_and_a_run_interrupted_end_in_the_same_bundle(tiny_scene
         if process.wait() == 0:
             break
     assert wild.bundle.read_bytes() == calm.bundle.read_bytes() and kills >= 2
+
+
+def test_many_blocks_fill_no_file_with_how_they_get_on(monkeypatch):
+    """A hundred of them for two weeks, looked at every five minutes."""
+    clock = itertools.count(0, 300)
+    monkeypatch.setattr(blocks_module.time, "monotonic", lambda: next(clock))
+    monkeypatch.setattr(blocks_module.time, "sleep", lambda seconds: None)
+
+    class Block:
+        code, progress, step, steps, looks = 0, {}, 0, 9, 0
+
+        def __init__(self, number):
+            self.block = SimpleNamespace(kind="block", number=number, name=f"block {number}")
+            self.ends = 40 * number
+
+        begin = staticmethod(lambda submit: None)
+
+        @property
+        def state(self):
+            return "done" if self.looks >= self.ends else "running"
+
+        def look(self, submit):
+            self.looks += 1
+            return self.looks >= self.ends
+
+    said = []
+    stage = [Block(number) for number in range(1, 101)]
+    blocks_module._train_stage(stage, stage, None, lambda kind, **values: said.append(values))
+    assert sum(len(event_line("progress", **values)) for values in said) < MOST_BYTES / 4
+    told = [values["blocks"] for values in said if "blocks" in values]
+    counts = [sum(each["state"] == "done" for each in blocks) for blocks in told]
+    assert set(counts) >= set(range(1, 100)) and said[-1]["blocks"] == told[-1] and counts[-1] == 100
