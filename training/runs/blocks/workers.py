@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
@@ -43,6 +43,25 @@ class Pending(Protocol):
 
 Submit = Callable[[Path], Pending]
 """Has a run's folder trained."""
+
+
+class _Given:
+    """What a Dask client was given, which is over, too, where the client has lost its scheduler: a future
+    that came in that moment would wait for ever."""
+
+    def __init__(self, future: Any, client: Any) -> None:
+        self._future, self._client = future, client
+
+    def done(self) -> bool:
+        return self._future.done() or self._client.status == "closed"
+
+    def result(self) -> int:
+        if self.done() and not self._future.done():
+            raise CancelledError
+        return self._future.result()
+
+    def cancel(self) -> object:
+        return self._future.cancel()
 
 
 def train_block(folder: str, threads: int = 0, cards: Sequence[str] = ()) -> int:
@@ -124,7 +143,8 @@ def workers(on: str = HERE, resources: dict[str, float] | None = None) -> Iterat
 
     def submit(folder: Path) -> Pending:
         try:
-            return client.submit(train_block, str(folder), threads, cards, pure=False, resources=resources)
+            given = client.submit(train_block, str(folder), threads, cards, pure=False, resources=resources)
+            return _Given(given, client)
         except distributed.client.ClosedClientError as error:
             raise LodgsError(
                 f"The Dask scheduler at {on} is gone.",
