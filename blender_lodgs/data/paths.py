@@ -6,14 +6,16 @@ something else.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import suppress
-from pathlib import Path
 
 import bpy
 
 _before: list[tuple[bpy.types.bpy_struct, str, str]] = []
-"""What paths were before the file is saved: where, which property, its value."""
+"""What paths were before the file is saved elsewhere: where, which property, its value."""
+_file = ""
+"""The file that was open then."""
 
 
 def relative_paths() -> Iterator[tuple[bpy.types.bpy_struct, str, str]]:
@@ -38,9 +40,11 @@ def relative_paths() -> Iterator[tuple[bpy.types.bpy_struct, str, str]]:
 @bpy.app.handlers.persistent
 def _on_save(path: str = "", *_) -> None:
     """Writes paths as they are from where the file will be."""
+    global _file
     _before.clear()
-    here, there = (str(Path(each).parent) for each in (bpy.data.filepath, path))
-    if not (bpy.data.filepath and path) or here == there:
+    _file = bpy.data.filepath
+    here, there = (os.path.dirname(os.path.abspath(each)) for each in (_file, path))
+    if not (_file and path) or here == there:
         return
     for owner, name, value in list(relative_paths()):
         moved = bpy.path.abspath(value)
@@ -51,9 +55,9 @@ def _on_save(path: str = "", *_) -> None:
 
 
 @bpy.app.handlers.persistent
-def _on_saved(path: str = "", *_) -> None:
+def _on_saved(*_) -> None:
     """Where a copy was saved, or nothing, the file that is open has not moved."""
-    if bpy.data.filepath != path:
+    if bpy.data.filepath == _file:
         for owner, name, value in _before:
             setattr(owner, name, value)
     _before.clear()

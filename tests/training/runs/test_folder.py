@@ -1,7 +1,6 @@
 """A run's folder: whose it is, what is written where, and which process is at work in it."""
 
 import errno
-import fcntl
 import json
 import os
 import subprocess
@@ -151,6 +150,7 @@ def test_a_link_among_exports_is_followed(tmp_path):
 
 def test_where_locks_are_writes_a_run_that_has_ended_is_not_running(tmp_path, monkeypatch):
     """As NFS has it: a lock takes a file that is open for writing."""
+    fcntl = pytest.importorskip("fcntl")
     run, real = RunFolder(tmp_path), fcntl.flock
 
     def flock(file, how):

@@ -211,7 +211,8 @@ class Method(Refining):
         return least_importance(importance.numpy(), views, most)
 
     def _most_distance(self, number: int) -> float:
-        """What leaves room for others before the next coarser level that has a distance, if there is one."""
+        """The largest distance, in scene units, that leaves room for further levels before the next coarser
+        one that was given a distance."""
         coarser = self.parameters.distances[number - 1 :: -1]
         steps = next((steps for steps, distance in enumerate(coarser) if distance), None)
         if steps is None:
