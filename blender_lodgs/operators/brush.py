@@ -17,13 +17,13 @@ from ...training.lod.brush import brushed, lassoed
 from .. import extension
 from ..data import cleaning, painting, scenes
 from ..viewport.strokes import Picture
-from .parts import OnOwnLevels, report_errors
+from .base import EditLevelsOperator, report_errors
 
 _POINT_APART = 2.0
 """Pixels that the mouse has to move for a lasso's next corner."""
 
 
-class OnStroke(OnOwnLevels):
+class StrokeOperator(EditLevelsOperator):
     """An operator that does something to the splats of every level under a stroke over the viewport."""
 
     through: bpy.props.BoolProperty(
@@ -160,7 +160,7 @@ class OnStroke(OnOwnLevels):
             self._line = None
 
 
-class LODGS_OT_select_splats(OnStroke, bpy.types.Operator):
+class LODGS_OT_select_splats(StrokeOperator, bpy.types.Operator):
     """Select the splats of every level that a stroke over the viewport covers"""
 
     bl_idname = "lodgs.select_splats"
@@ -226,7 +226,7 @@ def picture_of(context: bpy.types.Context, root: bpy.types.Object) -> Picture:
     )  # fmt: skip
 
 
-class LODGS_OT_paint_splats(OnStroke, bpy.types.Operator):
+class LODGS_OT_paint_splats(StrokeOperator, bpy.types.Operator):
     """Paint a colour over the splats of every level that a stroke over the viewport covers"""
 
     bl_idname = "lodgs.paint_splats"
@@ -282,7 +282,7 @@ class LODGS_OT_paint_splats(OnStroke, bpy.types.Operator):
         return painting.over(self._before, share, tuple(self.color) if self.action == "PAINT" else None)
 
 
-class LODGS_OT_remove_paint(OnOwnLevels, bpy.types.Operator):
+class LODGS_OT_remove_paint(EditLevelsOperator, bpy.types.Operator):
     """Show all splats in their own colours again"""
 
     bl_idname = "lodgs.remove_paint"
@@ -305,7 +305,7 @@ class LODGS_OT_remove_paint(OnOwnLevels, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LODGS_OT_select_all_splats(OnOwnLevels, bpy.types.Operator):
+class LODGS_OT_select_all_splats(EditLevelsOperator, bpy.types.Operator):
     """Deselect the splats of all levels, or select just the others"""
 
     bl_idname = "lodgs.select_all_splats"

@@ -8,7 +8,7 @@ from .. import extension
 from ..data import scenes
 from ..runs import capturing, processes
 from ..viewport import coverage
-from .parts import report_errors
+from .base import report_errors
 
 
 class LODGS_OT_capture_scene(bpy.types.Operator):

@@ -8,11 +8,11 @@ from mathutils import Matrix
 from ...training.errors import LodgsError
 from ...training.lod.cleaning import SHARE
 from ..data import cleaning, crops, scenes
+from .base import EditLevelsOperator, SceneOperator, report_errors
 from .brush import TOOLS
-from .parts import OnOwnLevels, OnScene, report_errors
 
 
-class LODGS_OT_add_crop(OnOwnLevels, bpy.types.Operator):
+class LODGS_OT_add_crop(EditLevelsOperator, bpy.types.Operator):
     """Add an object that crops every level of the splat scene: move, turn and scale it like any other"""
 
     bl_idname = "lodgs.add_crop"
@@ -59,7 +59,7 @@ def add_crop(
     return obj
 
 
-class LODGS_OT_add_region(OnScene, bpy.types.Operator):
+class LODGS_OT_add_region(SceneOperator, bpy.types.Operator):
     """Add a box of which the inside is trained in detail, and all else coarsely: move, turn and scale it"""
 
     bl_idname = "lodgs.add_region"
@@ -73,7 +73,7 @@ class LODGS_OT_add_region(OnScene, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LODGS_OT_remove_crop(OnOwnLevels, bpy.types.Operator):
+class LODGS_OT_remove_crop(EditLevelsOperator, bpy.types.Operator):
     """Remove this crop; what it left out is there again"""
 
     bl_idname = "lodgs.remove_crop"
@@ -97,7 +97,7 @@ class LODGS_OT_remove_crop(OnOwnLevels, bpy.types.Operator):
         )
 
 
-class LODGS_OT_hide_splats(OnOwnLevels, bpy.types.Operator):
+class LODGS_OT_hide_splats(EditLevelsOperator, bpy.types.Operator):
     """Hide splats of every level, or select them for Edit Mode; hidden ones can be shown again"""
 
     bl_idname = "lodgs.hide_splats"
@@ -182,7 +182,7 @@ class LODGS_OT_hide_splats(OnOwnLevels, bpy.types.Operator):
         return cleaning.find(root, test)
 
 
-class LODGS_OT_show_hidden_splats(OnOwnLevels, bpy.types.Operator):
+class LODGS_OT_show_hidden_splats(EditLevelsOperator, bpy.types.Operator):
     """Show all hidden splats of the scene again"""
 
     bl_idname = "lodgs.show_hidden_splats"
@@ -195,7 +195,7 @@ class LODGS_OT_show_hidden_splats(OnOwnLevels, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LODGS_OT_delete_left_out(OnOwnLevels, bpy.types.Operator):
+class LODGS_OT_delete_left_out(EditLevelsOperator, bpy.types.Operator):
     """Delete the splats that are hidden or cropped, of every level, and the crops with them"""
 
     bl_idname = "lodgs.delete_left_out"

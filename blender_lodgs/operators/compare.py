@@ -8,7 +8,7 @@ from ...training.errors import LodgsError
 from ..data import photographs, scenes
 from ..render import compare
 from ..runs import processes
-from .parts import report_errors
+from .base import report_errors
 
 
 class _OnViews:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..runs import environment, making, processes
-from .parts import report_errors
+from .base import report_errors
 
 
 class LODGS_OT_make_environment(bpy.types.Operator):

@@ -16,8 +16,8 @@ from ...training.splats.bundle import Bundle, Level, write_bundle, write_folder
 from ...training.splats.formats import FORMATS, PLY, STREAMED, Format, format_of, write_splats, write_streamed
 from ..data import scenes, selection
 from ..data.objects import megabytes, sh_degree
-from .frames import BesideBlender
-from .parts import OnLevels, report_errors
+from .base import ReadLevelsOperator, report_errors
+from .modal import BackgroundOperator
 
 _SOG = format_of(Path("level.sog"))
 
@@ -46,7 +46,7 @@ def _size(context: bpy.types.Context, kind: Format, level: int = 0) -> str:
     return f"{size / 1e6:,.1f} MB" if size > 1e5 else f"{size / 1e3:,.0f} kB"
 
 
-class _AsShown(OnLevels):
+class _AsShown(ReadLevelsOperator):
     """What all exports can be told."""
 
     placed: bpy.props.BoolProperty(
@@ -93,7 +93,7 @@ class _Export(_AsShown, ExportHelper):
         return Path(bpy.path.abspath(self.filepath))
 
 
-class _Converting(BesideBlender):
+class _Converting(BackgroundOperator):
     """What exports have in common that another program may have to do with."""
 
     written = said = ""
@@ -104,10 +104,10 @@ class _Converting(BesideBlender):
             self.said = said
             yield
 
-    def done(self, count):
+    def result_text(self, count):
         return self.written
 
-    def status(self, context, count):
+    def status_text(self, context, count):
         return f"splat-transform: {self.said}; Esc stops"
 
 

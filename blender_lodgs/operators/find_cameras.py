@@ -8,7 +8,7 @@ import bpy
 
 from ...training.scenes.reconstruct import PRESETS
 from ..runs import preparing, processes
-from .parts import report_errors
+from .base import report_errors
 
 _LENSES = (
     ("AUTO", "Automatic", "One lens, where all photographs are of one size; else each its own"),

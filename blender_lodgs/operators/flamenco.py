@@ -8,11 +8,11 @@ import bpy
 
 from ..data import scenes
 from ..runs import flamenco
-from .frames import PieceByPiece
-from .parts import OnScene
+from .base import SceneOperator
+from .modal import SteppedOperator
 
 
-class LODGS_OT_submit_to_flamenco(OnScene, PieceByPiece, bpy.types.Operator):
+class LODGS_OT_submit_to_flamenco(SceneOperator, SteppedOperator, bpy.types.Operator):
     bl_idname = "lodgs.submit_to_flamenco"
     bl_label = "Submit to Flamenco"
     bl_description = (
@@ -28,7 +28,7 @@ class LODGS_OT_submit_to_flamenco(OnScene, PieceByPiece, bpy.types.Operator):
     )
 
     def invoke(self, context, event):
-        return self.execute(context) if bpy.app.background else self.begin(context)
+        return self.execute(context) if bpy.app.background else self.start_modal(context)
 
     def work(self, context):
         self._said = "The manager may have the job nevertheless"
@@ -42,10 +42,10 @@ class LODGS_OT_submit_to_flamenco(OnScene, PieceByPiece, bpy.types.Operator):
             sender.shutdown(wait=False)
         self._said = f"Submitted: {sending.result()}. The run will be in {submission.settings['output']}"
 
-    def status(self, context, count):
+    def status_text(self, context, count):
         return "Submitting to Flamenco; Esc stops"
 
-    def done(self, count):
+    def result_text(self, count):
         return self._said
 
 

@@ -8,7 +8,7 @@ import bpy
 
 from ..data import photographs, scenes
 from ..runs import preparing
-from .parts import report_errors
+from .base import report_errors
 
 
 class LODGS_OT_import_colmap(bpy.types.Operator):

@@ -10,10 +10,10 @@ import bpy
 from ...training.splats.formats import READABLE
 from ..data import photographs, scenes
 from ..runs import preparing
-from .frames import BesideBlender
+from .modal import BackgroundOperator
 
 
-class LODGS_OT_import_splats(BesideBlender, bpy.types.Operator):
+class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
     """Import a bundle of levels, streamed levels, or any file of Gaussian splats as a single level"""
 
     bl_idname = "lodgs.import_splats"
@@ -68,7 +68,7 @@ class LODGS_OT_import_splats(BesideBlender, bpy.types.Operator):
         try:
             for path in self.paths():
                 read = reader.submit(scenes.read_splats_file, bpy.path.abspath(str(path)), self.budget)
-                while self._beside and not read.done():
+                while self._modal and not read.done():
                     yield
                 root = yield from scenes.place_splats(context, read.result(), self.upright, warn)
                 yield
@@ -80,10 +80,10 @@ class LODGS_OT_import_splats(BesideBlender, bpy.types.Operator):
         finally:
             reader.shutdown(wait=False, cancel_futures=True)
 
-    def done(self, count):
+    def result_text(self, count):
         return "; ".join(self._placed)
 
-    def status(self, context, count):
+    def status_text(self, context, count):
         return f"Reading {', '.join(path.name for path in self.paths())}; Esc stops"
 
 

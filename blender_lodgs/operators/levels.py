@@ -5,10 +5,10 @@ from __future__ import annotations
 import bpy
 
 from ..data import scenes
-from .parts import OnScene, report_errors
+from .base import SceneOperator, report_errors
 
 
-class LODGS_OT_show_only_level(OnScene, bpy.types.Operator):
+class LODGS_OT_show_only_level(SceneOperator, bpy.types.Operator):
     """Show this level everywhere; where levels add up, with all coarser ones"""
 
     bl_idname = "lodgs.show_only_level"

@@ -6,10 +6,10 @@ import bpy
 
 from ...training.errors import LodgsError
 from ..data import crops, looks, scenes
-from .parts import OnScene, report_errors
+from .base import SceneOperator, report_errors
 
 
-class LODGS_OT_reset_look(OnScene, bpy.types.Operator):
+class LODGS_OT_reset_look(SceneOperator, bpy.types.Operator):
     """Show the splats as they were trained"""
 
     bl_idname = "lodgs.reset_look"

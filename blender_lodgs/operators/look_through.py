@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..data import photographs, scenes
-from .parts import report_errors
+from .base import report_errors
 
 
 class LODGS_OT_look_through(bpy.types.Operator):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import bpy
 
 from ..data import flights, ground, photographs, scenes
-from .parts import OnScene, report_errors
+from .base import SceneOperator, report_errors
 
 
-class LODGS_OT_frame_scene(OnScene, bpy.types.Operator):
+class LODGS_OT_frame_scene(SceneOperator, bpy.types.Operator):
     """Have most of the splat scene in sight of the viewports, whatever far outliers it has"""
 
     bl_idname = "lodgs.frame_scene"
@@ -19,7 +19,7 @@ class LODGS_OT_frame_scene(OnScene, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LODGS_OT_set_ground(OnScene, bpy.types.Operator):
+class LODGS_OT_set_ground(SceneOperator, bpy.types.Operator):
     """Lay the splat scene on its ground, which is at Z = 0 then. The root keeps its location and angles"""
 
     bl_idname = "lodgs.set_ground"
@@ -50,7 +50,7 @@ class LODGS_OT_set_ground(OnScene, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LODGS_OT_set_scale(OnScene, bpy.types.Operator):
+class LODGS_OT_set_scale(SceneOperator, bpy.types.Operator):
     """Give the splat scene its size, by the length between two points or empties that are selected"""
 
     bl_idname = "lodgs.set_scale"
@@ -89,7 +89,7 @@ class LODGS_OT_set_scale(OnScene, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LODGS_OT_camera_path(OnScene, bpy.types.Operator):
+class LODGS_OT_camera_path(SceneOperator, bpy.types.Operator):
     """Add a camera that goes along the photographs by name, smoothed, in the scene's frames"""
 
     bl_idname = "lodgs.camera_path"
@@ -103,7 +103,7 @@ class LODGS_OT_camera_path(OnScene, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LODGS_OT_turntable(OnScene, bpy.types.Operator):
+class LODGS_OT_turntable(SceneOperator, bpy.types.Operator):
     """Add a camera that goes once around the splat scene in the scene's frames"""
 
     bl_idname = "lodgs.turntable"

@@ -6,10 +6,10 @@ import bpy
 
 from ..data import removal, scenes
 from ..runs.watch import watch_of
-from .parts import OnScene
+from .base import SceneOperator
 
 
-class LODGS_OT_remove_scene(OnScene, bpy.types.Operator):
+class LODGS_OT_remove_scene(SceneOperator, bpy.types.Operator):
     """Remove the splat scene: its levels, points, cameras and collections. Files and runs stay"""
 
     bl_idname = "lodgs.remove_scene"

@@ -10,8 +10,8 @@ from bpy_extras.io_utils import ExportHelper
 from ...training.scenes.cameras import write_camera
 from ..data import cameras, scenes
 from ..render import compositing, engine, quick
-from .frames import FrameByFrame
-from .parts import report_errors, show_image
+from .base import report_errors, show_image
+from .modal import FrameOperator
 
 
 class LODGS_OT_use_engine(bpy.types.Operator):
@@ -60,7 +60,7 @@ class LODGS_OT_separate_meshes(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LODGS_OT_render_mesh_depth(FrameByFrame, bpy.types.Operator):
+class LODGS_OT_render_mesh_depth(FrameOperator, bpy.types.Operator):
     """Render how far the meshes are with Cycles, and have them hold out the splats behind them"""
 
     bl_idname = "lodgs.render_mesh_depth"
@@ -74,13 +74,13 @@ class LODGS_OT_render_mesh_depth(FrameByFrame, bpy.types.Operator):
     def work(self, context):
         return compositing.render_mesh_depth(context.scene, self.frames(context))
 
-    def done(self, count):
+    def result_text(self, count):
         where = f"in {compositing.depth_files(bpy.context.scene).parent}"
         where += "" if bpy.data.filepath else ", until Blender is closed"
         return f"{'1 depth' if count == 1 else f'{count} depths'} of meshes {where}"
 
 
-class LODGS_OT_render_quick(FrameByFrame, bpy.types.Operator):
+class LODGS_OT_render_quick(FrameOperator, bpy.types.Operator):
     """Draw what the camera sees as the viewport does, on the graphics card: quick, and without a trainer"""
 
     bl_idname = "lodgs.render_quick"
@@ -98,7 +98,7 @@ class LODGS_OT_render_quick(FrameByFrame, bpy.types.Operator):
             show_image(context, image)
             yield image
 
-    def done(self, count):
+    def result_text(self, count):
         if self.animation:
             return f"{'1 frame' if count == 1 else f'{count} frames'} saved"
         return f"Drawn into the image '{quick.IMAGE}'; the Image Editor shows it"

@@ -10,8 +10,8 @@ from ...training.errors import LodgsError
 from ..data import cells, scenes
 from ..runs import jobs
 from ..runs.watch import Watch, root_by_uid, watch_of
-from .frames import PieceByPiece
-from .parts import OnScene, report_errors, show_image
+from .base import SceneOperator, report_errors, show_image
+from .modal import SteppedOperator
 
 
 def _follow(operator: bpy.types.Operator, watch: Watch):
@@ -22,7 +22,7 @@ def _follow(operator: bpy.types.Operator, watch: Watch):
     return {"FINISHED"} if watch.state in {"running", "done"} else {"CANCELLED"}
 
 
-class LODGS_OT_train(OnScene, bpy.types.Operator):
+class LODGS_OT_train(SceneOperator, bpy.types.Operator):
     bl_idname = "lodgs.train"
     bl_label = "Train Splats"
     bl_description = "Train splats with levels of detail from the scene's photographs, while you work on"
@@ -40,7 +40,7 @@ class LODGS_OT_train(OnScene, bpy.types.Operator):
         return _follow(self, jobs.start(scenes.active_root(context), self.folder))
 
 
-class LODGS_OT_resume_training(OnScene, bpy.types.Operator):
+class LODGS_OT_resume_training(SceneOperator, bpy.types.Operator):
     bl_idname = "lodgs.resume_training"
     bl_label = "Resume Training"
     bl_description = "Go on with the run where it stopped, with the settings that it began with"
@@ -51,7 +51,7 @@ class LODGS_OT_resume_training(OnScene, bpy.types.Operator):
         return _follow(self, jobs.resume(scenes.active_root(context)))
 
 
-class LODGS_OT_cancel_training(OnScene, bpy.types.Operator):
+class LODGS_OT_cancel_training(SceneOperator, bpy.types.Operator):
     bl_idname = "lodgs.cancel_training"
     bl_label = "Cancel Training"
     bl_description = "Ask the trainer to save and stop, so that it can be resumed; again: end it at once"
@@ -62,7 +62,7 @@ class LODGS_OT_cancel_training(OnScene, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LODGS_OT_plan_cells(OnScene, PieceByPiece, bpy.types.Operator):
+class LODGS_OT_plan_cells(SceneOperator, SteppedOperator, bpy.types.Operator):
     bl_idname = "lodgs.plan_cells"
     bl_label = "Plan Cells"
     bl_description = "Say what each cell will be trained on, and what that takes, before anything runs"
@@ -71,7 +71,7 @@ class LODGS_OT_plan_cells(OnScene, PieceByPiece, bpy.types.Operator):
     _found: cells.CellPlan | None = None
 
     def invoke(self, context, event):
-        return self.execute(context) if bpy.app.background else self.begin(context)
+        return self.execute(context) if bpy.app.background else self.start_modal(context)
 
     def work(self, context):
         root = scenes.active_root(context)
@@ -88,17 +88,17 @@ class LODGS_OT_plan_cells(OnScene, PieceByPiece, bpy.types.Operator):
         if root is not None:  # undo may have replaced it
             cells.show(root.lodgs.training, self._found)
 
-    def status(self, context, count):
+    def status_text(self, context, count):
         return "Planning cells; Esc stops"
 
-    def done(self, count):
+    def result_text(self, count):
         if self._found is None:
             return "Nothing is planned"
         views = [each.views for each in self._found.planned]
         return f"{len(views)} cells of {min(views)} to {max(views)} views"
 
 
-class _OnBlock(OnScene):
+class _OnBlock(SceneOperator):
     block: bpy.props.IntProperty(name="Cell", description="Number of the cell, from 1", min=1, default=1)
 
 
@@ -127,7 +127,7 @@ class LODGS_OT_resume_block(_OnBlock, bpy.types.Operator):
         return {"FINISHED"} if watch is followed else _follow(self, watch)
 
 
-class LODGS_OT_open_run(OnScene, bpy.types.Operator):
+class LODGS_OT_open_run(SceneOperator, bpy.types.Operator):
     bl_idname = "lodgs.open_run"
     bl_label = "Open Training Run"
     bl_description = "Load the levels of a run folder, and follow the run if it is at work"
@@ -150,7 +150,7 @@ class LODGS_OT_open_run(OnScene, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LODGS_OT_show_log(OnScene, bpy.types.Operator):
+class LODGS_OT_show_log(SceneOperator, bpy.types.Operator):
     bl_idname = "lodgs.show_log"
     bl_label = "Show Training Log"
     bl_description = "Show the end of the trainer's log; a text block keeps it"
@@ -172,7 +172,7 @@ class LODGS_OT_show_log(OnScene, bpy.types.Operator):
             self.layout.label(text=line.body)
 
 
-class LODGS_OT_show_costs(OnScene, bpy.types.Operator):
+class LODGS_OT_show_costs(SceneOperator, bpy.types.Operator):
     bl_idname = "lodgs.show_costs"
     bl_label = "Show Cost Curve"
     bl_description = "Show what each distance would have cost in an Image Editor"

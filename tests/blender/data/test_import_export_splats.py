@@ -278,7 +278,7 @@ def test_imported_piece_by_piece_and_ended_early(bpy, lodgs, bundle, tmp_path):
     def begun():
         pressed = SimpleNamespace(
             paths=lambda: [path], report=lambda kind, text: told.append(text), budget=0, upright=True,
-            _beside=True,
+            _modal=True,
         )  # fmt: skip
         return operator.work(pressed, bpy.context)
 

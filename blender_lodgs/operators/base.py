@@ -1,4 +1,4 @@
-"""What operators share: how they report errors, and what they need to be possible."""
+"""Base classes and helpers of operators: poll conditions, error reports, display of images."""
 
 from __future__ import annotations
 
@@ -11,11 +11,7 @@ from ..data import scenes
 
 
 def report_errors(execute):
-    """Wraps an operator's execute, or what its other methods call: a LodgsError becomes a report of its
-    sentences, and it cancels.
-
-    So does a lack of memory.
-    """
+    """Wrap an operator's method so that a LodgsError or a MemoryError is reported and cancels the operator."""
 
     @functools.wraps(execute)
     def wrapper(self, context, *event):
@@ -24,14 +20,14 @@ def report_errors(execute):
         except LodgsError as error:
             self.report({"ERROR"}, str(error))
         except MemoryError:
-            self.report({"ERROR"}, "There is not enough memory for this. Close other files and programs.")
+            self.report({"ERROR"}, "Out of memory. Close other files and programs.")
         return {"CANCELLED"}
 
     return wrapper
 
 
 def show_image(context: bpy.types.Context, image: bpy.types.Image) -> None:
-    """Shows an image where Blender shows renders, unless an Image Editor is open already."""
+    """Show an image in the open Image Editors; open one where Blender shows renders if there is none."""
     editors = _image_editors(context)
     if not editors and not bpy.app.background:
         bpy.ops.render.view_show("INVOKE_DEFAULT")
@@ -45,29 +41,29 @@ def _image_editors(context: bpy.types.Context) -> list[bpy.types.SpaceImageEdito
     return [area.spaces.active for area in areas if area.type == "IMAGE_EDITOR"]  # type: ignore[misc]
 
 
-class OnScene:
-    """An operator that acts on the active splat scene."""
+class SceneOperator:
+    """Base class of operators that change the active splat scene."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         root = scenes.active_root(context)
         if root is None:
-            cls.poll_message_set("Select a splat scene, or import one first")  # type: ignore[attr-defined]
+            cls.poll_message_set("Select or import a splat scene first")  # type: ignore[attr-defined]
         elif not root.is_editable:
             cls.poll_message_set(scenes.LINKED)  # type: ignore[attr-defined]
         return root is not None and root.is_editable
 
 
-class OnLevels:
-    """An operator that acts on the levels of the active splat scene."""
+class ReadLevelsOperator:
+    """Base class of operators that read the levels of the active splat scene."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         return _has_levels(cls, context)
 
 
-class OnOwnLevels(OnScene):
-    """An operator that changes the levels of the active splat scene."""
+class EditLevelsOperator(SceneOperator):
+    """Base class of operators that change the levels of the active splat scene."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -76,6 +72,6 @@ class OnOwnLevels(OnScene):
 
 def _has_levels(cls, context: bpy.types.Context) -> bool:
     if scenes.root_with_levels(context) is None:
-        cls.poll_message_set("Select a splat scene that has levels")
+        cls.poll_message_set("Select a splat scene with levels first")
         return False
     return True
