@@ -1,39 +1,40 @@
-# The front door. Whatever it opens sets up what it needs by itself.
+# Entry point for all tasks. Each target installs its own dependencies (make setup).
 PYTHON ?= python3
 VENV := .venv/bin/python
 BLENDER_5_2 := .venv-blender-5.2/bin/python
 METHOD ?= flod
 INPUTS ?= 20000
 SCENES ?= examples/lantern_garden examples/lantern_walk
-# What is installed, from requirements/*.in, to the last dependency and for every system, with hashes.
+# Lock every dependency in requirements/*.in, for all platforms, with hashes.
 LOCK := .venv/bin/uv pip compile --quiet --universal --generate-hashes --no-build --custom-compile-command "make pins"
-# One worker a core. Kernels are compiled once, into the user's cache.
+# One worker per core. Kernels are compiled once into the user's cache.
 PYTEST := -m pytest -n auto
-quick test test-5.0 fuzz: export OMP_NUM_THREADS := 1  # torch's threads would come on top of the workers
+quick test test-5.0 nightly fuzz: export OMP_NUM_THREADS := 1  # the workers already use every core
 export LODGS_TRAINER_PYTHON := $(CURDIR)/$(VENV)
 
-.PHONY: help setup demo check quick test test-5.0 fuzz attacks lint docs tables bench bench-quality bench-lod bench-tree bench-blocks extension pins \
+.PHONY: help setup demo check quick test test-5.0 nightly fuzz attacks lint docs tables bench bench-quality bench-lod bench-tree bench-blocks extension pins \
 	window interop clean
 
 help:
-	@echo "make setup      environments from pinned packages (needs Python 3.11; 3.13 for Blender 5.2's tests)"
+	@echo "make setup      create the environments from pinned packages (Python 3.11; also 3.13 for Blender 5.2's tests)"
 	@echo "make demo       import, train, select, measure and export the example scene (METHOD=flod)"
-	@echo "make check      style, types and the quick tests: about a minute, for every few minutes"
-	@echo "make test       all tests, in Blender 4.5 and, with Python 3.13, in Blender 5.2"
-	@echo "make fuzz       20,000 spoiled inputs at every door (INPUTS=20000, SEED=a number), some minutes"
+	@echo "make check      style, types and quick tests, about a minute; run it often"
+	@echo "make test       all tests except nightly ones, in Blender 4.5 and, with Python 3.13, in Blender 5.2"
+	@echo "make nightly    long tests and those of laboratory tools"
+	@echo "make fuzz       20,000 corrupt inputs for every reader (INPUTS=20000, SEED=number), some minutes"
 	@echo "make lint       style and types"
-	@echo "make docs       build/api: the trainer's functions and classes, from their docstrings"
-	@echo "make tables     docs/parameters.md and controls.md, from what methods and rules declare"
-	@echo "make bench      how fast it is, as ratios from one run"
-	@echo "make bench-quality  PSNR and veil against seconds, all methods (SCENES=\"DIR ...\", METHODS=\"flod ...\", BASE=another checkout)"
-	@echo "make bench-lod  levels and chunks on a town of 3 million splats (over an hour the first time; STAGES=\"town lodge others table\")"
-	@echo "make bench-tree cuts of trees of up to 10 million nodes, and training them in 400 MB (an hour and 10 GB the first time)"
-	@echo "make bench-blocks  what giving blocks out costs, and the plot for 1 to 64 workers (half an hour alone)"
-	@echo "make extension  dist/lodgs-VERSION.zip, checked by Blender"
-	@echo "make pins       requirements/*.txt anew from requirements/*.in (UPGRADE=1 takes the newest of what these leave open)"
-	@echo "make window     a tour in a real Blender window, with pictures (METHOD=flod; needs Blender, Xvfb, ImageMagick)"
-	@echo "make interop    other programs read our files, naga translates our shaders (needs Node)"
-	@echo "make attacks    trainers, workers and a scheduler killed at random moments, disks that fill up: half an hour"
+	@echo "make docs       build/api: trainer API reference from docstrings"
+	@echo "make tables     regenerate docs/parameters.md and docs/controls.md from the code"
+	@echo "make bench      speed, as ratios within one run (BASE=old.json compares)"
+	@echo "make bench-quality  PSNR and veil over time, all methods (SCENES=\"DIR ...\", METHODS=\"flod ...\", BASE=other checkout)"
+	@echo "make bench-lod  levels and chunks on a town of 3 million splats (first run: over an hour; STAGES=\"town lodge others table\")"
+	@echo "make bench-tree  cuts of trees with up to 10 million nodes, and training them in 400 MB (first run: an hour, 10 GB)"
+	@echo "make bench-blocks  overhead of distributing blocks, and a plot for 1 to 64 workers (half an hour on an idle machine)"
+	@echo "make extension  dist/lodgs-VERSION.zip, validated by Blender"
+	@echo "make pins       update requirements/*.txt from requirements/*.in (UPGRADE=1 takes the newest allowed versions)"
+	@echo "make window     tour in a real Blender window, with screenshots (METHOD=flod; needs Blender, Xvfb, ImageMagick)"
+	@echo "make interop    other programs read our files; naga translates our shaders (needs Node)"
+	@echo "make attacks    kill trainers, workers and a scheduler at random times; fill disks (half an hour)"
 
 setup:
 	@command -v $(PYTHON) >/dev/null || { echo "setup: Python is missing; install Python 3.11 with pip." >&2; exit 1; }
@@ -46,16 +47,21 @@ check: setup
 	@$(MAKE) --no-print-directory --jobs=2 lint quick
 
 quick: setup
-	$(VENV) $(PYTEST) -q -m "not slow and not blender"
+	$(VENV) $(PYTEST) -q -m "not slow and not blender and not nightly"
 
 test: setup
-	$(VENV) $(PYTEST) tests/training tests/fuzz
-	$(VENV) $(PYTEST) tests/blender
-	@if [ -x $(BLENDER_5_2) ]; then set -x; $(BLENDER_5_2) $(PYTEST) tests/blender; fi
+	$(VENV) $(PYTEST) -m "not nightly" tests/training tests/fuzz
+	$(VENV) $(PYTEST) -m "not nightly" tests/blender
+	@if [ -x $(BLENDER_5_2) ]; then set -x; $(BLENDER_5_2) $(PYTEST) -m "not nightly" tests/blender; fi
 
 test-5.0: setup
 	@$(PYTHON) tools/setup.py 5.0
 	.venv-blender-5.0/bin/python $(PYTEST) tests/blender
+
+nightly: setup
+	$(VENV) $(PYTEST) -m nightly tests/training tests/fuzz tests/lab
+	$(VENV) $(PYTEST) -m nightly tests/blender
+	@if [ -x $(BLENDER_5_2) ]; then set -x; $(BLENDER_5_2) $(PYTEST) -m nightly tests/blender; fi
 
 fuzz: setup
 	LODGS_FUZZ=$(INPUTS) $(VENV) $(PYTEST) tests/fuzz --timeout 0 $(if $(SEED),--hypothesis-seed $(SEED))
@@ -81,14 +87,14 @@ bench-quality: setup
 	$(VENV) tools/bench_quality.py $(SCENES) $(if $(BASE),--report --base $(BASE)) $(if $(METHODS),--methods $(METHODS))
 
 bench-lod: setup
-	$(VENV) tools/bench_lod.py $(STAGES)
+	$(VENV) lab/bench_lod.py $(STAGES)
 
 bench-tree: setup
-	$(VENV) tools/bench_tree.py
-	$(VENV) tools/bench_tree_memory.py
+	$(VENV) lab/bench_tree.py
+	$(VENV) lab/bench_tree_memory.py
 
 bench-blocks: setup
-	$(VENV) tools/bench_blocks.py
+	$(VENV) lab/bench_blocks.py
 
 extension: setup
 	$(VENV) tools/extension.py

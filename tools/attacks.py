@@ -37,8 +37,8 @@ from tests.training.conftest import FOCAL, HEIGHT, WIDTH, write_tiny_scene  # no
 from tools.attacks_blocks import FULL_SAYS, contents, disk  # noqa: E402
 from training import __main__, files  # noqa: E402
 from training.errors import LodgsError  # noqa: E402
-from training.methods import rows  # noqa: E402
-from training.methods.method import Method  # noqa: E402
+from training.optimize.method import Method  # noqa: E402
+from training.optimize.out_of_core import row_file  # noqa: E402
 from training.runs.endings import ending  # noqa: E402
 from training.runs.events import Events  # noqa: E402
 from training.runs.folder import RunFolder  # noqa: E402
@@ -87,7 +87,7 @@ def victim(job: Path, kind: str, number: int, share: float, counts_file: Path | 
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     os.dup2(1, 2)
     fsync, replace, train_step, append = os.fsync, os.replace, Method.train_step, Events._append
-    write = rows._write
+    write = row_file._write
 
     def sync(descriptor: int) -> None:
         place = f"/proc/self/fd/{descriptor}"
@@ -119,7 +119,7 @@ def victim(job: Path, kind: str, number: int, share: float, counts_file: Path | 
         moment("rows", lambda: write(file, blocks.reshape(-1)[: int(blocks.size * share)]))
         write(file, blocks)
 
-    rows._write = write_back
+    row_file._write = write_back
     files.os.fsync, files.os.replace = sync, move  # type: ignore[assignment]
     Method.train_step, Events._append = step, say  # pyright: ignore
     code = __main__.main(["train", str(job)])

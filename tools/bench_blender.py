@@ -37,9 +37,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import numpy as np
 import plyfile
 
+from lab.large_scene import write_large
 from tests.training.lod.trees import random_leaves, tree_of, write_in_pages
 from tools.blender_module import EXTENSION, start_blender
-from tools.large_scene import write_large
 
 PHOTOGRAPH = Path(__file__).resolve().parent.parent / "examples" / "lantern_garden" / "images" / "view_00.jpg"
 SCENE = 5_000_000, 5000

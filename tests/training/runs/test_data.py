@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lab.jitter import jittered
 from tests.training.conftest import write_tiny_scene
 from tests.training.scenes import synthetic
-from tools.jitter import jittered
 from training.errors import LodgsError
-from training.methods.data import TrainingData
+from training.optimize.training_data import TrainingData
 from training.runs.data import training_data
 from training.runs.folder import RunFolder
 from training.runs.job import Job

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tools.jitter import exposed
-from training.methods.data import TrainingData
+from lab.jitter import exposed
+from training.optimize.training_data import TrainingData
 from training.scenes import exposures
 from training.scenes.colmap import read_scene
 from training.scenes.exposures import evened, own_gains, relative_gains, smooth

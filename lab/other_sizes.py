@@ -1,7 +1,7 @@
 """How a run's held-out views do at other sizes than it was trained at, against the photographs at that size.
 
     python -m training train --scene DIR --out build/run --method 3dgs --image-scale 0.25 --validation
-    python tools/other_sizes.py build/run
+    python lab/other_sizes.py build/run
 
 A size at which photographs would have to be enlarged is left out. Of splats that were trained with
 Mip-Splatting's filter it also tells how programs do that do not know it.

@@ -1,12 +1,12 @@
-"""The makespan model of tools/bench_blocks.py, against cases that are worked by hand."""
+"""The makespan model of lab/bench_blocks.py, against cases that are worked by hand."""
 
 import json
 import sys
 
 import pytest
 
-from tools import bench_blocks
-from tools.bench_blocks import makespan, model, workers_of
+from lab import bench_blocks
+from lab.bench_blocks import makespan, model, workers_of
 
 
 def test_whoever_is_free_takes_the_next():

@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_a_tree_of_ten_times_the_budget_keeps_to_what_it_is_allowed(tmp_path):
     """By the system's own count; were all nodes in memory, it would be 90 MB more."""
     out = tmp_path / "tree.json"
-    command = [sys.executable, "tools/bench_tree_memory.py", "--tiny", "--out", str(out)]
+    command = [sys.executable, "lab/bench_tree_memory.py", "--tiny", "--out", str(out)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     (row,) = json.loads(out.read_text(encoding="utf-8"))["rows"]

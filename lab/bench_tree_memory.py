@@ -29,14 +29,14 @@ import torch
 from examples import town
 from training.lod.rules.cut import detail_of
 from training.methods import method_info
-from training.methods.cuts import BESIDE, LARGE
-from training.methods.data import TrainingData
-from training.methods.memory import keep_freed_memory
-from training.methods.parameters import override
 from training.methods.tree import TreeParameters
 from training.methods.tree.build import GrowingForest
 from training.methods.tree.store import layout_of
 from training.methods.tree.train import Method, SeenRecords
+from training.optimize.memory import keep_freed_memory
+from training.optimize.out_of_core.cut_cache import BESIDE, LARGE
+from training.optimize.parameters import override
+from training.optimize.training_data import TrainingData
 from training.rasterize import Gaussians, rasterize
 from training.rasterize.hspt import image_of
 from training.scenes.cameras import read_views, write_camera

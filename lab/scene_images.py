@@ -1,6 +1,6 @@
 """The pictures of docs/scenes.md that need no window: what masks, alpha, lenses and a region change.
 
-    python tools/scene_pictures.py build/scene_pictures [masks alone lens region]
+    python lab/scene_images.py build/scene_images [masks alone lens region]
 
 Each is made by the commands that its page tells of, of the example or of a monkey that Blender renders; a few
 minutes on two cores. Then look at them, and copy what is to be shown to docs/images.

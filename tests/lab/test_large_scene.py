@@ -3,7 +3,7 @@
 import numpy as np
 import pycolmap
 
-from tools.large_scene import TRACK, write_large
+from lab.large_scene import TRACK, write_large
 from training.scenes.colmap import read_scene
 
 

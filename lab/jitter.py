@@ -1,6 +1,6 @@
 """A copy of a scene whose photographs differ in exposure, to see what ``lr_exposure`` is worth.
 
-    python tools/jitter.py SCENE COPY [--stops 0.7]
+    python lab/jitter.py SCENE COPY [--stops 0.7]
     python tools/bench_quality.py COPY SCENE --report --methods 3dgs --shares 1 --set lr_exposure=0.01
 
 ``psnr`` counts what exposure is missed as well, ``fitted_psnr`` only what is left without it.

@@ -207,7 +207,7 @@ def main() -> None:
         print(f"At {max(row['nodes'] for row in rows):,} nodes HSPT is {times:.1f} times faster than: {name}")
     options.out.parent.mkdir(parents=True, exist_ok=True)
     known = json.loads(options.out.read_text(encoding="utf-8"))["rows"] if options.out.exists() else []
-    trained = [row for row in known if row.get("peak_mb") is not None]  # tools/bench_tree_memory.py's
+    trained = [row for row in known if row.get("peak_mb") is not None]  # lab/bench_tree_memory.py's
     report = {"threads": threads(), "hspt_times_faster": faster, "rows": rows + trained}
     options.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     plot(options.out.with_suffix(".png"), rows)

@@ -1,4 +1,4 @@
-"""What `tools/off_path.py` counts, against a wall whose surface is known."""
+"""What `lab/off_path.py` counts, against a wall whose surface is known."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import OpenEXR
 import pytest
 import torch
 
-from tools.off_path import decibels, pixels, positions
+from lab.off_path import decibels, pixels, positions
 from training.errors import LodgsError
 from training.rasterize import Gaussians, Target
 from training.scenes.cameras import Camera

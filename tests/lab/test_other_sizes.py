@@ -1,4 +1,4 @@
-"""What `tools/other_sizes.py` measures: splats in larger pictures, against photographs that show as much."""
+"""What `lab/other_sizes.py` measures: splats in larger pictures, against photographs that show as much."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from tools.other_sizes import psnr_by_size
+from lab.other_sizes import psnr_by_size
 from training.rasterize import Gaussians, rasterize
 from training.runs.job import Job
 from training.runs.train import train

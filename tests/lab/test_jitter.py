@@ -21,7 +21,7 @@ def linear(path: Path) -> np.ndarray:
 
 def test_photographs_change_by_stops_and_held_out_ones_stay(tiny_scene, tmp_path):
     copy = tmp_path / "copy"
-    command = [sys.executable, ROOT / "tools" / "jitter.py", tiny_scene, copy, "--test-every", "4"]
+    command = [sys.executable, ROOT / "lab" / "jitter.py", tiny_scene, copy, "--test-every", "4"]
     ran = subprocess.run([*map(str, command)], capture_output=True, text=True)
     assert ran.returncode == 0, ran.stderr
     train, test = read_scene(tiny_scene).split(4)

@@ -2,7 +2,7 @@
 
     python -m examples.build_scene build/example --samples 1 --percentage 50 --cameras view aside
     python -m training train --scene examples/lantern_garden --method 3dgs --out build/run
-    python tools/off_path.py build/run build/example
+    python lab/off_path.py build/run build/example
 
 The surfaces are the renderer's, drawn at the run's image scale. Held-out views beside it stand on the path.
 """
