@@ -59,7 +59,7 @@ def start(root: bpy.types.Object, folder: str = "", parameters: dict | None = No
         root: a scene root that was imported from a COLMAP folder; or one with splats alone, which are handed
             over as they are here, with the views of them that the settings ask for.
         folder: the run's folder; empty makes a new one where the settings say.
-        parameters: further parameters of the method by name (``training.methods.parameters``).
+        parameters: further parameters of the method by name (``training.optimize.parameters``).
 
     Raises:
         LodgsError: no trainer, no scene, an impossible setting, or a folder that is taken.

@@ -75,6 +75,15 @@ def tiny_scene(tmp_path_factory) -> Path:
     return write_tiny_scene(tmp_path_factory.mktemp("scene") / "tiny")
 
 
+@pytest.fixture(scope="module")
+def data(tiny_scene):
+    """Training data of the tiny scene."""
+    from training.optimize.training_data import TrainingData
+    from training.scenes.colmap import read_scene
+
+    return TrainingData(read_scene(tiny_scene), test_every=4)
+
+
 @pytest.fixture(scope="session")
 def tried_graphics() -> None:
     """A device for the gpu backend is there, this computer's own or the software that stands for one."""

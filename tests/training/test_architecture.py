@@ -33,6 +33,7 @@ FLOORS = {
         ("runs",),
         ("evaluate",),
         ("methods",),
+        ("optimize",),
         ("rasterize",),
         ("lod",),
         ("scenes",),

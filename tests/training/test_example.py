@@ -12,7 +12,7 @@ from PIL import Image
 
 from examples import rig
 from training.evaluate.aside import VEIL
-from training.methods.support import halfway
+from training.optimize.support import halfway
 from training.scenes.aside import read_aside
 from training.scenes.colmap import read_scene
 

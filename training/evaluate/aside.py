@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import expit
 
-from ..methods.data import TrainingData
-from ..methods.support import halfway
+from ..optimize.support import halfway
+from ..optimize.training_data import TrainingData
 from ..scenes.cameras import evenly
 from .views import Evaluation, ShownTo
 

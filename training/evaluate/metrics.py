@@ -32,7 +32,7 @@ def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = 
 def exposed_as(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
     """An image (H, W, 3) with the gain and offset of each channel that bring it closest to a target.
 
-    Least squares; what ``methods.exposure`` learns of a training view, found for one that was held out.
+    Least squares; what ``optimize.exposure`` learns of a training view, found for one that was held out.
 
     Args:
         mask: as of :func:`psnr`.

@@ -12,7 +12,7 @@ import torch
 from ..lod.rule import Values, find_rule
 from ..lod.selection import Choice, complete, settings
 from ..lod.sight import Sight
-from ..methods.data import TrainingData
+from ..optimize.training_data import TrainingData
 from ..rasterize import Gaussians, Rendering, Target, device_of, rasterize
 from ..rasterize.resident import Chosen, Resident, SplatSet, draw
 from ..scenes.cameras import Camera, evenly

@@ -2,7 +2,7 @@
 method does.
 
 A folder's ``__init__.py`` declares the method (``METHOD``, a `MethodInfo`; no torch), its ``train.py`` holds
-the class ``Method``, which derives from ``methods.method.Method``. Folders are found, not listed.
+the class ``Method``, which derives from ``optimize.method.Method``. Folders are found, not listed.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from importlib import import_module
 from pkgutil import iter_modules
 from typing import TYPE_CHECKING
 
-from ..documents import shown
+from ..documents import quote
 from ..errors import LodgsError
-from .info import PRESETS, MethodInfo
-from .parameters import Parameters, override
+from ..optimize.method_info import PRESETS, MethodInfo
+from ..optimize.parameters import Parameters, override
 
 if TYPE_CHECKING:
+    from ..optimize.method import Method
+    from ..optimize.training_data import TrainingData
     from ..splats.gaussians import SplatRows
-    from .data import TrainingData
-    from .method import Method
 
 __all__ = ["METHODS", "PRESETS", "MethodInfo", "create", "found", "method_info", "parameters_of"]
 
@@ -43,7 +43,7 @@ def method_info(name: str) -> MethodInfo:
         LodgsError: there is no such method.
     """
     if name not in METHODS:
-        raise LodgsError(f"There is no method {shown(name)}.", f"Choose one of: {', '.join(METHODS)}.")
+        raise LodgsError(f"There is no method {quote(name)}.", f"Choose one of: {', '.join(METHODS)}.")
     return METHODS[name]
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from textwrap import fill
 
+from ..optimize.parameters import possible
 from . import METHODS, PRESETS, method_info
-from .parameters import possible
 
 _WIDTH = 110
 

@@ -350,7 +350,7 @@ def twin_of(
 
     Args:
         adam: of means, quats, log_scales, opacity_logits and sh; what else it has stays as it is.
-        stats: (N,) statistics of density control, by name (``methods.model``).
+        stats: (N,) statistics of density control, by name (``optimize.model``).
         antialias: as of :func:`rasterize`.
 
     Raises:

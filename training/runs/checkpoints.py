@@ -2,7 +2,7 @@
 
 A checkpoint is what ``torch.save`` writes: a ZIP archive. It holds a CRC-32 of each of its parts, which
 ``torch.load`` does not look at and :func:`read_checkpoint` does. What is too much to be written every time
-lies beside them, in files of ``methods.rows``, of which a checkpoint holds a table.
+lies beside them, in files of ``optimize.out_of_core.row_file``, of which a checkpoint holds a table.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import IO, Any
 import torch
 
 from .. import VERSION
-from ..errors import LodgsError, out_of_memory
+from ..errors import LodgsError, is_out_of_memory
 from ..files import atomic_write, open_regular
 from .folder import RunFolder
 
@@ -65,7 +65,7 @@ def read_newest(
 
     Raises:
         LodgsError: none of those that are there can be read, or another version of LODGS wrote them.
-        MemoryError, RuntimeError: there is no memory for one (``errors.out_of_memory``).
+        MemoryError, RuntimeError: there is no memory for one (``errors.is_out_of_memory``).
     """
     paths, damaged = _newest_first(folder), list[Path]()
     for path in paths:
@@ -77,7 +77,7 @@ def read_newest(
         except OtherVersion:
             raise
         except Exception as error:
-            if out_of_memory(error):
+            if is_out_of_memory(error):
                 raise
             warn(f"The checkpoint {path.name} cannot be read ({error}); what it held is trained again.")
             damaged += [] if isinstance(error, OSError) else [path]

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import LodgsError
 from ..lod.crop import Crop
-from ..methods.data import TrainingData
+from ..optimize.training_data import TrainingData
 from ..scenes.cameras import Camera
 from ..scenes.colmap import Scene, read_scene, without
 from ..scenes.depths import Depths, with_points

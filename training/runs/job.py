@@ -7,12 +7,12 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 
-from ..documents import read_json, read_toml, shown
+from ..documents import read_json, read_toml, quote
 from ..errors import LodgsError
 from ..files import atomic_write
 from ..lod.crop import Crop, is_text_of_crop
 from ..methods import METHODS, method_info, parameters_of
-from ..methods.parameters import Parameters
+from ..optimize.parameters import Parameters
 from .folder import RunFolder
 
 BACKENDS = ("auto", "cpu", "cuda", "gpu", "reference")
@@ -137,7 +137,7 @@ class Job:
         unknown = sorted(set(values) - set(known))
         if unknown:
             raise LodgsError(
-                f"The job has the unknown key {shown(unknown[0])}.", f"Known are: {', '.join(known)}."
+                f"The job has the unknown key {quote(unknown[0])}.", f"Known are: {', '.join(known)}."
             )
         values = {"scene": "", **values} if values.get("capture") else dict(values)
         for key in ("out",) if values.get("capture") else ("scene", "out"):
@@ -157,7 +157,7 @@ class Job:
         for key in fields(self):
             value, (kind, name) = getattr(self, key.name), _KINDS[str(key.type)]
             if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-                raise LodgsError(f"{key.name} = {shown(value)} is not {name}.")
+                raise LodgsError(f"{key.name} = {quote(value)} is not {name}.")
         if not (0 <= self.seed < 2**31 and 0 <= self.test_every < 2**31) or self.test_every == 1:
             raise LodgsError(
                 f"seed = {self.seed!r}, test_every = {self.test_every!r} is not possible.",
@@ -179,7 +179,7 @@ class Job:
                 )
         if self.backend not in BACKENDS:
             raise LodgsError(
-                f"There is no backend {shown(self.backend)}.", f"Choose one of: {', '.join(BACKENDS)}."
+                f"There is no backend {quote(self.backend)}.", f"Choose one of: {', '.join(BACKENDS)}."
             )
         goes_on = self.resolved_parameters().goes_on
         if goes_on and not self.base:
@@ -318,11 +318,11 @@ def check_views(views: int, width: int) -> None:
 def _path(key: str, value: object, folder: Path) -> str:
     """An absolute path; relative ones are relative to ``folder``."""
     if not isinstance(value, str):
-        raise LodgsError(f"{key} = {shown(value)} is not a path.", "Give it in quotation marks.")
+        raise LodgsError(f"{key} = {quote(value)} is not a path.", "Give it in quotation marks.")
     try:
         path = str((folder / value).expanduser().resolve())
     except (OSError, ValueError, RuntimeError) as error:  # a NUL, an unknown ~name, links in a circle
-        raise LodgsError(f"{key} = {shown(value)} is not a path: {error}.", "Correct it.") from error
+        raise LodgsError(f"{key} = {quote(value)} is not a path: {error}.", "Correct it.") from error
     if len(path) > MOST_PATH:
         raise LodgsError(f"{key} is a path of {len(path)} characters.", f"Give at most {MOST_PATH}.")
     return path

@@ -29,9 +29,9 @@ from ..lod.rule import find_rule
 from ..lod.selection import levels_alone, settings
 from ..lod.sight import IN_MEMORY, in_parts, open_if_large
 from ..methods import METHODS, create
-from ..methods.data import TrainingData
-from ..methods.memory import keep_freed_memory
-from ..methods.method import Method
+from ..optimize.memory import keep_freed_memory
+from ..optimize.method import Method
+from ..optimize.training_data import TrainingData
 from ..rasterize import Gaussians, contributions, device_of, resolve, warm_up, why_cpu
 from ..rasterize.gpu.choice import chosen as graphics_device
 from ..rasterize.resident import Resident

@@ -8,7 +8,7 @@ import pytest
 @pytest.fixture
 def made_up(bpy, lodgs, monkeypatch):
     """The group of a method that nobody knew, on an object."""
-    parameters, methods = lodgs("training.methods.parameters"), lodgs("training.methods")
+    parameters, methods = lodgs("training.optimize.parameters"), lodgs("training.methods")
     parameter = parameters.parameter
 
     @dataclass(frozen=True)

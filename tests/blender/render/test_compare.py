@@ -77,7 +77,7 @@ def measured(bpy, lodgs, tmp_path):
     pytest.importorskip("torch", reason="the evaluation runs beside Blender here")
     from training.evaluate.views import Evaluation
     from training.lod.selection import Choice, settings
-    from training.methods.data import TrainingData
+    from training.optimize.training_data import TrainingData
     from training.scenes.colmap import read_scene
 
     rng, levels = np.random.default_rng(3), []

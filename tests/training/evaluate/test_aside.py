@@ -8,7 +8,7 @@ import pytest
 
 from training.evaluate.aside import MOST_PLACES, VEIL, oversized, veil
 from training.evaluate.views import Evaluation
-from training.methods.support import halfway
+from training.optimize.support import halfway
 from training.rasterize import Gaussians, rasterize
 from training.scenes.cameras import Camera, evenly
 from training.splats.gaussians import Splats

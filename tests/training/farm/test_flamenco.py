@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from training.methods import METHODS
-from training.methods.info import PRESETS
+from training.optimize.method_info import PRESETS
 from training.runs import train as training_loop
 from training.runs.blocks.plan import read_plan
 from training.runs.folder import RunFolder

@@ -12,7 +12,7 @@ import pytest
 
 from tests.training.scenes.depth_walls import FITTED, METRIC, depth_of, put, view, write_walls
 from training.methods import METHODS, create
-from training.methods.data import TrainingData
+from training.optimize.training_data import TrainingData
 from training.rasterize import Gaussians, rasterize
 from training.runs.job import Job
 from training.runs.train import train

@@ -5,8 +5,8 @@ import torch
 
 from training.methods import METHODS, create
 from training.methods.flod import finish
-from training.methods.method import ALL_FROM, MANY_VIEWS
-from training.methods.parameters import override
+from training.optimize.method import ALL_FROM, MANY_VIEWS
+from training.optimize.parameters import override
 
 PLAIN = ("3dgs", "flod", "octree", "clod", "lodge", "tree")
 

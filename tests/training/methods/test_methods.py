@@ -12,7 +12,7 @@ import torch
 from training import methods
 from training.errors import LodgsError
 from training.evaluate.metrics import psnr
-from training.methods.method import Method
+from training.optimize.method import Method
 from training.rasterize import Gaussians, rasterize
 from training.runs import train as training_loop
 from training.runs.base import read_base
@@ -273,7 +273,7 @@ def test_what_all_methods_record_of_a_scene(data, tiny):
 @pytest.mark.parametrize("name", sorted(methods.METHODS))
 def test_a_step_has_its_own_background_and_its_picture_has_none(data, name):
     from training.methods import create
-    from training.methods.parameters import override
+    from training.optimize.parameters import override
 
     presets = methods.method_info(name).presets
     method = create(name, data, presets["draft"], seed=0, backend="cpu")

@@ -6,7 +6,7 @@ import pytest
 
 from training.lod.crop import Crop
 from training.methods import METHODS, create, parameters_of
-from training.methods.data import TrainingData
+from training.optimize.training_data import TrainingData
 from training.scenes.colmap import read_scene
 
 HALF = "box -9 -9 -1.5 0 9 9"  # of what stands around the origin in the tiny scene the half where x < 0

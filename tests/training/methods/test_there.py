@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from training.methods import METHODS, create
-from training.methods.density import densify, prune, reset_opacities
-from training.methods.model import Model
-from training.methods.parameters import override
-from training.methods.start import from_points
+from training.optimize.density_control import densify, prune, reset_opacities
+from training.optimize.initialize import from_points
+from training.optimize.model import Model
+from training.optimize.parameters import override
 from training.rasterize import Target
 from training.scenes.cameras import Camera
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from training.lod.selection import complete
-from training.methods.data import TrainingData
+from training.optimize.training_data import TrainingData
 from training.rasterize import Gaussians, Target, rasterize
 from training.runs.job import Job
 from training.runs.train import train

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from training.methods.model import Model
+from training.optimize.model import Model
 from training.rasterize import Gaussians
 from training.splats.gaussians import Splats
 

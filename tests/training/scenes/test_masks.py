@@ -7,7 +7,7 @@ import pytest
 
 from training.__main__ import main
 from training.errors import LodgsError
-from training.methods.data import TrainingData
+from training.optimize.training_data import TrainingData
 from training.scenes.colmap import read_scene
 from training.scenes.images import load_image, load_mask, write_png
 from training.scenes.undistort import undistorted

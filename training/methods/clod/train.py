@@ -13,15 +13,15 @@ import numpy as np
 import torch
 
 from ...lod.rules.decay import SIGMA, attenuation
+from ...optimize.density_control import require_rows
+from ...optimize.method import Drawing
+from ...optimize.model import Model, splat_rates
+from ...optimize.schedules import due
+from ...optimize.training_data import TrainingView
 from ...rasterize import contributions
 from ...scenes.cameras import Camera
 from ...splats.bundle import Level
 from ...splats.gaussians import Splats
-from ..data import TrainingView
-from ..density import require_rows
-from ..method import Drawing
-from ..model import Model, splat_rates
-from ..schedules import due
 from ..threedgs import train as threedgs_train
 from . import ClodParameters
 

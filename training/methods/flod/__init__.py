@@ -3,9 +3,9 @@
 from dataclasses import dataclass, replace
 
 from ...errors import LodgsError
+from ...optimize.method_info import MethodInfo
+from ...optimize.parameters import PAPER, STANDARD, DensityParameters, parameter
 from ...splats.bundle import MOST_LEVELS
-from ..info import MethodInfo
-from ..parameters import PAPER, STANDARD, DensityParameters, parameter
 
 PAPER_FOOTPRINT = 40.0
 """Pixels that the paper's lambda, 0.2 COLMAP units, covers at the median depth of its scenes, about."""

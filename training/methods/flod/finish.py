@@ -19,14 +19,14 @@ import torch
 from ...lod.blocks import spatial_order
 from ...lod.rule import Values, facts_of
 from ...lod.rules.bands import RULE
+from ...optimize.model import Model, splat_rates
+from ...optimize.pruning import least_importance, room_taken_over
+from ...optimize.schedules import log_linear
+from ...optimize.training_data import TrainingData
 from ...rasterize import Gaussians, contributions
 from ...rasterize.adam import LearningRate
 from ...scenes.cameras import Camera, evenly
 from ...splats.bundle import Level
-from ..data import TrainingData
-from ..model import Model, splat_rates
-from ..pruning import least_importance, room_taken_over
-from ..schedules import log_linear
 from . import FlodParameters
 
 LEVEL = "level"

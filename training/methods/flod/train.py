@@ -14,16 +14,16 @@ from scipy.spatial import KDTree
 from ...errors import LodgsError
 from ...lod.rule import Values, every_control
 from ...lod.rules.bands import s_min_of
+from ...optimize import method
+from ...optimize.density_control import constrained_log, densify, prune, reset_opacities
+from ...optimize.initialize import distinct, from_points, from_splats, neighbour_distances, sampled
+from ...optimize.method import Drawing
+from ...optimize.model import Model, splat_rates
+from ...optimize.schedules import due, log_linear, shrink_at
+from ...optimize.training_data import TrainingView
 from ...rasterize import Gaussians
 from ...splats.bundle import Level
 from ...splats.gaussians import Splats
-from .. import method
-from ..data import TrainingView
-from ..density import constrained_log, densify, prune, reset_opacities
-from ..method import Drawing
-from ..model import Model, splat_rates
-from ..schedules import due, log_linear, shrink_at
-from ..start import distinct, from_points, from_splats, neighbour_distances, sampled
 from . import PAPER_REACH, TOGETHER, FlodParameters, finish
 
 

@@ -4,9 +4,9 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 from ...errors import LodgsError
+from ...optimize.method_info import MethodInfo
+from ...optimize.parameters import PAPER, STANDARD, parameter
 from ...splats.bundle import MOST_LEVELS
-from ..info import MethodInfo
-from ..parameters import PAPER, STANDARD, parameter
 from ..threedgs import ThreedgsParameters
 
 ROUNDS = (0.2, 0.6, 1.0)

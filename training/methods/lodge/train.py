@@ -14,16 +14,16 @@ from ...errors import LodgsError
 from ...lod.blocks import Blocks, block_quantiles, spatial_order
 from ...lod.rules.chunks import RULE, TABLE, member_columns
 from ...lod.streaming import BLOCKS, table_of_blocks
+from ...optimize.density_control import require_rows
+from ...optimize.method import Drawing, Made
+from ...optimize.model import NAMES
+from ...optimize.pruning import least_importance, room_taken_over
+from ...optimize.training_data import TrainingView
 from ...rasterize import Gaussians, photometric_loss
 from ...scenes.cameras import evenly
 from ...splats.bundle import Level
 from ...splats.gaussians import Splats
 from ...splats.ply import Columns
-from ..data import TrainingView
-from ..density import require_rows
-from ..method import Drawing, Made
-from ..model import NAMES
-from ..pruning import least_importance, room_taken_over
 from ..threedgs.refining import Refining
 from . import ROUNDS, LodgeParameters, chunks
 from .composite import (

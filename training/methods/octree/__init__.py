@@ -3,9 +3,9 @@
 from dataclasses import dataclass, replace
 
 from ...errors import LodgsError
+from ...optimize.method_info import MethodInfo
+from ...optimize.parameters import AS_PUBLISHED, STANDARD, Parameters, parameter
 from ...splats.bundle import MOST_LEVELS
-from ..info import MethodInfo
-from ..parameters import AS_PUBLISHED, STANDARD, Parameters, parameter
 
 
 @dataclass(frozen=True)

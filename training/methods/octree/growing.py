@@ -12,10 +12,10 @@ import numpy as np
 import torch
 
 from ...lod.rules.octree import faded, wanted_at
+from ...optimize.initialize import distinct, neighbour_scale
+from ...optimize.model import Model
+from ...optimize.training_data import TrainingData
 from ...scenes.cameras import Camera
-from ..data import TrainingData
-from ..model import Model
-from ..start import distinct, neighbour_scale
 from . import OctreeParameters, tree
 from .schedule import Schedule
 

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 
 from ...lod.rules.octree import faded, wanted_at
+from ...optimize.model import Model
+from ...optimize.training_data import TrainingData, TrainingView
 from ...rasterize.adam import LearningRate
 from ...scenes.cameras import Camera
-from ..data import TrainingData, TrainingView
-from ..model import Model
 from . import OctreeParameters
 from .tree import Octree
 

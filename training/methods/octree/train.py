@@ -13,18 +13,18 @@ import numpy as np
 import torch
 
 from ...lod.rules.octree import BIAS
+from ...optimize import method
+from ...optimize.density_control import require_rows, sample_inside
+from ...optimize.initialize import from_points
+from ...optimize.method import Drawing
+from ...optimize.model import Model, splat_rates
+from ...optimize.schedules import log_linear
+from ...optimize.training_data import TrainingView
 from ...rasterize import contributions
 from ...rasterize.rendering import ALPHA_MIN
 from ...scenes.cameras import Camera
 from ...splats.bundle import Level
 from ...splats.gaussians import Splats
-from .. import method
-from ..data import TrainingView
-from ..density import require_rows, sample_inside
-from ..method import Drawing
-from ..model import Model, splat_rates
-from ..schedules import log_linear
-from ..start import from_points
 from . import OctreeParameters, growing
 
 MARGIN = "margin"

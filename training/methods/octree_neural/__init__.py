@@ -3,9 +3,9 @@
 from dataclasses import dataclass, replace
 
 from ...errors import LodgsError
-from ..info import MethodInfo
+from ...optimize.method_info import MethodInfo
+from ...optimize.parameters import AS_PUBLISHED, parameter
 from ..octree import OctreeParameters
-from ..parameters import AS_PUBLISHED, parameter
 
 
 @dataclass(frozen=True)

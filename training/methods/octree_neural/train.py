@@ -17,6 +17,11 @@ from torch import nn
 from torch.nn.functional import normalize
 
 from ...lod.rules.octree import BIAS, faded
+from ...optimize import method
+from ...optimize.density_control import require_rows
+from ...optimize.model import Model
+from ...optimize.schedules import log_linear
+from ...optimize.training_data import TrainingView
 from ...rasterize import Adam, Contributions, Gaussians, Rendering, contributions, rasterize
 from ...rasterize.adam import LearningRate
 from ...rasterize.rendering import ALPHA_MIN
@@ -24,12 +29,7 @@ from ...scenes.cameras import Camera
 from ...splats import sh as harmonics
 from ...splats.bundle import Level
 from ...splats.gaussians import SH_C0, Splats
-from .. import method
-from ..data import TrainingView
-from ..density import require_rows
-from ..model import Model
 from ..octree import growing
-from ..schedules import log_linear
 from . import NeuralOctreeParameters
 
 HIDDEN = 32

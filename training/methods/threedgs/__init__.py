@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass, replace
 
-from ..info import MethodInfo
-from ..parameters import PAPER, STANDARD, DensityParameters, parameter
+from ...optimize.method_info import MethodInfo
+from ...optimize.parameters import PAPER, STANDARD, DensityParameters, parameter
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ from dataclasses import replace
 import torch
 
 from ...lod.blocks import spatial_order
+from ...optimize.initialize import from_splats
+from ...optimize.method import Optimizer
+from ...optimize.training_data import TrainingView
 from ...rasterize import Adam, Gaussians
 from ...splats.gaussians import Splats
-from ..data import TrainingView
-from ..method import Optimizer
-from ..start import from_splats
 from . import train as threedgs_train
 
 

@@ -7,16 +7,16 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 
+from ...optimize import method
+from ...optimize.density_control import densify, peak_scores, prune, require_rows, reset_opacities
+from ...optimize.initialize import distinct, from_points, from_splats, sampled
+from ...optimize.method import Drawing
+from ...optimize.model import Model, splat_rates
+from ...optimize.schedules import due, log_linear, shrink_at
+from ...optimize.training_data import TrainingView
 from ...rasterize import contributions
 from ...splats.bundle import Level
 from ...splats.gaussians import Splats
-from .. import method
-from ..data import TrainingView
-from ..density import densify, peak_scores, prune, require_rows, reset_opacities
-from ..method import Drawing
-from ..model import Model, splat_rates
-from ..schedules import due, log_linear, shrink_at
-from ..start import distinct, from_points, from_splats, sampled
 from . import ThreedgsParameters
 
 WEIGHED_AT = (8 / 30, 16 / 30, 24 / 30)

@@ -16,7 +16,7 @@ from scipy.special import logit
 from ...lod.crop import Crop
 from ...lod.forest import joined_trees, longest_of, shape_of, subtrees_of
 from ...lod.tree import Tree
-from ..density import along_longest_axis
+from ...optimize.density_control import along_longest_axis
 from .store import RecordPiece, Store
 
 GROWN = 2
@@ -73,8 +73,8 @@ def _losses(tree: Tree, dead: np.ndarray) -> np.ndarray:
 class Growing:
     """The records of a store after density control, made while its pieces are asked for, which is once.
 
-    Leaves are split along their longest axis (``methods.density``); in 3DGS-MCMC, which the paper follows,
-    both children are copies, which only noise would part. All scores begin anew.
+    Leaves are split along their longest axis (``optimize.density_control``). In 3DGS-MCMC, which the paper
+    follows, both children are copies that only noise separates. All scores are reset.
 
     Args:
         store: stays as it is, with nothing of it in memory.

@@ -20,15 +20,15 @@ import torch
 from ...lod.forest import Forest, ForestShape, Piece, side_by_side
 from ...lod.rules.cut import K_LEAST, detail_of
 from ...lod.tree import Tree
+from ...optimize.memory import free_memory
+from ...optimize.model import NAMES
+from ...optimize.out_of_core.cut_cache import CutCache, NoRoom
+from ...optimize.out_of_core.row_file import FileRows, Layout
 from ...rasterize import Gaussians
 from ...rasterize.hspt import LEAF, Upper, bounds_of, cut_off, image_of, search
 from ...rasterize.records import gather
 from ...scenes.cameras import Camera
 from ...splats.gaussians import Splats
-from ..cuts import CutCache, NoRoom
-from ..memory import free_memory
-from ..model import NAMES
-from ..rows import FileRows, Layout
 
 AT_ONCE = 1 << 14
 """Nodes that are looked at together where all are."""

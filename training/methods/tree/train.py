@@ -19,18 +19,18 @@ import torch
 from ...lod.forest import levels_of
 from ...lod.streaming import BLOCKS
 from ...lod.tree import LEAVES, treeless_columns
+from ...optimize.initialize import from_splats
+from ...optimize.method import Drawing, Made
+from ...optimize.out_of_core.view_order import Walk
+from ...optimize.schedules import due
+from ...optimize.training_data import TrainingView
 from ...rasterize import Gaussians, Rendering, records
 from ...rasterize.adam import LearningRate
 from ...splats.bundle import Level
 from ...splats.gaussians import SplatRows
 from ...splats.ply import Columns
-from ..data import TrainingView
-from ..method import Drawing, Made
-from ..schedules import due
-from ..start import from_splats
 from ..threedgs import train as threedgs_train
 from ..threedgs.refining import Refining
-from ..walk import Walk
 from . import TreeParameters
 from .build import GrowingForest
 from .density import Growing

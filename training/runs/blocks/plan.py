@@ -22,8 +22,8 @@ import numpy as np
 from ...errors import LodgsError
 from ...lod.rule import find_rule
 from ...methods import method_info
-from ...methods.memory import MOST_BYTES, TARGET_BYTES
-from ...methods.parameters import Parameters
+from ...optimize.memory import MOST_BYTES, TARGET_BYTES
+from ...optimize.parameters import Parameters
 from ...scenes.colmap import Scene, read_scene
 from ...scenes.regions import Region, plan_cells
 from ..folder import RunFolder

@@ -11,7 +11,7 @@ from training.lod.rule import facts_of, rules
 from training.lod.selection import select, settings
 from training.methods import create, method_info
 from training.methods.clod.train import ClodDrawing
-from training.methods.parameters import override
+from training.optimize.parameters import override
 from training.rasterize import contributions
 from training.splats.bundle import Bundle
 

@@ -10,12 +10,12 @@ from training.errors import LodgsError
 from training.lod.blocks import SIZE, spatial_order
 from training.lod.rule import every_control
 from training.lod.selection import select, settings
-from training.methods.data import TrainingData
 from training.methods.flod import METHOD, finish
 from training.methods.flod.train import Method, apart
-from training.methods.model import NAMES
-from training.methods.parameters import override
-from training.methods.start import from_splats
+from training.optimize.initialize import from_splats
+from training.optimize.model import NAMES
+from training.optimize.parameters import override
+from training.optimize.training_data import TrainingData
 from training.rasterize import Gaussians, contributions, rasterize
 from training.scenes.colmap import read_scene
 from training.splats.bundle import Bundle, Level

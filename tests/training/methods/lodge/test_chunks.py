@@ -8,7 +8,7 @@ from training.lod.rules.chunks import members as members_of
 from training.methods import create, method_info
 from training.methods.lodge import chunks
 from training.methods.lodge.composite import IndexedLevel
-from training.methods.parameters import override
+from training.optimize.parameters import override
 from training.rasterize import Gaussians
 from training.scenes.cameras import Camera, look_at
 from training.splats.gaussians import Splats

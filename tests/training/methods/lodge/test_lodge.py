@@ -14,8 +14,8 @@ from training.methods import create, method_info
 from training.methods.lodge import LodgeParameters
 from training.methods.lodge.composite import IndexedLevel, Stack, rows_seen, together
 from training.methods.lodge.thresholds import MOST_CURVES, TRIED, Thresholds
-from training.methods.parameters import override
 from training.methods.threedgs.train import WEIGHED_AT
+from training.optimize.parameters import override
 from training.rasterize import Gaussians, contributions, rasterize
 from training.scenes.cameras import Camera
 from training.splats.bundle import MOST_LEVELS, Bundle, Level, read_bundle, write_bundle

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from training.errors import LodgsError
-from training.methods.method import Drawing
 from training.methods.octree import METHOD
 from training.methods.octree.train import Method
-from training.methods.parameters import override
+from training.optimize.method import Drawing
+from training.optimize.parameters import override
 from training.rasterize import Target, photometric_loss, rasterize
 
 

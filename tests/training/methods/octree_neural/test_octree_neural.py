@@ -8,7 +8,7 @@ import torch
 
 from training.methods.octree_neural import METHOD
 from training.methods.octree_neural.train import Method
-from training.methods.parameters import override
+from training.optimize.parameters import override
 from training.rasterize import Gaussians, contributions, rasterize
 from training.runs.arrays import read_arrays
 

@@ -6,8 +6,8 @@ import torch
 
 from training.errors import LodgsError
 from training.methods import create, method_info
-from training.methods.density import peak_scores
-from training.methods.parameters import override
+from training.optimize.density_control import peak_scores
+from training.optimize.parameters import override
 from training.rasterize import contributions, rasterize
 
 

@@ -10,11 +10,11 @@ from tests.training.lod.trees import surfaces
 from tests.training.rasterize.test_hspt import cameras
 from training.errors import LodgsError
 from training.lod.forest import divided, joined, longest_of, shape_of
-from training.methods.cuts import BESIDE, PLACE
-from training.methods.rows import BLOCK, TABLES
 from training.methods.tree import store as store_module
 from training.methods.tree.build import build
 from training.methods.tree.store import Store, layout_of
+from training.optimize.out_of_core.cut_cache import BESIDE, PLACE
+from training.optimize.out_of_core.row_file import BLOCK, TABLES
 from training.rasterize.hspt import Hspt
 
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")

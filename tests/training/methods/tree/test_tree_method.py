@@ -13,9 +13,9 @@ from training.lod.rules.cut import least_size
 from training.lod.selection import Choice, settings
 from training.lod.tree import size_of
 from training.methods import create, method_info
-from training.methods.cuts import BESIDE
-from training.methods.parameters import override
 from training.methods.tree.store import layout_of
+from training.optimize.out_of_core.cut_cache import BESIDE
+from training.optimize.parameters import override
 from training.rasterize import Gaussians, rasterize
 from training.splats.bundle import Bundle
 from training.splats.gaussians import Splats

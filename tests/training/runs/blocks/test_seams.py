@@ -8,8 +8,8 @@ import torch
 
 from training.errors import LodgsError
 from training.methods import create
-from training.methods.data import TrainingData
-from training.methods.parameters import override
+from training.optimize.parameters import override
+from training.optimize.training_data import TrainingData
 from training.runs.blocks import merge as merge_module
 from training.runs.blocks.merge import merge, write_surroundings
 from training.runs.blocks.plan import STILL, Block, Division

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from training.methods.start import from_points, neighbour_distances
+from training.optimize.initialize import from_points, neighbour_distances
 
 
 def test_neighbour_distances_equal_brute_force():

@@ -6,7 +6,7 @@ import pytest
 
 from training.errors import LodgsError
 from training.methods import METHODS, PRESETS, method_info
-from training.methods.parameters import Parameters, override, parameter
+from training.optimize.parameters import Parameters, override, parameter
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,11 @@ from PIL import Image
 from tests.training.conftest import write_tiny_scene
 from training.errors import LodgsError
 from training.methods import METHODS, create
-from training.methods import memory as memory_module
-from training.methods import targets as targets_module
-from training.methods.data import TrainingData
-from training.methods.parameters import override
-from training.methods.targets import TARGET_BYTES, Targets, default_budget
+from training.optimize import image_cache as targets_module
+from training.optimize import memory as memory_module
+from training.optimize.image_cache import TARGET_BYTES, Targets, default_budget
+from training.optimize.parameters import override
+from training.optimize.training_data import TrainingData
 from training.rasterize import Target, photometric_loss
 from training.scenes.cameras import Camera
 from training.scenes.colmap import read_scene

@@ -15,14 +15,14 @@ from ..scenes.cameras import Camera
 from ..splats.bundle import Level
 from ..splats.gaussians import Splats
 from ..splats.ply import Columns
-from .data import TrainingData, TrainingView
-from .density import require_rows
+from .density_control import require_rows
 from .exposure import Exposure
 from .margins import Margins
 from .model import OUTSIDE, PEAKS, Model
 from .parameters import Parameters
 from .schedules import due, log_linear
 from .support import INTERVAL
+from .training_data import TrainingData, TrainingView
 
 DEPTH_FALL = 0.01
 """What is left of the weight of depths at the end."""

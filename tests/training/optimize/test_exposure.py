@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from training.methods import METHODS, create
-from training.methods.exposure import Exposure
+from training.optimize.exposure import Exposure
 from training.rasterize import Target
 
 

@@ -7,7 +7,7 @@ from dataclasses import Field, dataclass, field, fields, replace
 from math import inf, isfinite
 from typing import Any
 
-from ..documents import shown
+from ..documents import quote
 from ..errors import LodgsError
 from ..scenes.depths import KINDS
 
@@ -178,7 +178,7 @@ class Parameters:
 
 @dataclass(frozen=True)
 class DensityParameters(Parameters):
-    """Those of methods that clone, split and prune as 3DGS does (``methods.density``)."""
+    """Those of methods that clone, split and prune as 3DGS does (``optimize.density_control``)."""
 
     first_resolution: float = parameter(
         0.35,
@@ -252,7 +252,7 @@ def override(parameters: Parameters, values: dict) -> Parameters:
     known = {f.name: f for f in fields(parameters)}
     if unknown := sorted(set(values) - set(known)):
         raise LodgsError(
-            f"The job sets the unknown parameter {shown(unknown[0])}.", f"Known are: {', '.join(known)}."
+            f"The job sets the unknown parameter {quote(unknown[0])}.", f"Known are: {', '.join(known)}."
         )
     given = {name: value for name, value in values.items() if value is not None}
     changed: dict[str, Any] = {name: getattr(parameters, name) for name in known} | given
@@ -296,10 +296,10 @@ def _valid(f: Field, value: Any) -> Any:
         most = MOST_WHOLE if isinstance(default, int) else MOST_NUMBER
         if valid and value > most:
             raise LodgsError(
-                f"{f.name} = {shown(value)} is more than any use of it.", f"Give at most {most:g}."
+                f"{f.name} = {quote(value)} is more than any use of it.", f"Give at most {most:g}."
             )
     if not valid:
-        raise LodgsError(f"{f.name} = {shown(value)} is not possible.", f"Give {possible(f)}.")
+        raise LodgsError(f"{f.name} = {quote(value)} is not possible.", f"Give {possible(f)}.")
     return type(default)(value)
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from training.methods.density import constrained_log, densify, peak_scores, prune, reset_opacities
-from training.methods.model import NAMES, Model
+from training.optimize.density_control import constrained_log, densify, peak_scores, prune, reset_opacities
+from training.optimize.model import NAMES, Model
 
 ALL = (*NAMES, "decay")
 

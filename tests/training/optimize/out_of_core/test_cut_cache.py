@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from training.errors import LodgsError
-from training.methods.cuts import BESIDE, PLACE, CutCache
-from training.methods.rows import TABLES, FileRows, Layout
+from training.optimize.out_of_core.cut_cache import BESIDE, PLACE, CutCache
+from training.optimize.out_of_core.row_file import TABLES, FileRows, Layout
 
 LAYOUT = Layout({"values": (4,)})
 GROUPS, SIZE = 20, 30

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from training.lod.blocks import SIZE
-from training.methods.pruning import least_importance, room_taken_over
+from training.optimize.pruning import least_importance, room_taken_over
 
 
 @pytest.mark.parametrize("most, kept", [(100, "abcd"), (11, "abcd"), (10.9, "abd"), (4, "ab"), (3, "b")])

@@ -28,7 +28,7 @@ from uuid import uuid4
 import numpy as np
 import torch
 
-from ..errors import LodgsError
+from ...errors import LodgsError
 
 BLOCK = 16
 """Rows of a block. Of rows that a step brings half as many bytes are written as with 64: blocks are whole."""

@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from training.errors import LodgsError
-from training.methods import rows as rows_module
-from training.methods.rows import FileRows, Layout
+from training.optimize.out_of_core import row_file as rows_module
+from training.optimize.out_of_core.row_file import FileRows, Layout
 from training.runs.checkpoints import read_newest, remove_checkpoints, write_checkpoint
 from training.runs.folder import RunFolder
 
@@ -328,8 +328,8 @@ MEASURED = """
 import json, re, sys
 import numpy as np, torch
 from pathlib import Path
-from training.methods.cuts import CutCache
-from training.methods.rows import FileRows, Layout
+from training.optimize.out_of_core.cut_cache import CutCache
+from training.optimize.out_of_core.row_file import FileRows, Layout
 
 torch.set_num_threads(1)
 budget, times = int(sys.argv[1]), int(sys.argv[2])

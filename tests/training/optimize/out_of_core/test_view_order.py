@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from training.methods.walk import BLOCK, Walk
+from training.optimize.out_of_core.view_order import BLOCK, Walk
 
 CENTERS = np.random.default_rng(0).random((30, 3)) * (4, 1, 2)
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..errors import LodgsError
-from .memory import keep_freed_memory
-from .rows import STAGING, FileRows
-from .schedules import due
+from ...errors import LodgsError
+from ..memory import keep_freed_memory
+from ..schedules import due
+from .row_file import STAGING, FileRows
 
 REUSE = 0.77, 2.0
 """A cut is used again where the distance over that of its making is in here ("A LoD of Gaussians", Eq. 7)."""

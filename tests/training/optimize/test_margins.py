@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from training.methods import METHODS, create
-from training.methods.margins import BEHIND, Margins, blurred
-from training.methods.parameters import override
+from training.optimize.margins import BEHIND, Margins, blurred
+from training.optimize.parameters import override
 from training.rasterize import Gaussians, rasterize
 from training.scenes.cameras import Camera
 from training.splats.gaussians import SH_C0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from training.methods.model import NAMES, Model
+from training.optimize.model import NAMES, Model
 
 ALL = (*NAMES, "decay")
 

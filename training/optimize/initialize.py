@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 
 from ..errors import LodgsError
 from ..splats.gaussians import SH_C0, Splats
-from .density import constrained_log
+from .density_control import constrained_log
 from .model import NAMES
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import Field, dataclass, field, fields
 from typing import Any
 
-from ..documents import shown
+from ..documents import quote
 from ..errors import LodgsError
 from .parameters import Parameters
 
@@ -80,6 +80,6 @@ class MethodInfo:
         """
         if name not in self.presets:
             raise LodgsError(
-                f"There is no preset {shown(name)}.", f"Choose one of: {', '.join(self.presets)}."
+                f"There is no preset {quote(name)}.", f"Choose one of: {', '.join(self.presets)}."
             )
         return self.presets[name]

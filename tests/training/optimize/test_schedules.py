@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from training.methods import METHODS, create
-from training.methods.schedules import shrink_at
+from training.optimize.schedules import shrink_at
 
 
 def test_pixels_grow_evenly_from_the_first_to_all():

@@ -20,9 +20,9 @@ from ..scenes.colmap import Scene
 from ..scenes.depths import Depths
 from ..scenes.exposures import evened
 from ..scenes.images import load_image, load_mask
+from .image_cache import Targets, default_budget
 from .memory import TARGET_BYTES
 from .support import Support
-from .targets import Targets, default_budget
 
 TRIED = 3
 """Photographs that are looked at for whether they are transparent."""

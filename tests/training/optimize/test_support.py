@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from training.methods.support import Support
+from training.optimize.support import Support
 from training.scenes.cameras import Camera
 
 

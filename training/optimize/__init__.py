@@ -1,0 +1,1 @@
+"""The optimiser that methods share: model, density control, training data, losses, regularisation."""
