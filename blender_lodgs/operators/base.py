@@ -11,7 +11,7 @@ from ..data import scenes
 
 
 def report_errors(execute):
-    """Wrap an operator's method so that a LodgsError or a MemoryError is reported and cancels the operator."""
+    """Wrap an operator's method to report a LodgsError or MemoryError and cancel the operator."""
 
     @functools.wraps(execute)
     def wrapper(self, context, *event):

@@ -1,7 +1,7 @@
-"""Select and paint splats as they are seen, by strokes over the viewport, at every level alike.
+"""Brush and lasso strokes over the viewport that select or paint the splats of every level.
 
-Each stroke is one operator and one undo step; the tools of the toolbar start it, and Blender's own operator
-changes the brush's size.
+Each stroke is one operator call and one undo step. Toolbar tools start it; Blender's radial control changes
+the brush size.
 """
 
 from __future__ import annotations
@@ -19,45 +19,47 @@ from ..data import cleaning, painting, scenes
 from ..viewport.strokes import Picture
 from .base import EditLevelsOperator, report_errors
 
-_POINT_APART = 2.0
-"""Pixels that the mouse has to move for a lasso's next corner."""
+_MIN_MOUSE_STEP = 2.0
+"""Minimum distance in pixels between two points of a stroke."""
 
 
 class StrokeOperator(EditLevelsOperator):
-    """An operator that does something to the splats of every level under a stroke over the viewport."""
+    """Base class of operators that change the splats of every level under a stroke over the viewport."""
 
     through: bpy.props.BoolProperty(
-        name="Through", description="Also what other splats hide from the view", options={"SKIP_SAVE"}
+        name="Through",
+        description="Include splats that other splats hide from the view",
+        options={"SKIP_SAVE"},
     )
     radius: bpy.props.IntProperty(
-        name="Radius", description="Of the brush, in pixels", default=40, min=1, max=2000, subtype="PIXEL",
+        name="Radius", description="Radius of the brush", default=40, min=1, max=2000, subtype="PIXEL",
         options={"SKIP_SAVE"},
     )  # fmt: skip
     path: bpy.props.CollectionProperty(
         name="Path", type=bpy.types.OperatorMousePath, options={"HIDDEN", "SKIP_SAVE"}
     )
 
-    as_set = ("radius", "through")
-    """What a stroke that is drawn takes from ``Scene.lodgs_brush``, unless it is given."""
+    brush_settings = ("radius", "through")
+    """Properties that a drawn stroke copies from ``Scene.lodgs_brush`` unless they are set."""
     shape = "BRUSH"
     hardness = 1.0
     footprints = False
-    """Whether splats are hit as far as a brush covers them, not by their means."""
+    """True if a splat is hit in proportion to the brush's cover of its footprint, not by its mean."""
 
     def prepare(self, root: bpy.types.Object) -> None:
-        """Reads what the stroke changes, before it does."""
+        """Store the state that the stroke changes, before it starts."""
         raise NotImplementedError
 
-    def show(self, root: bpy.types.Object, hit: dict[int, np.ndarray]) -> None:
-        """Has viewports show what the stroke has hit so far."""
+    def show(self, root: bpy.types.Object, hits: dict[int, np.ndarray]) -> None:
+        """Preview in viewports the splats that the stroke has hit so far."""
         raise NotImplementedError
 
-    def apply(self, root: bpy.types.Object, hit: dict[int, np.ndarray]) -> str:
-        """Does it; what was done, in words."""
+    def apply(self, root: bpy.types.Object, hits: dict[int, np.ndarray]) -> str:
+        """Apply the stroke and return the operator's report."""
         raise NotImplementedError
 
-    def leave(self, root: bpy.types.Object | None) -> None:
-        """Has viewports show what is, after a stroke that has ended or was cancelled."""
+    def end_preview(self, root: bpy.types.Object | None) -> None:
+        """End the preview after a stroke that was finished or cancelled."""
         raise NotImplementedError
 
     @report_errors
@@ -66,13 +68,13 @@ class StrokeOperator(EditLevelsOperator):
         self.prepare(root)
         path = np.array([point.loc for point in self.path])
         picture = picture_of(context, root)
-        return self._finish(root, self._hit(picture, self._covered(picture, path)))
+        return self._finish(root, self._find_hits(picture, self._cover(picture, path)))
 
     def invoke(self, context, event):
-        return self._begin(context, event)
+        return self._start(context, event)
 
     def modal(self, context, event):
-        result = self._go_on(context, event)
+        result = self._handle_event(context, event)
         if "RUNNING_MODAL" not in result:
             self._stop(context)
         return result
@@ -81,9 +83,9 @@ class StrokeOperator(EditLevelsOperator):
         self._stop(context)
 
     @report_errors
-    def _begin(self, context, event):
+    def _start(self, context, event):
         settings = context.scene.lodgs_brush
-        for name in self.as_set:
+        for name in self.brush_settings:
             if not self.properties.is_property_set(name):
                 setattr(self, name, getattr(settings, name))
         root = scenes.active_root(context)
@@ -91,92 +93,104 @@ class StrokeOperator(EditLevelsOperator):
         self._picture = picture_of(context, root)
         self.prepare(root)
         counts = {item.number: len(item.object.data.points) for item in cleaning.levels(root)}
-        self._found = {number: np.zeros(count, np.float32) for number, count in counts.items()}
-        self._drawn = np.zeros(self._picture.size[::-1], np.float32)
-        self._line = None
+        self._hits = {number: np.zeros(count, np.float32) for number, count in counts.items()}
+        self._stroke_cover = np.zeros(self._picture.size[::-1], np.float32)
+        self._lasso_handle = None
         if self.shape == "LASSO":
-            self._line = context.space_data.draw_handler_add(_draw_path, (self.path,), "WINDOW", "POST_PIXEL")
-        self._go_to(context, event)
+            self._lasso_handle = context.space_data.draw_handler_add(
+                _draw_lasso, (self.path,), "WINDOW", "POST_PIXEL"
+            )
+        self._extend_path(context, event)
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
     @report_errors
-    def _go_on(self, context, event):
+    def _handle_event(self, context, event):
         if event.type in {"MOUSEMOVE", "INBETWEEN_MOUSEMOVE"}:
-            self._go_to(context, event)
+            self._extend_path(context, event)
         elif event.type == "LEFTMOUSE" and event.value == "RELEASE":
-            root = self._same_root(context)
+            root = self._unchanged_root(context)
             if self.shape == "LASSO":
                 path = np.array([point.loc for point in self.path])
-                self._found = self._hit(self._picture, self._covered(self._picture, path))
-            return self._finish(root, self._found)
+                self._hits = self._find_hits(self._picture, self._cover(self._picture, path))
+            return self._finish(root, self._hits)
         elif event.type in {"ESC", "RIGHTMOUSE"} and event.value == "PRESS":
             return {"CANCELLED"}
         return {"RUNNING_MODAL"}
 
-    def _go_to(self, context, event):
-        """Takes the stroke on to the mouse; what a brush hits on the way is shown at once."""
-        here = event.mouse_region_x + 0.5, event.mouse_region_y + 0.5
-        last = np.array(self.path[-1].loc if self.path else here)
-        if self.path and np.linalg.norm(last - here) < _POINT_APART:
+    def _extend_path(self, context, event):
+        """Extend the stroke to the mouse and preview the splats that a brush hits on the way."""
+        mouse = event.mouse_region_x + 0.5, event.mouse_region_y + 0.5
+        last = np.array(self.path[-1].loc if self.path else mouse)
+        if self.path and np.linalg.norm(last - mouse) < _MIN_MOUSE_STEP:
             return
-        self.path.add().loc = here
+        self.path.add().loc = mouse
         context.region.tag_redraw()
         if self.shape == "BRUSH":
-            root = self._same_root(context)
-            covered = self._covered(self._picture, np.array([last, here]))
-            if self.footprints:  # of which one part of the stroke covers less than all of it
-                covered = np.maximum(self._drawn, covered, out=self._drawn)
-            for number, hit in self._hit(self._picture, covered).items():
-                np.maximum(self._found[number], hit, out=self._found[number])
-            self.show(root, self._found)
+            root = self._unchanged_root(context)
+            cover = self._cover(self._picture, np.array([last, mouse]))
+            if self.footprints:  # a footprint can reach beyond this segment of the stroke
+                cover = np.maximum(self._stroke_cover, cover, out=self._stroke_cover)
+            for number, hit in self._find_hits(self._picture, cover).items():
+                np.maximum(self._hits[number], hit, out=self._hits[number])
+            self.show(root, self._hits)
 
-    def _same_root(self, context):
-        """The splat scene, as long as it has the levels with which the stroke began: training may go on."""
+    def _unchanged_root(self, context):
+        """Return the scene root if its levels are unchanged since the stroke began.
+
+        Raises:
+            LodgsError: a level was replaced.
+        """
         root = scenes.active_root(context)
-        there = {item.number: len(item.object.data.points) for item in cleaning.levels(root)}
-        if there != {number: len(hit) for number, hit in self._found.items()}:
-            raise LodgsError("The levels have been renewed during the stroke.", "Draw it again.")
+        counts = {item.number: len(item.object.data.points) for item in cleaning.levels(root)}
+        if counts != {number: len(hit) for number, hit in self._hits.items()}:
+            raise LodgsError("Cannot finish the stroke: training replaced the levels.", "Draw it again.")
         return root
 
-    def _covered(self, picture: Picture, path: np.ndarray) -> np.ndarray:
+    def _cover(self, picture: Picture, path: np.ndarray) -> np.ndarray:
         path = np.reshape(path, (-1, 2))
         if self.shape == "LASSO":
             return lassoed(path, picture.size)
         return brushed(path, self.radius, picture.size, self.hardness)
 
-    def _hit(self, picture: Picture, covered: np.ndarray) -> dict[int, np.ndarray]:
-        return picture.hits(covered, self.through, self.footprints)
+    def _find_hits(self, picture: Picture, cover: np.ndarray) -> dict[int, np.ndarray]:
+        return picture.hits(cover, self.through, self.footprints)
 
-    def _finish(self, root, hit):
-        self.report({"INFO"}, self.apply(root, hit))
+    def _finish(self, root, hits):
+        self.report({"INFO"}, self.apply(root, hits))
         return {"FINISHED"}
 
     def _stop(self, context):
-        self.leave(scenes.active_root(context))
+        self.end_preview(scenes.active_root(context))
         extension.redraw()
-        if self._line is not None:
-            context.space_data.draw_handler_remove(self._line, "WINDOW")
-            self._line = None
+        if self._lasso_handle is not None:
+            context.space_data.draw_handler_remove(self._lasso_handle, "WINDOW")
+            self._lasso_handle = None
 
 
 class LODGS_OT_select_splats(StrokeOperator, bpy.types.Operator):
-    """Select the splats of every level that a stroke over the viewport covers"""
+    """Select the splats of every level under a stroke over the viewport"""
 
     bl_idname = "lodgs.select_splats"
     bl_label = "Select Splats"
     bl_options = {"REGISTER", "UNDO"}
 
     shape: bpy.props.EnumProperty(
-        name="With",
-        description="What the stroke is",
-        items=[("BRUSH", "Brush", "All along the stroke"), ("LASSO", "Lasso", "What the stroke encloses")],
+        name="Shape",
+        description="Shape of the stroke",
+        items=[
+            ("BRUSH", "Brush", "Splats within the radius of the stroke"),
+            ("LASSO", "Lasso", "Splats enclosed by the stroke"),
+        ],
         options={"SKIP_SAVE"},
     )
     action: bpy.props.EnumProperty(
-        name="Do",
-        description="What is done with the splats that are hit",
-        items=[("ADD", "Select", "Select them as well"), ("REMOVE", "Deselect", "Select them no longer")],
+        name="Action",
+        description="Action on the splats under the stroke",
+        items=[
+            ("ADD", "Select", "Add the splats to the selection"),
+            ("REMOVE", "Deselect", "Remove the splats from the selection"),
+        ],
         options={"SKIP_SAVE"},
     )
 
@@ -189,70 +203,75 @@ class LODGS_OT_select_splats(StrokeOperator, bpy.types.Operator):
         layout.prop(self, "through")
 
     def prepare(self, root):
-        self._before = {item.number: cleaning.selected(item.object.data) for item in cleaning.levels(root)}
+        self._selected = {item.number: cleaning.selected(item.object.data) for item in cleaning.levels(root)}
 
-    def show(self, root, hit):
+    def show(self, root, hits):
         remove = self.action == "REMOVE"
         cleaning.show_selected(root, {
-            number: mask & ~(hit[number] > 0) if remove else mask | (hit[number] > 0)
-            for number, mask in self._before.items()
+            number: mask & ~(hits[number] > 0) if remove else mask | (hits[number] > 0)
+            for number, mask in self._selected.items()
         })  # fmt: skip
 
-    def apply(self, root, hit):
-        cleaning.select_also(root, hit, self.action == "REMOVE")
+    def apply(self, root, hits):
+        cleaning.select_also(root, hits, self.action == "REMOVE")
         counts = cleaning.count_selected(root)
         by_level = ", ".join(f"level {number} {count:,}" for number, count in counts.items())
         return f"{sum(counts.values()):,} splats selected: {by_level}"
 
-    def leave(self, root):
+    def end_preview(self, root):
         cleaning.show_selected(root, {})
 
 
 def picture_of(context: bpy.types.Context, root: bpy.types.Object) -> Picture:
-    """What the viewport of a context shows of a splat scene.
+    """Return a splat scene's image in the viewport of a context.
 
     Raises:
         LodgsError: the context has no viewport.
     """
-    area, looks = context.area, context.region_data
+    area = context.area
     region = context.region
+    view = context.region_data
     if area is not None and area.type == "VIEW_3D" and region.type != "WINDOW":
-        region, looks = (next(r for r in area.regions if r.type == "WINDOW"), area.spaces.active.region_3d)
-    if looks is None:
-        raise LodgsError("Strokes need a 3D viewport to be drawn over.", "Move the mouse into one.")
+        region = next(r for r in area.regions if r.type == "WINDOW")
+        view = area.spaces.active.region_3d
+    if view is None:
+        raise LodgsError("Cannot draw a stroke: no 3D viewport is active.", "Move the mouse into one.")
     return Picture(
-        root, context.evaluated_depsgraph_get(), np.array(looks.view_matrix), np.array(looks.window_matrix),
+        root, context.evaluated_depsgraph_get(), np.array(view.view_matrix), np.array(view.window_matrix),
         (region.width, region.height), context.space_data,
     )  # fmt: skip
 
 
 class LODGS_OT_paint_splats(StrokeOperator, bpy.types.Operator):
-    """Paint a colour over the splats of every level that a stroke over the viewport covers"""
+    """Paint a colour on the splats of every level under a stroke over the viewport"""
 
     bl_idname = "lodgs.paint_splats"
     bl_label = "Paint Splats"
     bl_options = {"REGISTER", "UNDO"}
 
     action: bpy.props.EnumProperty(
-        name="Do",
-        description="What is done with the splats that are hit",
-        items=[("PAINT", "Paint", "Put the colour over theirs"), ("ERASE", "Erase", "Bring back their own")],
+        name="Action",
+        description="Action on the splats under the stroke",
+        items=[
+            ("PAINT", "Paint", "Blend the colour over the splats"),
+            ("ERASE", "Erase", "Restore the splats' trained colours"),
+        ],
         options={"SKIP_SAVE"},
     )
     color: bpy.props.FloatVectorProperty(
-        name="Colour", description="What is painted, as the display shows it before the look",
+        name="Colour", description="Colour to paint, before the scene's look is applied",
         default=(0.8, 0.1, 0.1), min=0, max=1, size=3, subtype="COLOR_GAMMA", options={"SKIP_SAVE"},
     )  # fmt: skip
     strength: bpy.props.FloatProperty(
-        name="Strength", description="How much of the colour the stroke puts over the splats' own",
+        name="Strength", description="Opacity of the painted colour over the splats' own",
         default=1.0, min=0, max=1, subtype="FACTOR", options={"SKIP_SAVE"},
     )  # fmt: skip
     hardness: bpy.props.FloatProperty(
-        name="Hardness", description="Share of the radius in which the brush has its full strength",
+        name="Hardness", description="Fraction of the radius at full strength; the rest falls off",
         default=0.5, min=0, max=1, subtype="FACTOR", options={"SKIP_SAVE"},
     )  # fmt: skip
 
-    as_set = ("radius", "through", "color", "strength", "hardness")
+    brush_settings = ("radius", "through", "color", "strength", "hardness")
     footprints = True
 
     def draw(self, context):
@@ -265,25 +284,25 @@ class LODGS_OT_paint_splats(StrokeOperator, bpy.types.Operator):
             layout.prop(self, name)
 
     def prepare(self, root):
-        self._before = painting.read(root)
+        self._paint = painting.read(root)
 
-    def show(self, root, hit):
-        painting.show(root, self._painted(hit))
+    def show(self, root, hits):
+        painting.show(root, self._blend(hits))
 
-    def apply(self, root, hit):
-        count = painting.write(root, self._painted(hit))
-        return f"{count:,} splats of all levels are painted"
+    def apply(self, root, hits):
+        count = painting.write(root, self._blend(hits))
+        return f"{count:,} painted splats in all levels"
 
-    def leave(self, root):
+    def end_preview(self, root):
         painting.show(root, {})
 
-    def _painted(self, hit):
-        share = {number: self.strength * each for number, each in hit.items()}
-        return painting.over(self._before, share, tuple(self.color) if self.action == "PAINT" else None)
+    def _blend(self, hits):
+        alpha = {number: self.strength * hit for number, hit in hits.items()}
+        return painting.over(self._paint, alpha, tuple(self.color) if self.action == "PAINT" else None)
 
 
 class LODGS_OT_remove_paint(EditLevelsOperator, bpy.types.Operator):
-    """Show all splats in their own colours again"""
+    """Remove all paint and restore the splats' trained colours"""
 
     bl_idname = "lodgs.remove_paint"
     bl_label = "Remove Paint"
@@ -295,29 +314,29 @@ class LODGS_OT_remove_paint(EditLevelsOperator, bpy.types.Operator):
             return False
         painted = painting.is_painted(scenes.active_root(context))
         if not painted:
-            cls.poll_message_set("Nothing is painted")
+            cls.poll_message_set("No splats are painted")
         return painted
 
     @report_errors
     def execute(self, context):
         root = scenes.active_root(context)
-        painting.write(root, {number: 0 * there for number, there in painting.read(root).items()})
+        painting.write(root, {number: 0 * paint for number, paint in painting.read(root).items()})
         return {"FINISHED"}
 
 
 class LODGS_OT_select_all_splats(EditLevelsOperator, bpy.types.Operator):
-    """Deselect the splats of all levels, or select just the others"""
+    """Deselect all splats of every level, or invert the selection"""
 
     bl_idname = "lodgs.select_all_splats"
     bl_label = "Select All Splats"
     bl_options = {"REGISTER", "UNDO"}
 
     action: bpy.props.EnumProperty(
-        name="Do",
-        description="What is done",
+        name="Action",
+        description="Change of the selection",
         items=[
-            ("DESELECT", "Deselect", "Select none"),
-            ("INVERT", "Invert", "Select what is not selected, and deselect the rest"),
+            ("DESELECT", "Deselect", "Deselect all splats"),
+            ("INVERT", "Invert", "Invert the selection"),
         ],
     )
 
@@ -332,8 +351,8 @@ class LODGS_OT_select_all_splats(EditLevelsOperator, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def _draw_path(path) -> None:
-    """The line of a lasso, closed."""
+def _draw_lasso(path) -> None:
+    """Draw the closed outline of a lasso."""
     points = [tuple(point.loc) for point in path]
     shader = gpu.shader.from_builtin("POLYLINE_UNIFORM_COLOR")
     shader.uniform_float("viewportSize", gpu.state.viewport_get()[2:])
@@ -347,18 +366,18 @@ def _draw_path(path) -> None:
 _DRAG = {"type": "LEFTMOUSE", "value": "PRESS"}
 
 
-def _selects(shape: str):
-    """Drag selects; with Ctrl or Shift it deselects."""
+def _select_keys(shape: str):
+    """Return key map items: drag selects; Ctrl or Shift deselects."""
     return tuple(
-        ("lodgs.select_splats", _DRAG | held, {"properties": [("shape", shape), ("action", action)]})
-        for held, action in (({}, "ADD"), ({"ctrl": True}, "REMOVE"), ({"shift": True}, "REMOVE"))
+        ("lodgs.select_splats", _DRAG | modifiers, {"properties": [("shape", shape), ("action", action)]})
+        for modifiers, action in (({}, "ADD"), ({"ctrl": True}, "REMOVE"), ({"shift": True}, "REMOVE"))
     )
 
 
-def _turns(name: str, **held):
-    """F and the mouse change a number of the brush."""
+def _radial_key(name: str, **modifiers):
+    """Return the key map item that changes a brush setting with F and the mouse."""
     properties = {"properties": [("data_path_primary", f"scene.lodgs_brush.{name}")]}
-    return "wm.radial_control", {"type": "F", "value": "PRESS"} | held, properties
+    return "wm.radial_control", {"type": "F", "value": "PRESS"} | modifiers, properties
 
 
 def _draw_brush(context, tool, xy) -> None:
@@ -369,14 +388,14 @@ class SplatBrush(bpy.types.WorkSpaceTool):
     """Drag over splats to select them at every level.
 
     \u2022 Ctrl or Shift to deselect.
-    \u2022 F for the size"""
+    \u2022 F to change the radius"""
 
     bl_space_type = "VIEW_3D"
     bl_context_mode = "OBJECT"
     bl_idname = "lodgs.brush"
     bl_label = "Brush Splats"
     bl_icon = "ops.generic.select_circle"
-    bl_keymap = (*_selects("BRUSH"), _turns("radius"))
+    bl_keymap = (*_select_keys("BRUSH"), _radial_key("radius"))
     draw_cursor = staticmethod(_draw_brush)
 
     @staticmethod
@@ -395,7 +414,7 @@ class SplatLasso(bpy.types.WorkSpaceTool):
     bl_idname = "lodgs.lasso"
     bl_label = "Lasso Splats"
     bl_icon = "ops.generic.select_lasso"
-    bl_keymap = _selects("LASSO")
+    bl_keymap = _select_keys("LASSO")
 
     @staticmethod
     def draw_settings(context, layout, tool):
@@ -406,7 +425,7 @@ class SplatPaint(bpy.types.WorkSpaceTool):
     """Drag over splats to paint them at every level.
 
     \u2022 Ctrl to erase.
-    \u2022 F for the size, Shift F for the strength"""
+    \u2022 F to change the radius, Shift F the strength"""
 
     bl_space_type = "VIEW_3D"
     bl_context_mode = "OBJECT"
@@ -416,8 +435,8 @@ class SplatPaint(bpy.types.WorkSpaceTool):
     bl_keymap = (
         ("lodgs.paint_splats", _DRAG, {"properties": [("action", "PAINT")]}),
         ("lodgs.paint_splats", _DRAG | {"ctrl": True}, {"properties": [("action", "ERASE")]}),
-        _turns("radius"),
-        _turns("strength", shift=True),
+        _radial_key("radius"),
+        _radial_key("strength", shift=True),
     )
     draw_cursor = staticmethod(_draw_brush)
 

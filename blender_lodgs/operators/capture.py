@@ -1,4 +1,4 @@
-"""Operators that capture the Blender scene, stop that, and show how well its views cover it."""
+"""Operators that capture the Blender scene as images, cancel a capture and show its coverage."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from .base import report_errors
 
 class LODGS_OT_capture_scene(bpy.types.Operator):
     bl_idname = "lodgs.capture_scene"
-    bl_label = "Capture This Blender Scene"
+    bl_label = "Capture Scene"
     bl_description = (
-        "Render this Blender scene from many views with its own engine, while you work on, and make a COLMAP "
-        "scene of them to train from. What its folder holds already is not rendered again"
+        "Render this Blender scene from many views in the background and write a COLMAP scene to train from; "
+        "views already in the folder are kept"
     )
 
     @report_errors
@@ -32,7 +32,7 @@ class LODGS_OT_capture_scene(bpy.types.Operator):
 class LODGS_OT_cancel_capture(bpy.types.Operator):
     bl_idname = "lodgs.cancel_capture"
     bl_label = "Cancel"
-    bl_description = "Stop rendering views; Capture goes on from there"
+    bl_description = "Stop rendering views; Capture resumes with the next view"
     bl_options = {"INTERNAL"}
 
     @classmethod
@@ -49,8 +49,8 @@ class LODGS_OT_show_coverage(bpy.types.Operator):
     bl_idname = "lodgs.show_coverage"
     bl_label = "Show Coverage"
     bl_description = (
-        "Show as dots what the views will see: green where three of them or more do, orange where two, red "
-        "where one alone, and bare where none does. Press again to hide the dots"
+        "Show as dots how many views see each surface: green for three or more, orange for two, red for one "
+        "and no dot for none"
     )
     bl_options = {"INTERNAL"}
 
@@ -70,10 +70,10 @@ class LODGS_OT_show_coverage(bpy.types.Operator):
 
 class LODGS_OT_import_capture(bpy.types.Operator):
     bl_idname = "lodgs.import_capture"
-    bl_label = "Import What Was Captured"
+    bl_label = "Import Capture"
     bl_description = (
-        "Import the captured cameras, pictures and points, to train from. They lie where this Blender scene "
-        "is: hide its meshes to see splats in their place"
+        "Import the captured cameras, images and points to train from, in place; hide the meshes to see the "
+        "splats"
     )
     bl_options = {"REGISTER", "UNDO"}
 

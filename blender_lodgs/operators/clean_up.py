@@ -1,4 +1,4 @@
-"""Cut a splat scene free: crops, and hiding and deleting of clutter, at every level alike."""
+"""Crop a splat scene, and hide or delete clutter, at every level."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .brush import TOOLS
 
 
 class LODGS_OT_add_crop(EditLevelsOperator, bpy.types.Operator):
-    """Add an object that crops every level of the splat scene: move, turn and scale it like any other"""
+    """Add an object that crops every level of the splat scene; move, rotate and scale it to fit"""
 
     bl_idname = "lodgs.add_crop"
     bl_label = "Crop Splats"
@@ -21,16 +21,19 @@ class LODGS_OT_add_crop(EditLevelsOperator, bpy.types.Operator):
 
     shape: bpy.props.EnumProperty(
         name="Shape",
-        description="What it looks like",
-        items=[("BOX", "Box", "A box"), ("SPHERE", "Sphere", "A sphere, or with other scales an ellipsoid")],
+        description="Shape of the crop",
+        items=[
+            ("BOX", "Box", "Box"),
+            ("SPHERE", "Sphere", "Sphere; scale it unevenly for an ellipsoid"),
+        ],
     )
     keep: bpy.props.EnumProperty(
         name="Keep",
-        description="What is left of the splats",
+        description="Remaining splats",
         items=[
-            ("INSIDE", "Inside", "What lies in the crop stays"),
-            ("OUTSIDE", "Outside", "What lies in the crop goes"),
-            ("ALL", "All", "Nothing goes: what lies in the crop can be given a look of its own"),
+            ("INSIDE", "Inside", "Keep the splats inside the crop"),
+            ("OUTSIDE", "Outside", "Keep the splats outside the crop"),
+            ("ALL", "All", "Keep all splats, to give those inside the crop their own look"),
         ],
     )
 
@@ -43,7 +46,10 @@ class LODGS_OT_add_crop(EditLevelsOperator, bpy.types.Operator):
 def add_crop(
     context: bpy.types.Context, root: bpy.types.Object, shape: str, keep: str = "INSIDE"
 ) -> bpy.types.Object:
-    """A crop around most of a scene's splats, selected; one that cuts out is a third as large."""
+    """Add a crop around most of a scene's splats and select it.
+
+    Unless it keeps the inside, the crop is a third as large.
+    """
     if context.mode != "OBJECT":
         bpy.ops.object.mode_set(mode="OBJECT")
     context.view_layer.update()
@@ -52,15 +58,15 @@ def add_crop(
     if shape == "SPHERE":
         half[:] = half.max()
     obj = crops.new_crop(root, shape, Matrix.LocRotScale((low + high) / 2, None, half), keep)
-    for other in context.selected_objects:
-        other.select_set(False)
+    for selected in context.selected_objects:
+        selected.select_set(False)
     obj.select_set(True)
     context.view_layer.objects.active = obj
     return obj
 
 
 class LODGS_OT_add_region(SceneOperator, bpy.types.Operator):
-    """Add a box of which the inside is trained in detail, and all else coarsely: move, turn and scale it"""
+    """Add a box to train in detail, while everything outside is trained coarsely"""
 
     bl_idname = "lodgs.add_region"
     bl_label = "Add Region"
@@ -74,7 +80,7 @@ class LODGS_OT_add_region(SceneOperator, bpy.types.Operator):
 
 
 class LODGS_OT_remove_crop(EditLevelsOperator, bpy.types.Operator):
-    """Remove this crop; what it left out is there again"""
+    """Remove this crop and show the splats that it cut away"""
 
     bl_idname = "lodgs.remove_crop"
     bl_label = "Remove Crop"
@@ -93,48 +99,52 @@ class LODGS_OT_remove_crop(EditLevelsOperator, bpy.types.Operator):
                     context.view_layer.objects.active = root
                 return {"FINISHED"}
         raise LodgsError(
-            f"'{root.name}' has no crop of the name '{self.name}'.", "Choose one of the panel's."
+            f"Cannot remove crop: '{root.name}' has no crop '{self.name}'.",
+            "Choose a crop of the Clean Up panel.",
         )
 
 
 class LODGS_OT_hide_splats(EditLevelsOperator, bpy.types.Operator):
-    """Hide splats of every level, or select them for Edit Mode; hidden ones can be shown again"""
+    """Hide the matching splats of every level, or select them for Edit Mode"""
 
     bl_idname = "lodgs.hide_splats"
     bl_label = "Hide Splats"
     bl_options = {"REGISTER", "UNDO"}
 
-    test: bpy.props.EnumProperty(name="Which", description="Which splats are found", items=cleaning.TESTS)
+    test: bpy.props.EnumProperty(name="Splats", description="Splats to match", items=cleaning.TESTS)
     action: bpy.props.EnumProperty(
-        name="Do",
-        description="What is done with them",
+        name="Action",
+        description="Action on the matching splats",
         items=[
-            ("HIDE", "Hide", "Hide them everywhere: in viewports, renders and exports"),
-            ("SELECT", "Select", "Select them, to be looked at and changed in Edit Mode"),
+            ("HIDE", "Hide", "Hide them in viewports, renders and exports until they are shown again"),
+            ("SELECT", "Select", "Select them, to inspect or edit them in Edit Mode"),
         ],
         options={"SKIP_SAVE"},
     )
     size: bpy.props.FloatProperty(
-        name="Size", description="Find splats with a larger standard deviation, along their longest axis",
+        name="Size", description="Match splats whose largest standard deviation exceeds this",
         default=1.0, min=0.0, subtype="DISTANCE", options={"SKIP_SAVE"},
     )  # fmt: skip
     opacity: bpy.props.FloatProperty(
-        name="Opacity", description="Find splats of less opacity", default=0.05, min=0.0, max=1.0,
+        name="Opacity", description="Match splats less opaque than this", default=0.05, min=0.0, max=1.0,
         subtype="FACTOR",
     )  # fmt: skip
     distance: bpy.props.FloatProperty(
-        name="Distance", description="Find splats farther than this from every camera", default=10.0,
+        name="Distance", description="Match splats farther than this from every camera", default=10.0,
         min=0.0, subtype="DISTANCE", options={"SKIP_SAVE"},
     )  # fmt: skip
     views: bpy.props.IntProperty(
-        name="Views", description="Find splats in the frames of fewer cameras than this", default=3, min=1
+        name="Views",
+        description="Match splats inside the frames of fewer cameras than this",
+        default=3,
+        min=1,
     )
     gap: bpy.props.FloatProperty(
-        name="Gap", description="Nothing nearer than this is apart, nothing farther than twice this together",
+        name="Gap", description="Merge clusters closer than this; clusters twice as far apart stay separate",
         default=0.0, min=0.0, subtype="DISTANCE", options={"SKIP_SAVE"},
     )  # fmt: skip
     share: bpy.props.FloatProperty(
-        name="Largest Cluster", description="Clusters with more of all splats than this are no floaters",
+        name="Largest Cluster", description="Keep clusters with more than this share of all splats",
         default=100 * SHARE, min=0.0, max=100.0, precision=2, subtype="PERCENTAGE",
     )  # fmt: skip
 
@@ -156,19 +166,19 @@ class LODGS_OT_hide_splats(EditLevelsOperator, bpy.types.Operator):
     @report_errors
     def execute(self, context):
         root = scenes.active_root(context)
-        found = self._found(context, root)
-        count = sum(int(mask.sum()) for mask in found.values())
-        by_level = ", ".join(f"level {number} {mask.sum():,}" for number, mask in found.items())
+        matches = self._matches(context, root)
+        count = sum(int(mask.sum()) for mask in matches.values())
+        by_level = ", ".join(f"level {number} {mask.sum():,}" for number, mask in matches.items())
         if self.action == "SELECT":
-            cleaning.select(root, found)
+            cleaning.select(root, matches)
             self.report({"INFO"}, f"{count:,} splats selected: {by_level}")
             return {"FINISHED"}
         if count:
-            cleaning.hide(root, found)
+            cleaning.hide(root, matches)
         self.report({"INFO"}, f"{count:,} splats hidden: {by_level}")
         return {"FINISHED"}
 
-    def _found(self, context, root):
+    def _matches(self, context, root):
         if self.test == "FLOATERS":
             return cleaning.find_floaters(context, root, self.gap, self.share / 100)
         if self.test == "FAR":
@@ -183,7 +193,7 @@ class LODGS_OT_hide_splats(EditLevelsOperator, bpy.types.Operator):
 
 
 class LODGS_OT_show_hidden_splats(EditLevelsOperator, bpy.types.Operator):
-    """Show all hidden splats of the scene again"""
+    """Show all hidden splats of the scene"""
 
     bl_idname = "lodgs.show_hidden_splats"
     bl_label = "Show Hidden Splats"
@@ -191,15 +201,15 @@ class LODGS_OT_show_hidden_splats(EditLevelsOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        self.report({"INFO"}, f"{cleaning.show_all(scenes.active_root(context)):,} splats shown again")
+        self.report({"INFO"}, f"{cleaning.show_all(scenes.active_root(context)):,} hidden splats shown")
         return {"FINISHED"}
 
 
 class LODGS_OT_delete_left_out(EditLevelsOperator, bpy.types.Operator):
-    """Delete the splats that are hidden or cropped, of every level, and the crops with them"""
+    """Delete all hidden and cropped splats of every level, and remove the crops"""
 
     bl_idname = "lodgs.delete_left_out"
-    bl_label = "Delete What Is Left Out"
+    bl_label = "Delete Hidden Splats"
     bl_options = {"REGISTER", "UNDO"}
 
     @report_errors
@@ -220,26 +230,27 @@ class LODGS_MT_clean_up(bpy.types.Menu):
     def draw(self, context):
         layout = self.layout
         for shape, icon in (("BOX", "MESH_CUBE"), ("SPHERE", "MESH_UVSPHERE")):
-            operator = layout.operator("lodgs.add_crop", text=f"Crop Splats to a {shape.title()}", icon=icon)
+            operator = layout.operator("lodgs.add_crop", text=f"Crop Splats to {shape.title()}", icon=icon)
             operator.shape = shape
         layout.separator()
         for test, name, _ in cleaning.TESTS:
-            layout.operator("lodgs.hide_splats", text=f"Hide {_named(test, name)}").test = test
+            layout.operator("lodgs.hide_splats", text=f"Hide {_object_of(test, name)}").test = test
         layout.separator()
         for test, name, _ in cleaning.TESTS[:-1]:
-            operator = layout.operator("lodgs.hide_splats", text=f"Select {_named(test, name)}")
+            operator = layout.operator("lodgs.hide_splats", text=f"Select {_object_of(test, name)}")
             operator.test, operator.action = test, "SELECT"
         for tool in TOOLS if context.mode == "OBJECT" else ():
             layout.operator("wm.tool_set_by_id", text=tool.bl_label).name = tool.bl_idname
-        for action, name in (("DESELECT", "Deselect Splats"), ("INVERT", "Invert Selected Splats")):
+        for action, name in (("DESELECT", "Deselect Splats"), ("INVERT", "Invert Splat Selection")):
             layout.operator("lodgs.select_all_splats", text=name).action = action
         layout.separator()
         layout.operator("lodgs.show_hidden_splats")
-        layout.operator("lodgs.delete_left_out", text="Delete Hidden and Cropped Splats")
+        layout.operator("lodgs.delete_left_out")
 
 
-def _named(test: str, name: str) -> str:
-    return {"UNSEEN": "Splats Seen by Few", "FLOATERS": "Floating Splats"}.get(test, f"{name} Splats")
+def _object_of(test: str, name: str) -> str:
+    """Return the noun of a menu entry for a test of ``cleaning.TESTS``."""
+    return {"UNSEEN": "Rarely Seen Splats", "FLOATERS": "Floaters"}.get(test, f"{name} Splats")
 
 
 def _menu(self, context):

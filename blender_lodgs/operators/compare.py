@@ -1,4 +1,4 @@
-"""Comparing views with their photographs."""
+"""Operators that compare views with their photos."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from ..runs import processes
 from .base import report_errors
 
 
-class _OnViews:
-    """An operator that acts on the views of the active splat scene."""
+class _ViewsOperator:
+    """Base class of operators on the views of the active splat scene."""
 
     @classmethod
     def poll(cls, context):
         root = scenes.root_with_levels(context)
         if root is None or not photographs.photographed(root):
-            cls.poll_message_set("Select a splat scene that has levels and photographs")
+            cls.poll_message_set("Select a splat scene with levels and photos first")
             return False
         return True
 
 
-class LODGS_OT_measure_views(_OnViews, bpy.types.Operator):
-    """Render every view and say how alike it is to its photograph (PSNR); the splats are those shown now"""
+class LODGS_OT_measure_views(_ViewsOperator, bpy.types.Operator):
+    """Render every view with the visible splats and compare it with its photo (PSNR)"""
 
     bl_idname = "lodgs.measure_views"
     bl_label = "Measure Views"
@@ -40,7 +40,7 @@ class LODGS_OT_measure_views(_OnViews, bpy.types.Operator):
 
 
 class LODGS_OT_cancel_measuring(bpy.types.Operator):
-    """Stop measuring; what has been measured stays"""
+    """Stop measuring and keep the values measured so far"""
 
     bl_idname = "lodgs.cancel_measuring"
     bl_label = "Cancel Measuring"
@@ -54,39 +54,42 @@ class LODGS_OT_cancel_measuring(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class _Compare(_OnViews):
-    """Compares a view, and looks through it."""
+class _CompareOperator(_ViewsOperator):
+    """Base class of operators that compare a view and look through it."""
 
     def view(self, context: bpy.types.Context) -> bpy.types.Object | None:
-        """The camera object that is compared."""
+        """Return the camera object to compare."""
         raise NotImplementedError
 
     @report_errors
     def execute(self, context):
         root, view = scenes.active_root(context), self.view(context)
         if view not in photographs.views(root):
-            raise LodgsError("The scene's camera is none of the views.", "Choose one in the list.")
-        found = compare.show(context, root, view)
+            raise LodgsError(
+                "Cannot compare: the active camera is not a view of this splat scene.",
+                "Choose a view in the list.",
+            )
+        comparison = compare.show(context, root, view)
         if context.region_data is not None:
             context.region_data.view_perspective = "CAMERA"
-        seen = ", held out" if photographs.is_held_out(root, view) else ""
-        self.report({"INFO"}, f"{view.name}: {found.psnr:.2f} dB{seen}")
+        suffix = ", held out" if photographs.is_held_out(root, view) else ""
+        self.report({"INFO"}, f"{view.name}: {comparison.psnr:.2f} dB{suffix}")
         return {"FINISHED"}
 
 
-class LODGS_OT_compare_view(_Compare, bpy.types.Operator):
-    """Put the photograph of the scene's camera over its rendered picture, with a wipe"""
+class LODGS_OT_compare_view(_CompareOperator, bpy.types.Operator):
+    """Render the active camera's view and compare it with its photo by a wipe"""
 
     bl_idname = "lodgs.compare_view"
-    bl_label = "Compare View With Photograph"
+    bl_label = "Compare with Photo"
     bl_options = {"REGISTER", "UNDO"}
 
     def view(self, context):
         return context.scene.camera
 
 
-class LODGS_OT_compare_worst(_Compare, bpy.types.Operator):
-    """Compare the view that was least like its photograph when measured"""
+class LODGS_OT_compare_worst(_CompareOperator, bpy.types.Operator):
+    """Compare the view with the lowest measured PSNR"""
 
     bl_idname = "lodgs.compare_worst"
     bl_label = "Compare Worst View"

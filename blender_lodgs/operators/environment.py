@@ -1,4 +1,4 @@
-"""Operators for the trainer's environment, offered in the preferences."""
+"""Operators that install and check the trainer's Python environment, for the preferences."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from .base import report_errors
 
 class LODGS_OT_make_environment(bpy.types.Operator):
     bl_idname = "lodgs.make_environment"
-    bl_label = "Make Environment"
+    bl_label = "Install Trainer"
     bl_description = (
-        "Download PyTorch and what else training needs into a folder of its own. The environment that is "
-        "there serves until the new one has been tried"
+        "Download PyTorch and the trainer's other packages into a separate folder; a working environment is "
+        "replaced only after the new one passes its test"
     )
     bl_options = {"INTERNAL"}
 
@@ -30,7 +30,7 @@ class LODGS_OT_make_environment(bpy.types.Operator):
 class LODGS_OT_cancel_environment(bpy.types.Operator):
     bl_idname = "lodgs.cancel_environment"
     bl_label = "Cancel"
-    bl_description = "Stop making the environment and remove what is there of it"
+    bl_description = "Stop the installation and remove its files"
     bl_options = {"INTERNAL"}
 
     @classmethod
@@ -45,8 +45,8 @@ class LODGS_OT_cancel_environment(bpy.types.Operator):
 
 class LODGS_OT_check_environment(bpy.types.Operator):
     bl_idname = "lodgs.check_environment"
-    bl_label = "Check"
-    bl_description = "Say what the trainer's Python lacks, if anything, and what this computer can train on"
+    bl_label = "Check Trainer"
+    bl_description = "Report missing packages of the trainer's Python, and the devices it can train on"
     bl_options = {"INTERNAL"}
 
     @report_errors
@@ -55,7 +55,7 @@ class LODGS_OT_check_environment(bpy.types.Operator):
         if not report.ok:
             self.report({"ERROR"}, "\n".join(report.problems))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"Ready to train with PyTorch {report.versions['torch']}.")
+        self.report({"INFO"}, f"Ready to train with PyTorch {report.versions['torch']}")
         return {"FINISHED"}
 
 

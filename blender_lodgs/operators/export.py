@@ -13,16 +13,24 @@ from ...training.lod.paging import is_tree
 from ...training.lod.tree import complete_levels
 from ...training.lod.unfiltered import without_filter
 from ...training.splats.bundle import Bundle, Level, write_bundle, write_folder
-from ...training.splats.formats import FORMATS, PLY, STREAMED, Format, format_of, write_splats, write_streamed
+from ...training.splats.formats import (
+    FORMATS,
+    PLY,
+    STREAMED_FILE,
+    SplatFormat,
+    find_format,
+    write_splats,
+    write_streamed_levels,
+)
 from ..data import scenes, selection
 from ..data.objects import megabytes, sh_degree
 from .base import ReadLevelsOperator, report_errors
 from .modal import BackgroundOperator
 
-_SOG = format_of(Path("level.sog"))
+_SOG = find_format(Path("level.sog"))
 
 
-def _size(context: bpy.types.Context, kind: Format, level: int = 0) -> str:
+def _size(context: bpy.types.Context, kind: SplatFormat, level: int = 0) -> str:
     """About how large a file of the active scene's splats gets.
 
     Args:
@@ -200,7 +208,7 @@ class LODGS_OT_export_plain(_ForOthers, _Export, _Converting, bpy.types.Operator
         layout.prop(self, "placed")
         layout.prop(self, "looked")
         row = layout.row()
-        told = format_of(Path(f"splats{self.kind}")).antialiased
+        told = find_format(Path(f"splats{self.kind}")).antialiased
         row.active = scenes.active_root(context).lodgs.antialias and not told
         row.prop(self, "antialiased")
         layout.label(text="Format, and about how large:")
@@ -218,7 +226,7 @@ class LODGS_OT_export_plain(_ForOthers, _Export, _Converting, bpy.types.Operator
             splats = scenes.shown_splats(context, root, self.placed, self.looked)
         meta, path = selection.read_json(root.lodgs.meta), self._path()
         form = Bundle("", [Level(1, splats)], meta=meta, tables=scenes.view_tables(root, self.placed))
-        if not (self.antialiased or format_of(path).antialiased):
+        if not (self.antialiased or find_format(path).antialiased):
             form = without_filter(form)
         yield from self.told(write_splats(path, form.levels[0].rows, form.meta))
         self.written = f"{len(splats):,} splats written to {self._path()}"
@@ -287,8 +295,8 @@ class LODGS_OT_export_streamed(_ForOthers, _IntoFolder, _Converting, bpy.types.O
     def work(self, context):
         bundle = self._bundle(context)
         bundle = bundle if self.antialiased else without_filter(bundle)
-        yield from self.told(write_streamed(self._folder(), bundle))
-        self.written = f"{_levels(bundle)} written: {self._folder() / STREAMED}"
+        yield from self.told(write_streamed_levels(self._folder(), bundle))
+        self.written = f"{_levels(bundle)} written: {self._folder() / STREAMED_FILE}"
 
 
 def _levels(bundle: Bundle) -> str:

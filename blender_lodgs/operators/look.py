@@ -1,4 +1,4 @@
-"""The look of a splat scene: back to how it was trained."""
+"""Reset the look of a splat scene or of one of its crops."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from .base import SceneOperator, report_errors
 
 
 class LODGS_OT_reset_look(SceneOperator, bpy.types.Operator):
-    """Show the splats as they were trained"""
+    """Reset the look, so that the splats appear as trained"""
 
     bl_idname = "lodgs.reset_look"
     bl_label = "Reset Look"
     bl_options = {"REGISTER", "UNDO"}
 
     name: bpy.props.StringProperty(
-        name="Crop", description="Name of the crop whose look is reset; empty: the look everywhere"
+        name="Crop", description="Crop whose look is reset; empty for the look of the whole scene"
     )
 
     @report_errors
@@ -27,15 +27,17 @@ class LODGS_OT_reset_look(SceneOperator, bpy.types.Operator):
 
 
 def reset_look(root: bpy.types.Object, name: str = "") -> None:
-    """Gives a scene, or one of its crops by name, the look that changes nothing.
+    """Reset the look of a scene, or of one of its crops by name, to the neutral look.
 
     Raises:
-        LodgsError: there is no such crop.
+        LodgsError: the scene has no such crop.
     """
-    named = {obj.name: obj for obj in crops.crops_of(root)} | {"": root}
-    if name not in named:
-        raise LodgsError(f"'{root.name}' has no crop of the name '{name}'.", "Choose one of the panel's.")
-    looks.reset(root, named[name])
+    targets = {obj.name: obj for obj in crops.crops_of(root)} | {"": root}
+    if name not in targets:
+        raise LodgsError(
+            f"Cannot reset look: '{root.name}' has no crop '{name}'.", "Choose a crop of the Look panel."
+        )
+    looks.reset(root, targets[name])
 
 
 CLASSES = (LODGS_OT_reset_look,)

@@ -204,7 +204,7 @@ def test_a_look_is_undone_saved_duplicated_and_reset(bpy, lodgs, looking, tmp_pa
         bpy.ops.lodgs.remove_crop(name=region.name)
     bpy.context.view_layer.update()
     assert looks.modifier_of(obj) is None and looks.modifier_of(root.lodgs.levels[0].object)
-    with pytest.raises(RuntimeError, match="no crop of the name"):
+    with pytest.raises(RuntimeError, match="has no crop"):
         bpy.ops.lodgs.reset_look(name="nobody")
 
 

@@ -288,7 +288,7 @@ def test_what_cannot_be_compared_is_reported(bpy, lodgs, root, renderer):
     with pytest.raises(RuntimeError, match="has no photograph"):
         bpy.ops.lodgs.compare_view()
     bpy.context.scene.camera = None
-    with pytest.raises(RuntimeError, match="none of the views"):
+    with pytest.raises(RuntimeError, match="not a view"):
         bpy.ops.lodgs.compare_view()
 
 
