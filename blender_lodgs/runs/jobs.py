@@ -19,7 +19,7 @@ import numpy as np
 from ...training.errors import LodgsError
 from ...training.lod.selection import complete
 from ...training.methods import method_info, parameters_of
-from ...training.methods.parameters import Parameters
+from ...training.optimize.parameters import Parameters
 from ...training.runs.folder import RunFolder
 from ...training.runs.job import CHANGEABLE, DOME, Job
 from ...training.scenes.cameras import write_camera
@@ -158,12 +158,12 @@ def cancel(root: bpy.types.Object) -> None:
         if watch.process is not None:
             watch.process.kill()
         else:
-            watch.folder.end()
+            watch.folder.kill()
         for number in {each["block"] for each in watch.blocks}:  # with nobody to begin them again
             part = watch.part(number)
             with suppress(LodgsError, OSError):
                 if part is not None:
-                    part.folder.end()
+                    part.folder.kill()
     extension.redraw()
 
 
@@ -346,7 +346,7 @@ def _hand_over(root: bpy.types.Object, run: RunFolder, job: Job) -> None:
     views = []
     if job.capture:
         views = viewpoints.placed(bpy.context, root, complete(bundle, bundle.levels[-1]))
-    run.make()
+    run.create()
     write_bundle(run.base, bundle)
     for number, (camera, near) in enumerate(views):
         write_camera(run.cameras / f"{number:04d}.json", camera, near)
@@ -440,7 +440,7 @@ def _launch(
     environment.require(python, at_once)
     if hand_over:
         _hand_over(root, run, job)
-    run.make()
+    run.create()
     if write:
         job.resolved().write(run.job)
     what = ["train", str(run.job), "--out", str(run.path)]
