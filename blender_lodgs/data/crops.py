@@ -16,7 +16,7 @@ from ...training.lod.crop import Crop
 from .. import compat
 from ..attributes import HIDDEN
 from ..nodes import crops as groups
-from ..nodes.building import fresh_driver, modifier_with, take_away
+from ..nodes.building import find_modifier, remove_modifier, replace_driver
 from .placement import axes_of
 
 DRAWN_AS = {"BOX": "CUBE", "SPHERE": "SPHERE"}
@@ -83,7 +83,7 @@ def of_modifier(
         is_on: says of a modifier whether it is on.
     """
     modifier = modifier_of(evaluated)
-    count = groups.crops_of_group(modifier.node_group) if modifier is not None else None
+    count = groups.crop_count(modifier.node_group) if modifier is not None else None
     if count is None or not is_on(modifier):
         return None
     to_own, found = evaluated.matrix_world.inverted_safe(), []
@@ -115,13 +115,13 @@ def outdated(root: bpy.types.Object) -> bool:
     levels = [item.object for item in root.lodgs.levels if item.exists]
     given = [modifier.node_group for obj in levels if (modifier := modifier_of(obj))]
     return any(followed_by(obj) != crops for obj in levels) or not all(
-        groups.serves(group, len(crops)) for group in given
+        groups.is_current(group, len(crops)) for group in given
     )
 
 
 def modifier_of(obj: bpy.types.Object) -> bpy.types.NodesModifier | None:
     """The modifier of a level that follows crops, of any version."""
-    return modifier_with(obj, groups.COUNT)
+    return find_modifier(obj, groups.COUNT)
 
 
 def followed_by(obj: bpy.types.Object, count_key: str = groups.COUNT) -> list[bpy.types.Object | None]:
@@ -130,7 +130,7 @@ def followed_by(obj: bpy.types.Object, count_key: str = groups.COUNT) -> list[bp
     Args:
         count_key: the custom property by which its group tells how many it has places for.
     """
-    modifier = modifier_with(obj, count_key)
+    modifier = find_modifier(obj, count_key)
     if modifier is None or modifier.node_group is None:
         return []
     count = range(1, modifier.node_group[count_key] + 1)
@@ -142,7 +142,7 @@ def detach(obj: bpy.types.Object) -> None:
     """Takes the modifier that follows crops off a level, or a copy of one."""
     modifier = modifier_of(obj)
     if modifier is not None:
-        take_away(obj, modifier)
+        remove_modifier(obj, modifier)
 
 
 def _is_under(obj: bpy.types.Object | None, root: bpy.types.Object) -> bool:
@@ -163,7 +163,11 @@ def _crop(
 
 def _attach(obj: bpy.types.Object, crops: list[bpy.types.Object]) -> None:
     modifier = modifier_of(obj)
-    if modifier is not None and groups.serves(modifier.node_group, len(crops)) and followed_by(obj) == crops:
+    if (
+        modifier is not None
+        and groups.is_current(modifier.node_group, len(crops))
+        and followed_by(obj) == crops
+    ):
         return
     detach(obj)
     modifier = obj.modifiers.new(groups.NAME, "NODES")
@@ -189,7 +193,7 @@ def follow(
     for name, source, expression, without in driven:
         if compat.has_input(modifier, name.format(number)):
             path = compat.input_path(modifier, name.format(number))
-            read_from(fresh_driver(obj, path, expression), crop, source, without)
+            read_from(replace_driver(obj, path, expression), crop, source, without)
 
 
 def read_from(driver: bpy.types.Driver, obj: bpy.types.Object, source: str, without: float) -> None:

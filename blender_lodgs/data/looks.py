@@ -21,7 +21,7 @@ from ...training.lod.paint import COLUMNS as PAINT
 from .. import compat
 from ..nodes import ellipsoids
 from ..nodes import look as groups
-from ..nodes.building import fresh_driver, modifier_with, switched, take_away
+from ..nodes.building import add_switched_modifier, find_modifier, remove_modifier, replace_driver
 from . import crops
 from .objects import root_of
 
@@ -152,7 +152,7 @@ def attach(root: bpy.types.Object) -> None:
 
 def modifier_of(obj: bpy.types.Object) -> bpy.types.NodesModifier | None:
     """The modifier of a level that shows looks, of any version."""
-    return modifier_with(obj, groups.COUNT)
+    return find_modifier(obj, groups.COUNT)
 
 
 def outdated(root: bpy.types.Object) -> bool:
@@ -181,12 +181,12 @@ def _attach(obj: bpy.types.Object, root: bpy.types.Object, regions: list[bpy.typ
     modifier = modifier_of(obj)
     if (
         modifier is not None
-        and groups.serves(modifier.node_group, len(regions))
+        and groups.is_current(modifier.node_group, len(regions))
         and crops.followed_by(obj, groups.COUNT) == regions
     ):
         return
     detach(obj)
-    modifier = switched(
+    modifier = add_switched_modifier(
         obj, groups.look_group(len(regions)),
         show_viewport="lodgs_viewport.points", show_render="lodgs_render.draws_points",
     )  # fmt: skip
@@ -196,14 +196,14 @@ def _attach(obj: bpy.types.Object, root: bpy.types.Object, regions: list[bpy.typ
     for number, source in enumerate((root, *regions)):
         if number:
             crops.follow(obj, modifier, number, source)
-            driver = fresh_driver(obj, compat.input_path(modifier, groups.BEYOND.format(number)), "value")
+            driver = replace_driver(obj, compat.input_path(modifier, groups.BEYOND.format(number)), "value")
             crops.read_from(driver, source, "lodgs_look.outside", 0.0)
         for row, name in enumerate(groups.ROWS):
             path = compat.input_path(modifier, name.format(number))
             for column in range(3):
-                driver = fresh_driver(obj, path, "value", column)
+                driver = replace_driver(obj, path, "value", column)
                 crops.read_from(driver, source, f"lodgs_look.matrix[{3 * row + column}]", row == column)
-        driver = fresh_driver(obj, compat.input_path(modifier, groups.OPACITY.format(number)), "value")
+        driver = replace_driver(obj, compat.input_path(modifier, groups.OPACITY.format(number)), "value")
         crops.read_from(driver, source, "lodgs_look.opacity", 1.0)
 
 
@@ -211,7 +211,7 @@ def detach(obj: bpy.types.Object) -> None:
     """Takes the modifier that shows looks off a level."""
     modifier = modifier_of(obj)
     if modifier is not None:
-        take_away(obj, modifier)
+        remove_modifier(obj, modifier)
 
 
 CLASSES = (LookSettings,)

@@ -22,7 +22,7 @@ from .. import compat
 from ..nodes import crops as crop_groups
 from ..nodes import look as look_groups
 from ..nodes import rules as groups
-from ..nodes.building import fresh_driver, take_away
+from ..nodes.building import remove_modifier, replace_driver
 from ..nodes.display import NAME as DISPLAY
 from . import crops, looks
 from .placement import axes_of
@@ -43,12 +43,12 @@ def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Choic
     def value(name: str):
         return compat.get_input(modifier, name)
 
-    held = value(groups.FREEZE) or value(groups.EYE) >= groups.HELD
-    whose = groups.EYES[min(max(value(groups.EYE), 0), groups.HELD)]
+    held = value(groups.FREEZE) or value(groups.CAMERA_SOURCE) >= groups.VIEW_SOURCE
+    whose = groups.CAMERA_SOURCES[min(max(value(groups.CAMERA_SOURCE), 0), groups.VIEW_SOURCE)]
     if held or whose == "TRAINING":
-        eye = tuple(value(groups.EYE_POSITION))
+        eye = tuple(value(groups.CAMERA_POSITION))
     else:
-        obj = depsgraph.scene.camera if whose == "CAMERA" else value(groups.EYE_OBJECT)
+        obj = depsgraph.scene.camera if whose == "CAMERA" else value(groups.CAMERA_OBJECT)
         eye = (0.0, 0.0, 0.0)  # as geometry nodes have it without an object
         if obj is not None:
             place = obj.evaluated_get(depsgraph).matrix_world.translation
@@ -56,7 +56,7 @@ def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Choic
     return Choice(
         rule.name,
         eye,
-        value(groups.HELD_FOCAL if held else groups.FOCAL),
+        value(groups.STORED_FOCAL if held else groups.FOCAL),
         tuple((name, value(name)) for name in fact_names(rule)),
         tuple((control.name, value(control.name)) for control in rule.controls),
         tuple((name, _frozen(value(groups.table_socket(name)))) for name in rule.tables),
@@ -83,8 +83,8 @@ def _chooses(group: bpy.types.NodeTree | None) -> bool:
     """Whether a modifier's group is a rule's, the crops' or the look's, and what they made it."""
     return (
         groups.rule_of_group(group) is not None
-        or crop_groups.crops_of_group(group) is not None
-        or look_groups.is_look(group)
+        or crop_groups.crop_count(group) is not None
+        or look_groups.is_unedited_look(group)
     )
 
 
@@ -189,7 +189,7 @@ def outdated(root: bpy.types.Object) -> bool:
     modifiers = [_modifier(item.object) for item in root.lodgs.levels if item.exists]
     if rule is None:
         return any(modifiers)
-    return not all(modifier and groups.serves(modifier.node_group, rule) for modifier in modifiers)
+    return not all(modifier and groups.is_current(modifier.node_group, rule) for modifier in modifiers)
 
 
 def update_inputs(root: bpy.types.Object) -> None:
@@ -222,7 +222,7 @@ def _given(root: bpy.types.Object) -> Iterator[tuple[bpy.types.NodesModifier, st
         slots = item.object.material_slots if item.exists else ()
         material = {groups.MATERIAL: slots[0].material if slots else None}
         cropping = crops.modifier_of(item.object) if item.exists else None
-        eye = {groups.EYE_OBJECT: root.lodgs.eye_object}
+        eye = {groups.CAMERA_OBJECT: root.lodgs.eye_object}
         for each, given in ((modifier, eye | tables | material), (cropping, material)):
             if each is not None:
                 yield from ((each, name, value) for name, value in given.items())
@@ -253,7 +253,7 @@ def _drive_focal_length(root: bpy.types.Object) -> None:
         "ay": ("render.pixel_aspect_y", None),
     }
     width, height = "floor(rx * p / 100)", "floor(ry * p / 100)"
-    driver = fresh_driver(
+    driver = replace_driver(
         root,
         "lodgs.focal_px",
         f"lens * min(1, ax / ay) * ({width} / sw if fit == 1 or (fit == 0 and ax * {width} >= ay * {height})"
@@ -283,7 +283,7 @@ def _drive(
         index: of a vector's component.
         without: values of names where this extension, and with it the properties, are missing; others are 0.
     """
-    driver = fresh_driver(obj, path, expression, index)
+    driver = replace_driver(obj, path, expression, index)
     for name, source in sources.items():
         variable = driver.variables.new()
         variable.name, variable.type = name, "SINGLE_PROP"
@@ -319,24 +319,28 @@ def _drive_level(root: bpy.types.Object, obj: bpy.types.Object, rule: Rule, fact
         _set(modifier, name, float(value), lambda there, value: there == np.float32(value))
     for path in ("show_viewport", "show_render"):
         _drive(obj, f'modifiers["{modifier.name}"].{path}', root, "mode", mode="mode")
-    driven = {name: name for name in (groups.EYE, groups.FREEZE, groups.FOCAL, groups.HELD_FOCAL)}
+    driven = {name: name for name in (groups.CAMERA_SOURCE, groups.FREEZE, groups.FOCAL, groups.STORED_FOCAL)}
     driven |= {control.name: f"{rule.name}.{control.name}" for control in rule.controls}
     for name, source in driven.items():
         if compat.has_input(modifier, name):
             _drive(obj, compat.input_path(modifier, name), root, name, **{name: source})
     # Setting it would tell Blender that the points have changed, at every step of the viewport's eye.
-    for axis in range(3) if compat.has_input(modifier, groups.EYE_POSITION) else ():
+    for axis in range(3) if compat.has_input(modifier, groups.CAMERA_POSITION) else ():
         sources = {"held": f"held_eye[{axis}]", "center": f"camera_center[{axis}]"}
-        sources |= {name: name for name in (groups.EYE, groups.FREEZE)}
-        expression = f"held if {groups.FREEZE} or {groups.EYE} == {groups.HELD} else center"
-        _drive(obj, compat.input_path(modifier, groups.EYE_POSITION), root, expression, index=axis, **sources)
+        sources |= {name: name for name in (groups.CAMERA_SOURCE, groups.FREEZE)}
+        expression = f"held if {groups.FREEZE} or {groups.CAMERA_SOURCE} == {groups.VIEW_SOURCE} else center"
+        _drive(
+            obj, compat.input_path(modifier, groups.CAMERA_POSITION), root, expression, index=axis, **sources
+        )
 
 
 def _modifier_of(obj: bpy.types.Object, rule: Rule) -> bpy.types.NodesModifier:
     """The modifier with a rule's group, made where there is none, in the place of one with another rule."""
     modifier = _modifier(obj)
     place = len(obj.modifiers)
-    if modifier is not None and not groups.serves(modifier.node_group, rule):  # another method's, or older
+    if modifier is not None and not groups.is_current(
+        modifier.node_group, rule
+    ):  # another method's, or older
         place = obj.modifiers.find(modifier.name)
         _detach(obj)
         modifier = None
@@ -353,7 +357,7 @@ def _detach(obj: bpy.types.Object) -> None:
     """Takes away the modifier that chooses by distance."""
     modifier = _modifier(obj)
     if modifier is not None:
-        take_away(obj, modifier)
+        remove_modifier(obj, modifier)
 
 
 _BEFORE_RULES = ("LODGS Distance Band", "LODGS Octree Level")

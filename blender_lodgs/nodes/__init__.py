@@ -1,1 +1,1 @@
-"""Geometry-nodes groups, built in code; each states a rule of ``training.lod.rules``."""
+"""Geometry node groups built in code: display, clean-up, looks and level-of-detail rules."""

@@ -1,4 +1,4 @@
-"""How node groups are built: nodes from left to right, and formulas that read as formulas."""
+"""Builders for node groups: nodes placed left to right, and fields with arithmetic operators."""
 
 from __future__ import annotations
 
@@ -7,26 +7,27 @@ from collections.abc import Callable
 
 import bpy
 
-VERSION, AS_MADE = "lodgs_version", "lodgs_as_made"
-"""Custom properties of our groups: a group of another version, from an older file, is made anew; and what
-:func:`_fingerprint` said of it when it was made."""
+VERSION = "lodgs_version"
+"""Custom property of LODGS groups: their version. A group of another version is replaced by a new one."""
+FINGERPRINT = "lodgs_as_made"
+"""Custom property of LODGS groups: :func:`_fingerprint` of the unedited group."""
 
 _SETTINGS = ("operation", "data_type", "domain", "transform_space", "input_type", "clamp", "mute")
-"""What tells nodes of one type apart, where they have it."""
+"""Node settings that enter the fingerprint; most node types have only some of them."""
 
 
 class Nodes:
-    """Nodes of a tree, each to the right of all others.
+    """Builder that adds nodes to a tree from left to right.
 
     Attributes:
-        tree: a group's or a material's.
+        tree: node tree of a group or a material.
     """
 
     def __init__(self, tree: bpy.types.NodeTree) -> None:
         self.tree = tree
 
     def add(self, kind: str, **settings) -> bpy.types.Node:
-        """A node to the right of all others."""
+        """Add a node to the right of the existing ones."""
         node = self.tree.nodes.new(kind)
         for key, value in settings.items():
             setattr(node, key, value)
@@ -34,11 +35,11 @@ class Nodes:
         return node
 
     def link(self, source: bpy.types.NodeSocket, node: bpy.types.Node, name: str) -> None:
-        """Links to the node's visible input of that name; several have the same in some node types."""
+        """Link a socket to the enabled input of that name. Some node types repeat input names."""
         self.tree.links.new(source, next(s for s in node.inputs if s.name == name and s.enabled))
 
     def math(self, operation: str, *values: bpy.types.NodeSocket | float) -> bpy.types.NodeSocket:
-        """The result of a Math node on sockets and numbers."""
+        """Add a Math node on sockets and numbers. Return its output."""
         node = self.add("ShaderNodeMath", operation=operation)
         for socket, value in zip(node.inputs, values, strict=False):
             if isinstance(value, bpy.types.NodeSocket):
@@ -48,26 +49,26 @@ class Nodes:
         return node.outputs["Value"]
 
     def vector(self, operation: str, *vectors: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-        """The result of a Vector Math node, a vector or a number."""
+        """Add a Vector Math node. Return its enabled output: a vector or a number."""
         node = self.add("ShaderNodeVectorMath", operation=operation)
         for socket, value in zip(node.inputs, vectors, strict=False):
             self.tree.links.new(value, socket)
         return next(socket for socket in node.outputs if socket.enabled)
 
-    def named(self, name: str) -> bpy.types.NodeSocket:
-        """An attribute of numbers; 0 where there is none of that name."""
-        node = self.add("GeometryNodeInputNamedAttribute", data_type="FLOAT")
+    def attribute(self, name: str, kind: str = "FLOAT") -> bpy.types.NodeSocket:
+        """Read a named attribute. Points without it read 0."""
+        node = self.add("GeometryNodeInputNamedAttribute", data_type=kind)
         node.inputs["Name"].default_value = name
         return next(s for s in node.outputs if s.name == "Attribute" and s.enabled)
 
-    def sorted(self, points: bpy.types.NodeSocket, by: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-        """A geometry with its points in the order of a number, the smallest first."""
+    def sort_points(self, points: bpy.types.NodeSocket, key: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        """Sort the points of a geometry by a key, smallest first."""
         node = self.add("GeometryNodeSortElements", domain="POINT")
         self.link(points, node, "Geometry")
-        self.link(by, node, "Sort Weight")
+        self.link(key, node, "Sort Weight")
         return node.outputs["Geometry"]
 
-    def sampled(
+    def sample(
         self,
         points: bpy.types.NodeSocket,
         values: bpy.types.NodeSocket,
@@ -76,7 +77,10 @@ class Nodes:
         kind: str = "FLOAT",
         clamp: bool = False,
     ) -> bpy.types.NodeSocket:
-        """The value at one point of a geometry; 0, or with ``clamp`` the nearest, where there is none."""
+        """Read the value at one point of a geometry.
+
+        An index out of range reads 0, or with ``clamp`` the first or last point.
+        """
         node = self.add("GeometryNodeSampleIndex", data_type=kind, domain="POINT", clamp=clamp)
         self.link(points, node, "Geometry")
         self.link(values, node, "Value")
@@ -86,10 +90,10 @@ class Nodes:
             self.link(index, node, "Index")
         return next(socket for socket in node.outputs if socket.enabled)
 
-    def which(
+    def index_switch(
         self, index: Field, *sources: bpy.types.NodeSocket, kind: str = "FLOAT"
     ) -> bpy.types.NodeSocket:
-        """That one of several sources which a number names, counted from 0."""
+        """Select one of several sources by an index that starts at 0."""
         node = self.add("GeometryNodeIndexSwitch", data_type=kind)
         for _ in sources[2:]:
             node.index_switch_items.new()
@@ -99,61 +103,61 @@ class Nodes:
         return node.outputs["Output"]
 
     def field(self, socket: bpy.types.NodeSocket) -> Field:
-        """A socket to calculate with."""
+        """Wrap a socket in a :class:`Field`."""
         return Field(self, socket)
 
 
 class Field:
-    """A number, or one for each point, to calculate with: operators and methods add Math nodes.
+    """A number, or one number per point. Its operators and methods add Math nodes.
 
-    Comparisons give 1 where they hold, else 0.
+    Comparisons give 1 for true and 0 for false.
     """
 
     def __init__(self, nodes: Nodes, socket: bpy.types.NodeSocket) -> None:
         self.nodes, self.socket = nodes, socket
 
     def _math(self, operation: str, *values: Field | float) -> Field:
-        plain = (value.socket if isinstance(value, Field) else value for value in values)
-        return Field(self.nodes, self.nodes.math(operation, *plain))
+        operands = (value.socket if isinstance(value, Field) else value for value in values)
+        return Field(self.nodes, self.nodes.math(operation, *operands))
 
-    def __add__(self, other: Field | float) -> Field:
-        return self._math("ADD", self, other)
+    def __add__(self, value: Field | float) -> Field:
+        return self._math("ADD", self, value)
 
-    def __sub__(self, other: Field | float) -> Field:
-        return self._math("SUBTRACT", self, other)
+    def __sub__(self, value: Field | float) -> Field:
+        return self._math("SUBTRACT", self, value)
 
-    def __rsub__(self, other: float) -> Field:
-        return self._math("SUBTRACT", other, self)
+    def __rsub__(self, value: float) -> Field:
+        return self._math("SUBTRACT", value, self)
 
-    def __mul__(self, other: Field | float) -> Field:
-        return self._math("MULTIPLY", self, other)
+    def __mul__(self, value: Field | float) -> Field:
+        return self._math("MULTIPLY", self, value)
 
-    def __truediv__(self, other: Field | float) -> Field:
-        return self._math("DIVIDE", self, other)
+    def __truediv__(self, value: Field | float) -> Field:
+        return self._math("DIVIDE", self, value)
 
-    def __rtruediv__(self, other: float) -> Field:
-        return self._math("DIVIDE", other, self)
+    def __rtruediv__(self, value: float) -> Field:
+        return self._math("DIVIDE", value, self)
 
-    def __gt__(self, other: Field | float) -> Field:
-        return self._math("GREATER_THAN", self, other)
+    def __gt__(self, value: Field | float) -> Field:
+        return self._math("GREATER_THAN", self, value)
 
-    def __lt__(self, other: Field | float) -> Field:
-        return self._math("LESS_THAN", self, other)
+    def __lt__(self, value: Field | float) -> Field:
+        return self._math("LESS_THAN", self, value)
 
-    def __ge__(self, other: Field | float) -> Field:
-        return 1.0 - (self < other)
+    def __ge__(self, value: Field | float) -> Field:
+        return 1.0 - (self < value)
 
-    def __le__(self, other: Field | float) -> Field:
-        return 1.0 - (self > other)
+    def __le__(self, value: Field | float) -> Field:
+        return 1.0 - (self > value)
 
-    def __and__(self, other: Field) -> Field:
-        return self * other
+    def __and__(self, value: Field) -> Field:
+        return self * value
 
-    def maximum(self, other: Field | float) -> Field:
-        return self._math("MAXIMUM", self, other)
+    def maximum(self, value: Field | float) -> Field:
+        return self._math("MAXIMUM", self, value)
 
-    def minimum(self, other: Field | float) -> Field:
-        return self._math("MINIMUM", self, other)
+    def minimum(self, value: Field | float) -> Field:
+        return self._math("MINIMUM", self, value)
 
     def clip(self, low: Field | float, high: Field | float) -> Field:
         return self.maximum(low).minimum(high)
@@ -176,14 +180,17 @@ class Field:
     def floor(self) -> Field:
         return self._math("FLOOR", self)
 
-    def modulo(self, other: float) -> Field:
-        return self._math("FLOORED_MODULO", self, other)
+    def modulo(self, value: float) -> Field:
+        return self._math("FLOORED_MODULO", self, value)
 
-    def where(self, yes: Field | float, no: Field | float) -> Field:
-        """``yes`` where this is 1, ``no`` where it is 0; the other side may be anything, infinite too."""
+    def where(self, true: Field | float, false: Field | float) -> Field:
+        """Select ``true`` where this field is 1 and ``false`` where it is 0.
+
+        The value that is not selected may be infinite or NaN.
+        """
         node = self.nodes.add("GeometryNodeSwitch", input_type="FLOAT")
         self.nodes.link(self.socket, node, "Switch")
-        for name, value in (("True", yes), ("False", no)):
+        for name, value in (("True", true), ("False", false)):
             if isinstance(value, Field):
                 self.nodes.link(value.socket, node, name)
             else:
@@ -191,65 +198,68 @@ class Field:
         return Field(self.nodes, next(s for s in node.outputs if s.enabled))
 
 
-def group(name: str, version: int, build: Callable[[Nodes], None]) -> bpy.types.GeometryNodeTree:
-    """The modifier group of that name, made where this file has none of this version.
+def ensure_group(name: str, version: int, build: Callable[[Nodes], None]) -> bpy.types.GeometryNodeTree:
+    """Return the modifier group of a name and version. Build it if this file has none.
+
+    A group of another version is renamed, because its sockets may differ. Its users keep it until they are
+    given the new group. An edited group of this version (:func:`is_edited`) is returned unchanged.
 
     Args:
-        build: adds the nodes to a group that has geometry in and out, and nothing else yet. An older group
-            of that name is renamed: sockets of the new one may differ, so its users are to be given it anew.
-            One of this version that somebody has changed (:func:`edited`) stays what it is.
+        name: name of the group.
+        version: number that must be raised whenever ``build`` changes.
+        build: function that adds nodes to a group that has only its Geometry input and output.
     """
-    there = bpy.data.node_groups.get((name, None))  # of this file, not of a library
-    if isinstance(there, bpy.types.GeometryNodeTree) and there.get(VERSION) == version:
-        return there
-    if there is not None:
-        there.name = f"{name} (older)"
+    existing = bpy.data.node_groups.get((name, None))  # in this file, not in a library
+    if isinstance(existing, bpy.types.GeometryNodeTree) and existing.get(VERSION) == version:
+        return existing
+    if existing is not None:
+        existing.name = f"{name} (older)"
     tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
     assert isinstance(tree, bpy.types.GeometryNodeTree)
     tree.is_modifier = True
     tree[VERSION] = version
-    for way in ("INPUT", "OUTPUT"):
-        tree.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
+    for direction in ("INPUT", "OUTPUT"):
+        tree.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")
     build(Nodes(tree))
-    tree[AS_MADE] = _fingerprint(tree)
+    tree[FINGERPRINT] = _fingerprint(tree)
     return tree
 
 
 _edited: dict[int, bool] = {}
-"""What :func:`edited` has found, by ``session_uid``, until a group changes."""
+"""Results of :func:`is_edited` by ``session_uid``, valid until a group changes."""
 
 
-def edited(tree: bpy.types.NodeTree) -> bool:
-    """Whether somebody has changed one of our groups: it no longer does what the code says."""
+def is_edited(tree: bpy.types.NodeTree) -> bool:
+    """Return whether a user has changed the nodes of a LODGS group."""
     original = tree.original
     assert original is not None
     uid = original.session_uid
     if uid not in _edited:
-        made = original.get(AS_MADE)  # older files do not say it
-        _edited[uid] = made is not None and made != _fingerprint(original)
+        fingerprint = original.get(FINGERPRINT)  # missing in files of older versions
+        _edited[uid] = fingerprint is not None and fingerprint != _fingerprint(original)
     return _edited[uid]
 
 
 def _fingerprint(tree: bpy.types.NodeTree) -> str:
-    """Of what a group does: its nodes, their settings and numbers, and links; not of how it is laid out."""
-    said = []
+    """Hash the nodes of a group with their settings, input values and links. Ignore their layout."""
+    nodes = []
     for node in tree.nodes:
-        numbers = [
-            (socket.identifier, _plain(socket.default_value))
+        values = [
+            (socket.identifier, _as_python(socket.default_value))
             for socket in node.inputs
             if hasattr(socket, "default_value") and not socket.is_linked
         ]
-        said.append((node.name, node.bl_idname, [getattr(node, name, "") for name in _SETTINGS], numbers))
+        nodes.append((node.name, node.bl_idname, [getattr(node, name, "") for name in _SETTINGS], values))
     links = [
         (link.from_node.name, link.from_socket.identifier, link.to_node.name, link.to_socket.identifier)
         for link in tree.links
     ]
     sockets = [(item.name, item.item_type) for item in tree.interface.items_tree]
-    return hashlib.sha256(repr((sorted(said), sorted(links), sockets)).encode()).hexdigest()[:16]
+    return hashlib.sha256(repr((sorted(nodes), sorted(links), sockets)).encode()).hexdigest()[:16]
 
 
-def _plain(value):
-    """A socket's number, numbers or text as Python has them; the name of a datablock."""
+def _as_python(value):
+    """Convert a socket value to a plain Python value. A datablock becomes its name."""
     if isinstance(value, str | int | float | bool | None):
         return value
     return value.name if isinstance(value, bpy.types.ID) else tuple(value)
@@ -266,48 +276,56 @@ def _on_load(*_) -> None:
     _edited.clear()
 
 
-_ANEW = (bpy.app.handlers.load_post, bpy.app.handlers.undo_post, bpy.app.handlers.redo_post)
+_RELOAD_HANDLERS = (bpy.app.handlers.load_post, bpy.app.handlers.undo_post, bpy.app.handlers.redo_post)
 
 
 def register() -> None:
     bpy.app.handlers.depsgraph_update_post.append(_on_update)
-    for handlers in _ANEW:
+    for handlers in _RELOAD_HANDLERS:
         handlers.append(_on_load)
 
 
 def unregister() -> None:
     bpy.app.handlers.depsgraph_update_post.remove(_on_update)
-    for handlers in _ANEW:
+    for handlers in _RELOAD_HANDLERS:
         handlers.remove(_on_load)
 
 
-def fresh_driver(obj: bpy.types.Object, path: str, expression: str, index: int = -1) -> bpy.types.Driver:
-    """A fresh driver of the property at ``path``, or of a vector's component, without variables."""
+def replace_driver(obj: bpy.types.Object, path: str, expression: str, index: int = -1) -> bpy.types.Driver:
+    """Replace the driver of a property by a new one without variables.
+
+    Args:
+        obj: owner of the property.
+        path: data path of the property.
+        expression: expression of the new driver.
+        index: component of a vector property, or -1.
+    """
     obj.driver_remove(path, index)
     driver = obj.driver_add(path, index).driver
     assert driver is not None
-    driver.type, driver.expression = "SCRIPTED", expression
+    driver.type = "SCRIPTED"
+    driver.expression = expression
     return driver
 
 
-def take_away(obj: bpy.types.Object, modifier: bpy.types.NodesModifier) -> None:
-    """Removes a modifier, its drivers, and its group if it was the last that has it.
+def remove_modifier(obj: bpy.types.Object, modifier: bpy.types.NodesModifier) -> None:
+    """Remove a modifier, its drivers, and its node group if no other modifier uses it.
 
-    A group that somebody has changed is kept, for whoever wants it back.
+    An edited group is kept with a fake user.
     """
     for driver in list(obj.animation_data.drivers if obj.animation_data else ()):
         if driver.data_path.startswith(f'modifiers["{modifier.name}"]'):
             obj.animation_data.drivers.remove(driver)
     group = modifier.node_group
     obj.modifiers.remove(modifier)
-    if group is not None and edited(group):
+    if group is not None and is_edited(group):
         group.use_fake_user = True
     elif group is not None and not group.users:
         bpy.data.node_groups.remove(group)
 
 
-def modifier_with(obj: bpy.types.Object, key: str) -> bpy.types.NodesModifier | None:
-    """The modifier whose group has a custom property, of any version."""
+def find_modifier(obj: bpy.types.Object, key: str) -> bpy.types.NodesModifier | None:
+    """Return the modifier whose node group has the custom property ``key``, in any version."""
     for modifier in obj.modifiers:
         if (
             isinstance(modifier, bpy.types.NodesModifier)
@@ -318,19 +336,23 @@ def modifier_with(obj: bpy.types.Object, key: str) -> bpy.types.NodesModifier | 
     return None
 
 
-def switched(obj: bpy.types.Object, group: bpy.types.GeometryNodeTree, **by: str) -> bpy.types.NodesModifier:
-    """A new modifier with a group, which is on only where the active scene says so.
+def add_switched_modifier(
+    obj: bpy.types.Object, group: bpy.types.GeometryNodeTree, **switches: str
+) -> bpy.types.NodesModifier:
+    """Add a modifier that a property of the active scene switches on and off.
 
     Args:
-        by: for "show_viewport", "show_render" or both the data path of a property of scenes. Without this
-            extension it is off.
+        obj: object that receives the modifier.
+        group: node group of the modifier.
+        **switches: data path of a scene property for "show_viewport", "show_render" or both. The modifier is
+            off if this extension is missing.
     """
     modifier = obj.modifiers.new(group.name, "NODES")
     assert isinstance(modifier, bpy.types.NodesModifier)
     modifier.node_group, modifier.show_expanded = group, False
     modifier.show_viewport = modifier.show_render = False
-    for where, path in by.items():
-        driver = fresh_driver(obj, f'modifiers["{modifier.name}"].{where}', "on")
+    for switch, path in switches.items():
+        driver = replace_driver(obj, f'modifiers["{modifier.name}"].{switch}', "on")
         variable = driver.variables.new()
         variable.name, variable.type = "on", "CONTEXT_PROP"
         target = variable.targets[0]

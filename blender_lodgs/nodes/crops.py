@@ -1,7 +1,7 @@
-"""``training.lod.crop`` in geometry nodes: what crops and hiding leave of a level's points.
+"""Node group that removes hidden and cropped points: ``training.lod.crop`` in geometry nodes.
 
-A crop is an object (``data.cleaning``): its place, how large it is drawn and as what drive the sockets that
-bear its number, so that reading these gives the test's arguments back.
+A crop is an object (``data.cleaning``). Its transform, display size and display type drive the sockets with
+its number, so the arguments of the crop can be read back from the sockets.
 """
 
 from __future__ import annotations
@@ -10,14 +10,16 @@ import bpy
 
 from ...training.lod.crop import FACE
 from ..attributes import HIDDEN
-from .building import VERSION, Field, Nodes, edited, group
+from .building import VERSION, Field, Nodes, ensure_group, is_edited
 
 COUNT = "lodgs_crops"
-"""Custom property of these groups: how many crops they have."""
+"""Custom property of these groups: their number of crops."""
 NAME = "LODGS Clean Up"
 OBJECT, SIZE, SPHERE, OUTSIDE, USE = "crop_{}", "size_{}", "sphere_{}", "outside_{}", "use_{}"
-"""Sockets of each crop, counted from 1: its object, the half of its box's edges or its radius, and what is 1
-for a sphere, for one that cuts out, and for one in use."""
+"""Sockets of each crop, numbered from 1: object, radius or half edge length, and three flags (1 or 0).
+
+The flags select a sphere instead of a box, remove the inside instead of the outside, and enable the crop.
+"""
 _SOCKETS = {
     OBJECT: "NodeSocketObject", SIZE: "NodeSocketFloat", SPHERE: "NodeSocketFloat",
     OUTSIDE: "NodeSocketFloat", USE: "NodeSocketFloat",
@@ -27,8 +29,7 @@ MATERIAL = "material"
 
 
 def crops_group(count: int) -> bpy.types.GeometryNodeTree:
-    """The group for so many crops, made where this file has none of this version. It drops the points that
-    are hidden, or that crops do not keep."""
+    """Return the group for ``count`` crops. It removes hidden points and points that crops exclude."""
 
     def build(nodes: Nodes) -> None:
         nodes.tree[COUNT] = count
@@ -39,54 +40,55 @@ def crops_group(count: int) -> bpy.types.GeometryNodeTree:
         sockets = nodes.add("NodeGroupInput").outputs
         keep = nodes.add("GeometryNodeSeparateGeometry", domain="POINT")
         nodes.link(sockets["Geometry"], keep, "Geometry")
-        nodes.link(_kept(nodes, sockets, count).socket, keep, "Selection")
-        # Blender drops a point cloud's material when points go
+        nodes.link(_keep_mask(nodes, sockets, count).socket, keep, "Selection")
+        # Blender drops the material of a point cloud when points are removed
         material = nodes.add("GeometryNodeSetMaterial")
         nodes.link(keep.outputs["Selection"], material, "Geometry")
         nodes.link(sockets[MATERIAL], material, "Material")
         nodes.link(material.outputs["Geometry"], nodes.add("NodeGroupOutput"), "Geometry")
 
-    return group(NAME if count == 0 else f"{NAME} {count}", _VERSION, build)
+    return ensure_group(NAME if count == 0 else f"{NAME} {count}", _VERSION, build)
 
 
-def crops_of_group(tree: bpy.types.NodeTree | None) -> int | None:
-    """How many crops a modifier's group has; None for other groups, and for changed ones."""
-    return None if tree is None or COUNT not in tree or edited(tree) else tree[COUNT]
+def crop_count(tree: bpy.types.NodeTree | None) -> int | None:
+    """Return the number of crops of a modifier's group, or None for edited and unrelated groups."""
+    return None if tree is None or COUNT not in tree or is_edited(tree) else tree[COUNT]
 
 
-def serves(tree: bpy.types.NodeTree | None, count: int) -> bool:
-    """Whether a modifier's group is for so many crops and of this version, changed by somebody or not."""
+def is_current(tree: bpy.types.NodeTree | None, count: int) -> bool:
+    """Return whether a modifier's group, edited or not, has this version and ``count`` crops."""
     return tree is not None and tree.get(COUNT) == count and tree.get(VERSION) == _VERSION
 
 
-def _kept(nodes: Nodes, sockets, count: int) -> Field:
-    """1 for points that are not hidden and that the crops keep, as ``crop.kept`` has it."""
-    kept = 1.0 - nodes.field(nodes.named(HIDDEN))
+def _keep_mask(nodes: Nodes, sockets, count: int) -> Field:
+    """Return 1 for points to keep: not hidden and not excluded by crops, as in ``training.lod.crop``."""
+    keep = 1.0 - nodes.field(nodes.attribute(HIDDEN))
     position = nodes.add("GeometryNodeInputPosition").outputs["Position"]
-    inside, none_inside = None, None
+    inside: Field | None = None
+    no_keep_crop: Field | None = None  # 1 if no enabled crop keeps its inside
     for number in range(1, count + 1):
-        used, out = (nodes.field(sockets[name.format(number)]) for name in (USE, OUTSIDE))
-        held = holds(nodes, sockets, number, position) & used
-        keeps = used * (1.0 - out)
-        inside = held * keeps if inside is None else inside.maximum(held * keeps)
-        none_inside = 1.0 - keeps if none_inside is None else none_inside * (1.0 - keeps)
-        kept = kept * (1.0 - held * out)
-    return kept if inside is None or none_inside is None else kept * inside.maximum(none_inside)
+        enabled, removes = (nodes.field(sockets[name.format(number)]) for name in (USE, OUTSIDE))
+        in_crop = inside_crop(nodes, sockets, number, position) & enabled
+        keeps = enabled * (1.0 - removes)
+        inside = in_crop * keeps if inside is None else inside.maximum(in_crop * keeps)
+        no_keep_crop = 1.0 - keeps if no_keep_crop is None else no_keep_crop * (1.0 - keeps)
+        keep = keep * (1.0 - in_crop * removes)
+    return keep if inside is None or no_keep_crop is None else keep * inside.maximum(no_keep_crop)
 
 
-def holds(nodes: Nodes, sockets, number: int, position: bpy.types.NodeSocket) -> Field:
-    """1 for points that lie in the crop of a number, used or not. One that is flat holds none."""
+def inside_crop(nodes: Nodes, sockets, number: int, position: bpy.types.NodeSocket) -> Field:
+    """Return 1 for points inside a crop, enabled or not. A crop with a singular transform contains none."""
     info = nodes.add("GeometryNodeObjectInfo", transform_space="RELATIVE")
     nodes.link(sockets[OBJECT.format(number)], info, "Object")
     inverse = nodes.add("FunctionNodeInvertMatrix")
     nodes.link(info.outputs["Transform"], inverse, "Matrix")
-    own = nodes.add("FunctionNodeTransformPoint")
-    nodes.link(position, own, "Vector")
-    nodes.link(inverse.outputs["Matrix"], own, "Transform")
-    squared = nodes.vector("MULTIPLY", own.outputs["Vector"], own.outputs["Vector"])
-    apart = nodes.add("ShaderNodeSeparateXYZ")
-    nodes.link(squared, apart, "Vector")
-    x, y, z = (nodes.field(apart.outputs[axis]) for axis in "XYZ")
+    local = nodes.add("FunctionNodeTransformPoint")
+    nodes.link(position, local, "Vector")
+    nodes.link(inverse.outputs["Matrix"], local, "Transform")
+    squared = nodes.vector("MULTIPLY", local.outputs["Vector"], local.outputs["Vector"])
+    components = nodes.add("ShaderNodeSeparateXYZ")
+    nodes.link(squared, components, "Vector")
+    x, y, z = (nodes.field(components.outputs[axis]) for axis in "XYZ")
     size, sphere = (nodes.field(sockets[name.format(number)]) for name in (SIZE, SPHERE))
-    away = (sphere > 0.5).where(x + y + z, x.maximum(y).maximum(z))
-    return nodes.field(inverse.outputs["Invertible"]) & (away <= size * size * FACE)
+    distance2 = (sphere > 0.5).where(x + y + z, x.maximum(y).maximum(z))
+    return nodes.field(inverse.outputs["Invertible"]) & (distance2 <= size * size * FACE)

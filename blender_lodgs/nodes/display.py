@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from .. import compat
-from .building import Nodes, group, switched
+from .building import Nodes, add_switched_modifier, ensure_group
 
 NAME = "LODGS Display"
 
@@ -19,7 +19,7 @@ def display() -> bpy.types.GeometryNodeTree:
         nodes.link(source.outputs[0], radius, "Points")
         nodes.link(radius.outputs["Points"], nodes.add("NodeGroupOutput"), "Geometry")
 
-    return group(NAME, 1, build)
+    return ensure_group(NAME, 1, build)
 
 
 def attach(obj: bpy.types.Object) -> None:
@@ -28,4 +28,4 @@ def attach(obj: bpy.types.Object) -> None:
     Where Blender draws them as such by itself, there is nothing to hide.
     """
     if not compat.make_native(obj.data):
-        switched(obj, display(), show_viewport="lodgs_viewport.splats")
+        add_switched_modifier(obj, display(), show_viewport="lodgs_viewport.splats")

@@ -1,8 +1,8 @@
-"""The node group "LODGS Ellipsoids": splats as meshes that Cycles and EEVEE light, reflect and shadow.
+"""Node group "LODGS Ellipsoids": splats as meshes that Cycles and EEVEE light, reflect and shadow.
 
-Every splat becomes an instance of one sphere, turned and stretched to REACH standard deviations. Its material
-has the alpha of a Gaussian: where a ray passes the centre in d standard deviations, the opacity times
-exp(-d²/2), which is the splat's projection. Colours are those without view dependence.
+Every splat becomes an instance of one sphere, rotated and scaled to REACH standard deviations. The material
+has the alpha of a projected Gaussian: for a ray that passes the centre at a distance of d standard
+deviations, alpha is opacity * exp(-d²/2). Colours have no view dependence.
 """
 
 from __future__ import annotations
@@ -12,35 +12,35 @@ import math
 import bpy
 
 from ..attributes import COLOR, LOOK_OPACITY, OPACITY_LOGIT, ROTATION, SCALE, WEIGHT
-from .building import Nodes, edited, group, switched
+from .building import Nodes, add_switched_modifier, ensure_group, is_edited
 
 NAME = "LODGS Ellipsoids"
 MATERIAL = "LODGS Ellipsoids"
 ALPHA = "splat_opacity"
 REACH = 3.0
-"""Standard deviations from the middle to the surface, where alpha is 1 % of the opacity."""
+"""Radius of an ellipsoid in standard deviations. Alpha at its surface is 1 % of the opacity."""
 BOUNCES = 512
-"""Transparent surfaces that a ray of Cycles has to pass.
+"""Transparent bounces of Cycles.
 
-With its own limit, 8, it would leave black holes; ended by chance before that, it leaves noise, and the
-samples that remove it cost far more time than going on.
+The default of 8 leaves black holes. Ending rays at random leaves noise, and the samples that remove it take
+far longer than the additional bounces.
 """
 
 
 def attach(obj: bpy.types.Object) -> None:
-    """Gives an object of splats this modifier, last of all; it is on where its scene wants ellipsoids."""
+    """Add this modifier to a splat object as the last one. The scene's render settings switch it on."""
     modifier = obj.modifiers.get(NAME)
     if modifier is None:
-        switched(obj, ellipsoids(), show_render="lodgs_render.draws_ellipsoids")
+        add_switched_modifier(obj, ellipsoids(), show_render="lodgs_render.draws_ellipsoids")
     elif isinstance(modifier, bpy.types.NodesModifier) and (
-        modifier.node_group is None or not edited(modifier.node_group)
+        modifier.node_group is None or not is_edited(modifier.node_group)
     ):
-        modifier.node_group = ellipsoids()  # an older file has an older one
+        modifier.node_group = ellipsoids()  # a file of an older version has an older group
 
 
 def ellipsoids() -> bpy.types.GeometryNodeTree:
-    """The group."""
-    return group(NAME, 2, _build)
+    """Return the node group."""
+    return ensure_group(NAME, 2, _build)
 
 
 def _build(nodes: Nodes) -> None:
@@ -57,7 +57,7 @@ def _build(nodes: Nodes) -> None:
     points = add("NodeGroupInput").outputs[0]
     opacity = 1.0 / ((nodes.field(value(attribute(OPACITY_LOGIT, "FLOAT"))) * -1.0).exp() + 1.0)
     for factor in (attribute(WEIGHT, "FLOAT"), attribute(LOOK_OPACITY, "FLOAT")):
-        # splats without the attribute are there in full
+        # a missing attribute means 1
         opacity = opacity * nodes.field(factor.outputs["Exists"]).where(nodes.field(value(factor)), 1.0)
     store = add("GeometryNodeStoreNamedAttribute", data_type="FLOAT", domain="POINT")
     store.inputs["Name"].default_value = ALPHA
@@ -71,23 +71,23 @@ def _build(nodes: Nodes) -> None:
     material = add("GeometryNodeSetMaterial")
     link(smooth.outputs[0], material, "Geometry")
     material.inputs["Material"].default_value = falloff()
-    reach = add("ShaderNodeVectorMath", operation="SCALE")
-    nodes.tree.links.new(value(attribute(SCALE, "FLOAT_VECTOR")), reach.inputs[0])
-    reach.inputs["Scale"].default_value = REACH
-    stand = add("GeometryNodeInstanceOnPoints")
-    link(store.outputs["Geometry"], stand, "Points")
-    link(material.outputs["Geometry"], stand, "Instance")
-    link(value(attribute(ROTATION, "QUATERNION")), stand, "Rotation")
-    link(reach.outputs["Vector"], stand, "Scale")
-    link(stand.outputs["Instances"], add("NodeGroupOutput"), "Geometry")
+    scale = add("ShaderNodeVectorMath", operation="SCALE")
+    nodes.tree.links.new(value(attribute(SCALE, "FLOAT_VECTOR")), scale.inputs[0])
+    scale.inputs["Scale"].default_value = REACH
+    instances = add("GeometryNodeInstanceOnPoints")
+    link(store.outputs["Geometry"], instances, "Points")
+    link(material.outputs["Geometry"], instances, "Instance")
+    link(value(attribute(ROTATION, "QUATERNION")), instances, "Rotation")
+    link(scale.outputs["Vector"], instances, "Scale")
+    link(instances.outputs["Instances"], add("NodeGroupOutput"), "Geometry")
 
 
 def falloff() -> bpy.types.Material:
-    """The material of the ellipsoids: alpha of a Gaussian, once for each ray that passes.
+    """Return the material of the ellipsoids. A ray gets the alpha of the Gaussian once per ellipsoid.
 
-    On the unit sphere that all ellipsoids are images of, a ray from the direction v that meets the surface at
-    p passes the centre in a distance of sqrt(1 - (p·v)²). It counts where it enters; if it began inside,
-    where it leaves, as long as the centre was before it.
+    All ellipsoids are images of one unit sphere. There, a ray with direction v that hits the surface at p
+    passes the centre at a distance of sqrt(1 - (p·v)²). Alpha counts at the entry point. A ray that starts
+    inside gets it at the exit point, if it started before the centre.
     """
     material = bpy.data.materials.get((MATERIAL, None))
     if material is not None:
@@ -98,46 +98,53 @@ def falloff() -> bpy.types.Material:
     if hasattr(material, "surface_render_method"):
         material.surface_render_method = "BLENDED"
     material.use_backface_culling = False
-    tree = material.node_tree
-    tree.nodes.clear()
+    _build_falloff(material.node_tree)
+    return material
 
+
+def _build_falloff(tree: bpy.types.NodeTree) -> None:
+    """Build the nodes of :func:`falloff`."""
+    tree.nodes.clear()
     add = Nodes(tree).add
 
-    def join(operation: str, *values: bpy.types.NodeSocket | float, kind: str = "ShaderNodeMath"):
+    def math_node(
+        operation: str, *values: bpy.types.NodeSocket | float, kind: str = "ShaderNodeMath"
+    ) -> bpy.types.NodeSocket:
         node = add(kind, operation=operation)
-        for socket, given in zip(node.inputs, values, strict=False):
-            if isinstance(given, bpy.types.NodeSocket):
-                tree.links.new(given, socket)
+        for socket, value in zip(node.inputs, values, strict=False):
+            if isinstance(value, bpy.types.NodeSocket):
+                tree.links.new(value, socket)
             else:
-                socket.default_value = given
+                socket.default_value = value
         single = kind == "ShaderNodeMath" or operation in ("DOT_PRODUCT", "LENGTH")
         return node.outputs["Value" if single else "Vector"]
 
     geometry = add("ShaderNodeNewGeometry")
     local = add("ShaderNodeVectorTransform", vector_type="VECTOR", convert_from="WORLD", convert_to="OBJECT")
     tree.links.new(geometry.outputs["Incoming"], local.inputs["Vector"])
-    towards = join("NORMALIZE", local.outputs["Vector"], kind="ShaderNodeVectorMath")
-    place = join("NORMALIZE", add("ShaderNodeTexCoord").outputs["Object"], kind="ShaderNodeVectorMath")
-    cosine = join("DOT_PRODUCT", place, towards, kind="ShaderNodeVectorMath")
-    beside = join("SUBTRACT", 1.0, join("MULTIPLY", cosine, cosine))
-    bell = join("POWER", math.exp(-REACH * REACH / 2), beside)
+    direction = math_node("NORMALIZE", local.outputs["Vector"], kind="ShaderNodeVectorMath")
+    surface = math_node("NORMALIZE", add("ShaderNodeTexCoord").outputs["Object"], kind="ShaderNodeVectorMath")
+    cosine = math_node("DOT_PRODUCT", surface, direction, kind="ShaderNodeVectorMath")
+    distance2 = math_node("SUBTRACT", 1.0, math_node("MULTIPLY", cosine, cosine))
+    gaussian = math_node("POWER", math.exp(-REACH * REACH / 2), distance2)
     opacity = add("ShaderNodeAttribute", attribute_name=ALPHA, attribute_type="INSTANCER")
-    alpha = join("MINIMUM", join("MULTIPLY", opacity.outputs["Fac"], bell), 0.99)
-    stretch = join("LENGTH", local.outputs["Vector"], kind="ShaderNodeVectorMath")
-    way = join("MULTIPLY", add("ShaderNodeLightPath").outputs["Ray Length"], stretch)
-    half = join("ABSOLUTE", cosine)
-    began_inside = join("LESS_THAN", way, join("MULTIPLY", half, 2.0))
-    past_centre = join("GREATER_THAN", way, half)
-    leaves = join("MULTIPLY", geometry.outputs["Backfacing"], join("MULTIPLY", began_inside, past_centre))
-    enters = join("SUBTRACT", 1.0, geometry.outputs["Backfacing"])
-    once = join("MULTIPLY", alpha, join("ADD", enters, leaves))
+    alpha = math_node("MINIMUM", math_node("MULTIPLY", opacity.outputs["Fac"], gaussian), 0.99)
+    stretch = math_node("LENGTH", local.outputs["Vector"], kind="ShaderNodeVectorMath")
+    length = math_node("MULTIPLY", add("ShaderNodeLightPath").outputs["Ray Length"], stretch)
+    half_chord = math_node("ABSOLUTE", cosine)
+    starts_inside = math_node("LESS_THAN", length, math_node("MULTIPLY", half_chord, 2.0))
+    passed_centre = math_node("GREATER_THAN", length, half_chord)
+    exits = math_node(
+        "MULTIPLY", geometry.outputs["Backfacing"], math_node("MULTIPLY", starts_inside, passed_centre)
+    )
+    enters = math_node("SUBTRACT", 1.0, geometry.outputs["Backfacing"])
+    factor = math_node("MULTIPLY", alpha, math_node("ADD", enters, exits))
     color = add("ShaderNodeAttribute", attribute_name=COLOR, attribute_type="INSTANCER")
-    emission, through, mix = (
+    emission, transparent, mix = (
         add(kind) for kind in ("ShaderNodeEmission", "ShaderNodeBsdfTransparent", "ShaderNodeMixShader")
     )
     tree.links.new(color.outputs["Color"], emission.inputs["Color"])
-    tree.links.new(once, mix.inputs[0])
-    tree.links.new(through.outputs[0], mix.inputs[1])
+    tree.links.new(factor, mix.inputs[0])
+    tree.links.new(transparent.outputs[0], mix.inputs[1])
     tree.links.new(emission.outputs[0], mix.inputs[2])
     tree.links.new(mix.outputs[0], add("ShaderNodeOutputMaterial").inputs["Surface"])
-    return material

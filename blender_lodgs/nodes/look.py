@@ -1,9 +1,8 @@
-"""``training.lod.look`` in geometry nodes, and ``paint``: the colours and opacities in which Blender itself
-draws splats.
+"""Node group for looks and paint: ``training.lod.look`` and ``training.lod.paint`` in geometry nodes.
 
-What LODGS draws gets its look from the same settings without this group (``data.looks``). Splats keep their
-harmonics and opacities; the colour of points and ellipsoids is made of them, and the opacity's factor stands
-beside them.
+The group computes the colour and the opacity factor of points and ellipsoids, which Blender itself draws.
+Harmonics and opacities of the splats stay unchanged. LODGS' own drawing reads the same settings without this
+group (``data.looks``).
 """
 
 from __future__ import annotations
@@ -13,20 +12,21 @@ import bpy
 from ...training.lod.paint import COLUMNS as PAINT
 from ...training.splats.gaussians import SH_C0
 from ..attributes import BASE, COLOR, LOOK_OPACITY
-from .building import VERSION, Field, Nodes, edited, group
-from .crops import OBJECT, SIZE, SPHERE, USE, holds
+from .building import VERSION, Field, Nodes, ensure_group, is_edited
+from .crops import OBJECT, SIZE, SPHERE, USE, inside_crop
 
 COUNT = "lodgs_looks"
-"""Custom property of these groups: how many regions with looks of their own they have."""
+"""Custom property of these groups: their number of regions with a local look."""
 NAME = "LODGS Look"
 ROWS, OPACITY, BEYOND = ("red_{}", "green_{}", "blue_{}"), "opacity_{}", "beyond_{}"
-"""Sockets of each look: the rows of its matrix, and its opacity. 0 is the look everywhere; regions follow,
-with the sockets of crops, and what is 1 where a look counts outside of one."""
+"""Sockets of each look: the rows of its colour matrix, and its opacity factor. Look 0 applies everywhere. The
+looks of regions follow from 1: they also have the sockets of a crop, and a flag that is 1 if the look applies
+outside the region."""
 _VERSION = 2
 
 
 def look_group(count: int) -> bpy.types.GeometryNodeTree:
-    """The group for so many regions, made where this file has none of this version."""
+    """Return the group for ``count`` regions."""
 
     def build(nodes: Nodes) -> None:
         nodes.tree[COUNT] = count
@@ -34,21 +34,22 @@ def look_group(count: int) -> bpy.types.GeometryNodeTree:
             _add_sockets(nodes.tree, number)
         sockets = nodes.add("NodeGroupInput").outputs
         position = nodes.add("GeometryNodeInputPosition").outputs["Position"]
-        color, opacity = _own_color(nodes), nodes.field(sockets[OPACITY.format(0)])
+        color = _painted_color(nodes)
+        opacity = nodes.field(sockets[OPACITY.format(0)])
         color = _mapped(nodes, sockets, 0, color)
         for number in range(1, count + 1):
-            used, beyond = (nodes.field(sockets[name.format(number)]) for name in (USE, BEYOND))
-            held = holds(nodes, sockets, number, position)
-            held = used & (beyond > 0.5).where(1.0 - held, held)
-            there = _mapped(nodes, sockets, number, color)
-            color = [held.where(new, old) for new, old in zip(there, color, strict=True)]
-            opacity = opacity * held.where(nodes.field(sockets[OPACITY.format(number)]), 1.0)
-        shown = nodes.add("FunctionNodeCombineColor")
-        for socket, channel in zip(shown.inputs, color, strict=False):
+            enabled, beyond = (nodes.field(sockets[name.format(number)]) for name in (USE, BEYOND))
+            inside = inside_crop(nodes, sockets, number, position)
+            affected = enabled & (beyond > 0.5).where(1.0 - inside, inside)
+            mapped = _mapped(nodes, sockets, number, color)
+            color = [affected.where(new, old) for new, old in zip(mapped, color, strict=True)]
+            opacity = opacity * affected.where(nodes.field(sockets[OPACITY.format(number)]), 1.0)
+        display_color = nodes.add("FunctionNodeCombineColor")
+        for socket, channel in zip(display_color.inputs, color, strict=False):
             nodes.tree.links.new(_linear(channel.clip(0.0, 1.0)).socket, socket)
         points = sockets["Geometry"]
         for name, kind, value in (
-            (COLOR, "FLOAT_COLOR", shown.outputs["Color"]),
+            (COLOR, "FLOAT_COLOR", display_color.outputs["Color"]),
             (LOOK_OPACITY, "FLOAT", opacity.socket),
         ):
             store = nodes.add("GeometryNodeStoreNamedAttribute", data_type=kind, domain="POINT")
@@ -58,16 +59,16 @@ def look_group(count: int) -> bpy.types.GeometryNodeTree:
             points = store.outputs["Geometry"]
         nodes.link(points, nodes.add("NodeGroupOutput"), "Geometry")
 
-    return group(NAME if count == 0 else f"{NAME} {count}", _VERSION, build)
+    return ensure_group(NAME if count == 0 else f"{NAME} {count}", _VERSION, build)
 
 
-def is_look(tree: bpy.types.NodeTree | None) -> bool:
-    """Whether a modifier's group is such a one, and what it was made."""
-    return tree is not None and COUNT in tree and not edited(tree)
+def is_unedited_look(tree: bpy.types.NodeTree | None) -> bool:
+    """Return whether a modifier's group is an unedited look group."""
+    return tree is not None and COUNT in tree and not is_edited(tree)
 
 
-def serves(tree: bpy.types.NodeTree | None, count: int) -> bool:
-    """Whether a modifier's group is for so many regions and of this version, changed by somebody or not."""
+def is_current(tree: bpy.types.NodeTree | None, count: int) -> bool:
+    """Return whether a modifier's group, edited or not, has this version and ``count`` regions."""
     return tree is not None and tree.get(COUNT) == count and tree.get(VERSION) == _VERSION
 
 
@@ -79,24 +80,17 @@ def _add_sockets(tree: bpy.types.GeometryNodeTree, number: int) -> None:
         tree.interface.new_socket(name.format(number), in_out="INPUT", socket_type=kind)
 
 
-def _own_color(nodes: Nodes) -> list[Field]:
-    """Red, green and blue of the splats with their paint, without view dependence, display-coded."""
-    apart = nodes.add("ShaderNodeSeparateXYZ")
-    nodes.link(_attribute(nodes, "FLOAT_COLOR", BASE), apart, "Vector")
-    own = [nodes.field(apart.outputs[axis]) * SH_C0 + 0.5 for axis in "XYZ"]
-    *paint, amount = (nodes.field(_attribute(nodes, "FLOAT", name)) for name in PAINT)
-    return [(1.0 - amount) * channel + over for channel, over in zip(own, paint, strict=True)]
-
-
-def _attribute(nodes: Nodes, kind: str, name: str) -> bpy.types.NodeSocket:
-    """A named attribute, 0 where the points have none."""
-    node = nodes.add("GeometryNodeInputNamedAttribute", data_type=kind)
-    node.inputs["Name"].default_value = name
-    return next(s for s in node.outputs if s.name == "Attribute" and s.enabled)
+def _painted_color(nodes: Nodes) -> list[Field]:
+    """Return red, green and blue of the painted splats, sRGB-encoded and without view dependence."""
+    components = nodes.add("ShaderNodeSeparateXYZ")
+    nodes.link(nodes.attribute(BASE, "FLOAT_COLOR"), components, "Vector")
+    base = [nodes.field(components.outputs[axis]) * SH_C0 + 0.5 for axis in "XYZ"]
+    *paint, amount = (nodes.field(nodes.attribute(name)) for name in PAINT)
+    return [(1.0 - amount) * channel + coat for channel, coat in zip(base, paint, strict=True)]
 
 
 def _mapped(nodes: Nodes, sockets, number: int, color: list[Field]) -> list[Field]:
-    """What the matrix of a number makes of a colour."""
+    """Multiply a colour by the matrix of a look."""
     vector = nodes.add("ShaderNodeCombineXYZ")
     for channel, axis in zip(color, "XYZ", strict=True):
         nodes.link(channel.socket, vector, axis)
@@ -106,6 +100,6 @@ def _mapped(nodes: Nodes, sockets, number: int, color: list[Field]) -> list[Fiel
     ]
 
 
-def _linear(code: Field) -> Field:
-    """As ``training.scenes.color.linear_from_srgb``."""
-    return (code > 0.04045).where(((code + 0.055) / 1.055).power(2.4), code / 12.92)
+def _linear(srgb: Field) -> Field:
+    """Convert sRGB to linear, as ``training.scenes.color.linear_from_srgb``."""
+    return (srgb > 0.04045).where(((srgb + 0.055) / 1.055).power(2.4), srgb / 12.92)

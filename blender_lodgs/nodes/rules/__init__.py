@@ -1,11 +1,15 @@
-"""The rules of ``training.lod.rules`` in geometry nodes, one a module of the same name, found by itself.
+"""Node groups of the level-of-detail rules: ``training.lod.rules`` in geometry nodes.
 
-A module has ``VERSION``, to be raised whenever its nodes change; ``FADES``, whether weights lie between 0
-and 1; and ``weight(inputs)``, the formula. What all groups have in common is here: their sockets bear the
-names of the rule's facts and controls, so that properties drive them by bare names and reading them gives the
-rule's arguments back, with an object for each of its tables (``data.tables``); and distances are taken in
-the local space of the modifier's object, that is in the splats' own world, whatever the transforms of its
-parents.
+Each rule has a module of the same name in this package, which is imported automatically. It defines:
+
+- ``VERSION``: integer that must be raised whenever the nodes change.
+- ``FADES``: whether weights between 0 and 1 occur.
+- ``weight(inputs)``: formula of the weight.
+
+This file builds the parts that all groups share. Sockets have the names of the rule's facts and controls:
+drivers refer to properties of these names, and the arguments of the rule can be read back from the sockets.
+Each table of a rule has an object socket (``data.tables``). Distances are measured in the local space of the
+modifier's object, so transforms of its parents have no effect.
 """
 
 from __future__ import annotations
@@ -19,129 +23,142 @@ import bpy
 
 from ....training.lod.rule import Rule, fact_names, rules
 from ...attributes import COLUMN, OPACITY_LOGIT, WEIGHT
-from ..building import VERSION, Field, Nodes, edited, group
+from ..building import VERSION, Field, Nodes, ensure_group, is_edited
 
-EYE, FREEZE, EYE_OBJECT, EYE_POSITION = "eye", "freeze", "eye_object", "eye_position"
-FOCAL, HELD_FOCAL, MATERIAL = "focal_px", "held_focal", "material"
-EYES = ("CAMERA", "OBJECT", "TRAINING", "VIEW")
-"""What the socket "eye" counts, as ``SplatScene.eye``; the last two, and a frozen eye, are "eye_position"."""
-HELD = EYES.index("VIEW")
+CAMERA_SOURCE = "eye"
+FREEZE = "freeze"
+CAMERA_OBJECT = "eye_object"
+CAMERA_POSITION = "eye_position"
+FOCAL = "focal_px"
+STORED_FOCAL = "held_focal"
+MATERIAL = "material"
+CAMERA_SOURCES = ("CAMERA", "OBJECT", "TRAINING", "VIEW")
+"""Values of the socket CAMERA_SOURCE, as ``SplatScene.eye``. The position of the last two sources, and of a
+frozen camera, is the socket CAMERA_POSITION."""
+VIEW_SOURCE = CAMERA_SOURCES.index("VIEW")
 RULE = "lodgs_rule"
-"""Custom property of these groups: the rule's name."""
+"""Custom property of these groups: the name of the rule."""
 
 _SHARED = {
-    EYE: "NodeSocketInt", FREEZE: "NodeSocketBool", EYE_OBJECT: "NodeSocketObject",
-    EYE_POSITION: "NodeSocketVector", FOCAL: "NodeSocketFloat", HELD_FOCAL: "NodeSocketFloat",
+    CAMERA_SOURCE: "NodeSocketInt",
+    FREEZE: "NodeSocketBool",
+    CAMERA_OBJECT: "NodeSocketObject",
+    CAMERA_POSITION: "NodeSocketVector",
+    FOCAL: "NodeSocketFloat",
+    STORED_FOCAL: "NodeSocketFloat",
     MATERIAL: "NodeSocketMaterial",
-}  # fmt: skip
+}
 _SHARED_VERSION = 2
 
 
-class Inputs:
-    """What a formula is made of.
+class RuleInputs:
+    """Inputs of a rule's formula.
 
     Attributes:
-        eye: its place.
-        distance: of each point from the eye.
-        focal_px: the eye's focal length in pixels.
-        points: the geometry, for what needs all points at once.
-        nodes: to add others.
+        camera: position of the camera.
+        distance: distance of each point from the camera.
+        focal_px: focal length of the camera in pixels.
+        points: the geometry, for formulas that need all points at once.
+        nodes: builder of the group.
     """
 
     def __init__(self, nodes: Nodes) -> None:
         self.nodes = nodes
         self._sockets = nodes.add("NodeGroupInput").outputs
         self.points = self._sockets["Geometry"]
-        held = self._held()
-        self.focal_px = held.where(self[HELD_FOCAL], self[FOCAL])
-        self.eye = self._eye()
-        self.distance = nodes.field(nodes.vector("DISTANCE", self.position(), self.eye))
+        self.focal_px = self._is_stored().where(self[STORED_FOCAL], self[FOCAL])
+        self.camera = self._camera()
+        self.distance = nodes.field(nodes.vector("DISTANCE", self.position(), self.camera))
 
     def __getitem__(self, name: str) -> Field:
-        """A fact or a control."""
+        """Return a fact or a control of the rule."""
         return self.nodes.field(self._sockets[name])
 
     def column(self, name: str) -> Field:
-        """A column of the splats; 0 where they have none of that name."""
-        return self.nodes.field(self.nodes.named(name))
+        """Return a column of the splats, or 0 if it is missing."""
+        return self.nodes.field(self.nodes.attribute(name))
 
     def position(self) -> bpy.types.NodeSocket:
-        """Where each point is."""
+        """Return the position of each point."""
         return self.nodes.add("GeometryNodeInputPosition").outputs["Position"]
 
     def table(self, name: str) -> bpy.types.NodeSocket:
-        """A table, a point a row; none where the scene lacks it. Wherever its object is does not count."""
+        """Return a table as geometry with one point per row. A missing table is empty.
+
+        The transform of the table's object has no effect.
+        """
         info = self.nodes.add("GeometryNodeObjectInfo", transform_space="ORIGINAL")
         self.nodes.link(self._sockets[table_socket(name)], info, "Object")
         return info.outputs["Geometry"]
 
     def table_column(self, name: str) -> Field:
-        """A column of a table."""
-        return self.nodes.field(self.nodes.named(COLUMN.format(name)))
+        """Return a column of a table."""
+        return self.nodes.field(self.nodes.attribute(COLUMN.format(name)))
 
-    def table_place(self) -> bpy.types.NodeSocket:
-        """A table's columns ``x``, ``y``, ``z`` as places."""
+    def table_position(self) -> bpy.types.NodeSocket:
+        """Return the columns ``x``, ``y``, ``z`` of a table as positions."""
         node = self.nodes.add("ShaderNodeCombineXYZ")
         for name in "xyz":
             self.nodes.link(self.table_column(name).socket, node, name.upper())
         return node.outputs["Vector"]
 
     def opacity(self) -> Field:
-        """Each splat's own opacity."""
+        """Return the opacity of each splat before weighting."""
         return 1.0 / ((self.column(OPACITY_LOGIT) * -1.0).exp() + 1.0)
 
-    def _held(self) -> Field:
-        """Whether the eye stays where it is, or is the viewport's."""
-        return self[FREEZE].maximum(self[EYE] > HELD - 0.5)
+    def _is_stored(self) -> Field:
+        """Return 1 if the camera is frozen or is the viewport's: its focal length is then a stored value."""
+        return self[FREEZE].maximum(self[CAMERA_SOURCE] > VIEW_SOURCE - 0.5)
 
-    def _eye(self) -> bpy.types.NodeSocket:
+    def _camera(self) -> bpy.types.NodeSocket:
+        """Select the camera position by CAMERA_SOURCE and FREEZE."""
         nodes = self.nodes
-        seen_from = []
-        for obj in (
-            nodes.add("GeometryNodeInputActiveCamera").outputs["Active Camera"], self._sockets[EYE_OBJECT],
-        ):  # fmt: skip
+        active_camera = nodes.add("GeometryNodeInputActiveCamera").outputs["Active Camera"]
+        positions = []
+        for obj in (active_camera, self._sockets[CAMERA_OBJECT]):
             info = nodes.add("GeometryNodeObjectInfo", transform_space="RELATIVE")
             nodes.link(obj, info, "Object")
-            seen_from.append(info.outputs["Location"])
-        which = self[FREEZE].where(2.0, self[EYE].minimum(2.0))
-        return nodes.which(which, *seen_from, self._sockets[EYE_POSITION], kind="VECTOR")
+            positions.append(info.outputs["Location"])
+        index = self[FREEZE].where(2.0, self[CAMERA_SOURCE].minimum(2.0))
+        return nodes.index_switch(index, *positions, self._sockets[CAMERA_POSITION], kind="VECTOR")
 
 
 @cache
 def _modules() -> dict[str, ModuleType]:
-    names = [found.name for found in iter_modules(__path__)]
+    names = [module.name for module in iter_modules(__path__)]
     return {name: import_module(f"{__name__}.{name}") for name in names}
 
 
 def rule_group(rule: Rule) -> bpy.types.GeometryNodeTree:
-    """The group of a rule, made where this file has none of this version.
+    """Return the node group of a rule.
 
-    It gives each point its weight and drops those of weight 0. Where weights fade, they become the attribute
-    WEIGHT, and a factor on the points' radius, so that points fade as well.
+    The group computes the weight of each point and removes points of weight 0. If weights fade, they are also
+    stored as the attribute WEIGHT and multiplied into the point radius, so that points fade too.
     """
     module = _modules()[rule.name]
 
     def build(nodes: Nodes) -> None:
         nodes.tree[RULE] = rule.name
-        _sockets(nodes.tree, rule)
-        inputs = Inputs(nodes)
-        weight, points = module.weight(inputs), inputs.points
+        _add_sockets(nodes.tree, rule)
+        inputs = RuleInputs(nodes)
+        weight = module.weight(inputs)
+        points = inputs.points
         if module.FADES:
-            points = _faded(nodes, points, weight)
+            points = _store_weight(nodes, points, weight)
         keep = nodes.add("GeometryNodeSeparateGeometry", domain="POINT")
         nodes.link(points, keep, "Geometry")
         nodes.link((weight > 0.0).socket, keep, "Selection")
-        # Blender drops a point cloud's material when points go
+        # Blender drops the material of a point cloud when points are removed
         material = nodes.add("GeometryNodeSetMaterial")
         nodes.link(keep.outputs["Selection"], material, "Geometry")
         nodes.link(inputs[MATERIAL].socket, material, "Material")
         nodes.link(material.outputs["Geometry"], nodes.add("NodeGroupOutput"), "Geometry")
 
-    return group(f"LODGS {rule.name.title()}", _version(rule), build)
+    return ensure_group(f"LODGS {rule.name.title()}", _version(rule), build)
 
 
-def serves(tree: bpy.types.NodeTree | None, rule: Rule) -> bool:
-    """Whether a modifier's group is of a rule and of this version, changed by somebody or not."""
+def is_current(tree: bpy.types.NodeTree | None, rule: Rule) -> bool:
+    """Return whether a modifier's group, edited or not, belongs to a rule and has the current version."""
     return tree is not None and tree.get(RULE) == rule.name and tree.get(VERSION) == _version(rule)
 
 
@@ -150,16 +167,16 @@ def _version(rule: Rule) -> int:
 
 
 def rule_of_group(tree: bpy.types.NodeTree | None) -> Rule | None:
-    """The rule that a modifier's group states and follows; None for other groups, and changed ones."""
-    return None if tree is None or RULE not in tree or edited(tree) else rules().get(tree[RULE])
+    """Return the rule of a modifier's group, or None for edited and unrelated groups."""
+    return None if tree is None or RULE not in tree or is_edited(tree) else rules().get(tree[RULE])
 
 
 def table_socket(name: str) -> str:
-    """The socket of a rule's table: facts and controls may have the table's name."""
+    """Return the socket name of a table, which differs from fact and control names."""
     return f"{name}_table"
 
 
-def _sockets(tree: bpy.types.GeometryNodeTree, rule: Rule) -> None:
+def _add_sockets(tree: bpy.types.GeometryNodeTree, rule: Rule) -> None:
     for name in fact_names(rule):
         tree.interface.new_socket(name, in_out="INPUT", socket_type="NodeSocketFloat")
     for control in rule.controls:
@@ -175,7 +192,8 @@ def _sockets(tree: bpy.types.GeometryNodeTree, rule: Rule) -> None:
         tree.interface.new_socket(name, in_out="INPUT", socket_type=kind)
 
 
-def _faded(nodes: Nodes, points: bpy.types.NodeSocket, weight: Field) -> bpy.types.NodeSocket:
+def _store_weight(nodes: Nodes, points: bpy.types.NodeSocket, weight: Field) -> bpy.types.NodeSocket:
+    """Store the weight as an attribute and multiply the point radius by it."""
     store = nodes.add("GeometryNodeStoreNamedAttribute", data_type="FLOAT", domain="POINT")
     store.inputs["Name"].default_value = WEIGHT
     nodes.link(points, store, "Geometry")

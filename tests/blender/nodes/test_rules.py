@@ -96,7 +96,7 @@ def test_the_node_group_weights_every_splat_as_the_rule_does(bpy, lodgs, level, 
         obj, modifier, splats = level(rule, 4000, facts, values, rng, known)
         eye = rng.normal(0, 4, 3).astype(np.float32)
         obj.location = (3, -2, 1)  # the object's place must not count
-        place = {groups.EYE: 2, groups.EYE_POSITION: tuple(map(float, eye)), groups.FOCAL: focal}
+        place = {groups.CAMERA_SOURCE: 2, groups.CAMERA_POSITION: tuple(map(float, eye)), groups.FOCAL: focal}
         for socket, value in place.items():
             compat.set_input(modifier, socket, value)
         depsgraph = bpy.context.evaluated_depsgraph_get()
@@ -242,9 +242,9 @@ def test_a_group_that_an_artist_has_changed_is_followed_by_all(bpy, lodgs, half,
 
     as_ruled = agree()
     group = next(m.node_group for m in root.lodgs.levels[0].object.modifiers if "lodgs_rule" in m.node_group)
-    assert not lodgs("nodes.building").edited(group)
+    assert not lodgs("nodes.building").is_edited(group)
     change(group)
-    assert lodgs("nodes.building").edited(group)
+    assert lodgs("nodes.building").is_edited(group)
     assert agree() == everything() - as_ruled
     assert 0 < as_ruled < everything()
     views.clear()
@@ -273,7 +273,7 @@ def test_a_group_is_as_made_after_saving(bpy, lodgs, splat_scene, change, tmp_pa
             change(bpy.data.node_groups[group])
         bpy.ops.wm.save_as_mainfile(filepath=path, check_existing=False)
         bpy.ops.wm.open_mainfile(filepath=path)
-        assert lodgs("nodes.building").edited(bpy.data.node_groups[group]) == changed
+        assert lodgs("nodes.building").is_edited(bpy.data.node_groups[group]) == changed
 
 
 @pytest.mark.parametrize("name", RULES)
