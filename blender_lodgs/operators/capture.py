@@ -6,7 +6,7 @@ import bpy
 
 from .. import extension
 from ..data import scenes
-from ..runs import capturing, processes
+from ..runs import background_capture, processes
 from ..viewport import coverage
 from .base import report_errors
 
@@ -21,7 +21,7 @@ class LODGS_OT_capture_scene(bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        work = capturing.start(context)
+        work = background_capture.start(context)
         processes.follow(work.step)
         if work.problem:
             self.report({"ERROR"}, work.problem)
@@ -37,11 +37,11 @@ class LODGS_OT_cancel_capture(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return capturing.current is not None and capturing.current.running
+        return background_capture.current is not None and background_capture.current.running
 
     def execute(self, context):
-        assert capturing.current is not None
-        capturing.current.cancel()
+        assert background_capture.current is not None
+        background_capture.current.cancel()
         return {"FINISHED"}
 
 
@@ -79,7 +79,7 @@ class LODGS_OT_import_capture(bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        folder = capturing.folder_of(context.scene)
+        folder = background_capture.folder_of(context.scene)
         root = scenes.import_colmap(
             context, folder, upright=False, warn=lambda message: self.report({"WARNING"}, message)
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..runs import environment, making, processes
+from ..runs import environment, environment_setup, processes
 from .base import report_errors
 
 
@@ -19,7 +19,7 @@ class LODGS_OT_make_environment(bpy.types.Operator):
 
     @report_errors
     def execute(self, context: bpy.types.Context):
-        work = making.make()
+        work = environment_setup.make()
         processes.follow(work.step)
         if work.problem:
             self.report({"ERROR"}, work.problem)
@@ -35,11 +35,11 @@ class LODGS_OT_cancel_environment(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return making.current is not None and making.current.running
+        return environment_setup.current is not None and environment_setup.current.running
 
     def execute(self, context: bpy.types.Context):
-        if making.current is not None:
-            making.current.cancel()
+        if environment_setup.current is not None:
+            environment_setup.current.cancel()
         return {"FINISHED"}
 
 

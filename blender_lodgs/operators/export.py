@@ -1,4 +1,4 @@
-"""Exports of a splat scene: the bundle, one level for other programs, a folder of levels, and for the web."""
+"""Export a splat scene as a bundle, a plain splat file, a folder of levels, or levels for the web."""
 
 from __future__ import annotations
 
@@ -31,10 +31,11 @@ _SOG = find_format(Path("level.sog"))
 
 
 def _size(context: bpy.types.Context, kind: SplatFormat, level: int = 0) -> str:
-    """About how large a file of the active scene's splats gets.
+    """Estimate the file size of an export of the active scene, as text.
 
     Args:
-        level: of one level, with the coarser ones where levels add up; 0: of what is shown; -1: of all.
+        level: number of one level, with the coarser ones if levels add up; 0 for the visible splats, -1 for
+            all levels.
     """
     root = scenes.active_root(context)
     items = [item for item in root.lodgs.levels if item.exists]
@@ -54,38 +55,36 @@ def _size(context: bpy.types.Context, kind: SplatFormat, level: int = 0) -> str:
     return f"{size / 1e6:,.1f} MB" if size > 1e5 else f"{size / 1e3:,.0f} kB"
 
 
-class _AsShown(ReadLevelsOperator):
-    """What all exports can be told."""
+class _ExportOperator(ReadLevelsOperator):
+    """Base class with the options of all exports."""
 
     placed: bpy.props.BoolProperty(
         name="As Placed",
-        description="Write the splats where the scene stands in Blender: moved, turned and scaled with its "
-        "root, ground and size. Otherwise in the scene's own (COLMAP's) coordinates. Copies, and what of the "
-        "scene is moved by itself, count in neither",
+        description="Apply the scene's location, rotation and scale in Blender; disable to keep COLMAP's "
+        "coordinates. Transforms of single levels and instances are ignored",
         default=False,
     )
     looked: bpy.props.BoolProperty(
         name="With Look",
-        description="Write the splats in the colours and opacities that the Look panel gives them. Otherwise "
-        "as they were trained",
+        description="Apply the colours and opacities of the Look panel; disable to export the splats as "
+        "trained",
         default=True,
     )
 
 
-class _ForOthers(_AsShown):
-    """What exports for other programs can be told."""
+class _ForeignExport(_ExportOperator):
+    """Base class with the options of exports for other programs."""
 
     antialiased: bpy.props.BoolProperty(
         name="Antialiased",
-        description="For programs that draw splats with Mip-Splatting's filter, as LODGS does: leave "
-        "opacities as they were trained. Otherwise small splats are as faint as the photographs' views show "
-        "them, so that other programs do not draw them too bold. SPZ says which it is, and needs no choice",
+        description="Keep opacities as trained, for viewers with Mip-Splatting's filter; disable for other "
+        "viewers, which would draw small splats too bold. SPZ files store this choice themselves",
         default=False,
     )
 
 
-class _Export(_AsShown, ExportHelper):
-    """What exports to one PLY have in common: a name after the scene, and the browser's overwrite check."""
+class _FileExport(_ExportOperator, ExportHelper):
+    """Base class of exports to one file, named after the scene, with the File Browser's overwrite check."""
 
     filename_ext = ".ply"
     filter_glob: bpy.props.StringProperty(default="*.ply", options={"HIDDEN"})
@@ -101,40 +100,37 @@ class _Export(_AsShown, ExportHelper):
         return Path(bpy.path.abspath(self.filepath))
 
 
-class _Converting(BackgroundOperator):
-    """What exports have in common that another program may have to do with."""
+class _ConvertingExport(BackgroundOperator):
+    """Base class of exports that may run splat-transform."""
 
-    written = said = ""
+    written = ""
+    progress = ""
 
-    def told(self, work: Iterable[str]) -> Iterator[None]:
-        """Goes on with what the program does, and tells what it says."""
-        for said in work:
-            self.said = said
+    def follow(self, messages: Iterable[str]) -> Iterator[None]:
+        """Run the converter step by step and keep its last message for the status bar."""
+        for message in messages:
+            self.progress = message
             yield
 
     def result_text(self, count):
         return self.written
 
     def status_text(self, context, count):
-        return f"splat-transform: {self.said}; Esc stops"
+        return f"splat-transform: {self.progress}, Esc to stop"
 
 
-class LODGS_OT_export_bundle(_Export, bpy.types.Operator):
-    """Export all levels as one file, which other viewers open showing the finest level"""
+class LODGS_OT_export_bundle(_FileExport, bpy.types.Operator):
+    """Export all levels to one PLY file, of which other viewers show the finest level"""
 
     bl_idname = "lodgs.export_bundle"
     bl_label = "Export Bundle"
 
     order: bpy.props.EnumProperty(
         name="First",
-        description="The level that comes first in the file, which is what other viewers show",
+        description="First level in the file, which other viewers show",
         items=[
             ("finest_first", "Finest Level", "Other viewers show the finest level"),
-            (
-                "stream",
-                "Coarsest Level",
-                "For streaming: what has arrived so far is a complete coarser scene",
-            ),
+            ("stream", "Coarsest Level", "A partial download shows a complete coarse scene"),
         ],
     )
 
@@ -143,15 +139,15 @@ class LODGS_OT_export_bundle(_Export, bpy.types.Operator):
         self.layout.prop(self, "order")
         self.layout.prop(self, "placed")
         self.layout.prop(self, "looked")
-        self.layout.label(text=f"All levels: {_size(context, PLY, -1)}")
+        self.layout.label(text=f"Estimated size: {_size(context, PLY, -1)}")
 
     @report_errors
     def execute(self, context):
         root = scenes.active_root(context)
         if self.order == "stream" and not root.lodgs.complete:
             raise LodgsError(
-                "The coarser level of these splats is no scene by itself, which other viewers would show.",
-                "Put the finest level first.",
+                "Cannot write the coarsest level first: in a tree it is not a complete scene.",
+                "Set First to Finest Level.",
             )
         bundle = scenes.read_levels(root, self.placed, self.looked)
         write_bundle(self._path(), bundle, self.order)
@@ -159,8 +155,8 @@ class LODGS_OT_export_bundle(_Export, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LODGS_OT_export_plain(_ForOthers, _Export, _Converting, bpy.types.Operator):
-    """Export one level, or the splats that are shown now, as a plain file of splats for other programs"""
+class LODGS_OT_export_plain(_ForeignExport, _FileExport, _ConvertingExport, bpy.types.Operator):
+    """Export one level or the visible splats to a plain splat file for other programs"""
 
     bl_idname = "lodgs.export_plain"
     bl_label = "Export Splats"
@@ -171,26 +167,28 @@ class LODGS_OT_export_plain(_ForOthers, _Export, _Converting, bpy.types.Operator
     )
     kind: bpy.props.EnumProperty(
         name="Format",
-        description="The kind of file; in a script the file's name says it",
+        description="File format; scripts choose it by the file extension",
         items=[(kind.suffix, kind.label, kind.about) for kind in FORMATS],
     )
     source: bpy.props.EnumProperty(
         name="Splats",
-        description="What is exported",
+        description="Splats to export",
         items=[
             (
                 "SHOWN",
                 "As Shown",
-                "The splats of the levels that the viewport shows now, modifiers applied. Copies and the "
-                "viewport's limit do not count",
+                "The splats visible in the viewport with modifiers applied, regardless of instances and the "
+                "viewport's splat limit",
             ),
-            ("LEVEL", "One Level", "All splats of one level, modifiers not applied"),
+            ("LEVEL", "One Level", "All splats of one level, without modifiers"),
         ],
     )
-    level: bpy.props.IntProperty(name="Level", description="1 is the coarsest", default=1, min=1)
+    level: bpy.props.IntProperty(
+        name="Level", description="Level to export; 1 is the coarsest", default=1, min=1
+    )
 
     def check(self, context):
-        """The name follows the kind that is chosen."""
+        """Give the file name the extension of the chosen format."""
         path = next(
             (self.filepath[: -len(suffix)] for suffix in _SUFFIXES if self.filepath.endswith(suffix)),
             self.filepath,
@@ -208,10 +206,10 @@ class LODGS_OT_export_plain(_ForOthers, _Export, _Converting, bpy.types.Operator
         layout.prop(self, "placed")
         layout.prop(self, "looked")
         row = layout.row()
-        told = find_format(Path(f"splats{self.kind}")).antialiased
-        row.active = scenes.active_root(context).lodgs.antialias and not told
+        stores_filter = find_format(Path(f"splats{self.kind}")).antialiased
+        row.active = scenes.active_root(context).lodgs.antialias and not stores_filter
         row.prop(self, "antialiased")
-        layout.label(text="Format, and about how large:")
+        layout.label(text="Format and Estimated Size")
         column = layout.column(align=True)
         column.use_property_split = False
         for kind in FORMATS:
@@ -224,22 +222,23 @@ class LODGS_OT_export_plain(_ForOthers, _Export, _Converting, bpy.types.Operator
             splats = scenes.read_level(root, self.level, self.placed, self.looked)
         else:
             splats = scenes.shown_splats(context, root, self.placed, self.looked)
-        meta, path = selection.read_json(root.lodgs.meta), self._path()
-        form = Bundle("", [Level(1, splats)], meta=meta, tables=scenes.view_tables(root, self.placed))
+        path = self._path()
+        meta = selection.read_json(root.lodgs.meta)
+        bundle = Bundle("", [Level(1, splats)], meta=meta, tables=scenes.view_tables(root, self.placed))
         if not (self.antialiased or find_format(path).antialiased):
-            form = without_filter(form)
-        yield from self.told(write_splats(path, form.levels[0].rows, form.meta))
-        self.written = f"{len(splats):,} splats written to {self._path()}"
+            bundle = without_filter(bundle)
+        yield from self.follow(write_splats(path, bundle.levels[0].rows, bundle.meta))
+        self.written = f"{len(splats):,} splats written to {path}"
 
 
 _SUFFIXES = sorted((kind.suffix for kind in FORMATS), key=len, reverse=True)
 
 
-class _IntoFolder(_AsShown):
-    """What exports into a folder have in common."""
+class _FolderExport(_ExportOperator):
+    """Base class of exports to a folder."""
 
     directory: bpy.props.StringProperty(
-        name="Folder", description="Folder that receives the files", subtype="DIR_PATH"
+        name="Folder", description="Folder for the exported files", subtype="DIR_PATH"
     )
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
     kind = PLY
@@ -253,49 +252,51 @@ class _IntoFolder(_AsShown):
         for name in ("placed", "looked", "antialiased", "replace"):
             if name in self.bl_rna.properties:
                 self.layout.prop(self, name)
-        self.layout.label(text=f"About {_size(context, self.kind, -1)} in all")
+        self.layout.label(text=f"Estimated size: {_size(context, self.kind, -1)}")
 
     def _folder(self) -> Path:
         return Path(bpy.path.abspath(self.directory))
 
     def _bundle(self, context) -> Bundle:
-        """The levels, each a scene by itself."""
+        """Return the levels, each a complete scene."""
         bundle = scenes.read_levels(scenes.active_root(context), self.placed, self.looked)
         return complete_levels(bundle) if is_tree(bundle) else bundle
 
 
-class LODGS_OT_export_folder(_IntoFolder, bpy.types.Operator):
-    """Export levels as PLYs of their own, whole scenes each: lod0.ply (the finest), lod1.ply, ..."""
+class LODGS_OT_export_folder(_FolderExport, bpy.types.Operator):
+    """Export each level as a complete scene to its own PLY file: lod0.ply (the finest), lod1.ply and so on"""
 
     bl_idname = "lodgs.export_folder"
-    bl_label = "Export Folder of Levels"
+    bl_label = "Export Level Folder"
 
     replace: bpy.props.BoolProperty(
-        name="Replace", description="Replace levels that are in the folder already", options={"SKIP_SAVE"}
+        name="Replace", description="Overwrite levels that are already in the folder", options={"SKIP_SAVE"}
     )
 
     @report_errors
     def execute(self, context):
         folder = self._folder()
         if not self.replace and any(folder.glob("lod*.ply")):
-            raise LodgsError(f"{folder} already holds levels.", "Choose another folder, or tick Replace.")
+            raise LodgsError(
+                f"Cannot export: {folder} already holds levels.", "Choose another folder or enable Replace."
+            )
         bundle = self._bundle(context)
         write_folder(folder, bundle)
         self.report({"INFO"}, f"{_levels(bundle)} written to {folder}")
         return {"FINISHED"}
 
 
-class LODGS_OT_export_streamed(_ForOthers, _IntoFolder, _Converting, bpy.types.Operator):
-    """Export levels that web viewers load piece by piece, by distance. Slow without a graphics card"""
+class LODGS_OT_export_streamed(_ForeignExport, _FolderExport, _ConvertingExport, bpy.types.Operator):
+    """Export levels for web viewers that stream detail by distance; slow without a GPU"""
 
     bl_idname = "lodgs.export_streamed"
-    bl_label = "Export for the Web"
+    bl_label = "Export for Web"
     kind = _SOG
 
     def work(self, context):
         bundle = self._bundle(context)
         bundle = bundle if self.antialiased else without_filter(bundle)
-        yield from self.told(write_streamed_levels(self._folder(), bundle))
+        yield from self.follow(write_streamed_levels(self._folder(), bundle))
         self.written = f"{_levels(bundle)} written: {self._folder() / STREAMED_FILE}"
 
 
@@ -305,9 +306,9 @@ def _levels(bundle: Bundle) -> str:
 
 
 def _menu(self, context):
-    self.layout.operator(LODGS_OT_export_bundle.bl_idname, text="Splat Levels, Bundle (.ply)")
-    self.layout.operator(LODGS_OT_export_plain.bl_idname, text="Splats, Plain (.ply, .spz, .sog, .splat)")
-    self.layout.operator(LODGS_OT_export_folder.bl_idname, text="Splat Levels (folder)")
+    self.layout.operator(LODGS_OT_export_bundle.bl_idname, text="Splat Level Bundle (.ply)")
+    self.layout.operator(LODGS_OT_export_plain.bl_idname, text="Plain Splats (.ply, .spz, .sog, .splat)")
+    self.layout.operator(LODGS_OT_export_folder.bl_idname, text="Splat Level Folder")
     self.layout.operator(LODGS_OT_export_streamed.bl_idname, text="Splat Levels for the Web (folder)")
 
 

@@ -1,4 +1,4 @@
-"""File > Import > Photographs: their cameras are found first."""
+"""File > Import > Photos: find the cameras of photos or of a video, and import them as a scene."""
 
 from __future__ import annotations
 
@@ -7,54 +7,54 @@ from pathlib import Path
 import bpy
 
 from ...training.scenes.reconstruct import PRESETS
-from ..runs import preparing, processes
+from ..runs import photo_preparation, processes
 from .base import report_errors
 
 _LENSES = (
-    ("AUTO", "Automatic", "One lens, where all photographs are of one size; else each its own"),
-    ("one", "One for All", "The same camera at the same focal length took all photographs"),
-    ("folder", "One a Folder", "Each folder is of another camera"),
-    ("each", "Each Its Own", "Photographs from anywhere, or zoomed"),
+    ("AUTO", "Automatic", "One lens if all photos have the same size, otherwise one lens per photo"),
+    ("one", "Single Lens", "All photos were taken with one camera at one focal length"),
+    ("folder", "Lens per Folder", "Each folder holds the photos of one camera"),
+    ("each", "Lens per Photo", "Photos from different cameras, or with zoom"),
 )
 
 
 class LODGS_OT_find_cameras(bpy.types.Operator):
     bl_idname = "lodgs.find_cameras"
-    bl_label = "Import Photographs"
+    bl_label = "Import Photos"
     bl_description = (
-        "Find from where a folder of photographs, or a video, was taken, while you work on, and import them "
-        "as a scene. It takes minutes; stopped, it goes on from there"
+        "Find the camera positions of a folder of photos or of a video in the background, and import the "
+        "scene; a cancelled import resumes with the same files"
     )
     bl_options = {"REGISTER", "PRESET"}
 
     filepath: bpy.props.StringProperty(
-        name="Video", description="A video, instead of a folder of photographs", subtype="FILE_PATH"
+        name="Video", description="Video to use instead of a folder of photos", subtype="FILE_PATH"
     )
     directory: bpy.props.StringProperty(
-        name="Folder", description="Folder of the photographs, and of folders of them", subtype="DIR_PATH"
+        name="Folder", description="Folder with photos, also in subfolders", subtype="DIR_PATH"
     )
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
     filter_image: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
     filter_movie: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
     out: bpy.props.StringProperty(
-        name="Scene",
-        description="Folder that becomes the COLMAP scene; empty for one beside the photographs' folder",
+        name="Scene Folder",
+        description="Folder for the COLMAP scene; empty for a new folder next to the photos",
         subtype="DIR_PATH",
     )
     preset: bpy.props.EnumProperty(
         name="Preset",
-        description="How closely photographs are looked at",
+        description="Accuracy of the feature search",
         items=[
-            (name, name.title(), f"Up to {features:,} features of each, found at {size} pixels")
+            (name, name.title(), f"Up to {features:,} features per photo, at {size} pixels")
             for name, (size, features) in PRESETS.items()
         ],
     )
     ordered: bpy.props.BoolProperty(
-        name="In Order",
-        description="By name photographs follow the way that was walked, as frames of a video do: neighbours "
-        "are compared, which takes less time",
+        name="Sequential",
+        description="Match only neighbouring photos, which is faster; enable for photos named in the order "
+        "of a walk, such as video frames",
     )
-    lens: bpy.props.EnumProperty(name="Lens", description="Which photographs one lens took", items=_LENSES)
+    lens: bpy.props.EnumProperty(name="Lens", description="Photos that share a lens", items=_LENSES)
 
     def invoke(self, context, event):
         context.window_manager.fileselect_add(self)
@@ -66,10 +66,10 @@ class LODGS_OT_find_cameras(bpy.types.Operator):
         video = Path(bpy.path.abspath(self.filepath)).resolve() if self.filepath else photos
         if video.is_file() and video.suffix.lower() in bpy.path.extensions_movie:
             photos = video
-        beside = photos.with_name(f"{photos.stem if photos.is_file() else photos.name}_scene")
-        out = Path(bpy.path.abspath(self.out)).resolve() if self.out else beside
+        default_out = photos.with_name(f"{photos.stem if photos.is_file() else photos.name}_scene")
+        out = Path(bpy.path.abspath(self.out)).resolve() if self.out else default_out
         lens = "" if self.lens == "AUTO" else self.lens
-        work = preparing.find_cameras(photos, out, self.preset, self.ordered, lens)
+        work = photo_preparation.find_cameras(photos, out, self.preset, self.ordered, lens)
         processes.follow(work.step)
         for message in work.warnings:
             self.report({"WARNING"}, message)
@@ -83,21 +83,21 @@ class LODGS_OT_find_cameras(bpy.types.Operator):
 class LODGS_OT_cancel_find_cameras(bpy.types.Operator):
     bl_idname = "lodgs.cancel_find_cameras"
     bl_label = "Cancel"
-    bl_description = "Stop finding cameras; the same import goes on from there"
+    bl_description = "Stop the import; importing the same photos resumes it"
     bl_options = {"INTERNAL"}
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return preparing.current is not None and preparing.current.running
+        return photo_preparation.current is not None and photo_preparation.current.running
 
     def execute(self, context):
-        assert preparing.current is not None
-        preparing.current.cancel()
+        assert photo_preparation.current is not None
+        photo_preparation.current.cancel()
         return {"FINISHED"}
 
 
 def _menu(self, context):
-    self.layout.operator(LODGS_OT_find_cameras.bl_idname, text="Photographs (folder) or Video")
+    self.layout.operator(LODGS_OT_find_cameras.bl_idname, text="Photos (folder) or Video")
 
 
 CLASSES = (LODGS_OT_find_cameras, LODGS_OT_cancel_find_cameras)

@@ -1,4 +1,4 @@
-"""The operator that has a render farm train cells."""
+"""The operator that submits the training of cells to a render farm."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ class LODGS_OT_submit_to_flamenco(SceneOperator, SteppedOperator, bpy.types.Oper
     bl_idname = "lodgs.submit_to_flamenco"
     bl_label = "Submit to Flamenco"
     bl_description = (
-        "Have the render farm of the preferences train this scene in cells, with the settings of this panel. "
-        "Its workers have to see the scene's and the run's folder"
+        "Train this scene's cells on the render farm set in the preferences; all workers need access to the "
+        "scene folder and the run folder"
     )
 
     folder: bpy.props.StringProperty(
         name="Run Folder",
-        description="Folder of the run, which all workers see; empty: a new one where the settings say",
+        description="Run folder that all workers can access; empty for a new folder",
         subtype="DIR_PATH",
         options={"SKIP_SAVE", "PATH_SUPPORTS_BLEND_RELATIVE"},
     )
@@ -31,7 +31,7 @@ class LODGS_OT_submit_to_flamenco(SceneOperator, SteppedOperator, bpy.types.Oper
         return self.execute(context) if bpy.app.background else self.start_modal(context)
 
     def work(self, context):
-        self._said = "The manager may have the job nevertheless"
+        self._result = "The manager may have received the job"
         submission = flamenco.prepare(scenes.active_root(context), self.folder)
         sender = ThreadPoolExecutor(1, "lodgs-flamenco")
         try:
@@ -40,13 +40,13 @@ class LODGS_OT_submit_to_flamenco(SceneOperator, SteppedOperator, bpy.types.Oper
                 yield
         finally:
             sender.shutdown(wait=False)
-        self._said = f"Submitted: {sending.result()}. The run will be in {submission.settings['output']}"
+        self._result = f"Submitted: {sending.result()}. Run folder: {submission.settings['output']}"
 
     def status_text(self, context, count):
-        return "Submitting to Flamenco; Esc stops"
+        return "Submitting to Flamenco, Esc to stop"
 
     def result_text(self, count):
-        return self._said
+        return self._result
 
 
 CLASSES = (LODGS_OT_submit_to_flamenco,)

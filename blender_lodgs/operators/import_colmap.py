@@ -1,4 +1,4 @@
-"""File > Import > COLMAP Scene."""
+"""File > Import > COLMAP Scene: import cameras, photos and points."""
 
 from __future__ import annotations
 
@@ -7,31 +7,31 @@ from pathlib import Path
 import bpy
 
 from ..data import photographs, scenes
-from ..runs import preparing
+from ..runs import photo_preparation
 from .base import report_errors
 
 
 class LODGS_OT_import_colmap(bpy.types.Operator):
-    """Import the cameras, photographs and points of a COLMAP scene"""
+    """Import the cameras, photos and points of a COLMAP scene or another photogrammetry export"""
 
     bl_idname = "lodgs.import_colmap"
-    bl_label = "Import COLMAP"
+    bl_label = "Import COLMAP Scene"
     bl_options = {"REGISTER", "UNDO", "PRESET"}
 
     directory: bpy.props.StringProperty(
         name="Folder",
-        description="Folder of the COLMAP scene, with photographs and sparse model; or of what nerfstudio, "
-        "Polycam, Record3D, Metashape, OpenMVG or Bundler have exported",
+        description="Folder of a COLMAP scene with its photos, or of an export of nerfstudio, Polycam, "
+        "Record3D, Metashape, OpenMVG or Bundler",
         subtype="DIR_PATH",
     )
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
     upright: bpy.props.BoolProperty(
         name="Upright",
-        description="Turn the scene so that up for the cameras is up in Blender; off keeps COLMAP's axes",
+        description="Rotate the scene so that the cameras' up direction is Z; disable to keep COLMAP's axes",
         default=True,
     )
     photographs: bpy.props.BoolProperty(
-        name="Photographs", description="Show each camera's photograph behind its view", default=True
+        name="Photos", description="Show each camera's photo as its background image", default=True
     )
 
     def invoke(self, context, event):
@@ -51,9 +51,9 @@ class LODGS_OT_import_colmap(bpy.types.Operator):
             photographs=self.photographs,
             warn=warn,
         )
-        preparing.forget()
-        preparing.straighten(root, warn)
-        if first:  # otherwise the artist is looking at something
+        photo_preparation.forget()
+        photo_preparation.straighten(root, warn)
+        if first:  # keep the view if the file already shows a splat scene
             photographs.look_at_scene(context, root, warn)
         self.report({"INFO"}, f"'{root.name}': {scenes.contents(root)}")
         return {"FINISHED"}

@@ -1,4 +1,4 @@
-"""File > Import > Gaussian Splats, and dropping such files into the 3D viewport."""
+"""File > Import > Gaussian Splats, and the drop of such files into the 3D viewport."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import bpy
 
 from ...training.splats.formats import READABLE
 from ..data import photographs, scenes
-from ..runs import preparing
+from ..runs import photo_preparation
 from .modal import BackgroundOperator
 
 
 class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
-    """Import a bundle of levels, streamed levels, or any file of Gaussian splats as a single level"""
+    """Import a bundle, streamed levels, or a plain splat file as a single level"""
 
     bl_idname = "lodgs.import_splats"
     bl_label = "Import Splats"
@@ -22,7 +22,7 @@ class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
 
     filepath: bpy.props.StringProperty(
         name="File",
-        description="Bundle, or any file of splats: " + ", ".join(READABLE),
+        description="Bundle or splat file: " + ", ".join(READABLE),
         subtype="FILE_PATH",
         options={"SKIP_SAVE"},
     )
@@ -35,15 +35,14 @@ class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
     )
     upright: bpy.props.BoolProperty(
         name="Upright",
-        description="Turn the scene so that the file's -Y, which is up in most splat files, is up in Blender",
+        description="Rotate the scene so that the file's -Y axis, up in most splat files, becomes Z",
         default=True,
     )
 
     budget: bpy.props.IntProperty(
         name="Splats at Most",
-        description="How many splats of a tree are in memory at most. Of a larger one the coarse ones are "
-        "imported, and finer ones are read from the file as the eye comes near. 0 is no limit. Files without "
-        "a tree are imported whole",
+        description="Maximum number of splats of a tree in memory; finer splats are streamed from the file "
+        "when the camera comes near. 0 imports the whole tree, as for other files",
         default=0,
         min=0,
         step=100_000,
@@ -56,15 +55,17 @@ class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def paths(self) -> list[Path]:
-        found = [Path(self.directory, file.name) for file in self.files if file.name]
-        return found or [Path(self.filepath)]
+        """Return the chosen or dropped files."""
+        paths = [Path(self.directory, file.name) for file in self.files if file.name]
+        return paths or [Path(self.filepath)]
 
     def work(self, context):
         def warn(message: str) -> None:
             self.report({"WARNING"}, message)
 
         first = not scenes.roots(context.scene)
-        reader, self._placed = ThreadPoolExecutor(1, "lodgs-import"), []
+        reader = ThreadPoolExecutor(1, "lodgs-import")
+        self._imported = []
         try:
             for path in self.paths():
                 read = reader.submit(scenes.read_splats_file, bpy.path.abspath(str(path)), self.budget)
@@ -72,19 +73,19 @@ class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
                     yield
                 root = yield from scenes.place_splats(context, read.result(), self.upright, warn)
                 yield
-                if first:  # otherwise the artist is looking at something
+                if first:  # keep the view if the file already shows a splat scene
                     photographs.look_at_scene(context, root, warn)
                     first = False
-                preparing.forget()
-                self._placed.append(f"'{root.name}': {scenes.contents(root)}")
+                photo_preparation.forget()
+                self._imported.append(f"'{root.name}': {scenes.contents(root)}")
         finally:
             reader.shutdown(wait=False, cancel_futures=True)
 
     def result_text(self, count):
-        return "; ".join(self._placed)
+        return "; ".join(self._imported)
 
     def status_text(self, context, count):
-        return f"Reading {', '.join(path.name for path in self.paths())}; Esc stops"
+        return f"Reading {', '.join(path.name for path in self.paths())}, Esc to stop"
 
 
 class LODGS_FH_splats(bpy.types.FileHandler):

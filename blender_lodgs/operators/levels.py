@@ -1,4 +1,4 @@
-"""Buttons of the list of levels."""
+"""Operators of the list of levels."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ from .base import SceneOperator, report_errors
 
 
 class LODGS_OT_show_only_level(SceneOperator, bpy.types.Operator):
-    """Show this level everywhere; where levels add up, with all coarser ones"""
+    """Show only this level, together with all coarser ones if levels add up"""
 
     bl_idname = "lodgs.show_only_level"
-    bl_label = "Only This One"
+    bl_label = "Show Only Level"
     bl_options = {"REGISTER", "UNDO", "INTERNAL"}
 
-    level: bpy.props.IntProperty(name="Level", description="1 is the coarsest", default=1, min=1)
+    level: bpy.props.IntProperty(
+        name="Level", description="Level to show; 1 is the coarsest", default=1, min=1
+    )
 
     @report_errors
     def execute(self, context):

@@ -1,4 +1,4 @@
-"""Look through the cameras of a COLMAP scene."""
+"""The operator that looks through the cameras of a scene."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from .base import report_errors
 
 
 class LODGS_OT_look_through(bpy.types.Operator):
-    """Look through a camera of the scene, with its photograph and the render in its size"""
+    """Look through a training camera, with its photo in the background and the render size to match"""
 
     bl_idname = "lodgs.look_through"
-    bl_label = "Look Through Photograph"
+    bl_label = "Look Through Photo"
     bl_options = {"REGISTER", "UNDO"}
 
     step: bpy.props.IntProperty(
         name="Step",
-        description="Views to go on by name from the scene's camera; 0 takes the selected camera",
+        description="Number of views to move on by name from the active camera; 0 for the selected camera",
         options={"SKIP_SAVE"},
     )
 

@@ -1,4 +1,4 @@
-"""Clicking on splats selects their scene, as clicking on a mesh selects that."""
+"""Select a splat scene by clicking on its splats in the viewport."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from .. import viewport
 from ..data import picking
 from ..data.shown import is_splats
 
-_PRESSED = "3D View Tool: Tweak", "3D View Tool: Tweak (fallback)"
-"""Keymaps of tools in which Blender selects when the button is pressed: no click comes where that changes
-something. In all others it does so by a click, and a keymap of an extension's is asked before."""
+_PRESS_KEYMAPS = "3D View Tool: Tweak", "3D View Tool: Tweak (fallback)"
+"""Tool keymaps in which Blender selects on press; no click event follows a press that changes the selection.
+In all others it selects on click, after the extension's keymap."""
 _keymaps: list[tuple[bpy.types.KeyMap, bpy.types.KeyMapItem]] = []
 
 
 class LODGS_OT_select_clicked(bpy.types.Operator):
-    """Select what is clicked on, splat scenes too"""
+    """Select the object or splat scene under the mouse"""
 
     bl_idname = "lodgs.select_clicked"
     bl_label = "Select"
@@ -25,86 +25,92 @@ class LODGS_OT_select_clicked(bpy.types.Operator):
 
     pressed: bpy.props.BoolProperty(
         name="Pressed",
-        description="Blender has selected what is there when the button was pressed; otherwise it does now",
+        description="Blender has already selected on press, so its own click is not repeated",
         options={"SKIP_SAVE"},
     )
 
     @classmethod
     def poll(cls, context):
-        there = any(map(is_splats, bpy.data.pointclouds))  # without splats all is Blender's
-        return there and context.mode == "OBJECT" and context.region_data is not None
+        has_splats = any(map(is_splats, bpy.data.pointclouds))  # without splats Blender handles every click
+        return has_splats and context.mode == "OBJECT" and context.region_data is not None
 
     def invoke(self, context, event):
-        at = event.mouse_region_x, event.mouse_region_y
+        pixel = event.mouse_region_x, event.mouse_region_y
         if self.pressed:
-            clicked = not _dragged(context, event) and select(context, at)
-            return {"FINISHED"} if clicked else {"CANCELLED", "PASS_THROUGH"}
-        if not _selects_by_left(context):
+            selected = not _dragged(context, event) and select(context, pixel)
+            return {"FINISHED"} if selected else {"CANCELLED", "PASS_THROUGH"}
+        if not _left_click_selects(context):
             return {"CANCELLED", "PASS_THROUGH"}
-        changed = _blenders_own(at)
-        return {"FINISHED"} if select(context, at) or changed else {"CANCELLED"}
+        changed = _blender_click(pixel)
+        return {"FINISHED"} if select(context, pixel) or changed else {"CANCELLED"}
 
 
-def _blenders_own(at: tuple[int, int]) -> bool:
-    """What Blender's own click does; whether that changes what is selected."""
-    return "FINISHED" in bpy.ops.view3d.select(deselect_all=True, location=at)
+def _blender_click(pixel: tuple[int, int]) -> bool:
+    """Run Blender's own click and return True if it changes the selection."""
+    return "FINISHED" in bpy.ops.view3d.select(deselect_all=True, location=pixel)
 
 
 def _dragged(context: bpy.types.Context, event: bpy.types.Event) -> bool:
-    """Whether the mouse has moved since its button was pressed."""
-    ways = event.mouse_x - event.mouse_prev_press_x, event.mouse_y - event.mouse_prev_press_y
-    return max(map(abs, ways)) > context.preferences.inputs.drag_threshold_mouse
+    """Return True if the mouse has moved since its button was pressed."""
+    offset = event.mouse_x - event.mouse_prev_press_x, event.mouse_y - event.mouse_prev_press_y
+    return max(map(abs, offset)) > context.preferences.inputs.drag_threshold_mouse
 
 
-def _selects_by_left(context: bpy.types.Context) -> bool:
+def _left_click_selects(context: bpy.types.Context) -> bool:
     settings = context.window_manager.keyconfigs.active.preferences
     return getattr(settings, "select_mouse", "LEFT") == "LEFT"
 
 
-def select(context: bpy.types.Context, at: tuple[float, float]) -> bool:
-    """Selects the splat scene that the context's viewport shows at a pixel, after Blender's own click there:
-    in place of nothing, or of the one mesh that it found although splats hide it.
+def select(context: bpy.types.Context, pixel: tuple[float, float]) -> bool:
+    """Select the splat scene at a pixel of the context's viewport, after Blender's own click there.
+
+    The scene is selected if Blender's click selected nothing, or one mesh that splats hide.
 
     Args:
-        at: x from the left and y from below.
+        pixel: x from the left and y from the bottom.
 
     Returns:
-        Whether there is such a scene.
+        True if a scene is selected.
     """
-    region, looks, before = context.region, context.region_data, np.inf
-    others = context.selected_objects
-    if others:
-        depth = _depth_of_mesh(context, at, others)
+    region = context.region
+    view = context.region_data
+    max_depth = np.inf
+    selected = context.selected_objects
+    if selected:
+        depth = _depth_of_mesh(context, pixel, selected)
         if depth is None:
             return False
-        before = depth
+        max_depth = depth
     obj = picking.scene_at(
-        context.evaluated_depsgraph_get(), context.space_data, looks.view_matrix, looks.window_matrix,
-        (region.width, region.height), at, before,
+        context.evaluated_depsgraph_get(), context.space_data, view.view_matrix, view.window_matrix,
+        (region.width, region.height), pixel, max_depth,
     )  # fmt: skip
     if obj is None or not obj.visible_get(view_layer=context.view_layer):
         return False
-    for other in others:
-        other.select_set(False)
+    for deselected in selected:
+        deselected.select_set(False)
     obj.select_set(True)
     context.view_layer.objects.active = obj
     return True
 
 
 def _depth_of_mesh(
-    context: bpy.types.Context, at: tuple[float, float], selected: list[bpy.types.Object]
+    context: bpy.types.Context, pixel: tuple[float, float], selected: list[bpy.types.Object]
 ) -> float | None:
-    """Depth in the world of the surface at a pixel; None where it is none of the one selected object, or the
-    viewport draws no splats that could hide it."""
+    """Return the depth of the selected object's surface at a pixel, in world units.
+
+    None if several objects are selected, another surface is at the pixel, or the viewport draws no splats.
+    """
     if len(selected) > 1 or not viewport.draws_splats(context.scene, context.space_data):
         return None
-    region, view = context.region, context.region_data
-    eye = view3d_utils.region_2d_to_origin_3d(region, view, at)
-    ahead = view3d_utils.region_2d_to_vector_3d(region, view, at)
-    hit, place, *_, obj, _ = context.scene.ray_cast(context.evaluated_depsgraph_get(), eye, ahead)
+    region = context.region
+    view = context.region_data
+    origin = view3d_utils.region_2d_to_origin_3d(region, view, pixel)
+    direction = view3d_utils.region_2d_to_vector_3d(region, view, pixel)
+    hit, point, *_, obj, _ = context.scene.ray_cast(context.evaluated_depsgraph_get(), origin, direction)
     if not hit or obj != selected[0]:
         return None
-    return -(view.view_matrix @ place).z
+    return -(view.view_matrix @ point).z
 
 
 CLASSES = (LODGS_OT_select_clicked,)
@@ -113,12 +119,12 @@ CLASSES = (LODGS_OT_select_clicked,)
 def register() -> None:
     keyconfig = bpy.context.window_manager.keyconfigs.addon
     if keyconfig is not None:  # not in background
-        verb = LODGS_OT_select_clicked.bl_idname
+        idname = LODGS_OT_select_clicked.bl_idname
         keymap = keyconfig.keymaps.new(name="Object Mode")
-        _keymaps.append((keymap, keymap.keymap_items.new(verb, "LEFTMOUSE", "CLICK")))
-        for name in _PRESSED:
+        _keymaps.append((keymap, keymap.keymap_items.new(idname, "LEFTMOUSE", "CLICK")))
+        for name in _PRESS_KEYMAPS:
             keymap = keyconfig.keymaps.new(name=name, space_type="VIEW_3D", region_type="WINDOW", tool=True)
-            item = keymap.keymap_items.new(verb, "LEFTMOUSE", "RELEASE")
+            item = keymap.keymap_items.new(idname, "LEFTMOUSE", "RELEASE")
             item.properties.pressed = True
             _keymaps.append((keymap, item))
 

@@ -1,4 +1,4 @@
-"""Where a splat scene stands, on which ground and how large; and where to stand, to see it."""
+"""Operators for a splat scene's ground, scale and moving cameras."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .base import SceneOperator, report_errors
 
 
 class LODGS_OT_frame_scene(SceneOperator, bpy.types.Operator):
-    """Have most of the splat scene in sight of the viewports, whatever far outliers it has"""
+    """Move the viewports to show most of the splat scene, without far outliers"""
 
     bl_idname = "lodgs.frame_scene"
     bl_label = "Frame Splat Scene"
@@ -20,7 +20,7 @@ class LODGS_OT_frame_scene(SceneOperator, bpy.types.Operator):
 
 
 class LODGS_OT_set_ground(SceneOperator, bpy.types.Operator):
-    """Lay the splat scene on its ground, which is at Z = 0 then. The root keeps its location and angles"""
+    """Move the splat scene so that its ground lies at Z = 0, and keep the root's location and rotation"""
 
     bl_idname = "lodgs.set_ground"
     bl_label = "Set Ground"
@@ -28,30 +28,32 @@ class LODGS_OT_set_ground(SceneOperator, bpy.types.Operator):
 
     by: bpy.props.EnumProperty(
         name="Ground",
-        description="What says where the ground is",
+        description="Source of the ground plane",
         items=[
             (
                 "SELECTION",
                 "Selection",
-                "Three or more points that are selected in Edit Mode, or empties in Object Mode: a plane "
-                "through three, the one that fits best of more",
+                "Fit the plane to three or more points selected in Edit Mode, or empties selected in Object "
+                "Mode",
             ),
-            ("FOUND", "Found", "The plane that many points are on and hardly any are below"),
+            ("FOUND", "Detect", "Find the plane that holds many points and has few points below it"),
         ],
     )
-    flip: bpy.props.BoolProperty(name="Flip", description="Turn the scene upside down")
+    flip: bpy.props.BoolProperty(
+        name="Flip", description="Turn the scene upside down; enable if the ground faces down"
+    )
 
     @report_errors
     def execute(self, context):
         root = scenes.active_root(context)
-        places = ground.picked(context) if self.by == "SELECTION" else None
-        degrees = ground.lay_on_ground(root, places, self.flip)
-        self.report({"INFO"}, f"Its ground is at Z = 0 now: '{root.name}' was turned by {degrees:.1f}°")
+        points = ground.picked(context) if self.by == "SELECTION" else None
+        degrees = ground.lay_on_ground(root, points, self.flip)
+        self.report({"INFO"}, f"Ground set to Z = 0: '{root.name}' rotated by {degrees:.1f}°")
         return {"FINISHED"}
 
 
 class LODGS_OT_set_scale(SceneOperator, bpy.types.Operator):
-    """Give the splat scene its size, by the length between two points or empties that are selected"""
+    """Scale the splat scene by the true distance between two selected points or empties"""
 
     bl_idname = "lodgs.set_scale"
     bl_label = "Set Scale"
@@ -59,7 +61,7 @@ class LODGS_OT_set_scale(SceneOperator, bpy.types.Operator):
 
     length: bpy.props.FloatProperty(
         name="Length",
-        description="How far the two selected places are apart in truth",
+        description="True distance between the two selected points",
         default=1.0,
         min=1e-6,
         soft_max=1e4,
@@ -83,14 +85,15 @@ class LODGS_OT_set_scale(SceneOperator, bpy.types.Operator):
         root = scenes.active_root(context)
         factor = self.length / ground.measured(ground.picked(context))
         ground.scale(root, factor)
-        same = abs(factor - 1) < 1e-4
-        size = "as large as it was" if same else f"{factor:.4g} times as large"
-        self.report({"INFO"}, f"'{root.name}' is {size}")
+        unchanged = abs(factor - 1) < 1e-4
+        self.report(
+            {"INFO"}, f"'{root.name}' unchanged" if unchanged else f"'{root.name}' scaled by {factor:.4g}"
+        )
         return {"FINISHED"}
 
 
 class LODGS_OT_camera_path(SceneOperator, bpy.types.Operator):
-    """Add a camera that goes along the photographs by name, smoothed, in the scene's frames"""
+    """Add a camera that follows the training cameras on a smooth path over the frame range"""
 
     bl_idname = "lodgs.camera_path"
     bl_label = "Add Camera Path"
@@ -99,12 +102,12 @@ class LODGS_OT_camera_path(SceneOperator, bpy.types.Operator):
     @report_errors
     def execute(self, context):
         camera = flights.path(context, scenes.active_root(context))
-        self.report({"INFO"}, f"'{camera.name}' is the scene's camera")
+        self.report({"INFO"}, f"'{camera.name}' is the active camera")
         return {"FINISHED"}
 
 
 class LODGS_OT_turntable(SceneOperator, bpy.types.Operator):
-    """Add a camera that goes once around the splat scene in the scene's frames"""
+    """Add a camera that circles the splat scene once over the frame range"""
 
     bl_idname = "lodgs.turntable"
     bl_label = "Add Turntable"
@@ -113,7 +116,7 @@ class LODGS_OT_turntable(SceneOperator, bpy.types.Operator):
     @report_errors
     def execute(self, context):
         camera = flights.turntable(context, scenes.active_root(context))
-        self.report({"INFO"}, f"'{camera.name}' is the scene's camera")
+        self.report({"INFO"}, f"'{camera.name}' is the active camera")
         return {"FINISHED"}
 
 

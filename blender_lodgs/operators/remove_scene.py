@@ -1,4 +1,4 @@
-"""Remove a splat scene with all that belongs to it."""
+"""The operator that removes a splat scene and its objects."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .base import SceneOperator
 
 
 class LODGS_OT_remove_scene(SceneOperator, bpy.types.Operator):
-    """Remove the splat scene: its levels, points, cameras and collections. Files and runs stay"""
+    """Remove the splat scene with its levels, points and cameras from this file; files on disk are kept"""
 
     bl_idname = "lodgs.remove_scene"
     bl_label = "Remove Splat Scene"
@@ -20,17 +20,18 @@ class LODGS_OT_remove_scene(SceneOperator, bpy.types.Operator):
         name = scenes.active_root(context).name
         return context.window_manager.invoke_confirm(
             self, event, title=f"Remove '{name}'?", confirm_text="Remove", icon="WARNING",
-            message="Its levels, points and cameras leave this file. Photographs and runs stay on disk.",
+            message="Its levels, points and cameras are deleted. Photos and runs stay on disk.",
         )  # fmt: skip
 
     def execute(self, context):
         root = scenes.active_root(context)
-        name, watch = root.name, watch_of(root)
+        name = root.name
+        watch = watch_of(root)
         if context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
         removal.remove(root)
-        aside = f"; its training goes on in {watch.folder.path}" if watch and watch.running else ""
-        self.report({"INFO"}, f"'{name}' is removed{aside}")
+        suffix = f"; its training continues in {watch.folder.path}" if watch and watch.running else ""
+        self.report({"INFO"}, f"Removed '{name}'{suffix}")
         return {"FINISHED"}
 
 

@@ -1,4 +1,4 @@
-"""Rendering with the engine LODGS: choosing it, and taking its camera elsewhere."""
+"""Operators of the LODGS render engine: select it, combine it with meshes, render and export the camera."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from .modal import FrameOperator
 
 
 class LODGS_OT_use_engine(bpy.types.Operator):
-    """Render this scene with LODGS, in the colours of the photographs (view transform Standard)"""
+    """Set the render engine to LODGS and the view transform to Standard, to match the photos' colours"""
 
     bl_idname = "lodgs.use_engine"
-    bl_label = "Render With LODGS"
+    bl_label = "Use LODGS Engine"
     bl_options = {"REGISTER", "UNDO"}
 
     def execute(self, context):
@@ -27,30 +27,30 @@ class LODGS_OT_use_engine(bpy.types.Operator):
 
 
 class LODGS_OT_combine_with_meshes(bpy.types.Operator):
-    """Render the meshes with Cycles in a second scene, and join both pictures by depth in the compositor"""
+    """Render the meshes with Cycles in a second scene, and combine both images by depth in the compositor"""
 
     bl_idname = "lodgs.combine_with_meshes"
-    bl_label = "Combine With Meshes"
+    bl_label = "Combine with Meshes"
     bl_options = {"REGISTER", "UNDO"}
 
     @report_errors
     def execute(self, context):
         meshes = compositing.combine_with_meshes(context.scene)
-        self.report({"INFO"}, f"The meshes are rendered by the scene '{meshes.name}'")
+        self.report({"INFO"}, f"Scene '{meshes.name}' renders the meshes")
         return {"FINISHED"}
 
 
 class LODGS_OT_separate_meshes(bpy.types.Operator):
-    """Render without the meshes again: remove their scene and the nodes that join both pictures"""
+    """Remove the scene that renders the meshes and its compositor nodes, to render splats only"""
 
     bl_idname = "lodgs.separate_meshes"
-    bl_label = "Render Without Meshes"
+    bl_label = "Remove Meshes"
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
     def poll(cls, context):
         if context.scene.lodgs_render.meshes is None:
-            cls.poll_message_set("The scene is not combined with meshes")
+            cls.poll_message_set("Combine the scene with meshes first")
             return False
         return True
 
@@ -61,7 +61,7 @@ class LODGS_OT_separate_meshes(bpy.types.Operator):
 
 
 class LODGS_OT_render_mesh_depth(FrameOperator, bpy.types.Operator):
-    """Render how far the meshes are with Cycles, and have them hold out the splats behind them"""
+    """Render the depth of the meshes with Cycles, to hold out the splats behind them"""
 
     bl_idname = "lodgs.render_mesh_depth"
     bl_label = "Render Mesh Depth"
@@ -69,26 +69,26 @@ class LODGS_OT_render_mesh_depth(FrameOperator, bpy.types.Operator):
 
     @classmethod
     def description(cls, context, properties):
-        return f"{cls.__doc__}, in every frame of the range" if properties.animation else cls.__doc__
+        return f"{cls.__doc__}, for every frame of the range" if properties.animation else cls.__doc__
 
     def work(self, context):
         return compositing.render_mesh_depth(context.scene, self.frames(context))
 
     def result_text(self, count):
-        where = f"in {compositing.depth_files(bpy.context.scene).parent}"
-        where += "" if bpy.data.filepath else ", until Blender is closed"
-        return f"{'1 depth' if count == 1 else f'{count} depths'} of meshes {where}"
+        folder = compositing.depth_files(bpy.context.scene).parent
+        suffix = "" if bpy.data.filepath else " until Blender is closed"
+        return f"{'1 depth image' if count == 1 else f'{count} depth images'} in {folder}{suffix}"
 
 
 class LODGS_OT_render_quick(FrameOperator, bpy.types.Operator):
-    """Draw what the camera sees as the viewport does, on the graphics card: quick, and without a trainer"""
+    """Render the camera's view on the GPU in viewport quality, for a quick preview without a trainer"""
 
     bl_idname = "lodgs.render_quick"
-    bl_label = "Render in Viewport Quality"
+    bl_label = "Render Viewport Quality"
 
     @classmethod
     def description(cls, context, properties):
-        return f"{cls.__doc__}; saves every frame of the range" if properties.animation else cls.__doc__
+        return f"{cls.__doc__}, and save every frame of the range" if properties.animation else cls.__doc__
 
     def work(self, context):
         if self.animation:
@@ -101,11 +101,11 @@ class LODGS_OT_render_quick(FrameOperator, bpy.types.Operator):
     def result_text(self, count):
         if self.animation:
             return f"{'1 frame' if count == 1 else f'{count} frames'} saved"
-        return f"Drawn into the image '{quick.IMAGE}'; the Image Editor shows it"
+        return f"Rendered to image '{quick.IMAGE}'"
 
 
 class LODGS_OT_export_camera(bpy.types.Operator, ExportHelper):
-    """Write the scene's camera as a file, for the same picture without Blender (training render --camera)"""
+    """Write the active camera to a file, to render it outside Blender with lodgs render --camera"""
 
     bl_idname = "lodgs.export_camera"
     bl_label = "Export Camera"
@@ -116,7 +116,7 @@ class LODGS_OT_export_camera(bpy.types.Operator, ExportHelper):
     @classmethod
     def poll(cls, context):
         if scenes.active_root(context) is None or context.scene.camera is None:
-            cls.poll_message_set("Select a splat scene, and give the scene a camera")
+            cls.poll_message_set("Select a splat scene and add a camera first")
             return False
         return True
 

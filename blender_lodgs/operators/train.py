@@ -1,4 +1,4 @@
-"""Operators that start, stop and find trainings. Each calls one function of ``jobs``."""
+"""Operators that start, stop, resume and open training runs, each by one function of ``jobs``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .modal import SteppedOperator
 
 
 def _follow(operator: bpy.types.Operator, watch: Watch):
-    """Follow a run: to its end in background, from now on in a window."""
+    """Follow a run: to its end in background mode, otherwise while Blender stays responsive."""
     jobs.follow(watch)
     if watch.problem:
         operator.report({"ERROR"}, watch.problem)
@@ -25,12 +25,12 @@ def _follow(operator: bpy.types.Operator, watch: Watch):
 class LODGS_OT_train(SceneOperator, bpy.types.Operator):
     bl_idname = "lodgs.train"
     bl_label = "Train Splats"
-    bl_description = "Train splats with levels of detail from the scene's photographs, while you work on"
+    bl_description = "Train splats with levels of detail from the scene's photos in the background"
     bl_options = {"UNDO"}
 
     folder: bpy.props.StringProperty(
         name="Run Folder",
-        description="Folder of the run; empty: a new one where the settings say",
+        description="Folder of the run; empty for a new folder",
         subtype="DIR_PATH",
         options={"SKIP_SAVE", "PATH_SUPPORTS_BLEND_RELATIVE"},
     )
@@ -43,7 +43,7 @@ class LODGS_OT_train(SceneOperator, bpy.types.Operator):
 class LODGS_OT_resume_training(SceneOperator, bpy.types.Operator):
     bl_idname = "lodgs.resume_training"
     bl_label = "Resume Training"
-    bl_description = "Go on with the run where it stopped, with the settings that it began with"
+    bl_description = "Continue the run from its last checkpoint, with its original settings"
     bl_options = {"UNDO"}
 
     @report_errors
@@ -54,7 +54,7 @@ class LODGS_OT_resume_training(SceneOperator, bpy.types.Operator):
 class LODGS_OT_cancel_training(SceneOperator, bpy.types.Operator):
     bl_idname = "lodgs.cancel_training"
     bl_label = "Cancel Training"
-    bl_description = "Ask the trainer to save and stop, so that it can be resumed; again: end it at once"
+    bl_description = "Save a checkpoint and stop, to resume later; press twice to stop immediately"
 
     @report_errors
     def execute(self, context):
@@ -65,17 +65,18 @@ class LODGS_OT_cancel_training(SceneOperator, bpy.types.Operator):
 class LODGS_OT_plan_cells(SceneOperator, SteppedOperator, bpy.types.Operator):
     bl_idname = "lodgs.plan_cells"
     bl_label = "Plan Cells"
-    bl_description = "Say what each cell will be trained on, and what that takes, before anything runs"
+    bl_description = "Divide the scene into cells, and estimate the views, splats and memory of each"
     bl_options = {"UNDO"}
 
-    _found: cells.CellPlan | None = None
+    _plan: cells.CellPlan | None = None
 
     def invoke(self, context, event):
         return self.execute(context) if bpy.app.background else self.start_modal(context)
 
     def work(self, context):
         root = scenes.active_root(context)
-        uid, limits = root.session_uid, root.lodgs.training.limits
+        uid = root.session_uid
+        limits = root.lodgs.training.limits
         job = jobs.make_job(root, jobs.runs_folder(root), {})
         reader = ThreadPoolExecutor(1, "lodgs-plan")
         try:
@@ -84,28 +85,29 @@ class LODGS_OT_plan_cells(SceneOperator, SteppedOperator, bpy.types.Operator):
                 yield
         finally:
             reader.shutdown(wait=False)
-        self._found, root = reading.result(), root_by_uid(uid)
+        self._plan = reading.result()
+        root = root_by_uid(uid)
         if root is not None:  # undo may have replaced it
-            cells.show(root.lodgs.training, self._found)
+            cells.show(root.lodgs.training, self._plan)
 
     def status_text(self, context, count):
-        return "Planning cells; Esc stops"
+        return "Planning cells, Esc to stop"
 
     def result_text(self, count):
-        if self._found is None:
-            return "Nothing is planned"
-        views = [each.views for each in self._found.planned]
-        return f"{len(views)} cells of {min(views)} to {max(views)} views"
+        if self._plan is None:
+            return "No cells planned"
+        views = [cell.views for cell in self._plan.planned]
+        return f"{len(views)} cells with {min(views)} to {max(views)} views"
 
 
-class _OnBlock(SceneOperator):
-    block: bpy.props.IntProperty(name="Cell", description="Number of the cell, from 1", min=1, default=1)
+class _CellOperator(SceneOperator):
+    block: bpy.props.IntProperty(name="Cell", description="Cell number, from 1", min=1, default=1)
 
 
-class LODGS_OT_cancel_block(_OnBlock, bpy.types.Operator):
+class LODGS_OT_cancel_block(_CellOperator, bpy.types.Operator):
     bl_idname = "lodgs.cancel_block"
     bl_label = "Cancel Cell"
-    bl_description = "Ask this cell's training to save and stop, while the others go on"
+    bl_description = "Save this cell's checkpoint and stop it, while the other cells continue"
     bl_options = {"INTERNAL"}
 
     @report_errors
@@ -114,27 +116,31 @@ class LODGS_OT_cancel_block(_OnBlock, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LODGS_OT_resume_block(_OnBlock, bpy.types.Operator):
+class LODGS_OT_resume_block(_CellOperator, bpy.types.Operator):
     bl_idname = "lodgs.resume_block"
     bl_label = "Resume Cell"
-    bl_description = "Go on with this cell: beside the others where they are at work, else with it alone"
+    bl_description = "Continue this cell from its last checkpoint, along with the cells that are running"
     bl_options = {"INTERNAL"}
 
     @report_errors
     def execute(self, context):
         root = scenes.active_root(context)
-        followed, watch = watch_of(root), jobs.resume_block(root, self.block)
+        followed = watch_of(root)
+        watch = jobs.resume_block(root, self.block)
         return {"FINISHED"} if watch is followed else _follow(self, watch)
 
 
 class LODGS_OT_open_run(SceneOperator, bpy.types.Operator):
     bl_idname = "lodgs.open_run"
     bl_label = "Open Training Run"
-    bl_description = "Load the levels of a run folder, and follow the run if it is at work"
+    bl_description = "Load the levels of a run folder, and follow the run if it is active"
     bl_options = {"UNDO"}
 
     directory: bpy.props.StringProperty(
-        name="Run Folder", subtype="DIR_PATH", options={"SKIP_SAVE", "PATH_SUPPORTS_BLEND_RELATIVE"}
+        name="Run Folder",
+        description="Folder of the run to open",
+        subtype="DIR_PATH",
+        options={"SKIP_SAVE", "PATH_SUPPORTS_BLEND_RELATIVE"},
     )
 
     def invoke(self, context, event):
@@ -153,7 +159,7 @@ class LODGS_OT_open_run(SceneOperator, bpy.types.Operator):
 class LODGS_OT_show_log(SceneOperator, bpy.types.Operator):
     bl_idname = "lodgs.show_log"
     bl_label = "Show Training Log"
-    bl_description = "Show the end of the trainer's log; a text block keeps it"
+    bl_description = "Show the last lines of the trainer's log, and store the log in a text data-block"
 
     def invoke(self, context, event):
         result = self.execute(context)
@@ -175,15 +181,17 @@ class LODGS_OT_show_log(SceneOperator, bpy.types.Operator):
 class LODGS_OT_show_costs(SceneOperator, bpy.types.Operator):
     bl_idname = "lodgs.show_costs"
     bl_label = "Show Cost Curve"
-    bl_description = "Show what each distance would have cost in an Image Editor"
+    bl_description = "Plot the rendering cost of each level distance in an Image Editor"
 
     @report_errors
     def execute(self, context):
         plot = jobs.cost_plot(scenes.active_root(context))
         if plot is None:
-            raise LodgsError("No run with a cost curve is here.", "Open the run that made these levels.")
+            raise LodgsError(
+                "Cannot show the cost curve: the open run has none.", "Open the run of these levels."
+            )
         image = bpy.data.images.load(str(plot), check_existing=True)
-        image.reload()  # the run goes on
+        image.reload()  # a running training updates the plot
         show_image(context, image)
         return {"FINISHED"}
 

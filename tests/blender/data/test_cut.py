@@ -86,7 +86,7 @@ def test_a_coarser_level_is_not_shown_alone_nor_exported(bpy, lodgs, root, tmp_p
         bpy.ops.lodgs.show_only_level(level=1)
     with pytest.raises(RuntimeError, match="no scene by itself"):
         bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "a.ply"), source="LEVEL", level=1)
-    with pytest.raises(RuntimeError, match="Put the finest level first"):
+    with pytest.raises(RuntimeError, match="coarsest level first"):
         bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "a.ply"), order="stream")
     assert [path.name for path in tmp_path.iterdir()] == ["tree.ply"]
 

@@ -501,7 +501,7 @@ def test_a_removed_scenes_training_goes_on(bpy, jobs, fake, root, tmp_path, capf
     watch = jobs.start(root, str(tmp_path / "run"))
     _wait(watch, lambda: watch.progress)
     assert bpy.ops.lodgs.remove_scene() == {"FINISHED"}
-    assert f"its training goes on in {tmp_path / 'run'}" in capfd.readouterr().out
+    assert f"its training continues in {tmp_path / 'run'}" in capfd.readouterr().out
     assert not watch.step() and watch.process.poll() is None
     watch.folder.request_cancel()
     assert watch.process.wait(20) == 3
