@@ -11,7 +11,7 @@ from . import commands, operators, panels, viewport
 from .data import changes, loaded, looks, older_files, paths, properties, removal, scenes, updates
 from .nodes import building
 from .render import compare, engine, renderer
-from .runs import capturing, jobs, preparing
+from .runs import background_capture, jobs, photo_preparation
 from .viewport import wipe
 
 MODULES = (
@@ -33,8 +33,8 @@ MODULES = (
     wipe,
     compare,
     jobs,
-    capturing,
-    preparing,
+    background_capture,
+    photo_preparation,
     commands,
 )
 

@@ -13,24 +13,24 @@ from pathlib import Path
 import bpy
 
 from ..training.errors import LodgsError
-from ..training.evaluate.words import summary_lines
+from ..training.evaluate.messages import summary_lines
 from ..training.lod.describe import describe
 from ..training.lod.edit import Joined, finish
 from ..training.lod.unfiltered import without_filter
 from ..training.methods.describe import describe_method, describe_methods
 from ..training.runs.folder import RunFolder
 from ..training.runs.job import Job, check_views
-from ..training.runs.options import add_options, job_from, size_of
+from ..training.runs.options import add_options, job_from_options, parse_size
 from ..training.splats.bundle import write_bundle
 from ..training.splats.dialects import Warn
-from ..training.splats.formats import PLY, format_of, write_splats
+from ..training.splats.formats import PLY, find_format, write_splats
 from . import extension
 from .data import scenes, viewpoints
 from .render.capture import noise, render_views, write_model
 from .render.video import MOST_FRAMES, extract_frames
-from .runs import environment, jobs, preparing
+from .runs import environment, jobs, photo_preparation
+from .runs.messages import duration, level_line
 from .runs.watch import Watch
-from .runs.words import duration, level_line
 
 DONE, CRASHED, BAD_INPUT, CANCELLED = 0, 1, 2, 3
 """Exit codes, as the trainer's own."""
@@ -117,7 +117,7 @@ def _parser() -> argparse.ArgumentParser:
     where.add_argument("--animation", action="store_true", help="frames of the scene's camera")
     where.add_argument("--curve", metavar="NAME", help="a walk along a curve")
     capture.add_argument("--views", type=int, metavar="N", help="how many, but of cameras")
-    capture.add_argument("--size", type=size_of, metavar="WxH", help="pixels of the pictures")
+    capture.add_argument("--size", type=parse_size, metavar="WxH", help="pixels of the pictures")
     capture.add_argument(
         "--range", type=_range, metavar="A-B", help="render only these views, from 1 on, and make no model: "
         "for several computers, before one does the same without it",
@@ -140,7 +140,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _train(args: argparse.Namespace) -> int:
-    job = job_from(args)
+    job = job_from_options(args)
     if job.backend == "auto":
         job = replace(job, backend=extension.preferences().backend)
     _empty_file()
@@ -184,7 +184,7 @@ def _imported(job: Job) -> bpy.types.Object:
 def _photographed(folder: Path, warn: Warn) -> bpy.types.Object:
     """A COLMAP scene, its photographs straightened where their lens bends lines."""
     root = scenes.import_colmap(bpy.context, folder, warn=warn)
-    preparing.straighten(root, warn)
+    photo_preparation.straighten(root, warn)
     return root
 
 
@@ -210,10 +210,10 @@ def _export(args: argparse.Namespace) -> int:
         names = ", ".join(root.name for root in bpy.data.objects if root.lodgs.is_root) or "none"
         raise LodgsError(f"{args.blend} holds {len(found)} such scenes.", f"Name one with --root: {names}.")
     bundle = scenes.read_levels(found[0], args.placed, not args.as_trained)
-    if format_of(args.bundle) is PLY:
+    if find_format(args.bundle) is PLY:
         write_bundle(args.bundle, bundle)
     else:
-        form = bundle if format_of(args.bundle).antialiased else without_filter(bundle)
+        form = bundle if find_format(args.bundle).antialiased else without_filter(bundle)
         finish(write_splats(args.bundle, Joined.upto(form, form.levels[-1].number), form.meta))
     return DONE
 

@@ -7,7 +7,7 @@ import bpy
 from ...training.errors import LodgsError
 from ..data import scenes, viewpoints
 from ..render.capture import noise
-from ..runs import capturing, environment
+from ..runs import background_capture, environment
 from ..viewport import coverage
 from .parts import Panel, draw_environment, draw_views, say, split_column
 
@@ -22,7 +22,7 @@ class LODGS_PT_capture(Panel):
         return scenes.active_root(context) is None and not scenes.linked(context)
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout, work = self.layout, capturing.current
+        layout, work = self.layout, background_capture.current
         if work is not None and work.running:
             row = layout.row(align=True)
             row.progress(text=work.message, factor=work.fraction)
@@ -40,7 +40,7 @@ class LODGS_PT_capture(Panel):
             return
         layout.operator("lodgs.capture_scene", text="Capture", icon="RENDER_STILL")
         try:
-            folder = capturing.folder_of(context.scene)
+            folder = background_capture.folder_of(context.scene)
         except LodgsError as error:
             say(layout, str(error), "INFO")
             return

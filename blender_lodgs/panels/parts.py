@@ -9,7 +9,7 @@ import bpy
 from ..data import scenes
 from ..data.placement import axes_of
 from ..data.viewpoints import ViewsSettings
-from ..runs import making
+from ..runs import environment_setup
 
 
 class Panel(bpy.types.Panel):
@@ -80,7 +80,7 @@ def draw_environment(layout: bpy.types.UILayout, missing: str = "") -> None:
     Args:
         missing: what one lacks without it, as a sentence.
     """
-    work = making.current
+    work = environment_setup.current
     if work is not None and work.running:
         row = layout.row(align=True)
         row.progress(text=work.message, factor=work.fraction)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..data import photographs, scenes
-from ..runs import preparing
+from ..runs import photo_preparation
 from .parts import Panel, say, split_column
 
 
@@ -59,7 +59,7 @@ def _draw_import(layout: bpy.types.UILayout, another: bool) -> None:
 
 def _draw_finding(column: bpy.types.UILayout) -> None:
     """How far the cameras of photographs are found, or how it went."""
-    work = preparing.current
+    work = photo_preparation.current
     if work is None:
         return
     if work.running:

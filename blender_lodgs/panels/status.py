@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import bpy
 
 from .. import extension
-from ..runs import capturing, making, preparing
+from ..runs import background_capture, environment_setup, photo_preparation
 from ..runs.watch import root_by_uid, watches
 
 NOTICE = 60.0
@@ -47,7 +47,7 @@ def works() -> Iterator[Work]:
         root = root_by_uid(uid)
         name = "Splats" if root is None else root.name
         yield Work(watch, f"{name}: {watch.message}", watch.share, watch.running, bool(watch.problem))
-    for each in (capturing.current, preparing.current, making.current):
+    for each in (background_capture.current, photo_preparation.current, environment_setup.current):
         if each is not None:
             yield Work(each, each.message, each.fraction, each.running, bool(each.problem))
 

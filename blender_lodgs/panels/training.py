@@ -5,15 +5,15 @@ from __future__ import annotations
 import bpy
 
 from ...training.errors import LodgsError
-from ...training.evaluate.words import summary_lines
+from ...training.evaluate.messages import summary_lines
 from ...training.lod.rules.cut import RULE as CUT
 from ...training.methods import method_info
 from .. import extension
 from ..data import scenes, viewpoints
 from ..data.training import ALL_OFFER, chooses_distances, hold_out, level_distances, offered
 from ..runs import environment, jobs
+from ..runs.messages import measured_on, progress_facts, short_level_line
 from ..runs.watch import Watch, watch_of
-from ..runs.words import measured_on, progress_facts, short_level_line
 from .parts import Panel, draw_environment, draw_views, say, scene_length, split_column
 from .training_cells import draw_blocks
 

@@ -55,7 +55,7 @@ report: Report | None = None
 
 
 def folder() -> Path:
-    """Where the environments lie that the extension makes, in folders with numbers (``making``)."""
+    """Where the environments lie that the extension makes, in numbered folders (``environment_setup``)."""
     return extension.user_folder("trainer")
 
 

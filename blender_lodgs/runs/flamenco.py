@@ -18,7 +18,7 @@ from urllib.parse import urlsplit
 
 import bpy
 
-from ...training.documents import json_object
+from ...training.documents import parse_json
 from ...training.errors import LodgsError, printable
 from ...training.runs.folder import RunFolder
 from ...training.runs.options import options_of
@@ -118,7 +118,7 @@ class Submission:
 
     def _read(self, text: bytes) -> dict:
         try:
-            return json_object(text.decode("utf-8", "replace"), "The answer")
+            return parse_json(text.decode("utf-8", "replace"), "The answer")
         except LodgsError:
             raise self._stranger() from None
 
@@ -168,7 +168,7 @@ def prepare(root: bpy.types.Object, folder: str = "") -> Submission:
     if RunFolder(out).state() != "empty":
         raise LodgsError(f"{out} already holds a run.", "Choose another folder.")
     job = jobs.make_job(root, out, {})
-    job = job.in_cells(job.cells or "1x1")
+    job = job.with_cells(job.cells or "1x1")
     columns, rows = job.grid
     return Submission(manager, root.name, {
         "scene": job.scene, "output": job.out, "columns": columns, "rows": rows, "method": job.method,

@@ -16,9 +16,9 @@ import bpy
 
 from ...training.errors import LodgsError
 from ...training.lod.rules.cut import RULE as CUT
-from ...training.runs.endings import ending
 from ...training.runs.folder import RunFolder
-from ...training.splats.bundle import Bundle, Level, read_head, read_tables
+from ...training.runs.outcome import run_outcome
+from ...training.splats.bundle import Bundle, Level, read_header, read_tables
 from ...training.splats.ply import read_ply
 from .. import extension
 from ..data import cells, scenes
@@ -217,7 +217,7 @@ class Watch:
         return event.get("rule") == CUT.name and 2 * event["splats"] >= root.lodgs.stream.budget
 
     def _read_level(self, event: dict) -> Level:
-        splats = read_ply(self.folder.file(event["path"]))
+        splats = read_ply(self.folder.find_file(event["path"]))
         return Level(event["level"], splats, event.get("facts", {}))
 
     def _described(self, event: dict) -> Bundle:
@@ -248,7 +248,7 @@ class Watch:
             )
             reader.shutdown(wait=False)
             return
-        head = read_head(self.folder.bundle)
+        head = read_header(self.folder.bundle)
         head.tables = read_tables(self.folder.bundle)
         with extension.in_window():
             there = {item.number for item in root.lodgs.levels if item.exists}
@@ -262,7 +262,7 @@ class Watch:
     def _set_end(self) -> None:
         """Say how the run ended."""
         code = None if self.process is None else self.process.poll()
-        self.state, problem = ending(self.folder, code)
+        self.state, problem = run_outcome(self.folder, code)
         self.problem = problem or self.problem
         self.message = {
             "done": "Finished",

@@ -9,7 +9,7 @@ import pytest
 def drawn(bpy, lodgs, draw_panel, monkeypatch, tmp_path):
     """What the panel draws, with a trainer, of a scene that is to be captured to tmp_path/out."""
     monkeypatch.setenv("LODGS_TRAINER_PYTHON", "python")
-    monkeypatch.setattr(lodgs("runs.capturing"), "current", None)
+    monkeypatch.setattr(lodgs("runs.background_capture"), "current", None)
     bpy.context.scene.lodgs_capture.folder = str(tmp_path / "out")
     return lambda: draw_panel("capture", "LODGS_PT_capture")
 
@@ -68,7 +68,7 @@ def test_it_says_where_renders_will_be_noisy(bpy, lodgs, drawn, monkeypatch):
 
 def test_it_tells_how_far_a_capture_is_and_how_it_ended(bpy, lodgs, drawn, monkeypatch):
     work = SimpleNamespace(running=True, message="View 3 of 9", fraction=0.2, problem="")
-    monkeypatch.setattr(lodgs("runs.capturing"), "current", work)
+    monkeypatch.setattr(lodgs("runs.background_capture"), "current", work)
     assert (drawn().texts, drawn().operators) == (["View 3 of 9"], ["lodgs.cancel_capture"])
     work.running, work.message, work.problem = False, "Stopped", "The disk is full."
     assert "The disk is full." in drawn().texts and "lodgs.capture_scene" in drawn().operators

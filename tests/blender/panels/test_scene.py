@@ -41,7 +41,7 @@ def test_held_out_views_have_a_mean_of_their_own(bpy, lodgs, root, draw_panel):
 
 
 def test_how_an_import_went_is_told_until_there_is_another(bpy, lodgs, draw_panel, monkeypatch, tmp_path):
-    preparing = lodgs("runs.preparing")
+    photo_preparation = lodgs("runs.photo_preparation")
     write_bundle(tmp_path / "splats.ply", Bundle("flod", [Level(1, splats(5), {})], "bands"))
     imports = (
         lambda: bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "splats.ply")),
@@ -49,7 +49,7 @@ def test_how_an_import_went_is_told_until_there_is_another(bpy, lodgs, draw_pane
     )
     for again in imports:
         work = SimpleNamespace(running=False, message="All 9 found their place", problem="", root=None)
-        monkeypatch.setattr(preparing, "current", work)
+        monkeypatch.setattr(photo_preparation, "current", work)
         assert "All 9 found their place" in draw_panel("scene", "LODGS_PT_scene").texts
         assert again() == {"FINISHED"}
         assert "All 9 found their place" not in draw_panel("scene", "LODGS_PT_scene").texts

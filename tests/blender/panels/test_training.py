@@ -159,7 +159,7 @@ def test_without_a_trainer_one_sentence_and_one_button(root, draw, monkeypatch):
 def test_making_the_environment_is_shown_where_it_is_missing(lodgs, root, draw, monkeypatch):
     monkeypatch.delenv("LODGS_TRAINER_PYTHON", raising=False)
     setup = SimpleNamespace(running=True, message="Downloading torch", fraction=0.4, problem="")
-    monkeypatch.setattr(lodgs("runs.making"), "current", setup)
+    monkeypatch.setattr(lodgs("runs.environment_setup"), "current", setup)
     notes = draw()
     assert notes.operators == ["lodgs.cancel_environment"] and "Downloading torch" in notes.texts
     setup.running, setup.problem = False, "No network. Check it."

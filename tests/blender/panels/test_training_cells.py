@@ -72,13 +72,13 @@ def test_the_plan_is_offered_for_more_than_one_cell(bpy, root, draw, line):
 
 def test_cells_are_found_by_what_one_may_have(bpy, lodgs, root, draw, monkeypatch):
     cells, settings, asked = lodgs("data.cells"), root.lodgs.training, []
-    real = cells.cells_within
+    real = cells.choose_cells
 
     def found(job, splats, memory, scene):
         asked.append((job.cells, splats, memory))
         return grid or real(job, splats, memory, scene)
 
-    monkeypatch.setattr(cells, "cells_within", found)
+    monkeypatch.setattr(cells, "choose_cells", found)
     settings.divide_by, settings.cell_splats, grid = "SPLATS", settings.parameters.preset_max_splats, ""
     assert draw().properties == ["divide_by", "cell_splats", "at_once", "polish"]
     bpy.ops.lodgs.plan_cells()
@@ -137,7 +137,7 @@ def test_each_cell_says_how_it_gets_on(lodgs, root, draw_panel, line, watch):
 
 
 def test_no_time_is_told_before_there_is_a_speed(lodgs):
-    facts = lodgs("runs.words").progress_facts
+    facts = lodgs("runs.messages").progress_facts
     progress = {
         "level": 1, "levels": 1, "step": 0, "of": 90, "loss": 0.0, "psnr": 0.0, "splats": 0,
         "steps_per_s": 0.0, "eta_s": 0.0, "blocks": [],

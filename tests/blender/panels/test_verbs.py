@@ -61,7 +61,7 @@ class Notes:
 @pytest.fixture
 def work(lodgs, monkeypatch):
     work = SimpleNamespace(message="Photographs placed: 3 of 6", fraction=0.5, problem="", running=True)
-    monkeypatch.setattr(lodgs("runs.preparing"), "current", work)
+    monkeypatch.setattr(lodgs("runs.photo_preparation"), "current", work)
     return work
 
 
@@ -127,13 +127,13 @@ def test_what_ended_before_it_was_seen_is_no_news(lodgs, work):
 
 def test_another_work_at_the_place_of_one_that_is_gone_is_another(lodgs, work):
     """An object that is gone leaves its identity to the next."""
-    status, preparing = lodgs("panels.status"), lodgs("runs.preparing")
+    status, photo_preparation = lodgs("panels.status"), lodgs("runs.photo_preparation")
     state = {**vars(work), "running": False}
     for _ in range(20):
-        preparing.current = SimpleNamespace(**{**state, "running": True})
+        photo_preparation.current = SimpleNamespace(**{**state, "running": True})
         assert len(status.shown(0.0)) == 1
-        preparing.current = None
-        preparing.current = SimpleNamespace(**state)
+        photo_preparation.current = None
+        photo_preparation.current = SimpleNamespace(**state)
         assert status.shown(1.0) == []
 
 

@@ -380,14 +380,14 @@ def test_without_a_trainer_nothing_is_rendered(bpy, scene, capture, tmp_path, ca
 
 @needs_trainer
 def test_the_panel_captures_the_scene_as_it_is_now(bpy, lodgs, scene, blender, tmp_path):
-    settings, capturing = scene.lodgs_capture, lodgs("runs.capturing")
+    settings, background_capture = scene.lodgs_capture, lodgs("runs.background_capture")
     with pytest.raises(RuntimeError, match="not saved yet"):
         bpy.ops.lodgs.capture_scene()
     settings.folder, settings.views, settings.view_width = str(tmp_path / "out"), 4, 64
     scene.render.resolution_x, scene.render.resolution_y = 400, 300
     objects = len(bpy.data.objects)
     assert bpy.ops.lodgs.capture_scene() == {"FINISHED"}
-    work = capturing.current
+    work = background_capture.current
     assert (work.message, work.fraction, work.problem) == ("Captured", 1.0, "")
     assert len(bpy.data.objects) == objects and not bpy.data.filepath, "the artist's file is as it was"
     assert not (tmp_path / "out" / "capture.blend").exists()
@@ -430,10 +430,10 @@ def test_a_blender_that_crashes_says_what_to_do(bpy, lodgs, fake, scene, blender
 
 def test_a_capture_that_is_stopped_says_so(bpy, lodgs, fake, scene, blender, tmp_path):
     fake()
-    capturing = lodgs("runs.capturing")
+    background_capture = lodgs("runs.background_capture")
     settings = scene.lodgs_capture
     settings.folder, settings.views, settings.view_width = str(tmp_path / "out"), 30, 64
-    work = capturing.start(bpy.context)
+    work = background_capture.start(bpy.context)
     with pytest.raises(RuntimeError, match="at work already"):
         bpy.ops.lodgs.capture_scene()
     end = time.monotonic() + 60

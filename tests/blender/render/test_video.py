@@ -127,6 +127,6 @@ def test_a_folder_that_cannot_be_written(lodgs, video, tmp_path, capfd):
 
 def test_a_video_becomes_a_scene(bpy, lodgs, video, blender, tmp_path):
     assert bpy.ops.lodgs.find_cameras(filepath=str(video)) == {"FINISHED"}
-    work = lodgs("runs.preparing").current
+    work = lodgs("runs.photo_preparation").current
     assert work.root.lodgs.scene_folder == str(tmp_path / "walk_scene")
     assert len(work.root.lodgs.cameras.objects) >= 4

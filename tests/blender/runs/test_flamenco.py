@@ -141,7 +141,7 @@ def test_what_the_farm_compiles_of_it_is_the_job_that_training_here_has(lodgs, m
         "--method", said["method"], "--preset", said["preset"], "--image-scale", str(said["image_scale"]),
         "--polish", str(said["polish"]), *shlex.split(said["options"]),
     ]  # fmt: skip
-    there = options.job_from(parser.parse_args(command))
+    there = options.job_from_options(parser.parse_args(command))
     here = lodgs("runs.jobs").make_job(root, tmp_path / "runs" / "tiny", {})
     assert there.resolved() == here.resolved()
 

@@ -13,7 +13,7 @@ from ...training.scenes.rendered import CAMERAS
 from .. import extension
 from ..data import viewpoints
 from . import environment, processes
-from .words import duration
+from .messages import duration
 
 
 class Capturing:

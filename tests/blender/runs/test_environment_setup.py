@@ -13,8 +13,8 @@ ASKED = [
 
 
 @pytest.fixture
-def making(lodgs, tmp_path, monkeypatch):
-    module, environment = lodgs("runs.making"), lodgs("runs.environment")
+def environment_setup(lodgs, tmp_path, monkeypatch):
+    module, environment = lodgs("runs.environment_setup"), lodgs("runs.environment")
     monkeypatch.setattr(module, "current", None)
     monkeypatch.setattr(environment, "folder", lambda: tmp_path / "trainer")
     monkeypatch.delenv(environment.VARIABLE, raising=False)
@@ -31,7 +31,7 @@ def making(lodgs, tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def fake(making, tmp_path, monkeypatch):
+def fake(environment_setup, tmp_path, monkeypatch):
     """``fake(pip=.., tried=..)`` sets what pip and the trial do in environments that a fake Python makes."""
     python, base = tmp_path / "python", tmp_path / "base"
     python.write_text(
@@ -40,7 +40,7 @@ def fake(making, tmp_path, monkeypatch):
     base.write_text(f'#!/bin/sh\nmkdir -p "$3/bin" && cp {python} "$3/bin/python"\n')
     for program in (python, base):
         program.chmod(0o755)
-    monkeypatch.setattr(making, "find_base", lambda: base)
+    monkeypatch.setattr(environment_setup, "find_base", lambda: base)
 
     def behave(pip="true", tried="true", work="true"):
         for name, script in {"pip": pip, "tried": tried, "work": work}.items():
@@ -56,21 +56,21 @@ def there(tmp_path):
     return lambda: sorted(path.name for path in (tmp_path / "trainer").iterdir())
 
 
-def test_nothing_is_downloaded_without_leave(bpy, lodgs, making, monkeypatch):
-    monkeypatch.setattr(making, "bpy", bpy)
+def test_nothing_is_downloaded_without_leave(bpy, lodgs, environment_setup, monkeypatch):
+    monkeypatch.setattr(environment_setup, "bpy", bpy)
     assert not bpy.app.online_access
     with pytest.raises(RuntimeError, match="Allow Online Access"):
         bpy.ops.lodgs.make_environment()
-    assert making.current is None
+    assert environment_setup.current is None
 
 
-def test_what_is_tried_is_what_was_asked_for(making):
+def test_what_is_tried_is_what_was_asked_for(environment_setup):
     lines = [line for path in ASKED for line in path.read_text().splitlines()]
     names = {line.split("==")[0] for line in lines if "==" in line}
-    assert {"pillow" if name == "PIL" else name for name in making.MODULES} == names - {"numpy"}
+    assert {"pillow" if name == "PIL" else name for name in environment_setup.MODULES} == names - {"numpy"}
 
 
-def test_packages_are_those_of_the_lock(bpy, lodgs, making, fake, there, tmp_path, monkeypatch):
+def test_packages_are_those_of_the_lock(bpy, lodgs, environment_setup, fake, there, tmp_path, monkeypatch):
     """A real pip, with a package of our own whose hash decides; first in a real environment."""
     wheel = tmp_path / "tiny-1.0-py3-none-any.whl"
     with zipfile.ZipFile(wheel, "w") as file:
@@ -82,12 +82,15 @@ def test_packages_are_those_of_the_lock(bpy, lodgs, making, fake, there, tmp_pat
     digest = hashlib.sha256(wheel.read_bytes()).hexdigest()
     lock = tmp_path / "lock.txt"
     lock.write_text(f"tiny @ {wheel.as_uri()} --hash=sha256:{digest}\n")
-    monkeypatch.setattr(making, "REQUIREMENTS", lock)
-    monkeypatch.setattr(making, "MODULES", ("tiny",))
+    monkeypatch.setattr(environment_setup, "REQUIREMENTS", lock)
+    monkeypatch.setattr(environment_setup, "MODULES", ("tiny",))
     with monkeypatch.context() as real:
-        real.setattr(making, "find_base", lambda: Path(sys.executable))
+        real.setattr(environment_setup, "find_base", lambda: Path(sys.executable))
         assert bpy.ops.lodgs.make_environment() == {"FINISHED"}
-    assert making.current.fraction == 1 and making.current.message == "The environment is ready"
+    assert (
+        environment_setup.current.fraction == 1
+        and environment_setup.current.message == "The environment is ready"
+    )
     python = lodgs("runs.environment").trainer_python()
     assert python == tmp_path / "trainer" / "1" / "bin" / "python" and python.exists()
 
@@ -110,7 +113,9 @@ FAILURES = {
 
 
 @pytest.mark.parametrize("case", FAILURES)
-def test_the_environment_that_serves_survives_a_failed_making(bpy, lodgs, making, fake, there, case):
+def test_the_environment_that_serves_survives_a_failed_making(
+    bpy, lodgs, environment_setup, fake, there, case
+):
     behaviour, words = FAILURES[case]
     fake(**behaviour)
     with pytest.raises(RuntimeError, match=words) as failed:
@@ -125,7 +130,9 @@ def test_the_environment_that_serves_survives_a_failed_making(bpy, lodgs, making
     assert there() == ["1"] and before.exists() and lodgs("runs.environment").trainer_python() == before
 
 
-def test_a_new_environment_takes_the_place_of_the_one_before(bpy, lodgs, making, fake, there, tmp_path):
+def test_a_new_environment_takes_the_place_of_the_one_before(
+    bpy, lodgs, environment_setup, fake, there, tmp_path
+):
     (tmp_path / "trainer" / "bin").mkdir(parents=True)  # as versions before this one made it
     (tmp_path / "trainer" / "pyvenv.cfg").touch()
     cache = Path(lodgs("runs.processes").environment()["PYTHONPYCACHEPREFIX"])
@@ -137,19 +144,21 @@ def test_a_new_environment_takes_the_place_of_the_one_before(bpy, lodgs, making,
         assert there() == [made] and lodgs("runs.environment").trainer_python().parts[-3] == made
 
 
-def test_cancel_keeps_the_environment_that_serves(bpy, lodgs, making, fake, there):
+def test_cancel_keeps_the_environment_that_serves(bpy, lodgs, environment_setup, fake, there):
     assert bpy.ops.lodgs.make_environment() == {"FINISHED"}
     fake(pip="echo Collecting patience; exec sleep 30")
-    work = making.make()
+    work = environment_setup.make()
     with pytest.raises(Exception, match="being made already"):
-        making.make()
+        environment_setup.make()
     assert bpy.ops.lodgs.cancel_environment() == {"FINISHED"}
     work._thread.join(10)
     assert not work.running and work.message == "Cancelled" and work.problem == ""
     assert there() == ["1"] and lodgs("runs.environment").trainer_python().exists()
 
 
-def test_what_a_killed_making_left_is_removed_by_the_next(bpy, lodgs, making, fake, there, tmp_path):
+def test_what_a_killed_making_left_is_removed_by_the_next(
+    bpy, lodgs, environment_setup, fake, there, tmp_path
+):
     assert bpy.ops.lodgs.make_environment() == {"FINISHED"}
     left = tmp_path / "trainer" / "2" / "lib"
     left.mkdir(parents=True)
@@ -160,7 +169,7 @@ def test_what_a_killed_making_left_is_removed_by_the_next(bpy, lodgs, making, fa
     assert (tmp_path / "trainer" / "2" / lodgs("runs.environment").READY).exists()
 
 
-def test_the_making_of_another_blender_is_left_alone(bpy, lodgs, making, fake, there, tmp_path):
+def test_the_making_of_another_blender_is_left_alone(bpy, lodgs, environment_setup, fake, there, tmp_path):
     other = tmp_path / "trainer" / "1"
     other.mkdir(parents=True)
     (other / lodgs("runs.processes").MARK).touch()
@@ -170,7 +179,9 @@ def test_the_making_of_another_blender_is_left_alone(bpy, lodgs, making, fake, t
 
 
 @pytest.mark.parametrize("how", ["spawn", "converse"])
-def test_no_environment_is_removed_under_a_running_program(bpy, lodgs, making, fake, there, tmp_path, how):
+def test_no_environment_is_removed_under_a_running_program(
+    bpy, lodgs, environment_setup, fake, there, tmp_path, how
+):
     processes, environment = lodgs("runs.processes"), lodgs("runs.environment")
     fake(work="exec sleep 60")
     assert bpy.ops.lodgs.make_environment() == {"FINISHED"}
@@ -179,17 +190,19 @@ def test_no_environment_is_removed_under_a_running_program(bpy, lodgs, making, f
         output["output"] = tmp_path / "out"
     with getattr(processes, how)(command, **output) as trainer:
         assert bpy.ops.lodgs.make_environment() == {"FINISHED"}
-        assert making.current.message.endswith("; what is running goes on with the one before it")
+        assert environment_setup.current.message.endswith("; what is running goes on with the one before it")
         assert there() == ["1", "2"] and environment.trainer_python().parts[-3] == "2"
         trainer.kill()
     assert bpy.ops.lodgs.make_environment() == {"FINISHED"}
-    assert there() == ["3"] and making.current.message == "The environment is ready"
+    assert there() == ["3"] and environment_setup.current.message == "The environment is ready"
 
 
-def test_what_a_gpu_needs_is_installed_where_it_can_be_compiled(bpy, making, fake, tmp_path, monkeypatch):
+def test_what_a_gpu_needs_is_installed_where_it_can_be_compiled(
+    bpy, environment_setup, fake, tmp_path, monkeypatch
+):
     fake(pip=f'echo "$@" > {tmp_path}/said')
     programs = {"nvidia-smi": "/nvidia-smi"}
-    monkeypatch.setattr(making.shutil, "which", programs.get)
+    monkeypatch.setattr(environment_setup.shutil, "which", programs.get)
     for lock in ("cluster.txt", "cuda.txt"):
         assert bpy.ops.lodgs.make_environment() == {"FINISHED"}
         said = (tmp_path / "said").read_text()
@@ -197,16 +210,18 @@ def test_what_a_gpu_needs_is_installed_where_it_can_be_compiled(bpy, making, fak
         programs["nvcc"] = "/nvcc"
 
 
-def test_the_python_that_tests_run_on_goes_first(lodgs, making, monkeypatch):
-    monkeypatch.setattr(making.shutil, "which", lambda name: f"/bin/{name}")
+def test_the_python_that_tests_run_on_goes_first(lodgs, environment_setup, monkeypatch):
+    monkeypatch.setattr(environment_setup.shutil, "which", lambda name: f"/bin/{name}")
     versions = {"/bin/python3.11": (3, 8), "/bin/python3.12": (3, 12), "/bin/python3.13": (3, 13)}
-    monkeypatch.setattr(making.environment, "version_of", lambda python: versions.get(str(python), (0, 0)))
-    assert making.find_base() == Path("/bin/python3.12")
+    monkeypatch.setattr(
+        environment_setup.environment, "version_of", lambda python: versions.get(str(python), (0, 0))
+    )
+    assert environment_setup.find_base() == Path("/bin/python3.12")
     versions["/bin/python3.11"] = (3, 11)
-    assert making.find_base() == Path("/bin/python3.11")
+    assert environment_setup.find_base() == Path("/bin/python3.11")
     versions.clear()
     with pytest.raises(Exception, match=r"No Python from 3\.11 to 3\.14"):
-        making.find_base()
+        environment_setup.find_base()
 
 
 @pytest.mark.parametrize(
@@ -221,5 +236,5 @@ def test_the_python_that_tests_run_on_goes_first(lodgs, making, monkeypatch):
         ("Installing collected packages: mpmath, torch", "Installing the packages"),
     ],
 )
-def test_what_pip_does_in_few_words(making, line, words):
-    assert making.brief(line) == words
+def test_what_pip_does_in_few_words(environment_setup, line, words):
+    assert environment_setup.brief(line) == words

@@ -24,7 +24,7 @@ def photos(tmp_path_factory):
 
 def test_photographs_become_a_scene(bpy, lodgs, photos):
     assert bpy.ops.lodgs.find_cameras(directory=str(photos)) == {"FINISHED"}
-    work = lodgs("runs.preparing").current
+    work = lodgs("runs.photo_preparation").current
     assert "All 6 photographs found their place" in work.message and work.fraction == 1
     (root,) = lodgs("data.scenes").roots(bpy.context.scene)
     assert root == work.root and len(root.lodgs.cameras.objects) == 6
@@ -38,8 +38,8 @@ def test_photographs_become_a_scene(bpy, lodgs, photos):
 
 
 def test_what_is_stopped_goes_on(bpy, lodgs, photos, tmp_path):
-    preparing = lodgs("runs.preparing")
-    work = preparing.find_cameras(photos, tmp_path / "out")
+    photo_preparation = lodgs("runs.photo_preparation")
+    work = photo_preparation.find_cameras(photos, tmp_path / "out")
     with pytest.raises(RuntimeError, match="being prepared"):
         bpy.ops.lodgs.find_cameras(directory=str(photos))
     end = time.monotonic() + 60
@@ -58,7 +58,7 @@ def test_what_is_no_scene_is_a_sentence(bpy, lodgs, tmp_path):
     (tmp_path / "photos").mkdir()
     with pytest.raises(RuntimeError, match="holds 0 photographs that can be read"):
         bpy.ops.lodgs.find_cameras(directory=str(tmp_path / "photos"))
-    work = lodgs("runs.preparing").current
+    work = lodgs("runs.photo_preparation").current
     assert work.problem and not work.running and not lodgs("data.scenes").roots(bpy.context.scene)
 
 
@@ -107,6 +107,6 @@ def test_without_a_trainer_it_says_so(bpy, lodgs, bent, monkeypatch):
     monkeypatch.delenv("LODGS_TRAINER_PYTHON", raising=False)
     told = []
     root = lodgs("data.scenes").import_colmap(bpy.context, bent)
-    lodgs("runs.preparing").straighten(root, told.append)
+    lodgs("runs.photo_preparation").straighten(root, told.append)
     assert len(told) == 1 and "3 views have lens distortion" in told[0] and "none is set up" in told[0]
     assert all(view.data.lodgs.distorted for view in lodgs("data.photographs").views(root))
