@@ -1,8 +1,7 @@
-"""The Blender side of LODGS: the only code that imports bpy.
+"""The Blender side of LODGS, the only package that imports bpy.
 
-Each module that Blender must know names its classes in ``CLASSES`` and may have ``register()`` and
-``unregister()`` for handlers, menus and properties. They are registered in the order of ``MODULES`` and
-unregistered in reverse.
+Each module lists its Blender classes in ``CLASSES`` and may define ``register()`` and ``unregister()``, for
+handlers, menus and properties. Modules register in the order of ``MODULES`` and unregister in reverse.
 """
 
 import bpy
@@ -40,7 +39,7 @@ MODULES = (
 
 
 def register() -> None:
-    """Register every class, then each module's handlers and properties, in order."""
+    """Register the classes, handlers and properties of all modules, in order."""
     for module in MODULES:
         for cls in getattr(module, "CLASSES", ()):
             bpy.utils.register_class(cls)

@@ -1,4 +1,4 @@
-"""What Blender knows of this extension: its name, its folders, its preferences, and its panels on screen."""
+"""The extension's name, folders and preferences, and helpers for undo and redraw."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from typing import Protocol, cast
 import bpy
 
 FOLDER = Path(__file__).resolve().parent.parent
-"""The extension's folder: the trainer runs in it, because ``training`` lies there."""
+"""The extension's folder, which holds ``training``; the trainer runs in it."""
 
 ID = (__package__ or "").rpartition(".")[0]
 """The module name, such as ``bl_ext.user_default.lodgs``."""
 
 
-class Settings(Protocol):
-    """What the preferences hold.
+class PreferenceValues(Protocol):
+    """The extension's preferences.
 
     Attributes:
-        python: path of the trainer's Python; empty for the environment that the extension makes.
-        backend: name of the rasterizer's backend, or "auto".
-        flamenco: address of the manager of a render farm; empty for none.
+        python: path of the trainer's Python; empty for the installed environment.
+        backend: name of the rasterizer backend, or "auto".
+        flamenco: address of the Flamenco Manager; empty without a render farm.
     """
 
     python: str
@@ -30,17 +30,17 @@ class Settings(Protocol):
 
 
 def user_folder(name: str = "") -> Path:
-    """A folder of this extension's own in Blender's user folder (nothing is written beside the code)."""
+    """Return the extension's writable folder in Blender's user folder, or a subfolder of it."""
     return Path(bpy.utils.extension_path_user(ID, path=name))
 
 
-def preferences() -> Settings:
-    """The extension's preferences."""
-    return cast(Settings, bpy.context.preferences.addons[ID].preferences)
+def preferences() -> PreferenceValues:
+    """Return the extension's preferences."""
+    return cast(PreferenceValues, bpy.context.preferences.addons[ID].preferences)
 
 
 def in_window():
-    """A context with a window, which a timer lacks; as it is where there are none (in background)."""
+    """Return a context manager that sets a window, which timers lack; it does nothing in background mode."""
     windows = bpy.context.window_manager.windows
     if bpy.context.window is not None or not windows:
         return nullcontext()
@@ -48,16 +48,16 @@ def in_window():
 
 
 def undo_step(message: str) -> None:
-    """Makes what came by itself an undo step, so that undoing the user's next one does not take it away."""
+    """Push an undo step for a change made by a timer, so that the user's next undo does not revert it."""
     with in_window():
         bpy.ops.ed.undo_push(message=message)
 
 
 def redraw() -> None:
-    """Has the panels of the extension and the status bar drawn anew, soon."""
+    """Redraw the extension's panels and the status bar."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type in {"VIEW_3D", "PREFERENCES"}:
                 area.tag_redraw()
-        if not window.modal_operators:  # which may have a text of their own in the status bar
+        if not window.modal_operators:  # modal operators may show their own status text
             window.workspace.status_text_set_internal(None)

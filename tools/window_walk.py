@@ -105,8 +105,8 @@ def train() -> Steps:
     press("ed.undo_push", message="Hide")
     yield from settle()
     noticed = take("trained", f"{len(root.lodgs.levels)} levels")
-    seen = bool(status.shown(time.monotonic()))  # or drawing that took longer than it stands
-    yield from until(lambda: not status.shown(time.monotonic()), 200)
+    seen = bool(status.visible_work(time.monotonic()))  # or drawing that took longer than it stands
+    yield from until(lambda: not status.visible_work(time.monotonic()), 200)
     yield 2.0
     gone = take("notice-gone", redrawn=False)
     assert not seen or changed(noticed, gone, part="STATUSBAR") > 0, "The notice stays."

@@ -1,4 +1,4 @@
-"""What panels share: their place in the sidebar, sentences that wrap, and the way to a trainer."""
+"""Base classes and drawing helpers of panels."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Panel(bpy.types.Panel):
 
 
 class LevelsPanel(Panel):
-    """One that needs a splat scene with levels."""
+    """A panel for splat scenes with levels."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -29,7 +29,7 @@ class LevelsPanel(Panel):
 
 
 def split_column(layout: bpy.types.UILayout, heading: str = "", align: bool = False) -> bpy.types.UILayout:
-    """A column of properties with their names on the left, without dots for animation."""
+    """Add a column of properties with labels on the left and without animation dots."""
     column = layout.column(heading=heading, align=align)
     column.use_property_split = True
     column.use_property_decorate = False
@@ -37,20 +37,20 @@ def split_column(layout: bpy.types.UILayout, heading: str = "", align: bool = Fa
 
 
 def say(layout: bpy.types.UILayout, text: str, icon: str) -> None:
-    """A sentence in as many lines as the panel needs for it."""
+    """Draw a text that wraps to the panel's width."""
     column = layout.column(align=True)
     column.scale_y = 0.8
     width = bpy.context.region.width / bpy.context.preferences.system.ui_scale
-    letters = max(int((width - 85) / 5.6), 24)  # of the default font, beside the icon and the tabs
-    for number, line in enumerate(textwrap.wrap(text, letters, break_on_hyphens=False)):
+    columns = max(int((width - 85) / 5.6), 24)  # letters of the default font, without icon and tabs
+    for number, line in enumerate(textwrap.wrap(text, columns, break_on_hyphens=False)):
         column.label(text=line, icon="BLANK1" if number else icon)  # type: ignore[arg-type]
 
 
 def draw_views(column: bpy.types.UILayout, settings: ViewsSettings, count: int) -> None:
-    """From where pictures are drawn that take the place of photographs.
+    """Draw the settings of the views to render as training images.
 
     Args:
-        count: how many cameras there are.
+        count: number of cameras.
     """
     column.prop(settings, "views_from")
     if settings.views_from == "CURVE":
@@ -58,27 +58,28 @@ def draw_views(column: bpy.types.UILayout, settings: ViewsSettings, count: int) 
     if settings.views_from == "GRID":
         column.prop(settings, "height")
     if settings.views_from == "CAMERAS":
-        column.label(text=f"{count} cameras")
+        column.label(text=f"{count} camera{'' if count == 1 else 's'}")
     else:
         column.prop(settings, "views")
     column.prop(settings, "view_width")
-    if settings.views_from not in ("CAMERAS", "ANIMATION"):  # which Blender shows
+    if settings.views_from not in ("CAMERAS", "ANIMATION"):  # Blender draws those cameras itself
         column.prop(settings, "show_views")
 
 
 def scene_length(context: bpy.types.Context, root: bpy.types.Object, value: float) -> str:
-    """A length of a splat scene, in its own units, as Blender says it in the scene's."""
-    units, scale = context.scene.unit_settings, max(axes_of(root).matrix_world.to_scale())
+    """Format a length given in the splat scene's units, in the units of the Blender scene."""
+    units = context.scene.unit_settings
+    scale = max(axes_of(root).matrix_world.to_scale())
     return bpy.utils.units.to_string(
         units.system, "LENGTH", value * scale * units.scale_length, precision=3
     ).strip()
 
 
 def draw_environment(layout: bpy.types.UILayout, missing: str = "") -> None:
-    """The trainer's environment: a button that makes one and what is wrong, or how far the making is.
+    """Draw the installation of the trainer: its progress, or its last result and the button that starts it.
 
     Args:
-        missing: what one lacks without it, as a sentence.
+        missing: message to show if the trainer is not installed.
     """
     work = environment_setup.current
     if work is not None and work.running:

@@ -1,4 +1,4 @@
-"""The extension's preferences: which Python trains, on what, and which farm."""
+"""The extension's preferences: trainer Python, training device and render farm."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from ..runs import environment
 from .parts import draw_environment, say
 
 _items: list[tuple[str, str, str, int]] = []
-"""What :func:`_backends` gave last: Blender wants such texts kept."""
+"""Last items of :func:`_backends`: Blender requires a reference to their texts."""
 
 
 def _backends(_self: object, _context: object) -> list[tuple[str, str, str, int]]:
-    """The trainer's backends but for the reference, which is slow."""
+    """Return the trainer's backends as enum items, without the slow reference backend."""
     card = environment.report.graphics if environment.report else ""
     _items[:] = [
-        ("auto", "Automatic", "An NVIDIA card where training works on it with CUDA, else the processor", 0),
-        ("cpu", "CPU", "The processor: works on every computer", 1),
-        ("cuda", "NVIDIA GPU (CUDA)", "The graphics card: needs gsplat in the trainer's Python", 2),
+        ("auto", "Automatic", "Use CUDA if the computer supports it, otherwise the CPU", 0),
+        ("cpu", "CPU", "Train on the processor, which works on every computer", 1),
+        ("cuda", "NVIDIA GPU (CUDA)", "Train with CUDA, which requires gsplat in the trainer's Python", 2),
         (
             "gpu",
-            f"Graphics Card ({card})" if card else "Graphics Card",
-            "Any graphics card, by Vulkan, Metal or Direct3D 12. It is tried before it is first used: where "
-            "it draws otherwise than it should, the processor takes its place",
+            f"GPU ({card})" if card else "GPU",
+            "Train with Vulkan, Metal or Direct3D 12 on any GPU; falls back to the CPU if the GPU fails a "
+            "test on first use",
             3,
         ),
     ]
@@ -31,24 +31,24 @@ def _backends(_self: object, _context: object) -> list[tuple[str, str, str, int]
 
 
 class LodgsPreferences(bpy.types.AddonPreferences):
-    """What ``extension.Settings`` declares."""
+    """The preferences declared by ``extension.PreferenceValues``."""
 
     bl_idname = extension.ID
 
     python: bpy.props.StringProperty(
-        name="Trainer's Python",
-        description="Python outside Blender that has PyTorch; empty: the environment made below",
+        name="Trainer Python",
+        description="Python executable with PyTorch; empty for the trainer installed below",
         subtype="FILE_PATH",
     )
     backend: bpy.props.EnumProperty(
-        name="Train On",
-        description="What draws the splats while training; a run may go on with another one",
+        name="Training Device",
+        description="Device that renders the splats during training; a resumed run may use another one",
         items=_backends,
     )
     flamenco: bpy.props.StringProperty(
         name="Flamenco Manager",
-        description="Address of the manager of a render farm that is to train cells, such as "
-        "http://farm:8080; empty: no farm",
+        description="Address of the Flamenco Manager that trains cells, such as http://farm:8080; empty "
+        "without a render farm",
     )
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -68,7 +68,7 @@ class LodgsPreferences(bpy.types.AddonPreferences):
             if report.devices:
                 say(layout, report.devices, "INFO")
                 if self.backend == "gpu" and not report.graphics:
-                    say(layout, "There is no graphics card to train on: choose Automatic or CPU.", "ERROR")
+                    say(layout, "No usable GPU found. Choose Automatic or CPU.", "ERROR")
 
 
 CLASSES = (LodgsPreferences,)

@@ -1,4 +1,4 @@
-"""The Scene panel: bring a scene in, and what the chosen one is."""
+"""The Scene panel: import scenes and show the active one."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ class LODGS_PT_scene(Panel):
             say(layout, scenes.LINKED, "LINKED")
         if root is None:
             if scenes.roots(context.scene):
-                layout.label(text="Select one of the splat scenes", icon="INFO")
+                layout.label(text="Select a splat scene", icon="INFO")
             return
         column = split_column(layout)
         row = column.row(align=True)
         row.prop(root, "name", text="Name")
         row.operator("lodgs.remove_scene", text="", icon="TRASH")
         if root.lodgs.scene_folder:
-            column.prop(root.lodgs, "scene_folder", text="Photographs")
+            column.prop(root.lodgs, "scene_folder", text="Folder")
         if root.lodgs.levels:
             column.prop(root.lodgs, "antialias")
         row = layout.row(align=True)
@@ -45,20 +45,20 @@ class LODGS_PT_scene(Panel):
 
 
 def _draw_import(layout: bpy.types.UILayout, another: bool) -> None:
-    """The ways in; folded away where there is a scene."""
+    """Draw the import buttons, collapsed once the file has a splat scene."""
     column: bpy.types.UILayout | None = layout.column(align=True)
-    _draw_finding(column)
+    _draw_camera_search(column)
     if another:
         header, column = layout.panel("LODGS_import_another", default_closed=True)
         header.label(text="Import Another")
     if column is not None:
-        column.operator("lodgs.find_cameras", text="Import Photographs…", icon="IMAGE_DATA")
-        column.operator("lodgs.import_colmap", text="Import COLMAP or Export…", icon="CAMERA_DATA")
+        column.operator("lodgs.find_cameras", text="Import Photos…", icon="IMAGE_DATA")
+        column.operator("lodgs.import_colmap", text="Import COLMAP Scene…", icon="CAMERA_DATA")
         column.operator("lodgs.import_splats", text="Import Splats…", icon="POINTCLOUD_DATA")
 
 
-def _draw_finding(column: bpy.types.UILayout) -> None:
-    """How far the cameras of photographs are found, or how it went."""
+def _draw_camera_search(column: bpy.types.UILayout) -> None:
+    """Draw the progress or the result of the search for the photos' cameras."""
     work = photo_preparation.current
     if work is None:
         return

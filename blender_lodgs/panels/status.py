@@ -1,4 +1,4 @@
-"""The status bar: how far programs beside Blender are, in every workspace, and a notice at their end."""
+"""Progress of background work in the status bar of every workspace, with a notice when it ends."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from ..runs import background_capture, environment_setup, photo_preparation
 from ..runs.watch import root_by_uid, watches
 
 NOTICE = 60.0
-"""Seconds for which it is said that something has ended."""
+"""Seconds for which the notice of finished work is shown."""
 
 
 @dataclass(frozen=True)
 class Work:
-    """One thing that is done beside Blender.
+    """One piece of background work.
 
     Attributes:
-        source: what does it.
-        text: what is done, or how it ended.
-        share: how much of it, 0 to 1.
-        running: whether it is at work.
-        failed: whether it ended with a problem.
+        source: object that does the work.
+        text: current step, or the result.
+        share: progress, 0 to 1.
+        running: True while the work runs.
+        failed: True if the work ended with a problem.
     """
 
     source: object
@@ -35,44 +35,45 @@ class Work:
     failed: bool
 
 
-_seen: dict[int, tuple[object, float]] = {}
-"""What was seen at work, by its identity, and when it was seen to have ended: 0 where it is at work.
+_observed: dict[int, tuple[object, float]] = {}
+"""Source and end time of each work that was observed running, by the source's ``id``; 0 while it runs.
 
-The source itself is held, as the identity of one that is gone may come back as another's."""
+The reference to the source keeps Python from reusing its ``id``."""
 
 
-def works() -> Iterator[Work]:
-    """All that is at work, or was last."""
+def all_work() -> Iterator[Work]:
+    """Yield all current work, and the last of each kind that ended."""
     for uid, watch in watches.items():
         root = root_by_uid(uid)
         name = "Splats" if root is None else root.name
         yield Work(watch, f"{name}: {watch.message}", watch.share, watch.running, bool(watch.problem))
-    for each in (background_capture.current, photo_preparation.current, environment_setup.current):
-        if each is not None:
-            yield Work(each, each.message, each.fraction, each.running, bool(each.problem))
+    for job in (background_capture.current, photo_preparation.current, environment_setup.current):
+        if job is not None:
+            yield Work(job, job.message, job.fraction, job.running, bool(job.problem))
 
 
-def shown(now: float) -> list[Work]:
-    """What the status bar shows: what is at work, and what has ended since it was seen at work."""
-    found, all_works = [], list(works())
-    for gone in _seen.keys() - {id(work.source) for work in all_works}:
-        del _seen[gone]
-    for work in all_works:
-        _, ended = _seen.get(id(work.source), (None, None))
+def visible_work(now: float) -> list[Work]:
+    """Return the work that the status bar shows: running, or ended within the last ``NOTICE`` seconds."""
+    visible = []
+    current = list(all_work())
+    for removed in _observed.keys() - {id(work.source) for work in current}:
+        del _observed[removed]
+    for work in current:
+        _, ended = _observed.get(id(work.source), (None, None))
         if work.running:
             ended = 0.0
         elif ended == 0.0:
             ended = now
             bpy.app.timers.register(extension.redraw, first_interval=NOTICE, persistent=True)
         if ended is not None:
-            _seen[id(work.source)] = work.source, ended
+            _observed[id(work.source)] = work.source, ended
         if work.running or (ended is not None and now - ended < NOTICE):
-            found.append(work)
-    return found
+            visible.append(work)
+    return visible
 
 
 def _draw(self, context: bpy.types.Context) -> None:
-    for work in shown(time.monotonic()):
+    for work in visible_work(time.monotonic()):
         row = self.layout.row(align=True)
         if work.running:
             row.ui_units_x = 16

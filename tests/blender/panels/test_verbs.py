@@ -99,16 +99,16 @@ def test_the_status_bar_tells_of_work_and_for_a_while_of_its_end(bpy, lodgs, wor
     monkeypatch.setattr(
         bpy.app.timers, "register", lambda do, first_interval, persistent: timers.append((do, first_interval))
     )
-    (now,) = status.shown(100.0)
+    (now,) = status.visible_work(100.0)
     assert now.running and (now.text, now.share) == ("Photographs placed: 3 of 6", 0.5)
     work.running, work.message = False, "All 6 photographs found their place."
     assert (
-        [each.text for each in status.shown(110.0)]
+        [each.text for each in status.visible_work(110.0)]
         == [work.message]
-        == [each.text for each in status.shown(111.0)]
+        == [each.text for each in status.visible_work(111.0)]
     )
     assert timers == [(status.extension.redraw, status.NOTICE)], "it goes by itself"
-    assert status.shown(110.0 + status.NOTICE - 1) and not status.shown(110.0 + status.NOTICE + 1)
+    assert status.visible_work(110.0 + status.NOTICE - 1) and not status.visible_work(110.0 + status.NOTICE + 1)
     work.running, work.message, work.fraction = True, "Again", 0.1
     monkeypatch.setattr(status.time, "monotonic", lambda: 300.0)
     notes = Notes()
@@ -131,10 +131,10 @@ def test_another_work_at_the_place_of_one_that_is_gone_is_another(lodgs, work):
     state = {**vars(work), "running": False}
     for _ in range(20):
         photo_preparation.current = SimpleNamespace(**{**state, "running": True})
-        assert len(status.shown(0.0)) == 1
+        assert len(status.visible_work(0.0)) == 1
         photo_preparation.current = None
         photo_preparation.current = SimpleNamespace(**state)
-        assert status.shown(1.0) == []
+        assert status.visible_work(1.0) == []
 
 
 def test_runs_of_a_scene_are_listed_and_opened(bpy, lodgs, tmp_path, fake):

@@ -98,7 +98,7 @@ def test_the_check_tells_what_trains_here(bpy, lodgs, environment, preferences, 
     bpy.ops.lodgs.check_environment()
     assert environment.report.devices == "Automatic trains on the processor."
     backends = lodgs("panels.preferences")._backends(None, None)
-    assert [(name, label) for name, label, *_ in backends][-1] == ("gpu", "Graphics Card (Radeon 780M)")
+    assert [(name, label) for name, label, *_ in backends][-1] == ("gpu", "GPU (Radeon 780M)")
     assert [number for *_, number in backends] == [0, 1, 2, 3], "as files have saved them"
     preferences.python = str(_program(tmp_path / "older", f"echo '{ready}'"))  # knows of no devices
     bpy.ops.lodgs.check_environment()
