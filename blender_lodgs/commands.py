@@ -12,11 +12,11 @@ from pathlib import Path
 
 import bpy
 
+from ..training.editing.bake_filter import without_filter
+from ..training.editing.edit import Joined, finish
 from ..training.errors import LodgsError
 from ..training.evaluate.messages import summary_lines
 from ..training.lod.describe import describe
-from ..training.lod.edit import Joined, finish
-from ..training.lod.unfiltered import without_filter
 from ..training.methods.describe import describe_method, describe_methods
 from ..training.runs.folder import RunFolder
 from ..training.runs.job import Job, check_views

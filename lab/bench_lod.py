@@ -27,13 +27,13 @@ import torch
 
 from examples import town
 from training.evaluate.metrics import psnr
+from training.lod.partial_read import BLOCKS, read_part, table_of_blocks
 from training.lod.rules.chunks import RULE, TABLE, member_columns
 from training.lod.selection import settings
-from training.lod.streaming import BLOCKS, read_part, table_of_blocks
 from training.methods.lodge.chunks import members
 from training.methods.lodge.composite import IndexedLevel
 from training.rasterize import Gaussians, Rendering
-from training.rasterize.resident import Resident
+from training.rasterize.resident import ResidentBundle
 from training.runs.capture import write_scene
 from training.runs.folder import RunFolder
 from training.runs.job import Job
@@ -41,7 +41,7 @@ from training.scenes.cameras import Camera, evenly
 from training.scenes.colmap import read_scene
 from training.scenes.images import write_png
 from training.splats.bundle import Bundle, read_bundle, write_bundle
-from training.splats.ply import columns_of, columns_of_extras, read_ply, write_ply
+from training.splats.ply import extra_columns, read_ply, splat_columns, write_ply
 
 REPEATS = 7
 PACE = 1.5 / 24
@@ -77,7 +77,7 @@ class Row:
     """
 
     name: str
-    resident: Resident
+    resident: ResidentBundle
     draw: Draw
     bytes: int
 
@@ -152,13 +152,13 @@ def rows_of(file: Path, others: dict[str, Path]) -> list[Row]:
     """All ways to draw, the whole model first. Of each what it needs is read of its file."""
 
     def row(name: str, shown: Path, **values: float) -> Row:
-        resident = Resident(shown)
+        resident = ResidentBundle(shown)
         given = settings(resident.bundle, values)
         return Row(
             name, resident, lambda camera: resident.draw(camera, given, near=town.NEAR), bytes_of(shown)
         )
 
-    alone, plain = Resident(file), bytes_of(file, extras=False)
+    alone, plain = ResidentBundle(file), bytes_of(file, extras=False)
     finest = alone.bundle.levels[-1].number
     found = [
         Row("full", alone, lambda camera: alone.draw_level(finest, camera, near=town.NEAR), plain),
@@ -176,7 +176,7 @@ def rows_of(file: Path, others: dict[str, Path]) -> list[Row]:
 def bytes_of(file: Path, extras: bool = True) -> int:
     """Of a splat in a file."""
     splats = read_part(file, [])[0].levels[-1].splats
-    columns = columns_of(splats) | (columns_of_extras(splats) if extras else {})
+    columns = splat_columns(splats) | (extra_columns(splats) if extras else {})
     return sum(column.dtype.itemsize for column in columns.values())
 
 

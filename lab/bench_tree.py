@@ -22,10 +22,10 @@ import numpy as np
 
 from examples import town
 from training.lod.rules.cut import ABOVE_ROOT, detail_of
-from training.lod.tree import Tree
+from training.lod.tree.shape import Tree
 from training.methods.tree.build import build
-from training.rasterize.cpu.compile import STRICT, at_once, f32, in_parallel, inlined, kernel, threads
-from training.rasterize.hspt import Hspt
+from training.rasterize.cpu.compile import STRICT, run_serial, f32, run_parallel, inlined, kernel, thread_count
+from training.rasterize.sequential_point_tree import SequentialPointTree
 from training.scenes.cameras import Camera
 
 NODES = (100_000, 1_000_000, 10_000_000)
@@ -78,7 +78,7 @@ def walk_of(tree: Tree, balls: np.ndarray) -> Cut:
 
     def cut(camera: Camera, k: float) -> np.ndarray:
         eye = camera.center.astype(np.float32)
-        at_once(_walk_all, balls, tree.children, tree.leaves, eye, f32(k), ahead, found, count)
+        run_serial(_walk_all, balls, tree.children, tree.leaves, eye, f32(k), ahead, found, count)
         return found[: count[0]].copy()
 
     return cut
@@ -94,7 +94,7 @@ def asking_all(tree: Tree, balls: np.ndarray) -> Cut:
 
     def cut(camera: Camera, k: float) -> np.ndarray:
         eye = camera.center.astype(np.float32)
-        in_parallel(_ask_all, len(tree), _GRAIN, families, eye, f32(k), found, counts)
+        run_parallel(_ask_all, len(tree), _GRAIN, families, eye, f32(k), found, counts)
         parts = [found[part * _GRAIN : part * _GRAIN + count] for part, count in enumerate(counts)]
         return np.concatenate(parts)
 
@@ -138,7 +138,7 @@ def rows_of(nodes: int, pixels: float) -> list[dict]:
     splats, tree = build(splats)
     built = time.perf_counter()
     sizes = tree.sizes(splats.means, splats.log_scales)
-    hspt = Hspt(tree, splats.means, sizes, splats.log_scales)
+    hspt = SequentialPointTree(tree, splats.means, sizes, splats.log_scales)
     ready = time.perf_counter()
     print(
         f"{len(tree):,} nodes: town {made - begun:.0f} s, tree {built - made:.0f} s, "
@@ -208,7 +208,7 @@ def main() -> None:
     options.out.parent.mkdir(parents=True, exist_ok=True)
     known = json.loads(options.out.read_text(encoding="utf-8"))["rows"] if options.out.exists() else []
     trained = [row for row in known if row.get("peak_mb") is not None]  # lab/bench_tree_memory.py's
-    report = {"threads": threads(), "hspt_times_faster": faster, "rows": rows + trained}
+    report = {"threads": thread_count(), "hspt_times_faster": faster, "rows": rows + trained}
     options.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     plot(options.out.with_suffix(".png"), rows)
     print(f"{options.out} and {options.out.with_suffix('.png').name}")

@@ -18,10 +18,10 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(HERE))
 
+from training.editing.bake_filter import without_filter  # noqa: E402
 from training.errors import LodgsError  # noqa: E402
-from training.evaluate.views import Evaluation, shown_at  # noqa: E402
+from training.evaluate.views import Evaluation, full_detail_selector  # noqa: E402
 from training.lod.selection import levels_alone  # noqa: E402
-from training.lod.unfiltered import without_filter  # noqa: E402
 from training.runs.data import training_data  # noqa: E402
 from training.runs.folder import RunFolder  # noqa: E402
 from training.runs.job import Job  # noqa: E402
@@ -64,7 +64,11 @@ def psnr_by_size(run: Path) -> Iterator[tuple[int, str, dict[int, float]]]:
                 size,
                 who,
                 {
-                    level.number: float(evaluation.psnrs(evaluation.cameras, shown_at(bundle, level)).mean())
+                    level.number: float(
+                        evaluation.compare_views(
+                            evaluation.cameras, full_detail_selector(bundle, level)
+                        ).mean()
+                    )
                     for level in levels_alone(bundle)
                 },
             )

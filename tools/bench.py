@@ -23,16 +23,16 @@ import numpy as np
 import torch
 
 from training.lod.blocks import spatial_order
-from training.lod.choice import Choice, Chooser
+from training.lod.query import Choice, Chooser
 from training.lod.rule import facts_of
 from training.lod.rules.bands import RULE as BANDS
-from training.rasterize import Adam, Gaussians, Target, cpu, photometric_loss, rasterize, render, resolve
+from training.rasterize import Adam, Gaussians, Target, cpu, photometric_loss, rasterize, render, resolve_backend
 from training.rasterize.cpu import adam
 from training.rasterize.cpu.bin import LOG2_ALPHA_MIN
 from training.rasterize.cpu.blend import CAP, SPAN, T_MIN
-from training.rasterize.cpu.compile import FAST, Buffers, f32, in_parallel, kernel, set_threads, threads
+from training.rasterize.cpu.compile import FAST, Buffers, f32, run_parallel, kernel, set_thread_count, thread_count
 from training.rasterize.cpu.fastmath import exp2
-from training.rasterize.cpu.project import rows_of_strip
+from training.rasterize.cpu.project import strip_rows
 from training.scenes.cameras import Camera
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -102,7 +102,7 @@ class Stopwatch:
         self.originals = {stage: getattr(module, name) for stage, (module, name) in FUNCTIONS.items()}
         for stage, (module, name) in FUNCTIONS.items():
             setattr(module, name, self._timed(self.originals[stage], lambda *_, stage=stage: stage))
-        cpu.in_parallel = self._timed(in_parallel, lambda kernel, *_: KERNELS[kernel.__name__])
+        cpu.run_parallel = self._timed(run_parallel, lambda kernel, *_: KERNELS[kernel.__name__])
         return self
 
     def _timed(self, function: Callable, stage_of: Callable) -> Callable:
@@ -115,7 +115,7 @@ class Stopwatch:
         return call
 
     def __exit__(self, *_) -> None:
-        cpu.in_parallel = in_parallel
+        cpu.run_parallel = run_parallel
         for stage, (module, name) in FUNCTIONS.items():
             setattr(module, name, self.originals[stage])
 
@@ -153,12 +153,12 @@ def multiply_add(begin, end, values, rounds):
 
 def measured_peak() -> float:
     """Float32 operations a second (1e9) that multiply-adds reach on all threads."""
-    values, rounds = np.ones((threads(), 4096), np.float32), 16_000
-    in_parallel(multiply_add, len(values), 1, values, 1)
+    values, rounds = np.ones((thread_count(), 4096), np.float32), 16_000
+    run_parallel(multiply_add, len(values), 1, values, 1)
     seconds = []
     for _ in range(5):
         start = time.perf_counter()
-        in_parallel(multiply_add, len(values), 1, values, rounds)
+        run_parallel(multiply_add, len(values), 1, values, rounds)
         seconds.append(time.perf_counter() - start)
     return values.size * rounds * 16 / min(seconds) / 1e9
 
@@ -173,7 +173,7 @@ def count_work(begin, end, projected, splat, tile_start, tiles_x, walked, height
         for pair in range(tile_start[tile], tile_start[tile] + walked[tile]):
             row = projected[splat[pair]]
             left, top = f32(x0) + f32(0.5), f32(y0) + f32(0.5)
-            first, last = rows_of_strip(row, left, SPAN, top, min(16, height - y0))
+            first, last = strip_rows(row, left, SPAN, top, min(16, height - y0))
             lanes[tile] += 16 * max(0, last - first)
             for r in range(first, last):
                 for j in range(16):
@@ -191,20 +191,20 @@ def work(step: Step) -> tuple[int, float]:
     seen = {}
 
     def spy(kernel, total, grain, *args):
-        in_parallel(kernel, total, grain, *args)
+        run_parallel(kernel, total, grain, *args)
         if kernel is cpu.blend_forward:
             projected, splat, tile_start, tiles_x, _, _, _, transmittance, walked, _ = args
             lanes, blends = np.zeros((2, len(walked)), np.int64)
             rest = projected, splat, tile_start, tiles_x, walked, len(transmittance), lanes, blends
-            in_parallel(count_work, total, grain, *rest)
+            run_parallel(count_work, total, grain, *rest)
             seen["lanes"], seen["blends"] = int(lanes.sum()), int(blends.sum()) / transmittance.size
 
-    cpu.in_parallel = spy
+    cpu.run_parallel = spy
     try:
         with torch.no_grad():
             rasterize(step.splats, step.camera)
     finally:
-        cpu.in_parallel = in_parallel
+        cpu.run_parallel = run_parallel
     return seen["lanes"], seen["blends"]
 
 
@@ -229,7 +229,7 @@ def bytes_a_pair(step: Step) -> float:
 
 def bench(seconds: float) -> dict:
     peak = measured_peak()
-    count_of_threads = threads()
+    count_of_threads = thread_count()
     print(f"{count_of_threads} threads, FP32 peak measured {peak:.0f} GFLOP/s")
     columns = [*STAGES, "around", "step"]
     print(
@@ -297,15 +297,15 @@ def further(seconds: float) -> dict:
 
     found["choosing_ms"], found["asking_each_ms"] = choosing(splats, camera, seconds)
 
-    step, before = Step(50_000, 640, 480), threads()
+    step, before = Step(50_000, 640, 480), thread_count()
     by_threads, peaks = {}, {}
     try:
         for count in sorted({1, 2, before, 16}):
-            set_threads(count)
+            set_thread_count(count)
             by_threads[count] = least(step, seconds)
             peaks[count] = measured_peak()
     finally:
-        set_threads(before)
+        set_thread_count(before)
     found["step_ms_by_threads"], found["peak_by_threads"] = by_threads, peaks
 
     program = (
@@ -323,7 +323,7 @@ def further(seconds: float) -> dict:
                     run, cwd=ROOT, env=environment, capture_output=True, text=True, check=True
                 )
                 found[name] = min(found[name], float(said.stdout))
-    if resolve("auto") == "cuda":
+    if resolve_backend("auto") == "cuda":
         step = Step(200_000, 960, 540, "cuda")
         found["cuda_step_ms"] = least(lambda: (step(), torch.cuda.synchronize()), seconds)
         print(f"training step on the GPU, 200k splats at 960x540: {found['cuda_step_ms']:.1f} ms")

@@ -38,7 +38,7 @@ import numpy as np
 import plyfile
 
 from lab.large_scene import write_large
-from tests.training.lod.trees import random_leaves, tree_of, write_in_pages
+from tests.training.lod.tree.trees import random_leaves, tree_of, write_in_pages
 from tools.blender_module import EXTENSION, start_blender
 
 PHOTOGRAPH = Path(__file__).resolve().parent.parent / "examples" / "lantern_garden" / "images" / "view_00.jpg"
@@ -247,7 +247,7 @@ def clean_up(bpy, count: int) -> None:
     everywhere = least(lambda: cleaning.find_floaters(bpy.context, root, 0.0, 0.001))
     found = cleaning.find_floaters(bpy.context, root, 0.0, 0.001)
     strokes, depsgraph = load("blender_lodgs.viewport.strokes"), bpy.context.evaluated_depsgraph_get()
-    brushed = load("training.lod.brush").brushed
+    brushed = load("training.editing.brush").brushed
     look, size = np.eye(4), (1280, 800)
     look[2, 3] = -15.0
     clip = np.array([[2, 0, 0, 0], [0, 3.2, 0, 0], [0, 0, -1, -0.1], [0, 0, -1, 0]], float)

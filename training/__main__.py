@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from . import VERSION
-from .errors import LodgsError, out_of_memory
+from .errors import LodgsError, is_out_of_memory
 
 if TYPE_CHECKING:
     from .runs.job import Job
-    from .splats.placing import Placement
+    from .splats.similarity import Similarity
 
 PROGRAM = "lodgs" if __package__ == "lodgs" else "python -m training"
 _OTHERS = " (and, with splat-transform, .spz, .sog and others: see docs/formats.md)"
@@ -56,7 +56,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except (MemoryError, RuntimeError) as error:
-        if not out_of_memory(error):
+        if not is_out_of_memory(error):
             raise
         print("error: There is not enough memory. Close other programs, or ask for less.", file=sys.stderr)
         return 2
@@ -74,7 +74,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from .runs.options import add_options, size_of
+    from .runs.options import add_options, parse_size
     from .scenes.reconstruct import LENSES, PRESETS
     from .splats.formats import FORMATS
 
@@ -138,7 +138,7 @@ def _parser() -> argparse.ArgumentParser:
     eye.add_argument("--view", metavar="IMAGE", help="name of a photograph that the splats were trained from")
     render.add_argument("--scene", type=Path, help="COLMAP folder of the photographs, where no run knows it")
     render.add_argument("--out", type=Path, required=True, help="picture to write: .png or .exr")
-    render.add_argument("--size", type=size_of, metavar="WxH", help="pixels; otherwise the camera's own")
+    render.add_argument("--size", type=parse_size, metavar="WxH", help="pixels; otherwise the camera's own")
     render.add_argument("--level", type=int, default=0, help="level to draw (otherwise the finest)")
     render.add_argument(
         "--by-distance", action="store_true", help="draw levels by distance; so does any of these:"
@@ -340,18 +340,18 @@ def _add_placement(parser: argparse._ActionsContainer) -> None:
     )  # fmt: skip
 
 
-def _placement(chosen: argparse.Namespace) -> Placement | None:
+def _placement(chosen: argparse.Namespace) -> Similarity | None:
     """What the options of :func:`_add_placement` say but for --upright; None: nothing."""
     import numpy as np
 
-    from .splats.placing import Placement
+    from .splats.similarity import Similarity
 
     unmoved = (chosen.rotate, chosen.scale, chosen.translate) == ((0, 0, 0), 1.0, (0, 0, 0))
     if chosen.matrix is None:
-        return None if unmoved else Placement.composed(chosen.rotate, chosen.scale, chosen.translate)
+        return None if unmoved else Similarity.from_angles(chosen.rotate, chosen.scale, chosen.translate)
     if not unmoved:
         raise LodgsError("--matrix says all that --rotate, --scale and --translate say.", "Choose one.")
-    return Placement.of(np.reshape(chosen.matrix, (4, 4)))
+    return Similarity.from_matrix(np.reshape(chosen.matrix, (4, 4)))
 
 
 def _add_controls(parser: argparse.ArgumentParser) -> None:
@@ -409,9 +409,9 @@ def _colour(text: str) -> tuple[float, float, float] | None:
 
 
 def _train(chosen: argparse.Namespace) -> int:
-    from .runs.options import job_from
+    from .runs.options import job_from_options
 
-    return _trained(lambda: job_from(chosen))
+    return _trained(lambda: job_from_options(chosen))
 
 
 def _trained(job_of: Callable[[], Job], **where: Any) -> int:
@@ -441,17 +441,17 @@ def _blocks(chosen: argparse.Namespace) -> int:
 
 
 def _plan_blocks(chosen: argparse.Namespace) -> int:
-    from .runs.blocks.plan import cells_within, plan, plan_table, read_planned_scene, write_plan
+    from .runs.blocks.plan import choose_cells, plan, plan_table, read_planned_scene, write_plan
     from .runs.folder import RunFolder
-    from .runs.job import keep_job
-    from .runs.options import job_from
+    from .runs.job import save_job
+    from .runs.options import job_from_options
 
-    job = job_from(chosen).resolved()
+    job = job_from_options(chosen).resolved()
     scene = read_planned_scene(job)
     if chosen.block_splats or chosen.block_memory:
         if job.cells:
             raise LodgsError("It is said how many cells, and how large they may be.", "Leave out one.")
-        job = job.in_cells(cells_within(job, chosen.block_splats, chosen.block_memory * 10**6, scene))
+        job = job.with_cells(choose_cells(job, chosen.block_splats, chosen.block_memory * 10**6, scene))
     if not job.cells:
         raise LodgsError(
             "It is not said how many cells.",
@@ -459,29 +459,31 @@ def _plan_blocks(chosen: argparse.Namespace) -> int:
         )
     planned = plan(job, scene)
     folder = RunFolder(job.out)
-    folder.make()
+    folder.create()
     if folder.job.exists():
-        keep_job(job, folder)
+        save_job(job, folder)
     write_plan(job, folder, scene, planned)
-    keep_job(job, folder)  # now that it can be
+    save_job(job, folder)  # now that it can be
     print(plan_table(planned))
     print(f"Train them with: {PROGRAM} blocks run {folder.path}", flush=True)
     return 0
 
 
 def _run_blocks(chosen: argparse.Namespace) -> int:
-    from .runs.blocks.plan import planned_job, read_plan
-    from .runs.blocks.train import prepare
+    from .runs.blocks.plan import read_plan, read_planned_job
+    from .runs.blocks.train import prepare_part
     from .runs.folder import RunFolder
-    from .runs.options import amounts
+    from .runs.options import parse_resources
 
     if not chosen.only:
-        return _trained(lambda: planned_job(chosen.run), on=chosen.on, resources=amounts(chosen.takes))
+        return _trained(
+            lambda: read_planned_job(chosen.run), on=chosen.on, resources=parse_resources(chosen.takes)
+        )
     division = read_plan(RunFolder(chosen.run))
-    part = division.named(chosen.only)
+    part = division.part(chosen.only)
     if part is None:
         return 0
-    prepare(division, part)
+    prepare_part(division, part)
     return _trained(lambda: part.job)
 
 
@@ -493,16 +495,16 @@ def _methods(chosen: argparse.Namespace) -> int:
 
 
 def _evaluate(chosen: argparse.Namespace) -> int:
-    from .runs.measure import evaluate_run, table
+    from .runs.measure import evaluate_run, format_report
 
-    print(table(evaluate_run(chosen.run, _controls(chosen), chosen.picture, chosen.far, _warn)))
+    print(format_report(evaluate_run(chosen.run, _controls(chosen), chosen.picture, chosen.far, _warn)))
     return 0
 
 
 def _render(chosen: argparse.Namespace) -> int:
     from .lod.rule import find_rule
     from .lod.selection import unknown_rule
-    from .render.command import Source, render
+    from .render.command import RenderSource, render
     from .scenes.cameras import check_size, read_camera
 
     if chosen.size:
@@ -510,7 +512,7 @@ def _render(chosen: argparse.Namespace) -> int:
     given = _controls(chosen)
     if (given or chosen.by_distance) and chosen.level:
         raise LodgsError("--level draws one level, the other options levels by distance.", "Choose one.")
-    source = Source.read(chosen.source, _warn)
+    source = RenderSource.read(chosen.source, _warn)
     camera, near = read_camera(chosen.camera) if chosen.camera else source.view(chosen.view, chosen.scene)
     if chosen.size:
         camera = camera.resized(*chosen.size)
@@ -601,10 +603,10 @@ def _serve(chosen: argparse.Namespace) -> int:
 
 
 def _edit(chosen: argparse.Namespace) -> int:
-    from .lod.cleaning import Cleaning
+    from .editing.cleaning import Cleaning
+    from .editing.edit import edit
+    from .editing.look import RANGES, Look
     from .lod.crop import Crop
-    from .lod.edit import edit
-    from .lod.look import RANGES, Look
     from .runs.folder import RunFolder
     from .splats.formats import as_ply
 

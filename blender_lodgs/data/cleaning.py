@@ -1,4 +1,4 @@
-"""Clutter in a splat scene: found by the tests of ``training.lod.cleaning``, hidden, shown again, deleted.
+"""Clutter in a splat scene: found by the tests of ``training.editing.cleaning``, hidden, shown again, deleted.
 
 Hidden splats are a boolean attribute of their level's points; one modifier drops them (``crops``). A level
 that is trained anew has other points, of which none is hidden: the panel says how many were. Crops act on
@@ -12,11 +12,11 @@ from collections.abc import Callable, Mapping
 import bpy
 import numpy as np
 
+from ...training.editing import cleaning
 from ...training.errors import LodgsError
-from ...training.lod import cleaning
 from ...training.lod.crop import kept
-from ...training.lod.paging import COLUMNS
 from ...training.lod.rules.cut import RULE as CUT
+from ...training.lod.tree.paging import COLUMNS
 from ...training.scenes.cameras import Camera
 from ...training.splats.bundle import Bundle
 from ..attributes import BASE, HIDDEN, SCALE, SELECTION, read_attribute, view_attribute, write_attribute

@@ -1,7 +1,7 @@
 """How a splat scene looks: exposure, white balance, tint, saturation and opacity, on its root and its crops.
 
 ``Object.lodgs_look`` of a root counts everywhere in the scene, that of a crop in the crop, upon the root's
-(``training.lod.look``). Splats stay what they are: what LODGS draws, in viewports, F12 and comparisons, gets
+(``training.editing.look``). Splats stay what they are: what LODGS draws, in viewports, F12 and comparisons, gets
 :func:`looks_of`, and exports what that makes of them. For points and ellipsoids, which Blender draws, every
 level has a modifier (``nodes.look``) as soon as somebody has set something.
 """
@@ -15,9 +15,9 @@ from typing import NamedTuple
 import bpy
 from mathutils import Matrix
 
+from ...training.editing.look import DAYLIGHT, NEUTRAL, RANGES, Look
+from ...training.editing.paint import COLUMNS as PAINT
 from ...training.lod.crop import Crop
-from ...training.lod.look import DAYLIGHT, NEUTRAL, RANGES, Look
-from ...training.lod.paint import COLUMNS as PAINT
 from .. import compat
 from ..nodes import ellipsoids
 from ..nodes import look as groups
@@ -54,7 +54,7 @@ def _matrix(self) -> list[float]:
 
 
 class LookSettings(bpy.types.PropertyGroup):
-    """A look: see ``training.lod.look.Look``."""
+    """A look: see ``training.editing.look.Look``."""
 
     exposure: bpy.props.FloatProperty(
         name="Exposure",

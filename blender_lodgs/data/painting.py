@@ -1,4 +1,4 @@
-"""Paint on a splat scene: columns of its levels' splats, beside their own colours (``training.lod.paint``).
+"""Paint on a splat scene: columns of its levels' splats, beside their own colours (``training.editing.paint``).
 
 What LODGS draws has it mixed in where splats are read; for points and ellipsoids the modifier of the look has
 it (``looks``). Files that keep the splats as trained keep their paint beside, and give it back.
@@ -15,8 +15,8 @@ from dataclasses import replace
 import bpy
 import numpy as np
 
+from ...training.editing import paint
 from ...training.errors import LodgsError
-from ...training.lod import paint
 from ...training.splats.bundle import Level
 from ..attributes import view_attribute, write_attribute
 from . import changes, selection, streams

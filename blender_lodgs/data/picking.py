@@ -6,7 +6,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ...training.lod.brush import Projection
+from ...training.editing.brush import Projection
 from ..attributes import BASE, SCALE, WEIGHT, read_attribute
 from .objects import root_of
 from .shown import SplatInstance, splat_instances

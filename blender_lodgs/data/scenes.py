@@ -17,11 +17,12 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+from ...training.editing import look
+from ...training.editing import placement
 from ...training.errors import LodgsError
-from ...training.lod import look, placing
-from ...training.lod.paging import TreeFile, is_tree, read_within
 from ...training.lod.rule import Control, Tables, find_rule
 from ...training.lod.selection import complete, known_rule, not_alone, unknown_rule
+from ...training.lod.tree.paging import TreeFile, is_tree, read_within
 from ...training.methods import METHODS
 from ...training.scenes.cameras import Camera, extent_of
 from ...training.scenes.colmap import Scene, read_scene
@@ -29,8 +30,8 @@ from ...training.scenes.formats import colmap_scene
 from ...training.scenes.undistort import already_undistorted
 from ...training.scenes.views import VIEWS, tables_of, views_in
 from ...training.scenes.views import placed as placed_views
-from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder, read_head
-from ...training.splats.formats import STREAMED, as_ply, is_ply
+from ...training.splats.bundle import Bundle, Level, read_bundle, read_folder, read_header
+from ...training.splats.formats import STREAMED_FILE, is_plain_ply, open_as_ply
 from ...training.splats.gaussians import Splats
 from .. import extension
 from ..nodes import ellipsoids
@@ -245,9 +246,9 @@ def read_splats_file(path: Path | str, budget: int = 0) -> SplatsFile:
         LodgsError: the file cannot be read.
     """
     path, warnings, total = Path(path), [], 0
-    if path.name == STREAMED:
+    if path.name == STREAMED_FILE:
         path = path.resolve().parent
-    if budget and not path.is_dir() and is_ply(path) and is_tree(read_head(path)):
+    if budget and not path.is_dir() and is_plain_ply(path) and is_tree(read_header(path)):
         total = TreeFile(path).total
         bundle, _ = read_within(path, budget if total <= budget else streams.held_of(budget))
         here = sum(len(level.splats) for level in bundle.levels)
@@ -258,7 +259,7 @@ def read_splats_file(path: Path | str, budget: int = 0) -> SplatsFile:
             )
         total = total if here < total else 0
     else:
-        with as_ply(path) as there:
+        with open_as_ply(path) as there:
             bundle = (read_folder if there.is_dir() else read_bundle)(there, warnings.append)
     return SplatsFile(path, bundle, total, budget, warnings)
 
@@ -278,7 +279,7 @@ def place_splats(
             yield
         with _new_scene(context, file.path.stem.removesuffix(".compressed")) as root:
             if upright:
-                axes_of(root).rotation_quaternion = Matrix(bundle.upright.tolist()).to_quaternion()
+                axes_of(root).rotation_quaternion = Matrix(bundle.up_rotation.tolist()).to_quaternion()
             _fill(root, file, made)
             if cameras:
                 _add_views(context, root, cameras, extent_of(cameras) or 1.0, near)
@@ -438,7 +439,7 @@ def read_levels(root: bpy.types.Object, placed: bool = False, looked: bool = Fal
     if looked:
         bundle = look.looked_levels(bundle, _looks(root))
     if placed:
-        bundle = placing.placed(bundle, placement_of(root))
+        bundle = placement.placed(bundle, placement_of(root))
         bundle.meta["up_rotation"] = np.eye(3)
     return bundle
 

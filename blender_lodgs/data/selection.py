@@ -16,7 +16,7 @@ import bpy
 import numpy as np
 
 from ...training.errors import LodgsError
-from ...training.lod.choice import Choice
+from ...training.lod.query import Choice
 from ...training.lod.rule import Rule, fact_names, facts_of, find_rule
 from .. import compat
 from ..nodes import crops as crop_groups

@@ -11,9 +11,9 @@ import json
 import bpy
 import numpy as np
 
+from ...training.lod.partial_read import BLOCKS
 from ...training.lod.rule import Tables, find_rule
 from ...training.lod.rules.chunks import COLUMNS as SPHERE
-from ...training.lod.streaming import BLOCKS
 from ...training.scenes.views import TABLES as VIEWS
 from ..attributes import COLUMN
 from .objects import read_column, write_column

@@ -1,4 +1,4 @@
-"""Node group for looks and paint: ``training.lod.look`` and ``training.lod.paint`` in geometry nodes.
+"""Node group for looks and paint: ``training.editing.look`` and ``training.editing.paint`` in geometry nodes.
 
 The group computes the colour and the opacity factor of points and ellipsoids, which Blender itself draws.
 Harmonics and opacities of the splats stay unchanged. LODGS' own drawing reads the same settings without this
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import bpy
 
-from ...training.lod.paint import COLUMNS as PAINT
+from ...training.editing.paint import COLUMNS as PAINT
 from ...training.splats.gaussians import SH_C0
 from ..attributes import BASE, COLOR, LOOK_OPACITY
 from .building import VERSION, Field, Nodes, ensure_group, is_edited

@@ -12,8 +12,8 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 from gpu_extras.presets import draw_circle_2d
 
+from ...training.editing.brush import brushed, lassoed
 from ...training.errors import LodgsError
-from ...training.lod.brush import brushed, lassoed
 from .. import extension
 from ..data import cleaning, painting, scenes
 from ..viewport.strokes import Picture

@@ -5,8 +5,8 @@ from __future__ import annotations
 import bpy
 from mathutils import Matrix
 
+from ...training.editing.cleaning import SHARE
 from ...training.errors import LodgsError
-from ...training.lod.cleaning import SHARE
 from ..data import cleaning, crops, scenes
 from .base import EditLevelsOperator, SceneOperator, report_errors
 from .brush import TOOLS

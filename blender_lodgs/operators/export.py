@@ -8,10 +8,10 @@ from pathlib import Path
 import bpy
 from bpy_extras.io_utils import ExportHelper
 
+from ...training.editing.bake_filter import without_filter
 from ...training.errors import LodgsError
-from ...training.lod.paging import is_tree
-from ...training.lod.tree import complete_levels
-from ...training.lod.unfiltered import without_filter
+from ...training.lod.tree.paging import is_tree
+from ...training.lod.tree.shape import complete_levels
 from ...training.splats.bundle import Bundle, Level, write_bundle, write_folder
 from ...training.splats.formats import (
     FORMATS,

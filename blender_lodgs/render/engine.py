@@ -15,9 +15,9 @@ from pathlib import Path
 import bpy
 import numpy as np
 
+from ...training.editing.paint import COLUMNS as PAINT
+from ...training.editing.paint import painted
 from ...training.errors import LodgsError
-from ...training.lod.paint import COLUMNS as PAINT
-from ...training.lod.paint import painted
 from ...training.lod.rule import every_column
 from ...training.splats.gaussians import Splats
 from .. import attributes

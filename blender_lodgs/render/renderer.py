@@ -23,9 +23,9 @@ from typing import NamedTuple
 import bpy
 import numpy as np
 
+from ...training.editing.look import Looks, looks_as_dicts
 from ...training.errors import LodgsError
-from ...training.lod.choice import Choice
-from ...training.lod.look import Looks, looks_as_dicts
+from ...training.lod.query import Choice
 from ...training.render import wire
 from ...training.scenes.cameras import Camera, camera_as_dict
 from ...training.splats.gaussians import Splats
@@ -48,7 +48,7 @@ class Frame:
     """A picture.
 
     Attributes:
-        planes: (H, W) float32 by name as ``training.render.picture.Picture.passes``, rows from the top; the
+        planes: (H, W) float32 by name as ``training.render.image.RenderedImage.passes``, rows from the top; the
             photograph's, where one was given, are "Photograph.R", ..., display-coded.
         psnr: in dB against the photograph; NaN where none was given.
     """
@@ -126,7 +126,7 @@ class Renderer:
         python = environment.trainer_python()
         environment.require(python)
         self._folder = Path(tempfile.mkdtemp(prefix="lodgs-render-", dir=bpy.app.tempdir or None))
-        wire.claim(self._folder)
+        wire.claim_folder(self._folder)
         self._log = self._folder / "renderer.log"
         self._fresh = True  # the first frame on a computer compiles, for some seconds
         self._known: dict[int, _Known] = {}
@@ -260,7 +260,7 @@ class Renderer:
         if before is not None and one.version is not None and before.version == one.version:
             return before
         splats, weights = one.read()
-        columns = wire.packed(splats, weights)
+        columns = wire.pack_set(splats, weights)
         digest, names = wire.digest(columns), list(splats.extras)
         if before is not None and (before.digest, before.columns) == (digest, names):
             return before._replace(version=one.version)

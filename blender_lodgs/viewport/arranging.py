@@ -15,8 +15,8 @@ from typing import Protocol
 
 import numpy as np
 
-from ...training.lod.choice import Choice, Chooser
-from ...training.lod.look import Looks
+from ...training.editing.look import Looks
+from ...training.lod.query import Choice, Chooser
 from ...training.lod.rule import OPACITY
 
 SAMPLE, LEAST_SAMPLE = 16, 10_000

@@ -17,7 +17,7 @@ import bpy
 import gpu
 import numpy as np
 
-from ...training.lod.paint import mixed
+from ...training.editing.paint import mixed
 from ...training.lod.rule import every_column
 from .. import attributes
 from ..data import changes, cleaning, painting

@@ -15,9 +15,9 @@ import gpu
 import numpy as np
 from mathutils import Matrix
 
+from ...training.editing.look import Looks
 from ...training.lod.colors import LEVEL_COLORS
 from ...training.lod.crop import FACE
-from ...training.lod.look import Looks
 from .arranging import WIDTH, Arrangement
 
 MOST_COEFFICIENTS = 24

@@ -1,6 +1,6 @@
 """Trees of splats larger than memory: what an eye needs of a file is read beside Blender's own thread.
 
-A thread reads pages of the file (``training.lod.paging``), that of ``arranging`` takes them over, so that the
+A thread reads pages of the file (``training.lod.tree.paging``), that of ``arranging`` takes them over, so that the
 thread that draws has nothing of it but the upload of splats that it is to draw. Nothing of Blender in here.
 """
 
@@ -12,9 +12,9 @@ import time
 import numpy as np
 
 from ...training.errors import LodgsError
-from ...training.lod.choice import Choice
-from ...training.lod.paging import SIZE, Pager
+from ...training.lod.query import Choice
 from ...training.lod.rules.cut import NODE_SIZE, PARENT, PARENT_SIZE, detail_of
+from ...training.lod.tree.paging import SIZE, Pager
 from ...training.splats.gaussians import Splats
 from ..data.streams import Source
 

@@ -1,13 +1,13 @@
-"""What strokes over a viewport hit of a splat scene: of every level, as ``training.lod.brush`` tells it."""
+"""What strokes over a viewport hit of a splat scene: of every level, as ``training.editing.brush`` tells it."""
 
 from __future__ import annotations
 
 import bpy
 import numpy as np
 
-from ...training.lod.brush import Front, Projection, hits, middle
-from ...training.lod.choice import Chooser
+from ...training.editing.brush import Front, Projection, hits, middle
 from ...training.lod.crop import kept
+from ...training.lod.query import Chooser
 from ...training.lod.rule import HIDDEN, OPACITY
 from .. import attributes
 from ..data import cleaning, crops, shown

@@ -31,7 +31,7 @@ sys.path.insert(0, os.getcwd())
 import numpy as np
 
 from training.methods import METHODS
-from training.runs.events import PROTOCOL, Events
+from training.runs.events import PROTOCOL, EventWriter
 from training.runs.folder import RunFolder
 from training.runs.job import Job
 from training.splats.bundle import Bundle, Level, write_bundle
@@ -73,11 +73,11 @@ def main() -> int:
         what, remedy = "The run folder belongs to another job.", "Choose another."
         print(json.dumps({"event": "error", "what": what, "remedy": remedy}))
         return 2
-    with folder.hold():
-        return run(mode, job, folder, Events(folder.events_file, folder.reserve, sys.stdout))
+    with folder.locked():
+        return run(mode, job, folder, EventWriter(folder.events_file, folder.reserve, sys.stdout))
 
 
-def run(mode: str, job: Job, folder: RunFolder, say: Events) -> int:
+def run(mode: str, job: Job, folder: RunFolder, say: EventWriter) -> int:
     say("hello", protocol=PROTOCOL, version="0", method=job.method, preset=job.preset, scene=job.scene,
         out=job.out, pid=os.getpid())  # fmt: skip
     say("warning", message="One photograph is missing.")
@@ -166,7 +166,7 @@ class Cell:
             self.state = "done"
 
 
-def cells(job: Job, folder: RunFolder, say: Events, options: list[str]) -> bool:
+def cells(job: Job, folder: RunFolder, say: EventWriter, options: list[str]) -> bool:
     """Trains cells as ``train_blocks`` does; whether all are done."""
     print(*options, file=sys.stderr)  # for the log
     columns, rows = job.grid
@@ -193,9 +193,9 @@ def cells(job: Job, folder: RunFolder, say: Events, options: list[str]) -> bool:
     return all(block.state == "done" for block in blocks)
 
 
-def tree(folder: RunFolder, say: Events) -> int:
+def tree(folder: RunFolder, say: EventWriter) -> int:
     """As the method has it: its leaves when they are there, and all at the end."""
-    from tests.training.lod.trees import random_leaves, tree_of, write_in_pages
+    from tests.training.lod.tree.trees import random_leaves, tree_of, write_in_pages
 
     whole = tree_of(random_leaves(LEAVES, np.random.default_rng(5)))
     for numbers in ((2,), (1, 2)):

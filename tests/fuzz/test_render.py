@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 
 from tests.fuzz.doors import attempt
 from tests.fuzz.mutations import spoiled, spoiled_value
+from training.editing.look import Look, looks_as_dicts
 from training.lod.crop import Crop
-from training.lod.look import Look, looks_as_dicts
 from training.render import wire
-from training.render.requests import FrameRequest, read_line, read_request
+from training.render.requests import FrameRequest, parse_line, parse_request
 from training.render.scene import Instance, SplatSet, draw
 from training.scenes.cameras import MOST_PIXELS, Camera, camera_as_dict
-from training.splats.dialects import drawable
+from training.splats.dialects import drop_undrawable
 from training.splats.gaussians import Splats
 
 POSE = np.eye(4)
@@ -66,21 +66,23 @@ def answer(request, splats: Splats) -> None:
 @given(values=spoiled_value(REQUEST))
 def test_requests(splats, values):
     line = json.dumps(values).encode()
-    attempt("render request", lambda: answer(read_request(read_line(line)), splats), values)
+    attempt("render request", lambda: answer(parse_request(parse_line(line)), splats), values)
 
 
 @given(data=st.data())
 def test_lines(data):
     line = data.draw(spoiled([json.dumps(REQUEST).encode(), b'{"cancel": 7}']))
-    attempt("render request", lambda: read_request(read_line(line)), line)
+    attempt("render request", lambda: parse_request(parse_line(line)), line)
 
 
 @pytest.mark.cases(short=60, weight=1)
 @given(data=st.data(), count=st.sampled_from([20, 20, 20, 0, 1, 19, 21, 1 << 29]))
 def test_sets(folder, splats, data, count):
     path = folder / "set-1"
-    wire.write_set(path, wire.packed(splats, None))
+    wire.write_set(path, wire.pack_set(splats, None))
     content = data.draw(spoiled([path.read_bytes()]))
     path.write_bytes(content)
-    request = read_request(REQUEST)
-    attempt("render set", lambda: answer(request, drawable(wire.read_set(path, count)[0], path)), content)
+    request = parse_request(REQUEST)
+    attempt(
+        "render set", lambda: answer(request, drop_undrawable(wire.read_set(path, count)[0], path)), content
+    )

@@ -35,6 +35,7 @@ FLOORS = {
         ("methods",),
         ("optimize",),
         ("rasterize",),
+        ("editing",),
         ("lod",),
         ("scenes",),
         ("splats",),

@@ -9,49 +9,49 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from ..lod.on_disk import Sight
 from ..lod.rule import Values, find_rule
 from ..lod.selection import Choice, complete, settings
-from ..lod.sight import Sight
 from ..optimize.training_data import TrainingData
-from ..rasterize import Gaussians, Rendering, Target, device_of, rasterize
-from ..rasterize.resident import Chosen, Resident, SplatSet, draw
+from ..rasterize import Gaussians, Rendering, Target, tensor_device, rasterize
+from ..rasterize.resident import WeightedSet, ResidentBundle, SplatSet, draw
 from ..scenes.cameras import Camera, evenly
 from ..splats.bundle import Bundle, Level
 from ..splats.gaussians import Splats
 from .metrics import psnr, ssim
 
-MOST_TRAINING_VIEWS = 24
+MAX_TRAINING_VIEWS = 24
 """How many training views tell the quality of all."""
 REPEATS = 3
 """How often a view is drawn to time it."""
 
 Measure = Callable[[torch.Tensor, torch.Tensor, torch.Tensor | None], float | tuple[float, ...]]
 """What is found of a picture and its photograph, (H, W, 3) both, and of the mask of what counts of it."""
-ShownTo = Callable[[Camera], tuple[Splats, np.ndarray | None]]
+SplatSelector = Callable[[Camera], tuple[Splats, np.ndarray | None]]
 """What a camera is shown: splats, all that there are or those in its sight, and weights (N,) in [0, 1] on
 opacities; None: all 1."""
 
 
-def shown_at(bundle: Bundle, level: Level) -> ShownTo:
+def full_detail_selector(bundle: Bundle, level: Level) -> SplatSelector:
     """What a camera is shown at full detail up to a level.
 
     That is all that is drawn at the level, but for rules whose weights always count: there splats without
     them are not what was trained, and each camera is shown what the rule gives it. Of levels that are not in
     memory it is what the camera has in sight.
     """
-    if bundle.elsewhere:
+    if bundle.on_disk:
         return _in_sight(bundle, level)
     rule = find_rule(bundle.rule)
     if rule is None or not rule.always:
         everything = complete(bundle, level)
         return lambda camera: (everything, None)
-    alone = replace(bundle, levels=bundle.upto(level.number))
+    alone = replace(bundle, levels=bundle.drawn_levels(level.number))
     choice, values = Choice(alone), settings(alone, {})
     return lambda camera: (choice.splats, choice.weights(camera.center, camera.focal, values))
 
 
-def _in_sight(bundle: Bundle, level: Level) -> ShownTo:
-    sights = [Sight(each.rows) for each in bundle.upto(level.number)]
+def _in_sight(bundle: Bundle, level: Level) -> SplatSelector:
+    sights = [Sight(each.rows) for each in bundle.drawn_levels(level.number)]
     parts: list[Splats | None] = [None] * len(sights)
 
     def shown_to(camera: Camera) -> tuple[Splats, None]:
@@ -79,9 +79,9 @@ class Evaluation:
     """
 
     def __init__(self, data: TrainingData, backend: str = "auto", antialias: bool = False) -> None:
-        self.data, self.backend, self.device = data, backend, device_of(backend)
+        self.data, self.backend, self.device = data, backend, tensor_device(backend)
         self.antialias = antialias
-        self.cameras = data.test or evenly(data.train, MOST_TRAINING_VIEWS)
+        self.cameras = data.test or evenly(data.train, MAX_TRAINING_VIEWS)
         self.prefix = "" if data.test else "train_"
 
     def target(self, camera: Camera) -> Target:
@@ -116,10 +116,10 @@ class Evaluation:
     def _options(self) -> dict:
         return {"near": self.data.near, "antialias": self.antialias}
 
-    def psnrs(
+    def compare_views(
         self,
         cameras: Sequence[Camera],
-        shown_to: ShownTo,
+        shown_to: SplatSelector,
         measure: Measure = psnr,
     ) -> np.ndarray:
         """The PSNR of each of some views with a photograph, in dB, (V,); or what else ``measure`` finds."""
@@ -148,11 +148,11 @@ class Evaluation:
             drawn.append(int((rendering.radii > 0).sum()))
             return rendering.image.cpu()
 
-        quality = self.measure_pictures(picture)
+        quality = self.measure_images(picture)
         splats = np.mean([count(camera) for camera in self.cameras])
         return {"splats": round(float(splats)), "drawn": round(float(np.mean(drawn))), **quality}
 
-    def measure_pictures(self, picture: Callable[[Camera], torch.Tensor]) -> dict:
+    def measure_images(self, picture: Callable[[Camera], torch.Tensor]) -> dict:
         """Quality and ``frame_s`` as :meth:`measure`, of pictures however they are made."""
         rows = []
         for camera in self.cameras:
@@ -169,19 +169,19 @@ class Evaluation:
             "frame_s": round(float(np.median(table[:, 2])), 4),
         }
 
-    def measure_by_distance(self, resident: Resident, values: Values) -> dict:
+    def measure_by_distance(self, resident: ResidentBundle, values: Values) -> dict:
         """The same of what each view is shown of a bundle by its rule, with these values of the controls."""
 
         def count(camera: Camera) -> int:
-            shown = resident.by_distance(camera, values).values()
-            return sum(len(one.splats.chosen(one.choice)[0]) for one in shown)
+            shown = resident.select_by_rule(camera, values).values()
+            return sum(len(one.splats.select_visible(one.choice)[0]) for one in shown)
 
         return self.measure(lambda camera: resident.draw(camera, values, **self._options), count)
 
     def measure_level(self, bundle: Bundle, level: Level) -> dict:
         """The same of all that is drawn at a level; by the bundle's rule where its weights always count."""
-        rule, alone = find_rule(bundle.rule), replace(bundle, levels=bundle.upto(level.number))
-        resident = Resident(alone, self.backend)
+        rule, alone = find_rule(bundle.rule), replace(bundle, levels=bundle.drawn_levels(level.number))
+        resident = ResidentBundle(alone, self.backend)
         if rule is not None and rule.always:
             return self.measure_by_distance(resident, settings(alone, {}))
         total = sum(len(each.rows) for each in alone.levels)
@@ -189,9 +189,9 @@ class Evaluation:
             lambda camera: resident.draw_level(level.number, camera, **self._options), lambda camera: total
         )
 
-    def measure_set(self, splats: Splats, weights: np.ndarray | None = None) -> dict:
+    def measure_splats(self, splats: Splats, weights: np.ndarray | None = None) -> dict:
         """The same for one set of splats that every view is shown."""
-        shown = [Chosen(SplatSet(splats, weights, self.backend), None)]
+        shown = [WeightedSet(SplatSet(splats, weights, self.backend), None)]
         return self.measure(
             lambda camera: draw(shown, camera, backend=self.backend, **self._options),
             lambda camera: len(splats),
@@ -200,7 +200,7 @@ class Evaluation:
     def frame_times(self, draws: Mapping[str, Callable[[Camera], object]]) -> dict[str, float]:
         """Seconds a frame of several ways to draw, by name: the median over views, drawn in turn."""
         found: dict[str, list[float]] = {name: [] for name in draws}
-        for camera in evenly(self.cameras, MOST_TRAINING_VIEWS):
+        for camera in evenly(self.cameras, MAX_TRAINING_VIEWS):
             for _ in range(REPEATS):
                 for name, one in draws.items():
                     started = time.perf_counter()

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch.nn.functional import conv2d, normalize
 
-from ..lod.unfiltered import MIP_VARIANCE
+from ..editing.bake_filter import MIP_VARIANCE
 from ..splats import sh as harmonics
 from .features import rotation_matrices
 from .gaussians import Gaussians
@@ -21,18 +21,18 @@ from .rendering import (
     ALPHA_MIN,
     DILATION,
     TRANSMITTANCE_MIN,
-    Drawn,
-    Settings,
+    BackendOutput,
+    RasterSettings,
     Target,
-    View,
+    KernelCamera,
 )
 
 Moments = tuple[torch.Tensor, torch.Tensor]
 
 
 def rasterize(
-    gaussians: Gaussians, weights: torch.Tensor | None, features: torch.Tensor, settings: Settings
-) -> Drawn:
+    gaussians: Gaussians, weights: torch.Tensor | None, features: torch.Tensor, settings: RasterSettings
+) -> BackendOutput:
     """See :func:`training.rasterize.rasterize`."""
     means, view = gaussians.means, settings.view
     kind = {"dtype": means.dtype, "device": means.device}
@@ -49,7 +49,7 @@ def rasterize(
     if mean2d.requires_grad:
         mean2d.register_hook(keep_gradient)
 
-    values: list = [None] * harmonics.coefficients(settings.degree)
+    values: list = [None] * harmonics.coefficient_count(settings.degree)
     x, y, z = normalize(means[drawn] - torch.as_tensor(view.eye, **kind), dim=1).unbind(1)
     harmonics.basis(x, y, z, settings.degree, values)
     colour = (
@@ -81,7 +81,7 @@ def rasterize(
         splats = torch.cat([drawn[order], drawn.new_tensor([-1])])
         none = past.new_ones(1, view.height, view.width)
         middle = splats[torch.cat([past, none]).argmax(0)].int()
-    return Drawn(image, 1 - transmittance, seen.radii, grad2d, counts, absgrad2d, blended, middle)
+    return BackendOutput(image, 1 - transmittance, seen.radii, grad2d, counts, absgrad2d, blended, middle)
 
 
 class Ellipses(NamedTuple):
@@ -106,7 +106,7 @@ class Ellipses(NamedTuple):
     radii: torch.Tensor
 
 
-def ellipses(gaussians: Gaussians, weights: torch.Tensor | None, settings: Settings) -> Ellipses:
+def ellipses(gaussians: Gaussians, weights: torch.Tensor | None, settings: RasterSettings) -> Ellipses:
     """Which splats a camera sees, and where: differentiable in all but what is inside."""
     means, view = gaussians.means, settings.view
     rotation, translation = (
@@ -145,7 +145,7 @@ def squared_reach(opacity: torch.Tensor) -> torch.Tensor:
 
 
 def project(
-    position: torch.Tensor, half_covariance: torch.Tensor, view: View, dilation: float | torch.Tensor
+    position: torch.Tensor, half_covariance: torch.Tensor, view: KernelCamera, dilation: float | torch.Tensor
 ):
     """Means (N, 2) in pixels, dilated covariances' xx, xy, yy, their determinant, and sqrt(det before / det
     after), each (N,).
@@ -170,7 +170,7 @@ def project(
     return mean2d, (xx + dilation, xy, yy + dilation), determinant, before / determinant.sqrt()
 
 
-def pixel_offsets(mean2d: torch.Tensor, view: View) -> tuple[torch.Tensor, torch.Tensor]:
+def pixel_offsets(mean2d: torch.Tensor, view: KernelCamera) -> tuple[torch.Tensor, torch.Tensor]:
     """From the means (N, 2) to the pixels' centres, along x and along y, each (N, H, W)."""
     kind = {"dtype": mean2d.dtype, "device": mean2d.device}
     ys = torch.arange(view.height, **kind) + 0.5
@@ -181,7 +181,7 @@ def pixel_offsets(mean2d: torch.Tensor, view: View) -> tuple[torch.Tensor, torch
 
 
 @torch.no_grad()
-def tile_counts(seen: Ellipses, view: View) -> torch.Tensor:
+def tile_counts(seen: Ellipses, view: KernelCamera) -> torch.Tensor:
     """How many ellipses alpha = ALPHA_MIN meet the rectangle of the pixel centres of each 16x16 tile."""
     mean2d, (xx, xy, yy) = seen.mean2d[:, :, None, None], (v[:, None, None] for v in seen.covariance)
     left = 16 * torch.arange(-(-view.width // 16), device=xx.device)
@@ -215,7 +215,7 @@ def meets_tile(offset, conic, determinant, reach) -> torch.Tensor:
 
 
 def contributions(
-    gaussians: Gaussians, weights: torch.Tensor | None, settings: Settings
+    gaussians: Gaussians, weights: torch.Tensor | None, settings: RasterSettings
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """See :func:`training.rasterize.contributions`: of one view, the largest, the sum, pixels and radii."""
     count, means = len(gaussians), gaussians.means

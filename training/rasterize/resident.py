@@ -2,7 +2,7 @@
 
 A set of splats (``SplatSet``) is put in spatial order once, and looked at in blocks of rows: what is out of
 sight, or out of its level's reach, is left out before its splats are looked at one by one, and nothing that
-is left out is copied. ``Resident`` is a bundle's levels as such sets; of a file that has an index of its
+is left out is copied. ``ResidentBundle`` is a bundle's levels as such sets; of a file that has an index of its
 blocks it reads what the eye's region needs.
 """
 
@@ -18,22 +18,22 @@ import numpy as np
 import torch
 from torch.nn.functional import pad
 
+from ..editing.look import Looks, changed
 from ..errors import LodgsError
 from ..lod.blocks import SIZE, spatial_order
-from ..lod.choice import Choice, Chooser
-from ..lod.look import Looks, changed
+from ..lod.on_disk import Sight, open_if_large
+from ..lod.partial_read import BLOCKS, read_head_and_tables, read_part
+from ..lod.query import Choice, Chooser
 from ..lod.rule import OPACITY, Region, Values, every_column, facts_of
 from ..lod.selection import known_rule, levels_alone, not_alone, rule_of
-from ..lod.sight import Sight, open_if_large
-from ..lod.streaming import BLOCKS, read_head_and_tables, read_part
 from ..scenes.cameras import Camera
 from ..splats.bundle import Bundle
-from ..splats.dialects import Warn, silent
+from ..splats.dialects import Warn, ignore
 from ..splats.gaussians import Splats
 from ..splats.ply import Element, all_columns
-from . import device_of, rasterize
+from . import tensor_device, rasterize
 from .gaussians import Gaussians
-from .placing import transformed
+from .transform import transform_gaussians
 from .rendering import Rendering
 
 MANY = 16 * SIZE
@@ -60,7 +60,7 @@ class SplatSet:
         backend: str = "auto",
         ordered: bool = False,
     ) -> None:
-        device = device_of(backend)
+        device = tensor_device(backend)
         if not ordered and len(splats) >= MANY:
             order = spatial_order(splats.means)
             splats, weights = splats.select(order), None if weights is None else weights[order]
@@ -78,7 +78,7 @@ class SplatSet:
     def __len__(self) -> int:
         return len(self.gaussians)
 
-    def chosen(
+    def select_visible(
         self, choice: Choice | None, camera: Camera | None = None, near: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
         """The splats that have a weight, (M,) int32 ascending, and their weights (M,) float32.
@@ -97,17 +97,17 @@ class SplatSet:
         some = weights > 0
         return (rows, weights) if some.all() else (rows[some], weights[some])
 
-    def in_world(self, matrix: np.ndarray) -> Gaussians:
+    def transformed(self, matrix: np.ndarray) -> Gaussians:
         """The splats where a transform (4, 4) puts them, any affine one; kept while it is the same.
 
         Their harmonics stay the set's.
         """
         key = matrix.tobytes()
         if self._in_world is None or self._in_world[0] != key:
-            self._in_world = key, transformed(self.gaussians, matrix)
+            self._in_world = key, transform_gaussians(self.gaussians, matrix)
         return self._in_world[1]
 
-    def looked(self, looks: Looks) -> SplatSet:
+    def with_looks(self, looks: Looks) -> SplatSet:
         """The set as looks have it, with everything else shared; kept while they are the same."""
         if not looks:
             self._looked = None
@@ -121,7 +121,7 @@ class SplatSet:
             self._looked = looks, other
         return self._looked[1]
 
-    def joined(self, others: Sequence[SplatSet]) -> Gaussians:
+    def concatenated(self, others: Sequence[SplatSet]) -> Gaussians:
         """These splats and those of other sets as one, kept as long as these are the others.
 
         All of them are parts of it then, so that nothing is there twice.
@@ -151,15 +151,15 @@ class SplatSet:
         return Chooser(own.means.cpu().numpy(), self._columns, own.log_scales.cpu().numpy())
 
 
-class Chosen(NamedTuple):
+class WeightedSet(NamedTuple):
     """A set of splats, and by what they are weighted; None: by nothing but their own weights."""
 
     splats: SplatSet
     choice: Choice | None
 
 
-def looked_at(
-    sets: Sequence[Chosen], camera: Camera, near: float
+def combine_visible(
+    sets: Sequence[WeightedSet], camera: Camera, near: float
 ) -> tuple[Gaussians, torch.Tensor, torch.Tensor | None]:
     """Of sets that stand together all splats, N, which of them to look at, and weights: for ``rasterize``.
 
@@ -169,7 +169,7 @@ def looked_at(
     Returns:
         The splats; rows (M,) int32; weights (N,), which count in these rows only, or None: all are 1.
     """
-    gaussians = sets[0].splats.joined([one.splats for one in sets[1:]])
+    gaussians = sets[0].splats.concatenated([one.splats for one in sets[1:]])
     device = gaussians.means.device
     chosen = [splats.chosen(choice, camera, near) for splats, choice in sets]
     begins = np.cumsum([0, *(len(one.splats) for one in sets)], dtype=np.int32)
@@ -184,7 +184,7 @@ def looked_at(
 
 
 def draw(
-    sets: Sequence[Chosen], camera: Camera, *, near: float = 0.01, backend: str = "auto", **options: Any
+    sets: Sequence[WeightedSet], camera: Camera, *, near: float = 0.01, backend: str = "auto", **options: Any
 ) -> Rendering:
     """What a camera sees of sets that stand together. Nothing is kept for gradients.
 
@@ -192,17 +192,17 @@ def draw(
         options: as for :func:`training.rasterize.rasterize`.
     """
     with torch.no_grad():
-        gaussians, rows, weights = looked_at(sets, camera, near)
+        gaussians, rows, weights = combine_visible(sets, camera, near)
         return rasterize(gaussians, camera, near=near, rows=rows, weights=weights, backend=backend, **options)
 
 
-class Resident:
+class ResidentBundle:
     """A bundle's levels, for one picture after another.
 
     Args:
         source: a bundle, all of whose splats are kept ready, but for levels that are elsewhere: of these each
-            camera has read what it may see (``lod.sight``). Or the file of one. Of that is read what is asked
-            for: where it has a table of blocks (``lod.streaming``), and the rule tells for a region which
+            camera has read what it may see (``lod.on_disk``). Or the file of one. Of that is read what is asked
+            for: where it has a table of blocks (``lod.partial_read``), and the rule tells for a region which
             splats may be shown in it, these alone, which stay while the eye is there.
         backend: rasterizer.
         warn: as for ``read_bundle``.
@@ -221,7 +221,7 @@ class Resident:
         self,
         source: Bundle | str | Path,
         backend: str = "auto",
-        warn: Warn = silent,
+        warn: Warn = ignore,
         most: int = 0,
     ) -> None:
         self._path = None if isinstance(source, Bundle) else Path(source)
@@ -242,7 +242,7 @@ class Resident:
             if self._rule is not None and name in self._rule.tables
         )
 
-    def by_distance(self, camera: Camera, values: Values) -> dict[int, Chosen]:
+    def select_by_rule(self, camera: Camera, values: Values) -> dict[int, WeightedSet]:
         """The levels by number, weighted as the rule says for a camera's eye.
 
         Args:
@@ -258,12 +258,12 @@ class Resident:
             number: Choice(rule.name, (x, y, z), camera.focal, facts, tuple(values.items()), self._tables)
             for number, facts in self._all_facts().items()
         }
-        if self.bundle.elsewhere:
-            return {n: Chosen(self._in_sight(n, camera, choice), choice) for n, choice in choices.items()}
+        if self.bundle.on_disk:
+            return {n: WeightedSet(self._in_sight(n, camera, choice), choice) for n, choice in choices.items()}
         self._hold(next(iter(choices.values())).region(), frozenset(choices))
-        return {number: Chosen(self._sets[number], choice) for number, choice in choices.items()}
+        return {number: WeightedSet(self._sets[number], choice) for number, choice in choices.items()}
 
-    def complete(self, number: int, camera: Camera) -> dict[int, Chosen]:
+    def select_level(self, number: int, camera: Camera) -> dict[int, WeightedSet]:
         """All that a camera sees of a level: the level, and where levels add up the coarser ones before it.
 
         Raises:
@@ -276,21 +276,21 @@ class Resident:
             )
         if number not in [level.number for level in levels_alone(self.bundle)]:
             raise LodgsError(*not_alone(number, known[-1]))
-        numbers = [level.number for level in self.bundle.upto(number)]
-        if self.bundle.elsewhere:
-            return {number: Chosen(self._in_sight(number, camera, None), None) for number in numbers}
+        numbers = [level.number for level in self.bundle.drawn_levels(number)]
+        if self.bundle.on_disk:
+            return {number: WeightedSet(self._in_sight(number, camera, None), None) for number in numbers}
         self._hold(None, frozenset(numbers))
-        return {number: Chosen(self._sets[number], None) for number in numbers}
+        return {number: WeightedSet(self._sets[number], None) for number in numbers}
 
     def draw(self, camera: Camera, values: Values, *, near: float = 0.01, **options: Any) -> Rendering:
-        """What a camera is shown by the rule; arguments as of :meth:`by_distance` and :func:`draw`."""
-        return self._draw(self.by_distance(camera, values), camera, near, options)
+        """What a camera is shown by the rule; arguments as of :meth:`select_by_rule` and :func:`draw`."""
+        return self._draw(self.select_by_rule(camera, values), camera, near, options)
 
     def draw_level(self, number: int, camera: Camera, *, near: float = 0.01, **options: Any) -> Rendering:
-        """What a camera sees at a level; arguments as of :meth:`complete` and :func:`draw`."""
-        return self._draw(self.complete(number, camera), camera, near, options)
+        """What a camera sees at a level; arguments as of :meth:`select_level` and :func:`draw`."""
+        return self._draw(self.select_level(number, camera), camera, near, options)
 
-    def _draw(self, shown: dict[int, Chosen], camera: Camera, near: float, options: dict) -> Rendering:
+    def _draw(self, shown: dict[int, WeightedSet], camera: Camera, near: float, options: dict) -> Rendering:
         options = {"antialias": self.bundle.antialias, "backend": self._backend} | options
         return draw(list(shown.values()), camera, near=near, **options)
 

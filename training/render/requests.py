@@ -9,38 +9,38 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
-from ..documents import json_object
+from ..documents import parse_json
+from ..editing.look import RANGES, Look
 from ..errors import LodgsError
-from ..lod.choice import Choice
 from ..lod.crop import SHAPES, Crop
-from ..lod.look import RANGES, Look
+from ..lod.query import Choice
 from ..lod.rule import EVERYTHING, Rule, fact_names, find_rule
 from ..lod.rules.cut import RULE as CUT
 from ..scenes.cameras import FARTHEST, Camera, camera_from_dict, check_size
 
-BRIGHTEST = 1e6
+MAX_BACKGROUND = 1e6
 """No colour of a background is larger."""
-MOST_SPLATS = 1 << 30
+MAX_SPLATS = 1 << 30
 """Splats of one set."""
-LAST_LEVEL = 1 << 15
-LARGEST = 1e30
+MAX_LEVEL_NUMBER = 1 << 15
+MAX_NUMBER = 1e30
 """Of numbers that a rule is told: single precision holds them."""
-MOST_COLUMNS, MOST_ROWS = 32, 4096
+MAX_COLUMNS, MAX_ROWS = 32, 4096
 """Of a table, and columns of a set."""
-MOST_CROPS = 256
+MAX_CROPS = 256
 
 _NAME = re.compile(r"[\w-][\w.-]{0,99}", re.ASCII)
 
 
 @dataclass(frozen=True)
-class Cancel:
+class CancelRequest:
     """Do not draw a frame, or stop drawing it."""
 
     frame: int
 
 
 @dataclass(frozen=True)
-class NamedSet:
+class SetRequest:
     """A set of splats in a file, and where it stands; see ``scene.Instance``.
 
     Attributes:
@@ -88,32 +88,32 @@ class FrameRequest:
     photograph: Path | None
     mask: Path | None
     holdout: Path | None
-    sets: list[NamedSet]
+    sets: list[SetRequest]
 
 
-def frame_of(values: dict) -> int | None:
+def frame_number(values: dict) -> int | None:
     """The number of the frame that a request is about, if it has one."""
     frame = values.get("frame")
     return frame if _is_whole(frame) else None
 
 
-def read_line(line: bytes) -> dict:
+def parse_line(line: bytes) -> dict:
     """A request as it came.
 
     Raises:
         LodgsError: it is no JSON object, or breaks a bound of ``documents``.
     """
-    return json_object(line, "A request")
+    return parse_json(line, "A request")
 
 
-def read_request(values: dict) -> FrameRequest | Cancel:
+def parse_request(values: dict) -> FrameRequest | CancelRequest:
     """A request, checked.
 
     Raises:
         LodgsError: it lacks something, or something in it is impossible.
     """
     if "cancel" in values:
-        return Cancel(_whole(values, "cancel"))
+        return CancelRequest(_whole(values, "cancel"))
     frame = _whole(values, "frame")
     camera, near = camera_from_dict(_of_kind(values, "camera", dict))
     window = _window(values, camera)
@@ -122,7 +122,7 @@ def read_request(values: dict) -> FrameRequest | Cancel:
     if photograph and window:
         raise _refused("photograph", "given beside a window")
     if values.get("background") is not None:
-        red, green, blue = _numbers(values, "background", 3, BRIGHTEST)
+        red, green, blue = _numbers(values, "background", 3, MAX_BACKGROUND)
         background = red, green, blue
     return FrameRequest(
         frame=frame,
@@ -140,7 +140,7 @@ def read_request(values: dict) -> FrameRequest | Cancel:
     )
 
 
-def _named_set(values: Any) -> NamedSet:
+def _named_set(values: Any) -> SetRequest:
     if not isinstance(values, dict):
         raise _refused("sets", values)
     matrix = np.array(_of_kind(values, "matrix", list), object)
@@ -153,11 +153,11 @@ def _named_set(values: Any) -> NamedSet:
     choice = _choice(_of_kind(values, "choice", dict)) if values.get("choice") is not None else None
     if tree is not None and (choice is None or choice.rule != CUT.name):
         raise _refused("choice", "given with a tree")
-    return NamedSet(
+    return SetRequest(
         file="" if tree else _name(values, "file"),
-        count=0 if tree else _whole(values, "count", 0, MOST_SPLATS),
+        count=0 if tree else _whole(values, "count", 0, MAX_SPLATS),
         matrix=matrix,
-        level=0 if tree else _whole(values, "level", 0, LAST_LEVEL),
+        level=0 if tree else _whole(values, "level", 0, MAX_LEVEL_NUMBER),
         antialias=bool(values.get("antialias")),
         columns=_columns(values),
         choice=choice,
@@ -169,7 +169,7 @@ def _named_set(values: Any) -> NamedSet:
 def _columns(values: dict) -> tuple[str, ...]:
     given = _of_kind({"columns": []} | values, "columns", list)
     names = tuple(_name({"columns": name}, "columns") for name in given)
-    if len(names) > MOST_COLUMNS or len(set(names)) < len(names):
+    if len(names) > MAX_COLUMNS or len(set(names)) < len(names):
         raise _refused("columns", given)
     return names
 
@@ -180,7 +180,7 @@ def _choice(values: dict) -> Choice:
     if rule is None:
         raise _refused("rule", name)
     x, y, z = _numbers(values, "eye", 3, FARTHEST)
-    (focal_px,) = _numbers({"focal_px": [values.get("focal_px")]}, "focal_px", 1, LARGEST)
+    (focal_px,) = _numbers({"focal_px": [values.get("focal_px")]}, "focal_px", 1, MAX_NUMBER)
     controls = _by_name(values, "values", [control.name for control in rule.controls])
     for control in rule.controls:  # the ends of a slider, as single precision has them, are possible
         if not np.float32(control.low) <= np.float32(controls[control.name]) <= np.float32(control.high):
@@ -200,7 +200,7 @@ def _crops(values: dict) -> tuple[Crop, ...] | None:
 
 def _some(values: dict, key: str) -> list:
     given = _of_kind(values, key, list)
-    if len(given) > MOST_CROPS:
+    if len(given) > MAX_CROPS:
         raise _refused(key, f"{len(given)} of them")
     return given
 
@@ -211,7 +211,7 @@ def _crop(crop: Any) -> Crop:
     rows = _of_kind(crop, "to_own", list)
     if len(rows) != 3:
         raise _refused("to_own", rows)
-    a, b, c = (_numbers({"to_own": row}, "to_own", 4, LARGEST) for row in rows)
+    a, b, c = (_numbers({"to_own": row}, "to_own", 4, MAX_NUMBER) for row in rows)
     return Crop(crop["shape"], tuple(map(tuple, (a, b, c))), bool(crop.get("outside")))
 
 
@@ -221,7 +221,7 @@ def _looks(values: dict) -> tuple[tuple[Crop | None, Look], ...]:
         if not isinstance(one, dict):
             raise _refused("looks", one)
         look = dict(_of_kind(one, "look", dict))
-        red, green, blue = _numbers(look, "tint", 3, LARGEST)
+        red, green, blue = _numbers(look, "tint", 3, MAX_NUMBER)
         del look["tint"]
         parts = _by_name({"look": look}, "look", [name for name in RANGES if name != "tint"])
         crop = None if one.get("crop") is None else _crop(one["crop"])
@@ -233,12 +233,12 @@ def _tables(values: dict, rule: Rule) -> tuple:
     """Tables as ``Choice`` has them; those that the rule knows, if any."""
     found = []
     for name, table in _of_kind({"tables": {}} | values, "tables", dict).items():
-        if name not in rule.tables or not isinstance(table, dict) or len(table) > MOST_COLUMNS:
+        if name not in rule.tables or not isinstance(table, dict) or len(table) > MAX_COLUMNS:
             raise _refused("tables", name)
         lengths = {len(_of_kind(table, column, list)) for column in table}
-        if len(lengths) > 1 or max(lengths, default=0) > MOST_ROWS:
+        if len(lengths) > 1 or max(lengths, default=0) > MAX_ROWS:
             raise _refused(name, "of such columns")
-        rows = {column: _numbers(table, column, len(table[column]), LARGEST) for column in table}
+        rows = {column: _numbers(table, column, len(table[column]), MAX_NUMBER) for column in table}
         found.append((name, tuple((column, "<f8", np.array(row).tobytes()) for column, row in rows.items())))
     return tuple(found)
 
@@ -248,7 +248,7 @@ def _by_name(values: dict, key: str, names: list[str]) -> dict[str, float]:
     given = _of_kind(values, key, dict)
     if given.keys() != set(names):
         raise _refused(key, sorted(given))
-    numbers = _numbers({key: [given[name] for name in names]}, key, len(names), LARGEST)
+    numbers = _numbers({key: [given[name] for name in names]}, key, len(names), MAX_NUMBER)
     return dict(zip(names, numbers, strict=True))
 
 

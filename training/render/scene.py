@@ -9,20 +9,20 @@ import numpy as np
 import torch
 from torch.nn.functional import normalize
 
-from ..errors import LodgsError, out_of_memory
-from ..lod.choice import Choice
-from ..lod.look import Looks
-from ..rasterize import Gaussians, strips
-from ..rasterize.resident import Chosen, SplatSet, looked_at
+from ..editing.look import Looks
+from ..errors import LodgsError, is_out_of_memory
+from ..lod.query import Choice
+from ..rasterize import Gaussians, rasterize_strips
+from ..rasterize.resident import WeightedSet, SplatSet, combine_visible
 from ..scenes.cameras import Camera, check_size
-from ..splats.placing import similarity
-from ..splats.sh import basis, degree_of
-from .picture import NOTHING, Picture
+from ..splats.sh import basis, degree_from_count
+from ..splats.similarity import is_similarity
+from .image import NO_DEPTH, RenderedImage
 
-STRIP = 1 << 20
+STRIP_PIXELS = 1 << 20
 """Pixels drawn between two calls of ``progress``."""
 
-FLAT = 1e6
+MAX_CONDITION = 1e6
 """A transform that stretches one direction so many times as much as another is refused."""
 
 
@@ -58,7 +58,7 @@ def draw(
     limit: np.ndarray | None = None,
     backend: str = "auto",
     progress: Callable[[float], bool] = lambda share: True,
-) -> Picture | None:
+) -> RenderedImage | None:
     """What a camera sees of splats, all sets sorted together.
 
     Sets that stand together under one rotation, uniform scale and translation are drawn in their own
@@ -85,29 +85,29 @@ def draw(
     check_size(width, height)
     for one in instances:
         linear = one.matrix[:3, :3]
-        if not np.isfinite(one.matrix).all() or np.linalg.cond(linear) > FLAT or not linear.any():
+        if not np.isfinite(one.matrix).all() or np.linalg.cond(linear) > MAX_CONDITION or not linear.any():
             raise LodgsError("A set of splats is scaled to nothing.", "Give its object a scale above 0.")
     numbers = sorted({one.level for one in instances}) if levels else []
     try:
-        picture = Picture.empty(width, height, background, depth, numbers)
+        picture = RenderedImage.empty(width, height, background, depth, numbers)
         behind = background or (0.0, 0.0, 0.0)
         if limit is not None:  # the background, too, is behind meshes: over black here, added elsewhere
-            picture.image[limit < NOTHING], picture.alpha[limit < NOTHING] = 0, 0
+            picture.image[limit < NO_DEPTH], picture.alpha[limit < NO_DEPTH] = 0, 0
             behind = 0.0, 0.0, 0.0
         instances = [
-            replace(one, splats=one.splats.looked(one.looks)) for one in instances if len(one.splats)
+            replace(one, splats=one.splats.with_looks(one.looks)) for one in instances if len(one.splats)
         ]
         if not instances:
             return picture
         gaussians, rows, weights, counts, camera, near, unit = _in_one_frame(instances, camera, near)
         each = torch.tensor(counts, device=gaussians.means.device)
         features = _membership(instances, each, picture) if levels else None
-        for top, drawn in strips(
+        for top, drawn in rasterize_strips(
             gaussians, camera, rows=rows, weights=weights, background=behind, near=near,
             antialias=_filtered(instances, each),
             outputs=("depth", "median_depth") if depth else (), features=features, window=window,
             limit=None if limit is None else torch.from_numpy(limit / unit).to(gaussians.means),
-            strip=STRIP, backend=backend,
+            strip=STRIP_PIXELS, backend=backend,
         ):  # fmt: skip
             part = slice(top, top + len(drawn.alpha))
             alpha = drawn.alpha.cpu().numpy()
@@ -117,13 +117,13 @@ def draw(
             if depth:
                 assert drawn.depth is not None and drawn.median_depth is not None
                 seen = torch.where(drawn.median_depth > 0, drawn.median_depth, drawn.depth) * unit
-                picture.depth[part] = torch.where(drawn.alpha > 0, seen, NOTHING).cpu().numpy()
+                picture.depth[part] = torch.where(drawn.alpha > 0, seen, NO_DEPTH).cpu().numpy()
             if drawn.features is not None:
                 picture.masks[:, part] = drawn.features.permute(2, 0, 1).cpu().numpy()
             if not progress((top + len(drawn.alpha)) / height):
                 return None
     except Exception as error:
-        if not out_of_memory(error):
+        if not is_out_of_memory(error):
             raise
         raise LodgsError(
             f"There is not enough memory to draw {sum(len(x.splats) for x in instances):,} splats "
@@ -140,15 +140,15 @@ def _in_one_frame(
     1), and how many are of each set; the camera and its near depth in that frame, and how many units of the
     world one of its units is."""
     first = instances[0].matrix
-    if similarity(first) and all(np.array_equal(one.matrix, first) for one in instances):
+    if is_similarity(first) and all(np.array_equal(one.matrix, first) for one in instances):
         camera, unit = camera.within(first)
-        chosen = [Chosen(one.splats, one.choice) for one in instances]
-        gaussians, rows, weights = looked_at(chosen, camera, near / unit)
+        chosen = [WeightedSet(one.splats, one.choice) for one in instances]
+        gaussians, rows, weights = combine_visible(chosen, camera, near / unit)
         return gaussians, rows, weights, [len(one.splats) for one in instances], camera, near / unit, unit
     there, weights = [], []
     for one in instances:
-        inside, unit = camera.within(one.matrix) if similarity(one.matrix) else (None, 1.0)
-        rows, weight = (torch.from_numpy(each) for each in one.splats.chosen(one.choice, inside, near / unit))
+        inside, unit = camera.within(one.matrix) if is_similarity(one.matrix) else (None, 1.0)
+        rows, weight = (torch.from_numpy(each) for each in one.splats.select_visible(one.choice, inside, near / unit))
         there.append(_in_world(one, camera, rows.long()))
         weights.append(weight.to(there[-1].means))
     return Gaussians.concatenated(there), None, torch.cat(weights), list(map(len, there)), camera, near, 1.0
@@ -159,12 +159,12 @@ def _in_world(one: Instance, camera: Camera, some: torch.Tensor) -> Gaussians:
     sees: harmonics turn, shrink and lean with the set."""
     own = one.splats.gaussians
     some = some.to(own.means.device)
-    placed, means, sh = one.splats.in_world(one.matrix).select(some), own.means[some], own.sh[some]
+    placed, means, sh = one.splats.transformed(one.matrix).select(some), own.means[some], own.sh[some]
     eye = np.linalg.solve(one.matrix, np.append(camera.center, 1.0))[:3]
     directions = normalize(means - torch.as_tensor(eye).to(means), dim=1)
     values: list = [None] * sh.shape[1]
     x, y, z = directions.unbind(1)
-    basis(x, y, z, degree_of(len(values)), values)
+    basis(x, y, z, degree_from_count(len(values)), values)
     colours = (0.5 + torch.einsum("kn,nkc->nc", torch.stack(values), sh)).clamp_min(0)
     return replace(placed, sh=colours)
 
@@ -177,7 +177,7 @@ def _filtered(instances: list[Instance], counts: torch.Tensor) -> bool | torch.T
     return torch.tensor(flags, device=counts.device).repeat_interleave(counts)
 
 
-def _membership(instances: list[Instance], counts: torch.Tensor, picture: Picture) -> torch.Tensor:
+def _membership(instances: list[Instance], counts: torch.Tensor, picture: RenderedImage) -> torch.Tensor:
     """(N, L) with 1 where a splat is of a level of the picture's."""
     levels = torch.tensor(picture.levels, device=counts.device)
     of = torch.tensor([one.level for one in instances], device=counts.device)

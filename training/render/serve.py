@@ -19,10 +19,10 @@ display-coded; ``psnr`` then says how alike both are, where the mask is not blac
 the depth of what hides splats, of the camera's size or the window's.
 
 A set is read when its file is first named, and forgotten when a frame does not name it; its file may go after
-an answer ``frame``. With a choice (``lod.choice``: ``rule``, ``eye`` in the set's coordinates, ``focal_px``,
+an answer ``frame``. With a choice (``lod.query``: ``rule``, ``eye`` in the set's coordinates, ``focal_px``,
 and by name ``facts``, ``values`` and ``tables``) its splats are weighted as the rule says, times the file's
 weights; what the rule knows of each splat are the file's columns of these names. A tree is a bundle of the
-rule ``cut``, of which is read what the frame shows. Looks (``lod.look``) are what is made of its colours and
+rule ``cut``, of which is read what the frame shows. Looks (``editing.look``) are what is made of its colours and
 opacities: {"crop": {...} or null for everywhere, "look": {"exposure": 0.5, ...}}.
 """
 
@@ -43,21 +43,21 @@ import numpy as np
 import torch
 
 from .. import VERSION
-from ..errors import LodgsError, out_of_memory
+from ..errors import LodgsError, is_out_of_memory
 from ..evaluate.metrics import psnr
-from ..lod.paging import TreeFile
-from ..rasterize import resolve, why_cpu
+from ..lod.tree.paging import TreeFile
+from ..rasterize import resolve_backend, cpu_fallback_reason
 from ..runs.events import event_line
 from ..scenes.cameras import camera_as_dict
 from ..scenes.images import load_image, load_mask
-from ..splats.dialects import drawable
-from ..splats.placing import similarity
+from ..splats.dialects import drop_undrawable
+from ..splats.similarity import is_similarity
 from . import wire
-from .picture import read_depth
-from .requests import Cancel, FrameRequest, NamedSet, frame_of, read_line, read_request
+from .image import read_depth
+from .requests import CancelRequest, FrameRequest, SetRequest, frame_number, parse_line, parse_request
 from .scene import Instance, SplatSet, draw
 
-LONGEST = 1 << 20
+MAX_LINE_BYTES = 1 << 20
 """Bytes of a line that asks for something."""
 _WEIGHTS = ""
 """Where weights stand among the columns of a set, which all have a name."""
@@ -70,10 +70,10 @@ def serve(folder: Path, backend: str, requests: IO[bytes], answers: IO[str]) -> 
         LodgsError: for a backend that does not work here, or a folder with other things in it.
     """
     torch.set_num_threads(1)
-    if problem := why_cpu(backend):
+    if problem := cpu_fallback_reason(backend):
         print(problem, file=sys.stderr)
-    backend = resolve(backend)
-    wire.claim(folder)
+    backend = resolve_backend(backend)
+    wire.claim_folder(folder)
     server = _Server(folder, backend, answers)
     server.say("hello", protocol=wire.PROTOCOL, version=VERSION, backend=backend, pid=os.getpid())
     threading.Thread(target=server.listen, args=(requests,), daemon=True).start()
@@ -100,18 +100,18 @@ class _Server:
     def listen(self, requests: IO[bytes]) -> None:
         """In a thread of its own, so that a frame that is being drawn can be cancelled."""
         try:
-            while line := requests.readline(LONGEST + 1):
+            while line := requests.readline(MAX_LINE_BYTES + 1):
                 frame = None
                 try:
-                    values = read_line(line)
-                    frame = frame_of(values)
-                    request = read_request(values)
+                    values = parse_line(line)
+                    frame = frame_number(values)
+                    request = parse_request(values)
                 except LodgsError as error:
                     while line and not line.endswith(b"\n"):  # the rest of one that is too long
-                        line = requests.readline(LONGEST)
+                        line = requests.readline(MAX_LINE_BYTES)
                     self.say("error", frame=frame, what=error.what, remedy=error.remedy)
                     continue
-                if isinstance(request, Cancel):
+                if isinstance(request, CancelRequest):
                     self._cancelled.add(request.frame)
                 else:
                     self._requests.put(request)
@@ -130,7 +130,7 @@ class _Server:
                 traceback.print_exc()
                 what = f"The renderer could not use what it was given ({type(error).__name__}: {error})."
                 remedy = "Please report it with the log."
-                if out_of_memory(error):
+                if is_out_of_memory(error):
                     what, remedy = "There is not enough memory for this picture.", "Render a smaller one."
                 self.say("error", frame=request.frame, what=what, remedy=remedy)
 
@@ -194,7 +194,7 @@ class _Server:
         return instances
 
     def _cut_of(
-        self, one: NamedSet, request: FrameRequest
+        self, one: SetRequest, request: FrameRequest
     ) -> tuple[tuple, Callable[[], list[tuple[int, SplatSet]]]]:
         """What a tree's cut depends on, and what reads it: sets by their levels' numbers.
 
@@ -214,7 +214,7 @@ class _Server:
         if path not in self._trees or self._trees[path][0] != stamp:
             self._trees[path] = stamp, TreeFile(path)
         file = self._trees[path][1]
-        if similarity(one.matrix):
+        if is_similarity(one.matrix):
             camera, unit = request.camera.within(one.matrix)
         near = request.near / unit
         where = None if camera is None else json.dumps(camera_as_dict(camera, near))
@@ -225,15 +225,17 @@ class _Server:
 
         return (path, stamp, choice, where), read
 
-    def _read_set(self, frame: int, one: NamedSet) -> SplatSet:
+    def _read_set(self, frame: int, one: SetRequest) -> SplatSet:
         """A set from its file, without what cannot be drawn."""
         splats, weights = wire.read_set(self._folder / one.file, one.count, one.columns)
         splats.extras[_WEIGHTS] = np.nan_to_num(weights)
-        splats = drawable(splats, "the scene", lambda text: self.say("warning", frame=frame, message=text))
+        splats = drop_undrawable(
+            splats, "the scene", lambda text: self.say("warning", frame=frame, message=text)
+        )
         return SplatSet(splats, splats.extras.pop(_WEIGHTS), self._backend)
 
     def _end(self) -> None:
         """Clean up and go, whatever the other threads are at."""
-        wire.release(self._folder)
+        wire.release_folder(self._folder)
         sys.stderr.flush()
         os._exit(0)

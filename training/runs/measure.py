@@ -8,22 +8,22 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import LodgsError
-from ..evaluate.aside import veil
-from ..evaluate.distance import farther, jumps
-from ..evaluate.picture import level_picture
-from ..evaluate.summary import summary
-from ..evaluate.views import Evaluation, shown_at
-from ..evaluate.words import summary_lines
+from ..evaluate.distance import measure_farther_views, measure_popping
+from ..evaluate.level_sheet import write_level_sheet
+from ..evaluate.messages import summary_lines
+from ..evaluate.offset_views import measure_veil
+from ..evaluate.summary import summarize
+from ..evaluate.views import Evaluation, full_detail_selector
 from ..files import atomic_write
+from ..lod.on_disk import open_if_large
 from ..lod.rule import Values, find_rule
 from ..lod.selection import levels_alone, select, settings, unknown_rule
-from ..lod.sight import open_if_large
 from ..methods import create
-from ..rasterize.resident import Resident
+from ..rasterize.resident import ResidentBundle
 from ..scenes.aside import read_aside
 from ..splats.bundle import read_bundle
-from ..splats.dialects import Warn, silent
-from .arrays import damaged, read_arrays
+from ..splats.dialects import Warn, ignore
+from .arrays import array_error, read_arrays
 from .data import training_data
 from .folder import RunFolder
 from .job import Job
@@ -34,7 +34,7 @@ def evaluate_run(
     given: Values | None = None,
     picture: Path | None = None,
     far: bool = False,
-    warn: Warn = silent,
+    warn: Warn = ignore,
 ) -> dict:
     """Measures a finished run and writes its ``metrics.json``.
 
@@ -67,7 +67,7 @@ def evaluate_run(
             read; or something in the run is a link.
     """
     folder = RunFolder(run)
-    folder.require_own_files()
+    folder.reject_links()
     if not folder.bundle.exists():
         raise LodgsError(
             f"{run} is not the folder of a finished run (it has no bundle.ply).",
@@ -93,8 +93,10 @@ def evaluate_run(
     aside = [camera.scaled(job.image_scale) for camera in read_aside(Path(job.scene))]
     alone = levels_alone(bundle)
     *coarser, finest = alone
-    measured = summary(evaluation, bundle)
-    veils = [veil(evaluation, shown_at(bundle, level)) for level in coarser] + [measured["veil"]]
+    measured = summarize(evaluation, bundle)
+    veils = [measure_veil(evaluation, full_detail_selector(bundle, level)) for level in coarser] + [
+        measured["veil"]
+    ]
     levels = [
         {"level": level.number, **level.facts, **evaluation.measure_level(bundle, level), "veil": veiled}
         for level, veiled in zip(alone, veils, strict=True)
@@ -109,16 +111,16 @@ def evaluate_run(
         "selective": [],
     }
     if aside:
-        quality = float(evaluation.psnrs(aside, shown_at(bundle, finest)).mean())
+        quality = float(evaluation.compare_views(aside, full_detail_selector(bundle, finest)).mean())
         report["aside"] = {"psnr": round(quality, 3), "views": [camera.name for camera in aside]}
     values = settings(bundle, given or {}) if rule else {}
     if rule:
-        resident = Resident(bundle, job.backend)
+        resident = ResidentBundle(bundle, job.backend)
         per_view = evaluation.measure_by_distance(resident, values)
         report["selective"] = [{"set": "per view", **values, **per_view}]
-        if not bundle.elsewhere:
+        if not bundle.on_disk:
             predetermined = select(bundle, data.mean_camera, data.focal, values)
-            found = evaluation.measure_set(*predetermined)
+            found = evaluation.measure_splats(*predetermined)
             report["selective"].append({"set": "predetermined", **values, **found})
         if rule.sweep:
             name, steps = rule.sweep
@@ -137,14 +139,14 @@ def evaluate_run(
         try:
             method.load_arrays(arrays)
         except (KeyError, ValueError) as error:
-            raise damaged(folder.model, error) from error
-        report["networks"] = evaluation.measure_pictures(method.picture)
+            raise array_error(folder.model, error) from error
+        report["networks"] = evaluation.measure_images(method.picture)
     middle = evaluation.cameras[len(evaluation.cameras) // 2]
     if far and rule:
-        report["farther"] = farther(evaluation, bundle, values)
-        report["jumps"] = jumps(evaluation, bundle, values, middle)
+        report["farther"] = measure_farther_views(evaluation, bundle, values)
+        report["jumps"] = measure_popping(evaluation, bundle, values, middle)
     if picture is not None:
-        level_picture(picture, bundle, evaluation, middle, values)
+        write_level_sheet(picture, bundle, evaluation, middle, values)
     with atomic_write(folder.metrics) as temporary:
         Path(temporary).write_text(json.dumps(_finite(report), indent=1, allow_nan=False), encoding="utf-8")
     return report
@@ -163,7 +165,7 @@ def _finite(value):
             return value
 
 
-def table(report: dict) -> str:
+def format_report(report: dict) -> str:
     """``evaluate_run``'s report as text."""
     quality = [f"{'' if report['test_views'] else 'train_'}{name}" for name in ("psnr", "ssim")]
     measured = ("splats", "drawn", *quality, "frame_s", "veil")

@@ -22,36 +22,36 @@ from .. import VERSION
 from ..errors import LodgsError
 from ..evaluate.costs import cost_curves, write_cost_plot
 from ..evaluate.metrics import psnr
-from ..evaluate.summary import summary
+from ..evaluate.summary import summarize
 from ..evaluate.views import Evaluation
 from ..files import atomic_write
+from ..lod.on_disk import IN_MEMORY, in_parts, open_if_large
 from ..lod.rule import find_rule
 from ..lod.selection import levels_alone, settings
-from ..lod.sight import IN_MEMORY, in_parts, open_if_large
 from ..methods import METHODS, create
 from ..optimize.memory import keep_freed_memory
 from ..optimize.method import Method
 from ..optimize.training_data import TrainingData
-from ..rasterize import Gaussians, contributions, device_of, resolve, warm_up, why_cpu
-from ..rasterize.gpu.choice import chosen as graphics_device
-from ..rasterize.resident import Resident
+from ..rasterize import Gaussians, contributions, tensor_device, resolve_backend, warm_up, cpu_fallback_reason
+from ..rasterize.gpu.default_device import default_adapter as graphics_device
+from ..rasterize.resident import ResidentBundle
 from ..scenes.orientation import up_rotation
 from ..scenes.regions import Region
 from ..scenes.views import tables_of
 from ..splats.bundle import NO_SPLATS, Bundle, Level, open_ply, read_bundle, write_bundle
-from ..splats.dialects import comments_of
+from ..splats.dialects import comments_from_meta
 from ..splats.gaussians import SplatRows, Splats
-from ..splats.ply import AT_ONCE, Columns, read_ply, write_ply
+from ..splats.ply import BATCH_ROWS, Columns, read_ply, write_ply
 from .base import open_base
 from .blocks.plan import write_plan
 from .blocks.train import BlocksStopped, train_blocks
 from .blocks.workers import HERE, workers
 from .checkpoints import read_newest, remove_checkpoints, write_checkpoint
 from .data import training_data
-from .events import PROTOCOL, Events, event_line
-from .failures import CANCELLED, CRASHED, DONE, in_words
+from .events import PROTOCOL, EventWriter, event_line
+from .failures import CANCELLED, CRASHED, DONE, describe_error
 from .folder import RunFolder
-from .job import Job, keep_job
+from .job import Job, save_job
 
 CHECKPOINT_SECONDS = float(os.environ.get("LODGS_CHECKPOINT_SECONDS", "60"))
 PROGRESS_SECONDS = 0.25, 10.0
@@ -73,8 +73,8 @@ def train(
     """
     folder = RunFolder(job.out)
     try:
-        folder.make()
-        with folder.hold():
+        folder.create()
+        with folder.locked():
             return _go_on(job.resolved(), folder, stream, on, resources)
     except BaseException as error:  # the run is not ours to write into
         code, event = _last_words(error)
@@ -88,19 +88,19 @@ def _go_on(
     job: Job, folder: RunFolder, stream: IO[str] | None, on: str, resources: dict[str, float] | None
 ) -> int:
     """Begins, resumes or only repeats the end of the run in a folder that is held; returns an exit code."""
-    keep_job(job, folder)
+    save_job(job, folder)
     end = folder.end_event()
     if end is not None and end["event"] == "done" and folder.bundle.exists():
         remove_checkpoints(folder)  # a trainer that was killed after its last word has left them
         if stream is not None:
             print(event_line(end.pop("event"), **end), file=stream, flush=True)
         return DONE
-    events = Events(folder.events_file, folder.reserve, stream)  # from here on the run says what happens
+    events = EventWriter(folder.events_file, folder.reserve, stream)  # from here on the run says what happens
     try:
         return _train(job, folder, events, on, resources)
     except BaseException as error:
         code, event = _last_words(error)
-        events.last(**event)
+        events.write_final(**event)
         return code
     finally:
         events.close()
@@ -112,14 +112,16 @@ def _last_words(error: BaseException) -> tuple[int, dict]:
         return CANCELLED, {"kind": "cancelled", "message": str(error)}
     if isinstance(error, KeyboardInterrupt):
         return CANCELLED, {"kind": "cancelled", "message": "Stopped; it can be resumed."}
-    what, remedy, code = in_words(error)
+    what, remedy, code = describe_error(error)
     if code == CRASHED:
         with suppress(OSError):
             traceback.print_exc(file=sys.stderr)
     return code, {"kind": "error", "what": what, "remedy": remedy}
 
 
-def _train(job: Job, folder: RunFolder, events: Events, on: str, resources: dict[str, float] | None) -> int:
+def _train(
+    job: Job, folder: RunFolder, events: EventWriter, on: str, resources: dict[str, float] | None
+) -> int:
     started = time.monotonic()
     events(
         "hello", protocol=PROTOCOL, version=VERSION, method=job.method, preset=job.preset,
@@ -128,7 +130,7 @@ def _train(job: Job, folder: RunFolder, events: Events, on: str, resources: dict
     with _interrupted_by_cancel(folder):
         together = bool(job.cells) and METHODS[job.method].in_cells == job.method
         if job.cells:
-            whole = folder.bundle if together else folder.whole
+            whole = folder.bundle if together else folder.merged
             division = write_plan(job, folder)
             with workers(on, resources) as submit:
                 train_blocks(division, whole, submit, events)
@@ -138,7 +140,7 @@ def _train(job: Job, folder: RunFolder, events: Events, on: str, resources: dict
         events("status", message="Preparing to train (the first time on a computer up to a minute)")
         torch.set_num_threads(1)  # torch's thread pool beside the kernels' slows both
         keep_freed_memory()
-        backend = resolve(job.backend)
+        backend = resolve_backend(job.backend)
         warm_up(backend)
         _tell_backend(job.backend, backend, events)
         if together:
@@ -155,22 +157,24 @@ def _train(job: Job, folder: RunFolder, events: Events, on: str, resources: dict
 
 
 def _tell_done(
-    folder: RunFolder, events: Events, evaluation: Evaluation, bundle: Bundle, started: float
+    folder: RunFolder, events: EventWriter, evaluation: Evaluation, bundle: Bundle, started: float
 ) -> None:
     """The last word: what the run is worth."""
     seconds = round(time.monotonic() - started, 1)
     events("status", message="Measuring the result")
-    events("done", bundle=folder.bundle.name, seconds=seconds, **summary(evaluation, bundle))
+    events("done", bundle=folder.bundle.name, seconds=seconds, **summarize(evaluation, bundle))
 
 
-def _hand_over(folder: RunFolder, events: Events, data: TrainingData, backend: str, started: float) -> None:
+def _hand_over(
+    folder: RunFolder, events: EventWriter, data: TrainingData, backend: str, started: float
+) -> None:
     """Hands over the levels that blocks were put together to, and says what they are worth."""
     bundle = open_if_large(folder.bundle) or read_bundle(folder.bundle)
     evaluation = Evaluation(data, backend, bundle.antialias)
     alone = [level.number for level in levels_alone(bundle)]
     for place, level in enumerate(bundle.levels, 1):
         path = folder.levels_folder / f"level_{level.number}.ply"
-        write_ply(path, level.rows, comments_of(bundle.meta))
+        write_ply(path, level.rows, comments_from_meta(bundle.meta))
         quality = evaluation.measure_level(bundle, level) if level.number in alone else {}
         told = quality | _as_event(bundle, level, f"levels/{path.name}")
         events("level", **told, again=False, more=place < len(bundle.levels))
@@ -194,12 +198,14 @@ class _Run:
         levels: a record of each finished level, coarse to fine.
     """
 
-    def __init__(self, job: Job, backend: str, folder: RunFolder, events: Events, data: TrainingData) -> None:
+    def __init__(
+        self, job: Job, backend: str, folder: RunFolder, events: EventWriter, data: TrainingData
+    ) -> None:
         self.job, self.folder, self.events, self.data = job, folder, events, data
         self._backend = backend
         self.method = self._fresh_method()
         self.evaluation = Evaluation(data, backend, self.method.parameters.antialias)
-        self._device = device_of(backend)
+        self._device = tensor_device(backend)
         self.step = 0
         self.levels: list[dict] = []
         self._resume()
@@ -232,7 +238,7 @@ class _Run:
     def _in_region(self, base: Splats, antialias: bool, region: Region) -> Splats:
         """What of a base is about a region, or shows in its views."""
         found = contributions(
-            Gaussians.of(base, device_of(self._backend)), self.data.train, near=self.data.near,
+            Gaussians.of(base, tensor_device(self._backend)), self.data.train, near=self.data.near,
             antialias=antialias, backend=self._backend,
         )  # fmt: skip
         return base.select(region.surrounds(base.means) | (found.largest > 0).cpu().numpy())
@@ -246,7 +252,7 @@ class _Run:
         self._started, self._started_step = time.monotonic(), self.step
         last_checkpoint = last_progress = self._started
         while self.step < method.steps:
-            self.folder.require_held()
+            self.folder.require_lock()
             if stopped or self.folder.take_cancel():
                 self._save()
                 message = f"Stopped at step {self.step} of {method.steps}; it can be resumed."
@@ -276,7 +282,7 @@ class _Run:
 
     def write_bundle(self) -> Bundle:
         """All levels, as they were written one by one, in one file."""
-        self.folder.require_held()
+        self.folder.require_lock()
         levels = [self._written(record) for record in self.levels]
         up = up_rotation(self.data.whole.cameras).round(6)
         meta = {**self.method.meta(), "up_rotation": up, "seed": self.job.seed}
@@ -290,8 +296,8 @@ class _Run:
             with atomic_write(self.folder.model) as temporary, open(temporary, "wb") as file:
                 np.savez(file, **arrays)
             if self.data.test:
-                before = self.evaluation.measure_pictures(self.method.picture)["psnr"]
-                resident = Resident(bundle, self.evaluation.backend)
+                before = self.evaluation.measure_images(self.method.picture)["psnr"]
+                resident = ResidentBundle(bundle, self.evaluation.backend)
                 after = self.evaluation.measure_by_distance(resident, settings(bundle, {}))["psnr"]
                 meta |= {"neural_psnr": before, "baked_psnr": after}
                 message = f"Held-out views: {before:.2f} dB with networks, {after:.2f} dB baked for Blender."
@@ -307,7 +313,7 @@ class _Run:
 
     def _written(self, record: dict) -> Level:
         """A level as it was written; large ones stay in their file."""
-        path = self.folder.file(record["path"])
+        path = self.folder.find_file(record["path"])
         if record["splats"] > IN_MEMORY and in_parts(METHODS[self.job.method].rule):
             return Level(record["level"], NO_SPLATS, record["facts"], open_ply(path))
         return Level(record["level"], read_ply(path), record["facts"])
@@ -344,7 +350,7 @@ class _Run:
         alone = [level.number for level in levels_alone(bundle)]
         for place, level in enumerate(levels, 1):
             path = self.folder.levels_folder / f"level_{level.number}.ply"
-            write_ply(path, level.rows, comments_of(bundle.meta))
+            write_ply(path, level.rows, comments_from_meta(bundle.meta))
             record = {
                 "level": level.number,
                 "path": f"levels/{path.name}",
@@ -353,7 +359,7 @@ class _Run:
             }
             quality = {}
             if level.number in alone:
-                if level.elsewhere is not None:
+                if level.on_disk is not None:
                     level = self._written(record)
                 coarser = [other for other in levels if other.number < level.number]
                 quality = self.evaluation.measure_level(replace(bundle, levels=[*coarser, level]), level)
@@ -388,17 +394,17 @@ class _Run:
 
 def _seen(base: SplatRows, data: TrainingData) -> bool:
     """Whether a training view sees any of the splats."""
-    for begin in range(0, len(base), AT_ONCE):
-        means = base.select(slice(begin, begin + AT_ONCE)).means
+    for begin in range(0, len(base), BATCH_ROWS):
+        means = base.select(slice(begin, begin + BATCH_ROWS)).means
         if any(camera.sees(means, near=data.near).any() for camera in data.train):
             return True
     return False
 
 
-def _tell_backend(asked: str, backend: str, events: Events) -> None:
+def _tell_backend(asked: str, backend: str, events: EventWriter) -> None:
     """Which rasterizer trains; and why it is not a GPU's, where there is a GPU that could."""
     names = {"cpu": "the CPU", "cuda": "the NVIDIA GPU", "reference": "the CPU, by the slow reference"}
-    if problem := why_cpu(asked):
+    if problem := cpu_fallback_reason(asked):
         events("warning", message=problem)
     name = names.get(backend) or graphics_device().name
     events("status", message=f"Training on {name}", backend=backend)

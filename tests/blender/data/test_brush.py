@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tests.blender.data.test_cleaning import PLACE, blender, shown_rows
-from tests.training.lod.test_cleaning import bundle_of
-from tests.training.lod.trees import random_leaves, tree_of
+from tests.training.editing.test_cleaning import bundle_of
+from tests.training.lod.tree.trees import random_leaves, tree_of
 from training.splats.bundle import read_bundle, write_bundle
 
 NAMES = ["bands", "octree", "chunks", "decay"]

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.training.lod.test_cleaning import bundle_of, drawn_for_each_leaf
-from tests.training.lod.trees import random_leaves, tree_of
-from training.lod.cleaning import floaters
+from tests.training.editing.test_cleaning import bundle_of, drawn_for_each_leaf
+from tests.training.lod.tree.trees import random_leaves, tree_of
+from training.editing.cleaning import floaters
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.ply import read_ply
 

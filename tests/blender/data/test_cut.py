@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from tests.training.lod.trees import random_leaves, tree_of
+from tests.training.lod.tree.trees import random_leaves, tree_of
 
 LEAVES = 3000
 

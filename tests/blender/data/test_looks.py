@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tests.blender.data.test_cleaning import PLACE, blender, inside, placed, scene_of  # noqa: F401
-from tests.training.lod.test_cleaning import bundle_of
-from training.lod.look import Look
+from tests.training.editing.test_cleaning import bundle_of
+from training.editing.look import Look
 from training.scenes.color import linear_from_srgb
 from training.splats.bundle import read_bundle
 from training.splats.gaussians import SH_C0

@@ -11,10 +11,10 @@ from tests.blender.data.test_brush import (
     scene_of,  # noqa: F401
     viewport,  # noqa: F401
 )
-from tests.training.lod.test_cleaning import bundle_of
-from tests.training.lod.trees import random_leaves, tree_of, write_in_pages
-from training.lod.look import Look
-from training.lod.paint import COLUMNS
+from tests.training.editing.test_cleaning import bundle_of
+from tests.training.lod.tree.trees import random_leaves, tree_of, write_in_pages
+from training.editing.look import Look
+from training.editing.paint import COLUMNS
 from training.scenes.color import linear_from_srgb
 from training.splats.bundle import Level, read_bundle
 from training.splats.gaussians import SH_C0

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from tests.blender.fake_trainer import splats
-from training.lod.unfiltered import without_filter
+from training.editing.bake_filter import without_filter
 from training.scenes.cameras import Camera, look_at
 from training.scenes.colmap import read_scene
 from training.scenes.views import tables_of, views_in
 from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
-from training.splats.placing import Placement
+from training.splats.similarity import Similarity
 
 GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
 
@@ -82,7 +82,7 @@ def test_views_are_in_the_bundle_again_where_the_scene_stands(bpy, root, tmp_pat
     cameras, near, held_out = views_in(read_bundle(tmp_path / "out.ply").tables)
     assert held_out == {"v2.jpg"} and near == pytest.approx(0.04 if placed else 0.02)
     if placed:
-        there = Placement.of(np.array(root.lodgs.axes.matrix_world, np.float64).round(6))
+        there = Similarity.from_matrix(np.array(root.lodgs.axes.matrix_world, np.float64).round(6))
         cameras = [camera.within(there.matrix)[0] for camera in cameras]
     check(cameras, views())
 

@@ -235,7 +235,7 @@ def test_a_group_that_an_artist_has_changed_is_followed_by_all(bpy, lodgs, half,
         if placed.choice is None:
             return len(splats)
         columns = splats.extras | {"opacity": 1 / (1 + np.exp(-splats.opacity_logits))}
-        return len(lodgs("training.lod.choice").Chooser(splats.means, columns).chosen(placed.choice)[0])
+        return len(lodgs("training.lod.query").Chooser(splats.means, columns).chosen(placed.choice)[0])
 
     def everything():
         return sum(len(item.object.data.points) for item in root.lodgs.levels if item.object.visible_get())

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.training.lod.test_cleaning import bundle_of
+from tests.training.editing.test_cleaning import bundle_of
 from training.splats.bundle import write_bundle
 
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from tests.training.lod.trees import random_leaves, tree_of
+from tests.training.lod.tree.trees import random_leaves, tree_of
 from training.lod.rule import rules
 from training.lod.rules.chunks import member_columns
 from training.splats.bundle import Bundle, Level

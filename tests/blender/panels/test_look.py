@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from tests.training.lod.test_cleaning import bundle_of
-from training.lod.look import RANGES
+from tests.training.editing.test_cleaning import bundle_of
+from training.editing.look import RANGES
 from training.splats.bundle import write_bundle
 
 

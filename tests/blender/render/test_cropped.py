@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tests.training.lod.test_cleaning import bundle_of
-from tests.training.lod.trees import random_leaves, tree_of, write_in_pages
+from tests.training.editing.test_cleaning import bundle_of
+from tests.training.lod.tree.trees import random_leaves, tree_of, write_in_pages
 from training.lod.crop import Crop
 from training.splats.bundle import write_bundle
 

@@ -5,9 +5,9 @@ import pytest
 
 from tests.blender.data.test_looks import give
 from tests.blender.render.test_cropped import camera  # noqa: F401
-from tests.training.lod.test_cleaning import bundle_of
-from tests.training.lod.trees import random_leaves, tree_of, write_in_pages
-from training.lod.look import Look
+from tests.training.editing.test_cleaning import bundle_of
+from tests.training.lod.tree.trees import random_leaves, tree_of, write_in_pages
+from training.editing.look import Look
 from training.scenes.color import srgb_from_linear
 from training.splats.bundle import write_bundle
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.training.lod.trees import random_leaves, tree_of, write_in_pages
+from tests.training.lod.tree.trees import random_leaves, tree_of, write_in_pages
 
 pytestmark = pytest.mark.usefixtures("renderer")
 LEAVES, BUDGET = 9000, 3000

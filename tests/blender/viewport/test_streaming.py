@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.blender.viewport.test_resident import stored
-from tests.training.lod.test_paging import Truth
-from tests.training.lod.trees import random_leaves, tree_of, write_in_pages
+from tests.training.lod.tree.test_paging import Truth
+from tests.training.lod.tree.trees import random_leaves, tree_of, write_in_pages
 
 LEAVES, BUDGET, SIZE = 12_000, 23_500, 96
 EYES = [(0, 0, 30), (9, 9, 1), (-9, 8, 1), (8, -9, 2), (0, 0, 30)]
@@ -29,7 +29,7 @@ def path(tree, tmp_path):
 @pytest.fixture
 def root(bpy, lodgs, path, monkeypatch):
     """A tree of which the top is here; pages come a few at a time."""
-    monkeypatch.setattr(lodgs("training.lod.paging"), "AT_ONCE", 4)
+    monkeypatch.setattr(lodgs("training.lod.tree.paging"), "AT_ONCE", 4)
     root = lodgs("data.scenes").import_splats(bpy.context, path, upright=False, budget=BUDGET)
     yield root
     lodgs("viewport.views").clear()
@@ -69,7 +69,7 @@ def on_the_card(view):
 
 def test_finer_ones_come_and_what_is_drawn_is_complete_at_any_time(bpy, lodgs, tree, path, root, look):
     views, truth = lodgs("viewport.views"), Truth(tree)
-    index = lodgs("training.lod.paging").TreeFile(path).index()
+    index = lodgs("training.lod.tree.paging").TreeFile(path).index()
     view, streamed, numbers, begun = views.ViewState(), 0, [], False
     held = sum(len(item.object.data.points) for item in root.lodgs.levels)
     for eye in EYES:

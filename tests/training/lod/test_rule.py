@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.training.lod.trees import random_leaves, tree_of
+from tests.training.lod.tree.trees import random_leaves, tree_of
 from training.errors import LodgsError
 from training.lod.rule import Control, Rule, distances, every_control, facts_of, find_rule, rules
 from training.lod.selection import Choice, select, select_levels, settings

@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 import torch
 
+from training.editing.look import Look
 from training.errors import LodgsError
-from training.lod import sight
+from training.lod import on_disk
 from training.lod.blocks import SIZE, spatial_order
-from training.lod.choice import Choice, Chooser
-from training.lod.look import Look
+from training.lod.partial_read import BLOCKS, table_of_blocks
+from training.lod.query import Choice, Chooser
 from training.lod.rule import HIDDEN, rules
 from training.lod.rules.chunks import member_columns
 from training.lod.selection import complete, select, settings
-from training.lod.streaming import BLOCKS, table_of_blocks
 from training.methods.tree.build import build
 from training.rasterize import Gaussians, rasterize
-from training.rasterize.resident import MANY, Resident, SplatSet
+from training.rasterize.resident import MANY, ResidentBundle, SplatSet
 from training.scenes.cameras import Camera, look_at
 from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
 from training.splats.gaussians import Splats
@@ -86,7 +86,7 @@ def views():
 )  # fmt: skip
 def test_pictures_are_those_of_what_is_selected(rule, given):
     shown, most = bundle(rule), 0
-    values, resident = settings(shown, given), Resident(shown, "cpu")
+    values, resident = settings(shown, given), ResidentBundle(shown, "cpu")
     for camera in views():
         ours = resident.draw(camera, values, near=NEAR)
         splats, weights = select(shown, camera.center, camera.focal, values)
@@ -102,7 +102,7 @@ def test_pictures_are_those_of_what_is_selected(rule, given):
 @pytest.mark.parametrize("rule", ["bands", "octree"])
 def test_a_level_is_drawn_with_all_that_belongs_to_it(rule):
     shown, camera = bundle(rule), next(views())
-    resident = Resident(shown, "cpu")
+    resident = ResidentBundle(shown, "cpu")
     for number in (1, 3):
         one = next(level for level in shown.levels if level.number == number)
         whole = rasterize(Gaussians.of(complete(shown, one)), camera, near=NEAR, backend="cpu").image
@@ -111,8 +111,8 @@ def test_a_level_is_drawn_with_all_that_belongs_to_it(rule):
 
 @pytest.mark.parametrize("rule", ["bands", "octree", "cut"])
 def test_of_a_large_file_a_camera_has_read_what_it_may_see(tmp_path, monkeypatch, rule):
-    monkeypatch.setattr(sight, "_GAP", 1)
-    monkeypatch.setattr(sight, "_AT_ONCE", 2 * SIZE)
+    monkeypatch.setattr(on_disk, "_GAP", 1)
+    monkeypatch.setattr(on_disk, "_AT_ONCE", 2 * SIZE)
     shown = bundle(rule)
     for each in shown.levels:  # a tree's are in an order already
         if rule != "cut":
@@ -121,7 +121,7 @@ def test_of_a_large_file_a_camera_has_read_what_it_may_see(tmp_path, monkeypatch
     write_bundle(tmp_path / "bundle.ply", shown)
     shown = read_bundle(tmp_path / "bundle.ply")
     told, values, total = [], settings(shown, {}), sum(len(each.splats) for each in shown.levels)
-    whole, part = Resident(shown, "cpu"), Resident(tmp_path / "bundle.ply", "cpu", told.append, most=1000)
+    whole, part = ResidentBundle(shown, "cpu"), ResidentBundle(tmp_path / "bundle.ply", "cpu", told.append, most=1000)
     finest, loaded, read = shown.levels[-1].number, [], []
     for camera in views():
         for draw in (lambda one, c=camera: one.draw(c, values, near=NEAR),
@@ -156,7 +156,7 @@ def members(shown: Bundle, *chunks: int) -> int:
 
 def test_of_a_file_only_what_a_region_can_show_is_loaded_and_pictures_are_the_same_bits(tmp_path):
     shown = indexed(tmp_path / "bundle.ply")
-    whole, part = Resident(shown, "cpu"), Resident(tmp_path / "bundle.ply", "cpu")
+    whole, part = ResidentBundle(shown, "cpu"), ResidentBundle(tmp_path / "bundle.ply", "cpu")
     values, total = settings(shown, {}), sum(len(level.splats) for level in shown.levels)
     assert part.loaded == part.bytes_read == 0
     loaded, read = [], []
@@ -177,10 +177,10 @@ def test_of_a_file_only_what_a_region_can_show_is_loaded_and_pictures_are_the_sa
 
 def test_of_a_file_a_level_is_read_alone(tmp_path):
     shown, camera = indexed(tmp_path / "bundle.ply"), next(views())
-    part = Resident(tmp_path / "bundle.ply", "cpu")
+    part = ResidentBundle(tmp_path / "bundle.ply", "cpu")
     for level in shown.levels:
         picture = part.draw_level(level.number, camera, near=NEAR).image
-        assert torch.equal(picture, Resident(shown, "cpu").draw_level(level.number, camera, near=NEAR).image)
+        assert torch.equal(picture, ResidentBundle(shown, "cpu").draw_level(level.number, camera, near=NEAR).image)
         assert part.loaded == len(level.splats)
     with pytest.raises(LodgsError, match="There is no level 7"):
         part.draw_level(7, camera)
@@ -189,7 +189,7 @@ def test_of_a_file_a_level_is_read_alone(tmp_path):
 def test_what_is_drawn_now_and_then_at_a_level_is_what_was(tmp_path):
     """Sets are joined anew where others are drawn together."""
     shown = bundle("octree")
-    resident, values, camera = Resident(shown, "cpu"), settings(shown, {}), next(views())
+    resident, values, camera = ResidentBundle(shown, "cpu"), settings(shown, {}), next(views())
     first = resident.draw(camera, values, near=NEAR).image
     resident.draw_level(2, camera, near=NEAR)
     assert torch.equal(resident.draw(camera, values, near=NEAR).image, first)
@@ -199,19 +199,19 @@ def test_what_is_drawn_now_and_then_at_a_level_is_what_was(tmp_path):
 def test_nothing_with_a_weight_is_passed_over(rule):
     """Whatever is chosen for a camera, is all that has a weight among what it sees."""
     shown = bundle(rule)
-    resident, values, passed = Resident(shown, "cpu"), settings(shown, {}), 0
+    resident, values, passed = ResidentBundle(shown, "cpu"), settings(shown, {}), 0
     for camera in views():
         for level in shown.levels:
-            splats, choice = resident.by_distance(camera, values)[level.number]
+            splats, choice = resident.select_by_rule(camera, values)[level.number]
             ordered = level.splats
             if len(ordered) >= MANY:
                 ordered = ordered.select(spatial_order(ordered.means))
             opacity, own = 1 / (1 + np.exp(-ordered.opacity_logits)), splats.gaussians
             weights = choice.weights(ordered.means, ordered.extras | {"opacity": opacity})
-            everywhere, found = splats.chosen(choice)
+            everywhere, found = splats.select_visible(choice)
             np.testing.assert_array_equal(everywhere, np.flatnonzero(weights > 0))
             np.testing.assert_array_equal(found, weights[everywhere])
-            some, found = splats.chosen(choice, camera, NEAR)
+            some, found = splats.select_visible(choice, camera, NEAR)
             np.testing.assert_array_equal(found, weights[some])
             left_out = torch.from_numpy(np.setdiff1d(everywhere, some)).long()
             alone = rasterize(own.select(left_out), camera, near=NEAR, backend="cpu")
@@ -254,10 +254,10 @@ def test_within_a_band_nothing_is_asked_and_the_same_is_chosen(monkeypatch):
 
 def test_a_crop_may_come_while_the_eye_stays_in_its_region():
     shown, camera = bundle("chunks"), next(views())
-    everything = Resident(shown, "cpu").by_distance(camera, settings(shown, {}))
+    everything = ResidentBundle(shown, "cpu").by_distance(camera, settings(shown, {}))
     for splats, choice in everything.values():
-        before = splats.chosen(choice)[0]
-        np.testing.assert_array_equal(splats.chosen(replace(choice, crops=()))[0], before)
+        before = splats.select_visible(choice)[0]
+        np.testing.assert_array_equal(splats.select_visible(replace(choice, crops=()))[0], before)
 
 
 @pytest.mark.parametrize("looked_first", [True, False])
@@ -265,10 +265,10 @@ def test_looks_change_what_is_seen_and_not_what_is_chosen(looked_first):
     shown = bundle("decay")
     own = shown.levels[0].splats
     camera, looks = next(views()), ((None, Look(opacity=0.2)),)
-    _, choice = Resident(shown, "cpu").by_distance(camera, settings(shown, {}))[1]
+    _, choice = ResidentBundle(shown, "cpu").by_distance(camera, settings(shown, {}))[1]
     trained = {"opacity": 1 / (1 + np.exp(-own.opacity_logits)), **own.extras}
     truth = np.flatnonzero(choice.weights(own.means, trained) > 0)
     splats = SplatSet(own, backend="cpu", ordered=True)
-    for one in (splats.looked(looks), splats) if looked_first else (splats, splats.looked(looks)):
-        np.testing.assert_array_equal(one.chosen(choice)[0], truth)
+    for one in (splats.with_looks(looks), splats) if looked_first else (splats, splats.with_looks(looks)):
+        np.testing.assert_array_equal(one.select_visible(choice)[0], truth)
     assert 0 < len(truth) < len(own)

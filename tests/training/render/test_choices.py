@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from training.lod.choice import Choice
+from training.editing.look import Look, looks_as_dicts
 from training.lod.crop import Crop
-from training.lod.look import Look, looks_as_dicts
+from training.lod.query import Choice
 from training.lod.rule import NO_FINER, fact_names, rules
 from training.lod.rules.chunks import TABLE, member_columns
-from training.render.requests import read_request
+from training.render.requests import parse_request
 from training.render.scene import Instance, SplatSet, draw
 from training.scenes.cameras import camera_as_dict
 from training.splats.gaussians import Splats
@@ -63,7 +63,7 @@ def by_rule(choice: Choice, splats: Splats) -> np.ndarray:
 def weights_of(held: SplatSet, choice: Choice) -> np.ndarray:
     """The weights (N,) of all."""
     weights = np.zeros(COUNT, np.float32)
-    some, found = held.chosen(choice)
+    some, found = held.select_visible(choice)
     weights[some] = found
     return weights
 
@@ -98,7 +98,7 @@ def test_while_the_eye_stays_in_a_region_only_what_is_loaded_there_is_looked_at(
     monkeypatch.setattr(type(rule), "loaded", once)
     for eye, weight in zip(eyes, wanted, strict=True):
         np.testing.assert_array_equal(weights_of(held, choice_of("chunks", eye)), weight)
-        held.chosen(choice_of("chunks", eye))  # the same frame again
+        held.select_visible(choice_of("chunks", eye))  # the same frame again
     assert found == [(0, 1)] and len(looked_at) == len(eyes)
     either = (splats.extras["chunks_0"].astype(int) & 3) > 0
     assert set(looked_at) == {either.sum()} and either.sum() < COUNT
@@ -130,11 +130,11 @@ def test_the_picture_is_that_of_the_chosen_alone(splats, make_splats, camera, ap
 
 def test_sets_that_stand_together_are_in_memory_once(make_splats):
     sets = [SplatSet(make_splats(50, seed=seed)) for seed in range(3)]
-    whole = sets[0].joined(sets[1:])
-    assert sets[0].joined(sets[1:]) is whole
+    whole = sets[0].concatenated(sets[1:])
+    assert sets[0].concatenated(sets[1:]) is whole
     begin = whole.means.data_ptr()
     assert [each.gaussians.means.data_ptr() - begin for each in sets] == [0, 600, 1200]
-    assert torch.equal(sets[0].joined(sets[2:]).means, torch.cat([whole.means[:50], whole.means[100:]]))
+    assert torch.equal(sets[0].concatenated(sets[2:]).means, torch.cat([whole.means[:50], whole.means[100:]]))
 
 
 def test_a_choice_travels_as_json(camera):
@@ -142,7 +142,7 @@ def test_a_choice_travels_as_json(camera):
         choice = choice_of(name, (0.1, -2, 3))
         one = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "choice": choice.as_dict()}
         asked = {"frame": 1, "out": "o", "camera": camera_as_dict(camera, 0.1), "sets": [one]}
-        found = read_request(asked).sets[0].choice
+        found = parse_request(asked).sets[0].choice
         assert found.as_dict() == choice.as_dict()
         assert found.region() == choice.region()
     crops = (Crop.sphere((1, 2, 3), 4), Crop.box((0, 0, 0), (1, 2, 3), True))
@@ -152,14 +152,14 @@ def test_a_choice_travels_as_json(camera):
         asked = json.loads(
             json.dumps({"frame": 1, "out": "o", "camera": camera_as_dict(camera, 0.1), "sets": [one]})
         )
-        assert read_request(asked).sets[0].choice == choice
+        assert parse_request(asked).sets[0].choice == choice
 
 
 def test_looks_travel_as_json(camera):
     looks = ((None, Look(0.5, 5000, (1, 0.5, 0.2), 0.8, 0.9)), (Crop.sphere((1, 2, 3), 4), Look(opacity=0.1)))
     one = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "looks": looks_as_dicts(looks)}
     asked = {"frame": 1, "out": "o", "camera": camera_as_dict(camera, 0.1), "sets": [one]}
-    assert read_request(json.loads(json.dumps(asked))).sets[0].looks == looks
+    assert parse_request(json.loads(json.dumps(asked))).sets[0].looks == looks
 
 
 NEUTRAL = {"exposure": 0, "temperature": 6500, "tint": [1, 1, 1], "saturation": 1, "opacity": 1}
@@ -181,7 +181,7 @@ def test_impossible_looks_are_a_sentence(camera, looks, said):
 
     one = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "looks": looks}
     with pytest.raises(LodgsError, match=said):
-        read_request({"frame": 1, "out": "o", "camera": camera_as_dict(camera, 0.1), "sets": [one]})
+        parse_request({"frame": 1, "out": "o", "camera": camera_as_dict(camera, 0.1), "sets": [one]})
 
 
 def low(values: dict) -> dict:
@@ -211,7 +211,7 @@ def test_impossible_choices_are_a_sentence(camera, change):
     choice |= change(choice) if callable(change) else change
     one = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "choice": choice}
     with pytest.raises(LodgsError, match="is not valid"):
-        read_request({"frame": 1, "out": "o", "camera": camera_as_dict(camera, 0.1), "sets": [one]})
+        parse_request({"frame": 1, "out": "o", "camera": camera_as_dict(camera, 0.1), "sets": [one]})
 
 
 @pytest.mark.parametrize("name", sorted(rules()))
@@ -222,4 +222,4 @@ def test_the_ends_of_sliders_are_possible(camera, name):
         choice = choice_of(name, (0, 0, 0), **ends).as_dict()
         one = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "choice": choice}
         asked = {"frame": 1, "out": "o", "camera": camera_as_dict(camera, 0.1), "sets": [one]}
-        assert read_request(asked).sets[0].choice.as_dict() == choice
+        assert parse_request(asked).sets[0].choice.as_dict() == choice

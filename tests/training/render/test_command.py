@@ -9,13 +9,13 @@ import pytest
 from PIL import Image
 
 from tests.training.conftest import write_tiny_scene
-from tests.training.lod.trees import tree_of
+from tests.training.lod.tree.trees import tree_of
 from training.__main__ import main
 from training.lod.blocks import spatial_order
+from training.lod.partial_read import BLOCKS, table_of_blocks
 from training.lod.rule import rules
 from training.lod.rules.chunks import member_columns
 from training.lod.selection import select
-from training.lod.streaming import BLOCKS, table_of_blocks
 from training.rasterize import Gaussians, render
 from training.runs.job import Job
 from training.scenes.cameras import camera_as_dict, read_camera, write_camera
@@ -234,7 +234,7 @@ def test_little_memory_is_a_sentence(bundle, camera, tmp_path, capsys, monkeypat
         str(tmp_path / "a.png"),
     ]
     torchs = RuntimeError("[enforce fail at alloc_cpu.cpp:117] DefaultCPUAllocator: can't allocate memory: 9")
-    for place in ("picture.Picture.empty", "picture.Picture.eight_bit", "scene.strips", "command.Resident"):
+    for place in ("picture.Picture.empty", "picture.Picture.eight_bit", "scene.rasterize_strips", "command.ResidentBundle"):
         for error in (MemoryError(), torchs):
 
             def fail(*_, error=error, **__):

@@ -10,7 +10,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from training.lod.choice import Choice
+from training.lod.query import Choice
 from training.lod.rule import rules
 from training.render import wire
 from training.render.scene import Instance, SplatSet, draw
@@ -63,7 +63,7 @@ def test_frames_are_what_draw_draws(client, make_splats, camera):
     hello = client.hear("hello")
     assert hello["protocol"] == wire.PROTOCOL and hello["backend"] == "cpu"
     splats, weights = make_splats(80), np.linspace(0, 1, 80, dtype=np.float32)
-    wire.write_set(client.folder / "one", wire.packed(splats, weights))
+    wire.write_set(client.folder / "one", wire.pack_set(splats, weights))
     matrix = np.diag([2.0, 2, 2, 1])
     sets = [{"file": "one", "count": 80, "matrix": matrix.tolist(), "level": 4}]
     for frame in (1, 2, 3):
@@ -87,7 +87,7 @@ def test_of_a_set_each_frame_draws_what_it_chooses(client, make_splats, camera):
     client.hear("hello")
     splats = make_splats(200)
     splats.extras["lod_bias"] = np.linspace(-1, 1, 200, dtype=np.float32)
-    wire.write_set(client.folder / "one", wire.packed(splats, None))
+    wire.write_set(client.folder / "one", wire.pack_set(splats, None))
     rule, pictures = rules()["octree"], []
     facts = {"level": 2.0, "finer": 3.0, "coarser": 1.0, "levels": 3.0, "d_max": 1.2, "d_max_focal": 1.5}
     values = {"offset": 0.25, "fade": 1}
@@ -111,7 +111,7 @@ def test_of_a_set_each_frame_draws_what_it_chooses(client, make_splats, camera):
 def test_a_holdout_is_read_and_told_where_it_cannot_be(client, make_splats, camera, tmp_path):
     client.hear("hello")
     splats = make_splats(80)
-    wire.write_set(client.folder / "one", wire.packed(splats, None))
+    wire.write_set(client.folder / "one", wire.pack_set(splats, None))
     sets = [{"file": "one", "count": 80, "matrix": np.eye(4).tolist(), "level": 0}]
     depth = np.full((48, 64), 4, np.float32)
     OpenEXR.File({"type": OpenEXR.scanlineimage}, {"L.Depth.Z": depth}).write(str(tmp_path / "depth.exr"))
@@ -159,7 +159,7 @@ def test_odd_requests_end_nothing(client, make_splats, camera):
     shear = np.eye(4)
     shear[0, 1] = 0.5
     for name, each in (("good", splats.select(slice(5, None))), ("bad", spoiled)):
-        wire.write_set(client.folder / name, wire.packed(each, None))
+        wire.write_set(client.folder / name, wire.pack_set(each, None))
     planes = []
     for frame, (name, count) in enumerate((("good", 45), ("bad", 50))):
         one = {"file": name, "count": count, "matrix": shear.tolist(), "level": 0}
@@ -192,7 +192,7 @@ def test_a_folder_of_somebodys_is_left_alone(tmp_path):
 @pytest.mark.slow
 def test_a_frame_is_cancelled(client, make_splats, camera):
     client.hear("hello")
-    wire.write_set(client.folder / "one", wire.packed(make_splats(3000), None))
+    wire.write_set(client.folder / "one", wire.pack_set(make_splats(3000), None))
     sets = [{"file": "one", "count": 3000, "matrix": np.eye(4).tolist(), "level": 0}]
     large = camera.resized(8192, 6144)
     client.say(**request(large, sets, 1))
@@ -209,7 +209,7 @@ def test_a_frame_is_cancelled(client, make_splats, camera):
 def test_it_ends_with_the_program_that_started_it(client, make_splats, camera):
     """In the middle of a large frame, too; and what it kept on the disk is gone."""
     client.hear("hello")
-    wire.write_set(client.folder / "one", wire.packed(make_splats(3000), None))
+    wire.write_set(client.folder / "one", wire.pack_set(make_splats(3000), None))
     sets = [{"file": "one", "count": 3000, "matrix": np.eye(4).tolist(), "level": 0}]
     client.say(**request(camera.resized(8192, 6144), sets, 1))
     client.hear("progress")
@@ -222,7 +222,7 @@ def test_it_ends_with_the_program_that_started_it(client, make_splats, camera):
 
 def test_a_set_without_splats_is_read_once_too(client, make_splats, camera):
     client.hear("hello")
-    wire.write_set(client.folder / "none", wire.packed(make_splats(0), None))
+    wire.write_set(client.folder / "none", wire.pack_set(make_splats(0), None))
     sets = [{"file": "none", "count": 0, "matrix": np.eye(4).tolist(), "level": 1}]
     for frame in (1, 2):
         client.say(**request(camera, sets, frame))

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.training.lod.trees import tree_of
+from tests.training.lod.tree.trees import tree_of
 from training.__main__ import main
 from training.errors import LodgsError
-from training.lod import sight
+from training.lod import on_disk
 from training.rasterize import Gaussians, rasterize
 from training.runs.folder import RunFolder
 from training.runs.job import Job
-from training.runs.measure import evaluate_run, table
+from training.runs.measure import evaluate_run, format_report
 from training.scenes.cameras import write_camera
 from training.scenes.colmap import read_scene
 from training.splats.bundle import Bundle, Level, write_bundle
@@ -48,7 +48,7 @@ def finished(scene, splats, tmp_path):
 
     def make(**keys):
         run = RunFolder(tmp_path / "run")
-        run.make()
+        run.create()
         values = {"scene": str(scene), "out": str(run.path), "image_scale": 1.0, "backend": "cpu"}
         Job.from_dict(values | keys).write(run.job)
         levels = [Level(1, splats.select(slice(0, 20)), {"s_min": 0.1}), Level(2, splats, {"s_min": 0.0})]
@@ -65,14 +65,14 @@ def test_of_a_tree_the_finest_level_alone_is_measured(finished, splats, tmp_path
     (row,) = report["levels"]
     assert (row["level"], row["splats"]) == (2, len(splats)) and row["veil"] == report["veil"]
     assert [row["pixels"] for row in report["curve"]] == [0.5, 1, 2, 4, 8, 16]
-    assert "level 1" not in table(report)
+    assert "level 1" not in format_report(report)
 
 
 def test_of_a_large_tree_the_same_is_measured_in_parts(finished, splats, tmp_path, monkeypatch):
     run = finished(test_every=4)
     write_bundle(RunFolder(run).bundle, tree_of(splats))
     expected = evaluate_run(run, far=True)
-    monkeypatch.setattr(sight, "IN_MEMORY", 100)
+    monkeypatch.setattr(on_disk, "IN_MEMORY", 100)
     report = evaluate_run(run, picture=tmp_path / "levels.png", far=True)
     assert (tmp_path / "levels.png").is_file()
     assert [row["set"] for row in report["selective"]] == ["per view"]
@@ -111,7 +111,7 @@ def test_training_views_and_the_worst_held_out_one(finished, scene, splats):
     assert report["oversized"] == 0 and report["veil"] == report["levels"][1]["veil"]
     assert "aside" not in report
     assert set(report["frame_s"]) == {"by_distance", "full"} and min(report["frame_s"].values()) > 0
-    assert f"Training views: {report['train_psnr']:.1f} dB" in table(report).splitlines()
+    assert f"Training views: {report['train_psnr']:.1f} dB" in format_report(report).splitlines()
 
 
 def test_without_held_out_views_quality_is_of_training_views_and_is_called_so(
@@ -124,7 +124,7 @@ def test_without_held_out_views_quality_is_of_training_views_and_is_called_so(
     assert report["levels"][1]["train_psnr"] == report["train_psnr"]
     for row in (*report["levels"], *report["selective"]):
         assert "psnr" not in row and row["train_ssim"] > 0
-    said = table(report).splitlines()
+    said = format_report(report).splitlines()
     assert "No views were held out: quality is of training views." in said
     assert (tmp_path / "levels.png").is_file()
 
@@ -141,7 +141,7 @@ def test_views_off_the_path_are_measured_where_the_scene_has_some(finished, scen
     report = evaluate_run(run)
     found = report["aside"]
     assert found["views"] == ["a.jpg", "b.jpg"]
-    assert "Off the path:" in table(report)
+    assert "Off the path:" in format_report(report)
     whole = evaluate_run(finished(test_every=4))["aside"]
     assert whole["psnr"] == pytest.approx(np.mean([quality(splats, camera) for camera in cameras]), abs=0.02)
     assert found["psnr"] != whole["psnr"]
@@ -178,7 +178,7 @@ def test_metrics_are_valid_json_whatever_was_measured(finished, monkeypatch):
     assert all(np.isfinite(row["psnr"]) for row in report["farther"])
     monkeypatch.setattr("training.evaluate.views.ssim", lambda *_: float("nan"))
     report = evaluate_run(run)
-    assert np.isnan(report["levels"][0]["ssim"]) and "nan" in table(report)
+    assert np.isnan(report["levels"][0]["ssim"]) and "nan" in format_report(report)
 
     def refuse(constant):
         raise ValueError(f"{constant} is no JSON")

@@ -18,11 +18,11 @@ import pytest
 import torch
 
 from training.errors import LodgsError
-from training.lod import sight
+from training.lod import on_disk
 from training.methods import METHODS
 from training.runs import train as training_loop
 from training.runs.data import training_data
-from training.runs.events import Events
+from training.runs.events import EventWriter
 from training.runs.folder import RunFolder
 from training.runs.job import Job
 from training.scenes.colmap import read_scene
@@ -30,7 +30,7 @@ from training.scenes.orientation import up_rotation
 from training.scenes.views import views_in
 from training.splats.bundle import NO_SPLATS, read_bundle
 from training.splats.ply import read_ply
-from training.splats.scratch import Scratch
+from training.splats.scratch import ScratchFile
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -103,7 +103,7 @@ def test_every_line_is_an_event_and_the_file_holds_the_same(unbroken):
     assert {"train_psnr", "veil", "oversized", "worst"} <= printed[-1].keys()
     assert {event["level"] for event in folder.levels()} == {1, 2, 3}
     assert folder.state() == "done"
-    last = folder.last("progress")
+    last = folder.last_event("progress")
     assert last is not None and last["step"] == last["of"] == 70
 
 
@@ -281,8 +281,8 @@ def test_a_polite_signal_saves(unbroken, tmp_path, number):
 def test_two_trainings_in_one_folder_are_refused_and_the_first_goes_on(unbroken, tmp_path):
     keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
     folder = RunFolder(keys["out"])
-    folder.make()
-    with folder.hold():
+    folder.create()
+    with folder.locked():
         assert folder.state() == "running"
         second = subprocess.run(
             command(tmp_path / "job.json", keys), cwd=ROOT, capture_output=True, text=True, timeout=120
@@ -426,7 +426,7 @@ def test_cancel_is_heard_while_the_trainer_starts(unbroken, tmp_path, monkeypatc
     """In the background of a shell, too, which has programs ignore Ctrl-C."""
     keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
     folder = RunFolder(keys["out"])
-    folder.make()
+    folder.create()
     folder.request_cancel()  # pressed before the trainer had the run's lock
     assert run_in_process(keys)[0] == training_loop.CANCELLED and folder.state() == "cancelled"
 
@@ -469,7 +469,7 @@ def test_a_run_that_is_deleted_while_it_trains_is_not_made_again(
 def test_a_disk_that_is_full_for_events_too_still_takes_the_last_words(unbroken, tmp_path, monkeypatch):
     keys = {**unbroken["keys"], "out": str(tmp_path / "run")}
     folder = RunFolder(keys["out"])
-    real = Events._append
+    real = EventWriter._append
 
     def full(self, data):
         if b"progress" in data:
@@ -479,7 +479,7 @@ def test_a_disk_that_is_full_for_events_too_still_takes_the_last_words(unbroken,
             raise OSError(errno.ENOSPC, "No space left on device")
         real(self, data)
 
-    monkeypatch.setattr(Events, "_append", full)
+    monkeypatch.setattr(EventWriter, "_append", full)
     code, events = run_in_process(keys)
     assert code == 2 and events[-1]["what"] == "The disk is full; training stopped."
     assert folder.state() == "failed" and not folder.reserve.exists()
@@ -570,14 +570,14 @@ def test_levels_that_are_elsewhere_end_in_the_same_bundle(tiny_scene, tmp_path, 
     def in_files(self, step):
         levels = levels_after(self, step)
         for level in levels:
-            if len(levels) > 1 and level.elsewhere is None:
-                level.elsewhere = file = Scratch(tmp_path)
+            if len(levels) > 1 and level.on_disk is None:
+                level.on_disk = file = ScratchFile(tmp_path)
                 file.append(level.splats)
                 level.splats = NO_SPLATS
         return levels
 
     monkeypatch.setattr(method, "levels_after", in_files)
-    for module in (training_loop, sight):
+    for module in (training_loop, on_disk):
         monkeypatch.setattr(module, "IN_MEMORY", 20)
     code, parts = run_in_process({**keys, "out": str(tmp_path / "parts")})
     assert code == 0

@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from training.editing.cleaning import Cleaning, cleaned
+from training.editing.placement import placed
 from training.errors import LodgsError
-from training.lod.cleaning import Cleaning, cleaned
 from training.lod.crop import Crop
-from training.lod.placing import placed
 from training.scenes.cameras import Camera, look_at
 from training.scenes.views import NAMES, VIEWS, tables_of, views_in
 from training.splats.bundle import Bundle, Level, read_bundle, read_folder, write_bundle, write_folder
 from training.splats.gaussians import Splats
-from training.splats.placing import Placement
+from training.splats.similarity import Similarity
 
 POSE = [f"w2c_{row}{column}" for row in range(3) for column in range(4)]
 
@@ -60,14 +60,14 @@ def test_views_come_back_to_the_bit_and_the_header_stays_small(tmp_path, count):
 
 def test_views_of_a_placed_scene_see_the_same():
     views, rng = cameras(), np.random.default_rng(2)
-    placement = Placement.composed((20, 40, 60), 2.5, (1, -2, 3))
+    placement = Similarity.from_angles((20, 40, 60), 2.5, (1, -2, 3))
     there, near, _ = views_in(placed(bundle_of(views), placement).tables)
     assert near == 0.625
     points = rng.normal(size=(20, 3))
     for before, after in zip(views, there, strict=True):
         pixels, depths = before.project(points)
-        assert np.allclose(after.project(placement.points(points))[0], pixels, atol=1e-8)
-        assert np.allclose(after.project(placement.points(points))[1], 2.5 * depths)
+        assert np.allclose(after.project(placement.transform_points(points))[0], pixels, atol=1e-8)
+        assert np.allclose(after.project(placement.transform_points(points))[1], 2.5 * depths)
 
 
 def test_cleaning_leaves_views_alone_whatever_the_rule():

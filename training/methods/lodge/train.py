@@ -12,8 +12,8 @@ import torch
 
 from ...errors import LodgsError
 from ...lod.blocks import Blocks, block_quantiles, spatial_order
+from ...lod.partial_read import BLOCKS, table_of_blocks
 from ...lod.rules.chunks import RULE, TABLE, member_columns
-from ...lod.streaming import BLOCKS, table_of_blocks
 from ...optimize.density_control import require_rows
 from ...optimize.method import Drawing, Made
 from ...optimize.model import NAMES

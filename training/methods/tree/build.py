@@ -19,11 +19,11 @@ from scipy.special import expit, logit, spence
 
 from ...errors import LodgsError
 from ...lod.blocks import AXIS_BITS, places_on_curve
-from ...lod.forest import Piece, divided, joined, joined_trees, longest_of
-from ...lod.tree import Tree, area_of
-from ...rasterize.cpu.compile import STRICT, in_parallel, inlined, kernel
+from ...lod.tree.forest import Piece, divided, joined, joined_trees, longest_of
+from ...lod.tree.shape import Tree, area_of
+from ...rasterize.cpu.compile import STRICT, run_parallel, inlined, kernel
 from ...splats.gaussians import SH_C0, SplatRows, Splats
-from ...splats.scratch import Scratch
+from ...splats.scratch import ScratchFile
 
 RADIUS = 16
 """A splat's partner is among so many on either side of it on a curve through space."""
@@ -52,7 +52,7 @@ def build(leaves: Splats) -> tuple[Splats, Tree]:
 
 
 class GrowingForest:
-    """A tree over splats, built while its subtrees are asked for, which is once (``lod.forest.Forest``).
+    """A tree over splats, built while its subtrees are asked for, which is once (``lod.tree.forest.Forest``).
 
     The partner that two splats choose is the one with which they make the least area (of the merged
     covariance, more where colours differ); those that choose each other merge (parallel locally-ordered
@@ -131,7 +131,7 @@ def _by_cells(leaves: SplatRows, scratch: Path | None, most: int) -> Iterator[Sp
     for number, cell in enumerate(pairwise(borders)):
         cell_of[order[slice(*cell)]] = number
     filled = np.array(borders[:-1])
-    with Scratch(scratch) as file:
+    with ScratchFile(scratch) as file:
         for part in _parts(len(leaves)):
             splats, cells = _bare(leaves.select(part)), cell_of[part]
             by_cell = np.argsort(cells, kind="stable")
@@ -193,7 +193,7 @@ def _merged_up(moments: np.ndarray) -> tuple[np.ndarray, Tree]:
     best = np.zeros(leaves, np.int32)
     while len(moments) > 1:
         count = len(moments)
-        in_parallel(_choose_partners, count, 1 << 12, moments, RADIUS, COLOR, best)
+        run_parallel(_choose_partners, count, 1 << 12, moments, RADIUS, COLOR, best)
         first, second = _pairs(best[:count])
         merged = _merged(moments[first], moments[second])
         children.append(np.stack([numbers[first], numbers[second]], axis=1))

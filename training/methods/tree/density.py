@@ -14,8 +14,8 @@ import torch
 from scipy.special import logit
 
 from ...lod.crop import Crop
-from ...lod.forest import joined_trees, longest_of, shape_of, subtrees_of
-from ...lod.tree import Tree
+from ...lod.tree.forest import joined_trees, longest_of, shape_of, subtrees_of
+from ...lod.tree.shape import Tree
 from ...optimize.density_control import along_longest_axis
 from .store import RecordPiece, Store
 

@@ -17,16 +17,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from ...lod.forest import Forest, ForestShape, Piece, side_by_side
 from ...lod.rules.cut import K_LEAST, detail_of
-from ...lod.tree import Tree
+from ...lod.tree.forest import Forest, ForestShape, Piece, side_by_side
+from ...lod.tree.shape import Tree
 from ...optimize.memory import free_memory
 from ...optimize.model import NAMES
 from ...optimize.out_of_core.cut_cache import CutCache, NoRoom
 from ...optimize.out_of_core.row_file import FileRows, Layout
 from ...rasterize import Gaussians
-from ...rasterize.hspt import LEAF, Upper, bounds_of, cut_off, image_of, search
-from ...rasterize.records import gather
+from ...rasterize.sequential_point_tree import LEAF, UpperTree, node_bounds, first_below, image_borders, search_lists
+from ...rasterize.records import gather_gaussians
 from ...scenes.cameras import Camera
 from ...splats.gaussians import Splats
 
@@ -42,7 +42,7 @@ the node's mean and size."""
 
 
 RecordPiece = tuple[torch.Tensor, Tree]
-"""As ``lod.forest.Piece``: the nodes' records, (., width), and the tree."""
+"""As ``lod.tree.forest.Piece``: the nodes' records, (., width), and the tree."""
 
 
 def default_budget(device: torch.device | str = "cpu") -> int:
@@ -196,7 +196,7 @@ class Store:
         distances compared are those from its root, over the focal length, times the granularity.
         """
         k, eye = detail_of(camera.focal, pixels), camera.center
-        nodes, lists, bands = self._top.walk(eye, k, image_of(camera, near))
+        nodes, lists, bands = self._top.traverse(eye, k, image_borders(camera, near))
         subtrees = len(self.shape.counts)
         alone, above = nodes[nodes < subtrees], nodes[nodes >= subtrees] - subtrees
         groups = np.append(alone, lists)
@@ -224,7 +224,7 @@ class Store:
 
         Args:
             groups: (G,) ascending.
-            bands: (G, 2) as ``Upper.walk`` says them; infinite where the root is fine enough.
+            bands: (G, 2) as ``UpperTree.traverse`` says them; infinite where the root is fine enough.
         """
         counts = np.ones(len(groups), np.int64)
         alone = np.isinf(bands[:, 0])
@@ -232,7 +232,7 @@ class Store:
         searched = np.flatnonzero(~alone)
         lists, bands = groups[searched], bands[searched]
         begins, marks = self.shape.list_begins[lists], self._mark_ends[lists - 1] * (lists > 0)
-        lengths = MARK * (cut_off(self._marks, marks, self._mark_ends[lists], bands[:, 0]) - marks)
+        lengths = MARK * (first_below(self._marks, marks, self._mark_ends[lists], bands[:, 0]) - marks)
         lengths = np.minimum(lengths, self.shape.list_ends[lists] - begins)
         for some in _batches(lengths):
             entries = self._lists.read(_ranges(begins[some], lengths[some])).numpy()
@@ -241,13 +241,13 @@ class Store:
             links[:, :2], links[:, 2:] = entries[:, 1:3] + first[:, None], entries[:, 3:5]
             borders = np.append(0, np.cumsum(lengths[some]))
             these = np.arange(len(borders) - 1, dtype=np.int32)
-            found, counts[searched[some]] = search(links, entries[:, 5:], borders, these, bands[some], eye, k)
+            found, counts[searched[some]] = search_lists(links, entries[:, 5:], borders, these, bands[some], eye, k)
             rows.append(found)
         return np.sort(np.concatenate(rows).astype(np.int64)), counts
 
     def gaussians_at(self, places: np.ndarray) -> Gaussians:
         """A copy of the splats at places (M,) in the cache."""
-        return gather(self.cache.records, places, self._terms)
+        return gather_gaussians(self.cache.records, places, self._terms)
 
     def are_leaves(self, places: np.ndarray) -> np.ndarray:
         """Which (M,) bool of the records at places (M,) are leaves."""
@@ -268,7 +268,7 @@ class Store:
         log_scales = np.append(shapes, upper["log_scales"].numpy(), axis=0)
         sizes = self.shape.upper.sizes(means, log_scales, roots[:, 3])
         low, high, reach = bounds
-        self._top = Upper.over(self.shape.upper, means, log_scales, sizes, (low, high, reach))
+        self._top = UpperTree.from_bounds(self.shape.upper, means, log_scales, sizes, (low, high, reach))
 
     def _resized(self, some: slice) -> tuple[np.ndarray, ...]:
         """Sorts the lists of some subtrees anew; their marks, and of each subtree what stands above it has to
@@ -290,7 +290,7 @@ class Store:
         entries[:, :3] = entries[by_size, :3]
         entries[:, 3:5], entries[:, 5:] = ranks[family[by_size, 1:]], balls[family[by_size, 0]]
         self._lists.write(self._of_lists(some), torch.from_numpy(entries))
-        bounds = bounds_of(means, log_scales, begins)
+        bounds = node_bounds(means, log_scales, begins)
         return entries[within % MARK == 0, 8], balls[ends - 1], log_scales[ends - 1], *bounds
 
     def _read(self, some: slice) -> tuple[torch.Tensor, np.ndarray]:
@@ -378,7 +378,7 @@ class Store:
         }
         self._take_shape(ForestShape(arrays["counts"], Tree(arrays["upper"])))
         self._marks = arrays["marks"]
-        self._top = Upper(self.shape.upper, arrays["balls"], arrays["boxes"])
+        self._top = UpperTree(self.shape.upper, arrays["balls"], arrays["boxes"])
         self._lists.load_state_dict(state["lists"])
         self.cache.load_state_dict(state["cache"])
 

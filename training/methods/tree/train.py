@@ -16,9 +16,9 @@ from functools import cached_property, partial
 import numpy as np
 import torch
 
-from ...lod.forest import levels_of
-from ...lod.streaming import BLOCKS
-from ...lod.tree import LEAVES, treeless_columns
+from ...lod.partial_read import BLOCKS
+from ...lod.tree.forest import levels_of
+from ...lod.tree.shape import LEAVES, treeless_columns
 from ...optimize.initialize import from_splats
 from ...optimize.method import Drawing, Made
 from ...optimize.out_of_core.view_order import Walk
@@ -82,7 +82,7 @@ class SeenRecords:
         ]
         cache = self._store.cache
         told = self.rendering, self._number, torch.cat(rates), self._shares
-        records.step(cache.records, self._places, gradients, *told)
+        records.adam_step(cache.records, self._places, gradients, *told)
         cache.changed(self._places[(self.rendering.radii > 0).numpy(force=True)])
 
     def zero_grad(self) -> None:

@@ -11,9 +11,9 @@ import math
 
 import numpy as np
 
-from ...lod.unfiltered import MIP_VARIANCE
+from ...editing.bake_filter import MIP_VARIANCE
 from ...splats import sh as harmonics
-from ..rendering import ALPHA_MIN, DILATION, View
+from ..rendering import ALPHA_MIN, DILATION, KernelCamera
 from .compile import FAST, f32, inlined, kernel
 from .fastmath import fetch_ahead
 
@@ -52,7 +52,7 @@ sh_basis = inlined(FAST)(harmonics.basis)
 sh_basis_gradient = inlined(FAST)(harmonics.basis_gradient)
 
 
-def lens_of(view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def lens_of(view: KernelCamera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The view as the kernels take it, float32: pose (3, 4), lens (9,) and eye (3,)."""
     pose = np.column_stack([view.rotation, view.translation]).astype(np.float32)
     lens = [view.fx, view.fy, view.cx, view.cy, *view.x_limits, *view.y_limits, view.near]
@@ -72,7 +72,7 @@ def clamp(value, low, high):
 
 
 @inlined(FAST)
-def rows_of_strip(row, left, across, top, rows):
+def strip_rows(row, left, across, top, rows):
     """The first row and one past the last that a splat's ellipse reaches in a strip of pixel columns.
 
     The strip's pixel centres lie between x = ``left`` and ``left + across``; its rows are at y = ``top``,

@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from ...lod.unfiltered import MIP_VARIANCE
+from ...editing.bake_filter import MIP_VARIANCE
 from ...splats import sh as harmonics
 from ..rendering import ALPHA_MAX, ALPHA_MIN, DILATION, TRANSMITTANCE_MIN
 
@@ -69,7 +69,7 @@ class _Term:
 
 def _harmonics() -> str:
     """``basis`` and ``basis_gradient`` of :mod:`...splats.sh` as WGSL, band by band."""
-    most = harmonics.coefficients(harmonics.MAX_DEGREE)
+    most = harmonics.coefficient_count(harmonics.MAX_DEGREE)
     direction = _Term("d.x"), _Term("d.y"), _Term("d.z")
     values: list[Any] = [None] * most
     slopes: list[list[Any]] = [[None] * most for _ in range(3)]
@@ -84,7 +84,8 @@ def _harmonics() -> str:
         for degree in range(harmonics.MAX_DEGREE + 1):
             body += f"    if (degree < {degree}u) {{ return; }}\n" if degree else ""
             body += "".join(
-                f"    (*out)[{k}] = {lines[k]};\n" for k in range(degree**2, harmonics.coefficients(degree))
+                f"    (*out)[{k}] = {lines[k]};\n"
+                for k in range(degree**2, harmonics.coefficient_count(degree))
             )
         return f"fn {name}(d: vec3f, degree: u32, out: ptr<function, array<{kind}, {most}>>) {{\n{body}}}\n"
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit
 
 from training.errors import LodgsError
-from training.lod.tree import area_of
+from training.lod.tree.shape import area_of
 from training.methods.tree.build import OPAQUE, SPREAD, build, optical_depth
 from training.rasterize import Gaussians, rasterize
 from training.scenes.cameras import Camera
@@ -149,13 +149,13 @@ def test_one_splat_is_a_sentence():
 def test_a_tree_is_the_same_on_any_number_of_threads():
     from training.rasterize.cpu import compile
 
-    before, found = compile.threads(), []
+    before, found = compile.thread_count(), []
     try:
         for count in (1, 3):
-            compile.set_threads(count)
+            compile.set_thread_count(count)
             found.append(build(scene(20_000)))
     finally:
-        compile.set_threads(before)
+        compile.set_thread_count(before)
     (one, tree), (other, same) = found
     np.testing.assert_array_equal(tree.children, same.children)
     np.testing.assert_array_equal(one.sh, other.sh)

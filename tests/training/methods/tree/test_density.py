@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from tests.training.lod.trees import random_tree
-from training.lod.forest import joined, longest_of
-from training.lod.tree import Tree
+from tests.training.lod.tree.trees import random_tree
+from training.lod.tree.forest import joined, longest_of
+from training.lod.tree.shape import Tree
 from training.methods.tree.build import GrowingForest
 from training.methods.tree.density import GROWN, Growing, edited
 from training.methods.tree.store import Store

@@ -5,8 +5,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from training.lod.forest import joined, levels_of
 from training.lod.selection import select_levels, settings
+from training.lod.tree.forest import joined, levels_of
 from training.methods.tree.build import GrowingForest, _cells
 from training.splats.bundle import Bundle, open_ply, read_bundle, write_bundle
 from training.splats.ply import write_ply

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from tests.training.lod.trees import surfaces
-from tests.training.rasterize.test_hspt import cameras
+from tests.training.lod.tree.trees import surfaces
+from tests.training.rasterize.test_sequential_point_tree import cameras
 from training.errors import LodgsError
-from training.lod.forest import divided, joined, longest_of, shape_of
+from training.lod.tree.forest import divided, joined, longest_of, shape_of
 from training.methods.tree import store as store_module
 from training.methods.tree.build import build
 from training.methods.tree.store import Store, layout_of
 from training.optimize.out_of_core.cut_cache import BESIDE, PLACE
 from training.optimize.out_of_core.row_file import BLOCK, TABLES
-from training.rasterize.hspt import Hspt
+from training.rasterize.sequential_point_tree import SequentialPointTree
 
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
 RECORD = 4 * layout_of(1).width + BESIDE
@@ -55,7 +55,7 @@ def test_a_cut_made_anew_is_that_of_hspt_in_memory(town, tmp_path, longest, monk
     made = stored(tmp_path, town, longest=longest)
     order = names_of(means_of(made), nodes.means)
     sizes = tree.sizes(nodes.means, nodes.log_scales)
-    hspt = Hspt(tree, nodes.means, sizes, nodes.log_scales, longest or longest_of(tree.leaves))
+    hspt = SequentialPointTree(tree, nodes.means, sizes, nodes.log_scales, longest or longest_of(tree.leaves))
     found = 0
     for camera in cameras(np.random.default_rng(longest)):
         for pixels in (0.2, 0.7, 1.8):
@@ -94,7 +94,7 @@ def test_sizes_follow_what_has_moved(town, tmp_path, monkeypatch):
         longest = longest_of(tree.leaves)
         order, _ = shape_of(tree, longest)
         sizes = tree.sizes(nodes.means, nodes.log_scales)
-        hspt = Hspt(tree, nodes.means, sizes, nodes.log_scales, longest)
+        hspt = SequentialPointTree(tree, nodes.means, sizes, nodes.log_scales, longest)
         for camera in cameras(np.random.default_rng(5), 4):
             made.cache.forget()
             rows = made.cache.rows_at(made.take(camera, 0.7, 0.3))

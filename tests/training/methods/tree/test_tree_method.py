@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from tests.training.lod.trees import surfaces
-from training.lod.forest import joined
+from tests.training.lod.tree.trees import surfaces
 from training.lod.rules.cut import least_size
 from training.lod.selection import Choice, settings
-from training.lod.tree import size_of
+from training.lod.tree.forest import joined
+from training.lod.tree.shape import size_of
 from training.methods import create, method_info
 from training.methods.tree.store import layout_of
 from training.optimize.out_of_core.cut_cache import BESIDE
@@ -31,7 +31,7 @@ def trained(tree, begin=0, until=None):
     for step in range(begin, until or tree.steps):
         tree.train_step(step)
         levels += [
-            replace(level, splats=level.rows.select(slice(None)), elsewhere=None)
+            replace(level, splats=level.rows.select(slice(None)), on_disk=None)
             for level in tree.levels_after(step)
         ]
     return levels

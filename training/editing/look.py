@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from ..errors import LodgsError
+from ..lod.crop import Crop
 from ..splats.bundle import Bundle
 from ..splats.gaussians import SH_C0, SplatRows, Splats
-from .crop import Crop
 from .paint import painted
 
 GAMMA = 2.2
@@ -166,8 +166,8 @@ def looked_levels(bundle: Bundle, looks: Looks) -> Bundle:
     are written."""
     levels = [
         replace(level, splats=looked(level.splats, looks))
-        if level.elsewhere is None
-        else replace(level, elsewhere=LookedRows(level.elsewhere, looks))
+        if level.on_disk is None
+        else replace(level, on_disk=LookedRows(level.on_disk, looks))
         for level in bundle.levels
     ]
     return replace(bundle, levels=levels)

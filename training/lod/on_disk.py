@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from ..scenes.cameras import Camera
-from ..splats.bundle import Bundle, open_bundle, read_head
-from ..splats.dialects import Warn, drawable, left_out, silent
+from ..splats.bundle import Bundle, open_bundle, read_header
+from ..splats.dialects import Warn, drop_undrawable, dropped_message, ignore
 from ..splats.gaussians import SplatRows, Splats
 from .blocks import SIZE, Blocks
-from .choice import Choice
+from .query import Choice
 from .rule import Rule, find_rule
 from .selection import columns_of
 
@@ -46,13 +46,13 @@ def open_if_large(path: str | Path, most: int = 0) -> Bundle | None:
     Raises:
         LodgsError: as ``read_bundle``.
     """
-    if not in_parts(read_head(path).rule):
+    if not in_parts(read_header(path).rule):
         return None
     bundle, rows = open_bundle(path)
     if sum(map(len, rows.values())) <= (most or IN_MEMORY):
         return None
     for level in bundle.levels:
-        level.elsewhere = rows[level.number]
+        level.on_disk = rows[level.number]
     return bundle
 
 
@@ -69,13 +69,13 @@ class Sight:
     """
 
     def __init__(
-        self, rows: SplatRows, rule: Rule | None = None, path: object = "", warn: Warn = silent
+        self, rows: SplatRows, rule: Rule | None = None, path: object = "", warn: Warn = ignore
     ) -> None:
         self._rows, self._rule, self._path = rows, rule, str(path)
         parts, of_columns, undrawable = [], [], 0
         for begin in range(0, len(rows), _AT_ONCE):
             splats = rows.select(slice(begin, begin + _AT_ONCE))
-            missing = len(splats) - len(drawable(splats, self._path))
+            missing = len(splats) - len(drop_undrawable(splats, self._path))
             undrawable += missing
             blocks = Blocks.of(splats.means, splats.log_scales)
             if missing:  # no numbers to go by
@@ -84,7 +84,7 @@ class Sight:
             columns = {} if rule is None else columns_of(rule, splats)
             of_columns.append({name: blocks.highest(column) for name, column in columns.items()})
         if undrawable:
-            warn(left_out(undrawable, self._path))
+            warn(dropped_message(undrawable, self._path))
         none = Blocks.of(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
         low, high, reach = (
             np.concatenate([getattr(none, name), *(part[i] for part in parts)])
@@ -119,7 +119,7 @@ class Sight:
             self._held[begin:end] = True
         splats = Splats.concatenated(parts) if parts else self._rows.select(slice(0, 0))
         self.count += len(splats)
-        return drawable(splats, self._path)
+        return drop_undrawable(splats, self._path)
 
 
 def in_sight(bundle: Bundle, camera: Camera) -> Bundle:
@@ -129,7 +129,7 @@ def in_sight(bundle: Bundle, camera: Camera) -> Bundle:
         sight = Sight(level.rows)
         blocks = sight.missing(camera)
         assert blocks is not None, "nothing has been read yet"
-        levels.append(replace(level, splats=sight.read(blocks), elsewhere=None))
+        levels.append(replace(level, splats=sight.read(blocks), on_disk=None))
     return replace(bundle, levels=levels)
 
 

@@ -9,29 +9,29 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LodgsError
+from ..lod.selection import known_rule
+from ..lod.tree.paging import is_tree
+from ..lod.tree.shape import complete_levels
 from ..splats.bundle import Bundle, DrawableRows, Level, open_bundle, read_folder, write_bundle, write_folder
-from ..splats.dialects import Warn, comments_of, meta_of, silent
+from ..splats.dialects import Warn, comments_from_meta, ignore, meta_from_comments
 from ..splats.formats import PLY, SPLAT, format_of, program, write_splats, write_streamed
 from ..splats.gaussians import SplatRows, Splats
-from ..splats.placing import Placement
 from ..splats.ply import write_ply
+from ..splats.similarity import Similarity
+from .bake_filter import without_filter
 from .cleaning import Cleaning, cleaned
 from .look import Looks, looked_levels
-from .paging import is_tree
-from .placing import placed, standing
-from .selection import known_rule
-from .tree import complete_levels
-from .unfiltered import without_filter
+from .placement import placed, standing
 
 
 def edit(
     source: Path,
     out: Path | None,
     cleaning: Cleaning,
-    warn: Warn = silent,
+    warn: Warn = ignore,
     *,
     looks: Looks = (),
-    placement: Placement | None = None,
+    placement: Similarity | None = None,
     upright: bool = False,
     ground: bool = False,
     points: np.ndarray | None = None,
@@ -74,20 +74,20 @@ def edit(
     else:
         bundle, rows = open_bundle(source)
         for level in bundle.levels:
-            level.elsewhere = DrawableRows(rows[level.number], warn)
+            level.on_disk = DrawableRows(rows[level.number], warn)
     known_rule(bundle)
     found = looked_levels(cleaned(bundle, cleaning), looks)
     if placement is not None or upright or ground:
         stands = standing(bundle, upright, ground, points)
-        found = placed(found, stands if placement is None else placement.after(stands))
+        found = placed(found, stands if placement is None else placement.compose(stands))
         if upright or ground:
             found.meta["up_rotation"] = np.eye(3)
     if out is None:
         pass
     elif source.is_dir():
         write_folder(out, found)
-    elif bundle == Bundle("", bundle.levels[:1], meta=meta_of(comments_of(bundle.meta))):
-        write_ply(out, found.levels[0].rows, comments_of(bundle.meta))
+    elif bundle == Bundle("", bundle.levels[:1], meta=meta_from_comments(comments_from_meta(bundle.meta))):
+        write_ply(out, found.levels[0].rows, comments_from_meta(bundle.meta))
     else:
         write_bundle(out, found)
     lines = [
@@ -122,7 +122,7 @@ class Joined:
     @classmethod
     def upto(cls, bundle: Bundle, number: int) -> Joined:
         """All that is drawn at a level."""
-        return cls([level.rows for level in bundle.upto(number)])
+        return cls([level.rows for level in bundle.drawn_levels(number)])
 
     def __len__(self) -> int:
         return sum(map(len, self.sets))

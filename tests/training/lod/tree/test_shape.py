@@ -6,7 +6,7 @@ import pytest
 from training.lod.rule import rules
 from training.lod.rules.cut import ABOVE_ROOT, K_LEAST
 from training.lod.selection import select_levels, settings
-from training.lod.tree import area_of, complete_levels, size_of, treeless_columns
+from training.lod.tree.shape import area_of, complete_levels, size_of, treeless_columns
 from training.splats.bundle import Bundle, Level, read_bundle, read_folder, write_bundle, write_folder
 from training.splats.gaussians import Splats
 

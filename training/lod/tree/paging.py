@@ -20,15 +20,16 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import LodgsError
-from ..scenes.cameras import Camera
-from ..splats.bundle import Bundle, Level, Rows, open_bundle
-from ..splats.dialects import drawable
-from ..splats.gaussians import Splats
-from .blocks import ROUNDING, SIZE, Blocks, places_on_curve
-from .choice import Choice
-from .rule import distances_by_axes
-from .rules.cut import (
+from ...errors import LodgsError
+from ...scenes.cameras import Camera
+from ...splats.bundle import Bundle, FileRows, Level, open_bundle
+from ...splats.dialects import drop_undrawable
+from ...splats.gaussians import Splats
+from ..blocks import ROUNDING, SIZE, Blocks, places_on_curve
+from ..partial_read import BLOCKS
+from ..query import Choice
+from ..rule import distances_by_axes
+from ..rules.cut import (
     ABOVE_ROOT,
     K_LEAST,
     NODE_SIZE,
@@ -39,7 +40,6 @@ from .rules.cut import (
     hashed,
     identities,
 )
-from .streaming import BLOCKS
 
 BOUNDS = tuple(f"{end}_{axis}" for end in ("low", "high") for axis in "xyz")
 """Columns of the table of blocks beside ``level`` and ``parent_size``: bounds of the parents' places."""
@@ -153,7 +153,7 @@ class TreeFile:
         splats = self._rows[number].select(rows)
         nothing = np.zeros(len(splats), np.float32)
         splats.extras = dict.fromkeys(COLUMNS, nothing) | splats.extras | dict(beside or {})
-        return drawable(splats, self.path)
+        return drop_undrawable(splats, self.path)
 
     def details(self, eye: np.ndarray | None) -> dict[int, np.ndarray]:
         """By the level's number, (N,) float32: the least detail k at which an eye needs each splat, which is
@@ -230,7 +230,7 @@ class TreeFile:
         return PageIndex.of({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
 
 
-def _columns_of(rows: Rows, some: slice) -> dict[str, np.ndarray]:
+def _columns_of(rows: FileRows, some: slice) -> dict[str, np.ndarray]:
     found = rows.columns(some, (PARENT_SIZE, *PARENT))
     nothing = np.zeros(len(rows.vertices[some]), np.float32)
     return {name: np.nan_to_num(found.get(name, nothing)) for name in (PARENT_SIZE, *PARENT)}

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from training.lod.cleaning import Cleaning
-from training.lod.edit import edit
-from training.lod.unfiltered import without_filter
+from training.editing.bake_filter import without_filter
+from training.editing.cleaning import Cleaning
+from training.editing.edit import edit
 from training.rasterize import Gaussians, rasterize
 from training.scenes.cameras import Camera, look_at
 from training.scenes.views import tables_of
 from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
-from training.splats.formats import as_ply
+from training.splats.formats import open_as_ply
 from training.splats.gaussians import Splats
 from training.splats.ply import read_ply
 
@@ -101,7 +101,7 @@ def test_files_for_others_have_it_and_bundles_do_not(bundle, tmp_path):
         assert plain.antialias is antialiased, "so that it is not done twice"
         expected = (bundle if antialiased else without_filter(bundle)).levels[0].rows.select(slice(None))
         np.testing.assert_array_equal(plain.levels[0].splats.opacity_logits, expected.opacity_logits)
-        with as_ply(paths[1]) as path:
+        with open_as_ply(paths[1]) as path:
             opacity = torch.sigmoid(torch.from_numpy(read_ply(path).opacity_logits)).numpy()
         np.testing.assert_allclose(opacity, 1 / (1 + np.exp(-expected.opacity_logits)), atol=3 / 255)
 

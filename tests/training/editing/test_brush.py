@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from training.lod.brush import Front, Placed, Projection, brushed, hits, lassoed
+from training.editing.brush import Front, Placed, Projection, brushed, hits, lassoed
 from training.scenes.cameras import Camera, look_at
 
 SIZE = (96, 64)

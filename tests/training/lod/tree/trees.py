@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from training.lod.blocks import spatial_order
-from training.lod.paging import streaming_order, table_of_pages
+from training.lod.partial_read import BLOCKS
 from training.lod.rules.cut import ABOVE_ROOT, least_size
-from training.lod.streaming import BLOCKS
-from training.lod.tree import Tree
+from training.lod.tree.paging import streaming_order, table_of_pages
+from training.lod.tree.shape import Tree
 from training.splats.bundle import Bundle, Level, write_bundle
 from training.splats.gaussians import Splats
 

@@ -13,17 +13,17 @@ from math import inf
 import numpy as np
 
 from ..errors import LodgsError
+from ..lod.crop import Crop, kept
+from ..lod.partial_read import BLOCKS, table_of_blocks
+from ..lod.rule import find_rule
+from ..lod.rules.cut import PARENT, PARENT_SIZE
+from ..lod.selection import unknown_rule
+from ..lod.tree.paging import COLUMNS, Standing, is_tree, table_of_pages
 from ..scenes.cameras import Camera
 from ..scenes.views import TABLES
 from ..splats.bundle import Bundle
 from ..splats.gaussians import SplatRows, Splats
-from ..splats.ply import AT_ONCE
-from .crop import Crop, kept
-from .paging import COLUMNS, Standing, is_tree, table_of_pages
-from .rule import find_rule
-from .rules.cut import PARENT, PARENT_SIZE
-from .selection import unknown_rule
-from .streaming import BLOCKS, table_of_blocks
+from ..splats.ply import BATCH_ROWS
 
 SHARE = 0.001
 """Of all splats: clusters that have no larger share are floaters."""
@@ -201,12 +201,12 @@ def without(bundle: Bundle, masks: Masks, family: Family | None = None) -> Bundl
     levels = []
     for level in bundle.levels:
         rows, columns = np.flatnonzero(masks[level.number]), changed.get(level.number, {})
-        if level.elsewhere is None:
+        if level.on_disk is None:
             splats = level.splats.select(rows)
             splats.extras |= columns
             levels.append(replace(level, splats=splats))
         else:
-            levels.append(replace(level, elsewhere=SomeRows(level.rows, rows, columns)))
+            levels.append(replace(level, on_disk=SomeRows(level.rows, rows, columns)))
     if not any(len(level.rows) for level in levels):
         raise LodgsError("Nothing is left of the splats.", "Look at the crops, and at the limits.")
     tables = dict(bundle.tables)
@@ -325,9 +325,9 @@ class SomeRows:
 
 
 def in_parts(rows: SplatRows) -> Iterator[Splats]:
-    """All splats, AT_ONCE of them at a time; at least one part, which may be empty."""
-    for begin in range(0, max(len(rows), 1), AT_ONCE):
-        yield rows.select(slice(begin, begin + AT_ONCE))
+    """All splats, BATCH_ROWS of them at a time; at least one part, which may be empty."""
+    for begin in range(0, max(len(rows), 1), BATCH_ROWS):
+        yield rows.select(slice(begin, begin + BATCH_ROWS))
 
 
 def _or_zeros(column: np.ndarray | None, count: int) -> np.ndarray:

@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.training.lod.trees import random_leaves, tree_of
+from tests.training.lod.tree.trees import random_leaves, tree_of
 from training.errors import LodgsError
-from training.lod import choice as by_values
-from training.lod import paging
+from training.lod import query as by_values
 from training.lod.blocks import SIZE
-from training.lod.paging import Pager, Standing, TreeFile, read_within, streaming_order, table_of_pages
+from training.lod.partial_read import BLOCKS
 from training.lod.rule import rules
 from training.lod.rules.cut import ABOVE_ROOT
 from training.lod.selection import Choice, select
-from training.lod.streaming import BLOCKS
+from training.lod.tree import paging
+from training.lod.tree.paging import Pager, Standing, TreeFile, read_within, streaming_order, table_of_pages
 from training.scenes.cameras import Camera, look_at
 from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
 

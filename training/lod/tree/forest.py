@@ -11,13 +11,13 @@ from typing import Protocol
 
 import numpy as np
 
-from ..splats.bundle import NO_SPLATS, Level
-from ..splats.gaussians import Splats
-from ..splats.ply import Columns
-from ..splats.scratch import Scratch
+from ...splats.bundle import NO_SPLATS, Level
+from ...splats.gaussians import Splats
+from ...splats.ply import Columns
+from ...splats.scratch import ScratchFile
+from ..rules.cut import NODE_SIZE, PARENT, PARENT_SIZE
 from .paging import streaming_order, table_of_pages
-from .rules.cut import NODE_SIZE, PARENT, PARENT_SIZE
-from .tree import LEAVES, NODES, Apart, Tree
+from .shape import LEAVES, NODES, Apart, Tree
 
 Piece = tuple[Splats, Tree]
 """Splats, and the tree that they are the nodes of."""
@@ -242,7 +242,7 @@ class _LevelFile:
     """A level's splats in a file, and in memory by what they are put in order, (N, 4) float32 in parts."""
 
     def __init__(self, folder: Path) -> None:
-        self.splats, self.keys = Scratch(folder), []
+        self.splats, self.keys = ScratchFile(folder), []
 
     def append(self, splats: Splats) -> None:
         if len(splats):
@@ -255,14 +255,14 @@ class _LevelFile:
         columns: Columns = dict(zip(_KEYS, keys.T, strict=True))
         order = streaming_order(columns).astype(np.int32)
         table = table_of_pages({number: {name: column[order] for name, column in columns.items()}})
-        return Level(number, NO_SPLATS, elsewhere=_Ordered(self.splats, order)), table
+        return Level(number, NO_SPLATS, on_disk=_Ordered(self.splats, order)), table
 
 
 @dataclass(frozen=True)
 class _Ordered:
     """The splats of a file at rows (N,)."""
 
-    file: Scratch
+    file: ScratchFile
     rows: np.ndarray
 
     def __len__(self) -> int:

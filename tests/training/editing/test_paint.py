@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.training.lod.test_cleaning import bundle_of
-from training.lod.cleaning import Cleaning
-from training.lod.edit import edit
-from training.lod.look import Look, looked
-from training.lod.paint import COLUMNS, carried, columns_of, mixed, over, paint_of, painted
+from tests.training.editing.test_cleaning import bundle_of
+from training.editing.cleaning import Cleaning
+from training.editing.edit import edit
+from training.editing.look import Look, looked
+from training.editing.paint import COLUMNS, carried, columns_of, mixed, over, paint_of, painted
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.ply import read_ply
 from training.splats.sh import basis

@@ -7,9 +7,9 @@ import pytest
 
 from training.errors import LodgsError
 from training.lod.blocks import SIZE, spatial_order
+from training.lod.partial_read import BLOCKS, read_part, table_of_blocks
 from training.lod.rule import rules
 from training.lod.rules.chunks import member_columns, members
-from training.lod.streaming import BLOCKS, read_part, table_of_blocks
 from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
 from training.splats.gaussians import Splats
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..splats.bundle import Bundle, read_bundle, read_head, read_tables
-from ..splats.dialects import Warn, silent
+from ..splats.bundle import Bundle, read_bundle, read_header, read_tables
+from ..splats.dialects import Warn, ignore
 from ..splats.gaussians import Splats
-from ..splats.ply import columns_of as columns_in_file
-from ..splats.ply import columns_of_extras
+from ..splats.ply import extra_columns
+from ..splats.ply import splat_columns as columns_in_file
 from .blocks import SIZE
 from .rule import Region, Rule
 from .selection import columns_of, rule_of
@@ -40,11 +40,11 @@ def read_head_and_tables(path: str | Path) -> Bundle:
     Raises:
         LodgsError: as ``read_bundle``.
     """
-    return replace(read_head(path), tables=read_tables(path))
+    return replace(read_header(path), tables=read_tables(path))
 
 
 def read_part(
-    path: str | Path, numbers: Collection[int], region: Region | None = None, warn: Warn = silent
+    path: str | Path, numbers: Collection[int], region: Region | None = None, warn: Warn = ignore
 ) -> tuple[Bundle, int]:
     """Some levels of a bundle, or what eyes in a region may be shown of them; and how many bytes were read.
 
@@ -80,7 +80,7 @@ def read_part(
     bundle = read_bundle(path, warn, rows_of)
     rule = None if region is None or BLOCKS not in bundle.tables else rule_of(bundle)
     for level in bundle.levels:
-        columns = columns_in_file(level.splats) | columns_of_extras(level.splats)
+        columns = columns_in_file(level.splats) | extra_columns(level.splats)
         size += sum(column.dtype.itemsize for column in columns.values()) * len(level.splats)
         if rule is not None and region is not None:
             level.splats = level.splats.select(rule.loaded(columns_of(rule, level.splats), region))

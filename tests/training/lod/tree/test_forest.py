@@ -5,16 +5,16 @@ from itertools import count
 import numpy as np
 import pytest
 
-from training.lod import paging
-from training.lod.forest import divided, joined, levels_of, longest_of
-from training.lod.paging import Pager, table_of_pages
 from training.lod.rule import rules
 from training.lod.selection import Choice, select_levels, settings
-from training.lod.tree import Tree
+from training.lod.tree import paging
+from training.lod.tree.forest import divided, joined, levels_of, longest_of
+from training.lod.tree.paging import Pager, table_of_pages
+from training.lod.tree.shape import Tree
 from training.methods.tree.build import build
 from training.splats.bundle import Bundle, read_bundle, write_bundle
 
-from .test_tree import nodes
+from .test_shape import nodes
 from .trees import random_leaves, random_tree
 
 CUT = rules()["cut"]

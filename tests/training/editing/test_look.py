@@ -4,26 +4,26 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.training.splats.test_placing import drawn, some_splats
 
 from tests.training.conftest import look_at
-from tests.training.lod.test_cleaning import bundle_of
-from tests.training.splats.test_placing import drawn, some_splats
+from tests.training.editing.test_cleaning import bundle_of
 from training.__main__ import main
+from training.editing.look import LUMA, NEUTRAL, Look, LookedRows, looked
 from training.errors import LodgsError
 from training.lod.crop import Crop
-from training.lod.look import LUMA, NEUTRAL, Look, LookedRows, looked
 from training.scenes.cameras import Camera
 from training.scenes.color import linear_from_srgb, srgb_from_linear
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import SH_C0
-from training.splats.sh import basis, coefficients
+from training.splats.sh import basis, coefficient_count
 
 LOOK = Look(exposure=-0.7, temperature=8000, tint=(1, 0.8, 0.9), saturation=0.4, opacity=0.6)
 
 
 def seen(splats, degree, direction):
     """(N, 3) float64, colours from a direction, before black is their end."""
-    values = np.empty(coefficients(degree))
+    values = np.empty(coefficient_count(degree))
     basis(*direction, degree, values)
     return 0.5 + np.einsum("k,nkc->nc", values, splats.sh.astype(np.float64))
 

@@ -8,12 +8,11 @@ from functools import cached_property
 
 import numpy as np
 
-from ..scenes.views import TABLES
-from ..splats.bundle import MOST_LEVELS, Bundle, Level
-from ..splats.gaussians import Splats
-from .paging import streaming_order
-from .rules.bands import RULE as BANDS
-from .rules.cut import (
+from ...scenes.views import TABLES
+from ...splats.bundle import MAX_LEVELS, Bundle, Level
+from ...splats.gaussians import Splats
+from ..rules.bands import RULE as BANDS
+from ..rules.cut import (
     ABOVE_ROOT,
     NODE_SIZE,
     PARENT,
@@ -24,6 +23,7 @@ from .rules.cut import (
     least_size,
     rounded_up,
 )
+from .paging import streaming_order
 
 NODES, LEAVES = 1, 2
 """Numbers of the levels: the nodes above, and the leaves, which are the full scene."""
@@ -204,7 +204,7 @@ def complete_levels(bundle: Bundle) -> Bundle:
     counts = np.searchsorted(np.sort(own), sizes, "right") - np.searchsorted(np.sort(above), sizes, "right")
     cuts = [0.0]
     most = counts[0] // THINNING
-    while most >= FEWEST and len(cuts) < MOST_LEVELS:
+    while most >= FEWEST and len(cuts) < MAX_LEVELS:
         place = int(np.argmax(counts <= most))  # counts fall
         cuts.append(float(sizes[place]))
         most = counts[place] // THINNING

@@ -5,16 +5,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.training.lod.test_rule import RULES, any_values, bundle_of
-from tests.training.lod.trees import random_tree, surfaces
+from tests.training.lod.tree.trees import random_tree, surfaces
 from training.__main__ import main
+from training.editing.placement import placed
 from training.errors import LodgsError
-from training.lod.paging import TreeFile, streaming_order, table_of_pages
-from training.lod.placing import placed
+from training.lod.partial_read import BLOCKS
 from training.lod.rule import rules
 from training.lod.rules.chunks import member_columns
 from training.lod.selection import Choice, settings
-from training.lod.streaming import BLOCKS
-from training.lod.tree import Tree
+from training.lod.tree.paging import TreeFile, streaming_order, table_of_pages
+from training.lod.tree.shape import Tree
 from training.splats.bundle import (
     Bundle,
     Level,
@@ -25,8 +25,8 @@ from training.splats.bundle import (
     write_folder,
 )
 from training.splats.gaussians import Splats
-from training.splats.placing import Placement
 from training.splats.ply import write_ply
+from training.splats.similarity import Similarity
 
 QUARTER = np.array([[0, -2.0, 0, 0], [2, 0, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]])
 """A quarter turn to twice the size: of float32 numbers it makes float32 numbers, without rounding."""
@@ -57,17 +57,17 @@ def choosable(name: str, seed: int = 0) -> Bundle:
     return bundle
 
 
-def general(scale: float, away: float) -> Placement:
+def general(scale: float, away: float) -> Similarity:
     matrix = np.eye(4)
     matrix[:3, :3] = scale * Rotation.random(random_state=3).as_matrix()
     matrix[:3, 3] = away, -away, 2 * away
-    return Placement.of(matrix)
+    return Similarity.from_matrix(matrix)
 
 
 @pytest.mark.parametrize("name", RULES)
 def test_every_rule_chooses_as_before_bit_for_bit(name):
     """Where nothing is rounded. A length or a place that a rule does not declare would show."""
-    bundle, placement, rng = choosable(name), Placement.of(QUARTER), np.random.default_rng(1)
+    bundle, placement, rng = choosable(name), Similarity.from_matrix(QUARTER), np.random.default_rng(1)
     there, shown = placed(bundle, placement), 0
     before, after = Choice(bundle), Choice(there)
     for _ in range(40):
@@ -75,7 +75,7 @@ def test_every_rule_chooses_as_before_bit_for_bit(name):
         values = settings(bundle, any_values(rules()[name], rng))
         weights = before.weights(eye, focal, values)
         shown += np.count_nonzero(weights)
-        np.testing.assert_array_equal(after.weights(placement.points(eye), focal, values), weights)
+        np.testing.assert_array_equal(after.weights(placement.transform_points(eye), focal, values), weights)
     assert 0 < shown < 40 * len(before.splats)
 
 
@@ -90,7 +90,7 @@ def test_every_rule_chooses_as_before_anywhere(name, scale):
         eye, focal = np.float32(rng.normal(0, 4, 3)), rng.uniform(1, 90)
         values = settings(bundle, any_values(rules()[name], rng))
         weights = before.weights(eye, focal, values)
-        same = np.isclose(after.weights(placement.points(eye), focal, values), weights, atol=2e-4)
+        same = np.isclose(after.weights(placement.transform_points(eye), focal, values), weights, atol=2e-4)
         assert np.count_nonzero(~same) <= 1 + len(same) // 200
 
 
@@ -134,7 +134,7 @@ def test_what_a_bundle_says_goes_along():
         "camera_center": [1, 0, 0], "view": [[0, 0, 0], [0, 1, 0]], "up_rotation": np.eye(3),
         "median_depth": 4, "focal_px": 100.0, "costs": [{"level": 1, "distances": [1.5, 2]}], "seed": 3,
     }  # fmt: skip
-    there = placed(bundle, Placement.of(QUARTER))
+    there = placed(bundle, Similarity.from_matrix(QUARTER))
     assert there.meta == {
         "camera_center": [0, 2, 0], "view": [[0, 0, 0], [-2, 0, 0]], "median_depth": 8.0,
         "up_rotation": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], "focal_px": 100.0,
@@ -151,7 +151,7 @@ def test_what_stays_in_a_file_is_placed_as_what_is_in_memory(name, tmp_path):
     write_bundle(tmp_path / "in.ply", bundle)
     head, rows = open_bundle(tmp_path / "in.ply")
     for level in head.levels:
-        level.elsewhere = rows[level.number]
+        level.on_disk = rows[level.number]
     placement = general(1.7, 2.0)
     write_bundle(tmp_path / "out.ply", placed(head, placement))
     wanted, found = placed(bundle, placement), read_bundle(tmp_path / "out.ply")
@@ -179,9 +179,9 @@ def test_a_placed_tree_is_read_by_pages(tmp_path):
 def test_an_unknown_rule_is_refused():
     bundle = Bundle("new", [Level(1, surfaces(5))], "of tomorrow")
     with pytest.raises(LodgsError, match="of tomorrow"):
-        placed(bundle, Placement.of(QUARTER))
+        placed(bundle, Similarity.from_matrix(QUARTER))
     bundle.rule = ""
-    assert len(placed(bundle, Placement.of(QUARTER)).levels[0].splats) == 5
+    assert len(placed(bundle, Similarity.from_matrix(QUARTER)).levels[0].splats) == 5
 
 
 def test_the_command_writes_the_same_form(tmp_path, capsys):
@@ -193,7 +193,7 @@ def test_the_command_writes_the_same_form(tmp_path, capsys):
     plain = bundle.levels[-1].splats
     plain.extras["mine"] = np.arange(len(plain), dtype=np.float32)
     write_ply(tmp_path / "p.ply", plain, ["SplatRenderMode: mip"])
-    placement = Placement.composed((10, 20, 30), 2.0, (-1, 0, 3))
+    placement = Similarity.from_angles((10, 20, 30), 2.0, (-1, 0, 3))
     options = ["--rotate", "10,20,30", "--scale", "2", "--translate=-1,0,3"]
     for name in ("b.ply", "levels", "p.ply"):
         out = tmp_path / f"out_{name}"
@@ -209,7 +209,7 @@ def test_the_command_writes_the_same_form(tmp_path, capsys):
     assert b"lodsplat" not in text and b"property float mine" in text and b"SplatRenderMode: mip" in text
     assert main(["edit", str(tmp_path / "b.ply"), "--out", str(tmp_path / "u.ply"), "--upright"]) == 0
     up = read_bundle(tmp_path / "u.ply")
-    np.testing.assert_allclose(up.upright, np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(up.up_rotation, np.eye(3), atol=1e-6)
     x, y, z = bundle.levels[0].splats.means.T
     np.testing.assert_allclose(up.levels[0].splats.means, np.stack([x, z, -y], axis=1), atol=1e-5)
 

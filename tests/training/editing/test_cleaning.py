@@ -5,16 +5,16 @@ from collections import deque
 import numpy as np
 import pytest
 
-from tests.training.lod.trees import random_leaves, surfaces, tree_of, write_in_pages
+from tests.training.lod.tree.trees import random_leaves, surfaces, tree_of, write_in_pages
 from training.__main__ import main
+from training.editing.cleaning import Cleaning, Family, cleaned, far, floaters, unseen, without
 from training.errors import LodgsError
-from training.lod.choice import Choice, Chooser
-from training.lod.cleaning import Cleaning, Family, cleaned, far, floaters, unseen, without
 from training.lod.crop import Crop, kept
-from training.lod.paging import COLUMNS, Standing, TreeFile, read_within
+from training.lod.partial_read import BLOCKS, read_part, table_of_blocks
+from training.lod.query import Choice, Chooser
 from training.lod.rule import OPACITY, facts_of, rules
 from training.lod.selection import select_levels, settings
-from training.lod.streaming import BLOCKS, read_part, table_of_blocks
+from training.lod.tree.paging import COLUMNS, Standing, TreeFile, read_within
 from training.scenes.cameras import Camera, look_at
 from training.splats.bundle import Bundle, Level, read_bundle, read_folder, write_bundle, write_folder
 from training.splats.gaussians import Splats

@@ -8,19 +8,19 @@ from typing import Any
 import numpy as np
 
 from ..errors import LodgsError
+from ..lod.partial_read import BLOCKS
+from ..lod.rule import Rule, find_rule
+from ..lod.selection import columns_of, unknown_rule
+from ..lod.tree.paging import BOUNDS, table_of_pages
 from ..scenes import views
 from ..scenes.ground import about_cameras, find_ground, level_at_zero
 from ..splats.bundle import META_LENGTHS, NO_SPLATS, Bundle, Level
 from ..splats.gaussians import SplatRows, Splats
-from ..splats.placing import PlacedRows, Placement
-from ..splats.ply import AT_ONCE, Columns
-from .paging import BOUNDS, table_of_pages
-from .rule import Rule, find_rule
-from .selection import columns_of, unknown_rule
-from .streaming import BLOCKS
+from ..splats.ply import BATCH_ROWS, Columns
+from ..splats.similarity import Similarity, TransformedRows
 
 
-def placed(bundle: Bundle, placement: Placement) -> Bundle:
+def placed(bundle: Bundle, placement: Similarity) -> Bundle:
     """A bundle whose splats, and all that it says of places and lengths, stand elsewhere.
 
     Levels that are in files stay there until they are written. Of a rule whose columns are ``related`` these
@@ -35,7 +35,7 @@ def placed(bundle: Bundle, placement: Placement) -> Bundle:
     lengths, places = (rule.lengths, rule.places) if rule else ((), ())
 
     def of(splats: Splats) -> Splats:
-        return placement.splats(splats, lengths, places)
+        return placement.transform_splats(splats, lengths, places)
 
     def facts(known: dict[str, float]) -> dict[str, float]:
         return {n: value * placement.scale if n in lengths else value for n, value in known.items()}
@@ -43,17 +43,17 @@ def placed(bundle: Bundle, placement: Placement) -> Bundle:
     remade = _agreed(bundle, rule, placement) if rule and rule.related else [{} for _ in bundle.levels]
     levels = []
     for level, columns in zip(bundle.levels, remade, strict=True):
-        if level.elsewhere is None:
+        if level.on_disk is None:
             splats = of(level.splats)
             splats.extras |= columns
             levels.append(Level(level.number, splats, facts(level.facts)))
         else:
-            rows = PlacedRows(level.elsewhere, of, columns)
+            rows = TransformedRows(level.on_disk, of, columns)
             levels.append(Level(level.number, NO_SPLATS, facts(level.facts), rows))
     tables = dict(bundle.tables)
     for name in rule.tables if rule else ():
         if name in tables:
-            tables[name] = placement.columns(tables[name], lengths, places)
+            tables[name] = placement.transform_columns(tables[name], lengths, places)
     if views.VIEWS in tables:
         tables[views.VIEWS] = views.placed(tables[views.VIEWS], placement)
     if BOUNDS[0] in tables.get(BLOCKS, {}):
@@ -64,7 +64,7 @@ def placed(bundle: Bundle, placement: Placement) -> Bundle:
 
 def standing(
     bundle: Bundle, upright: bool = False, ground: bool = False, points: np.ndarray | None = None
-) -> Placement:
+) -> Similarity:
     """What stands a bundle's scene upright, z up, and where it is asked for its ground on z = 0.
 
     Args:
@@ -74,8 +74,8 @@ def standing(
     Raises:
         LodgsError: no ground is found.
     """
-    left, _, right = np.linalg.svd(bundle.upright)  # of numbers that have been rounded
-    stands = Placement(left @ right if upright or ground else np.eye(3), 1.0, np.zeros(3))
+    left, _, right = np.linalg.svd(bundle.up_rotation)  # of numbers that have been rounded
+    stands = Similarity(left @ right if upright or ground else np.eye(3), 1.0, np.zeros(3))
     if not ground:
         return stands
     meta, places = bundle.meta, _opaque(bundle.levels[-1].rows) if points is None else points
@@ -83,29 +83,29 @@ def standing(
     if center is not None and isinstance(depth, int | float):
         places = about_cameras(places, np.asarray(center), depth)
     try:
-        plane = find_ground(stands.points(places), np.array([0.0, 0.0, 1.0]))
+        plane = find_ground(stands.transform_points(places), np.array([0.0, 0.0, 1.0]))
     except LodgsError as error:
         raise LodgsError(
             error.what, "Name its photographs' folder with --scene, or place it by --rotate and --translate."
         ) from error
-    return level_at_zero(*plane).after(stands)
+    return level_at_zero(*plane).compose(stands)
 
 
 def _opaque(rows: SplatRows) -> np.ndarray:
     """(P, 3) float32, where splats are that are more opaque than not."""
     found = [np.zeros((0, 3), np.float32)]
-    for begin in range(0, len(rows), AT_ONCE):
-        some = rows.select(slice(begin, begin + AT_ONCE))
+    for begin in range(0, len(rows), BATCH_ROWS):
+        some = rows.select(slice(begin, begin + BATCH_ROWS))
         found.append(some.means[some.opacity_logits > 0])
     return np.concatenate(found)
 
 
-def _meta(meta: dict, placement: Placement) -> dict:
+def _meta(meta: dict, placement: Similarity) -> dict:
     """What a bundle says of places, directions and lengths beside its splats."""
     found = dict(meta) if placement.scale == 1 else _scaled(meta, placement.scale)
     for name in ("camera_center", "view"):
         if name in meta:
-            points = placement.points(np.asarray(meta[name], np.float64).reshape(-1, 3))
+            points = placement.transform_points(np.asarray(meta[name], np.float64).reshape(-1, 3))
             found[name] = points.reshape(np.shape(meta[name])).tolist()
     if "up_rotation" in meta:
         found["up_rotation"] = (np.asarray(meta["up_rotation"]) @ placement.rotation.T).round(9).tolist()
@@ -124,16 +124,16 @@ def _scaled(value: Any, scale: float, length: bool = False) -> Any:
     return value
 
 
-def _agreed(bundle: Bundle, rule: Rule, placement: Placement) -> list[Columns]:
+def _agreed(bundle: Bundle, rule: Rule, placement: Similarity) -> list[Columns]:
     """The rule's columns of each level where they stand then, as they agree with each other."""
     parts, ends = [], []
     for level in bundle.levels:
-        for begin in range(0, max(len(level.rows), 1), AT_ONCE):
-            splats = level.rows.select(slice(begin, begin + AT_ONCE))
+        for begin in range(0, max(len(level.rows), 1), BATCH_ROWS):
+            splats = level.rows.select(slice(begin, begin + BATCH_ROWS))
             parts.append(columns_of(rule, splats) | dict(zip("xyz", splats.means.T.copy(), strict=True)))
         ends.append(len(level.rows))
     before = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    after = placement.columns(before, rule.lengths, (*rule.places, ("x", "y", "z")))
+    after = placement.transform_columns(before, rule.lengths, (*rule.places, ("x", "y", "z")))
     after |= rule.agreed(before, after)
     parts = [np.split(after[name], np.cumsum(ends)[:-1]) for name in rule.columns]
     return [dict(zip(rule.columns, columns, strict=True)) for columns in zip(*parts, strict=True)]

@@ -1,0 +1,1 @@
+"""Trees of splats: their shape, trees in pieces, and trees paged from disk."""
