@@ -39,10 +39,10 @@ from training import __main__, files  # noqa: E402
 from training.errors import LodgsError  # noqa: E402
 from training.optimize.method import Method  # noqa: E402
 from training.optimize.out_of_core import row_file  # noqa: E402
-from training.runs.endings import ending  # noqa: E402
-from training.runs.events import Events  # noqa: E402
+from training.runs.events import EventWriter  # noqa: E402
 from training.runs.folder import RunFolder  # noqa: E402
 from training.runs.job import Job  # noqa: E402
+from training.runs.outcome import run_outcome  # noqa: E402
 from training.scenes.undistort import CACHE  # noqa: E402
 from training.splats.gaussians import Splats  # noqa: E402
 from training.splats.ply import write_ply  # noqa: E402
@@ -86,7 +86,7 @@ def victim(job: Path, kind: str, number: int, share: float, counts_file: Path | 
 
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     os.dup2(1, 2)
-    fsync, replace, train_step, append = os.fsync, os.replace, Method.train_step, Events._append
+    fsync, replace, train_step, append = os.fsync, os.replace, Method.train_step, EventWriter._append
     write = row_file._write
 
     def sync(descriptor: int) -> None:
@@ -121,7 +121,7 @@ def victim(job: Path, kind: str, number: int, share: float, counts_file: Path | 
 
     row_file._write = write_back
     files.os.fsync, files.os.replace = sync, move  # type: ignore[assignment]
-    Method.train_step, Events._append = step, say  # pyright: ignore
+    Method.train_step, EventWriter._append = step, say  # pyright: ignore
     code = __main__.main(["train", str(job)])
     if counts_file is not None:
         counts_file.write_text(json.dumps(counts))
@@ -197,7 +197,7 @@ class Bench:
                 if dead:
                     kinds.remove(kind)
                     found["killed"][kind] += 1
-                    state, said = ending(RunFolder(out), None)
+                    state, said = run_outcome(RunFolder(out), None)
                     if state not in ("interrupted", "done"):
                         found["wrong"].append(f"{method}, {kind}: {state} {said}")
             self._finish(method, job, out, found, found["killed"])
@@ -229,10 +229,10 @@ class Bench:
             with disk(self.work / "disk", size) as place:
                 run, log = RunFolder(place / "run"), place / "run" / "trainer.log"
                 try:
-                    run.make()
+                    run.create()
                     Job.from_file(self.job(method, self.work / "full")).resolved().write(run.job)
                     code = self._train(run)
-                    state, problem = ending(run, code)
+                    state, problem = run_outcome(run, code)
                 except LodgsError as error:
                     state, problem = "failed", str(error)
                 text = log.read_text() if log.exists() else ""

@@ -230,7 +230,7 @@ class Bench:
         blocks = [RunFolder(path) for path in sorted(run.blocks.glob("[0-9]*"))]
 
         def cancel_one(_) -> None:
-            if blocks[1].last("progress") and not blocks[1].last("cancelled"):
+            if blocks[1].last_event("progress") and not blocks[1].last_event("cancelled"):
                 blocks[1].request_cancel()
 
         code, said = self.run(run, on, cancel_one)
@@ -243,7 +243,7 @@ class Bench:
 
         def interrupt(process: subprocess.Popen) -> None:
             if not asked and all(
-                block.last("progress") for block in blocks[: WORKERS if on != "here" else 1]
+                block.last_event("progress") for block in blocks[: WORKERS if on != "here" else 1]
             ):
                 asked.append(os.killpg(process.pid, signal.SIGINT))
 
@@ -274,7 +274,7 @@ def makes_steps(trainer: psutil.Process) -> bool:
     jobs = [
         Path(each) for each in trainer.cmdline() if each.endswith("job.toml")
     ]  # none of one that has ended
-    told = RunFolder(jobs[0].parent).last("hello", "progress") if jobs else None
+    told = RunFolder(jobs[0].parent).last_event("hello", "progress") if jobs else None
     return told is not None and told["event"] == "progress" and trainer.create_time() < told["time"]
 
 

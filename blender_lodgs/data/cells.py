@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import bpy
 import numpy as np
 
-from ...training.runs.blocks.plan import Planned, cells_within, plan, read_planned_scene
+from ...training.runs.blocks.plan import PlannedCell, choose_cells, plan, read_planned_scene
 from ...training.runs.job import Job
 from ...training.scenes.colmap import Scene
 from ...training.scenes.regions import Region
@@ -48,7 +48,7 @@ class CellPlan:
     """
 
     job: Job
-    planned: list[Planned]
+    planned: list[PlannedCell]
     outlines: list[tuple[np.ndarray, np.ndarray]]
     places: list[list[int]]
 
@@ -65,7 +65,7 @@ def plan_cells(job: Job, splats: int = 0, memory: int = 0) -> CellPlan:
     """
     scene = read_planned_scene(job)
     if splats or memory:
-        job = job.in_cells(cells_within(job.in_cells("1x1"), splats, memory, scene))
+        job = job.with_cells(choose_cells(job.with_cells("1x1"), splats, memory, scene))
     planned = plan(job, scene)
     if len(planned) == 1:
         job = replace(job, cells="")

@@ -207,9 +207,9 @@ def test_the_trainer_outlives_blender(bpy, lodgs, fake, tmp_path):
     with _started(tmp_path / "run") as process:
         process.kill()
     run = lodgs("training.runs.folder").RunFolder(tmp_path / "run")
-    step = run.last("progress")["step"]
+    step = run.last_event("progress")["step"]
     time.sleep(0.5)
-    assert run.state() == "running" and run.last("progress")["step"] > step
+    assert run.state() == "running" and run.last_event("progress")["step"] > step
     run.request_cancel()
     end = time.monotonic() + 20
     while run.state() != "cancelled":

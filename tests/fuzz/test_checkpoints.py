@@ -35,7 +35,7 @@ def archive() -> bytes:
 def run(tmp_path_factory):
     """A run with two checkpoints."""
     folder = RunFolder(tmp_path_factory.mktemp("run"))
-    folder.make()
+    folder.create()
     (folder.levels_folder / "level_1.ply").touch()
     for step in (3, 5):
         checkpoints.write_checkpoint(folder, step, LEVELS, STATE)

@@ -41,7 +41,7 @@ def lines(events: list) -> bytes:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = RunFolder(tmp_path_factory.mktemp("run"))
-    folder.make()
+    folder.create()
     return folder
 
 
@@ -56,7 +56,7 @@ def follow(run: RunFolder) -> None:
         assert level["level"] >= 1 and level["splats"] >= 0
         assert (run.path / level["path"]).resolve().is_relative_to(run.path.resolve())
     assert run.state() in {"empty", "running", "done", "cancelled", "failed", "interrupted"}
-    run.last("error", "done")
+    run.last_event("error", "done")
     run.log_tail(1).encode()
 
 

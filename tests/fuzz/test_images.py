@@ -11,7 +11,7 @@ from PIL import Image
 
 from tests.fuzz.doors import attempt
 from tests.fuzz.mutations import spoiled
-from training.render.picture import read_depth
+from training.render.image import read_depth
 from training.scenes.images import MOST_PIXELS, check_image, image_size, load_image
 
 

@@ -15,7 +15,7 @@ from tests.fuzz.doors import attempt
 from tests.fuzz.mutations import ODD_VALUES, spoiled, spoiled_value
 from training.methods import METHODS
 from training.runs.job import Job
-from training.runs.options import add_options, job_from
+from training.runs.options import add_options, job_from_options
 from training.scenes.regions import Region
 
 JOBS = [
@@ -71,7 +71,7 @@ def test_parameters_of_the_command_line(name, value):
     parser = argparse.ArgumentParser()
     add_options(parser)
     chosen = parser.parse_args(["--scene", "s", "--out", "o", "--set", f"{name}={value}"])
-    attempt("--set", lambda: job_from(chosen).resolved(), value)
+    attempt("--set", lambda: job_from_options(chosen).resolved(), value)
 
 
 REGION = {

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from training.__main__ import main
-from training.runs.measure import table
+from training.runs.measure import format_report
 from training.scenes.cameras import Camera, write_camera
 from training.splats.bundle import Bundle, Level, write_bundle
 from training.splats.gaussians import Splats
@@ -124,7 +124,7 @@ def test_the_table_of_evaluate(file_regression):
         "farther": [{"factor": 2, "drawn": 9_000, "drawn_full": 120_000, "psnr": 31.5}],
         "jumps": {"faded": 1.25, "hard": 3.5},
     }
-    file_regression.check(table(report) + "\n", basename="evaluate")
+    file_regression.check(format_report(report) + "\n", basename="evaluate")
 
 
 @pytest.mark.parametrize("name", ["", "flod"])

@@ -1,1 +1,1 @@
-"""A run: its job, its folder, what it says, and the loop that trains it."""
+"""Training runs: jobs, run folders, events, checkpoints and the training loop."""

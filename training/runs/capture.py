@@ -1,4 +1,4 @@
-"""Splats without photographs become a COLMAP scene: their own pictures are the photographs."""
+"""Capture splats that have no photographs: render views of them as a COLMAP scene to train from."""
 
 from __future__ import annotations
 
@@ -11,57 +11,58 @@ import numpy as np
 from PIL import Image
 
 from ..errors import LodgsError
-from ..rasterize import Gaussians, rasterize, why_cpu
+from ..rasterize import Gaussians, rasterize, cpu_fallback_reason
 from ..scenes.cameras import Camera, read_views
 from ..scenes.viewpoints import dome
 from ..scenes.write_colmap import write_seen
-from ..splats.dialects import Warn, silent
+from ..splats.dialects import Warn, ignore
 from ..splats.gaussians import Splats
 from .base import read_base
 from .job import DOME
 
 POINTS = 60_000
-"""About so many points a scene gets, those that only one view sees among them."""
+"""Approximate number of points in a captured scene, including those that only one view sees."""
 
-Tell = Callable[[int, int], object]
-"""Is told before each view which one it is, from 1 on, and of how many."""
+ReportView = Callable[[int, int], object]
+"""Called before each view with its number, from 1, and the number of views."""
 
 
 def capture(
     base: str | Path,
     scene: Path,
-    where: str | Path,
+    source: str | Path,
     views: int,
     width: int,
     *,
     backend: str = "auto",
-    tell: Tell = lambda number, count: None,
-    warn: Warn = silent,
+    report: ReportView = lambda number, count: None,
+    warn: Warn = ignore,
 ) -> tuple[int, int]:
-    """Draws splats as a COLMAP scene to train from.
+    """Render splats as a COLMAP scene to train from.
 
     Args:
-        base: what ``read_base`` reads.
-        scene: a folder that is not there yet.
-        where: DOME, or a folder of camera files.
-        views, width: how many views a dome has, and the pixels that their pictures are wide.
-        tell, warn: as for :func:`write_scene` and ``read_base``.
+        base: splats that ``read_base`` reads.
+        scene: new folder.
+        source: DOME, or a folder of camera files.
+        views, width: number of views of a dome, and their image width in pixels.
+        backend: rasterizer.
+        report, warn: as for :func:`write_scene` and ``read_base``.
 
     Returns:
-        How many views and points the scene has.
+        The number of views and of points in the scene.
 
     Raises:
         LodgsError: the base or the camera files cannot be read, or as :func:`write_scene`.
     """
-    if problem := why_cpu(backend):
+    if problem := cpu_fallback_reason(backend):
         warn(problem)
     splats, antialias = read_base(base, warn)
-    if where == DOME:
+    if source == DOME:
         cameras, near = dome(splats, views, width, round(width * 2 / 3))
     else:
-        cameras, near = read_views(Path(where))
+        cameras, near = read_views(Path(source))
     return len(cameras), write_scene(
-        scene, splats, cameras, near, backend=backend, antialias=antialias, tell=tell
+        scene, splats, cameras, near, backend=backend, antialias=antialias, report=report
     )
 
 
@@ -73,45 +74,47 @@ def write_scene(
     points: int = POINTS,
     backend: str = "auto",
     antialias: bool = False,
-    tell: Tell = lambda number, count: None,
+    report: ReportView = lambda number, count: None,
 ) -> int:
-    """Writes scene/images/*.jpg and scene/sparse/0/*.bin; nothing is left of it when something goes wrong.
+    """Write scene/images/*.jpg and scene/sparse/0/*.bin, or nothing if an error occurs.
 
-    Points are where rays through random pixels meet the splats (median depth), as far as two views agree.
-    One view is in memory at a time; the depths of the others wait on the disk.
+    Points lie where rays through random pixels hit the splats (median depth), if a second view agrees.
+    One view is in memory at a time; depth maps wait on disk.
 
     Args:
-        scene: a folder that is not there yet.
-        cameras: the views, in the splats' world.
-        near: depth at which drawing begins, in world units.
-        points: how many to look for.
-        antialias: how the splats are drawn, see ``Bundle.antialias``.
-        tell: is told before each view which one it is and how many there are.
+        scene: new folder.
+        splats: splats to render.
+        cameras: views, in the splats' world.
+        near: near clipping depth in world units.
+        points: number of rays.
+        backend: rasterizer.
+        antialias: rendering mode of the splats, see ``Bundle.antialias``.
+        report: called before each view with its number and the number of views.
 
     Returns:
-        How many points there are.
+        The number of points.
 
     Raises:
-        LodgsError: the folder exists or cannot be written, or no two views see the same.
+        LodgsError: the folder exists or cannot be written, or no two views see the same surface.
     """
     scene = Path(scene)
     if scene.exists():
-        raise LodgsError(f"{scene} exists already.", "Choose a new folder.")
-    beside = scene.with_name(f".{scene.name}.tmp")
+        raise LodgsError(f"Cannot write scene: {scene} already exists.", "Choose a new folder.")
+    temporary = scene.with_name(f".{scene.name}.tmp")
     try:
-        shutil.rmtree(beside, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
         for folder in ("images", "depths"):
-            (beside / folder).mkdir(parents=True)
-        count = _write(beside, splats, cameras, near, points, backend, antialias, tell)
-        shutil.rmtree(beside / "depths")
-        beside.rename(scene)
+            (temporary / folder).mkdir(parents=True)
+        count = _write(temporary, splats, cameras, near, points, backend, antialias, report)
+        shutil.rmtree(temporary / "depths")
+        temporary.rename(scene)
     except OSError as error:
         raise LodgsError(
-            f"The scene {scene} could not be written: {error.strerror or error}.",
-            "Free some space there or choose another folder.",
+            f"Cannot write scene {scene}: {error.strerror or error}.",
+            "Free some disk space or choose another folder.",
         ) from error
     finally:
-        shutil.rmtree(beside, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
     return count
 
 
@@ -123,26 +126,28 @@ def _write(
     points: int,
     backend: str,
     antialias: bool,
-    tell: Tell,
+    report: ReportView,
 ) -> int:
-    gaussians, rng = Gaussians.of(splats), np.random.default_rng(0)
+    gaussians = Gaussians.of(splats)
+    rng = np.random.default_rng(0)
     views = [replace(camera, name=f"{camera.name}.jpg") for camera in cameras]
-    found, colors = [], []
+    positions = []
+    colors = []
     for number, view in enumerate(views):
-        tell(number + 1, len(views))
-        drawn = rasterize(
+        report(number + 1, len(views))
+        rendering = rasterize(
             gaussians, view, near=near, antialias=antialias, outputs=("median_depth",), backend=backend
         )
-        assert drawn.median_depth is not None  # as asked for
-        picture = (drawn.image.cpu().numpy().clip(0, 1) * 255).round().astype(np.uint8)
-        depth = drawn.median_depth.cpu().numpy()
-        Image.fromarray(picture).save(scene / "images" / view.name, quality=95, subsampling=0)
+        assert rendering.median_depth is not None  # requested in outputs
+        image = (rendering.image.cpu().numpy().clip(0, 1) * 255).round().astype(np.uint8)
+        depth = rendering.median_depth.cpu().numpy()
+        Image.fromarray(image).save(scene / "images" / view.name, quality=95, subsampling=0)
         np.save(scene / "depths" / f"{number}.npy", depth)
         x, y = rng.integers([view.width, view.height], size=(points // len(views) + 1, 2)).T
         x, y = x[depth[y, x] > 0], y[depth[y, x] > 0]
-        found.append(view.unproject(np.column_stack([x, y]) + 0.5, depth[y, x]))
-        colors.append(picture[y, x])
+        positions.append(view.unproject(np.column_stack([x, y]) + 0.5, depth[y, x]))
+        colors.append(image[y, x])
     return write_seen(
         scene, views, lambda number: np.load(scene / "depths" / f"{number}.npy"),
-        np.concatenate(found), np.concatenate(colors),
+        np.concatenate(positions), np.concatenate(colors),
     )  # fmt: skip

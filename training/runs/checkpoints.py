@@ -22,7 +22,7 @@ from .folder import RunFolder
 FORMAT = 1
 """Version of what a checkpoint holds; raised when a method's state means something else than before."""
 
-KEPT = 2
+MAX_CHECKPOINTS = 2
 """How many checkpoints a run has, so that one that the disk has spoilt does not end it."""
 
 
@@ -40,7 +40,7 @@ def write_checkpoint(folder: RunFolder, step: int, levels: list[dict], method: d
     state = {"format": FORMAT, "version": VERSION, "step": step, "levels": levels, "method": method}
     with atomic_write(folder.checkpoints / f"step_{step:07d}.pt") as temporary, open(temporary, "wb") as file:
         _save(state, file)
-    for old in _newest_first(folder)[KEPT:]:
+    for old in _newest_first(folder)[MAX_CHECKPOINTS:]:
         old.unlink(missing_ok=True)
 
 
@@ -72,7 +72,7 @@ def read_newest(
         try:
             state = read_checkpoint(path, device)
             for record in state["levels"]:
-                folder.file(record["path"])
+                folder.find_file(record["path"])
             take(state["method"])
         except OtherVersion:
             raise

@@ -76,7 +76,7 @@ def training_data(
             most = max(abs(np.log(gain)).max() for gain in gains.values())
             tell("status", message=f"Photographs differ in exposure by up to {np.expm1(most):.0%}: evened")
     if job.crop is not None:
-        scene = coarse_outside(scene, job.crop, int(OUTSIDE * parameters.max_splats))
+        scene = thin_outside_region(scene, job.crop, int(OUTSIDE * parameters.max_splats))
     warnings += [warning for warning in scene.warnings if warning not in warnings]
     for warning in warnings:
         if tell:
@@ -96,7 +96,7 @@ def training_data(
     )  # fmt: skip
 
 
-def coarse_outside(scene: Scene, region: Crop, most: int) -> Scene:
+def thin_outside_region(scene: Scene, region: Crop, most: int) -> Scene:
     """The scene with at most so many of its points outside of a region, even in space.
 
     Raises:

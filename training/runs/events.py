@@ -21,12 +21,12 @@ import numpy as np
 
 from ..errors import LodgsError
 from ..files import open_regular
-from ..splats.bundle import META_SHAPES, MOST_LEVELS
+from ..splats.bundle import MAX_LEVELS, META_SHAPES
 
 PROTOCOL = 1
 """Version of the events; raised when a reader of older ones would misunderstand."""
 
-MOST_BYTES, MOST_LINE, MOST_EVENTS = 1 << 26, 1 << 18, 300_000
+MAX_BYTES, MAX_LINE, MAX_EVENTS = 1 << 26, 1 << 18, 300_000
 """Bounds of the file, of a line in it and of the number of events: a month of training keeps within them."""
 
 BLOCK_KINDS = ("coarse", "block", "seam")
@@ -61,11 +61,11 @@ def read_events(path: Path, since: int = 0) -> tuple[list[dict], int]:
     with file:
         size = os.fstat(file.fileno()).st_size
         offset = file.seek(since if 0 <= since <= size else 0)
-        while line := file.readline(MOST_LINE):
-            if line[-1:] != b"\n" and len(line) < MOST_LINE:
+        while line := file.readline(MAX_LINE):
+            if line[-1:] != b"\n" and len(line) < MAX_LINE:
                 break
             offset += len(line)
-            if offset > MOST_BYTES or len(events) == MOST_EVENTS:
+            if offset > MAX_BYTES or len(events) == MAX_EVENTS:
                 raise LodgsError(f"{path} is too long to be a run's events.", "Choose another run folder.")
             said = _object(line)
             if said is None:
@@ -118,7 +118,7 @@ def _is_count(value: object) -> bool:
 
 
 def _is_level(value: object) -> bool:
-    return type(value) is int and 1 <= value <= MOST_LEVELS
+    return type(value) is int and 1 <= value <= MAX_LEVELS
 
 
 def _is_bool(value: object) -> bool:
@@ -236,7 +236,7 @@ def _finite(value):
     return value
 
 
-class Events:
+class EventWriter:
     """Speaks the protocol: one JSON object a line, to a run's events and to a stream.
 
     Args:
@@ -270,7 +270,7 @@ class Events:
                 self._stream = None
         self._append(b"\n" * self._torn + line.encode() + b"\n")
 
-    def last(self, kind: str, **values) -> None:
+    def write_final(self, kind: str, **values) -> None:
         """Writes the event that ends a run, in the room that was kept for it; if that fails, nobody hears."""
         with suppress(OSError):
             self._reserve.unlink(missing_ok=True)

@@ -60,22 +60,22 @@ class RunFolder:
         self.blocks = self.path / "blocks"
         self.coarse = self.blocks / "coarse"
         self.seams = self.blocks / "seams"
-        self.whole = self.blocks / "whole.ply"
+        self.merged = self.blocks / "whole.ply"
         self.reserve = self.path / "reserve"
         self._lock = self.path / "lock"
         self._cancel = self.path / "cancel"
         self._resume = self.path / "resume"
         self._held: IO[bytes] | None = None
 
-    def make(self) -> None:
+    def create(self) -> None:
         """Makes the folder and those inside it, to write there.
 
         Raises:
-            LodgsError: if it cannot be written, or as ``require_own_files``.
+            LodgsError: if it cannot be written, or as ``reject_links``.
         """
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            self.require_own_files()
+            self.reject_links()
             for folder in (self.checkpoints, self.levels_folder):
                 folder.mkdir(exist_ok=True)
         except OSError as error:
@@ -84,7 +84,7 @@ class RunFolder:
                 "Choose a folder that you may write to.",
             ) from error
 
-    def require_own_files(self) -> None:
+    def reject_links(self) -> None:
         """Makes sure that what is written here is written here: whoever sends a run may have put links in it.
 
         Raises:
@@ -106,7 +106,7 @@ class RunFolder:
                 )
 
     @property
-    def begun(self) -> bool:
+    def started(self) -> bool:
         """Whether a trainer has been at work here."""
         return self.events_file.exists() or any(self.checkpoints.glob("step_*.pt"))
 
@@ -123,7 +123,7 @@ class RunFolder:
         """
         return read_events(self.events_file, since)
 
-    def file(self, path: str) -> Path:
+    def find_file(self, path: str) -> Path:
         """A file of the run by the path that an event or a checkpoint gives, relative to the run.
 
         Raises:
@@ -134,13 +134,13 @@ class RunFolder:
             raise LodgsError(f"The run {self.path} holds no file {path}.", "Resume it, or train it anew.")
         return place
 
-    def last(self, *kinds: str) -> dict | None:
+    def last_event(self, *kinds: str) -> dict | None:
         """The newest event of one of these kinds, or None."""
         return next((e for e in reversed(self.events()[0]) if e["event"] in kinds), None)
 
     def end_event(self) -> dict | None:
         """The event that tells how the run stands where no trainer is at work; None before the first one."""
-        return self.last("hello", "error", "cancelled", "done")
+        return self.last_event("hello", "error", "cancelled", "done")
 
     def levels(self) -> list[dict]:
         """The newest ``level`` event of each level, coarse to fine."""
@@ -205,7 +205,7 @@ class RunFolder:
         """Whether that was asked since the last call."""
         return _take(self._resume)
 
-    def end(self) -> None:
+    def kill(self) -> None:
         """Ends the trainer that is at work here by force, if it is a process of this computer.
 
         Raises:
@@ -213,7 +213,7 @@ class RunFolder:
         """
         holder = self._holder() if self.running else {}
         pid, identity = holder.get("pid"), holder.get("identity")
-        if type(pid) is not int or not isinstance(identity, str) or not processes.end(pid, identity):
+        if type(pid) is not int or not isinstance(identity, str) or not processes.kill(pid, identity):
             raise LodgsError(
                 f"The trainer in {self.path} cannot be ended from here: it is not known as a process of this "
                 "computer.",
@@ -221,7 +221,7 @@ class RunFolder:
             )
 
     @contextmanager
-    def hold(self) -> Iterator[None]:
+    def locked(self) -> Iterator[None]:
         """For the trainer: holds the run's lock, and removes what killed trainers left half-done.
 
         Raises:
@@ -247,13 +247,13 @@ class RunFolder:
             finally:
                 self._held = None
 
-    def require_held(self) -> None:
+    def require_lock(self) -> None:
         """For the trainer: makes sure that the folder is still where it was, and its own.
 
         Raises:
             LodgsError: it was moved or deleted, or its lock was.
         """
-        assert self._held is not None, "only within hold()"
+        assert self._held is not None, "only within locked()"
         with suppress(OSError):
             if os.path.samestat(os.stat(self._lock), os.fstat(self._held.fileno())):
                 return

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 
-from ..documents import read_json, read_toml, quote
+from ..documents import quote, read_json, read_toml
 from ..errors import LodgsError
 from ..files import atomic_write
 from ..lod.crop import Crop, is_text_of_crop
@@ -18,17 +18,17 @@ from .folder import RunFolder
 BACKENDS = ("auto", "cpu", "cuda", "gpu", "reference")
 CHANGEABLE = ("backend", "out", "photo_memory", "splat_memory")
 """The keys that a run may go on with other values of: they say where it is trained, not what."""
-MOST_STOPS = 32
+MAX_STOPS = 32
 """Most stops that a job lightens or darkens linear images by."""
 DOME = "dome"
 """What ``capture`` is for views from all around."""
 VIEWS, VIEW_WIDTHS = (2, 2000), (32, 8192)
 """Bounds of how many views a dome has, and of the pixels that their pictures are wide."""
-POLISH = 300
+POLISH_STEPS = 300
 """Steps that fit a cell's borders to the cells beside it, if nothing is said."""
-MOST_CELLS = 256
+MAX_CELLS = 256
 """Most cells of a scene."""
-MOST_PATH = 2000
+MAX_PATH = 2000
 """Most characters of a path, so that a job with all of its paths is within the bounds of a TOML file."""
 _KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
     "str": (str, "a text; give it in quotation marks"),
@@ -96,7 +96,7 @@ class Job:
     images: str = ""
     region: str = ""
     cells: str = ""
-    polish: int = POLISH
+    polish: int = POLISH_STEPS
     parameters: dict = field(default_factory=dict)
 
     @classmethod
@@ -122,7 +122,7 @@ class Job:
             retired = METHODS[method].retired
             values["parameters"] = {k: value for k, value in parameters.items() if k not in retired}
         run = RunFolder(path.parent)
-        if path == run.job and run.begun:
+        if path == run.job and run.started:
             values["out"] = "."
         return cls.from_dict(values, folder=path.parent)
 
@@ -167,10 +167,10 @@ class Job:
             raise LodgsError(
                 f"image_scale = {self.image_scale!r} is not possible.", "Give a number above 0, at most 1."
             )
-        if not abs(self.exposure) <= MOST_STOPS:
+        if not abs(self.exposure) <= MAX_STOPS:
             raise LodgsError(
                 f"exposure = {self.exposure!r} is not possible.",
-                f"Give stops from {-MOST_STOPS} to {MOST_STOPS}.",
+                f"Give stops from {-MAX_STOPS} to {MAX_STOPS}.",
             )
         for key, what in (("photo_memory", "megabytes"), ("splat_memory", "megabytes"), ("polish", "steps")):
             if not 0 <= getattr(self, key) < 2**31:
@@ -213,10 +213,10 @@ class Job:
 
     def _check_cells(self) -> None:
         columns, rows = self.grid
-        if not 0 < columns * rows <= MOST_CELLS:
+        if not 0 < columns * rows <= MAX_CELLS:
             raise LodgsError(
                 f"cells = {self.cells!r} is not possible.",
-                f"Say columns and rows, such as 2x4, {MOST_CELLS} cells at most.",
+                f"Say columns and rows, such as 2x4, {MAX_CELLS} cells at most.",
             )
         for key in ("base", "capture", "region"):
             if getattr(self, key):
@@ -227,7 +227,7 @@ class Job:
                 "Choose another method, or leave out 'cells'.",
             )
 
-    def in_cells(self, cells: str) -> Job:
+    def with_cells(self, cells: str) -> Job:
         """The same job in cells.
 
         Raises:
@@ -287,7 +287,7 @@ class Job:
             Path(temporary).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def keep_job(job: Job, folder: RunFolder) -> None:
+def save_job(job: Job, folder: RunFolder) -> None:
     """Writes a resolved job into its run, which keeps to the one that it began with, but for CHANGEABLE.
 
     Raises:
@@ -323,8 +323,8 @@ def _path(key: str, value: object, folder: Path) -> str:
         path = str((folder / value).expanduser().resolve())
     except (OSError, ValueError, RuntimeError) as error:  # a NUL, an unknown ~name, links in a circle
         raise LodgsError(f"{key} = {quote(value)} is not a path: {error}.", "Correct it.") from error
-    if len(path) > MOST_PATH:
-        raise LodgsError(f"{key} is a path of {len(path)} characters.", f"Give at most {MOST_PATH}.")
+    if len(path) > MAX_PATH:
+        raise LodgsError(f"{key} is a path of {len(path)} characters.", f"Give at most {MAX_PATH}.")
     return path
 
 

@@ -8,7 +8,7 @@ from collections.abc import Collection
 from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 
-from ..documents import json_object
+from ..documents import parse_json
 from ..errors import LodgsError, printable
 from ..methods import METHODS, PRESETS
 from .job import BACKENDS, Job
@@ -23,7 +23,7 @@ def _whole(text: str) -> int:
     raise argparse.ArgumentTypeError(f"{text} is no whole number from 0 to {2**31 - 1}")
 
 
-def size_of(text: str) -> tuple[int, int]:
+def parse_size(text: str) -> tuple[int, int]:
     """Width and height of an option such as 640x480."""
     width, _, height = text.lower().partition("x")
     if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
@@ -100,7 +100,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def job_from(chosen: argparse.Namespace) -> Job:
+def job_from_options(chosen: argparse.Namespace) -> Job:
     """The job that the options of :func:`add_options` ask for, checked; paths are relative to here.
 
     Raises:
@@ -121,7 +121,7 @@ def job_from(chosen: argparse.Namespace) -> Job:
 
 
 def options_of(job: Job, but: Collection[str] = ()) -> list[str]:
-    """The options that :func:`job_from` makes a job of: what it says otherwise than its defaults.
+    """The options that :func:`job_from_options` makes a job of: what it says otherwise than its defaults.
 
     Args:
         but: keys that are left out.
@@ -138,7 +138,7 @@ def options_of(job: Job, but: Collection[str] = ()) -> list[str]:
     return told
 
 
-def amounts(given: list[str]) -> dict[str, float] | None:
+def parse_resources(given: list[str]) -> dict[str, float] | None:
     """What ``NAME=NUMBER`` texts say, by name; None where there are none.
 
     Raises:
@@ -159,7 +159,7 @@ def _assignment(text: str) -> tuple[str, object]:
     if value.isidentifier() and value not in ("true", "false", "null"):
         return name.strip(), value
     try:
-        return name.strip(), json_object(f'{{"value": {value}}}', "--set")["value"]
+        return name.strip(), parse_json(f'{{"value": {value}}}', "--set")["value"]
     except (LodgsError, KeyError):
         raise LodgsError(
             f"--set {printable(text[:200])} is not NAME=VALUE.", "For example: --set max_splats=50000"

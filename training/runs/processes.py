@@ -26,7 +26,7 @@ def identity(pid: int) -> str:
     return f"{platform.node()} {pid} {started}" if started else ""
 
 
-def end(pid: int, known: str) -> bool:
+def kill(pid: int, known: str) -> bool:
     """Ends a process by force if it is the one that ``identity`` described; whether it was."""
     if not known or identity(pid) != known or pid == os.getpid():
         return False

@@ -13,7 +13,7 @@ from training.optimize.method_info import PRESETS
 from training.runs import train as training_loop
 from training.runs.blocks.plan import read_plan
 from training.runs.folder import RunFolder
-from training.runs.job import POLISH, Job
+from training.runs.job import POLISH_STEPS, Job
 from training.splats.bundle import read_bundle
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -88,7 +88,7 @@ def test_it_offers_what_there_is(tmp_path):
     settings = {each["key"]: each for each in compiled(tmp_path)["type"]["settings"]}
     assert set(settings["method"]["choices"]) == {name for name, info in METHODS.items() if info.in_cells}
     assert settings["preset"]["choices"] == list(PRESETS)
-    assert settings["polish"]["default"] == POLISH
+    assert settings["polish"]["default"] == POLISH_STEPS
     for each in settings.values():
         assert each["type"] in ("string", "int32", "float", "bool") and each["description"]
 

@@ -190,7 +190,7 @@ def test_a_run_is_antialiased_where_its_base_is(tiny, tiny_scene, tmp_path, anti
     bundle = read_bundle(folder.bundle)
     assert bundle.antialias is antialias and bundle.meta.get("antialias", False) is antialias
     level = next(event for event in events if event["event"] == "level")
-    assert read_bundle(folder.file(level["path"])).antialias is antialias
+    assert read_bundle(folder.find_file(level["path"])).antialias is antialias
     near, splats = read_scene(tiny_scene).near(), Gaussians.of(bundle.levels[0].splats)
     rows = evaluate_run(folder.path)["levels"], [level]
     for flag in (antialias, not antialias):
@@ -229,7 +229,7 @@ def test_a_base_is_the_finest_complete_level_of_a_run_a_bundle_or_a_ply(tmp_path
     run = RunFolder(tmp_path / "run")
     with pytest.raises(LodgsError, match="There is no"):
         read_base(run.path)
-    run.make()
+    run.create()
     with pytest.raises(LodgsError, match=r"no finished run.*to the end"):
         read_base(run.path)
     levels = [Level(1, coarse), Level(2, fine)]

@@ -9,7 +9,7 @@ from training.runs import base
 from training.runs.base import read_base
 from training.splats import bundle as bundles
 from training.splats.bundle import Bundle, Level, read_bundle, write_bundle, write_folder
-from training.splats.dialects import comments_of
+from training.splats.dialects import comments_from_meta
 from training.splats.gaussians import Splats
 from training.splats.ply import write_ply
 
@@ -37,7 +37,7 @@ def test_an_exported_folder_is_as_good_as_its_bundle(tmp_path, cumulative):
 def test_a_base_says_whether_it_is_antialiased(tmp_path):
     for meta in ({}, {"antialias": True}):
         write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, splats(3))], meta=meta))
-        write_ply(tmp_path / "p.ply", splats(3), comments_of(meta))
+        write_ply(tmp_path / "p.ply", splats(3), comments_from_meta(meta))
         assert [read_base(tmp_path / name)[1] for name in ("b.ply", "p.ply")] == [bool(meta)] * 2
 
 
@@ -48,7 +48,7 @@ def test_a_folder_of_something_else_is_no_base(tmp_path):
 
 @pytest.mark.parametrize("kind", ["plain", "finest_first", "stream", "cumulative", "smoothed"])
 def test_splats_that_stay_in_their_file_are_those_that_are_read(tmp_path, monkeypatch, kind):
-    monkeypatch.setattr(bundles, "AT_ONCE", 7)
+    monkeypatch.setattr(bundles, "BATCH_ROWS", 7)
     path, told, finest = tmp_path / "b.ply", [], splats(50)
     finest.means[20] = np.nan
     finest.extras["size"] = np.arange(50, dtype=np.float32)

@@ -197,7 +197,7 @@ def test_a_capture_that_is_cancelled_leaves_nothing_and_goes_on_where_the_run_li
     ball, tmp_path, capsys, monkeypatch
 ):
     run = RunFolder(tmp_path / "run")
-    run.make()
+    run.create()
     write_ply(run.base, ball)
     words = [
         "--base",

@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from training.runs.checkpoints import read_checkpoint, read_newest, write_checkpoint
-from training.runs.failures import in_words
+from training.runs.failures import describe_error
 from training.runs.folder import RunFolder
 
 
 @pytest.fixture
 def run(tmp_path) -> RunFolder:
     run = RunFolder(tmp_path)
-    run.make()
+    run.create()
     generator = torch.Generator().manual_seed(1)
     for step in (1, 2):
         write_checkpoint(run, step, [], {"means": torch.rand(200, 3, generator=generator), "step": step})
@@ -75,7 +75,7 @@ def test_a_full_disk_is_said_to_be_full(run, monkeypatch):
     monkeypatch.setattr(checkpoints, "_Remembering", Full)
     with pytest.raises(Exception, match="No space left on device") as error:
         write_checkpoint(run, 3, [], {"means": torch.zeros(5000, 3)})
-    assert "Free some space" in in_words(error.value)[1]
+    assert "Free some space" in describe_error(error.value)[1]
     assert [path.name for path in sorted(run.checkpoints.iterdir())] == ["step_0000001.pt", "step_0000002.pt"]
 
 
@@ -91,7 +91,7 @@ def test_a_full_disk_is_said_to_be_full(run, monkeypatch):
     ],
 )  # fmt: skip
 def test_what_a_computer_lacks_is_a_sentence(error, says):
-    what, remedy, code = in_words(error)
+    what, remedy, code = describe_error(error)
     assert says in what and remedy and code == 2
 
 

@@ -7,7 +7,7 @@ import os
 import pytest
 
 from training.errors import LodgsError
-from training.runs.events import MOST_BYTES, MOST_LINE, Events, event_line, read_events
+from training.runs.events import MAX_BYTES, MAX_LINE, EventWriter, event_line, read_events
 
 LEVEL = {
     "event": "level", "level": 1, "path": "levels/level_1.ply", "splats": 5, "facts": {"s_min": 0.1},
@@ -85,7 +85,7 @@ def test_progress_has_numbers(tmp_path, name, value):
 
 def test_lines_that_are_no_events_are_passed_over(tmp_path):
     deep = '{"event": "done", "x": ' + "[" * 100_000 + "]" * 100_000 + "}"
-    long = '{"event": "warning", "message": "' + "x" * MOST_LINE + '"}'
+    long = '{"event": "warning", "message": "' + "x" * MAX_LINE + '"}'
     odd = [
         "not json",
         "[1]",
@@ -104,7 +104,7 @@ def test_lines_that_are_no_events_are_passed_over(tmp_path):
 def test_a_file_that_is_too_long_is_a_sentence(tmp_path):
     path = tmp_path / "events.jsonl"
     with path.open("wb") as file:
-        file.truncate(MOST_BYTES + MOST_LINE)
+        file.truncate(MAX_BYTES + MAX_LINE)
     with pytest.raises(LodgsError, match="too long to be a run's events"):
         read_events(path)
 
@@ -131,9 +131,9 @@ def test_every_line_is_json_that_other_programs_read(tmp_path):
 def test_after_a_torn_line_a_new_one_begins(tmp_path):
     path = tmp_path / "events.jsonl"
     path.write_text('{"event": "pro')
-    events = Events(path, tmp_path / "reserve", None)
+    events = EventWriter(path, tmp_path / "reserve", None)
     events("status", message="Reading the scene")
-    events.last("cancelled")
+    events.write_final("cancelled")
     events.close()
     assert [event["event"] for event in read_events(path)[0]] == ["status", "cancelled"]
     assert os.listdir(tmp_path) == ["events.jsonl"]

@@ -18,14 +18,14 @@ from training.runs.folder import RunFolder
 ROOT = Path(__file__).resolve().parents[3]
 HOLDS = (
     "import sys, time; from training.runs.folder import RunFolder\n"
-    "with RunFolder(sys.argv[1]).hold(): print('held', flush=True); time.sleep(600)"
+    "with RunFolder(sys.argv[1]).locked(): print('held', flush=True); time.sleep(600)"
 )
 
 
 @pytest.fixture
 def run(tmp_path) -> RunFolder:
     run = RunFolder(tmp_path / "run")
-    run.make()
+    run.create()
     return run
 
 
@@ -54,7 +54,7 @@ def test_links_in_a_run_are_refused(run, tmp_path, name):
         place.rmdir()
     place.symlink_to(tmp_path / "elsewhere")
     with pytest.raises(LodgsError, match="is a link or a special file"):
-        run.make()
+        run.create()
     assert not (tmp_path / "elsewhere").exists()
 
 
@@ -62,10 +62,10 @@ def test_files_of_a_run_lie_in_it(run, tmp_path):
     (run.path / "levels" / "level_1.ply").write_text("here")
     (tmp_path / "secret").write_text("there")
     (run.path / "levels" / "level_2.ply").symlink_to(tmp_path / "secret")
-    assert run.file("levels/level_1.ply").read_text() == "here"
+    assert run.find_file("levels/level_1.ply").read_text() == "here"
     for path in ("levels/level_2.ply", "levels", "levels/level_3.ply", "../secret"):
         with pytest.raises(LodgsError, match="holds no file"):
-            run.file(path)
+            run.find_file(path)
 
 
 def test_what_killed_trainers_left_goes_and_nothing_else(run):
@@ -74,34 +74,34 @@ def test_what_killed_trainers_left_goes_and_nothing_else(run):
     for path in left + kept:
         path.write_text("")
     (run.undistorted / "undistorting-x" / "images").mkdir(parents=True)
-    with run.hold():
+    with run.locked():
         assert not any(path.exists() for path in left) and all(path.exists() for path in kept)
         assert not any(run.undistorted.iterdir())
 
 
 def test_a_cancel_that_was_meant_for_another_trainer_is_forgotten(run):
     run.request_cancel()
-    with run.hold():
+    with run.locked():
         assert run.take_cancel() and not run.take_cancel()
     run.request_cancel()
     long_ago = time.time() - 3600
     os.utime(run.path / "cancel", (long_ago, long_ago))
-    with run.hold():
+    with run.locked():
         assert not run.take_cancel()
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows does not delete what is open")
 def test_who_has_lost_the_lock_notices(run):
-    with run.hold():
-        run.require_held()
+    with run.locked():
+        run.require_lock()
         os.unlink(run.path / "lock")
-        with RunFolder(run.path).hold(), pytest.raises(LodgsError, match="or its lock was"):
-            run.require_held()
+        with RunFolder(run.path).locked(), pytest.raises(LodgsError, match="or its lock was"):
+            run.require_lock()
 
 
 def test_a_trainer_is_ended_by_force(run, holder):
     assert run.running
-    run.end()
+    run.kill()
     holder.wait(20)
     assert not run.running
 
@@ -118,7 +118,7 @@ def test_no_other_process_is_ended_whatever_the_file_says(run, holder, change, m
     lock.write_text(json.dumps(json.loads(lock.read_text()) | change))
     monkeypatch.setattr(os, "kill", lambda *_: pytest.fail("it was"))
     with pytest.raises(LodgsError, match="cannot be ended from here"):
-        run.end()
+        run.kill()
     assert holder.poll() is None
 
 
@@ -127,7 +127,7 @@ def test_no_process_is_ended_where_none_is_at_work(run, monkeypatch):
     (run.path / "lock").write_text(json.dumps(holder))
     monkeypatch.setattr(os, "kill", lambda *_: pytest.fail("it was"))
     with pytest.raises(LodgsError, match="cannot be ended from here"):
-        run.end()
+        run.kill()
 
 
 def test_processes_are_told_apart(monkeypatch):
@@ -158,8 +158,8 @@ def test_where_locks_are_writes_a_run_that_has_ended_is_not_running(tmp_path, mo
             raise OSError(errno.EBADF, "Bad file descriptor")
         real(file, how)
 
-    run.make()
+    run.create()
     monkeypatch.setattr(fcntl, "flock", flock)
-    with run.hold():
+    with run.locked():
         assert run.running
     assert not run.running

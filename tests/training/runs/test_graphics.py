@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from training.rasterize import trial
-from training.rasterize.gpu import choice
+from training.rasterize import self_test
+from training.rasterize.gpu import default_device
 from training.runs import train as training_loop
 from training.runs.folder import RunFolder
 from training.runs.job import Job
@@ -88,7 +88,7 @@ def test_a_lost_device_or_no_memory_is_a_sentence_and_the_run_goes_on(
 
     def lose(self, step):
         if step == 8:
-            device = choice.open_chosen()._device
+            device = default_device.open_default_device()._device
 
             def fail(**_):
                 raise error
@@ -108,7 +108,7 @@ def test_a_lost_device_or_no_memory_is_a_sentence_and_the_run_goes_on(
 
 
 def test_a_device_that_draws_otherwise_is_a_warning_and_the_processor_trains(graphics, keys, monkeypatch):
-    monkeypatch.setattr(trial, "difference", lambda adapter: "its pictures are 3% off")
+    monkeypatch.setattr(self_test, "failure", lambda adapter: "its pictures are 3% off")
     keys["parameters"]["steps"] = [1, 1, 1]
     code, events = run_in_process(keys)
     assert code == 0

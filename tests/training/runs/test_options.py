@@ -8,13 +8,13 @@ import pytest
 from training.__main__ import main
 from training.errors import LodgsError
 from training.runs.job import Job
-from training.runs.options import add_options, job_from, options_of
+from training.runs.options import add_options, job_from_options, options_of
 
 
 def job(*words) -> Job:
     parser = argparse.ArgumentParser()
     add_options(parser)
-    return job_from(parser.parse_args([str(word) for word in words]))
+    return job_from_options(parser.parse_args([str(word) for word in words]))
 
 
 def test_every_key_of_a_job_has_an_option(capsys):

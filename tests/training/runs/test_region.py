@@ -9,7 +9,7 @@ import pytest
 
 from training.errors import LodgsError
 from training.lod.crop import Crop
-from training.runs.data import coarse_outside, training_data
+from training.runs.data import thin_outside_region, training_data
 from training.runs.failures import BAD_INPUT
 from training.runs.folder import RunFolder
 from training.runs.job import Job
@@ -65,15 +65,15 @@ def test_points_outside_are_few_and_even(tiny_scene):
     scene, region = read_scene(tiny_scene), Crop.from_text(HALF)
     inside = region.holds(scene.points)
     assert 10 < inside.sum() < 40
-    found = coarse_outside(scene, region, 8)
+    found = thin_outside_region(scene, region, 8)
     kept = region.holds(found.points)
     np.testing.assert_array_equal(found.points[kept], scene.points[inside])
     np.testing.assert_array_equal(found.point_ids[kept], scene.point_ids[inside])
     assert 4 <= (~kept).sum() <= 8
-    everything = coarse_outside(scene, region, 60)
+    everything = thin_outside_region(scene, region, 60)
     np.testing.assert_array_equal(everything.points, scene.points)
     with pytest.raises(LodgsError, match="none of the scene's points"):
-        coarse_outside(scene, Crop.sphere((500, 0, 0), 1), 8)
+        thin_outside_region(scene, Crop.sphere((500, 0, 0), 1), 8)
 
 
 def test_in_a_run(tiny_scene, tmp_path, capsys):

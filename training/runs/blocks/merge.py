@@ -13,11 +13,11 @@ import numpy as np
 
 from ...errors import LodgsError
 from ...scenes.regions import Region
-from ...splats.bundle import NO_SPLATS, Bundle, Level, Rows, open_bundle, write_bundle
-from ...splats.dialects import comments_of, drawable
+from ...splats.bundle import NO_SPLATS, Bundle, FileRows, Level, open_bundle, write_bundle
+from ...splats.dialects import comments_from_meta, drop_undrawable
 from ...splats.gaussians import Splats
-from ...splats.ply import AT_ONCE, write_ply
-from ...splats.scratch import Scratch
+from ...splats.ply import BATCH_ROWS, write_ply
+from ...splats.scratch import ScratchFile
 from ..folder import RunFolder
 from .plan import Block, Division
 
@@ -46,11 +46,11 @@ def merge(division: Division, path: Path) -> list[tuple[int, int]]:
     seams = {seam.number: seam for seam in division.seams}
     kept = []
     with ExitStack() as stack:
-        levels = {number: stack.enter_context(Scratch(path.parent)) for number in sorted(facts)}
+        levels = {number: stack.enter_context(ScratchFile(path.parent)) for number in sorted(facts)}
         for block, (head, rows) in zip(division.blocks, opened, strict=True):
             assert block.region is not None
             fitted = _Fitted(seams[block.number]) if block.number in seams else None
-            detail = {level.number for level in head.upto(max(rows))}
+            detail = {level.number for level in head.drawn_levels(max(rows))}
             before = sum(map(len, levels.values()))
             for number in sorted(rows):
                 for splats in _cropped(rows[number], block.region):
@@ -63,7 +63,7 @@ def merge(division: Division, path: Path) -> list[tuple[int, int]]:
             head, rows = found = open_bundle(division.coarse.folder.bundle)
             _check_alike(division.coarse, found, first)
             coarser = [level for level in head.levels if level.number not in facts]
-            made = [replace(level, elsewhere=rows[level.number]) for level in coarser] + made
+            made = [replace(level, on_disk=rows[level.number]) for level in coarser] + made
         write_bundle(path, replace(first, levels=made))
     return kept
 
@@ -81,7 +81,7 @@ def write_surroundings(division: Division, seam: Block) -> None:
     if path.exists():
         return
     assert seam.region is not None
-    with Scratch(path.parent) as found:
+    with ScratchFile(path.parent) as found:
         meta = {}
         for block in division.blocks:
             assert block.region is not None
@@ -89,14 +89,14 @@ def write_surroundings(division: Division, seam: Block) -> None:
                 continue
             head, rows = open_bundle(block.folder.bundle)
             meta |= head.meta
-            for level in head.upto(max(rows)):
+            for level in head.drawn_levels(max(rows)):
                 for splats in _pieces(rows[level.number]):
                     around = seam.region.surrounds(splats.means)
                     chosen = around & block.region.contains(splats.means)
                     if block.number == seam.number:
                         chosen |= ~around
                     found.append(replace(splats.select(chosen), extras={}))
-        write_ply(path, found, comments_of(meta))
+        write_ply(path, found, comments_from_meta(meta))
 
 
 class _Fitted:
@@ -124,17 +124,17 @@ class _Fitted:
         return replace(splats, opacity_logits=opacity_logits, sh=sh)
 
 
-def _cropped(rows: Rows, region: Region) -> Iterator[Splats]:
+def _cropped(rows: FileRows, region: Region) -> Iterator[Splats]:
     for splats in _pieces(rows):
         yield splats.select(region.contains(splats.means))
 
 
-def _pieces(rows: Rows) -> Iterator[Splats]:
-    for begin in range(0, len(rows), AT_ONCE):
-        yield drawable(rows.select(slice(begin, begin + AT_ONCE)), rows.path)
+def _pieces(rows: FileRows) -> Iterator[Splats]:
+    for begin in range(0, len(rows), BATCH_ROWS):
+        yield drop_undrawable(rows.select(slice(begin, begin + BATCH_ROWS)), rows.path)
 
 
-def _check_alike(block: Block, found: tuple[Bundle, Mapping[int, Rows]], first: Bundle) -> None:
+def _check_alike(block: Block, found: tuple[Bundle, Mapping[int, FileRows]], first: Bundle) -> None:
     head, rows = found
     if not rows or (head.method, head.rule, head.facts) != (first.method, first.rule, first.facts):
         raise LodgsError(

@@ -27,7 +27,7 @@ from ...optimize.parameters import Parameters
 from ...scenes.colmap import Scene, read_scene
 from ...scenes.regions import Region, plan_cells
 from ..folder import RunFolder
-from ..job import MOST_CELLS, Job
+from ..job import MAX_CELLS, Job
 
 REGION = "region.json"
 COARSE, BLOCK, SEAM = "coarse", "block", "seam"
@@ -98,7 +98,7 @@ class Division:
         """What can be trained side by side, in order."""
         return [[self.coarse] if self.coarse else [], self.blocks, self.seams]
 
-    def named(self, name: str) -> Block | None:
+    def part(self, name: str) -> Block | None:
         """The part ``coarse``, ``block-3`` or ``seam-3``; None where this division needs no such part.
 
         Raises:
@@ -117,7 +117,7 @@ class Division:
 
 
 @dataclass(frozen=True)
-class Planned:
+class PlannedCell:
     """A cell before anything is trained, for whoever shows or chooses a division.
 
     Attributes:
@@ -156,7 +156,7 @@ def read_planned_scene(job: Job) -> Scene:
     return scene
 
 
-def plan(job: Job, scene: Scene | None = None) -> list[Planned]:
+def plan(job: Job, scene: Scene | None = None) -> list[PlannedCell]:
     """The cells of a job's scene, each with what its training will take; nothing is written.
 
     Of the steps each block has as many as it has views, so that every view is seen as often as if the scene
@@ -183,12 +183,12 @@ def plan(job: Job, scene: Scene | None = None) -> list[Planned]:
         its = replace(whole, steps=_scaled(whole.steps, share), max_splats=splats)
         memory = _memory(its, views, pixels, job.photo_memory)
         found.append(
-            Planned(number, region, _part_of(job, its), views, points, its.total_steps, splats, memory)
+            PlannedCell(number, region, _part_of(job, its), views, points, its.total_steps, splats, memory)
         )
     return found
 
 
-def cells_within(job: Job, splats: int = 0, memory: int = 0, scene: Scene | None = None) -> str:
+def choose_cells(job: Job, splats: int = 0, memory: int = 0, scene: Scene | None = None) -> str:
     """The fewest cells of which none has more splats, or takes more memory: a job's ``cells``.
 
     Args:
@@ -213,12 +213,12 @@ def cells_within(job: Job, splats: int = 0, memory: int = 0, scene: Scene | None
             "Allow more for a block, or lower max_splats.",
         )
     raise trouble or LodgsError(
-        f"{MOST_CELLS} cells, the most that there can be, are too few.", "Allow more for a block."
+        f"{MAX_CELLS} cells, the most that there can be, are too few.", "Allow more for a block."
     )
 
 
 def write_plan(
-    job: Job, folder: RunFolder, scene: Scene | None = None, planned: list[Planned] | None = None
+    job: Job, folder: RunFolder, scene: Scene | None = None, planned: list[PlannedCell] | None = None
 ) -> Division:
     """Writes a job's parts into the run's folder, ready to be trained; parts that are there stay.
 
@@ -268,7 +268,7 @@ def read_plan(folder: RunFolder) -> Division:
     )
 
 
-def planned_job(path: Path) -> Job:
+def read_planned_job(path: Path) -> Job:
     """The job of a run that is divided.
 
     Raises:
@@ -280,7 +280,7 @@ def planned_job(path: Path) -> Job:
     return job
 
 
-def plan_table(planned: list[Planned]) -> str:
+def plan_table(planned: list[PlannedCell]) -> str:
     """What each block will take, for people."""
     lines = ["block   views    points  splats at most     steps  memory, about"]
     for each in planned:
@@ -347,8 +347,8 @@ def _grids(scene: Scene, fewest: float) -> Iterator[str]:
     ground = scene.up_rotation()
     eyes = np.array([camera.center for camera in scene.cameras]) @ ground.T
     longer, shorter = sorted(np.ptp(eyes[:, :2], axis=0), reverse=True)
-    aspect = min(longer / max(shorter, 1e-9), MOST_CELLS)
-    for count in range(ceil(fewest), MOST_CELLS + 1):
+    aspect = min(longer / max(shorter, 1e-9), MAX_CELLS)
+    for count in range(ceil(fewest), MAX_CELLS + 1):
         ways = ((count // rows, rows) for rows in range(1, count + 1) if count % rows == 0)
         slim, columns, rows = min((abs(float(np.log(aspect * b / a))), a, b) for a, b in ways)
         if slim <= np.log(SLIMMEST) or count == 1:

@@ -8,8 +8,8 @@ from concurrent.futures import CancelledError
 from pathlib import Path
 
 from ...errors import LodgsError
-from ..endings import ending
 from ..failures import BAD_INPUT, CANCELLED, DONE
+from ..outcome import run_outcome
 from .merge import merge, write_surroundings
 from .plan import BLOCK, Block, Division
 from .workers import Pending, Submit
@@ -31,7 +31,7 @@ class BlocksStopped(Exception):
     """Some blocks were asked to stop, and the others are finished; the message says which."""
 
 
-def prepare(division: Division, part: Block) -> None:
+def prepare_part(division: Division, part: Block) -> None:
     """Writes what a part begins with, of those that are finished before it.
 
     Raises:
@@ -135,7 +135,7 @@ class _Watched:
         if block.folder.bundle.exists() and block.folder.state() == "done":
             self.code = DONE
         self._lost, self._reached = 0, -1
-        self.progress = block.folder.last("progress") or {}
+        self.progress = block.folder.last_event("progress") or {}
         self._since, self._heard = block.folder.events()[1], False
         self.steps = block.job.resolved_parameters().total_steps
         self._why = ""
@@ -143,7 +143,7 @@ class _Watched:
     def begin(self, submit: Submit) -> None:
         """Has it trained, unless it is finished."""
         if self.code is None:
-            prepare(self._division, self.block)
+            prepare_part(self._division, self.block)
             self._heard = False
             self._pending = submit(self.block.folder.path)
 
@@ -209,7 +209,7 @@ class _Watched:
             end = self.block.folder.end_event()
             if end is not None and end["event"] == "error":
                 return LodgsError(f"{self._name}: {end['what']}", end.get("remedy", ""))
-            return LodgsError(f"{self._name}: {ending(self.block.folder, self.code)[1]}")
+            return LodgsError(f"{self._name}: {run_outcome(self.block.folder, self.code)[1]}")
         why = f" ({self._why})" if self._why else ""
         return LodgsError(
             f"{self._name} was lost {TRIES} times at step {self.step}{why}.",

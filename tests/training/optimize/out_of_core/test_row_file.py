@@ -208,7 +208,7 @@ STEPS = 6
 def undisturbed(tmp_path_factory):
     """What each checkpoint of an undisturbed run holds."""
     folder = RunFolder(tmp_path_factory.mktemp("run"))
-    folder.make()
+    folder.create()
     truth = {0: np.zeros(0)}
     for end in range(2, STEPS + 1, 2):
         life(folder, 0, end)
@@ -279,7 +279,7 @@ def test_wherever_it_ends_the_last_checkpoint_is_whole_and_the_run_goes_on(
     at = ends = 0
     while True:
         folder = RunFolder(tmp_path / f"{at}")
-        folder.make()
+        folder.create()
         process = fork.Process(target=end, args=(folder, at, counted))
         process.start()
         process.join()
@@ -300,7 +300,7 @@ def test_wherever_it_ends_the_last_checkpoint_is_whole_and_the_run_goes_on(
 
 def test_an_older_checkpoint_serves_where_the_newest_is_spoilt(tmp_path, undisturbed):
     folder = RunFolder(tmp_path)
-    folder.make()
+    folder.create()
     life(folder, 0, STEPS)
     (folder.checkpoints / f"step_{STEPS:07d}.pt").write_bytes(b"nothing")
     rows, warned = FileRows(folder.checkpoints, LAYOUT, block=4), []
@@ -314,7 +314,7 @@ def test_an_older_checkpoint_serves_where_the_newest_is_spoilt(tmp_path, undistu
 
 def test_files_of_earlier_lives_go(tmp_path):
     folder = RunFolder(tmp_path)
-    folder.make()
+    folder.create()
     (folder.checkpoints / "rows_0123abcd.bin").write_bytes(b"left")
     (folder.checkpoints / "rows_of_mine.bin").write_bytes(b"not ours")
     life(folder, 0, STEPS)

@@ -24,12 +24,12 @@ from training.methods import METHODS
 from training.runs import train as training_loop
 from training.runs.blocks import train as blocks_module
 from training.runs.blocks.merge import merge
-from training.runs.blocks.plan import Block, Division, cells_within, plan, read_plan, write_plan
+from training.runs.blocks.plan import Block, Division, choose_cells, plan, read_plan, write_plan
 from training.runs.blocks.train import BlocksStopped, train_blocks
 from training.runs.data import training_data
-from training.runs.events import MOST_BYTES, event_line
+from training.runs.events import MAX_BYTES, event_line
 from training.runs.folder import RunFolder
-from training.runs.job import POLISH, Job
+from training.runs.job import POLISH_STEPS, Job
 from training.scenes.cameras import Camera
 from training.scenes.colmap import Scene
 from training.scenes.regions import Region
@@ -51,7 +51,7 @@ def job_for(scene, out, method="3dgs", **further) -> Job:
 
 def planned(job: Job) -> list[Block]:
     folder = RunFolder(job.out)
-    folder.make()
+    folder.create()
     return write_plan(job.resolved(), folder).blocks
 
 
@@ -171,7 +171,7 @@ def test_seams_are_planned_where_views_stand_at_borders_and_rules_allow_it(tiny_
         return read_plan(RunFolder(job.out)).seams
 
     found = seams("one")
-    assert found and all(seam.job.parameters["steps"] == POLISH for seam in found)
+    assert found and all(seam.job.parameters["steps"] == POLISH_STEPS for seam in found)
     assert all(seam.region.seam and seam.job.base == str(seam.folder.base) for seam in found)
     assert not seams("none", polish=0) and not seams("clod", method="clod")
 
@@ -184,16 +184,16 @@ def test_as_few_cells_as_keep_to_what_a_block_may_have(tmp_path):
     scene = street_map(tmp_path)
     sizes = {}
     for cells in ("1x1", "2x1", "2x2"):
-        sizes[cells] = max(each.splats for each in plan(job.in_cells(cells), scene))
+        sizes[cells] = max(each.splats for each in plan(job.with_cells(cells), scene))
     assert sizes["1x1"] == 900 and sizes["2x2"] < sizes["2x1"] < 900
     for cells, most in sizes.items():
-        assert cells_within(job, splats=most, scene=scene) == cells
-    more = cells_within(job, splats=sizes["2x2"] // 2, scene=scene)
-    assert max(each.splats for each in plan(job.in_cells(more), scene)) <= sizes["2x2"] // 2
+        assert choose_cells(job, splats=most, scene=scene) == cells
+    more = choose_cells(job, splats=sizes["2x2"] // 2, scene=scene)
+    assert max(each.splats for each in plan(job.with_cells(more), scene)) <= sizes["2x2"] // 2
     assert Job("s", "o", cells=more).grid > (2, 2)
-    assert cells_within(job, memory=10**12, scene=scene) == "1x1"
+    assert choose_cells(job, memory=10**12, scene=scene) == "1x1"
     with pytest.raises(LodgsError, match=r"still has|too few|too little"):
-        cells_within(job, splats=3, scene=scene)
+        choose_cells(job, splats=3, scene=scene)
 
 
 def street_map(folder: Path) -> Scene:
@@ -213,11 +213,11 @@ def test_parts_have_names(tiny_scene, tmp_path):
     job = job_for(tiny_scene, tmp_path / "run", test_every=0)
     planned(job)
     division = read_plan(RunFolder(job.out))
-    assert division.named("block-2") == division.blocks[1] and division.named("coarse") is None
-    assert division.named("seam-1") == division.seams[0]
+    assert division.part("block-2") == division.blocks[1] and division.part("coarse") is None
+    assert division.part("seam-1") == division.seams[0]
     for name in ("", "block", "block-3", "block-0", "seam-", "coarse-1", "merge", "2"):
         with pytest.raises(LodgsError, match="There is no part"):
-            division.named(name)
+            division.part(name)
     assert main(["blocks", "run", job.out, "--only", "coarse"]) == 0, "a part that is not needed is done"
     assert main(["blocks", "run", job.out, "--only", "seam-1"]) == 2, "its blocks are not finished"
 
@@ -250,7 +250,7 @@ def test_what_cannot_be_is_refused_in_a_sentence(tiny_scene, tmp_path):
 def finished(folder: Path, number: int, cell, splats: list[Splats], **further) -> Block:
     """A block with a bundle of these levels."""
     run = RunFolder(folder / str(number))
-    run.make()
+    run.create()
     levels = [Level(i, each, {"s_min": 1.0 / i}) for i, each in enumerate(splats, 1)]
     write_bundle(run.bundle, Bundle(**({"method": "flod", "rule": "bands"} | further), levels=levels))
     inside = np.array([cell, [-np.inf, np.inf]])
@@ -268,7 +268,7 @@ def random_splats(rng, count) -> Splats:
 def test_every_splat_of_its_own_cell_is_there_once_and_no_other(tmp_path, monkeypatch):
     from training.runs.blocks import merge as merge_module
 
-    monkeypatch.setattr(merge_module, "AT_ONCE", 7)
+    monkeypatch.setattr(merge_module, "BATCH_ROWS", 7)
     rng = np.random.default_rng(0)
     sets = [[random_splats(rng, n) for n in (20, 50)] for _ in range(3)]
     cells = [(-np.inf, -0.3), (-0.3, 0.4), (0.4, np.inf)]
@@ -553,7 +553,7 @@ def test_cells_give_a_bundle_like_the_whole(tiny_scene, tmp_path, method):
     same = {key: value for key, value in one.meta.items() if key in other.meta}
     assert same == other.meta
     assert [event["splats"] for event in folder.levels()] == [len(level.splats) for level in one.levels]
-    assert folder.state() == "done" and "train_psnr" in folder.last("done")
+    assert folder.state() == "done" and "train_psnr" in folder.last_event("done")
 
 
 @pytest.mark.slow
@@ -562,7 +562,7 @@ def test_a_tree_is_built_over_what_blocks_give_together(tiny_scene, tmp_path):
     keys = asdict(job_for(tiny_scene, tmp_path / "cells", "tree", parameters=parameters))
     code, folder = run_all(keys)
     assert code == 0, folder.events()[0][-1]
-    leaves, made = read_bundle(folder.whole), read_bundle(folder.bundle)
+    leaves, made = read_bundle(folder.merged), read_bundle(folder.bundle)
     assert made.rule == "cut" and len(made.levels[-1].splats) == len(leaves.levels[-1].splats)
 
 
@@ -584,9 +584,9 @@ def test_trainers_killed_and_a_run_interrupted_end_in_the_same_bundle(tiny_scene
         while process.poll() is None and time.monotonic() < until:
             time.sleep(0.02)  # less than a block takes, on any machine
             for block in read_plan(wild).blocks if wild.blocks.exists() else ():
-                if kills < 4 and block.folder.running and block.folder.last("progress"):
+                if kills < 4 and block.folder.running and block.folder.last_event("progress"):
                     with suppress(LodgsError):  # it has just ended by itself
-                        block.folder.end()
+                        block.folder.kill()
                         kills += 1
             if attempt == 0 and kills >= 2:
                 process.send_signal(signal.SIGKILL)
@@ -621,7 +621,7 @@ def test_many_blocks_fill_no_file_with_how_they_get_on(monkeypatch):
     said = []
     stage = [Block(number) for number in range(1, 101)]
     blocks_module._train_stage(stage, stage, None, lambda kind, **values: said.append(values))
-    assert sum(len(event_line("progress", **values)) for values in said) < MOST_BYTES / 4
+    assert sum(len(event_line("progress", **values)) for values in said) < MAX_BYTES / 4
     told = [values["blocks"] for values in said if "blocks" in values]
     counts = [sum(each["state"] == "done" for each in blocks) for blocks in told]
     assert set(counts) >= set(range(1, 100)) and said[-1]["blocks"] == told[-1] and counts[-1] == 100

@@ -36,7 +36,7 @@ def divided(folder, rng, counts=(20, 50), **further) -> tuple[Division, list[lis
         region = Region(np.eye(3), cell, cell + 0.1 * np.array([[-1, 1], [0, 0]]), ("a", "b"))
         blocks.append(replace(block, region=region))
         run = RunFolder(folder / "seams" / str(number))
-        run.make()
+        run.create()
         seams.append(Block(number, run, replace(region, seam=True)))
     return Division(None, blocks, seams), sets
 
@@ -46,7 +46,7 @@ def x_of(splats: Splats) -> np.ndarray:
 
 
 def test_a_seam_begins_with_the_cell_its_neighbours_and_what_its_own_block_has_beyond(tmp_path, monkeypatch):
-    monkeypatch.setattr(merge_module, "AT_ONCE", 7)
+    monkeypatch.setattr(merge_module, "BATCH_ROWS", 7)
     division, sets = divided(tmp_path, np.random.default_rng(0))
     write_surroundings(division, division.seams[1])
     found = read_ply(division.seams[1].folder.base)

@@ -25,7 +25,7 @@ from .test_blocks import TINY, job_for
 def block(tiny_scene, tmp_path):
     job = job_for(tiny_scene, tmp_path / "run").resolved()
     folder = RunFolder(job.out)
-    folder.make()
+    folder.create()
     return write_plan(job, folder).blocks[0].folder
 
 
@@ -60,7 +60,7 @@ def test_a_trainer_that_was_left_behind_is_waited_for_and_stopped_with_its_run(b
     left = RunFolder(block.path)
 
     def trainer():
-        with left.hold():
+        with left.locked():
             begun.set()
             stop.wait(10)
             with left.events_file.open("a") as file:

@@ -6,7 +6,7 @@ from .events import read_events
 from .folder import RunFolder
 
 
-def ending(folder: RunFolder, code: int | None) -> tuple[str, str]:
+def run_outcome(folder: RunFolder, code: int | None) -> tuple[str, str]:
     """What became of a run whose trainer is not at work any more.
 
     Args:
