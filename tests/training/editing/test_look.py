@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.training.splats.test_placing import drawn, some_splats
 
 from tests.training.conftest import look_at
 from tests.training.editing.test_cleaning import bundle_of
+from tests.training.splats.test_similarity import drawn, some_splats
 from training.__main__ import main
 from training.editing.look import LUMA, NEUTRAL, Look, LookedRows, looked
 from training.errors import LodgsError
