@@ -24,7 +24,15 @@ from examples import town
 from training.lod.rules.cut import ABOVE_ROOT, detail_of
 from training.lod.tree.shape import Tree
 from training.methods.tree.build import build
-from training.rasterize.cpu.compile import STRICT, run_serial, f32, run_parallel, inlined, kernel, thread_count
+from training.rasterize.cpu.compile import (
+    STRICT,
+    f32,
+    inlined,
+    kernel,
+    run_parallel,
+    run_serial,
+    thread_count,
+)
 from training.rasterize.sequential_point_tree import SequentialPointTree
 from training.scenes.cameras import Camera
 

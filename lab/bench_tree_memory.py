@@ -38,7 +38,7 @@ from training.optimize.out_of_core.cut_cache import BESIDE, LARGE
 from training.optimize.parameters import override
 from training.optimize.training_data import TrainingData
 from training.rasterize import Gaussians, rasterize
-from training.rasterize.hspt import image_of
+from training.rasterize.sequential_point_tree import image_borders
 from training.scenes.cameras import read_views, write_camera
 from training.scenes.colmap import Scene
 from training.scenes.images import write_png
@@ -123,7 +123,7 @@ def level(options: argparse.Namespace) -> dict:
         counts = []
         for camera in method.data.train:
             eye, k = camera.center, detail_of(camera.focal, pixels)
-            nodes, lists, bands = store._top.walk(eye, k, image_of(camera, town.NEAR))
+            nodes, lists, bands = store._top.traverse(eye, k, image_borders(camera, town.NEAR))
             counts.append(len(nodes) + len(store.cut(lists.astype(np.int64), bands, eye, k)[0]))
         return float(np.mean(counts))
 

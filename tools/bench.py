@@ -26,11 +26,28 @@ from training.lod.blocks import spatial_order
 from training.lod.query import Choice, Chooser
 from training.lod.rule import facts_of
 from training.lod.rules.bands import RULE as BANDS
-from training.rasterize import Adam, Gaussians, Target, cpu, photometric_loss, rasterize, render, resolve_backend
+from training.rasterize import (
+    Adam,
+    Gaussians,
+    Target,
+    cpu,
+    photometric_loss,
+    rasterize,
+    render,
+    resolve_backend,
+)
 from training.rasterize.cpu import adam
 from training.rasterize.cpu.bin import LOG2_ALPHA_MIN
 from training.rasterize.cpu.blend import CAP, SPAN, T_MIN
-from training.rasterize.cpu.compile import FAST, Buffers, f32, run_parallel, kernel, set_thread_count, thread_count
+from training.rasterize.cpu.compile import (
+    FAST,
+    Buffers,
+    f32,
+    kernel,
+    run_parallel,
+    set_thread_count,
+    thread_count,
+)
 from training.rasterize.cpu.fastmath import exp2
 from training.rasterize.cpu.project import strip_rows
 from training.scenes.cameras import Camera

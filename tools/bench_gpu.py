@@ -34,14 +34,14 @@ from training.rasterize import (  # noqa: E402
     Adam,
     Gaussians,
     Target,
+    make_device_model,
     photometric_loss,
     rasterize,
-    resolve,
-    twin_of,
+    resolve_backend,
     warm_up,
 )
 from training.rasterize.gpu import scene  # noqa: E402
-from training.rasterize.gpu.choice import open_chosen  # noqa: E402
+from training.rasterize.gpu.default_device import open_default_device  # noqa: E402
 from training.rasterize.gpu.device import LANES, Device  # noqa: E402
 
 CASES = [(50_000, 640, 426), (200_000, 960, 540), (1_000_000, 1920, 1080)]
@@ -109,7 +109,7 @@ class Case:
 
     def there(self) -> Callable[[], object]:
         """A step that stays on the device."""
-        twin = twin_of("gpu", self.adam, self.stats)
+        twin = make_device_model("gpu", self.adam, self.stats)
         assert twin is not None
         options = {"near": 0.01, "sh_degree": 3, "background": (0.0, 0.0, 0.0), "ssim_weight": 0.2}
         return lambda: twin.step(self.camera, self.target, shrink=1, **options)
@@ -144,7 +144,7 @@ def stages_of(device: Device, step: Callable[[], object]) -> dict[str, float]:
 
 
 def bench(seconds: float) -> dict:
-    device, fastest = open_chosen(), Fastest(seconds)
+    device, fastest = open_default_device(), Fastest(seconds)
     warm_up("gpu")
     flops, bandwidth = peaks(device, fastest)
     print(f"{device.adapter.name}: {flops:.0f} GFLOP/s of multiply-adds, copies {bandwidth:.1f} GB/s")
@@ -188,7 +188,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     try:
-        if resolve("gpu") != "gpu":
+        if resolve_backend("gpu") != "gpu":
             raise LodgsError("The graphics device does not draw what the reference draws.")
         result = bench(options.seconds)
     except LodgsError as problem:

@@ -88,24 +88,24 @@ def data(tiny_scene):
 def tried_graphics() -> None:
     """A device for the gpu backend is there, this computer's own or the software that stands for one."""
     from training.errors import LodgsError
-    from training.rasterize import trial
-    from training.rasterize.gpu import choice
+    from training.rasterize import self_test
+    from training.rasterize.gpu import default_device
 
     try:
-        if all(adapter.software for adapter in choice.adapters()):
-            os.environ.setdefault(choice.VARIABLE, "software")
-        device = choice.open_chosen()
+        if all(adapter.software for adapter in default_device.adapters()):
+            os.environ.setdefault(default_device.VARIABLE, "software")
+        device = default_device.open_default_device()
     except LodgsError as problem:
         pytest.skip(f"no graphics device: {problem}")
-    assert trial.try_out(device.adapter) == "", "or the cpu would stand for it in these tests"
+    assert self_test.run_self_test(device.adapter) == "", "or the cpu would stand for it in these tests"
 
 
 @pytest.fixture
 def graphics(tried_graphics):
     """The device that the gpu backend uses: another one after a test that has lost it."""
-    from training.rasterize.gpu import choice
+    from training.rasterize.gpu import default_device
 
-    return choice.open_chosen()
+    return default_device.open_default_device()
 
 
 @pytest.fixture

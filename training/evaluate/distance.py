@@ -10,24 +10,24 @@ import numpy as np
 
 from ..lod.rule import Values
 from ..lod.selection import rule_of
-from ..rasterize.resident import Resident
+from ..rasterize.resident import ResidentBundle
 from ..scenes.cameras import Camera
 from ..splats.bundle import Bundle
 from .metrics import psnr
-from .views import Evaluation, shown_at
+from .views import Evaluation, full_detail_selector
 
 FACTORS = (1, 2, 4, 8)
 FRAMES = 120
 
 
-def pulled_back(camera: Camera, factor: float, depth: float) -> Camera:
+def pull_back(camera: Camera, factor: float, depth: float) -> Camera:
     """The view from ``factor`` times as far away from what lies at ``depth`` before it."""
     pose = camera.world_to_camera.copy()
     pose[2, 3] += (factor - 1) * depth
     return replace(camera, world_to_camera=pose)
 
 
-def farther(evaluation: Evaluation, bundle: Bundle, values: Values) -> list[dict]:
+def measure_farther_views(evaluation: Evaluation, bundle: Bundle, values: Values) -> list[dict]:
     """The evaluation's views, pulled back: splats drawn by distance and at full detail, how alike they look.
 
     Weights at full detail are those that the view has before it is pulled back.
@@ -36,13 +36,13 @@ def farther(evaluation: Evaluation, bundle: Bundle, values: Values) -> list[dict
         For each of FACTORS ``factor``, ``drawn`` and ``drawn_full`` (splats in the image), and ``psnr`` of
         the picture by distance against that of full detail, means over views.
     """
-    rows, full_detail = [], shown_at(bundle, bundle.levels[-1])
-    resident = Resident(bundle, evaluation.backend)
+    rows, full_detail = [], full_detail_selector(bundle, bundle.levels[-1])
+    resident = ResidentBundle(bundle, evaluation.backend)
     for factor in FACTORS:
         found = []
         for camera in evaluation.cameras:
-            view = pulled_back(camera, factor, evaluation.data.median_depth)
-            everything, fixed = full_detail(view if bundle.elsewhere else camera)
+            view = pull_back(camera, factor, evaluation.data.median_depth)
+            everything, fixed = full_detail(view if bundle.on_disk else camera)
             full = evaluation.render(everything, view, fixed)
             some = resident.draw(view, values, near=evaluation.data.near)
             counts = [int((rendering.radii > 0).sum()) for rendering in (some, full)]
@@ -59,7 +59,7 @@ def farther(evaluation: Evaluation, bundle: Bundle, values: Values) -> list[dict
     return rows
 
 
-def jumps(evaluation: Evaluation, bundle: Bundle, values: Values, camera: Camera) -> dict:
+def measure_popping(evaluation: Evaluation, bundle: Bundle, values: Values, camera: Camera) -> dict:
     """How much more neighbouring frames differ on the way out than with all splats in all frames.
 
     The camera is pulled back from 1 to 8 times its distance in FRAMES equal factors. A jump is the mean
@@ -70,11 +70,11 @@ def jumps(evaluation: Evaluation, bundle: Bundle, values: Values, camera: Camera
         The largest jump, by what it is of: ``by distance``; where the rule's levels fade, ``faded`` and
         ``hard``, with levels switched on and off.
     """
-    shown, resident = shown_at(bundle, bundle.levels[-1]), Resident(bundle, evaluation.backend)
+    shown, resident = full_detail_selector(bundle, bundle.levels[-1]), ResidentBundle(bundle, evaluation.backend)
     everything, fixed = shown(camera)
     everything = evaluation.load(everything)
     views = [
-        pulled_back(camera, factor, evaluation.data.median_depth)
+        pull_back(camera, factor, evaluation.data.median_depth)
         for factor in np.geomspace(FACTORS[0], FACTORS[-1], FRAMES)
     ]
 
@@ -88,7 +88,7 @@ def jumps(evaluation: Evaluation, bundle: Bundle, values: Values, camera: Camera
         return round(float((differences(pictures)[moved] / still[moved]).max(initial=0)), 3)
 
     def full(view: Camera) -> np.ndarray:
-        splats = shown(view)[0] if bundle.elsewhere else everything
+        splats = shown(view)[0] if bundle.on_disk else everything
         return evaluation.draw(splats, view, fixed).numpy()
 
     still = differences(map(full, views))

@@ -13,8 +13,8 @@ from ..lod.on_disk import Sight
 from ..lod.rule import Values, find_rule
 from ..lod.selection import Choice, complete, settings
 from ..optimize.training_data import TrainingData
-from ..rasterize import Gaussians, Rendering, Target, tensor_device, rasterize
-from ..rasterize.resident import WeightedSet, ResidentBundle, SplatSet, draw
+from ..rasterize import Gaussians, Rendering, Target, rasterize, tensor_device
+from ..rasterize.resident import ResidentBundle, SplatSet, WeightedSet, draw
 from ..scenes.cameras import Camera, evenly
 from ..splats.bundle import Bundle, Level
 from ..splats.gaussians import Splats

@@ -71,7 +71,7 @@ def create(
 
     Args:
         name: a key of METHODS.
-        backend: the rasterizer's; the tensors live where it draws (``rasterize.device_of``).
+        backend: the rasterizer's; the tensors live where it draws (``rasterize.tensor_device``).
         base: splats to begin with instead of the scene's points, where the method can (``from_base``); in
             memory, but for methods that take them in parts (``base_in_parts``).
 

@@ -10,7 +10,7 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 import numpy as np
 import torch
 
-from ..rasterize import Gaussians, Rendering, Target, device_of, photometric_loss, rasterize
+from ..rasterize import Gaussians, Rendering, Target, photometric_loss, rasterize, tensor_device
 from ..scenes.cameras import Camera
 from ..splats.bundle import Level
 from ..splats.gaussians import Splats
@@ -89,7 +89,7 @@ class Method(ABC, Generic[P, D]):
     ) -> None:
         self.warn: Callable[[str], None] = lambda message: None
         self.data, self.parameters, self.seed, self.backend = data, parameters, seed, backend
-        self.device = device_of(backend)
+        self.device = tensor_device(backend)
         self.exposure = Exposure([view.name for view in data.train], parameters.lr_exposure, self.device)
         self.setup(base)
 
@@ -204,7 +204,7 @@ class Method(ABC, Generic[P, D]):
             min_scale=min_scale,
             shrink=view.shrink if self.counts(view, step) else None,
         )
-        return Made(loss, lambda: self.over_black(*twin.picture(), step), target)
+        return Made(loss, lambda: self.over_black(*twin.last_image(), step), target)
 
     def is_plain(self, step: int) -> bool:
         """Whether a step has one picture, of all the model's splats as :meth:`shown`, and this class's loss.

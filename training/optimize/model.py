@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 
-from ..rasterize import Adam, Gaussians, Rendering, Twin, twin_of
+from ..rasterize import Adam, DeviceModel, Gaussians, Rendering, make_device_model
 from ..rasterize.adam import LearningRate
 from ..splats.gaussians import Splats
 from .parameters import Parameters
@@ -57,7 +57,7 @@ class Model:
         stats: Mapping[str, torch.Tensor] | None = None,
         peaks: bool = False,
     ) -> None:
-        self._twin: Twin | None = None
+        self._twin: DeviceModel | None = None
         self._adam = Adam({name: tensor.requires_grad_(True) for name, tensor in tensors.items()}, lr=lr)
         self.columns = dict(columns or {})
         blank = self["means"].detach().new_zeros(len(self))
@@ -97,16 +97,16 @@ class Model:
     def lr(self, rates: dict[str, LearningRate]) -> None:
         self._adam.lr = rates
 
-    def twin(self, backend: str, antialias: bool) -> Twin | None:
-        """What a backend trains in the model's place, until somebody asks for what it is; see ``twin_of``."""
+    def twin(self, backend: str, antialias: bool) -> DeviceModel | None:
+        """What a backend trains in the model's place, until somebody asks for what it is; see ``make_device_model``."""
         if self._twin is None and HELD not in self.columns:
-            self._twin = twin_of(backend, self._adam, self._stats, antialias=antialias)
+            self._twin = make_device_model(backend, self._adam, self._stats, antialias=antialias)
         return self._twin
 
     def look(self, name: str) -> torch.Tensor:
         """A trained tensor's or a statistic's values, to read only: what is trained elsewhere stays there."""
         if self._twin is not None and (name in NAMES or name in self._stats):
-            return self._twin.look(name)
+            return self._twin.read(name)
         return self._stats[name] if name in self._stats else self._adam.tensors[name].detach()
 
     @property
@@ -122,7 +122,7 @@ class Model:
     def _come_home(self) -> None:
         twin, self._twin = self._twin, None
         if twin is not None:
-            twin.bring_home()
+            twin.copy_to_host()
 
     @property
     def gaussians(self) -> Gaussians:
@@ -132,7 +132,7 @@ class Model:
     def rows(self, index: torch.Tensor) -> dict[str, torch.Tensor]:
         """A copy of the trained tensors at indices (M,), by name."""
         here = {name: self._adam.tensors[name].detach()[index] for name in self._here}
-        return here if self._twin is None else here | self._twin.rows(index)
+        return here if self._twin is None else here | self._twin.read_rows(index)
 
     @torch.no_grad()
     def keep(self, mask: torch.Tensor) -> None:
@@ -141,7 +141,7 @@ class Model:
         if not mask.any():
             self._come_home()
         if self._twin is not None and not mask.all():
-            self._twin.keep(torch.nonzero(mask).squeeze(1))
+            self._twin.select(torch.nonzero(mask).squeeze(1))
         for name in self._here:
             first, second = self._adam.state[name]
             self._replace(name, self._adam.tensors[name][mask], first[mask], second[mask])
@@ -182,7 +182,7 @@ class Model:
         if self._twin is None:
             self["log_scales"].copy_(torch.maximum(self["log_scales"], least[:, None]))
         else:
-            self._twin.keep_above(least)
+            self._twin.raise_log_scales(least)
 
     def hold(self, rows: torch.Tensor) -> None:
         """From now on these rows, (N,) bool, stay as they are."""

@@ -21,23 +21,23 @@ import torch
 from ..errors import LodgsError
 from ..scenes.cameras import Camera
 from ..splats.gaussians import SH_C0
-from ..splats.sh import degree_of
+from ..splats.sh import degree_from_count
 from .adam import Adam
 from .features import depths, normals
 from .gaussians import Gaussians
-from .rendering import OUTPUTS, Contributions, Rendering, Settings, Target, View
+from .rendering import OUTPUTS, Contributions, KernelCamera, RasterSettings, Rendering, Target
 
 __all__ = [
-    "BACKENDS", "OUTPUTS", "Adam", "Contributions", "Gaussians", "Rendering", "Target", "Twin",
-    "contributions", "device_of", "photometric_loss", "rasterize", "render", "resolve", "strips", "twin_of",
-    "warm_up", "why_cpu",
+    "BACKENDS", "OUTPUTS", "Adam", "Contributions", "DeviceModel", "Gaussians", "Rendering", "Target",
+    "contributions", "cpu_fallback_reason", "make_device_model", "photometric_loss", "rasterize", "rasterize_strips",
+    "render", "resolve_backend", "tensor_device", "warm_up",
 ]  # fmt: skip
 
 BACKENDS = ("cpu", "cuda", "gpu", "reference")
-"""Backends by name; :func:`resolve` says which one ``auto`` is."""
+"""Backends by name; :func:`resolve_backend` says which one ``auto`` is."""
 
 STRIP = 1 << 21
-"""Pixels that :func:`strips` draws at a time: a Full HD frame at once, an 8k frame in sixteen strips."""
+"""Pixels that :func:`rasterize_strips` draws at a time: a Full HD frame at once, an 8k frame in sixteen strips."""
 
 
 def rasterize(
@@ -89,7 +89,7 @@ def rasterize(
             where gradients are wanted.
         LodgsError: for a backend that does not exist, or does not work on this computer.
     """
-    count, means, view = len(gaussians), gaussians.means, View.of(camera, near, window)
+    count, means, view = len(gaussians), gaussians.means, KernelCamera.of(camera, near, window)
     _check_weights(weights, count)
     _check_antialias(antialias, count)
     gaussians = replace(gaussians, sh=_coefficients(gaussians.sh))
@@ -112,7 +112,7 @@ def rasterize(
     if "normals" in outputs:
         blended.append(normals(gaussians, view))
     red, green, blue = (float(value) for value in background)
-    settings = Settings(
+    settings = RasterSettings(
         view, float(min_scale), antialias, (red, green, blue), _degree(gaussians.sh, sh_degree),
         median="median_depth" in outputs, absolute="absgrad2d" in outputs, limit=limit, rows=rows,
     )  # fmt: skip
@@ -139,7 +139,7 @@ def rasterize(
 
 
 @torch.no_grad()
-def strips(
+def rasterize_strips(
     gaussians: Gaussians,
     camera: Camera,
     *,
@@ -193,7 +193,7 @@ def render(
         raise ValueError(f'dtype can be "uint8", "float16" or "float32", not "{dtype}"')
     for camera in cameras:
         picture = np.empty((camera.height, camera.width, 4), dtype)
-        for top, drawn in strips(gaussians, camera, strip=strip, **options):
+        for top, drawn in rasterize_strips(gaussians, camera, strip=strip, **options):
             pixels = torch.cat([drawn.image, drawn.alpha[..., None]], 2)
             if dtype == "uint8":
                 pixels = pixels.clamp_(0, 1).mul_(255).round_()
@@ -224,7 +224,7 @@ def contributions(
     largest, total, radius = (torch.zeros(count, dtype=torch.float32, device=device) for _ in range(3))
     pixels, views = (torch.zeros(count, dtype=torch.int64, device=device) for _ in range(2))
     for camera in cameras:
-        settings = Settings(View.of(camera, near), float(min_scale), antialias, rows=rows)
+        settings = RasterSettings(KernelCamera.of(camera, near), float(min_scale), antialias, rows=rows)
         found = _backend(backend, gaussians.means).contributions(gaussians, weights, settings)
         largest = torch.maximum(largest, found[0])
         total += found[1]
@@ -251,7 +251,7 @@ def _coefficients(sh: torch.Tensor) -> torch.Tensor:
 
 def _degree(sh: torch.Tensor, active: int | None) -> int:
     """The degree to draw with; ValueError unless sh (N, K, 3) is of that degree at least."""
-    degree = degree_of(sh.shape[1])
+    degree = degree_from_count(sh.shape[1])
     if active is not None and active > degree:
         raise ValueError(f"sh has degree {degree}, sh_degree asks for {active}")
     return degree if active is None else active
@@ -278,7 +278,7 @@ def photometric_loss(
     return _backend(backend, image).photometric_loss(image, target, float(ssim_weight))
 
 
-class Twin(Protocol):
+class DeviceModel(Protocol):
     """Splats that a backend trains where it draws them: what is here in the meantime is what they were.
 
     Whatever is asked of it raises LodgsError where the device was lost, or has too little memory. Where that
@@ -312,19 +312,19 @@ class Twin(Protocol):
         """
         ...
 
-    def picture(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def last_image(self) -> tuple[torch.Tensor, torch.Tensor]:
         """The last step's picture (H, W, 3), and its alpha (H, W)."""
         ...
 
-    def look(self, name: str) -> torch.Tensor:
+    def read(self, name: str) -> torch.Tensor:
         """A tensor's values, or a statistic's, as they are now; all others stay where they are."""
         ...
 
-    def rows(self, index: torch.Tensor) -> dict[str, torch.Tensor]:
+    def read_rows(self, index: torch.Tensor) -> dict[str, torch.Tensor]:
         """Tensors' values at indices (M,), by name."""
         ...
 
-    def keep(self, index: torch.Tensor) -> None:
+    def select(self, index: torch.Tensor) -> None:
         """Only the splats at indices (M,), at least one, stay, in this order."""
 
     def append(self, rows: Mapping[str, torch.Tensor]) -> None:
@@ -336,16 +336,16 @@ class Twin(Protocol):
     def reset_stats(self) -> None:
         """Begins anew with what is added up."""
 
-    def keep_above(self, least: torch.Tensor) -> None:
+    def raise_log_scales(self, minimum: torch.Tensor) -> None:
         """No log-scale of a splat is below its least one (N,) from here."""
 
-    def bring_home(self) -> None:
+    def copy_to_host(self) -> None:
         """Makes of what is here what has become of it: other tensors in the same places."""
 
 
-def twin_of(
+def make_device_model(
     backend: str, adam: Adam, stats: MutableMapping[str, torch.Tensor], *, antialias: bool = False
-) -> Twin | None:
+) -> DeviceModel | None:
     """What a model trains, where a backend can train it by itself; None where it cannot.
 
     Args:
@@ -356,15 +356,15 @@ def twin_of(
     Raises:
         LodgsError: the device was lost, or has too little memory.
     """
-    make = getattr(_backend(backend, adam.tensors["means"]), "twin_of", None)
+    make = getattr(_backend(backend, adam.tensors["means"]), "make_device_model", None)
     return make and make(adam, stats, antialias)
 
 
-def resolve(backend: str) -> str:
+def resolve_backend(backend: str) -> str:
     """The backend that a name means on this computer: ``auto`` is cuda where that works, else cpu.
 
     ``gpu`` is cpu where the graphics device does not draw what the reference draws, which is tried before the
-    device is first used (:func:`why_cpu` says so).
+    device is first used (:func:`cpu_fallback_reason` says so).
 
     Raises:
         LodgsError: for a backend that does not exist, or does not work on this computer.
@@ -380,26 +380,26 @@ def resolve(backend: str) -> str:
     if backend == "cuda" and (problem := cuda.problem()):
         raise problem
     if backend == "gpu":
-        from .gpu.choice import chosen
-        from .trial import difference
+        from .gpu.default_device import default_adapter
+        from .self_test import failure
 
-        return "cpu" if difference(chosen()) else "gpu"
+        return "cpu" if failure(default_adapter()) else "gpu"
     return backend
 
 
-def why_cpu(backend: str) -> str:
+def cpu_fallback_reason(backend: str) -> str:
     """Why the cpu draws where a GPU was asked for, or could be; nothing where there is no reason to say so.
 
     Raises:
-        LodgsError: as :func:`resolve`.
+        LodgsError: as :func:`resolve_backend`.
     """
     from . import cuda
 
     if backend == "auto" and torch.cuda.is_available() and (problem := cuda.problem()):
         return f"The NVIDIA GPU is not used. {problem}"
-    if backend == "gpu" and resolve(backend) == "cpu":
-        from .gpu.choice import chosen
-        from .trial import difference
+    if backend == "gpu" and resolve_backend(backend) == "cpu":
+        from .gpu.default_device import default_adapter
+        from .self_test import failure
 
         device = chosen()
         return (
@@ -409,11 +409,11 @@ def why_cpu(backend: str) -> str:
     return ""
 
 
-def device_of(backend: str) -> torch.device:
-    """Where the tensors live that a backend draws; LodgsError as :func:`resolve`."""
+def tensor_device(backend: str) -> torch.device:
+    """Where the tensors live that a backend draws; LodgsError as :func:`resolve_backend`."""
     from . import cuda
 
-    return torch.device(cuda.DEVICE if resolve(backend) == "cuda" else "cpu")
+    return torch.device(cuda.DEVICE if resolve_backend(backend) == "cuda" else "cpu")
 
 
 def warm_up(backend: str = "auto") -> None:
@@ -426,7 +426,7 @@ def warm_up(backend: str = "auto") -> None:
     collects = gc.isenabled()
     gc.disable()
     try:
-        if resolve(backend) == "cpu":
+        if resolve_backend(backend) == "cpu":
             from .cpu.compile import compile_in_two_processes
 
             compile_in_two_processes(partial(_step, "cpu"))
@@ -438,7 +438,7 @@ def warm_up(backend: str = "auto") -> None:
 
 def _step(backend: str) -> None:
     one = [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0, 0.0]], [[0.0] * 3], [0.0], [[[0.0] * 3]]
-    device = device_of(backend)
+    device = tensor_device(backend)
     gaussians = Gaussians(*(torch.tensor(values, device=device, requires_grad=True) for values in one))
     camera = Camera("", 16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
     drawn = rasterize(gaussians, camera, backend=backend)
@@ -449,4 +449,4 @@ def _step(backend: str) -> None:
 def _backend(name: str, tensor: torch.Tensor):
     if name == "auto":  # whoever made the tensors has chosen
         name = "cuda" if tensor.is_cuda else "cpu"
-    return import_module(f".{resolve(name)}", __package__)
+    return import_module(f".{resolve_backend(name)}", __package__)

@@ -23,10 +23,18 @@ from typing import Any, NamedTuple
 import torch
 
 from ..errors import LodgsError
-from ..files import one_at_a_time
+from ..files import exclusive
 from .gaussians import Gaussians
 from .reference import ellipses, loss_to, meets_tile, moments, squared_reach
-from .rendering import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Drawn, Settings, Target, View
+from .rendering import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    TRANSMITTANCE_MIN,
+    BackendOutput,
+    KernelCamera,
+    RasterSettings,
+    Target,
+)
 
 DEVICE = "cuda"
 TILE = 16
@@ -40,13 +48,13 @@ def problem() -> LodgsError | None:
     if not torch.cuda.is_available():
         return LodgsError(
             "This computer has no NVIDIA GPU that torch can use.",
-            "Train on the CPU (Train On in Blender, backend = auto or cpu in a job), or install the driver "
-            "and a torch built for CUDA.",
+            "Train on the CPU (Training Device in Blender, backend = auto or cpu in a job), or install the "
+            "driver and a torch built for CUDA.",
         )
     try:
         # it talks, and the trainer's standard output is for events; processes that compile at once undo each
         # other's work
-        with redirect_stdout(sys.stderr), one_at_a_time("gsplat"):
+        with redirect_stdout(sys.stderr), exclusive("gsplat"):
             gsplat = _gsplat()
             one = torch.ones(1, 3, device=DEVICE)
             gsplat.spherical_harmonics(0, one, one[None]).cpu()
@@ -69,14 +77,14 @@ def problem() -> LodgsError | None:
 
 
 def rasterize(
-    gaussians: Gaussians, weights: torch.Tensor | None, features: torch.Tensor, settings: Settings
-) -> Drawn:
+    gaussians: Gaussians, weights: torch.Tensor | None, features: torch.Tensor, settings: RasterSettings
+) -> BackendOutput:
     """See :func:`training.rasterize.rasterize`. Tensors are float32 on one GPU; ValueError otherwise."""
     gsplat = _gsplat()
     _check(features)
     means, view, limit = gaussians.means, settings.view, settings.limit
-    splats = Visible.of(gaussians, weights, settings)
-    tiles = Tiles.of(splats, view)
+    splats = VisibleSplats.of(gaussians, weights, settings)
+    tiles = TileLists.of(splats, view)
     towards = means[splats.which] - torch.as_tensor(view.eye).to(means)
     colours = gsplat.spherical_harmonics(settings.degree, towards, gaussians.sh[splats.which])
     colours = (colours + 0.5).clamp_min(0)
@@ -91,7 +99,7 @@ def rasterize(
         image, alpha, blended = blend_limited(
             splats, tiles, view, limit.to(means), colours, features[splats.which], behind
         )
-    return Drawn(
+    return BackendOutput(
         image=image, alpha=alpha, radii=splats.radii, grad2d=gradients[0], tile_counts=tiles.counts,
         absgrad2d=gradients[1] if settings.absolute else None, features=blended,
         median=median_splat(splats, tiles, view, limit) if settings.median else None,
@@ -100,13 +108,13 @@ def rasterize(
 
 @torch.no_grad()
 def contributions(
-    gaussians: Gaussians, weights: torch.Tensor | None, settings: Settings
+    gaussians: Gaussians, weights: torch.Tensor | None, settings: RasterSettings
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """See :func:`training.rasterize.contributions`: of one view, the largest, the sum, pixels and radii."""
-    splats, view = Visible.of(gaussians, weights, settings), settings.view
+    splats, view = VisibleSplats.of(gaussians, weights, settings), settings.view
     largest, total = gaussians.means.new_zeros(2, len(gaussians))
     pixels = torch.zeros(len(gaussians), dtype=torch.int64, device=largest.device)
-    for _, splat, weight, _ in walk(splats, Tiles.of(splats, view), view):
+    for _, splat, weight, _ in walk(splats, TileLists.of(splats, view), view):
         splat = splats.which[splat].flatten()
         largest.scatter_reduce_(0, splat, weight.amax(1).flatten(), "amax")
         total.index_add_(0, splat, weight.sum(1).flatten())
@@ -135,7 +143,7 @@ def _check(*tensors: torch.Tensor | None) -> None:
             )
 
 
-class Visible(NamedTuple):
+class VisibleSplats(NamedTuple):
     """The n splats that meet the image, front to back.
 
     Attributes:
@@ -158,7 +166,9 @@ class Visible(NamedTuple):
     radii: torch.Tensor
 
     @classmethod
-    def of(cls, gaussians: Gaussians, weights: torch.Tensor | None, settings: Settings) -> Visible:
+    def of(
+        cls, gaussians: Gaussians, weights: torch.Tensor | None, settings: RasterSettings
+    ) -> VisibleSplats:
         """The splats that meet an image; ``weights`` (N,) as in ``rasterize``, or None.
 
         Raises:
@@ -177,11 +187,11 @@ class Visible(NamedTuple):
         return cls(which, mean2d, conic, opacity, depth, covariance, determinant, seen.radii)
 
 
-class Tiles(NamedTuple):
+class TileLists(NamedTuple):
     """Which splats each tile of 16x16 pixels has to look at.
 
     Attributes:
-        splat: (P,) int32, rows of :class:`Visible`, tile after tile, front to back in each.
+        splat: (P,) int32, rows of :class:`VisibleSplats`, tile after tile, front to back in each.
         start: (tiles down, tiles across) int32, each tile's first place in ``splat``.
         counts: (tiles down, tiles across) int64.
     """
@@ -192,7 +202,7 @@ class Tiles(NamedTuple):
 
     @classmethod
     @torch.no_grad()
-    def of(cls, splats: Visible, view: View) -> Tiles:
+    def of(cls, splats: VisibleSplats, view: KernelCamera) -> TileLists:
         """Takes each ellipse's box of tiles, and keeps the tiles that the ellipse meets."""
         across, down = -(-view.width // TILE), -(-view.height // TILE)
         limits = torch.tensor([across, down], device=splats.which.device)
@@ -272,7 +282,7 @@ class _Blend(torch.autograd.Function):
 
 
 def walk(
-    splats: Visible, tiles: Tiles, view: View, limit: torch.Tensor | None = None
+    splats: VisibleSplats, tiles: TileLists, view: KernelCamera, limit: torch.Tensor | None = None
 ) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]]:
     """Blends in plain torch what gsplat does not tell: some splats of every tile at a time, front to back.
 
@@ -316,7 +326,7 @@ def walk(
 
 @torch.no_grad()
 def blend_limited(
-    splats: Visible, tiles: Tiles, view: View, limit: torch.Tensor,
+    splats: VisibleSplats, tiles: TileLists, view: KernelCamera, limit: torch.Tensor,
     colours: torch.Tensor, features: torch.Tensor, background: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
     """Image, alpha and blended features of what lies before a depth, which gsplat's kernels cannot draw."""
@@ -331,7 +341,7 @@ def blend_limited(
 
 @torch.no_grad()
 def median_splat(
-    splats: Visible, tiles: Tiles, view: View, limit: torch.Tensor | None = None
+    splats: VisibleSplats, tiles: TileLists, view: KernelCamera, limit: torch.Tensor | None = None
 ) -> torch.Tensor:
     """(H, W) int32: the splat that brings a pixel's transmittance to a half or below, -1 where none does."""
     down, across = tiles.counts.shape
@@ -343,7 +353,7 @@ def median_splat(
     return _as_picture(found[..., None], tiles, view)[..., 0].contiguous()
 
 
-def _as_picture(pixels: torch.Tensor, tiles: Tiles, view: View) -> torch.Tensor:
+def _as_picture(pixels: torch.Tensor, tiles: TileLists, view: KernelCamera) -> torch.Tensor:
     """(H, W, K) of what tiles have in their pixels, (tiles, 256, K)."""
     down, across = tiles.counts.shape
     rows = pixels.view(down, across, TILE, TILE, -1).transpose(1, 2)

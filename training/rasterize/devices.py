@@ -16,17 +16,17 @@ from . import (
     Gaussians,
     Target,
     cuda,
-    device_of,
+    make_device_model,
     photometric_loss,
     rasterize,
-    resolve,
-    twin_of,
+    resolve_backend,
+    tensor_device,
     warm_up,
 )
-from .cpu.compile import threads
-from .gpu import choice
+from .cpu.compile import thread_count
+from .gpu import default_device
 from .gpu.device import Adapter, adapters, open_device
-from .trial import try_out
+from .self_test import run_self_test
 
 SPLATS, SIZE = 50_000, (640, 426)
 """Of what :func:`step_seconds` draws."""
@@ -59,14 +59,14 @@ class Devices:
         except LodgsError as problem:
             return cls(card, [], None, str(problem))
         try:
-            return cls(card, found, choice.chosen(), "")
+            return cls(card, found, default_device.default_adapter(), "")
         except LodgsError as problem:
             return cls(card, found, None, str(problem))
 
     @property
     def sentence(self) -> str:
         """What trains by itself, and what might be faster."""
-        cores = f"the processor ({threads()} thread{'s' * (threads() > 1)})"
+        cores = f"the processor ({thread_count()} thread{'s' * (thread_count() > 1)})"
         if self.card and find_spec("gsplat"):
             return f"Automatic trains on {self.card} if gsplat works there, else on {cores}."
         if self.chosen is not None and not self.chosen.software:
@@ -91,7 +91,7 @@ def describe(timed: bool = False) -> str:
         timed: measure a training step on each as well, some seconds for each.
     """
     found = Devices.found()
-    rows = [("cpu", f"{threads()} threads")]
+    rows = [("cpu", f"{thread_count()} threads")]
     problem = cuda.problem()
     rows.append(("cuda", str(problem) if problem else f"{found.card}, through gsplat"))
     working = ["cpu"] if problem else ["cpu", "cuda"]
@@ -102,11 +102,11 @@ def describe(timed: bool = False) -> str:
             working += ["gpu"] * works
             told += said
         else:
-            told.append(f"not chosen: {choice.VARIABLE} may name it")
+            told.append(f"not chosen: {default_device.VARIABLE} may name it")
         rows.append(("gpu", f"{adapter.name}: {', '.join(filter(None, told))}"))
     if found.chosen is None:
         rows.append(("gpu", found.missing))
-    rows.append(("auto", resolve("auto")))
+    rows.append(("auto", resolve_backend("auto")))
     lines = [f"{name:<6}{text}" for name, text in rows]
     if timed:
         lines.append(f"A step with {SPLATS:,} splats, {SIZE[0]}x{SIZE[1]} pixels:")
@@ -118,7 +118,7 @@ def _tried(adapter: Adapter) -> tuple[list[str], bool]:
     """What is to be said of the chosen device, and whether it works."""
     try:
         memory = f"{open_device(adapter.name).most_bytes >> 20} MB in one buffer"
-        differs = try_out(adapter)
+        differs = run_self_test(adapter)
     except LodgsError as problem:
         return [str(problem)], False
     if differs:
@@ -139,7 +139,7 @@ def step_seconds(backend: str) -> float:
         "opacity_logits": random.normal(0, 2, SPLATS),
         "sh": random.normal(0, 0.3, (SPLATS, 16, 3)),
     }
-    device = device_of(backend)
+    device = tensor_device(backend)
     leaves = {
         name: torch.tensor(array, dtype=torch.float32, device=device).requires_grad_()
         for name, array in arrays.items()
@@ -148,7 +148,7 @@ def step_seconds(backend: str) -> float:
     target = Target(random.uniform(0, 1, (height, width, 3)).astype(np.float32))
     adam, taken = Adam(leaves, dict.fromkeys(leaves, 1e-4)), []
     warm_up(backend)
-    twin = twin_of(backend, adam, {})
+    twin = make_device_model(backend, adam, {})
 
     def step() -> None:
         if twin is not None:

@@ -6,15 +6,15 @@ import torch
 from torch.nn.functional import normalize
 
 from .gaussians import Gaussians
-from .rendering import View
+from .rendering import KernelCamera
 
 
-def depths(means: torch.Tensor, view: View) -> torch.Tensor:
+def depths(means: torch.Tensor, view: KernelCamera) -> torch.Tensor:
     """Depth (N,) of means (N, 3) along the camera's z axis, in world units."""
     return means @ torch.as_tensor(view.rotation[2]).to(means) + float(view.translation[2])
 
 
-def normals(gaussians: Gaussians, view: View) -> torch.Tensor:
+def normals(gaussians: Gaussians, view: KernelCamera) -> torch.Tensor:
     """Each splat's shortest axis (N, 3), unit length, in camera coordinates, turned towards the camera."""
     means, quats = gaussians.means, gaussians.quats
     shortest = gaussians.log_scales.detach().argmin(dim=1)

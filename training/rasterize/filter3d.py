@@ -6,7 +6,7 @@ import torch
 from torch.nn.functional import logsigmoid
 
 
-def smoothed(
+def apply_filter3d(
     log_scales: torch.Tensor, opacity_logits: torch.Tensor, std: torch.Tensor | float
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Splats convolved with a round Gaussian, their mass kept; differentiable.

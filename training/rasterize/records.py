@@ -22,7 +22,7 @@ OPACITY_LOGIT = 10
 """Its column."""
 
 
-def gather(records: torch.Tensor, places: np.ndarray, terms: int) -> Gaussians:
+def gather_gaussians(records: torch.Tensor, places: np.ndarray, terms: int) -> Gaussians:
     """The splats (M,) at places (M,) int64 of records (N, width), with so many harmonics: a copy."""
     shapes = (3,), (4,), (3,), (), (terms, 3)
     if records.device.type == "cpu":
@@ -38,7 +38,7 @@ def gather(records: torch.Tensor, places: np.ndarray, terms: int) -> Gaussians:
 
 
 @torch.no_grad()
-def step(
+def adam_step(
     records: torch.Tensor,
     places: np.ndarray,
     gradients: Sequence[torch.Tensor],

@@ -22,9 +22,9 @@ from .rendering import (
     DILATION,
     TRANSMITTANCE_MIN,
     BackendOutput,
+    KernelCamera,
     RasterSettings,
     Target,
-    KernelCamera,
 )
 
 Moments = tuple[torch.Tensor, torch.Tensor]

@@ -25,7 +25,7 @@ FRUSTUM_MARGIN = 0.3
 
 
 @dataclass(frozen=True)
-class View:
+class KernelCamera:
     """A camera as the kernels take it: numbers only.
 
     Attributes:
@@ -50,7 +50,7 @@ class View:
     near: float
 
     @classmethod
-    def of(cls, camera: Camera, near: float, window: tuple[int, int, int, int] | None = None) -> View:
+    def of(cls, camera: Camera, near: float, window: tuple[int, int, int, int] | None = None) -> KernelCamera:
         """The whole image, or the part of it that a window (left, top, width, height) shows."""
         left, top, width, height = window or (0, 0, camera.width, camera.height)
         margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / camera.fx
@@ -72,16 +72,16 @@ class View:
 
 
 @dataclass(frozen=True)
-class Settings:
+class RasterSettings:
     """What a backend is told besides tensors of splats; see :func:`training.rasterize.rasterize`.
 
     Attributes:
         degree: of the harmonics to draw with.
-        median, absolute: whether ``Drawn.median`` and ``Drawn.absgrad2d`` are wanted.
+        median, absolute: whether ``BackendOutput.median`` and ``BackendOutput.absgrad2d`` are wanted.
         rows: (M,) int32, those that are looked at; None: all.
     """
 
-    view: View
+    view: KernelCamera
     min_scale: float
     antialias: bool | torch.Tensor
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -158,7 +158,7 @@ class Contributions:
 
 @dataclass
 class SideOutputs:
-    """What a backend for the CPU's tensors fills in besides what autograd differentiates, see Drawn."""
+    """What a backend for the CPU's tensors fills in besides what autograd differentiates, see BackendOutput."""
 
     radii: torch.Tensor
     grad2d: torch.Tensor
@@ -167,7 +167,7 @@ class SideOutputs:
     tile_counts: torch.Tensor
 
     @classmethod
-    def of(cls, count: int, settings: Settings, tile: int) -> SideOutputs:
+    def of(cls, count: int, settings: RasterSettings, tile: int) -> SideOutputs:
         """Those of N splats, to be filled, with tiles of so many pixels a side."""
         height, width = settings.view.height, settings.view.width
         return cls(
@@ -188,7 +188,7 @@ def require_plain(tensors: Iterable[torch.Tensor], backend: str) -> None:
             )
 
 
-class Drawn(NamedTuple):
+class BackendOutput(NamedTuple):
     """What a backend returns: a :class:`Rendering` before its outputs are named.
 
     Attributes:

@@ -31,10 +31,10 @@ from ..splats.bundle import Bundle
 from ..splats.dialects import Warn, ignore
 from ..splats.gaussians import Splats
 from ..splats.ply import Element, all_columns
-from . import tensor_device, rasterize
+from . import rasterize, tensor_device
 from .gaussians import Gaussians
-from .transform import transform_gaussians
 from .rendering import Rendering
+from .transform import transform_gaussians
 
 MANY = 16 * SIZE
 """Fewer splats are not worth being put in order; of equally deep ones the first in order is in front."""
@@ -259,7 +259,9 @@ class ResidentBundle:
             for number, facts in self._all_facts().items()
         }
         if self.bundle.on_disk:
-            return {n: WeightedSet(self._in_sight(n, camera, choice), choice) for n, choice in choices.items()}
+            return {
+                n: WeightedSet(self._in_sight(n, camera, choice), choice) for n, choice in choices.items()
+            }
         self._hold(next(iter(choices.values())).region(), frozenset(choices))
         return {number: WeightedSet(self._sets[number], choice) for number, choice in choices.items()}
 

@@ -8,22 +8,22 @@ from pathlib import Path
 from ..errors import LodgsError
 from ..lod.rule import Values, find_rule
 from ..lod.selection import settings
-from ..rasterize import why_cpu
-from ..rasterize.resident import Resident
+from ..rasterize import cpu_fallback_reason
+from ..rasterize.resident import ResidentBundle
 from ..runs.data import training_data
 from ..runs.folder import RunFolder
 from ..runs.job import Job
 from ..scenes.cameras import Camera
 from ..scenes.colmap import read_scene
 from ..scenes.views import views_in
-from ..splats.bundle import Bundle, read_folder, read_head, read_tables
-from ..splats.dialects import Warn, silent
-from .picture import read_depth, write_picture
+from ..splats.bundle import Bundle, read_folder, read_header, read_tables
+from ..splats.dialects import Warn, ignore
+from .image import read_depth, write_image
 from .scene import Instance, draw
 
 
 @dataclass(frozen=True)
-class Source:
+class RenderSource:
     """What is rendered: levels, and where they were trained, the views that they were trained from.
 
     Attributes:
@@ -37,7 +37,7 @@ class Source:
     run: RunFolder | None
 
     @classmethod
-    def read(cls, path: Path, warn: Warn = silent) -> Source:
+    def read(cls, path: Path, warn: Warn = ignore) -> RenderSource:
         """A run's folder, a bundle, a folder of levels, or any 3DGS PLY.
 
         Args:
@@ -57,7 +57,7 @@ class Source:
                 )
             path = run.bundle
         levels = read_folder(path, warn) if path.is_dir() else path
-        rule = (levels if isinstance(levels, Bundle) else read_head(levels)).rule
+        rule = (levels if isinstance(levels, Bundle) else read_header(levels)).rule
         return cls(levels, rule, run if run.job.exists() else None)
 
     def view(self, name: str, scene: Path | None = None) -> tuple[Camera, float]:
@@ -97,7 +97,7 @@ class Source:
 
 
 def render(
-    source: Source,
+    source: RenderSource,
     camera: Camera,
     near: float,
     out: Path,
@@ -107,8 +107,8 @@ def render(
     background: tuple[float, float, float] | None = (0.0, 0.0, 0.0),
     holdout: Path | None = None,
     backend: str = "auto",
-    warn: Warn = silent,
-) -> Resident:
+    warn: Warn = ignore,
+) -> ResidentBundle:
     """Draws one view into a file: a PNG, or an EXR with depth and levels besides.
 
     Args:
@@ -129,14 +129,14 @@ def render(
     if out.suffix.lower() not in (".png", ".exr"):
         raise LodgsError(f"{out.name} is neither .png nor .exr.", "Choose one of these endings.")
     limit = None if holdout is None else read_depth(holdout, camera.width, camera.height, None)
-    if problem := why_cpu(backend):
+    if problem := cpu_fallback_reason(backend):
         warn(problem)
-    resident = Resident(source.levels, backend, warn)
+    resident = ResidentBundle(source.levels, backend, warn)
     bundle, rule = resident.bundle, find_rule(source.rule)
     if given is not None or (rule is not None and rule.always and not level):
-        shown = resident.by_distance(camera, settings(bundle, given or {}))
+        shown = resident.select_by_rule(camera, settings(bundle, given or {}))
     else:
-        shown = resident.complete(level or bundle.levels[-1].number, camera)
+        shown = resident.select_level(level or bundle.levels[-1].number, camera)
     instances = [
         Instance(one.splats, level=number, antialias=bundle.antialias, choice=one.choice)
         for number, one in shown.items()
@@ -147,5 +147,5 @@ def render(
         backend=backend,
     )  # fmt: skip
     assert picture is not None
-    write_picture(out, picture)
+    write_image(out, picture)
     return resident

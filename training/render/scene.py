@@ -13,7 +13,7 @@ from ..editing.look import Looks
 from ..errors import LodgsError, is_out_of_memory
 from ..lod.query import Choice
 from ..rasterize import Gaussians, rasterize_strips
-from ..rasterize.resident import WeightedSet, SplatSet, combine_visible
+from ..rasterize.resident import SplatSet, WeightedSet, combine_visible
 from ..scenes.cameras import Camera, check_size
 from ..splats.sh import basis, degree_from_count
 from ..splats.similarity import is_similarity

@@ -46,7 +46,7 @@ from .. import VERSION
 from ..errors import LodgsError, is_out_of_memory
 from ..evaluate.metrics import psnr
 from ..lod.tree.paging import TreeFile
-from ..rasterize import resolve_backend, cpu_fallback_reason
+from ..rasterize import cpu_fallback_reason, resolve_backend
 from ..runs.events import event_line
 from ..scenes.cameras import camera_as_dict
 from ..scenes.images import load_image, load_mask

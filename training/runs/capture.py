@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from ..errors import LodgsError
-from ..rasterize import Gaussians, rasterize, cpu_fallback_reason
+from ..rasterize import Gaussians, cpu_fallback_reason, rasterize
 from ..scenes.cameras import Camera, read_views
 from ..scenes.viewpoints import dome
 from ..scenes.write_colmap import write_seen

@@ -32,7 +32,7 @@ from ..methods import METHODS, create
 from ..optimize.memory import keep_freed_memory
 from ..optimize.method import Method
 from ..optimize.training_data import TrainingData
-from ..rasterize import Gaussians, contributions, tensor_device, resolve_backend, warm_up, cpu_fallback_reason
+from ..rasterize import Gaussians, contributions, cpu_fallback_reason, resolve_backend, tensor_device, warm_up
 from ..rasterize.gpu.default_device import default_adapter as graphics_device
 from ..rasterize.resident import ResidentBundle
 from ..scenes.orientation import up_rotation

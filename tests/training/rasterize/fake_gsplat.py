@@ -26,7 +26,7 @@ def spherical_harmonics(
     assert (degrees_to_use + 1) ** 2 <= coeffs.shape[-2] and coeffs.shape[:-2] == dirs.shape[:-1]
     assert dirs.shape[-1] == coeffs.shape[-1] == 3
     assert dirs.dtype == coeffs.dtype == torch.float32
-    values: list = [None] * sh.coefficients(degrees_to_use)
+    values: list = [None] * sh.coefficient_count(degrees_to_use)
     sh.basis(*normalize(dirs, dim=-1).unbind(-1), degrees_to_use, values)
     return (torch.stack(values, -1)[..., None] * coeffs[..., : len(values), :]).sum(-2)
 

@@ -12,14 +12,22 @@ import pytest
 import torch
 
 from tests.training.rasterize import fake_gsplat
-from tests.training.rasterize.scenes import CONTRIBUTING, SCENES, contributed, drawn_and_differentiated
+from tests.training.rasterize.comparison import CONTRIBUTING, SCENES, contributed, drawn_and_differentiated
 from training import rasterize as rasterizer
 from training.errors import LodgsError
 from training.files import try_lock
-from training.rasterize import Target, cuda, device_of, photometric_loss, rasterize, reference, resolve
+from training.rasterize import (
+    Target,
+    cuda,
+    photometric_loss,
+    rasterize,
+    reference,
+    resolve_backend,
+    tensor_device,
+)
 from training.rasterize.features import depths
 from training.rasterize.reference import ellipses, squared_reach
-from training.rasterize.rendering import Settings, View
+from training.rasterize.rendering import KernelCamera, RasterSettings
 from training.scenes.cameras import Camera
 
 GSPLAT_CAP = 0.999
@@ -109,10 +117,10 @@ def test_median_depths_agree_with_the_reference(device, make_splats, odd_camera,
 
 def test_every_splat_is_in_every_tile_it_touches_once_and_front_to_back(device, make_splats, odd_camera):
     """Against a count over all pixels in float64, as the cpu backend's pairs."""
-    splats, view = make_splats(400, seed=2), View.of(odd_camera, 0.2)
-    settings = Settings(view, min_scale=0.01, antialias=False)
-    visible = cuda.Visible.of(splats.to(device, torch.float32), None, settings)
-    tiles = cuda.Tiles.of(visible, view)
+    splats, view = make_splats(400, seed=2), KernelCamera.of(odd_camera, 0.2)
+    settings = RasterSettings(view, min_scale=0.01, antialias=False)
+    visible = cuda.VisibleSplats.of(splats.to(device, torch.float32), None, settings)
+    tiles = cuda.TileLists.of(visible, view)
     exact = ellipses(splats, None, settings)
 
     (xx, xy, yy), mean = (v[:, None, None] for v in exact.covariance), exact.mean2d[:, :, None, None]
@@ -209,17 +217,17 @@ def card(monkeypatch):
 
 
 def test_auto_is_cuda_where_a_gpu_and_gsplat_are(card, monkeypatch):
-    assert resolve("auto") == resolve("cuda") == "cuda"
+    assert resolve_backend("auto") == resolve_backend("cuda") == "cuda"
     monkeypatch.setattr(cuda, "DEVICE", "cuda")
-    assert device_of("auto") == torch.device("cuda")
-    assert resolve("cpu") == "cpu" and device_of("reference") == torch.device("cpu")
+    assert tensor_device("auto") == torch.device("cuda")
+    assert resolve_backend("cpu") == "cpu" and tensor_device("reference") == torch.device("cpu")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this computer has a GPU")
 def test_auto_is_cpu_without_a_gpu():
-    assert resolve("auto") == "cpu" and device_of("auto") == torch.device("cpu")
+    assert resolve_backend("auto") == "cpu" and tensor_device("auto") == torch.device("cpu")
     with pytest.raises(LodgsError, match=r"no NVIDIA GPU that torch can use\..*auto or cpu"):
-        resolve("cuda")
+        resolve_backend("cuda")
 
 
 def test_auto_follows_the_tensors_that_it_is_given(card, monkeypatch, make_splats, odd_camera):
@@ -235,9 +243,9 @@ def test_what_is_missing_is_said_with_a_remedy(card, monkeypatch):
     def problem_with(gsplat) -> str:
         monkeypatch.setitem(sys.modules, "gsplat", gsplat)
         cuda.problem.cache_clear()
-        assert resolve("auto") == "cpu"
+        assert resolve_backend("auto") == "cpu"
         with pytest.raises(LodgsError) as caught:
-            resolve("cuda")
+            resolve_backend("cuda")
         return str(caught.value)
 
     assert "needs gsplat" in (said := problem_with(None)) and "pip install gsplat" in said

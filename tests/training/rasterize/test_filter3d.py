@@ -4,13 +4,13 @@ import math
 
 import torch
 
-from training.rasterize.filter3d import smoothed
+from training.rasterize.filter3d import apply_filter3d
 
 
 def test_a_filtered_splat_is_wider_and_keeps_its_mass():
     scales = torch.tensor([[0.3, 0.4, 1.2], [2.0, 1e-6, 1.0]], dtype=torch.float64)
     opacities = torch.tensor([0.9, 0.2], dtype=torch.float64)
-    wider, logits = smoothed(scales.log(), opacities.logit(), torch.tensor([0.4, 1.0]))
+    wider, logits = apply_filter3d(scales.log(), opacities.logit(), torch.tensor([0.4, 1.0]))
     torch.testing.assert_close(
         wider.exp()[0], torch.tensor([0.5, math.sqrt(0.32), math.sqrt(1.6)]).double(), rtol=1e-6, atol=0
     )
@@ -20,16 +20,16 @@ def test_a_filtered_splat_is_wider_and_keeps_its_mass():
 
 def test_no_filter_changes_nothing():
     log_scales, logits = torch.randn(5, 3), torch.randn(5)
-    wider, faded = smoothed(log_scales, logits, 0.0)
+    wider, faded = apply_filter3d(log_scales, logits, 0.0)
     torch.testing.assert_close(wider, log_scales)
     torch.testing.assert_close(faded, logits)
 
 
 def test_the_filters_gradients_are_finite_differences():
     tensors = [torch.randn(4, 3).double().requires_grad_(), torch.randn(4).double().requires_grad_()]
-    assert torch.autograd.gradcheck(lambda a, b: smoothed(a, b, 0.7), tensors)
+    assert torch.autograd.gradcheck(lambda a, b: apply_filter3d(a, b, 0.7), tensors)
 
 
 def test_no_splats_are_no_trouble():
-    wider, logits = smoothed(torch.zeros(0, 3), torch.zeros(0), 1.0)
+    wider, logits = apply_filter3d(torch.zeros(0, 3), torch.zeros(0), 1.0)
     assert wider.shape == (0, 3) and logits.shape == (0,)

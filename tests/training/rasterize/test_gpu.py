@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.training.rasterize.scenes import contributed, drawn_and_differentiated
+from tests.training.rasterize.comparison import contributed, drawn_and_differentiated
 from training.errors import LodgsError
 from training.rasterize import Target, gpu, photometric_loss, render
 from training.rasterize.gpu import bin, device
@@ -68,7 +68,7 @@ def test_the_least_that_a_device_can_do_is_enough(graphics, make_splats, odd_cam
     assert least._device.limits["max-storage-buffers-per-shader-stage"] == 8
     found = []
     for each in (least, graphics):
-        monkeypatch.setattr(gpu, "open_chosen", lambda each=each: each)
+        monkeypatch.setattr(gpu, "open_default_device", lambda each=each: each)
         drawn = drawn_and_differentiated("degree 3", make_splats, odd_camera, "gpu", torch.float32)
         share, _ = contributed("degree 3", make_splats, odd_camera, "gpu", torch.float32)
         loss = photometric_loss(drawn["image"].float(), Target(torch.zeros(50, 75, 3)), backend="gpu")

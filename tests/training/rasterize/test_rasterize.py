@@ -12,7 +12,13 @@ import numpy as np
 import pytest
 import torch
 
-from tests.training.rasterize.scenes import CONTRIBUTING, SCENES, contributed, drawn_and_differentiated, scene
+from tests.training.rasterize.comparison import (
+    CONTRIBUTING,
+    SCENES,
+    contributed,
+    drawn_and_differentiated,
+    scene,
+)
 from training.errors import LodgsError
 from training.rasterize import (
     OUTPUTS,
@@ -22,11 +28,11 @@ from training.rasterize import (
     cpu,
     photometric_loss,
     rasterize,
+    rasterize_strips,
     render,
-    strips,
 )
 from training.rasterize.cpu.bin import TILE, bin_splats
-from training.rasterize.cpu.compile import Buffers, _idle, in_parallel, numba, set_threads, threads
+from training.rasterize.cpu.compile import Buffers, _idle, numba, run_parallel, set_thread_count, thread_count
 from training.rasterize.cpu.fastmath import exp2
 from training.rasterize.cpu.project import (
     COLUMNS,
@@ -39,7 +45,7 @@ from training.rasterize.cpu.project import (
     RISE,
     SLOPE,
     X_OF_TOP,
-    rows_of_strip,
+    strip_rows,
 )
 from training.scenes.cameras import Camera
 
@@ -236,7 +242,7 @@ def test_limits_of_strips_and_windows(backend, make_splats, odd_camera):
     for left, top, width, height in ((0, 0, 75, 50), (20, 7, 41, 36)):
         inside = slice(top, top + height), slice(left, left + width)
         window = {"window": (left, top, width, height), "limit": limit[inside]}
-        parts = [drawn for _, drawn in strips(splats, odd_camera, strip=1, **window, **options)]
+        parts = [drawn for _, drawn in rasterize_strips(splats, odd_camera, strip=1, **window, **options)]
         assert len(parts) > 2
         for output in ("image", "alpha", "median_depth"):
             found = torch.cat([getattr(part, output) for part in parts])
@@ -256,7 +262,7 @@ def test_a_limit_is_for_pictures(backend, make_splats, odd_camera):
     with pytest.raises(ValueError, match="it has no gradients"):
         rasterize(splats, odd_camera, limit=torch.ones(50, 75), backend=backend)
     with pytest.raises(ValueError, match=r"limit must have shape \(50, 75\)"):
-        next(strips(splats, odd_camera, limit=torch.ones(75, 50), backend=backend))
+        next(rasterize_strips(splats, odd_camera, limit=torch.ones(75, 50), backend=backend))
 
 
 def test_median_depths_agree_with_the_reference(kernels, make_splats, odd_camera):
@@ -447,23 +453,23 @@ def test_rendered_pictures_are_what_training_sees(backend, make_splats, odd_came
 
 def test_the_same_bits_whatever_the_number_of_threads(make_splats, odd_camera):
     splats, truth = make_splats(2000), Target(torch.rand(50, 75, 3))
-    before, results = threads(), []
+    before, results = thread_count(), []
     try:
         for count in (1, 2, 16, 1):
-            set_threads(count)
+            set_thread_count(count)
             results.append(everything(splats, odd_camera, truth))
     finally:
-        set_threads(before)
+        set_thread_count(before)
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
 @pytest.fixture
 def sixteen_threads():
-    before = threads()
-    set_threads(16)
+    before = thread_count()
+    set_thread_count(16)
     yield
-    set_threads(before)
+    set_thread_count(before)
 
 
 @pytest.mark.parametrize("name", ["degree 3", "antialiased some", "crowd"])
@@ -489,7 +495,7 @@ def test_sixteen_threads_take_every_range_once_and_none_more_than_another(sixtee
         taken.append((begin, threading.get_ident()))
         together.wait()
 
-    in_parallel(work, 16 * 5 * 7, 7, 7)
+    run_parallel(work, 16 * 5 * 7, 7, 7)
     assert sorted(begin for begin, _ in taken) == list(range(0, 16 * 5 * 7, 7))
     by_thread = Counter(thread for _, thread in taken)
     assert len(by_thread) == 16 and set(by_thread.values()) == {5}
@@ -497,10 +503,10 @@ def test_sixteen_threads_take_every_range_once_and_none_more_than_another(sixtee
 
 def test_the_last_range_ends_where_the_work_does(sixteen_threads):
     taken = []
-    in_parallel(lambda begin, end: taken.append((begin, end)), 10, 4)
+    run_parallel(lambda begin, end: taken.append((begin, end)), 10, 4)
     assert sorted(taken) == [(0, 4), (4, 8), (8, 10)]
     with pytest.raises(ZeroDivisionError):  # what goes wrong in a thread goes wrong for the caller
-        in_parallel(lambda begin, end: 1 // (begin - 8), 10, 4)
+        run_parallel(lambda begin, end: 1 // (begin - 8), 10, 4)
 
 
 def test_ranges_are_fine_enough_for_sixteen_threads(make_splats, sixteen_threads, monkeypatch):
@@ -515,9 +521,9 @@ def test_ranges_are_fine_enough_for_sixteen_threads(make_splats, sixteen_threads
 
     def spy(kernel, total, grain, *args):
         dealt.append((kernel.__name__, total, grain))
-        in_parallel(kernel, total, grain, *args)
+        run_parallel(kernel, total, grain, *args)
 
-    monkeypatch.setattr(cpu, "in_parallel", spy)
+    monkeypatch.setattr(cpu, "run_parallel", spy)
     drawn = rasterize(leaves, camera)
     drawn.image.sum().backward()
     tiles = drawn.tile_counts.flatten().numpy()
@@ -633,7 +639,7 @@ def ellipses(count, random, largest):
 
 @numba.njit
 def rows_over(projected):
-    return [rows_of_strip(row, np.float32(0.5), np.float32(15), np.float32(0.5), 16) for row in projected]
+    return [strip_rows(row, np.float32(0.5), np.float32(15), np.float32(0.5), 16) for row in projected]
 
 
 def test_the_rows_of_a_tile_hold_every_pixel_of_the_ellipse_and_hardly_more():

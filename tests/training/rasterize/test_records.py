@@ -43,7 +43,7 @@ def test_each_record_makes_steps_of_its_own():
         drawn = rendering(200)
         opacity = some[at, 10].sigmoid()
         shares = torch.tensor([0.0, 0.25, 1.0])[torch.arange(200) % 3] if number % 2 else None
-        records.step(some, places, gradients, drawn, number, rates, shares)
+        records.adam_step(some, places, gradients, drawn, number, rates, shares)
         score = drawn.grad2d.norm(dim=1) * drawn.radii * opacity**0.2
         g = torch.cat([each.reshape(200, -1) for each in gradients], 1).double()
         largest[at] = torch.maximum(largest[at], score)

@@ -121,7 +121,10 @@ def test_of_a_large_file_a_camera_has_read_what_it_may_see(tmp_path, monkeypatch
     write_bundle(tmp_path / "bundle.ply", shown)
     shown = read_bundle(tmp_path / "bundle.ply")
     told, values, total = [], settings(shown, {}), sum(len(each.splats) for each in shown.levels)
-    whole, part = ResidentBundle(shown, "cpu"), ResidentBundle(tmp_path / "bundle.ply", "cpu", told.append, most=1000)
+    whole, part = (
+        ResidentBundle(shown, "cpu"),
+        ResidentBundle(tmp_path / "bundle.ply", "cpu", told.append, most=1000),
+    )
     finest, loaded, read = shown.levels[-1].number, [], []
     for camera in views():
         for draw in (lambda one, c=camera: one.draw(c, values, near=NEAR),
@@ -180,7 +183,9 @@ def test_of_a_file_a_level_is_read_alone(tmp_path):
     part = ResidentBundle(tmp_path / "bundle.ply", "cpu")
     for level in shown.levels:
         picture = part.draw_level(level.number, camera, near=NEAR).image
-        assert torch.equal(picture, ResidentBundle(shown, "cpu").draw_level(level.number, camera, near=NEAR).image)
+        assert torch.equal(
+            picture, ResidentBundle(shown, "cpu").draw_level(level.number, camera, near=NEAR).image
+        )
         assert part.loaded == len(level.splats)
     with pytest.raises(LodgsError, match="There is no level 7"):
         part.draw_level(7, camera)
@@ -254,7 +259,7 @@ def test_within_a_band_nothing_is_asked_and_the_same_is_chosen(monkeypatch):
 
 def test_a_crop_may_come_while_the_eye_stays_in_its_region():
     shown, camera = bundle("chunks"), next(views())
-    everything = ResidentBundle(shown, "cpu").by_distance(camera, settings(shown, {}))
+    everything = ResidentBundle(shown, "cpu").select_by_rule(camera, settings(shown, {}))
     for splats, choice in everything.values():
         before = splats.select_visible(choice)[0]
         np.testing.assert_array_equal(splats.select_visible(replace(choice, crops=()))[0], before)
@@ -265,7 +270,7 @@ def test_looks_change_what_is_seen_and_not_what_is_chosen(looked_first):
     shown = bundle("decay")
     own = shown.levels[0].splats
     camera, looks = next(views()), ((None, Look(opacity=0.2)),)
-    _, choice = ResidentBundle(shown, "cpu").by_distance(camera, settings(shown, {}))[1]
+    _, choice = ResidentBundle(shown, "cpu").select_by_rule(camera, settings(shown, {}))[1]
     trained = {"opacity": 1 / (1 + np.exp(-own.opacity_logits)), **own.extras}
     truth = np.flatnonzero(choice.weights(own.means, trained) > 0)
     splats = SplatSet(own, backend="cpu", ordered=True)

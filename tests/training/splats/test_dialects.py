@@ -9,7 +9,7 @@ from plyfile import PlyData, PlyElement
 
 from training.errors import LodgsError
 from training.lod.describe import describe
-from training.rasterize.filter3d import smoothed
+from training.rasterize.filter3d import apply_filter3d
 from training.render.scene import Instance, SplatSet, draw
 from training.scenes.cameras import Camera
 from training.splats.bundle import (
@@ -17,11 +17,11 @@ from training.splats.bundle import (
     Level,
     read_bundle,
     read_folder,
-    read_head,
+    read_header,
     write_bundle,
     write_folder,
 )
-from training.splats.dialects import comments_of
+from training.splats.dialects import comments_from_meta
 from training.splats.ply import read_ply, write_ply
 
 XYZ = ["x", "y", "z"]
@@ -100,7 +100,7 @@ def test_a_filtered_scene_looks_as_the_trainers_filter_makes_it(write):
     raw = read_ply(write(PLAIN, {k: v for k, v in values.items() if k in PLAIN}, count=count, name="raw.ply"))
     read = read_ply(write([*PLAIN, "filter_3D"], values, count=count))
     std = torch.from_numpy(values["filter_3D"]).float()
-    log_scales, logits = smoothed(torch.from_numpy(raw.log_scales), torch.from_numpy(raw.opacity_logits), std)
+    log_scales, logits = apply_filter3d(torch.from_numpy(raw.log_scales), torch.from_numpy(raw.opacity_logits), std)
     camera = Camera("a", 48, 40, 40.0, 40.0, 24.0, 20.0, np.eye(4))
 
     def picture(splats):
@@ -162,7 +162,7 @@ PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 )
 def test_what_cannot_be_drawn_is_named(write, columns, what, remedy):
     path = write(columns)
-    for read in (read_ply, read_bundle, read_head):
+    for read in (read_ply, read_bundle, read_header):
         with pytest.raises(LodgsError, match=what) as caught:
             read(path)
         assert str(path) in caught.value.what and remedy in caught.value.remedy
@@ -196,7 +196,7 @@ def test_the_coarsest_level_of_flod_is_known_by_its_folder(write):
 def test_a_2d_filter_is_known(write, comments, mip):
     path, warnings = write(PLAIN, comments=comments), []
     bundle = read_bundle(path, warnings.append)
-    assert bundle.meta == ({"antialias": True} if mip else {}) == read_head(path).meta
+    assert bundle.meta == ({"antialias": True} if mip else {}) == read_header(path).meta
     assert bundle.antialias is mip and ("antialias: true" in describe(path)) is mip
     assert warnings == []
 
@@ -214,7 +214,7 @@ def test_the_2d_filter_survives_every_way_of_writing(tmp_path, make_splats):
     write_bundle(tmp_path / "b.ply", bundle)
     assert comment in PlyData.read(str(tmp_path / "b.ply"))["vertex"].comments
     assert read_bundle(tmp_path / "b.ply").meta == bundle.meta
-    write_ply(tmp_path / "p.ply", levels[0].splats, comments_of(bundle.meta))
+    write_ply(tmp_path / "p.ply", levels[0].splats, comments_from_meta(bundle.meta))
     assert read_bundle(tmp_path / "p.ply").meta == bundle.meta
     write_folder(tmp_path / "f", bundle)
     assert all(
@@ -222,7 +222,7 @@ def test_the_2d_filter_survives_every_way_of_writing(tmp_path, make_splats):
     )
     (tmp_path / "f" / "manifest.json").unlink()
     assert read_folder(tmp_path / "f").meta == bundle.meta
-    assert comments_of({}) == []
+    assert comments_from_meta({}) == []
 
 
 def test_splats_that_are_no_numbers_are_left_out(write):

@@ -12,7 +12,7 @@ from ...lod.blocks import Blocks
 from ...lod.rule import facts_of
 from ...lod.rules.chunks import RULE
 from ...rasterize import Gaussians, contributions
-from ...rasterize.filter3d import smoothed
+from ...rasterize.filter3d import apply_filter3d
 from ...scenes.cameras import Camera
 
 Rows = Mapping[int, np.ndarray]
@@ -21,7 +21,7 @@ Rows = Mapping[int, np.ndarray]
 
 def filtered(gaussians: Gaussians, std: float) -> Gaussians:
     """Splats with LODGE's filter of that standard deviation, in scene units (Eq. 3)."""
-    scales, opacities = smoothed(gaussians.log_scales, gaussians.opacity_logits, std)
+    scales, opacities = apply_filter3d(gaussians.log_scales, gaussians.opacity_logits, std)
     return replace(gaussians, log_scales=scales, opacity_logits=opacities)
 
 

@@ -21,7 +21,7 @@ from ...errors import LodgsError
 from ...lod.blocks import AXIS_BITS, places_on_curve
 from ...lod.tree.forest import Piece, divided, joined, joined_trees, longest_of
 from ...lod.tree.shape import Tree, area_of
-from ...rasterize.cpu.compile import STRICT, run_parallel, inlined, kernel
+from ...rasterize.cpu.compile import STRICT, inlined, kernel, run_parallel
 from ...splats.gaussians import SH_C0, SplatRows, Splats
 from ...splats.scratch import ScratchFile
 

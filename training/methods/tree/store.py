@@ -25,8 +25,15 @@ from ...optimize.model import NAMES
 from ...optimize.out_of_core.cut_cache import CutCache, NoRoom
 from ...optimize.out_of_core.row_file import FileRows, Layout
 from ...rasterize import Gaussians
-from ...rasterize.sequential_point_tree import LEAF, UpperTree, node_bounds, first_below, image_borders, search_lists
 from ...rasterize.records import gather_gaussians
+from ...rasterize.sequential_point_tree import (
+    LEAF,
+    UpperTree,
+    first_below,
+    image_borders,
+    node_bounds,
+    search_lists,
+)
 from ...scenes.cameras import Camera
 from ...splats.gaussians import Splats
 

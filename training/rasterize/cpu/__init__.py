@@ -15,10 +15,10 @@ import numpy as np
 import torch
 
 from ..gaussians import Gaussians
-from ..rendering import Drawn, Settings, SideOutputs, Target, View, require_plain
+from ..rendering import BackendOutput, KernelCamera, RasterSettings, SideOutputs, Target, require_plain
 from .bin import TILE, Pairs, bin_splats
 from .blend import blend_backward, blend_backward_absolute, blend_forward, blend_median, blend_weights
-from .compile import Buffers, f32, in_parallel, serialised
+from .compile import Buffers, f32, run_parallel, serialised
 from .loss import loss_and_gradient, moments_of
 from .project import (
     BLUE,
@@ -40,8 +40,8 @@ TILES = 16
 
 
 def rasterize(
-    gaussians: Gaussians, weights: torch.Tensor | None, features: torch.Tensor, settings: Settings
-) -> Drawn:
+    gaussians: Gaussians, weights: torch.Tensor | None, features: torch.Tensor, settings: RasterSettings
+) -> BackendOutput:
     """See :func:`training.rasterize.rasterize`. Tensors are float32 on the CPU; ValueError otherwise.
 
     The image is laid out in planes: ``image.permute(2, 0, 1)`` is contiguous.
@@ -56,18 +56,18 @@ def rasterize(
     behind, most = np.array(settings.background, np.float32), None if limit is None else limit.numpy()
     drawn = _Rasterize.apply(*tensors, _rows(settings), _of_kernels(settings), view, behind, most, side)
     planes, alpha, blended = drawn
-    return Drawn(
+    return BackendOutput(
         image=planes.permute(1, 2, 0), alpha=alpha, radii=side.radii, grad2d=side.grad2d,
         tile_counts=side.tile_counts, absgrad2d=side.absgrad2d, features=blended.permute(1, 2, 0),
         median=side.median,
     )  # fmt: skip
 
 
-def _rows(settings: Settings) -> np.ndarray | None:
+def _rows(settings: RasterSettings) -> np.ndarray | None:
     return None if settings.rows is None else settings.rows.to(torch.int32).contiguous().numpy()
 
 
-def _of_kernels(settings: Settings) -> tuple:
+def _of_kernels(settings: RasterSettings) -> tuple:
     """The settings as ``project``'s kernels take them."""
     view = settings.view
     size = view.width, view.height
@@ -76,7 +76,12 @@ def _of_kernels(settings: Settings) -> tuple:
 
 
 def _project_and_bin(
-    splats: list, rows: np.ndarray | None, settings: tuple, view: View, radii: torch.Tensor, buffers: Buffers
+    splats: list,
+    rows: np.ndarray | None,
+    settings: tuple,
+    view: KernelCamera,
+    radii: torch.Tensor,
+    buffers: Buffers,
 ) -> tuple[np.ndarray, np.ndarray, Pairs]:
     """The M splats that have a weight, or the ``rows`` given; these projected, (M, COLUMNS); and their pairs
     with tiles. All that follows counts only these M. Fills the radii, which are zeros. The last two live in
@@ -87,7 +92,9 @@ def _project_and_bin(
         some = (np.flatnonzero(weights > 0) if len(weights) else np.arange(len(radii))).astype(np.int32)
     projected = buffers.take("projected", np.float32, len(some), COLUMNS)
     depths = np.empty(len(some), np.float32)
-    in_parallel(project_forward, len(some), GRAIN, *splats, *settings, some, depths, projected, radii.numpy())
+    run_parallel(
+        project_forward, len(some), GRAIN, *splats, *settings, some, depths, projected, radii.numpy()
+    )
     drawn = np.flatnonzero(depths).astype(np.int32)
     return some, projected, bin_splats(projected, drawn, depths[drawn], view.width, view.height, buffers)
 
@@ -117,13 +124,13 @@ class _Rasterize(torch.autograd.Function):
         images = np.empty((len(passes), 3, view.height, view.width), np.float32)
         for coloured, image in zip(passes, images, strict=True):
             behind = background if coloured is projected else np.zeros_like(background)
-            in_parallel(
+            run_parallel(
                 blend_forward, counts.size, TILES, coloured, *tiles, behind, limit, image, transmittance,
                 walked, reached,
             )  # fmt: skip
         if side.median is not None:
             median = side.median.numpy()
-            in_parallel(blend_median, counts.size, TILES, projected, *tiles, walked, limit, median)
+            run_parallel(blend_median, counts.size, TILES, projected, *tiles, walked, limit, median)
             median[median >= 0] = some[median[median >= 0]]
         ctx.save_for_backward(*tensors)
         ctx.rest = (
@@ -153,13 +160,13 @@ class _Rasterize(torch.autograd.Function):
         )
         working = Buffers()
         pair_sums = working.take("pair_sums", np.float32, len(pairs.splat), columns)
-        in_parallel(
+        run_parallel(
             backward, walked.size, TILES, passes[0], *tiles, walked, reached, images[0], transmittance,
             by_planes.contiguous().numpy(), by_alpha.contiguous().numpy(), pair_sums,
         )  # fmt: skip
         if side.absgrad2d is not None:
             sums = np.zeros((count, columns), np.float32)
-            in_parallel(gather_sums, count, GRAIN, *of_pairs, pair_sums, sums)
+            run_parallel(gather_sums, count, GRAIN, *of_pairs, pair_sums, sums)
             height, width = transmittance.shape
             half_size = np.array([width / 2, height / 2], np.float32)
             side.absgrad2d.numpy()[some] = sums[:, SUMS:] * (half_size * LN2)
@@ -171,18 +178,18 @@ class _Rasterize(torch.autograd.Function):
         for k, coloured in enumerate(passes[1:]):
             further = working.take(f"further_sums {k}", np.float32, len(pair_sums), SUMS)
             sums = np.zeros((count, SUMS), np.float32)
-            in_parallel(
+            run_parallel(
                 blend_backward, walked.size, TILES, coloured, *tiles, walked, reached, images[k + 1],
                 transmittance, by_images[k], no_alpha, further,
             )  # fmt: skip
-            in_parallel(gather_sums, count, GRAIN, *of_pairs, further, sums)
+            run_parallel(gather_sums, count, GRAIN, *of_pairs, further, sums)
             by_features[some, 3 * k : 3 * k + 3] = sums[:, G_RED:]
             pair_sums[:, :G_RED] += further[:, :G_RED]
 
         # of splats without a weight no kernel writes the gradients
         empty = torch.empty_like if count == len(side.radii) else torch.zeros_like
         gradients = [empty(tensor, requires_grad=False) for tensor in tensors]
-        in_parallel(
+        run_parallel(
             project_backward, count, GRAIN, *(tensor.detach().numpy() for tensor in tensors), *settings,
             some, passes[0], *of_pairs, pair_sums,
             *(gradient.numpy() for gradient in gradients), side.grad2d.numpy(),
@@ -204,7 +211,7 @@ def _as_colours(features: np.ndarray, projected: np.ndarray) -> list[np.ndarray]
 
 @serialised
 def contributions(
-    gaussians: Gaussians, weights: torch.Tensor | None, settings: Settings
+    gaussians: Gaussians, weights: torch.Tensor | None, settings: RasterSettings
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """See :func:`training.rasterize.contributions`: of one view, the largest, the sum, pixels and radii."""
     count, view = len(gaussians), settings.view
@@ -219,11 +226,11 @@ def contributions(
     )
     pair_weights = buffers.take("pair_weights", np.float32, len(pairs.splat), 3)
     found, everywhere = np.empty((len(some), 3), np.float32), np.zeros((count, 3), np.float32)
-    in_parallel(
+    run_parallel(
         blend_weights, len(pairs.tile_start) - 1, TILES, projected, pairs.splat, pairs.tile_start,
         -(-view.width // TILE), view.width, view.height, pair_weights,
     )  # fmt: skip
-    in_parallel(gather_weights, len(some), GRAIN, pairs.first, pairs.count, pairs.row, pair_weights, found)
+    run_parallel(gather_weights, len(some), GRAIN, pairs.first, pairs.count, pairs.row, pair_weights, found)
     everywhere[some] = found
     largest, total, pixels = torch.from_numpy(everywhere).unbind(1)
     return largest, total, pixels.long(), radii

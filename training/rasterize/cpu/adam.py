@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from .compile import STRICT, f32, in_parallel, inlined, kernel, serialised
+from .compile import STRICT, f32, inlined, kernel, run_parallel, serialised
 
 ROW = 1024
 VALUES = 1 << 16
@@ -60,7 +60,7 @@ def update_rows(parameter, rows, gradient, m, v, lr, betas, eps, step) -> None:
     width = int(np.prod(parameter.shape[1:], dtype=int))
     rate = np.asarray(lr, np.float32) / np.float32(1 - betas[0] ** step)
     row = np.ascontiguousarray(np.broadcast_to(rate, parameter.shape[1:])).reshape(-1)
-    in_parallel(
+    run_parallel(
         _update_rows, len(rows), max(VALUES // width, 1),
         parameter.reshape(-1), rows, gradient.reshape(-1), m.reshape(-1), v.reshape(-1), row,
         f32(betas[0]), f32(betas[1]), f32(1 / (1 - betas[1] ** step)), f32(eps),
@@ -76,7 +76,7 @@ def update(parameter, gradient, m, v, lr, betas, eps, step) -> None:
         lr_row = np.full(ROW, lr.item(), np.float32)
     else:
         lr_row = np.ascontiguousarray(np.broadcast_to(lr, parameter.shape[1:])).reshape(-1)
-    in_parallel(
+    run_parallel(
         _update, -(-parameter.size // len(lr_row)), -(-VALUES // len(lr_row)),
         parameter.reshape(-1), gradient.reshape(-1), m.reshape(-1), v.reshape(-1), lr_row,
         f32(betas[0]), f32(betas[1]), f32(1 / (1 - betas[1] ** step)), f32(eps),

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..rendering import ALPHA_MIN
-from .compile import STRICT, Buffers, at_once, f32, in_parallel, inlined, kernel
+from .compile import STRICT, Buffers, f32, inlined, kernel, run_parallel, run_serial
 from .fastmath import fetch_ahead
 from .project import (
     AHEAD,
@@ -181,22 +181,22 @@ def bin_splats(
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     order = np.empty_like(drawn)
     keys = depths.view(np.uint32)
-    at_once(sort_by_depth, keys, drawn, np.empty_like(keys), order)
+    run_serial(sort_by_depth, keys, drawn, np.empty_like(keys), order)
 
     box_start = np.zeros(len(order) + 1, np.int64)
-    in_parallel(box_sizes, len(order), 4096, projected, order, tiles_x, tiles_y, box_start[1:])
+    run_parallel(box_sizes, len(order), 4096, projected, order, tiles_x, tiles_y, box_start[1:])
     np.cumsum(box_start, out=box_start)
     first = buffers.take("first", np.int64, len(projected))
     count = buffers.take("count", np.int32, len(projected))
     count[:] = 0
     hits = buffers.take("hits", np.int32, int(box_start[-1]))
     histogram = np.zeros((CHUNKS, tiles_x * tiles_y), np.int32)
-    in_parallel(
+    run_parallel(
         find_tiles, CHUNKS, 1,
         projected, order, box_start, tiles_x, tiles_y, first, count, hits, histogram,
     )  # fmt: skip
     tile_start = np.zeros(tiles_x * tiles_y + 1, np.int64)
-    at_once(start_of_each, histogram, tile_start)
+    run_serial(start_of_each, histogram, tile_start)
     splat = buffers.take("splat", np.int32, int(tile_start[-1]))
-    in_parallel(place_pairs, CHUNKS, 1, order, first, count, hits, histogram, splat)
+    run_parallel(place_pairs, CHUNKS, 1, order, first, count, hits, histogram, splat)
     return Pairs(splat, tile_start, first, count, hits)

@@ -36,7 +36,7 @@ from .project import (
     RED,
     SUMS,
     G,
-    rows_of_strip,
+    strip_rows,
 )
 
 ZERO, HALF, ONE, TWO = f32(0), f32(0.5), f32(1), f32(2)
@@ -54,7 +54,7 @@ def find_rows(projected, splat, begin, end, left, top, rows, reached):
     Done ahead of blending, which would have to wait for the roots.
     """
     for pair in range(begin, end):
-        first, last = rows_of_strip(projected[splat[pair]], left, SPAN, top, rows)
+        first, last = strip_rows(projected[splat[pair]], left, SPAN, top, rows)
         reached[pair, 0], reached[pair, 1] = first, last
 
 
@@ -160,7 +160,7 @@ def blend_median(begin, end, projected, splat, tile_start, tiles_x, walked, limi
                     limits[16 * r + j] = limit[y0 + r, x0 + j]
         for pair in range(tile_start[tile], tile_start[tile] + walked[tile]):
             row = projected[splat[pair]]
-            first, last = rows_of_strip(row, left, SPAN, top, rows)
+            first, last = strip_rows(row, left, SPAN, top, rows)
             offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
             for r in range(first, last):
                 dy = f32(r) + offset_y
@@ -225,7 +225,7 @@ def blend_weights(begin, end, projected, splat, tile_start, tiles_x, width, heig
             stop = min(pair + LOOK_EVERY, last_pair)
             for k in range(pair, stop):
                 row = projected[splat[k]]
-                first, last = rows_of_strip(row, left, SPAN, top, rows)
+                first, last = strip_rows(row, left, SPAN, top, rows)
                 xx, xy, yy, log2_opacity = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY], row[LOG2_OPACITY]
                 offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
                 for j in range(48):

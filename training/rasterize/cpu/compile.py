@@ -1,6 +1,6 @@
 """How kernels are compiled, cached and run on several threads. Import numba's names from here only.
 
-Kernels are serial functions of a range of work, and :func:`in_parallel` deals ranges out to threads. Numba's
+Kernels are serial functions of a range of work, and :func:`run_parallel` deals ranges out to threads. Numba's
 own ``parallel=True`` would link the body of each loop into its caller and optimise it a second time, so that
 a kernel rounds otherwise in the process that compiled it than in those that read it from the cache; its
 threads wait for each other at barriers, and its fallback layer aborts on concurrent calls.
@@ -84,18 +84,18 @@ _threads = available_threads()
 _pool: ThreadPoolExecutor | None = None
 
 
-def threads() -> int:
+def thread_count() -> int:
     """How many threads kernels run on."""
     return _threads
 
 
-def set_threads(count: int) -> None:
+def set_thread_count(count: int) -> None:
     """Run kernels on this many threads from now on; results do not depend on it."""
     global _threads, _pool
     _threads, _pool = count, None
 
 
-def in_parallel(kernel: Callable, total: int, grain: int, *args: Any) -> None:
+def run_parallel(kernel: Callable, total: int, grain: int, *args: Any) -> None:
     """Call ``kernel(begin, end, *args)`` on all threads, for ranges of ``grain`` that cover range(total).
 
     Whoever is free takes the next range, the caller too, so a thread that the system holds up delays nobody
@@ -120,7 +120,7 @@ def in_parallel(kernel: Callable, total: int, grain: int, *args: Any) -> None:
         helper.result()
 
 
-def at_once(kernel: Callable, *args: Any) -> None:
+def run_serial(kernel: Callable, *args: Any) -> None:
     """Call a kernel whose work cannot be dealt out."""
     if _noted is not None:
         _noted[kernel] = args
@@ -144,7 +144,7 @@ def compile_in_two_processes(step: Callable[[], Any]) -> None:
         step: is content with kernels that do nothing.
     """
     cached = any(Path(numba.config.CACHE_DIR).rglob("*.nbi"))  # type: ignore[attr-defined]
-    if cached or threads() == 1 or not sys.platform.startswith("linux"):
+    if cached or thread_count() == 1 or not sys.platform.startswith("linux"):
         return
     noted = _kernels_of(step)
     with tempfile.TemporaryDirectory(prefix="lodgs-") as taken:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .compile import FAST, Buffers, f32, helper, in_parallel, kernel
+from .compile import FAST, Buffers, f32, helper, kernel, run_parallel
 
 ROWS, COLUMNS = 16, 64
 """Size of a block."""
@@ -187,7 +187,7 @@ def block_count(channels: int, height: int, width: int) -> int:
 def moments_of(truth: np.ndarray) -> np.ndarray:
     """What :func:`loss_and_gradient` wants to know about a photograph (3, H, W): (2, 3, H, W)."""
     moments = np.empty((2, *truth.shape), np.float32)
-    in_parallel(target_moments, block_count(*truth.shape), BLOCKS, truth, moments)
+    run_parallel(target_moments, block_count(*truth.shape), BLOCKS, truth, moments)
     return moments
 
 
@@ -200,9 +200,9 @@ def loss_and_gradient(
     buffers = Buffers()
     by_moments = buffers.take("by_moments", np.float32, 3, *image.shape)
     gradient = np.empty_like(image)
-    in_parallel(similarity, blocks, BLOCKS, image, truth, moments, by_moments, similar)
+    run_parallel(similarity, blocks, BLOCKS, image, truth, moments, by_moments, similar)
     weights = f32((1 - ssim_weight) / image.size), f32(ssim_weight / image.size)
-    in_parallel(loss_gradient, blocks, BLOCKS, image, truth, by_moments, *weights, gradient, different)
+    run_parallel(loss_gradient, blocks, BLOCKS, image, truth, by_moments, *weights, gradient, different)
     l1 = different.sum(dtype=np.float64) / image.size
     ssim = similar.sum(dtype=np.float64) / image.size
     return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim), gradient

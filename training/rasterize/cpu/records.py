@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from .adam import moved
-from .compile import STRICT, f32, in_parallel, inlined, kernel, serialised
+from .compile import STRICT, f32, inlined, kernel, run_parallel, serialised
 
 _GRAIN = 1 << 12
 
@@ -79,7 +79,7 @@ def gather(records, places, arrays) -> None:
     """Copies the values of records (N, width) at places (M,) int64 to arrays (M, ...), in their order."""
     *arrays, sh = arrays
     sh = sh.reshape(len(places), 3 * sh.shape[1])
-    in_parallel(_gather, len(places), _GRAIN, records.reshape(-1), records.shape[1], places, *arrays, sh)
+    run_parallel(_gather, len(places), _GRAIN, records.reshape(-1), records.shape[1], places, *arrays, sh)
 
 
 @serialised
@@ -87,7 +87,7 @@ def step(records, places, gradients, grad2d, radii, number, lr, shares, betas, e
     """As ``rasterize.records.step``, of arrays."""
     made = _corrections(betas, 1 << int(number + 1).bit_length())
     flat = (array.reshape(-1) for array in (*gradients, grad2d))
-    in_parallel(
+    run_parallel(
         _step, len(places), _GRAIN, records.reshape(-1), records.shape[1], places, *flat, radii, f32(number),
         lr, shares, *made, f32(betas[0]), f32(betas[1]), f32(eps),
     )  # fmt: skip

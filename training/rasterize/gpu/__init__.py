@@ -18,18 +18,18 @@ import torch
 
 from ..adam import Adam
 from ..gaussians import Gaussians
-from ..rendering import Drawn, Settings, SideOutputs, Target, require_plain
+from ..rendering import BackendOutput, RasterSettings, SideOutputs, Target, require_plain
 from .bin import TILE
-from .choice import open_chosen
+from .default_device import open_default_device
 from .device import Buffer, Device
+from .device_model import COLUMNS, STATS, GpuModel, packed
 from .loss import loss_and_gradient
 from .scene import BY_SPLAT, GEOMETRY, SUMS, Scene
-from .twin import COLUMNS, STATS, Twin, packed
 
 
 def rasterize(
-    gaussians: Gaussians, weights: torch.Tensor | None, features: torch.Tensor, settings: Settings
-) -> Drawn:
+    gaussians: Gaussians, weights: torch.Tensor | None, features: torch.Tensor, settings: RasterSettings
+) -> BackendOutput:
     """See :func:`training.rasterize.rasterize`. Tensors are float32 on the CPU; ValueError otherwise.
 
     Raises:
@@ -41,17 +41,17 @@ def rasterize(
     require_plain(tensors, "gpu")
     side = SideOutputs.of(count, settings, TILE)
     image, alpha, blended = _Rasterize.apply(*tensors, settings, side)  # type: ignore[misc]
-    return Drawn(
+    return BackendOutput(
         image, alpha, side.radii, side.grad2d, side.tile_counts, side.absgrad2d, blended, side.median
     )
 
 
 @torch.no_grad()
 def contributions(
-    gaussians: Gaussians, weights: torch.Tensor | None, settings: Settings
+    gaussians: Gaussians, weights: torch.Tensor | None, settings: RasterSettings
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """See :func:`training.rasterize.contributions`: of one view, the largest, the sum, pixels and radii."""
-    count, device = len(gaussians), open_chosen()
+    count, device = len(gaussians), open_default_device()
     gaussians = replace(gaussians, sh=gaussians.means.new_zeros(count, 1, 3))
     weights = torch.ones(0) if weights is None else weights
     with device.lock:
@@ -62,11 +62,13 @@ def contributions(
     return largest, total, pixels.long(), torch.from_numpy(radii)
 
 
-def twin_of(adam: Adam, stats: MutableMapping[str, torch.Tensor], antialias: bool) -> Twin | None:
-    """See :func:`training.rasterize.twin_of`."""
+def make_device_model(
+    adam: Adam, stats: MutableMapping[str, torch.Tensor], antialias: bool
+) -> GpuModel | None:
+    """See :func:`training.rasterize.make_device_model`."""
     if not {*COLUMNS, "sh"} <= set(adam.tensors) or not set(stats) <= set(STATS):
         return None
-    return Twin(open_chosen(), adam, stats, antialias) if len(adam.tensors["means"]) else None
+    return GpuModel(open_default_device(), adam, stats, antialias) if len(adam.tensors["means"]) else None
 
 
 def photometric_loss(image: torch.Tensor, target: Target, ssim_weight: float) -> torch.Tensor:
@@ -79,7 +81,11 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, means, quats, log_scales, logits, sh, weights, features, settings, side):
-        tensors, device, view = [means, quats, log_scales, logits, sh, weights], open_chosen(), settings.view
+        tensors, device, view = (
+            [means, quats, log_scales, logits, sh, weights],
+            open_default_device(),
+            settings.view,
+        )
         with device.lock:
             scene, some = _scene_of(device, tensors, settings)
             limit = np.zeros(1, np.float32)
@@ -150,7 +156,7 @@ class _Rasterize(torch.autograd.Function):
 class _Photometric(torch.autograd.Function):
     @staticmethod
     def forward(ctx, image, target, ssim_weight):
-        device = open_chosen()
+        device = open_default_device()
         with device.lock:
             if target.cache.get("gpu", (None,))[0] is not device:
                 target.cache["gpu"] = device, device.upload(_planes(target.image.float()))
@@ -165,7 +171,9 @@ class _Photometric(torch.autograd.Function):
         return (ctx.gradient if by_loss == 1 else ctx.gradient * by_loss), None, None
 
 
-def _scene_of(device: Device, tensors: list[torch.Tensor], settings: Settings) -> tuple[Scene, np.ndarray]:
+def _scene_of(
+    device: Device, tensors: list[torch.Tensor], settings: RasterSettings
+) -> tuple[Scene, np.ndarray]:
     """Those splats that have a weight and are looked at, copied to a device, and which (M,) they are.
 
     Args:

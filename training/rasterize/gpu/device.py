@@ -33,7 +33,7 @@ SMALLEST = 64
 ALIGNED = 64
 """Rows after which a binding may begin: of 4 bytes and more, as no device asks for more than 256 bytes."""
 BINDING = re.compile(r"@group\(0\) @binding\((\d+)\) var<(uniform|storage)[^>]*> (\w+)")
-REMEDY = "Train on the CPU (Train On in Blender, backend = cpu in a job), or install the device's driver."
+REMEDY = "Train on the CPU (Training Device in Blender, backend = cpu in a job), or install the GPU's driver."
 
 
 class Adapter(NamedTuple):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..rendering import Settings, View
+from ..rendering import KernelCamera, RasterSettings
 from .bin import TILE, Band, bin_splats, groups_of
 from .device import Buffer, Device
 
@@ -39,7 +39,7 @@ class Scene:
     """
 
     device: Device
-    view: View
+    view: KernelCamera
     count: int
     lens: np.ndarray
     degree: int
@@ -52,7 +52,7 @@ class Scene:
     ranges: Buffer
 
     @classmethod
-    def of(cls, device: Device, splats: Buffer, sh: Buffer, settings: Settings) -> Scene:
+    def of(cls, device: Device, splats: Buffer, sh: Buffer, settings: RasterSettings) -> Scene:
         """Projects and bins; LodgsError where the device was lost, or has too little memory."""
         view, count = settings.view, splats.shape[0]
         lens = np.append(_lens_of(view), np.float32(settings.min_scale))
@@ -143,7 +143,7 @@ def _project(device: Device, entry: str, lens: np.ndarray, degree: int, **buffer
         device.run("project", entry, groups_of(count), (lens, count, degree, terms), **part)
 
 
-def _lens_of(view: View) -> np.ndarray:
+def _lens_of(view: KernelCamera) -> np.ndarray:
     """The view as project.wgsl takes it, as far as ``near``."""
     pose = np.column_stack([view.rotation, view.translation])
     limits = np.array([view.x_limits, view.y_limits]).T

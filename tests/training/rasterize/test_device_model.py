@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from training.rasterize import Adam, Gaussians, Target, photometric_loss, rasterize, twin_of
+from training.rasterize import Adam, Gaussians, Target, make_device_model, photometric_loss, rasterize
 
 RATES = {
     "means": 1e-3,
@@ -59,13 +59,13 @@ def test_steps_are_those_through_torch(graphics, make_splats, odd_camera, photog
     weights = torch.from_numpy(np.random.default_rng(1).choice([0.0, 0.5, 1.0], 300)).float()
     expected(one, stats, odd_camera, photograph, None, "cpu")
     expected(other, ours, odd_camera, photograph, None, "cpu")
-    twin = twin_of("gpu", other, ours, antialias=True)
+    twin = make_device_model("gpu", other, ours, antialias=True)
     assert twin is not None
     for given in (weights, None, weights):
         told = twin.step(odd_camera, photograph, ssim_weight=0.2, weights=given, shrink=2, **VIEW)
         assert told == pytest.approx(expected(one, stats, odd_camera, photograph, given, backend), rel=1e-4)
-    torch.testing.assert_close(twin.look("means"), one.tensors["means"].detach(), atol=2e-4, rtol=0)
-    twin.bring_home()
+    torch.testing.assert_close(twin.read("means"), one.tensors["means"].detach(), atol=2e-4, rtol=0)
+    twin.copy_to_host()
     assert one.steps == other.steps
     for name, tensor in one.tensors.items():
         rate = float(torch.as_tensor(RATES[name]).max())
@@ -86,16 +86,16 @@ def test_a_device_that_binds_little_trains_the_same(
     for most in (graphics.most_bytes, 200 << 10):
         monkeypatch.setattr(graphics, "most_bytes", most)
         adam, stats = adam_of(make_splats(1500)), blank(1500)
-        twin = twin_of("gpu", adam, stats)
+        twin = make_device_model("gpu", adam, stats)
         assert twin is not None
         weights = torch.linspace(0, 1, 1500)
         told = [
             twin.step(odd_camera, photograph, ssim_weight=0.2, weights=w, shrink=1, **VIEW)
             for w in (None, weights)
         ]
-        twin.keep_above(torch.linspace(-4, -2, 1500))
-        seen = twin.look("quats")
-        twin.bring_home()
+        twin.raise_log_scales(torch.linspace(-4, -2, 1500))
+        seen = twin.read("quats")
+        twin.copy_to_host()
         moments = [moment for state in adam.state.values() for moment in state]
         tensors = [tensor.detach() for tensor in adam.tensors.values()]
         found.append([*tensors, *moments, *stats.values(), seen, torch.tensor(told)])
@@ -108,10 +108,10 @@ def test_what_is_not_asked_for_stays(graphics, make_splats, odd_camera, photogra
     before = {name: tensor.detach().clone() for name, tensor in adam.tensors.items()}
     weights = torch.ones(50)
     weights[:10] = 0
-    twin = twin_of("gpu", adam, stats)
+    twin = make_device_model("gpu", adam, stats)
     assert twin is not None
     twin.step(odd_camera, photograph, ssim_weight=0.2, weights=weights, **VIEW)
-    twin.bring_home()
+    twin.copy_to_host()
     assert all((values == 0).all() for values in stats.values())
     after = {name: tensor.detach() for name, tensor in adam.tensors.items()}
     assert torch.equal(after["sh"][:, 9:], before["sh"][:, 9:])
@@ -121,12 +121,12 @@ def test_what_is_not_asked_for_stays(graphics, make_splats, odd_camera, photogra
 
 def test_log_scales_rise_to_their_least(graphics, make_splats):
     adam = adam_of(make_splats(50))
-    twin, before = twin_of("gpu", adam, {}), adam.tensors["log_scales"].detach().clone()
+    twin, before = make_device_model("gpu", adam, {}), adam.tensors["log_scales"].detach().clone()
     assert twin is not None
     least = torch.linspace(-4, 0, 50)
     least[7] = -torch.inf
-    twin.keep_above(least)
-    assert torch.equal(twin.look("log_scales"), torch.maximum(before, least[:, None]))
+    twin.raise_log_scales(least)
+    assert torch.equal(twin.read("log_scales"), torch.maximum(before, least[:, None]))
     assert torch.equal(adam.tensors["log_scales"], before)  # until it is brought home
 
 
@@ -134,7 +134,7 @@ def test_a_step_moves_a_few_numbers(graphics, make_splats, odd_camera, photograp
     """However many splats there are."""
     moved = []
     for count in (100, 4000):
-        twin = twin_of("gpu", adam_of(make_splats(count)), blank(count))
+        twin = make_device_model("gpu", adam_of(make_splats(count)), blank(count))
         assert twin is not None
         twin.step(odd_camera, photograph, ssim_weight=0.2, shrink=1, **VIEW)
         before = graphics.moved
@@ -147,11 +147,11 @@ def test_a_step_is_the_same_however_often_its_numbers_fill_their_buffer(
     graphics, make_splats, odd_camera, photograph, monkeypatch
 ):
     def trained() -> torch.Tensor:
-        twin = twin_of("gpu", adam_of(make_splats(300)), blank(300))
+        twin = make_device_model("gpu", adam_of(make_splats(300)), blank(300))
         assert twin is not None
         for _ in range(2):
             twin.step(odd_camera, photograph, ssim_weight=0.2, shrink=1, **VIEW)
-        return torch.cat([twin.look(name).reshape(300, -1) for name in ("means", "sh", "gradient_sum")], 1)
+        return torch.cat([twin.read(name).reshape(300, -1) for name in ("means", "sh", "gradient_sum")], 1)
 
     submit, submitted = graphics.submit, []
     monkeypatch.setattr(graphics, "submit", lambda: (submitted.append(1), submit()))
@@ -163,7 +163,7 @@ def test_a_step_is_the_same_however_often_its_numbers_fill_their_buffer(
 
 def test_only_splats_that_a_device_can_count_go_there(graphics, make_splats):
     adam = adam_of(make_splats(5))
-    assert twin_of("cpu", adam, {}) is None
-    assert twin_of("gpu", adam, {"something": torch.zeros(5)}) is None
-    assert twin_of("gpu", Adam({"means": torch.zeros(5, 3)}, {"means": 1.0}), {}) is None
-    assert twin_of("gpu", adam_of(make_splats(5).select(torch.arange(0))), {}) is None
+    assert make_device_model("cpu", adam, {}) is None
+    assert make_device_model("gpu", adam, {"something": torch.zeros(5)}) is None
+    assert make_device_model("gpu", Adam({"means": torch.zeros(5, 3)}, {"means": 1.0}), {}) is None
+    assert make_device_model("gpu", adam_of(make_splats(5).select(torch.arange(0))), {}) is None

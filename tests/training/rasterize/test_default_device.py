@@ -5,9 +5,9 @@ import torch
 
 from training import __main__ as command
 from training.errors import LodgsError
-from training.rasterize import cpu, cuda, gpu, resolve, trial, why_cpu
+from training.rasterize import cpu, cpu_fallback_reason, cuda, gpu, resolve_backend, self_test
 from training.rasterize.devices import Devices, describe
-from training.rasterize.gpu import choice
+from training.rasterize.gpu import default_device
 from training.rasterize.gpu.device import Adapter
 
 CARD = Adapter("GeForce RTX 4070 Laptop", "discrete", "Vulkan", "555.1")
@@ -29,22 +29,22 @@ def there(monkeypatch, tmp_path):
                 raise LodgsError("No graphics device with Vulkan, Metal or D3D12 was found.")
             return list(found)
 
-        monkeypatch.setattr(choice, "adapters", adapters)
+        monkeypatch.setattr(default_device, "adapters", adapters)
         monkeypatch.setattr("training.rasterize.devices.adapters", adapters)
 
     class Opened:
         most_bytes = 2 << 30
 
-    monkeypatch.delenv(choice.VARIABLE, raising=False)
-    monkeypatch.setattr(trial, "cache_folder", lambda: tmp_path)
+    monkeypatch.delenv(default_device.VARIABLE, raising=False)
+    monkeypatch.setattr(self_test, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr("training.rasterize.devices.open_device", lambda name: Opened())
     for name in ("rasterize", "contributions", "photometric_loss"):
         monkeypatch.setattr(gpu, name, getattr(cpu, name), raising=False)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    trial.difference.cache_clear()
+    self_test.failure.cache_clear()
     cuda.problem.cache_clear()
     yield are
-    trial.difference.cache_clear()
+    self_test.failure.cache_clear()
     cuda.problem.cache_clear()
 
 
@@ -61,15 +61,15 @@ def spoiled(monkeypatch):
 
 def test_the_best_device_is_taken_and_software_never_by_itself(there, monkeypatch):
     there(CARD, WITHIN, SOFTWARE)
-    assert choice.chosen() == CARD
+    assert default_device.default_adapter() == CARD
     there(WITHIN, SOFTWARE)
-    assert choice.chosen() == WITHIN
+    assert default_device.default_adapter() == WITHIN
     there(SOFTWARE)
     with pytest.raises(LodgsError, match=r"no graphics device that helps: llvmpipe .* runs on the processor"):
-        resolve("gpu")
+        resolve_backend("gpu")
     there()
     with pytest.raises(LodgsError, match="No graphics device"):
-        resolve("gpu")
+        resolve_backend("gpu")
 
 
 @pytest.mark.parametrize(
@@ -78,34 +78,36 @@ def test_the_best_device_is_taken_and_software_never_by_itself(there, monkeypatc
 )
 def test_a_name_or_a_part_of_it_takes_another(there, monkeypatch, name, expected):
     there(CARD, LARGER, WITHIN, SOFTWARE)
-    monkeypatch.setenv(choice.VARIABLE, name)
-    assert choice.chosen() == expected
-    monkeypatch.setenv(choice.VARIABLE, "voodoo")
+    monkeypatch.setenv(default_device.VARIABLE, name)
+    assert default_device.default_adapter() == expected
+    monkeypatch.setenv(default_device.VARIABLE, "voodoo")
     with pytest.raises(LodgsError, match=r'no graphics device "voodoo".*LODGS_GPU.*There are: GeForce'):
-        choice.chosen()
+        default_device.default_adapter()
 
 
 def test_a_device_that_draws_as_it_should_is_used_and_tested_once(there, monkeypatch):
     there(CARD)
-    assert resolve("gpu") == "gpu" and why_cpu("gpu") == ""
-    trial.difference.cache_clear()  # as another process
+    assert resolve_backend("gpu") == "gpu" and cpu_fallback_reason("gpu") == ""
+    self_test.failure.cache_clear()  # as another process
 
     def refuse(*_):
         raise AssertionError("tested again")
 
-    monkeypatch.setattr(trial, "try_out", refuse)
-    assert resolve("gpu") == "gpu"
+    monkeypatch.setattr(self_test, "run_self_test", refuse)
+    assert resolve_backend("gpu") == "gpu"
     there(CARD._replace(driver="556.0"))
     with pytest.raises(AssertionError, match="tested again"):
-        resolve("gpu")
+        resolve_backend("gpu")
 
 
 def test_a_device_that_draws_otherwise_is_not_used_and_it_is_said(there, spoiled):
     there(CARD)
-    assert resolve("gpu") == "cpu"
-    assert why_cpu("gpu").startswith("GeForce RTX 4070 Laptop is not used: its pictures are 2% off.")
-    trial.difference.cache_clear()
-    assert resolve("gpu") == "cpu", "remembered"
+    assert resolve_backend("gpu") == "cpu"
+    assert cpu_fallback_reason("gpu").startswith(
+        "GeForce RTX 4070 Laptop is not used: its pictures are 2% off."
+    )
+    self_test.failure.cache_clear()
+    assert resolve_backend("gpu") == "cpu", "remembered"
 
 
 @pytest.mark.parametrize("name", ["means", "weights"])
@@ -132,7 +134,7 @@ def test_wrong_gradients_are_found(there, monkeypatch, name):
         return cpu.rasterize(gaussians, weights, features, settings)
 
     monkeypatch.setattr(gpu, "rasterize", otherwise, raising=False)
-    assert trial.difference(CARD) == f"its gradients of {name} are 2% off"
+    assert self_test.failure(CARD) == f"its gradients of {name} are 2% off"
 
 
 def test_what_is_not_the_same_twice_or_no_number_is_found(there, monkeypatch):
@@ -144,8 +146,8 @@ def test_what_is_not_the_same_twice_or_no_number_is_found(there, monkeypatch):
         return drawn._replace(image=drawn.image + next(noise))
 
     monkeypatch.setattr(gpu, "rasterize", restless, raising=False)
-    assert trial.try_out(CARD) == "its pictures change from run to run"
-    assert "off" in trial.try_out(CARD)
+    assert self_test.run_self_test(CARD) == "its pictures change from run to run"
+    assert "off" in self_test.run_self_test(CARD)
 
 
 def test_a_driver_that_refuses_a_shader_is_not_used(there, monkeypatch):
@@ -155,19 +157,19 @@ def test_a_driver_that_refuses_a_shader_is_not_used(there, monkeypatch):
         raise RuntimeError("Validation Error\n\n  error X3663: thread sync" + " and more" * 100)
 
     monkeypatch.setattr(gpu, "rasterize", refuse, raising=False)
-    assert resolve("gpu") == "cpu"
-    said = why_cpu("gpu")
+    assert resolve_backend("gpu") == "cpu"
+    said = cpu_fallback_reason("gpu")
     assert "is not used: it failed (RuntimeError: Validation Error error X3663: thread sync and more" in said
     assert len(said) < 600 and said.endswith("The processor takes its place; a newer driver may help.")
 
 
 def test_a_spoiled_cache_is_as_none(there, tmp_path):
     there(CARD)
-    (tmp_path / trial.ANSWERS).write_text("{no json")
-    assert resolve("gpu") == "gpu"
-    trial.difference.cache_clear()
-    (tmp_path / trial.ANSWERS).write_text('{"x": 5}')
-    assert resolve("gpu") == "gpu"
+    (tmp_path / self_test.ANSWERS).write_text("{no json")
+    assert resolve_backend("gpu") == "gpu"
+    self_test.failure.cache_clear()
+    (tmp_path / self_test.ANSWERS).write_text('{"x": 5}')
+    assert resolve_backend("gpu") == "gpu"
 
 
 def test_devices_are_described(there, monkeypatch, spoiled):
@@ -214,7 +216,7 @@ def test_lost_devices_are_a_sentence_and_are_tested_again(there, monkeypatch):
 
     monkeypatch.setattr(gpu, "rasterize", lost, raising=False)
     with pytest.raises(LodgsError, match="does not answer"):
-        resolve("gpu")
+        resolve_backend("gpu")
     assert "does not answer any more" in describe()
     monkeypatch.setattr(gpu, "rasterize", cpu.rasterize, raising=False)
-    assert resolve("gpu") == "gpu"
+    assert resolve_backend("gpu") == "gpu"

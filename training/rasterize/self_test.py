@@ -23,7 +23,7 @@ from ..scenes.cameras import Camera
 from . import gpu, reference
 from .gaussians import Gaussians
 from .gpu.device import Adapter
-from .rendering import Settings, Target, View
+from .rendering import KernelCamera, RasterSettings, Target
 
 ANSWERS = "devices.json"
 """File in the user's cache folder that keeps the answers."""
@@ -36,7 +36,7 @@ MOST_REASON = 300
 
 
 @cache
-def difference(adapter: Adapter) -> str:
+def failure(adapter: Adapter) -> str:
     """In what the chosen device's pictures or gradients differ from the reference's; empty if in nothing.
 
     A device is tested once for each of its drivers and each state of this backend; the answer is kept.
@@ -48,11 +48,11 @@ def difference(adapter: Adapter) -> str:
     with suppress(LodgsError):
         if isinstance(known := read_json(answers).get(key), str):
             return known
-    return try_out(adapter)
+    return run_self_test(adapter)
 
 
-def try_out(adapter: Adapter) -> str:
-    """:func:`difference`, found anew."""
+def run_self_test(adapter: Adapter) -> str:
+    """:func:`failure`, found anew."""
     try:
         found = _compared()
     except LodgsError:
@@ -102,7 +102,7 @@ def _drawn(backend: ModuleType, kind: torch.dtype) -> dict[str, torch.Tensor]:
     weights, features = leaves["weights"], leaves["features"]
     splats = Gaussians(*(leaves[name] for name in Gaussians.__dataclass_fields__))
     camera = Camera("", size[1], size[0], 60.0, 66.0, 33.0, 27.5, np.eye(4))
-    view = Settings(View.of(camera, 0.2), 0.01, False, (0.1, 0.5, 0.3), degree=3, absolute=True)
+    view = RasterSettings(KernelCamera.of(camera, 0.2), 0.01, False, (0.1, 0.5, 0.3), degree=3, absolute=True)
     plain, sharp = (
         backend.rasterize(splats, weights, features, settings)
         for settings in (view, replace(view, antialias=True, degree=1))

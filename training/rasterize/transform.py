@@ -8,17 +8,17 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from ..splats.placing import similarity
+from ..splats.similarity import is_similarity
 from .features import rotation_matrices
 from .gaussians import Gaussians
 
 
-def transformed(own: Gaussians, matrix: np.ndarray) -> Gaussians:
+def transform_gaussians(own: Gaussians, matrix: np.ndarray) -> Gaussians:
     """Splats where a transform (4, 4) puts them, any affine one; their harmonics stay as they are."""
     linear, shift = torch.from_numpy(matrix).to(own.means.device)[:3].split([3, 1], 1)
     means = (own.means.double() @ linear.T + shift[:, 0]).float()
     turned, lengths = rotation_matrices(own.quats.double()), own.log_scales.double().exp()
-    if similarity(matrix):
+    if is_similarity(matrix):
         unit = torch.linalg.det(linear) ** (1 / 3)
         turned, lengths = linear @ turned / unit, lengths * unit
     else:

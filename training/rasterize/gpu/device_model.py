@@ -13,7 +13,7 @@ import torch
 
 from ...scenes.cameras import Camera
 from ..adam import Adam
-from ..rendering import Settings, Target, View
+from ..rendering import KernelCamera, RasterSettings, Target
 from .bin import groups_of
 from .device import Buffer, Device
 from .loss import loss_of, sums_and_gradient
@@ -50,8 +50,8 @@ def packed(
     return found
 
 
-class Twin:
-    """N splats on a device. What is here in the meantime is what they were; see :meth:`bring_home`.
+class GpuModel:
+    """N splats on a device. What is here in the meantime is what they were; see :meth:`copy_to_host`.
 
     Args:
         adam: of what is trained, of which ``COLUMNS`` and ``sh`` go along.
@@ -60,7 +60,7 @@ class Twin:
 
     Raises:
         LodgsError: the device was lost, or has too little memory. Then what is here is still whole. Methods
-            raise it as the ``Twin`` of :mod:`training.rasterize` says.
+            raise it as the ``DeviceModel`` of :mod:`training.rasterize` says.
     """
 
     def __init__(
@@ -115,7 +115,9 @@ class Twin:
             LodgsError: the device was lost, or has too little memory. The splats are lost with it.
         """
         device, count = self.device, len(self)
-        settings = Settings(View.of(camera, near), min_scale, self._antialias, background, sh_degree)
+        settings = RasterSettings(
+            KernelCamera.of(camera, near), min_scale, self._antialias, background, sh_degree
+        )
         with device.lock:
             self._weigh(weights)
             scene = Scene.of(device, self._splats, self._sh, settings)
@@ -143,12 +145,12 @@ class Twin:
             l1, ssim = device.read(told)
         return loss_of(l1, ssim, 3 * size[0] * size[1], ssim_weight)
 
-    def picture(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def last_image(self) -> tuple[torch.Tensor, torch.Tensor]:
         """The last step's (H, W, 3), and its alpha (H, W)."""
         drawn = torch.from_numpy(self.device.read(self.drawn))
         return drawn[..., :3], 1 - drawn[..., 3]
 
-    def look(self, name: str) -> torch.Tensor:
+    def read(self, name: str) -> torch.Tensor:
         """A tensor's values, or a statistic's, as they are now, a copy."""
         device = self.device
         with device.lock:
@@ -162,7 +164,7 @@ class Twin:
             self._run("look", numbers, values=values, totals=found)
             return _as_trained(device.read(found))
 
-    def rows(self, index: torch.Tensor) -> dict[str, torch.Tensor]:
+    def read_rows(self, index: torch.Tensor) -> dict[str, torch.Tensor]:
         """Tensors' values at indices (M,), by name, a copy."""
         with self.device.lock:
             wanted = self.device.upload(index.numpy().astype(np.uint32))
@@ -170,7 +172,7 @@ class Twin:
         found = {name: _as_trained(splats[:, at]) for name, at in COLUMNS.items()}
         return found | {"sh": torch.from_numpy(sh)}
 
-    def keep(self, index: torch.Tensor) -> None:
+    def select(self, index: torch.Tensor) -> None:
         """Only the splats at indices (M,), at least one, stay, in this order."""
         with self.device.lock:
             wanted = self.device.upload(index.numpy().astype(np.uint32))
@@ -203,13 +205,13 @@ class Twin:
         """Begins anew with what is added up."""
         self._counted = self.device.empty(np.float32, *self._counted.shape)
 
-    def keep_above(self, least: torch.Tensor) -> None:
+    def raise_log_scales(self, minimum: torch.Tensor) -> None:
         """No log-scale of a splat is below its least one (N,) from here."""
-        lowest = least.numpy().clip(np.finfo(np.float32).min)  # not every device knows an infinity
+        lowest = minimum.numpy().clip(np.finfo(np.float32).min)  # not every device knows an infinity
         with self.device.lock:
             self._run("widen", {}, parts=self.device.upload(lowest), values=self._splats)
 
-    def bring_home(self) -> None:
+    def copy_to_host(self) -> None:
         """Makes tensors, moments and statistics here what they are on the device."""
         with self.device.lock:
             splats, sh, of_splats, of_sh, counted = map(

@@ -11,7 +11,7 @@ VARIABLE = "LODGS_GPU"
 """Environment variable with the name of the device to use, or a part of it; or "software"."""
 
 
-def chosen() -> Adapter:
+def default_adapter() -> Adapter:
     """The device that is used: the one that ``LODGS_GPU`` names, else the best that is no software.
 
     Raises:
@@ -32,11 +32,11 @@ def chosen() -> Adapter:
     raise LodgsError(
         f"This computer has no graphics device that helps: {names} runs on the processor, slower than the "
         "cpu backend.",
-        "Train on the CPU (Train On in Blender, backend = auto or cpu in a job), or install the driver of "
-        "your graphics card.",
+        "Train on the CPU (Training Device in Blender, backend = auto or cpu in a job), or install the GPU's "
+        "driver.",
     )
 
 
-def open_chosen() -> Device:
+def open_default_device() -> Device:
     """:func:`chosen`, opened once; LodgsError as there, or it cannot be opened."""
-    return open_device(chosen().name)
+    return open_device(default_adapter().name)
