@@ -12,15 +12,15 @@ from pathlib import Path
 
 import bpy
 
+from ..training.cli.info import describe
+from ..training.cli.job_options import add_options, job_from_options, parse_size
+from ..training.cli.methods import describe_method, describe_methods
 from ..training.editing.bake_filter import without_filter
 from ..training.editing.edit import Joined, finish
 from ..training.errors import LodgsError
 from ..training.evaluate.messages import summary_lines
-from ..training.lod.describe import describe
-from ..training.methods.describe import describe_method, describe_methods
 from ..training.runs.folder import RunFolder
 from ..training.runs.job import Job, check_views
-from ..training.runs.options import add_options, job_from_options, parse_size
 from ..training.splats.bundle import write_bundle
 from ..training.splats.dialects import Warn
 from ..training.splats.formats import PLY, find_format, write_splats
@@ -29,7 +29,7 @@ from .data import scenes, viewpoints
 from .render.capture import noise, render_views, write_model
 from .render.video import MOST_FRAMES, extract_frames
 from .runs import environment, jobs, photo_preparation
-from .runs.messages import duration, level_line
+from .runs.messages import format_duration, level_line
 from .runs.watch import Watch
 
 DONE, CRASHED, BAD_INPUT, CANCELLED = 0, 1, 2, 3
@@ -184,7 +184,7 @@ def _imported(job: Job) -> bpy.types.Object:
 def _photographed(folder: Path, warn: Warn) -> bpy.types.Object:
     """A COLMAP scene, its photographs straightened where their lens bends lines."""
     root = scenes.import_colmap(bpy.context, folder, warn=warn)
-    photo_preparation.straighten(root, warn)
+    photo_preparation.undistort_photos(root, warn)
     return root
 
 
@@ -329,7 +329,7 @@ class _Bar:
             print(
                 f"\r\033[K{watch.message:<16} |{bar:<24}| {share:4.0%}  {progress['splats']:,} splats  "
                 f"{progress['psnr']:.1f} dB in training  {progress['steps_per_s']:.1f} steps/s  "
-                f"{duration(progress['eta_s'])} left",
+                f"{format_duration(progress['eta_s'])} left",
                 end="", file=sys.stderr, flush=True,
             )  # fmt: skip
         elif (

@@ -74,7 +74,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from .runs.options import add_options, parse_size
+    from .cli.job_options import add_options, parse_size
     from .scenes.reconstruct import LENSES, PRESETS
     from .splats.formats import FORMATS
 
@@ -409,7 +409,7 @@ def _colour(text: str) -> tuple[float, float, float] | None:
 
 
 def _train(chosen: argparse.Namespace) -> int:
-    from .runs.options import job_from_options
+    from .cli.job_options import job_from_options
 
     return _trained(lambda: job_from_options(chosen))
 
@@ -441,10 +441,10 @@ def _blocks(chosen: argparse.Namespace) -> int:
 
 
 def _plan_blocks(chosen: argparse.Namespace) -> int:
+    from .cli.job_options import job_from_options
     from .runs.blocks.plan import choose_cells, plan, plan_table, read_planned_scene, write_plan
     from .runs.folder import RunFolder
     from .runs.job import save_job
-    from .runs.options import job_from_options
 
     job = job_from_options(chosen).resolved()
     scene = read_planned_scene(job)
@@ -470,10 +470,10 @@ def _plan_blocks(chosen: argparse.Namespace) -> int:
 
 
 def _run_blocks(chosen: argparse.Namespace) -> int:
+    from .cli.job_options import parse_resources
     from .runs.blocks.plan import read_plan, read_planned_job
     from .runs.blocks.train import prepare_part
     from .runs.folder import RunFolder
-    from .runs.options import parse_resources
 
     if not chosen.only:
         return _trained(
@@ -488,7 +488,7 @@ def _run_blocks(chosen: argparse.Namespace) -> int:
 
 
 def _methods(chosen: argparse.Namespace) -> int:
-    from .methods.describe import describe_method, describe_methods
+    from .cli.methods import describe_method, describe_methods
 
     print(describe_method(chosen.name) if chosen.name else describe_methods())
     return 0
@@ -652,7 +652,7 @@ def _edit(chosen: argparse.Namespace) -> int:
 
 
 def _info(chosen: argparse.Namespace) -> int:
-    from .lod.describe import describe
+    from .cli.info import describe
     from .splats.formats import as_ply
 
     with as_ply(chosen.file) as there:

@@ -18,10 +18,10 @@ from urllib.parse import urlsplit
 
 import bpy
 
+from ...training.cli.job_options import options_of
 from ...training.documents import parse_json
 from ...training.errors import LodgsError, printable
 from ...training.runs.folder import RunFolder
-from ...training.runs.options import options_of
 from .. import extension
 from ..data import viewpoints
 from . import jobs

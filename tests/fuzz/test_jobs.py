@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from tests.fuzz.doors import attempt
 from tests.fuzz.mutations import ODD_VALUES, spoiled, spoiled_value
+from training.cli.job_options import add_options, job_from_options
 from training.methods import METHODS
 from training.runs.job import Job
-from training.runs.options import add_options, job_from_options
 from training.scenes.regions import Region
 
 JOBS = [

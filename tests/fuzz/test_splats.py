@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from tests.fuzz.doors import attempt
 from tests.fuzz.mutations import spoiled, spoiled_value
-from training.lod.describe import describe
+from training.cli.info import describe
 from training.splats.bundle import (
     Bundle,
     Level,

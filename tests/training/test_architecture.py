@@ -29,6 +29,7 @@ FLOORS = {
     ),
     "training": (
         ("__main__",),
+        ("cli",),
         ("render",),
         ("runs",),
         ("evaluate",),

@@ -133,7 +133,7 @@ def test_what_the_farm_compiles_of_it_is_the_job_that_training_here_has(lodgs, m
     settings.parameters.levels = 3
     submit(bpy)
     said = manager.asked[1][2]["settings"]
-    options = lodgs("training.runs.options")
+    options = lodgs("training.cli.job_options")
     parser = argparse.ArgumentParser()
     options.add_options(parser)
     command = [

@@ -7,13 +7,13 @@ import sys
 import numpy as np
 import pytest
 
+from training.cli.job_options import options_of
 from training.errors import LodgsError
 from training.lod.crop import Crop
 from training.runs.data import thin_outside_region, training_data
 from training.runs.failures import BAD_INPUT
 from training.runs.folder import RunFolder
 from training.runs.job import Job
-from training.runs.options import options_of
 from training.runs.train import train
 from training.scenes.colmap import read_scene
 from training.splats.bundle import read_bundle

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
+from training.cli.info import describe
 from training.errors import LodgsError
-from training.lod.describe import describe
 from training.splats.bundle import (
     Bundle,
     Level,
     read_bundle,
     read_folder,
-    read_head,
+    read_header,
     write_bundle,
     write_folder,
 )
@@ -58,19 +58,19 @@ def check_same(a: Bundle, b: Bundle, same):
 def test_the_head_is_that_of_the_bundle(tmp_path, bundle, cumulative, monkeypatch):
     bundle.cumulative = cumulative
     write_bundle(tmp_path / "b.ply", bundle)
-    monkeypatch.setattr("training.splats.bundle.splats_from", None)  # no splat is looked at
-    head = read_head(tmp_path / "b.ply")
+    monkeypatch.setattr("training.splats.bundle.splats_from_rows", None)  # no splat is looked at
+    head = read_header(tmp_path / "b.ply")
     assert (head.method, head.rule, head.controls, head.meta) == ("flod", "bands", {"gamma": 1.5}, META)
     assert [(level.number, level.facts) for level in head.levels] == [
         (n, {"s_min": s_min}) for n, s_min in enumerate(S_MIN, 1)
     ]
     assert head.cumulative is cumulative
     write_ply(tmp_path / "plain.ply", bundle.levels[0].splats)
-    plain = read_head(tmp_path / "plain.ply")
+    plain = read_header(tmp_path / "plain.ply")
     assert (plain.method, plain.rule, [level.number for level in plain.levels]) == ("", "", [1])
     (tmp_path / "b.ply").write_bytes((tmp_path / "b.ply").read_bytes().replace(b'"level":2', b'"level":[]'))
     with pytest.raises(LodgsError, match="cannot be followed"):
-        read_head(tmp_path / "b.ply")
+        read_header(tmp_path / "b.ply")
 
 
 @pytest.mark.parametrize("order", ["finest_first", "stream"])
@@ -191,7 +191,7 @@ def test_a_bundle_says_whether_it_is_antialiased_and_others_are_not(tmp_path, bu
         bundle.meta = meta
         write_bundle(tmp_path / "b.ply", bundle)
         back = read_bundle(tmp_path / "b.ply")
-        assert back.antialias is read_head(tmp_path / "b.ply").antialias is flag and back.meta == meta
+        assert back.antialias is read_header(tmp_path / "b.ply").antialias is flag and back.meta == meta
 
 
 def test_numpy_numbers_in_meta_read_back_as_plain_ones(tmp_path, bundle):

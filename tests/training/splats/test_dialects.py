@@ -7,8 +7,8 @@ import pytest
 import torch
 from plyfile import PlyData, PlyElement
 
+from training.cli.info import describe
 from training.errors import LodgsError
-from training.lod.describe import describe
 from training.rasterize.filter3d import apply_filter3d
 from training.render.scene import Instance, SplatSet, draw
 from training.scenes.cameras import Camera
@@ -100,7 +100,9 @@ def test_a_filtered_scene_looks_as_the_trainers_filter_makes_it(write):
     raw = read_ply(write(PLAIN, {k: v for k, v in values.items() if k in PLAIN}, count=count, name="raw.ply"))
     read = read_ply(write([*PLAIN, "filter_3D"], values, count=count))
     std = torch.from_numpy(values["filter_3D"]).float()
-    log_scales, logits = apply_filter3d(torch.from_numpy(raw.log_scales), torch.from_numpy(raw.opacity_logits), std)
+    log_scales, logits = apply_filter3d(
+        torch.from_numpy(raw.log_scales), torch.from_numpy(raw.opacity_logits), std
+    )
     camera = Camera("a", 48, 40, 40.0, 40.0, 24.0, 20.0, np.eye(4))
 
     def picture(splats):

@@ -6,9 +6,9 @@ from dataclasses import fields, replace
 import pytest
 
 from training.__main__ import main
+from training.cli.job_options import add_options, job_from_options, options_of
 from training.errors import LodgsError
 from training.runs.job import Job
-from training.runs.options import add_options, job_from_options, options_of
 
 
 def job(*words) -> Job:

@@ -11,7 +11,7 @@ from pathlib import Path
 from ..documents import parse_json
 from ..errors import LodgsError, printable
 from ..methods import METHODS, PRESETS
-from .job import BACKENDS, Job
+from ..runs.job import BACKENDS, Job
 
 
 def _whole(text: str) -> int:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from ..splats.bundle import Bundle, DrawableRows, as_plain, bounds_of, open_bundle, read_folder
+from ..lod.rule import find_rule
+from ..splats.bundle import Bundle, DrawableRows, bounding_box, json_default, open_bundle, read_folder
 from ..splats.ply import Element, all_columns
-from .rule import find_rule
 
 
 def describe(path: str | Path) -> str:
@@ -22,10 +22,11 @@ def describe(path: str | Path) -> str:
     else:
         bundle, rows = open_bundle(path)
         for level in bundle.levels:
-            level.elsewhere = DrawableRows(rows[level.number], warnings.append)
+            level.on_disk = DrawableRows(rows[level.number], warnings.append)
     count = len(bundle.levels)
     low, high = (
-        ", ".join(f"{x:.4g}" for x in corner) for corner in bounds_of([level.rows for level in bundle.levels])
+        ", ".join(f"{x:.4g}" for x in corner)
+        for corner in bounding_box([level.rows for level in bundle.levels])
     )
     names = sorted({name for level in bundle.levels for name in level.facts})
     lines = [
@@ -46,7 +47,7 @@ def describe(path: str | Path) -> str:
         rows_of_table = len(next(iter(table.values()), ()))
         lines.append(f"table {name}: {rows_of_table:,} rows of {', '.join(table)}")
     said = {**bundle.facts, **bundle.controls, **bundle.meta}
-    lines += [f"{name}: {json.dumps(value, default=as_plain)}" for name, value in said.items()]
+    lines += [f"{name}: {json.dumps(value, default=json_default)}" for name, value in said.items()]
     return "\n".join([*lines, *warnings])
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from textwrap import fill
 
+from ..methods import METHODS, PRESETS, method_info
 from ..optimize.parameters import possible
-from . import METHODS, PRESETS, method_info
 
 _WIDTH = 110
 
