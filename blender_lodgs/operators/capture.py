@@ -49,8 +49,8 @@ class LODGS_OT_show_coverage(bpy.types.Operator):
     bl_idname = "lodgs.show_coverage"
     bl_label = "Show Coverage"
     bl_description = (
-        "Show as dots how many views see each surface: green for three or more, orange for two, red for one "
-        "and no dot for none"
+        "Show surfaces as dots: green if three or more views see them, orange for two views, red for one; the "
+        "button then shows the share of green dots"
     )
     bl_options = {"INTERNAL"}
 
@@ -79,7 +79,7 @@ class LODGS_OT_import_capture(bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        folder = background_capture.folder_of(context.scene)
+        folder = background_capture.capture_folder(context.scene)
         root = scenes.import_colmap(
             context, folder, upright=False, warn=lambda message: self.report({"WARNING"}, message)
         )

@@ -19,7 +19,7 @@ class LODGS_OT_make_environment(bpy.types.Operator):
 
     @report_errors
     def execute(self, context: bpy.types.Context):
-        work = environment_setup.make()
+        work = environment_setup.start()
         processes.follow(work.step)
         if work.problem:
             self.report({"ERROR"}, work.problem)
@@ -51,7 +51,7 @@ class LODGS_OT_check_environment(bpy.types.Operator):
 
     @report_errors
     def execute(self, context: bpy.types.Context):
-        report = environment.check_now()
+        report = environment.check_current()
         if not report.ok:
             self.report({"ERROR"}, "\n".join(report.problems))
             return {"CANCELLED"}

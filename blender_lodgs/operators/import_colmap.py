@@ -51,8 +51,8 @@ class LODGS_OT_import_colmap(bpy.types.Operator):
             photographs=self.photographs,
             warn=warn,
         )
-        photo_preparation.forget()
-        photo_preparation.straighten(root, warn)
+        photo_preparation.clear_result()
+        photo_preparation.undistort_photos(root, warn)
         if first:  # keep the view if the file already shows a splat scene
             photographs.look_at_scene(context, root, warn)
         self.report({"INFO"}, f"'{root.name}': {scenes.contents(root)}")

@@ -76,7 +76,7 @@ class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
                 if first:  # keep the view if the file already shows a splat scene
                     photographs.look_at_scene(context, root, warn)
                     first = False
-                photo_preparation.forget()
+                photo_preparation.clear_result()
                 self._imported.append(f"'{root.name}': {scenes.contents(root)}")
         finally:
             reader.shutdown(wait=False, cancel_futures=True)

@@ -1,4 +1,4 @@
-"""The panel that turns the Blender scene into photographs, where there is no splat scene yet."""
+"""The Capture Scene panel: render the Blender scene as training images while no splat scene is active."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .parts import Panel, draw_environment, draw_views, say, split_column
 
 
 class LODGS_PT_capture(Panel):
-    bl_label = "Capture This Blender Scene"
+    bl_label = "Capture Scene"
     bl_order = 1
     bl_options = {"DEFAULT_CLOSED"}
 
@@ -36,11 +36,11 @@ class LODGS_PT_capture(Panel):
         try:
             environment.trainer_python()
         except LodgsError:
-            draw_environment(layout, "Capturing needs the trainer's environment.")
+            draw_environment(layout, "Capturing a scene requires the trainer.")
             return
         layout.operator("lodgs.capture_scene", text="Capture", icon="RENDER_STILL")
         try:
-            folder = background_capture.folder_of(context.scene)
+            folder = background_capture.capture_folder(context.scene)
         except LodgsError as error:
             say(layout, str(error), "INFO")
             return
@@ -54,17 +54,17 @@ def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context) -> No
     draw_views(column, settings, viewpoints.count_of_scene(context.scene))
     if settings.views_from in ("DOME", "GRID"):
         count = len(viewpoints.chosen(context))
-        selected = f"Of what is selected: {count} object{'' if count == 1 else 's'}."
-        say(column, selected if count else "Of everything: nothing is selected.", "INFO")
+        objects = f"{count} selected object{'' if count == 1 else 's'}" if count else "all objects"
+        say(column, f"Views cover {objects}.", "INFO")
     width, height = viewpoints.size(context.scene, settings)
     measured = coverage.current(context.scene)
-    text = f"{measured.enough:.0%} Seen by {coverage.ENOUGH} or More" if measured else "Show Coverage"
+    text = f"Coverage: {measured.enough:.0%}" if measured else "Show Coverage"
     column.operator(
         "lodgs.show_coverage", text=text, icon="HIDE_OFF" if measured else "HIDE_ON", depress=bool(measured)
     )
-    say(layout, f"Pictures of {width} × {height}, as the scene's own engine renders them.", "INFO")
-    if noisy := noise(context.scene):
-        say(layout, noisy, "ERROR")
+    say(layout, f"Renders images of {width} × {height} px with the scene's render engine.", "INFO")
+    if warning := noise(context.scene):
+        say(layout, warning, "ERROR")
     split_column(layout).prop(settings, "folder")
 
 

@@ -1,4 +1,4 @@
-"""The Clean Up panel: crops, what is hidden, and how much of each level is left."""
+"""The Clean Up panel: crops, selection, hidden splats and the remaining splats of each level."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class LODGS_PT_clean_up(LevelsPanel):
             row.prop(crop.lodgs_crop, "keep", text="")
             row.operator("lodgs.remove_crop", text="", icon="X").name = crop.name
 
-        layout.label(text="Select splats of all levels:")
+        layout.label(text="Select in All Levels")
         column, brush = layout.column(align=True), context.scene.lodgs_brush
         row = column.row(align=True)
         row.enabled = context.mode == "OBJECT"
@@ -40,21 +40,21 @@ class LODGS_PT_clean_up(LevelsPanel):
             row.operator("lodgs.select_all_splats", text="Deselect").action = "DESELECT"
             row.operator("lodgs.select_all_splats", text="Invert").action = "INVERT"
 
-        layout.label(text="Hide splats of all levels:")
+        layout.label(text="Hide in All Levels")
         grid = layout.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
         for test, name, _ in cleaning.TESTS:
             grid.operator("lodgs.hide_splats", text=name).test = test
 
         column = layout.column(align=True)
-        for number, (left, there) in cleaning.count_left(root, context.view_layer.depsgraph).items():
-            column.label(text=f"Level {number}: {left:,} of {there:,} left")
+        for number, (visible, total) in cleaning.count_left(root, context.view_layer.depsgraph).items():
+            column.label(text=f"Level {number}: {visible:,} of {total:,} splats")
         lost = {item.number: item.lost for item in cleaning.levels(root) if item.lost}
         if lost:
             counts = ", ".join(f"level {number}: {count:,}" for number, count in lost.items())
-            say(column, f"Levels were renewed, and nothing of them is hidden now ({counts} were).", "INFO")
+            say(column, f"Training replaced these levels and shows their hidden splats ({counts}).", "INFO")
         column = layout.column(align=True)
         column.operator("lodgs.show_hidden_splats", text="Show All Hidden")
-        column.operator("lodgs.delete_left_out", text="Delete Hidden and Cropped", icon="TRASH")
+        column.operator("lodgs.delete_left_out", text="Delete Hidden", icon="TRASH")
 
 
 CLASSES = (LODGS_PT_clean_up,)

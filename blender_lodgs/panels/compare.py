@@ -1,4 +1,4 @@
-"""The Compare panel: the views with how alike they are to their photographs, and the wipe."""
+"""The Compare panel: measured quality of the views, and the wipe between render and photo."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from ..viewport import wipe
 from .parts import Panel, say
 
 HELD_OUT = "HIDE_ON"
-"""The icon of views that training has not seen."""
+"""Icon of held-out views."""
 
 
 class LODGS_UL_views(bpy.types.UIList):
     worst_first: bpy.props.BoolProperty(
-        name="Worst First", description="List the views that are least like their photographs first"
+        name="Worst First", description="Sort the views by PSNR, lowest first"
     )
 
     def draw_item(self, context, layout, data, item, icon, active_data, active_property, index=0, flt_flag=0):
@@ -33,10 +33,10 @@ class LODGS_UL_views(bpy.types.UIList):
         row.prop(self, "worst_first", text="", icon="SORT_ASC")
 
     def filter_items(self, context, data, propname):
-        objects, letters = getattr(data, propname), self.filter_name.lower()
+        objects = getattr(data, propname)
+        query = self.filter_name.lower()
         flags = [
-            self.bitflag_filter_item * (obj.type == "CAMERA" and letters in obj.name.lower())
-            for obj in objects
+            self.bitflag_filter_item * (obj.type == "CAMERA" and query in obj.name.lower()) for obj in objects
         ]
 
         def sort_key(index: int):
@@ -72,7 +72,7 @@ class LODGS_PT_compare(Panel):
         else:
             row = layout.row(align=True)
             row.operator("lodgs.measure_views", text="Measure", icon="DRIVER_DISTANCE")
-            row.operator("lodgs.compare_worst", text="Worst", icon="SORT_ASC")
+            row.operator("lodgs.compare_worst", text="Worst View", icon="SORT_ASC")
             if measurement is not None and measurement.problem:
                 say(layout, measurement.problem, "ERROR")
         _draw_means(layout, root)
@@ -83,16 +83,16 @@ class LODGS_PT_compare(Panel):
             row.prop(settings, "show_comparison", text="", icon="SPLIT_VERTICAL")
             row.prop(settings, "wipe", slider=True)
             if context.scene.camera is None or context.scene.camera.session_uid != comparison.view:
-                say(layout, "Press Compare for this view.", "INFO")
+                say(layout, "Press Compare to compare this view.", "INFO")
 
 
 def _draw_means(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
-    """What was measured, in the mean: held-out views apart, because only they tell of what is between."""
+    """Draw mean PSNRs, separately for held-out views: only they measure quality between training views."""
     held_out = set(photographs.held_out(root))
     measured = [view for view in photographs.views(root) if view.data.lodgs.psnr > 0]
     column = layout.column(align=True)
     for name, icon, views in (
-        ("Trained on" if held_out else "Mean", "BLANK1", [view for view in measured if view not in held_out]),
+        ("Training" if held_out else "Mean", "BLANK1", [view for view in measured if view not in held_out]),
         ("Held out", HELD_OUT, [view for view in measured if view in held_out]),
     ):
         if views:

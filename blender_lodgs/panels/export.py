@@ -12,10 +12,10 @@ class LODGS_PT_export(LevelsPanel):
 
     def draw(self, context):
         column = self.layout.column(align=True)
-        column.operator("lodgs.export_bundle", text="Bundle, All Levels…", icon="EXPORT")
-        column.operator("lodgs.export_plain", text="Splats for Other Programs…")
-        column.operator("lodgs.export_folder", text="Folder of Levels…")
-        column.operator("lodgs.export_streamed", text="Levels for the Web…")
+        column.operator("lodgs.export_bundle", text="Level Bundle…", icon="EXPORT")
+        column.operator("lodgs.export_plain", text="Plain Splats…")
+        column.operator("lodgs.export_folder", text="Level Folder…")
+        column.operator("lodgs.export_streamed", text="Levels for Web…")
 
 
 CLASSES = (LODGS_PT_export,)

@@ -1,4 +1,4 @@
-"""The list of levels, and how much detail is shown where."""
+"""The Levels, Detail and Streaming panels."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .parts import LevelsPanel, say, split_column
 
 
 def _columns(row: bpy.types.UILayout, *texts: str) -> None:
-    """Four texts in columns."""
+    """Draw four texts in columns."""
     for text, share in zip(texts, (0.18, 0.4, 0.4), strict=False):
         row = row.split(factor=share)
         row.label(text=text)
@@ -20,7 +20,7 @@ def _columns(row: bpy.types.UILayout, *texts: str) -> None:
 
 
 def _short(value: float, digits: int = 0) -> str:
-    """A number that fits its column: 682,973; 3.97 M; 79.2; 344."""
+    """Format a number for a narrow column: 682,973; 3.97 M; 79.2; 344."""
     if value >= 1e6:
         return f"{value / 1e6:.3g} M" if value < 1e9 else f"{value / 1e9:.3g} G"
     return f"{value:,.{digits if value < 100 else 0}f}"
@@ -32,17 +32,17 @@ class LODGS_UL_levels(bpy.types.UIList):
         row.prop(item, "show", text="", icon="HIDE_OFF" if item.show else "HIDE_ON", emboss=False)
         cloud = item.object.data
         facts = selection.read_facts(item.facts).values()
-        detail = " ".join(f"{value:.2g}" if value else "all" for value in facts)  # 0: nothing is too small
+        detail = " ".join(f"{value:.2g}" if value else "all" for value in facts)  # 0: no splat is too small
         _columns(
             row, str(item.number), _short(len(cloud.points)), _short(objects.megabytes(cloud), 1), detail
         )
-        alone = data.mode == "SINGLE" and data.single_level == item.number
+        solo = data.mode == "SINGLE" and data.single_level == item.number
         row = row.row(align=True)
         row.enabled = data.complete or item.number == data.levels[-1].number
-        only = row.operator(
-            "lodgs.show_only_level", text="", icon="SOLO_ON" if alone else "SOLO_OFF", emboss=False
+        operator = row.operator(
+            "lodgs.show_only_level", text="", icon="SOLO_ON" if solo else "SOLO_OFF", emboss=False
         )
-        only.level = item.number
+        operator.level = item.number
 
     def filter_items(self, context, data, propname):
         return [self.bitflag_filter_item * item.exists for item in getattr(data, propname)], []
@@ -57,7 +57,7 @@ class LODGS_PT_levels(LevelsPanel):
         rule = find_rule(settings.rule)
         row = self.layout.row(align=True)
         row.label(text="", icon="BLANK1")
-        _columns(row, "Level", "Adds" if settings.cumulative else "Splats", "MB",
+        _columns(row, "Level", "Added" if settings.cumulative else "Splats", "MB",
                  "Detail" if rule and rule.level_facts else "")  # fmt: skip
         row.label(text="", icon="BLANK1")
         rows = min(max(len(settings.levels), 3), 10)
@@ -66,7 +66,7 @@ class LODGS_PT_levels(LevelsPanel):
         )
         if not settings.complete and len(settings.levels) > 1:
             first, *_, finest = (item.number for item in settings.levels)
-            text = f"Splats of level {first} stand for groups of level {finest}'s: no scene by themselves."
+            text = f"Level {first} holds coarse nodes of a tree: only level {finest} is a complete scene."
             say(self.layout, text, "INFO")
 
 
@@ -82,10 +82,10 @@ class LODGS_PT_detail(LevelsPanel):
         row.enabled = rule is not None
         row.prop(settings, "mode", expand=True)
         if rule is None:
-            what, remedy = unknown_rule(settings.rule)
-            say(layout, f"{what} {remedy}" if settings.rule else what, "INFO")
+            problem, remedy = unknown_rule(settings.rule)
+            say(layout, f"{problem} {remedy}" if settings.rule else problem, "INFO")
         elif rule.always and settings.mode == "SINGLE":
-            text = "These splats are made to be shown By Distance: all of them together are too opaque."
+            text = "These splats are trained for By Distance. As one level they look too opaque."
             say(layout, text, "INFO")
 
         column = layout.column()
@@ -111,25 +111,25 @@ class LODGS_PT_detail(LevelsPanel):
             elif settings.eye == "TRAINING":
                 column.prop(settings, "camera_center", text="Position")
             if context.scene.camera is None and settings.eye != "VIEW":
-                layout.label(text="The scene has no camera", icon="ERROR")
+                layout.label(text="No active camera", icon="ERROR")
         for item in settings.tables:
-            if item.collection and len(item.collection.objects) > 1:  # the first holds its rows
+            if item.collection and len(item.collection.objects) > 1:  # the first object holds the rows
                 text, spheres = f"Show {item.name.title()}", item.collection
                 layout.prop(spheres, "hide_viewport", text=text, toggle=True, invert_checkbox=True)
-        _counts(layout, context, root)
+        _draw_counts(layout, context, root)
 
 
-def _counts(layout: bpy.types.UILayout, context: bpy.types.Context, root: bpy.types.Object) -> None:
-    """How much is drawn; and where the eye is, and what has to be at hand there."""
+def _draw_counts(layout: bpy.types.UILayout, context: bpy.types.Context, root: bpy.types.Object) -> None:
+    """Draw the camera's chunk and the numbers of visible and loaded splats."""
     choice = loaded.chosen(context, root) if root.lodgs.mode == "SELECTIVE" else None
     column = layout.column(align=True)
-    where = choice.where() if choice else ""
-    if where:
-        column.label(text=where)
-    if not streams.file_of(root):  # else viewports draw more than the levels hold
-        shown, everything = scenes.count_shown(context, root)
-        column.label(text=f"{shown:,} of {everything:,} splats shown")
-    if choice and where:
+    position = choice.where() if choice else ""
+    if position:
+        column.label(text=position)
+    if not streams.file_of(root):  # when streaming, viewports draw more splats than the levels hold
+        visible, total = scenes.count_shown(context, root)
+        column.label(text=f"{visible:,} of {total:,} splats shown")
+    if choice and position:
         splats, megabytes = loaded.count_loaded(root, choice)
         column.label(text=f"{splats:,} loaded, {megabytes:.1f} MB")
 
@@ -145,23 +145,24 @@ class LODGS_PT_stream(LevelsPanel):
 
     def draw(self, context):
         root, layout = scenes.active_root(context), self.layout
-        stream, settings = views.stream(root), root.lodgs.stream
-        here = settings.here + (stream.splats if stream is not None and stream.ready else 0)
-        layout.label(text=f"{_short(here)} of {_short(settings.total)} splats in memory")
+        stream = views.stream(root)
+        settings = root.lodgs.stream
+        resident = settings.here + (stream.splats if stream is not None and stream.ready else 0)
+        layout.label(text=f"{_short(resident)} of {_short(settings.total)} splats in memory")
         if streams.changed(root):
-            say(layout, "Its splats are other ones than the file's now: they are drawn as they are.", "INFO")
+            say(layout, "These splats no longer match the file, so streaming is off.", "INFO")
         elif root.lodgs.mode != "SELECTIVE":
-            say(layout, "Finer ones are drawn By Distance.", "INFO")
+            say(layout, "Choose By Distance to stream finer splats.", "INFO")
         elif stream is not None and stream.problem:
-            say(layout, f"{stream.problem} What the scene holds is drawn.", "ERROR")
+            say(layout, f"{stream.problem} Only the splats in memory are drawn.", "ERROR")
         elif stream is None:  # no viewport draws splats
-            layout.label(text="Finer ones are read when drawn", icon="INFO")
+            layout.label(text="Streams when the viewport draws splats", icon="INFO")
         elif stream.busy:
-            layout.label(text="Reading finer ones…", icon="SORTTIME")
+            layout.label(text="Loading finer splats…", icon="SORTTIME")
         elif stream.short:
-            layout.label(text="No room for finer ones", icon="INFO")
+            layout.label(text="Limit reached for this view", icon="INFO")
         else:
-            layout.label(text="All that is needed is here", icon="CHECKMARK")
+            layout.label(text="Full detail for this view", icon="CHECKMARK")
         column = split_column(layout)
         column.prop(settings, "file")
         column.prop(settings, "budget")

@@ -1,4 +1,4 @@
-"""From where on each level is shown, and what that saves: below the list of levels, registered after it."""
+"""The Distances panel: the distance from which each level is shown, and the saved rendering cost."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class LODGS_PT_costs(LevelsPanel):
     def draw(self, context):
         root = scenes.active_root(context)
         column = self.layout.column(align=True)
-        column.label(text="Splats in a tile of the picture:")
+        column.label(text="Splats per Image Tile")
         for line in _lines(context, root):
             column.label(text=line)
         if jobs.cost_plot(root) is not None:
@@ -31,7 +31,7 @@ class LODGS_PT_costs(LevelsPanel):
 
 
 def _lines(context: bpy.types.Context, root: bpy.types.Object) -> list[str]:
-    """What the distances are and cost, in Blender's units."""
+    """Return one line per level: its distance in Blender units and its rendering cost."""
     meta = selection.read_json(root.lodgs.meta)
     return cost_lines(meta, lambda value: scene_length(context, root, value))
 

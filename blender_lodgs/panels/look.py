@@ -1,4 +1,4 @@
-"""The Look panel: exposure, white balance, tint, saturation and opacity, everywhere and in regions; paint."""
+"""The Look panel: colour and opacity of the scene and of regions, and paint."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class LODGS_PT_look_paint(LevelsPanel):
 
 
 class LODGS_PT_look_regions(LevelsPanel):
-    bl_label = "In Regions"
+    bl_label = "Regions"
     bl_parent_id = "LODGS_PT_look"
 
     def draw(self, context):
@@ -64,7 +64,7 @@ class LODGS_PT_look_regions(LevelsPanel):
 
 def _draw_look(layout: bpy.types.UILayout, obj: bpy.types.Object) -> None:
     column = split_column(layout)
-    column.use_property_decorate = True  # a look may be animated
+    column.use_property_decorate = True  # looks can be animated
     for name in looks.PARTS:
         column.prop(obj.lodgs_look, name)
 

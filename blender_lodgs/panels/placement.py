@@ -1,4 +1,4 @@
-"""The Placement panel, and the same verbs in the viewport's menus, where F3 finds them."""
+"""The Placement panel, and its operators in the viewport's menus, so that F3 search lists them."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ class LODGS_PT_placement(Panel):
         layout = self.layout
         layout.operator("lodgs.frame_scene", text="Frame Scene", icon="ZOOM_ALL")
         column = layout.column(align=True)
-        column.label(text="Ground at Z = 0")
+        column.label(text="Ground")
         row = column.row(align=True)
         row.operator("lodgs.set_ground", text="From Selection", icon="SNAP_PERPENDICULAR").by = "SELECTION"
-        row.operator("lodgs.set_ground", text="Find", icon="VIEWZOOM").by = "FOUND"
+        row.operator("lodgs.set_ground", text="Detect", icon="VIEWZOOM").by = "FOUND"
         column.operator("lodgs.set_scale", text="Set Scale…", icon="DRIVER_DISTANCE")
         column = layout.column(align=True)
-        column.label(text="Moving Camera")
-        column.operator("lodgs.camera_path", text="Along Photographs", icon="CURVE_PATH")
+        column.label(text="Camera Animation")
+        column.operator("lodgs.camera_path", text="Camera Path", icon="CURVE_PATH")
         column.operator("lodgs.turntable", text="Turntable", icon="FILE_REFRESH")
 
 
@@ -38,8 +38,8 @@ class LODGS_MT_placement(bpy.types.Menu):
 
     def draw(self, context):
         layout = self.layout
-        layout.operator("lodgs.set_ground", text="Ground From Selection").by = "SELECTION"
-        layout.operator("lodgs.set_ground", text="Find Ground").by = "FOUND"
+        layout.operator("lodgs.set_ground", text="Set Ground from Selection").by = "SELECTION"
+        layout.operator("lodgs.set_ground", text="Detect Ground").by = "FOUND"
         layout.operator("lodgs.set_scale", text="Set Scale…")
         layout.operator("lodgs.camera_path")
         layout.operator("lodgs.turntable")

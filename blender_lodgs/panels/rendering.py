@@ -1,4 +1,4 @@
-"""The Rendering panel of the sidebar, and the engine's own panels among Blender's properties."""
+"""The Rendering panel of the sidebar, and the engine's panels in the Properties editor."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class LODGS_PT_rendering(Panel):
             layout.operator("lodgs.use_engine", icon="RENDER_STILL")
             layout.prop(scene.lodgs_render, "ellipsoids")
             if scene.lodgs_render.ellipsoids:
-                text = "Slow, without view-dependent colours; fine up to some hundred thousand splats."
+                text = "Slow, and without view-dependent colours. Use it up to some hundred thousand splats."
                 say(layout, text, "INFO")
             return
         _draw_film(layout, scene)
@@ -34,7 +34,7 @@ class LODGS_PT_rendering(Panel):
         column = layout.column(align=True)
         if missing:
             draw_environment(column, missing)
-            say(column, "Or draw with the graphics card, as the viewport does:", "INFO")
+            say(column, "Viewport Quality renders without the trainer.", "INFO")
         else:
             _draw_passes(layout, scene, context.view_layer)
             column = layout.column(align=True)
@@ -82,12 +82,12 @@ def _draw_film(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     row.prop(scene.lodgs_render, "background")
     if scene.view_settings.view_transform != "Standard":
         name = scene.view_settings.view_transform
-        say(layout, f"{name} changes the colours of the photographs; Standard keeps them.", "INFO")
+        say(layout, f"View transform {name} changes the colours of the photos. Standard keeps them.", "INFO")
         layout.operator("lodgs.use_engine", text="Use Standard", icon="COLOR")
 
 
 def _missing_trainer() -> str:
-    """What one lacks without a trainer's Python, as a sentence; empty with one."""
+    """Return the problem to show if the trainer is not installed, else an empty string."""
     try:
         environment.trainer_python()
     except LodgsError as error:
@@ -96,16 +96,17 @@ def _missing_trainer() -> str:
 
 
 def _draw_render(layout: bpy.types.UILayout, operator: str, text: str, icon: str) -> None:
-    """A button for one picture, and a small one for every frame."""
+    """Draw a button that renders one image, and a small one that renders every frame."""
     row = layout.row(align=True)
-    row.operator_context = "INVOKE_DEFAULT"  # with progress, beside which one works on
+    row.operator_context = "INVOKE_DEFAULT"  # Blender stays responsive and shows the progress
     row.operator(operator, text=text, icon=icon).animation = False
     row.operator(operator, text="", icon="RENDER_ANIMATION").animation = True
 
 
 def _draw_meshes(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
-    """Whether the meshes are rendered as well, by which scene, and how to stop that."""
-    meshes, column = scene.lodgs_render.meshes, layout.column(align=True)
+    """Draw the button that combines splats with meshes, or the scene that renders the meshes."""
+    meshes = scene.lodgs_render.meshes
+    column = layout.column(align=True)
     if meshes is None:
         column.operator("lodgs.combine_with_meshes", icon="NODE_COMPOSITING")
         return

@@ -1,4 +1,4 @@
-"""The training panel: what to train, how far it is, how it ended."""
+"""The Training panel: settings, progress and results of training runs."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ class LODGS_PT_training(Panel):
             _draw_ended(self.layout, watch, root)
         elif root.lodgs.training.run:
             row = self.layout.row()
-            row.label(text="There was a run", icon="FILE_FOLDER")
+            row.label(text="Previous run", icon="FILE_FOLDER")
             row.operator("lodgs.open_run", text="Open Run").directory = root.lodgs.training.run
         resumable = watch is not None and watch.state != "done"
         choices: bpy.types.UILayout | None = self.layout
-        if scenes.root_with_levels(context) is not None and root.lodgs.training.run:  # next are the levels
+        if scenes.root_with_levels(context) is not None and root.lodgs.training.run:
             header, choices = self.layout.panel("LODGS_train_anew", default_closed=True)
-            header.label(text="Train Anew")
+            header.label(text="Train Again")
         if choices is not None:
             _draw_choices(choices, context, root, resumable)
             if extension.preferences().flamenco and root.lodgs.scene_folder:
@@ -94,18 +94,19 @@ def _draw_choices(
     layout: bpy.types.UILayout, context: bpy.types.Context, root: bpy.types.Object, resumable: bool
 ) -> None:
     settings = root.lodgs.training
-    alone, info = viewpoints.alone(root), method_info(settings.method)
-    if not root.lodgs.scene_folder and not alone:
-        say(layout, "Not imported from photographs: nothing to train on.", "INFO")
+    without_photos = viewpoints.alone(root)
+    info = method_info(settings.method)
+    if not root.lodgs.scene_folder and not without_photos:
+        say(layout, "No photos to train on. Import photos or a COLMAP scene.", "INFO")
         return
     column = split_column(layout)
     column.prop(settings, "method")
-    if alone and not info.from_base:
-        say(layout, f"{info.label} needs photographs, and these splats have none.", "INFO")
+    if without_photos and not info.from_base:
+        say(layout, f"{info.label} needs photos. Choose another method for splats without photos.", "INFO")
         return
     column.prop(settings, "preset")
     column.prop(settings, "image_scale")
-    if alone:
+    if without_photos:
         _draw_views(column, context, root)
     elif info.from_base:
         column.prop(settings, "start_from")
@@ -115,15 +116,15 @@ def _draw_choices(
         parameters = jobs.parameters(settings)
         levels = parameters.levels  # 0: the scene decides
         text = f" in {levels} levels" if levels > 1 else ""
-        text += f", {settings.columns * settings.rows} cells" if settings.grid and not alone else ""
-        begun = alone or (info.from_base and settings.start_from != "POINTS")
-        steps = parameters.base_steps if begun else parameters.total_steps
+        text += f", {settings.columns * settings.rows} cells" if settings.grid and not without_photos else ""
+        from_base = without_photos or (info.from_base and settings.start_from != "POINTS")
+        steps = parameters.base_steps if from_base else parameters.total_steps
         column.label(text=f"{steps:,} steps{text}")
         match hold_out(root):
-            case 0 if not alone:
-                say(layout, "No photographs are held out: quality will be of training views.", "INFO")
+            case 0 if not without_photos:
+                say(layout, "No views are held out, so quality is measured on training views.", "INFO")
             case 1:
-                say(layout, "All photographs would be held out: give 0, or at least 2.", "ERROR")
+                say(layout, "No views are left to train on. Set Hold Out Every to 0 or at least 2.", "ERROR")
                 return
     except LodgsError as error:
         say(layout, str(error), "ERROR")
@@ -134,31 +135,31 @@ def _draw_choices(
         draw_environment(layout, error.what)
         return
     if not bpy.data.is_saved and not settings.output:
-        text = f"This file is not saved yet: the run's folder will lie in {jobs.runs_folder(root)}."
+        text = f"This file is not saved. The run is written to {jobs.runs_folder(root)}."
         say(layout, text, "INFO")
     if resumable:
-        layout.operator("lodgs.train", text="Train Anew", icon="FILE_REFRESH")
+        layout.operator("lodgs.train", text="Train Again", icon="FILE_REFRESH")
     else:
         layout.operator("lodgs.train", text="Train", icon="PLAY")
 
 
 def _draw_views(column: bpy.types.UILayout, context: bpy.types.Context, root: bpy.types.Object) -> None:
-    """From where splats without photographs are looked at."""
+    """Draw the settings of the views to render from splats without photos."""
     settings = root.lodgs.training
     column.separator()
     draw_views(column, settings, viewpoints.count(settings))
     if settings.views_from == "DOME":
         try:
-            _, shells = viewpoints.dome_of(root)
+            _, radii = viewpoints.dome_of(root)
         except LodgsError as error:
             say(column, str(error), "ERROR")
             return
-        near, far = (scene_length(context, root, away) for away in shells)
-        say(column, f"Half of them {near} from the middle of the splats, half {far}.", "INFO")
+        near, far = (scene_length(context, root, radius) for radius in radii)
+        say(column, f"Half the views are {near} from the centre of the splats, half {far}.", "INFO")
 
 
 def _draw_parameter(layout: bpy.types.UILayout, group: bpy.types.PropertyGroup, name: str) -> None:
-    """A box to tick before the artist's value, or before that which is taken without one, greyed."""
+    """Draw a checkbox with the artist's value, or with the preset's value greyed out."""
     row = layout.row(align=True, heading=group.bl_rna.properties[name].name)
     row.prop(group, f"use_{name}", text="")
     value = row.row(align=True)
@@ -167,34 +168,34 @@ def _draw_parameter(layout: bpy.types.UILayout, group: bpy.types.PropertyGroup, 
 
 
 def _draw_distances(layout: bpy.types.UILayout, context: bpy.types.Context, root: bpy.types.Object) -> None:
-    """From where on each coarser level is shown, where training is not to find it; and how far that is."""
+    """Draw the distance from which each coarser level is shown, unless training finds the distances."""
     settings = root.lodgs.training
     layout.prop(settings, "find_distances")
     if settings.find_distances:
         return
     column = layout.column(align=True)
-    for number, place in level_distances(settings):
-        column.prop(settings, "distances", index=place, text=f"Level {number} From")
-    text = "In median depths: half of what photographs show is nearer than 1"
+    for number, index in level_distances(settings):
+        column.prop(settings, "distances", index=index, text=f"Level {number} From")
+    text = "Unit: median depth of the photos"
     if settings.median_depth:
-        text += f", which is {scene_length(context, root, settings.median_depth)}"
-    say(layout, f"{text}.", "INFO")
+        text += f" ({scene_length(context, root, settings.median_depth)})"
+    say(layout, text, "INFO")
 
 
 def _draw_running(layout: bpy.types.UILayout, watch: Watch, root: bpy.types.Object) -> None:
-    progress, share = watch.progress, watch.share
+    share = watch.share
     row = layout.row(align=True)
-    message, _, aside = watch.message.partition(" (")  # the bar has room for a few words
+    message, _, note = watch.message.partition(" (")  # the bar has room for a few words
     row.progress(text=f"{message} · {share:.0%}" if share else message, factor=share)
     row.operator("lodgs.cancel_training", text="", icon="X")
-    if aside:
-        say(layout, aside.rstrip(")").capitalize(), "INFO")
+    if note:
+        say(layout, note.rstrip(")").capitalize(), "INFO")
     if watch.cancel_requested:
-        layout.label(text="Cancel again to end it at once", icon="INFO")
+        layout.label(text="Cancel again to stop immediately", icon="INFO")
     elif watch.unresponsive:
-        say(layout, "The trainer has not answered for a while. Cancel it, then resume.", "ERROR")
+        say(layout, "The trainer is not responding. Cancel it, then resume.", "ERROR")
     draw_blocks(layout, root, watch)
-    facts = progress_facts(progress)
+    facts = progress_facts(watch.progress)
     if facts:
         grid = layout.grid_flow(row_major=True, columns=2, even_columns=True)
         for name, value in facts.items():
@@ -203,18 +204,19 @@ def _draw_running(layout: bpy.types.UILayout, watch: Watch, root: bpy.types.Obje
 
 
 def _draw_ended(layout: bpy.types.UILayout, watch: Watch, root: bpy.types.Object) -> None:
-    box, there = layout.box(), {item.number for item in root.lodgs.levels if item.exists}
+    box = layout.box()
+    loaded = {item.number for item in root.lodgs.levels if item.exists}
     box.label(text=watch.message, icon="CHECKMARK" if watch.state == "done" else "PAUSE")
     column = box.column(align=True)
     column.scale_y = 0.8
-    shown = [watch.levels[number] for number in sorted(watch.levels.keys() & there)]
-    if views := next(filter(None, map(measured_on, shown)), ""):
-        column.label(text=f"On {views}:", icon="BLANK1")
-    for event in shown:
+    events = [watch.levels[number] for number in sorted(watch.levels.keys() & loaded)]
+    if views := next(filter(None, map(measured_on, events)), ""):
+        column.label(text=f"Quality on {views}", icon="BLANK1")
+    for event in events:
         column.label(text=short_level_line(event), icon="BLANK1")
-    if missing := sorted(watch.levels.keys() - there):
-        say(box, f"The run has more than is here: level {', '.join(map(str, missing))}.", "INFO")
-        load = box.operator("lodgs.open_run", text="Load Its Levels", icon="IMPORT")
+    if missing := sorted(watch.levels.keys() - loaded):
+        say(box, f"Levels not loaded: {', '.join(map(str, missing))}", "INFO")
+        load = box.operator("lodgs.open_run", text="Load Levels", icon="IMPORT")
         load.directory = str(watch.folder.path)
     for line in summary_lines(watch.summary):
         say(box, line, "BLANK1")

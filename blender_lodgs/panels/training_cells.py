@@ -1,4 +1,4 @@
-"""Training a large scene in cells: their plan before it runs, and how each gets on."""
+"""The Large Scene panel: plan and progress of training in cells."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from ..runs import jobs
 from ..runs.watch import Part, Watch, watch_of
 from .parts import Panel, say, split_column
 
-_NUMBER = 0.16
-"""Of the width of a line, for a cell's colour and number."""
+_NUMBER_WIDTH = 0.16
+"""Fraction of a row's width for the cell's colour and number."""
 _ICONS = {
     "waiting": "SORTTIME",
     "done": "CHECKMARK",
@@ -23,7 +23,7 @@ _ICONS = {
 
 
 class LODGS_UL_cells(bpy.types.UIList):
-    """What the plan says of each cell."""
+    """List of planned cells."""
 
     def draw_item(
         self, context, layout, data, item, icon, active_data, active_property, index: int = 0, flt_flag=0
@@ -33,15 +33,17 @@ class LODGS_UL_cells(bpy.types.UIList):
 
 
 class LODGS_UL_blocks(bpy.types.UIList):
-    """How the training of each cell gets on."""
+    """List of cells in training, with their progress."""
 
     def draw_item(
         self, context, layout, data, item, icon, active_data, active_property, index: int = 0, flt_flag=0
     ):
-        watch, number = watch_of(data.id_data), index + 1
+        watch = watch_of(data.id_data)
+        number = index + 1
         part = watch.part(number) if watch else None
         if watch is not None and part is not None:
-            row, stopping = _numbered(layout, number).row(align=True), (part.kind, number) in watch.stopping
+            row = _numbered(layout, number).row(align=True)
+            stopping = (part.kind, number) in watch.stopping
             _draw_part(row, part, stopping)
             if watch.running and part.state == "waiting" and stopping:
                 row.label(icon="BLANK1")
@@ -52,16 +54,16 @@ class LODGS_UL_blocks(bpy.types.UIList):
 
 
 def _draw_part(layout: bpy.types.UILayout, part: Part, stopping: bool = False) -> None:
-    share, what = f"{part.share:.0%}", "Borders, " if part.kind == "seam" else ""
-    if stopping and part.state == "waiting":  # the run says so when it next comes to it
+    share = f"{part.share:.0%}"
+    if stopping and part.state == "waiting":  # the run reports it only when it reaches this cell
         layout.label(text="Cancelled", icon=_ICONS["cancelled"])
     elif stopping:
         layout.label(text=f"Stopping at {share}", icon="SORTTIME")
     elif part.state == "running":
-        layout.progress(text=f"{what}{share}", factor=part.share)
+        layout.progress(text=f"Borders, {share}" if part.kind == "seam" else share, factor=part.share)
     else:
-        at = f" at {share}" if part.share and part.state != "done" else ""
-        layout.label(text=f"{part.state.capitalize()}{at}", icon=_ICONS[part.state])
+        suffix = f" at {share}" if part.share and part.state != "done" else ""
+        layout.label(text=f"{part.state.capitalize()}{suffix}", icon=_ICONS[part.state])
 
 
 class LODGS_PT_training_cells(Panel):
@@ -78,12 +80,12 @@ class LODGS_PT_training_cells(Panel):
         root = scenes.active_root(context)
         layout, settings, watch = self.layout, root.lodgs.training, watch_of(root)
         if not (watch and watch.running):
-            _draw_choices(layout, root)
+            _draw_settings(layout, root)
         if settings.planned_for:
             layout.prop(settings, "show_cells", toggle=True)
 
 
-def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
+def _draw_settings(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
     settings = root.lodgs.training
     column = split_column(layout)
     column.prop(settings, "divide_by", text="Cells")
@@ -94,7 +96,7 @@ def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
     else:
         column.prop(settings, "cell_splats" if settings.divide_by == "SPLATS" else "cell_memory")
     if settings.divide_by == "GRID" and not settings.grid:
-        say(layout, "One cell: the scene is trained as a whole.", "INFO")
+        say(layout, "One cell trains the scene as a whole.", "INFO")
         return
     column.prop(settings, "at_once")
     column.prop(settings, "polish")
@@ -105,11 +107,11 @@ def _draw_choices(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
         return
     layout.operator("lodgs.plan_cells", icon="MESH_GRID")
     if settings.planned_for:
-        fits = cells.is_planned(settings, job)
-        if not fits:
-            say(layout, "Planned for other settings: plan again.", "INFO")
+        current = cells.is_planned(settings, job)
+        if not current:
+            say(layout, "The settings have changed. Plan the cells again.", "INFO")
         column = layout.column()
-        column.active = fits
+        column.active = current
         _draw_plan(column, settings)
 
 
@@ -118,18 +120,19 @@ def _draw_plan(layout, settings):
     _columns(_numbered(head, None), "Views", "Splats", "Memory")
     rows = min(max(len(settings.planned_cells), 3), 8)
     layout.template_list("LODGS_UL_cells", "", settings, "planned_cells", settings, "active_cell", rows=rows)
-    chosen = settings.planned_cells[settings.active_cell]
-    layout.label(text=f"From {chosen.points:,} points, {chosen.steps:,} steps")
+    cell = settings.planned_cells[settings.active_cell]
+    layout.label(text=f"{cell.points:,} initial points, {cell.steps:,} steps")
 
 
 def draw_blocks(layout: bpy.types.UILayout, root: bpy.types.Object, watch: Watch) -> None:
-    """How each cell of a run gets on, with a button that stops it or goes on."""
-    settings, whole = root.lodgs.training, watch.part(0)
-    if whole is not None and whole.state != "done":
-        parts = layout.split(factor=0.4)
-        parts.label(text="Coarse levels")
-        _draw_part(parts, whole)
-    if len(settings.planned_cells) == watch.cells > 0:  # else another plan was made since
+    """Draw the progress of each cell of a run, with a button to cancel or resume it."""
+    settings = root.lodgs.training
+    coarse = watch.part(0)
+    if coarse is not None and coarse.state != "done":
+        row = layout.split(factor=0.4)
+        row.label(text="Coarse levels")
+        _draw_part(row, coarse)
+    if len(settings.planned_cells) == watch.cells > 0:  # a newer plan has other cells
         rows = min(max(len(settings.planned_cells), 3), 8)
         layout.template_list(
             "LODGS_UL_blocks", "", settings, "planned_cells", settings, "active_cell", rows=rows
@@ -137,13 +140,13 @@ def draw_blocks(layout: bpy.types.UILayout, root: bpy.types.Object, watch: Watch
 
 
 def _numbered(layout: bpy.types.UILayout, number: int | None) -> bpy.types.UILayout:
-    """A line that begins with a cell's colour and number, or the space that they take; the rest of it."""
-    parts = layout.split(factor=_NUMBER)
-    row = parts.row(align=True)
+    """Start a row with a cell's colour and number, or an empty space, and return the rest of the row."""
+    split = layout.split(factor=_NUMBER_WIDTH)
+    row = split.row(align=True)
     if number is not None:
         row.template_node_socket(color=(*level_color(number), 1.0))
     row.label(text=str(number or ""))
-    return parts
+    return split
 
 
 def _columns(row: bpy.types.UILayout, *texts: str) -> None:
@@ -153,7 +156,7 @@ def _columns(row: bpy.types.UILayout, *texts: str) -> None:
 
 
 def _brief(value: float) -> str:
-    """A number that fits a narrow column: 9,812; 68.3 k; 1.23 M."""
+    """Format a number for a narrow column: 9,812; 68.3 k; 1.23 M."""
     if value < 10_000:
         return f"{value:,.0f}"
     return f"{value / 1e3:.3g} k" if value < 999_500 else f"{value / 1e6:.3g} M"

@@ -1,4 +1,4 @@
-"""The menu of all verbs, so that Blender's search (F3) finds them; and that of a scene's runs."""
+"""The LODGS menu of all operators, so that F3 search lists them, and the menu of a scene's training runs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ VERBS = (
     ("lodgs.capture_scene", "lodgs.import_capture", "lodgs.reset_look", "lodgs.remove_paint",
      "lodgs.remove_scene"),
 )  # fmt: skip
-"""What the menu has, beside what other menus have: placing, cleaning, File's Import and Export."""
+"""Operators of the menu, without those that other menus list: placement, clean-up, import and export."""
 
 
 class LODGS_MT_verbs(bpy.types.Menu):
@@ -34,8 +34,8 @@ class LODGS_MT_verbs(bpy.types.Menu):
 
 
 class LODGS_MT_runs(bpy.types.Menu):
-    bl_label = "Runs of This Scene"
-    bl_description = "Show the levels of another run; what is shown now stays in its own folder"
+    bl_label = "Training Runs"
+    bl_description = "Load the levels of another run of this scene; all runs stay in their folders"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -43,18 +43,18 @@ class LODGS_MT_runs(bpy.types.Menu):
 
     def draw(self, context):
         root = scenes.active_root(context)
-        found = jobs.runs_of(root) if root is not None else []
+        runs = jobs.runs_of(root) if root is not None else []
         current = jobs.run_folder(root) if root is not None else None
-        for run in found:
+        for run in runs:
             text = (
                 f"{run.folder.path.name}: {method_info(run.job.method).label}, {run.job.preset}, {run.state}"
             )
-            shown = current is not None and current.path == run.folder.path
-            icon = "RADIOBUT_ON" if shown else "RADIOBUT_OFF"
+            is_current = current is not None and current.path == run.folder.path
+            icon = "RADIOBUT_ON" if is_current else "RADIOBUT_OFF"
             operator = self.layout.operator("lodgs.open_run", text=text, icon=icon)
             operator.directory = str(run.folder.path)
-        if not found:
-            self.layout.label(text="None yet", icon="INFO")
+        if not runs:
+            self.layout.label(text="No runs yet", icon="INFO")
 
 
 def _menu(self, context):
