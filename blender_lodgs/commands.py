@@ -1,4 +1,4 @@
-"""The command line without a window: ``blender --command lodgs --help``."""
+"""Blender's command line in background mode: ``blender --command lodgs --help``."""
 
 from __future__ import annotations
 
@@ -28,33 +28,34 @@ from . import extension
 from .data import scenes, viewpoints
 from .render.capture import noise, render_views, write_model
 from .render.video import MOST_FRAMES, extract_frames
-from .runs import environment, jobs, photo_preparation
+from .runs import environment, job_settings, jobs, photo_preparation
 from .runs.messages import format_duration, level_line
 from .runs.watch import Watch
 
 DONE, CRASHED, BAD_INPUT, CANCELLED = 0, 1, 2, 3
-"""Exit codes, as the trainer's own."""
+"""Exit codes, the same as the trainer's."""
+_Commands = argparse._SubParsersAction  # argparse has no public name for it
 
 
 def main(arguments: list[str]) -> int:
     """Run one command.
 
     Args:
-        arguments: what follows ``blender --command lodgs``.
+        arguments: the arguments after ``blender --command lodgs``.
 
     Returns:
-        An exit code. Errors of the user are a sentence on standard error.
+        An exit code. Input errors print one sentence to standard error.
     """
     try:
         args = _parser().parse_args(arguments)
-    except SystemExit as stop:  # argparse has printed its help or the mistake
+    except SystemExit as stop:  # argparse has printed help or an error
         return int(stop.code or 0)
     try:
         return args.command(args)
     except LodgsError as error:
         _print(f"error: {error}")
         return BAD_INPUT
-    except RuntimeError as error:  # an operator of Blender's own, such as saving, says no
+    except RuntimeError as error:  # a Blender operator failed, such as saving
         _print(str(error).strip())
         return CRASHED
 
@@ -62,81 +63,103 @@ def main(arguments: list[str]) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="blender --command lodgs",
-        description="Splats with levels of detail.",
-        epilog="The trainer's Python is that of the preferences, or of the environment variable "
+        description="Train, import, export and capture Gaussian splats with levels of detail.",
+        epilog="The trainer's Python is set in the preferences or by the environment variable "
         f"{environment.VARIABLE}. Exit codes: 0 done, 1 crash, 2 bad input, 3 cancelled.",
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    _add_train(commands)
+    _add_methods(commands)
+    _add_import(commands)
+    _add_export(commands)
+    _add_capture(commands)
+    _add_frames(commands)
+    _add_info(commands)
+    return parser
 
-    train = commands.add_parser("train", help="photographs to splats: import, train, save, export")
+
+def _add_train(commands: _Commands) -> None:
+    train = commands.add_parser("train", help="import photos, train splats, save and export them")
     train.set_defaults(command=_train)
     add_options(train)
-    train.add_argument("--blend", type=Path, help=".blend file to save, with the levels and their selection")
+    train.add_argument("--blend", type=Path, help=".blend file to save with the levels")
     train.add_argument("--export", type=Path, help="bundle to write")
 
-    methods = commands.add_parser("methods", help="say which methods there are, or what one can be told")
+
+def _add_methods(commands: _Commands) -> None:
+    methods = commands.add_parser("methods", help="list the methods, or the parameters of one method")
     methods.set_defaults(command=_methods)
     methods.add_argument("name", nargs="?", metavar="NAME", help="method whose parameters to list")
 
-    convert = commands.add_parser("import", help="a COLMAP folder or any file of splats to a .blend")
-    convert.set_defaults(command=_import)
-    convert.add_argument("source", type=Path, help="folder or file")
-    convert.add_argument("--blend", type=Path, required=True, help=".blend file to save")
 
+def _add_import(commands: _Commands) -> None:
+    importer = commands.add_parser("import", help="import a COLMAP folder or a splat file into a .blend file")
+    importer.set_defaults(command=_import)
+    importer.add_argument("source", type=Path, help="folder or file to import")
+    importer.add_argument("--blend", type=Path, required=True, help=".blend file to save")
+
+
+def _add_export(commands: _Commands) -> None:
     export = commands.add_parser(
-        "export", help="the levels of a .blend to a bundle, or the finest to another kind of file"
+        "export", help="export the levels of a .blend file to a bundle, or the finest level to another format"
     )
     export.set_defaults(command=_export)
     export.add_argument("blend", type=Path, help=".blend file")
     export.add_argument(
-        "bundle", type=Path, help="bundle to write (.ply); or .spz, .sog, .compressed.ply, .splat"
+        "bundle", type=Path, help="file to write: a bundle (.ply), .spz, .sog, .compressed.ply or .splat"
     )
-    export.add_argument("--root", help="name of the scene root, where the file holds several")
+    export.add_argument("--root", help="name of the scene root, if the file holds several")
     export.add_argument(
         "--placed",
         action="store_true",
-        help="where the scene stands in the .blend, not in COLMAP's coordinates",
+        help="apply the scene's location, rotation and scale instead of keeping COLMAP's coordinates",
     )
-    export.add_argument(
-        "--as-trained", action="store_true", help="without the look that the scene has in the .blend"
-    )
+    export.add_argument("--as-trained", action="store_true", help="ignore the scene's look")
 
+
+def _add_capture(commands: _Commands) -> None:
     capture = commands.add_parser(
         "capture",
-        help="any Blender scene to a COLMAP scene of its renders, to train from",
-        description="Renders views with the scene's own engine, writes their exact cameras and a model of "
-        "them. What is not said is as the file's LODGS tab has it. Given again, it goes on where it stopped.",
+        help="render a Blender scene as a COLMAP scene to train from",
+        description="Render views with the scene's render engine and write their exact cameras as a COLMAP "
+        "model. Options default to the settings of the file's LODGS tab. The same command resumes an "
+        "interrupted capture.",
     )
     capture.set_defaults(command=_capture)
     capture.add_argument("blend", type=Path, help=".blend file")
-    capture.add_argument("--out", type=Path, required=True, help="folder that becomes the COLMAP scene")
-    where = capture.add_mutually_exclusive_group()
-    where.add_argument("--around", action="store_true", help="views around what is selected, or all")
-    where.add_argument("--above", action="store_true", help="a grid above what is selected, or all")
-    where.add_argument("--cameras", action="store_true", help="every camera of the scene")
-    where.add_argument("--animation", action="store_true", help="frames of the scene's camera")
-    where.add_argument("--curve", metavar="NAME", help="a walk along a curve")
-    capture.add_argument("--views", type=int, metavar="N", help="how many, but of cameras")
-    capture.add_argument("--size", type=parse_size, metavar="WxH", help="pixels of the pictures")
+    capture.add_argument("--out", type=Path, required=True, help="folder for the COLMAP scene")
+    source = capture.add_mutually_exclusive_group()
+    source.add_argument(
+        "--around", action="store_true", help="place views around the selected objects, or all"
+    )
+    source.add_argument("--above", action="store_true", help="place a grid of views above these objects")
+    source.add_argument("--cameras", action="store_true", help="use every camera of the scene")
+    source.add_argument("--animation", action="store_true", help="use the frames of the active camera")
+    source.add_argument("--curve", metavar="NAME", help="place views along a curve")
+    capture.add_argument("--views", type=int, metavar="N", help="number of views, except with --cameras")
+    capture.add_argument("--size", type=parse_size, metavar="WxH", help="image size in pixels")
     capture.add_argument(
-        "--range", type=_range, metavar="A-B", help="render only these views, from 1 on, and make no model: "
-        "for several computers, before one does the same without it",
+        "--range", type=_range, metavar="A-B", help="render only views A to B and write no model, to share a "
+        "capture between computers; then run the command once without --range",
     )  # fmt: skip
 
+
+def _add_frames(commands: _Commands) -> None:
     frames = commands.add_parser(
-        "frames", help="sharp frames of a video, from which lodgs scene --photos --ordered finds cameras"
+        "frames", help="extract the sharpest frames of a video, for lodgs scene --photos --ordered"
     )
     frames.set_defaults(command=_frames)
-    frames.add_argument("video", type=Path, help="any video that Blender reads")
-    frames.add_argument("--out", type=Path, required=True, help="folder of the frames")
+    frames.add_argument("video", type=Path, help="video in any format that Blender reads")
+    frames.add_argument("--out", type=Path, required=True, help="folder for the frames")
     frames.add_argument(
-        "--most", type=int, default=MOST_FRAMES, metavar="N", help=f"at most so many ({MOST_FRAMES})"
+        "--most", type=int, default=MOST_FRAMES, metavar="N", help=f"maximum number of frames ({MOST_FRAMES})"
     )
 
-    info = commands.add_parser("info", help="say what a bundle or any 3DGS PLY holds")
+
+def _add_info(commands: _Commands) -> None:
+    info = commands.add_parser("info", help="describe a bundle or a 3DGS PLY file")
     info.set_defaults(command=_info)
-    info.add_argument("file", type=Path)
-    return parser
+    info.add_argument("file", type=Path, help="file to describe")
 
 
 def _train(args: argparse.Namespace) -> int:
@@ -144,11 +167,11 @@ def _train(args: argparse.Namespace) -> int:
     if job.backend == "auto":
         job = replace(job, backend=extension.preferences().backend)
     _empty_file()
-    root = _imported(job)
-    jobs.show(root.lodgs.training, job)  # when the .blend is opened
+    root = _import_for(job)
+    job_settings.apply_job(root.lodgs.training, job)  # for the panel when the .blend is opened
     watch = jobs.start_or_resume(root, job)
     with _interrupts():
-        jobs.follow(watch, _Bar())
+        jobs.follow(watch, _ProgressBar())
     for line in summary_lines(watch.summary):
         _print(line)
     for warning in watch.warnings:
@@ -162,27 +185,27 @@ def _train(args: argparse.Namespace) -> int:
         _print(watch.folder.log_tail())
         return CRASHED
     if watch.state == "cancelled":
-        _print("Cancelled. The same command goes on from here.")
+        _print("Cancelled. The same command resumes.")
         return CANCELLED
     if args.export:
         write_bundle(args.export, scenes.read_levels(root))
     return DONE
 
 
-def _imported(job: Job) -> bpy.types.Object:
-    """What a job trains on, as a splat scene: its photographs, or its splats alone."""
+def _import_for(job: Job) -> bpy.types.Object:
+    """Import a job's photos, or its base splats if it trains on captured views, and return the scene root."""
 
     def warn(message: str) -> None:
         _print(f"warning: {message}")
 
     if not job.capture:
-        return _photographed(Path(job.scene), warn)
+        return _import_photos(Path(job.scene), warn)
     run = RunFolder(job.base)
     return scenes.import_splats(bpy.context, run.bundle if run.bundle.exists() else run.path, warn=warn)
 
 
-def _photographed(folder: Path, warn: Warn) -> bpy.types.Object:
-    """A COLMAP scene, its photographs straightened where their lens bends lines."""
+def _import_photos(folder: Path, warn: Warn) -> bpy.types.Object:
+    """Import a COLMAP scene, undistort its photos if needed and return the scene root."""
     root = scenes.import_colmap(bpy.context, folder, warn=warn)
     photo_preparation.undistort_photos(root, warn)
     return root
@@ -196,7 +219,7 @@ def _methods(args: argparse.Namespace) -> int:
 def _import(args: argparse.Namespace) -> int:
     _empty_file()
     if args.source.is_dir():
-        _photographed(args.source.resolve(), lambda m: _print(f"warning: {m}"))
+        _import_photos(args.source.resolve(), lambda m: _print(f"warning: {m}"))
     else:
         scenes.import_splats(bpy.context, args.source.resolve(), warn=lambda m: _print(f"warning: {m}"))
     _save(args.blend)
@@ -205,16 +228,20 @@ def _import(args: argparse.Namespace) -> int:
 
 def _export(args: argparse.Namespace) -> int:
     _open(args.blend)
-    found = [root for root in bpy.data.objects if root.lodgs.is_root and args.root in {None, root.name}]
-    if len(found) != 1:
-        names = ", ".join(root.name for root in bpy.data.objects if root.lodgs.is_root) or "none"
-        raise LodgsError(f"{args.blend} holds {len(found)} such scenes.", f"Name one with --root: {names}.")
-    bundle = scenes.read_levels(found[0], args.placed, not args.as_trained)
+    roots = [root for root in bpy.data.objects if root.lodgs.is_root]
+    matches = [root for root in roots if args.root in {None, root.name}]
+    if len(matches) != 1:
+        names = ", ".join(root.name for root in roots) or "none"
+        raise LodgsError(
+            f"Cannot export {args.blend}: {len(matches)} splat scenes match.",
+            f"Name one of its scenes with --root: {names}.",
+        )
+    bundle = scenes.read_levels(matches[0], args.placed, not args.as_trained)
     if find_format(args.bundle) is PLY:
         write_bundle(args.bundle, bundle)
     else:
-        form = bundle if find_format(args.bundle).antialiased else without_filter(bundle)
-        finish(write_splats(args.bundle, Joined.upto(form, form.levels[-1].number), form.meta))
+        exported = bundle if find_format(args.bundle).antialiased else without_filter(bundle)
+        finish(write_splats(args.bundle, Joined.upto(exported, exported.levels[-1].number), exported.meta))
     return DONE
 
 
@@ -228,7 +255,9 @@ def _capture(args: argparse.Namespace) -> int:
     if args.curve:
         settings.curve = bpy.data.objects.get(args.curve)
         if settings.curve is None or settings.curve.type != "CURVE":
-            raise LodgsError(f"{args.blend} has no curve '{args.curve}'.", "Name another one.")
+            raise LodgsError(
+                f"Cannot capture: {args.blend} has no curve '{args.curve}'.", "Name a curve of the file."
+            )
     width, height = args.size or viewpoints.size(scene, settings)
     views = settings.views if args.views is None else args.views
     check_views(views, width)
@@ -236,41 +265,42 @@ def _capture(args: argparse.Namespace) -> int:
     if not args.range:
         environment.require(environment.trainer_python())
 
-    def tell(number: int, count: int) -> None:
+    def report(number: int, count: int) -> None:
         _print(f"View {number} of {count}")
 
-    folder, engine = args.out.resolve(), scene.render.engine
+    folder = args.out.resolve()
+    engine = scene.render.engine
     if engine.startswith(("BLENDER_EEVEE", "BLENDER_WORKBENCH")):
         name = "Workbench" if "WORKBENCH" in engine else "EEVEE"
-        _print(
-            f"{name} needs graphics, in background too. If Blender crashes now, there are none: take Cycles."
-        )
-    if noisy := noise(scene):
-        _print(f"warning: {noisy}")
+        _print(f"{name} needs a GPU, also in background mode. If Blender crashes now, use Cycles.")
+    if warning := noise(scene):
+        _print(f"warning: {warning}")
     try:
         with _interrupts():
-            count = render_views(bpy.context, folder, width, height, args.range, tell)
+            count = render_views(bpy.context, folder, width, height, args.range, report)
             if args.range:
                 _print(f"{folder}: views {args.range[0]} to {min(args.range[1], count)} of {count}")
             else:
                 _print(write_model(folder))
     except KeyboardInterrupt:
-        _print("Cancelled. The same command goes on from here.")
+        _print("Cancelled. The same command resumes.")
         return CANCELLED
     return DONE
 
 
 def _frames(args: argparse.Namespace) -> int:
     if args.most < 2:
-        raise LodgsError(f"{args.most} frames make no scene.", "Ask for some dozens with --most.")
+        raise LodgsError(
+            f"Cannot make a scene of {args.most} frames.", "Set --most to at least 2, better to some dozens."
+        )
     if not args.video.is_file():
-        raise LodgsError(f"There is no file {args.video}.", "Choose a video.")
+        raise LodgsError(f"Cannot read video: {args.video} does not exist.", "Choose a video file.")
 
-    def tell(number: int, count: int) -> None:
-        _print(f"Frames of the video: {number} of {count}")
+    def report(number: int, count: int) -> None:
+        _print(f"Video frame {number} of {count}")
 
     folder = args.out.resolve()
-    count = extract_frames(args.video.resolve(), folder, args.most, tell)
+    count = extract_frames(args.video.resolve(), folder, args.most, report)
     _print(f"{folder}: {count} frames")
     return DONE
 
@@ -278,17 +308,20 @@ def _frames(args: argparse.Namespace) -> int:
 def _range(text: str) -> tuple[int, int]:
     first, _, last = text.partition("-")
     if not (first.isdecimal() and last.isdecimal() and 1 <= int(first) <= int(last)):
-        raise argparse.ArgumentTypeError(f"{text} is not FIRST-LAST, such as 1-16")
+        raise argparse.ArgumentTypeError(f"{text} is not of the form FIRST-LAST, such as 1-16")
     return int(first), int(last)
 
 
 def _open(blend: Path) -> None:
     if not blend.is_file():
-        raise LodgsError(f"There is no file {blend}.")
+        raise LodgsError(f"Cannot open {blend}: no such file.", "Choose an existing .blend file.")
     try:
         bpy.ops.wm.open_mainfile(filepath=str(blend.resolve()))
     except RuntimeError as error:
-        raise LodgsError(f"{blend} cannot be opened.", "Choose a .blend, not of a newer Blender.") from error
+        raise LodgsError(
+            f"Cannot open {blend}: Blender cannot read it.",
+            "Choose a .blend file of this or an older version.",
+        ) from error
 
 
 def _info(args: argparse.Namespace) -> int:
@@ -304,7 +337,9 @@ def _save(path: Path) -> None:
     try:
         path.resolve().parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise LodgsError(f"The folder {path.parent} cannot be made: {error.strerror}.") from error
+        raise LodgsError(
+            f"Cannot create folder {path.parent}: {error.strerror}.", "Choose another folder."
+        ) from error
     bpy.ops.wm.save_as_mainfile(filepath=str(path.resolve()), check_existing=False)
 
 
@@ -312,11 +347,13 @@ def _print(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-class _Bar:
-    """Progress on standard error: a line for each thing done, and on a terminal a bar over the last one."""
+class _ProgressBar:
+    """Progress on standard error: one line per finished step, and on a terminal a bar in the last line."""
 
     def __init__(self) -> None:
-        self._message, self._levels, self._terminal = "", set(), sys.stderr.isatty()
+        self._message = ""
+        self._levels: set[int] = set()
+        self._terminal = sys.stderr.isatty()
 
     def __call__(self, watch: Watch) -> None:
         for number in sorted(watch.levels.keys() - self._levels):
@@ -332,9 +369,9 @@ class _Bar:
                 f"{format_duration(progress['eta_s'])} left",
                 end="", file=sys.stderr, flush=True,
             )  # fmt: skip
-        elif (
-            message := re.sub(r"\d+", "", watch.message)
-        ) != self._message:  # a line for all that is counted
+            return
+        message = re.sub(r"\d+", "", watch.message)  # print a counter's message once
+        if message != self._message:
             self._message = message
             self._line(watch.message)
 
@@ -344,13 +381,13 @@ class _Bar:
 
 @contextmanager
 def _interrupts():
-    """Ctrl-C raises KeyboardInterrupt, as in any Python; in background Blender itself would end at once."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    """Make Ctrl-C raise KeyboardInterrupt; by default background Blender exits immediately."""
+    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         yield
     finally:
-        if before is not None:  # None: a handler that Python did not set and cannot set again
-            signal.signal(signal.SIGINT, before)
+        if previous is not None:  # None: the handler was not set by Python and cannot be restored
+            signal.signal(signal.SIGINT, previous)
 
 
 _command = None

@@ -72,7 +72,7 @@ def test_train_from_a_base_is_what_the_panel_then_shows(
     (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
     settings = root.lodgs.training
     assert (settings.start_from, settings.parameters.max_splats) == ("FILE", 500)
-    panels = lodgs("runs.jobs").make_job(root, tmp_path / "second", {})
+    panels = lodgs("runs.job_settings").make_job(root, tmp_path / "second", {})
     assert panels.resolved() == written, "the panel asks for the same"
 
 
@@ -197,7 +197,7 @@ def test_ctrl_c_cancels_politely(bpy, fake, tmp_path):
         assert process.wait(30) == 3
         assert process.stderr is not None
         said = process.stderr.read()
-    assert "Cancelled. The same command goes on from here." in said and "Traceback" not in said
+    assert "Cancelled. The same command resumes." in said and "Traceback" not in said
     last = json.loads((tmp_path / "run" / "events.jsonl").read_text().splitlines()[-1])
     assert last["event"] == "cancelled"
 

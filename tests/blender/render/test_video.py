@@ -115,7 +115,7 @@ def test_what_is_no_video(lodgs, tmp_path, content, capfd):
         path.write_bytes(content)
     assert lodgs("commands").main(["frames", str(path), "--out", str(tmp_path / "out")]) == 2
     said = capfd.readouterr().err
-    assert "cannot be read as a video" in said or "There is no file" in said
+    assert "cannot be read as a video" in said or "does not exist" in said
     assert not (tmp_path / "out").exists()
 
 
