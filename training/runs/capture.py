@@ -12,7 +12,7 @@ from PIL import Image
 
 from ..errors import LodgsError
 from ..rasterize import Gaussians, cpu_fallback_reason, rasterize
-from ..scenes.cameras import Camera, read_views
+from ..scenes.cameras import Camera, read_camera_folder
 from ..scenes.viewpoints import dome
 from ..scenes.write_colmap import write_seen
 from ..splats.dialects import Warn, ignore
@@ -60,7 +60,7 @@ def capture(
     if source == DOME:
         cameras, near = dome(splats, views, width, round(width * 2 / 3))
     else:
-        cameras, near = read_views(Path(source))
+        cameras, near = read_camera_folder(Path(source))
     return len(cameras), write_scene(
         scene, splats, cameras, near, backend=backend, antialias=antialias, report=report
     )

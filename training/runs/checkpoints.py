@@ -1,8 +1,8 @@
-"""Checkpoints of a run: written whole, verified, and read whole or not at all.
+"""Checkpoints of a run, written atomically and verified when read.
 
-A checkpoint is what ``torch.save`` writes: a ZIP archive. It holds a CRC-32 of each of its parts, which
-``torch.load`` does not look at and :func:`read_checkpoint` does. What is too much to be written every time
-lies beside them, in files of ``optimize.out_of_core.row_file``, of which a checkpoint holds a table.
+``torch.save`` writes a ZIP archive with a CRC-32 of each member. ``torch.load`` ignores these checksums;
+:func:`read_checkpoint` verifies them. Data too large to rewrite for every checkpoint is in separate files
+of ``optimize.out_of_core.row_file``; the checkpoint holds a table of them.
 """
 
 from __future__ import annotations
@@ -20,22 +20,23 @@ from ..files import atomic_write, open_regular
 from .folder import RunFolder
 
 FORMAT = 1
-"""Version of what a checkpoint holds; raised when a method's state means something else than before."""
+"""Version of the checkpoint format; increased when the meaning of a method's state changes."""
 
 MAX_CHECKPOINTS = 2
-"""How many checkpoints a run has, so that one that the disk has spoilt does not end it."""
+"""Number of checkpoints to keep, so that a run survives one corrupt file."""
 
 
 def write_checkpoint(folder: RunFolder, step: int, levels: list[dict], method: dict) -> None:
-    """Writes a checkpoint, then drops all but the newest ones.
+    """Write a checkpoint, then delete all but the newest ones.
 
     Args:
-        step: the next step to make.
-        levels: a record of each finished level: ``level``, ``path``, ``splats``, ``facts``.
+        folder: the run.
+        step: next step.
+        levels: record of each finished level: ``level``, ``path``, ``splats``, ``facts``.
         method: the method's ``state_dict``.
 
     Raises:
-        LodgsError: it cannot be written.
+        LodgsError: the checkpoint cannot be written.
     """
     state = {"format": FORMAT, "version": VERSION, "step": step, "levels": levels, "method": method}
     with atomic_write(folder.checkpoints / f"step_{step:07d}.pt") as temporary, open(temporary, "wb") as file:
@@ -45,81 +46,84 @@ def write_checkpoint(folder: RunFolder, step: int, levels: list[dict], method: d
 
 
 def remove_checkpoints(folder: RunFolder) -> None:
-    """Removes all checkpoints: a finished run has no more use for them."""
+    """Delete all checkpoints of a finished run."""
     for path in [*_newest_first(folder), *folder.checkpoints.glob("*_????????.bin")]:
         path.unlink(missing_ok=True)
 
 
 def read_newest(
-    folder: RunFolder, device: torch.device | str, take: Callable[[dict], None], warn: Callable[[str], None]
+    folder: RunFolder, device: torch.device | str, load: Callable[[dict], None], warn: Callable[[str], None]
 ) -> tuple[int, list[dict]] | None:
-    """Takes up the newest checkpoint that can be read.
+    """Load the newest readable checkpoint.
 
     Args:
-        device: where its tensors go.
-        take: told the method's state; it raises where that does not fit, and may then be told an older one.
-        warn: told of each checkpoint that cannot be read.
+        folder: the run.
+        device: device of the loaded tensors.
+        load: called with the method's state. If it raises, an older checkpoint is tried.
+        warn: called with a message for each unreadable checkpoint.
 
     Returns:
-        The next step and the records of finished levels; None where there are no checkpoints.
+        The next step and the records of finished levels; None if there are no checkpoints.
 
     Raises:
-        LodgsError: none of those that are there can be read, or another version of LODGS wrote them.
-        MemoryError, RuntimeError: there is no memory for one (``errors.is_out_of_memory``).
+        LodgsError: no existing checkpoint is readable, or another version of LODGS wrote it.
+        MemoryError, RuntimeError: not enough memory (``errors.is_out_of_memory``).
     """
-    paths, damaged = _newest_first(folder), list[Path]()
+    paths = _newest_first(folder)
+    corrupt: list[Path] = []
     for path in paths:
         try:
             state = read_checkpoint(path, device)
             for record in state["levels"]:
                 folder.find_file(record["path"])
-            take(state["method"])
+            load(state["method"])
         except OtherVersion:
             raise
         except Exception as error:
             if is_out_of_memory(error):
                 raise
-            warn(f"The checkpoint {path.name} cannot be read ({error}); what it held is trained again.")
-            damaged += [] if isinstance(error, OSError) else [path]
+            warn(f"Cannot read checkpoint {path.name} ({error}). Its steps are trained again.")
+            corrupt += [] if isinstance(error, OSError) else [path]
             continue
-        for spoilt in damaged:  # which would stand in the place of one that can be read
-            spoilt.unlink(missing_ok=True)
+        for path in corrupt:  # they would displace readable ones
+            path.unlink(missing_ok=True)
         return state["step"], state["levels"]
     if paths:
         raise LodgsError(
-            f"No checkpoint of the run {folder.path} can be read.",
-            f"Train it anew: in another folder, or here after deleting {folder.checkpoints.name} in it.",
+            f"Cannot resume run {folder.path}: no checkpoint is readable.",
+            f"Train again in another folder, or delete {folder.checkpoints.name} in this one first.",
         )
     return None
 
 
 class OtherVersion(LodgsError):
-    """A checkpoint is whole, but another version of LODGS wrote it."""
+    """An intact checkpoint in the format of another version of LODGS."""
 
 
 def read_checkpoint(path: Path, device: torch.device | str) -> dict[str, Any]:
-    """What a checkpoint holds: ``step``, ``levels`` and ``method``, after all of it has been verified.
+    """Read and verify a checkpoint: ``step``, ``levels`` and ``method``.
 
     Raises:
-        OtherVersion: it is of another format.
-        Exception: it is damaged, or no checkpoint.
+        OtherVersion: the checkpoint has another format.
+        Exception: the file is damaged or not a checkpoint.
     """
     with open_regular(path) as file:
         with zipfile.ZipFile(file) as archive:
-            if damaged := archive.testzip():
-                raise ValueError(f"{damaged} in it is damaged")
+            if member := archive.testzip():
+                raise ValueError(f"its member {member} is damaged")
         file.seek(0)
         state = torch.load(file, map_location=device, weights_only=True)
     if state.get("format") != FORMAT:
         version = state.get("version")
-        maker = f"LODGS {version}" if isinstance(version, str) and version != VERSION else "another LODGS"
+        named = isinstance(version, str) and version != VERSION
+        writer = f"LODGS {version}" if named else "another version of LODGS"
         raise OtherVersion(
-            f"The checkpoint {path} was made by {maker}, and this one ({VERSION}) cannot go on from it.",
-            "Finish the run with that version, or train it anew in another folder.",
+            f"Cannot resume from checkpoint {path} with LODGS {VERSION}: {writer} wrote it.",
+            "Finish the run with that version, or train again in another folder.",
         )
     step, levels, method = state["step"], state["levels"], state["method"]
     if type(step) is not int or step < 0 or not isinstance(levels, list) or not isinstance(method, dict):
-        raise ValueError("its step, levels or state is of the wrong kind")
+        raise ValueError("its step, levels or state has the wrong type")
     return state
 
 
@@ -127,8 +131,8 @@ def _newest_first(folder: RunFolder) -> list[Path]:
     return sorted(folder.checkpoints.glob("step_*.pt"), reverse=True)
 
 
-class _Remembering:
-    """A file to write to that remembers why it could not be: torch says nothing of it."""
+class _ErrorRecorder:
+    """A writable file that keeps its last OSError, because ``torch.save`` hides it."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
@@ -146,11 +150,11 @@ class _Remembering:
 
 
 def _save(state: dict, file: IO[bytes]) -> None:
-    remembering: Any = _Remembering(file)
+    recorder: Any = _ErrorRecorder(file)
     try:
-        torch.save(state, remembering)
+        torch.save(state, recorder)
     except RuntimeError:
-        if remembering.error is not None:
-            raise remembering.error from None
+        if recorder.error is not None:
+            raise recorder.error from None
         raise
     file.flush()

@@ -1,4 +1,4 @@
-"""From a job to the views that it trains and is measured on."""
+"""Load a job's training data: its scene, cameras and held-out views."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from ..errors import LodgsError
 from ..lod.crop import Crop
 from ..optimize.training_data import TrainingData
 from ..scenes.cameras import Camera
-from ..scenes.colmap import Scene, read_scene, without
-from ..scenes.depths import Depths, with_points
-from ..scenes.exposures import own_gains
+from ..scenes.colmap import Scene, read_scene, exclude_views
+from ..scenes.depths import DepthPriors, add_depth_points
+from ..scenes.exposures import exposure_gains
 from ..scenes.images import check_image, check_mask
 from ..scenes.regions import Region
 from ..scenes.rendered import even
@@ -24,95 +24,100 @@ from .capture import capture
 from .folder import RunFolder
 from .job import Job
 
-OUTSIDE = 0.1
-"""Most points outside of a job's region, as a share of the splats that a model may have."""
+OUTSIDE_SHARE = 0.1
+"""Maximum number of points outside a job's region, as a share of the maximum number of splats."""
 DECODERS = 4
-"""Photographs that are decoded at once to see whether they can be."""
+"""Number of threads that check whether photos can be decoded."""
 
 
 def training_data(
-    job: Job, folder: RunFolder, tell: Callable[..., None] | None = None, *, pixels: bool = True
+    job: Job, folder: RunFolder, report: Callable[..., None] | None = None, *, pixels: bool = True
 ) -> TrainingData:
-    """The job's scene, read and where needed captured and undistorted (once, beside it).
+    """Read the job's scene; capture and undistort it first where needed, once per scene.
 
-    Where it is trained in cells, units and held-out views are those of the model as it was read, whatever
-    photographs cannot be decoded: so the same in all blocks, and where they are measured together.
+    For a scene in cells, units and held-out views come from the model as read, regardless of undecodable
+    photos, so that they are the same in all blocks and in the merged result.
 
     Args:
-        tell: called with an event's kind and values (status, warning) while this goes on.
-        pixels: leave out views whose photograph cannot be decoded; to be saved where none is looked at.
+        job: the job.
+        folder: its run.
+        report: called with the kind and values of an event (status, warning).
+        pixels: drop views whose photo cannot be decoded. Disable if no pixel is used, to save time.
 
     Raises:
-        LodgsError: if the scene cannot be read, or has too little to train on.
+        LodgsError: the scene cannot be read, or has too little data to train on.
     """
+    report = report or _ignore
     model, images = (Path(path) if path else None for path in (job.model, job.images))
-    whole = read_scene(_scene_folder(job, folder, tell), model=model, images=images)
+    full_scene = read_scene(_scene_folder(job, folder, report), model=model, images=images)
     region = Region.read(Path(job.cell)) if job.cell else None
-    scene = whole if region is None else region.views_of(whole)
+    scene = full_scene if region is None else region.views_of(full_scene)
     if pixels:
-        scene = without(scene, _undecodable(scene.cameras))
+        scene = exclude_views(scene, _undecodable(scene.cameras))
         for camera in scene.cameras:
             if camera.mask is not None:
                 check_mask(camera.mask, camera.width, camera.height)
     warnings = list(scene.warnings)
     if scene.distorted:
-        if tell:
-            tell("status", message=f"Undistorting {len(scene.distorted)} views")
+        report("status", message=f"Undistorting {len(scene.distorted)} views")
         scene = undistorted(scene, cache_of(scene, folder.undistorted))
-    parameters, depths = job.resolved_parameters(), None
+    parameters = job.resolved_parameters()
+    depths = None
     if pixels and parameters.depth == "metric" and region is None and not job.cells:
-        scene = with_points(scene)
-    whole = whole if job.cells or region is not None else scene
+        scene = add_depth_points(scene)
+    full_scene = full_scene if job.cells or region is not None else scene
     if pixels and parameters.depth_weight:
-        depths = Depths(scene, parameters.depth)
+        depths = DepthPriors(scene, parameters.depth)
         scene = replace(scene, warnings=[*scene.warnings, *depths.warnings])
     gains = None
     if pixels and parameters.match_exposure:
-        if tell:
-            tell("status", message="Comparing the photographs' exposure")
-        trained = {camera.name for camera in whole.split(job.test_every, job.validation)[0]}
-        gains = own_gains(scene, [each for each in scene.cameras if each.name in trained], job.exposure)
-        if gains and tell:
-            most = max(abs(np.log(gain)).max() for gain in gains.values())
-            tell("status", message=f"Photographs differ in exposure by up to {np.expm1(most):.0%}: evened")
+        report("status", message="Comparing exposure of the photos")
+        trained = {camera.name for camera in full_scene.split(job.test_every, job.validation)[0]}
+        gains = exposure_gains(scene, [camera for camera in scene.cameras if camera.name in trained], job.exposure)
+        if gains:
+            largest = max(abs(np.log(gain)).max() for gain in gains.values())
+            report("status", message=f"Compensating exposure differences of up to {np.expm1(largest):.0%}")
     if job.crop is not None:
-        scene = thin_outside_region(scene, job.crop, int(OUTSIDE * parameters.max_splats))
+        scene = thin_outside_region(scene, job.crop, int(OUTSIDE_SHARE * parameters.max_splats))
     warnings += [warning for warning in scene.warnings if warning not in warnings]
     for warning in warnings:
-        if tell:
-            tell("warning", message=warning)
+        report("warning", message=warning)
     if region is not None:
-        these = region.points_of(whole)
-        scene = replace(scene, points=whole.points[these], point_colors=whole.point_colors[these])
+        inside = region.points_of(full_scene)
+        scene = replace(scene, points=full_scene.points[inside], point_colors=full_scene.point_colors[inside])
     return TrainingData(
         scene, job.image_scale, job.test_every, job.exposure, job.validation,
         photo_memory=job.photo_memory * 10**6 or None,
         splat_memory=job.splat_memory * 10**6 or None,
         scratch=folder.checkpoints,
-        whole=whole,
+        whole=full_scene,
         depths=depths,
         region=job.crop,
         gains=gains,
     )  # fmt: skip
 
 
-def thin_outside_region(scene: Scene, region: Crop, most: int) -> Scene:
-    """The scene with at most so many of its points outside of a region, even in space.
+def _ignore(kind: str, **values: object) -> None:
+    pass
+
+
+def thin_outside_region(scene: Scene, region: Crop, limit: int) -> Scene:
+    """Thin the scene's points outside a region to at most ``limit``, evenly in space.
 
     Raises:
-        LodgsError: the region holds no point.
+        LodgsError: the region contains no point.
     """
     inside = region.holds(scene.points)
     if not inside.any():
         raise LodgsError(
-            "The region holds none of the scene's points.",
-            "Move it to where they are, or leave it out. It is told in the scene's own coordinates.",
+            "Cannot train the region: it contains none of the scene's points.",
+            "Move the region or remove it. It is in the scene's COLMAP coordinates.",
         )
     outside = np.flatnonzero(~inside)
-    if len(outside) > most:
+    if len(outside) > limit:
         points = scene.points[outside]
-        away = np.linalg.norm(points - scene.center, axis=1)
-        outside = outside[even(points, away, most, np.random.default_rng(0))]
+        distances = np.linalg.norm(points - scene.center, axis=1)
+        outside = outside[even(points, distances, limit, np.random.default_rng(0))]
     rows = np.sort(np.concatenate([np.flatnonzero(inside), outside]))
     return replace(
         scene, points=scene.points[rows], point_colors=scene.point_colors[rows],
@@ -120,27 +125,26 @@ def thin_outside_region(scene: Scene, region: Crop, most: int) -> Scene:
     )  # fmt: skip
 
 
-def _scene_folder(job: Job, folder: RunFolder, tell: Callable[..., None] | None) -> Path:
-    """Where the job's scene is; it is made of the base's own pictures, where the job says so."""
+def _scene_folder(job: Job, folder: RunFolder, report: Callable[..., None]) -> Path:
+    """Return the folder of the job's scene; capture it from the base first if the job asks for it."""
     if not job.capture:
         return Path(job.scene)
     if not folder.captured.exists():
 
-        def tell_view(number: int, count: int) -> None:
-            if tell:
-                tell("status", message=f"Drawing view {number} of {count}", step=number, of=count)
+        def report_view(number: int, count: int) -> None:
+            report("status", message=f"Rendering view {number} of {count}", step=number, of=count)
 
         capture(
             job.base, folder.captured, job.capture, job.views, job.view_width,
-            backend=job.backend, tell=tell_view,
+            backend=job.backend, report=report_view,
         )  # fmt: skip
     return folder.captured
 
 
 def _undecodable(cameras: Sequence[Camera]) -> dict[str, str]:
-    """Why a photograph cannot be decoded, by the names of the views of which that is so."""
+    """Return the decoding error of each undecodable photo, by view name."""
 
-    def trouble(camera: Camera) -> str:
+    def decoding_error(camera: Camera) -> str:
         assert camera.image is not None
         try:
             check_image(camera.image)
@@ -149,5 +153,5 @@ def _undecodable(cameras: Sequence[Camera]) -> dict[str, str]:
         return ""
 
     with ThreadPoolExecutor(DECODERS) as pool:  # Pillow decodes without holding Python's lock
-        found = zip(cameras, pool.map(trouble, cameras), strict=True)
-        return {camera.name: why for camera, why in found if why}
+        errors = zip(cameras, pool.map(decoding_error, cameras), strict=True)
+        return {camera.name: error for camera, error in errors if error}

@@ -1,8 +1,8 @@
-"""The events of a run: the lines that the trainer writes, and the one door where they are read.
+"""Events of a run: JSON lines that the trainer writes, and the only reader for them.
 
-Whoever reads a run's folder reads what somebody else may have written, damaged or made up. What leaves
-:func:`read_events` is well-formed: of a known kind, with all that its readers rely on, numbers that are
-finite and in range, texts that can be shown, and paths that do not lead out of the run's folder.
+A run folder may be damaged or come from an untrusted source. :func:`read_events` returns only well-formed
+events: of a known kind, with every required value, finite numbers in range, printable texts, and paths
+inside the run folder.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from ..files import open_regular
 from ..splats.bundle import MAX_LEVELS, META_SHAPES
 
 PROTOCOL = 1
-"""Version of the events; raised when a reader of older ones would misunderstand."""
+"""Version of the events; increased when a reader of older events would misread them."""
 
 MAX_BYTES, MAX_LINE, MAX_EVENTS = 1 << 26, 1 << 18, 300_000
-"""Bounds of the file, of a line in it and of the number of events: a month of training keeps within them."""
+"""Limits of file size, line length and number of events; a month of training stays below them."""
 
 BLOCK_KINDS = ("coarse", "block", "seam")
-"""What of a scene in cells is trained by itself: levels of the whole, a cell, the borders of one."""
+"""Parts of a scene in cells: coarse levels of the full scene, a cell, the borders of a cell."""
 BLOCK_STATES = ("waiting", "running", "done", "cancelled", "failed")
-"""How that gets on."""
+"""Training states of a part."""
 
-_MOST_TEXT, _MOST_NUMBER, _DEEPEST = 10_000, 1e30, 8
+_MAX_TEXT, _MAX_NUMBER, _MAX_DEPTH = 10_000, 1e30, 8
 _RESERVE = 1 << 16  # bytes
 
 
@@ -42,22 +42,22 @@ _RESERVE = 1 << 16  # bytes
 
 
 def read_events(path: Path, since: int = 0) -> tuple[list[dict], int]:
-    """The whole lines after byte ``since``, as events, and the byte to go on from next time.
+    """Read complete lines after byte ``since``; return their events and the offset for the next call.
 
-    A last line without its end is left for later. A line that is no event (from a killed trainer), or of a
-    kind that this version does not know, is passed over; so is a value that nobody relies on and that is not
-    of its name's kind. Where one is missing that is relied on, a warning stands instead, one for each kind.
+    An incomplete last line is left for the next call. Lines that are not events (from a killed trainer) and
+    events of unknown kinds are skipped; so are malformed optional values. An event with a missing or
+    malformed required value is replaced by a warning, once per kind.
 
     Raises:
-        LodgsError: the file is too long to be a run's.
-        OSError: it cannot be read, or is no file.
+        LodgsError: the file exceeds MAX_BYTES or MAX_EVENTS.
+        OSError: the path is unreadable or not a file.
     """
     try:
         file = open_regular(path)
     except FileNotFoundError:
         return [], 0
     events: list[dict] = []
-    odd: set[str] = set()
+    malformed: set[str] = set()
     with file:
         size = os.fstat(file.fileno()).st_size
         offset = file.seek(since if 0 <= since <= size else 0)
@@ -66,51 +66,54 @@ def read_events(path: Path, since: int = 0) -> tuple[list[dict], int]:
                 break
             offset += len(line)
             if offset > MAX_BYTES or len(events) == MAX_EVENTS:
-                raise LodgsError(f"{path} is too long to be a run's events.", "Choose another run folder.")
-            said = _object(line)
-            if said is None:
+                raise LodgsError(
+                    f"Cannot read {path}: it is too large for the events of a run.",
+                    "Choose another run folder.",
+                )
+            record = _parse(line)
+            if record is None:
                 continue
-            kind = said["event"]
-            event = _well_formed(said)
-            if event is None and kind not in odd:
-                odd.add(kind)
-                message = f"The trainer sent a '{kind}' that this version does not understand."
+            kind = record["event"]
+            event = _well_formed(record)
+            if event is None and kind not in malformed:
+                malformed.add(kind)
+                message = f"Ignored a '{kind}' event in an unknown format: its values are missing or invalid."
                 event = {"event": "warning", "message": message}
             if event is not None:
                 events.append(event)
     return events, offset
 
 
-def _object(line: bytes) -> dict | None:
-    """The JSON object of a line, if it is one of a kind that is known."""
+def _parse(line: bytes) -> dict | None:
+    """Return a line's JSON object if it is an event of a known kind, else None."""
     if not line.startswith(b"{"):
         return None
     try:
-        said = json.loads(line, parse_constant=_refuse)
+        record = json.loads(line, parse_constant=_reject_constant)
     except (ValueError, RecursionError):
         return None
-    kind = said.get("event")
-    return said if isinstance(kind, str) and kind in _NEEDED else None
+    kind = record.get("event")
+    return record if isinstance(kind, str) and kind in _REQUIRED else None
 
 
-def _refuse(constant: str) -> None:
+def _reject_constant(constant: str) -> None:
     raise ValueError(f"{constant} is not JSON")
 
 
-def _well_formed(said: dict) -> dict | None:
-    """An event without the values that are not what their names say; None where one is relied on."""
-    kept = {name: value for name, value in said.items() if _VALUES.get(name, _is_plain)(value)}
-    return kept if _NEEDED[said["event"]] <= kept.keys() else None
+def _well_formed(record: dict) -> dict | None:
+    """Drop malformed values from an event; return None if one of them is required."""
+    valid = {name: value for name, value in record.items() if _VALUES.get(name, _is_plain)(value)}
+    return valid if _REQUIRED[record["event"]] <= valid.keys() else None
 
 
 def _is_text(value: object) -> bool:
-    if not isinstance(value, str) or len(value) > _MOST_TEXT or "\0" in value:
+    if not isinstance(value, str) or len(value) > _MAX_TEXT or "\0" in value:
         return False
     return not any("\ud800" <= character <= "\udfff" for character in value)
 
 
 def _is_number(value: object) -> bool:
-    return type(value) in (int, float) and -_MOST_NUMBER <= value <= _MOST_NUMBER  # pyright: ignore
+    return type(value) in (int, float) and -_MAX_NUMBER <= value <= _MAX_NUMBER  # pyright: ignore
 
 
 def _is_count(value: object) -> bool:
@@ -126,7 +129,7 @@ def _is_bool(value: object) -> bool:
 
 
 def _is_path(value: object) -> bool:
-    """Whether a value is a path that, taken word for word, stays inside the folder it is relative to."""
+    """Return whether a value is a relative path without ``..``, on any platform."""
     if not isinstance(value, str) or not _is_text(value) or value in ("", ".") or ":" in value:
         return False
     return not any(
@@ -136,13 +139,13 @@ def _is_path(value: object) -> bool:
 
 
 def _are_blocks(value: object) -> bool:
-    """What a ``progress`` event says of each block of a scene in cells."""
+    """Return whether a value is the list of block states of a ``progress`` event."""
     return isinstance(value, list) and all(
-        isinstance(each, dict)
-        and each.get("kind") in BLOCK_KINDS
-        and each.get("state") in BLOCK_STATES
-        and all(_is_count(each.get(name)) for name in ("block", "step", "of"))
-        for each in value
+        isinstance(block, dict)
+        and block.get("kind") in BLOCK_KINDS
+        and block.get("state") in BLOCK_STATES
+        and all(_is_count(block.get(name)) for name in ("block", "step", "of"))
+        for block in value
     )
 
 
@@ -153,7 +156,7 @@ def _are_numbers(value: object) -> bool:
 
 
 def _is_plain(value: object, depth: int = 0) -> bool:
-    """Whether a value of any kind is small, not nested deeply, and can be shown and written again."""
+    """Return whether a value is small, not deeply nested, printable and writable as JSON."""
     match value:
         case None | bool():
             return True
@@ -162,10 +165,10 @@ def _is_plain(value: object, depth: int = 0) -> bool:
         case str():
             return _is_text(value)
         case list():
-            return depth < _DEEPEST and all(_is_plain(each, depth + 1) for each in value)
+            return depth < _MAX_DEPTH and all(_is_plain(item, depth + 1) for item in value)
         case dict():
-            return depth < _DEEPEST and all(
-                _is_text(name) and _is_plain(each, depth + 1) for name, each in value.items()
+            return depth < _MAX_DEPTH and all(
+                _is_text(name) and _is_plain(item, depth + 1) for name, item in value.items()
             )
     return False
 
@@ -184,7 +187,7 @@ def _has_shape(value: object, shape: tuple[int, ...]) -> bool:
     return array.shape == shape and array.dtype.kind in "if"
 
 
-_NEEDED: dict[str, set[str]] = {
+_REQUIRED: dict[str, set[str]] = {
     "hello": {"event"},
     "status": {"message"},
     "progress": {"level", "levels", "step", "of", "loss", "psnr", "splats", "steps_per_s", "eta_s"},
@@ -194,7 +197,7 @@ _NEEDED: dict[str, set[str]] = {
     "cancelled": {"event"},
     "done": {"event"},
 }
-"""What readers rely on, by kind."""
+"""Required values by kind of event."""
 
 _VALUES: dict[str, Callable[[object], bool]] = {
     **dict.fromkeys(("event", "message", "what", "remedy", "method", "rule", "stage", "version"), _is_text),
@@ -209,16 +212,16 @@ _VALUES: dict[str, Callable[[object], bool]] = {
     "meta": _is_meta,
     "blocks": _are_blocks,
 }
-"""What values are by their names; those of other names are anything plain."""
+"""Validators by value name; values with other names must be plain JSON (``_is_plain``)."""
 
 
 # -- writing ---------------------------------------------------------------------------------------------
 
 
 def event_line(kind: str, **values) -> str:
-    """One event of the protocol as a line of JSON; ``time`` (seconds since 1970) is added.
+    """Format an event as a line of JSON, with ``time`` (seconds since 1970).
 
-    Numbers that are not finite become null, and what a name has that is no text a question mark.
+    Numbers that are not finite become null; characters that UTF-8 cannot encode become question marks.
     """
     event = {"event": kind, "time": round(time.time(), 3), **values}
     line = json.dumps(_finite(event), ensure_ascii=False, allow_nan=False)
@@ -230,34 +233,36 @@ def _finite(value):
         case float():
             return value if math.isfinite(value) else None
         case dict():
-            return {name: _finite(each) for name, each in value.items()}
+            return {name: _finite(item) for name, item in value.items()}
         case list() | tuple():
-            return [_finite(each) for each in value]
+            return [_finite(item) for item in value]
     return value
 
 
 class EventWriter:
-    """Speaks the protocol: one JSON object a line, to a run's events and to a stream.
+    """Writer of events, one JSON object per line, to a run's file and a stream.
 
     Args:
         path: the run's ``events.jsonl``.
-        reserve: a file that keeps some room on the disk for the last words of a run that has filled it.
-        stream: where the events go besides.
+        reserve: file that reserves disk space for the final event of a run that filled the disk.
+        stream: additional output, or None.
 
     Raises:
         OSError: a file cannot be written.
     """
 
     def __init__(self, path: Path, reserve: Path, stream: IO[str] | None) -> None:
-        self._stream, self._reserve, self._torn = stream, reserve, False
-        self._file = path.open("a+b", buffering=0)  # so that closing has nothing left to write
+        self._stream = stream
+        self._reserve = reserve
+        self._torn = False
+        self._file = path.open("a+b", buffering=0)  # unbuffered: nothing remains to be written on close
         if end := self._file.seek(0, os.SEEK_END):
             self._file.seek(end - 1)
             self._torn = self._file.read(1) != b"\n"  # a killed trainer's last line
         reserve.write_bytes(os.urandom(_RESERVE))
 
     def __call__(self, kind: str, **values) -> None:
-        """Writes one event.
+        """Write one event.
 
         Raises:
             OSError: the run's file cannot be written.
@@ -266,19 +271,19 @@ class EventWriter:
         if self._stream is not None:
             try:
                 print(line, file=self._stream, flush=True)
-            except OSError:  # the reader is gone, or the disk is full; the run's own file is what counts
+            except OSError:  # broken pipe or full disk; the run's own file decides
                 self._stream = None
         self._append(b"\n" * self._torn + line.encode() + b"\n")
 
     def write_final(self, kind: str, **values) -> None:
-        """Writes the event that ends a run, in the room that was kept for it; if that fails, nobody hears."""
+        """Write the event that ends a run into the reserved disk space; ignore failures."""
         with suppress(OSError):
             self._reserve.unlink(missing_ok=True)
         with suppress(OSError):
             self(kind, **values)
 
     def close(self) -> None:
-        """Closes the file and gives up the reserve; nothing can be said after it."""
+        """Close the file and release the reserved disk space."""
         self._file.close()
         with suppress(OSError):
             self._reserve.unlink(missing_ok=True)

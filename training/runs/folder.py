@@ -1,18 +1,18 @@
-"""A run's folder and what can be read from it, by anyone, at any time. No torch: Blender polls it.
+"""Run folders: paths, state and events, readable at any time. Imports no torch: Blender polls runs.
 
     run/  job.toml  events.jsonl  checkpoints/  levels/level_1.ply ..  bundle.ply  metrics.json
-          costs.png (what finding the distances of levels has told)
-          model.npz (what a method with networks has beside its levels)
-          undistorted/ (photographs without their lens's distortion, where the scene may not be written to)
-          blocks/ (the runs of cells of a scene that is trained in cells, and what they are together)
-      captured/ (the pictures of splats that had no photographs, as a COLMAP scene)
-          base.ply, cameras/ (the splats, and the views of them, that Blender has handed over)
-          trainer.log, trainer.out (what a trainer that Blender started printed)
+          costs.png (plot of the costs measured to choose the levels' distances)
+          model.npz (networks of a method that has them)
+          undistorted/ (photos without lens distortion, if the scene folder is read-only)
+          blocks/ (runs of the parts of a scene in cells, and their merged bundle)
+          captured/ (COLMAP scene rendered from splats that have no photos)
+          base.ply, cameras/ (splats and views that Blender exported for the run)
+          trainer.log, trainer.out (output of a trainer that Blender started)
           lock  cancel  resume  reserve
 
-A run is its folder, wherever that lies. ``events.jsonl`` holds one JSON object a line, the same lines that
-the trainer prints. While a trainer runs, it holds an operating-system lock on ``lock``, which vanishes with
-its process however that ends, and says there which process it is.
+A run folder can be moved. ``events.jsonl`` holds one JSON object per line, the same lines that the trainer
+prints. A running trainer holds an operating-system lock on ``lock``, which ends with its process, and
+stores the process's identity there.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from ..files import open_regular, remove_temporaries, try_lock
 from . import processes
 from .events import read_events
 
-_BEGUN = time.time()
-_LATE = 10.0
-"""Seconds before this process: whoever cancelled earlier meant another one, that ended without hearing it."""
+_STARTED = time.time()
+_STALE_SECONDS = 10.0
+"""Cancel requests older than this at process start were meant for an earlier trainer."""
 _LOG_TAIL = 1 << 16  # bytes
 
 
 class RunFolder:
-    """The paths of a run, and the state that they tell."""
+    """Paths and state of a run."""
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
@@ -65,13 +65,13 @@ class RunFolder:
         self._lock = self.path / "lock"
         self._cancel = self.path / "cancel"
         self._resume = self.path / "resume"
-        self._held: IO[bytes] | None = None
+        self._lock_file: IO[bytes] | None = None
 
     def create(self) -> None:
-        """Makes the folder and those inside it, to write there.
+        """Create the folder and its subfolders.
 
         Raises:
-            LodgsError: if it cannot be written, or as ``reject_links``.
+            LodgsError: the folder cannot be written, or as ``reject_links``.
         """
         try:
             self.path.mkdir(parents=True, exist_ok=True)
@@ -80,80 +80,78 @@ class RunFolder:
                 folder.mkdir(exist_ok=True)
         except OSError as error:
             raise LodgsError(
-                f"The run folder {self.path} cannot be made: {error.strerror}.",
-                "Choose a folder that you may write to.",
+                f"Cannot create run folder {self.path}: {error.strerror}.",
+                "Choose a writable folder.",
             ) from error
 
     def reject_links(self) -> None:
-        """Makes sure that what is written here is written here: whoever sends a run may have put links in it.
+        """Reject links in a run folder, which would redirect writes outside of it.
 
         Raises:
             LodgsError: one of the run's files is a link or a special file.
             OSError: the folder cannot be read.
         """
-        places = [place for place in vars(self).values() if isinstance(place, Path) and place != self.path]
+        paths = [path for path in vars(self).values() if isinstance(path, Path) and path != self.path]
         for folder in (self.checkpoints, self.levels_folder, self.cameras):
             if folder.is_dir() and not folder.is_symlink():
-                places += folder.iterdir()
-        for place in places:
-            if os.path.lexists(place) and stat.S_IFMT(place.lstat().st_mode) not in (
+                paths += folder.iterdir()
+        for path in paths:
+            if os.path.lexists(path) and stat.S_IFMT(path.lstat().st_mode) not in (
                 stat.S_IFREG,
                 stat.S_IFDIR,
             ):
                 raise LodgsError(
-                    f"{place} is a link or a special file, which a run does not have.",
+                    f"Cannot use run folder: {path} is a link or a special file.",
                     "Remove it, or choose another run folder.",
                 )
 
     @property
     def started(self) -> bool:
-        """Whether a trainer has been at work here."""
+        """Whether training has started in this folder."""
         return self.events_file.exists() or any(self.checkpoints.glob("step_*.pt"))
 
     # -- reading ---------------------------------------------------------------------------------------
 
     def events(self, since: int = 0) -> tuple[list[dict], int]:
-        """The whole lines after byte ``since``, as objects, and the byte to go on from next time.
-
-        What they look like, and what is passed over, is said in ``runs.events``.
+        """Return the events after byte ``since`` and the offset for the next call, see ``runs.events``.
 
         Raises:
-            LodgsError: the file is too long to be a run's.
-            OSError: it cannot be read, or is no file.
+            LodgsError: the file is too large for the events of a run.
+            OSError: the path is unreadable or not a file.
         """
         return read_events(self.events_file, since)
 
     def find_file(self, path: str) -> Path:
-        """A file of the run by the path that an event or a checkpoint gives, relative to the run.
+        """Return the file at a relative path given by an event or a checkpoint.
 
         Raises:
-            LodgsError: it is not there, is no file, or does not lie in the run's folder.
+            LodgsError: the path does not exist, is not a file or leads out of the run folder.
         """
-        place = self.path / path
-        if not place.is_file() or not place.resolve().is_relative_to(self.path.resolve()):
-            raise LodgsError(f"The run {self.path} holds no file {path}.", "Resume it, or train it anew.")
-        return place
+        file = self.path / path
+        if not file.is_file() or not file.resolve().is_relative_to(self.path.resolve()):
+            raise LodgsError(f"The run {self.path} has no file {path}.", "Resume the run, or train it again.")
+        return file
 
     def last_event(self, *kinds: str) -> dict | None:
-        """The newest event of one of these kinds, or None."""
+        """Return the newest event of these kinds, or None."""
         return next((e for e in reversed(self.events()[0]) if e["event"] in kinds), None)
 
     def end_event(self) -> dict | None:
-        """The event that tells how the run stands where no trainer is at work; None before the first one."""
+        """Return the event that gives the state of a run without a trainer; None if it never started."""
         return self.last_event("hello", "error", "cancelled", "done")
 
     def levels(self) -> list[dict]:
-        """The newest ``level`` event of each level, coarse to fine."""
+        """Return the newest ``level`` event of each level, coarse to fine."""
         newest = {e["level"]: e for e in self.events()[0] if e["event"] == "level"}
         return [newest[level] for level in sorted(newest)]
 
     @property
     def running(self) -> bool:
-        """Whether a trainer is at work here."""
+        """Whether a trainer is running in this folder."""
         try:
             try:
                 file = open_regular(self._lock, writing=True)
-            except OSError:  # somebody else's
+            except OSError:  # another user's
                 file = open_regular(self._lock)
             with file:
                 return not try_lock(file)
@@ -161,14 +159,14 @@ class RunFolder:
             return False
 
     def state(self) -> str:
-        """One of
+        """Return the run's state.
 
-        - ``empty``: nothing was started here
-        - ``running``: a trainer is at work
+        - ``empty``: not started
+        - ``running``: a trainer is running
         - ``done``: finished
         - ``cancelled``: stopped on request, can be resumed
-        - ``failed``: stopped with an ``error`` event, can be resumed when its cause is gone
-        - ``interrupted``: the trainer ended without a word (killed, power cut), can be resumed
+        - ``failed``: stopped with an ``error`` event, can be resumed once the cause is fixed
+        - ``interrupted``: the trainer ended without an event (killed, power cut), can be resumed
         """
         if self.running:
             return "running"
@@ -178,7 +176,7 @@ class RunFolder:
         return {"error": "failed", "cancelled": "cancelled", "done": "done"}.get(last["event"], "interrupted")
 
     def log_tail(self, lines: int = 20) -> str:
-        """The last lines of what the trainer wrote outside the protocol (its standard error)."""
+        """Return the last lines of the trainer's standard error."""
         try:
             with open_regular(self.log) as file:
                 file.seek(max(file.seek(0, os.SEEK_END) - _LOG_TAIL, 0))
@@ -187,93 +185,92 @@ class RunFolder:
             return ""
         return "\n".join(text.splitlines()[-lines:])
 
-    # -- asking and holding ----------------------------------------------------------------------------
+    # -- requests and locking --------------------------------------------------------------------------
 
     def request_cancel(self) -> None:
-        """Asks the trainer to save and stop; it does so within a step or two."""
+        """Ask the trainer to save and stop, which takes one or two steps."""
         self._cancel.touch()
 
     def take_cancel(self) -> bool:
-        """For the trainer, and for who starts one: whether it was asked to stop since the last call."""
+        """Return whether a stop was requested since the last call, and clear the request."""
         return _take(self._cancel)
 
     def request_resume(self) -> None:
-        """Asks whoever trains the blocks of a scene to go on with this one, which was stopped."""
+        """Ask the trainer of a scene in cells to resume this cancelled block."""
         self._resume.touch()
 
     def take_resume(self) -> bool:
-        """Whether that was asked since the last call."""
+        """Return whether resuming was requested since the last call, and clear the request."""
         return _take(self._resume)
 
     def kill(self) -> None:
-        """Ends the trainer that is at work here by force, if it is a process of this computer.
+        """Kill the trainer of this run if it is a process of this computer.
 
         Raises:
-            LodgsError: it is not, or nothing tells.
+            LodgsError: the trainer is not identified as a process of this computer.
         """
         holder = self._holder() if self.running else {}
         pid, identity = holder.get("pid"), holder.get("identity")
         if type(pid) is not int or not isinstance(identity, str) or not processes.kill(pid, identity):
             raise LodgsError(
-                f"The trainer in {self.path} cannot be ended from here: it is not known as a process of this "
-                "computer.",
-                "End it where it was started.",
+                f"Cannot kill the trainer of {self.path}: it is not a known process of this computer.",
+                "Stop it on the computer that started it.",
             )
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """For the trainer: holds the run's lock, and removes what killed trainers left half-done.
+        """Hold the run's lock, and delete incomplete files of killed trainers. Used by the trainer.
 
         Raises:
-            LodgsError: if another trainer holds it.
-            OSError: if it cannot be written.
+            LodgsError: another trainer holds the lock.
+            OSError: the lock cannot be written.
         """
         with self._lock.open("a+b", buffering=0) as file:
-            for _ in range(10):  # somebody who asks for the state holds the lock for an instant
+            for _ in range(10):  # reading the state holds the lock for a moment
                 if try_lock(file):
                     break
                 time.sleep(0.1)
             else:
                 raise LodgsError(
-                    f"Another training is already at work in {self.path}.",
+                    f"Cannot train in {self.path}: another trainer is running there.",
                     "Wait for it, cancel it, or choose another run folder.",
                 )
             file.truncate(0)
             file.write(json.dumps({"pid": os.getpid(), "identity": processes.identity(os.getpid())}).encode())
             self._clean()
-            self._held = file
+            self._lock_file = file
             try:
                 yield
             finally:
-                self._held = None
+                self._lock_file = None
 
     def require_lock(self) -> None:
-        """For the trainer: makes sure that the folder is still where it was, and its own.
+        """Check that the folder was not moved and still contains the lock file. Used by the trainer.
 
         Raises:
-            LodgsError: it was moved or deleted, or its lock was.
+            LodgsError: the folder or its lock file was moved or deleted.
         """
-        assert self._held is not None, "only within locked()"
+        assert self._lock_file is not None, "only within locked()"
         with suppress(OSError):
-            if os.path.samestat(os.stat(self._lock), os.fstat(self._held.fileno())):
+            if os.path.samestat(os.stat(self._lock), os.fstat(self._lock_file.fileno())):
                 return
         raise LodgsError(
-            f"The run folder {self.path} was moved or deleted, or its lock was, while it was trained.",
-            "Resume the run where it lies now, or train it anew.",
+            f"Training stopped: the run folder {self.path} or its lock was moved or deleted.",
+            "Resume the run in its new folder, or train it again.",
         )
 
     def _clean(self) -> None:
         for folder in (self.path, self.checkpoints, self.levels_folder):
             remove_temporaries(folder)
         self.reserve.unlink(missing_ok=True)
-        for left in self.undistorted.glob("undistorting-*"):
-            shutil.rmtree(left, ignore_errors=True)
+        for temporary in self.undistorted.glob("undistorting-*"):
+            shutil.rmtree(temporary, ignore_errors=True)
         with suppress(FileNotFoundError):
-            if self._cancel.stat().st_mtime < _BEGUN - _LATE:
+            if self._cancel.stat().st_mtime < _STARTED - _STALE_SECONDS:
                 self._cancel.unlink()
 
     def _holder(self) -> dict:
-        """What the trainer says of itself in the lock."""
+        """Return the trainer's process ID and identity from the lock file."""
         try:
             with open_regular(self._lock) as file:
                 holder = json.loads(file.read(1000))
@@ -283,7 +280,7 @@ class RunFolder:
 
 
 def _take(request: Path) -> bool:
-    """Whether a request was there, which it is not any more."""
+    """Delete a request file; return whether it existed."""
     try:
         request.unlink()
     except FileNotFoundError:

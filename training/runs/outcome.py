@@ -1,4 +1,4 @@
-"""How a run's trainer ended, in words, for whoever started or followed it. No torch: Blender says it."""
+"""Describe how a run's trainer ended. Imports no torch: Blender uses it."""
 
 from __future__ import annotations
 
@@ -7,30 +7,31 @@ from .folder import RunFolder
 
 
 def run_outcome(folder: RunFolder, code: int | None) -> tuple[str, str]:
-    """What became of a run whose trainer is not at work any more.
+    """Return the state of a run whose trainer has ended, and a message if it did not end as intended.
 
     Args:
-        code: the exit code of its process; None where somebody else started it.
+        folder: the run.
+        code: exit code of the trainer's process; None if another process started it.
 
     Returns:
-        ``RunFolder.state``, and where nobody wanted that, why it is so and what to do: a sentence or two.
+        ``RunFolder.state``, and one or two sentences with cause and remedy, or "".
 
     Raises:
-        LodgsError, OSError: the run's folder cannot be read.
+        LodgsError, OSError: the run folder cannot be read.
     """
     if not folder.path.is_dir():
-        return "interrupted", f"The run folder {folder.path} is gone: it was moved or deleted."
+        return "interrupted", f"The run folder {folder.path} does not exist: it was moved or deleted."
     state = folder.state()
     error = folder.end_event() if state == "failed" else None
-    if error is None and code == 2:  # it could not even open its run
+    if error is None and code == 2:  # it could not open its run
         printed = read_events(folder.output)[0]
         error = printed[-1] if printed and printed[-1]["event"] == "error" else None
     if error is not None:
         return "failed", f"{error['what']} {error.get('remedy', '')}".strip()
     if code == 2:
         return "failed", (
-            f"The trainer could write nothing more into {folder.path}: the disk is full, or must not be "
-            "written to. Free some space and resume the run."
+            f"The trainer could not write to {folder.path}: the disk is full or read-only. "
+            "Free some space and resume the run."
         )
     if state in {"interrupted", "empty"} or code not in {None, 0, 3}:
         return "interrupted", _exit_reason(code, folder.log_tail(1))
@@ -38,12 +39,12 @@ def run_outcome(folder: RunFolder, code: int | None) -> tuple[str, str]:
 
 
 def _exit_reason(code: int | None, last_line: str) -> str:
-    """Why a trainer that sent no error has ended, as far as one can know."""
+    """Return the likely reason for the end of a trainer that reported no error."""
     if code is not None and code < 0:
-        how = f"was killed (signal {-code}); often that means too little memory"
+        reason = f"was killed (signal {-code}), often because memory ran out"
     elif code:
-        how = f"stopped with exit code {code}"
+        reason = f"stopped with exit code {code}"
     else:
-        how = "stopped without a word: killed, or the computer was switched off"
-    last = f" Its last words: {last_line.strip()}" if last_line.strip() else ""
-    return f"The trainer {how}.{last}"
+        reason = "stopped without a message: it was killed, or the computer was switched off"
+    last = f" Its last log line: {last_line.strip()}" if last_line.strip() else ""
+    return f"The trainer {reason}.{last}"

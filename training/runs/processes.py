@@ -1,4 +1,4 @@
-"""Which process is which: a number alone is given to another one later, and on another computer at once."""
+"""Identify processes: a process ID alone is reused over time and across computers."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pathlib import Path
 
 
 def identity(pid: int) -> str:
-    """What tells a running process of this computer from every other there ever was, here or elsewhere.
+    """Return a globally unique name of a running process of this computer.
 
     Returns:
-        The computer, when it was started where that is known, and when the process was; "" where there is no
-        such process or the system does not tell.
+        Host name, boot ID if available, and start time of the process; "" if there is no such process or the
+        system does not report it.
     """
     if pid <= 0:
         return ""
@@ -26,9 +26,9 @@ def identity(pid: int) -> str:
     return f"{platform.node()} {pid} {started}" if started else ""
 
 
-def kill(pid: int, known: str) -> bool:
-    """Ends a process by force if it is the one that ``identity`` described; whether it was."""
-    if not known or identity(pid) != known or pid == os.getpid():
+def kill(pid: int, expected: str) -> bool:
+    """Kill a process if its :func:`identity` is ``expected``; return whether it was killed."""
+    if not expected or identity(pid) != expected or pid == os.getpid():
         return False
     try:
         os.kill(pid, signal.SIGTERM if sys.platform == "win32" else signal.SIGKILL)
@@ -42,25 +42,25 @@ def _started(pid: int) -> str:
         return _started_on_windows(pid)
     if sys.platform == "linux":
         boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-        status = Path(f"/proc/{pid}/stat").read_text()  # the name in brackets may hold anything
+        status = Path(f"/proc/{pid}/stat").read_text()  # the name in brackets may contain spaces and brackets
         state, *fields = status[status.rindex(")") + 1 :].split()
         return "" if state == "Z" else f"{boot} {fields[18]}"
     command = ["ps", "-o", "lstart=", "-p", str(pid)]
     environment = {**os.environ, "LC_ALL": "C"}
-    done = subprocess.run(command, capture_output=True, text=True, timeout=5, env=environment, check=False)
-    return " ".join(done.stdout.split())
+    result = subprocess.run(command, capture_output=True, text=True, timeout=5, env=environment, check=False)
+    return " ".join(result.stdout.split())
 
 
 def _started_on_windows(pid: int) -> str:
     import ctypes
 
-    kernel = getattr(ctypes, "windll").kernel32  # noqa: B009 - not there elsewhere
+    kernel = getattr(ctypes, "windll").kernel32  # noqa: B009 - exists on Windows only
     kernel.OpenProcess.restype = ctypes.c_void_p
     handle = kernel.OpenProcess(0x1000, False, pid)  # PROCESS_QUERY_LIMITED_INFORMATION
     if not handle:
         return ""
-    times = (ctypes.c_uint64 * 4)()  # created, ended, in the kernel, outside it
-    places = [ctypes.byref(times, 8 * i) for i in range(4)]
-    told = kernel.GetProcessTimes(ctypes.c_void_p(handle), *places)
+    times = (ctypes.c_uint64 * 4)()  # creation, exit, kernel time, user time
+    pointers = [ctypes.byref(times, 8 * i) for i in range(4)]
+    succeeded = kernel.GetProcessTimes(ctypes.c_void_p(handle), *pointers)
     kernel.CloseHandle(ctypes.c_void_p(handle))
-    return str(times[0]) if told and not times[1] else ""
+    return str(times[0]) if succeeded and not times[1] else ""
