@@ -22,7 +22,7 @@ from training.runs.capture import write_scene
 from training.scenes.cameras import Camera, look_at, write_camera
 from training.splats.gaussians import SH_C0, Splats
 from training.splats.ply import write_ply
-from training.splats.sh import basis, coefficients
+from training.splats.sh import basis, coefficient_count
 
 from . import town_shapes as shapes
 from .town_shapes import Plan
@@ -299,12 +299,12 @@ def _splats(discs: Discs, sh_degree: int, rng: np.random.Generator) -> Splats:
     sizes = np.column_stack([size[:, 0], size[:, -1], 0.15 * size.min(axis=1)])
     scales = 0.55 * sizes * rng.uniform(0.85, 1.15, (count, 3))
     opacity = rng.uniform(0.9, 0.99, count)
-    sh = np.zeros((count, coefficients(sh_degree), 3), np.float32)
+    sh = np.zeros((count, coefficient_count(sh_degree), 3), np.float32)
     sh[:, 0] = (color - 0.5) / SH_C0
     # where the sun's light goes on to, mirrored; a camera that it meets looks the other way
     onwards = 2 * normals * (normals @ shapes.SUN)[:, None] - shapes.SUN
     x, y, z = -onwards.T
-    about = np.zeros((coefficients(sh_degree), count))
+    about = np.zeros((coefficient_count(sh_degree), count))
     basis(x, y, z, sh_degree, about)
     # exp(4 (cos - 1)) as zonal harmonics, degree by degree
     lobe = np.repeat([1.5703, 1.1788, 0.6862, 0.3211], [1, 3, 5, 7])[: len(about)]

@@ -37,7 +37,7 @@ from training.rasterize.resident import ResidentBundle
 from training.runs.capture import write_scene
 from training.runs.folder import RunFolder
 from training.runs.job import Job
-from training.scenes.cameras import Camera, evenly
+from training.scenes.cameras import Camera, pick_evenly
 from training.scenes.colmap import read_scene
 from training.scenes.images import write_png
 from training.splats.bundle import Bundle, read_bundle, write_bundle
@@ -232,7 +232,7 @@ def jumps(rows: Sequence[Row], bundle: Bundle, plan: town.Plan, picture: Path) -
     nearest = [RULE.near_chunks(view.center, values, bundle.tables)[:1] for view in views]
     borders = [number for number, (a, b) in enumerate(pairwise(nearest)) if a != b]
     places = {"border": borders, "elsewhere": [(a + b) // 2 for a, b in pairwise(borders)]}
-    places = {name: [max(place - 2, 0) for place in evenly(some, PLACES)] for name, some in places.items()}
+    places = {name: [max(place - 2, 0) for place in pick_evenly(some, PLACES)] for name, some in places.items()}
     shown = [rows[0], *rows[3:5]]
 
     def drawn(row: Row, place: int) -> list[np.ndarray]:

@@ -505,10 +505,10 @@ def _render(chosen: argparse.Namespace) -> int:
     from .lod.rule import find_rule
     from .lod.selection import unknown_rule
     from .render.command import RenderSource, render
-    from .scenes.cameras import check_size, read_camera
+    from .scenes.cameras import check_render_size, read_camera
 
     if chosen.size:
-        check_size(*chosen.size)
+        check_render_size(*chosen.size)
     given = _controls(chosen)
     if (given or chosen.by_distance) and chosen.level:
         raise LodgsError("--level draws one level, the other options levels by distance.", "Choose one.")
@@ -544,9 +544,9 @@ def _capture(chosen: argparse.Namespace) -> int:
 def _scene(chosen: argparse.Namespace) -> int:
     if chosen.photos:
         return _reconstruct(chosen)
-    from .scenes.formats import convert
+    from .scenes.formats import convert_export
 
-    made = convert(chosen.source, chosen.out)
+    made = convert_export(chosen.source, chosen.out)
     for message in made.warnings:
         _warn(message)
     print(f"{made.folder}: {made.views} views, {made.points:,} points, from {made.what}")

@@ -18,13 +18,13 @@ from typing import IO, Any
 from .errors import LodgsError, printable
 from .files import open_regular
 
-MOST_JSON = 1 << 20
+MAX_JSON_BYTES = 1 << 20
 """Most bytes of one JSON text: a file, or a line where each is an object. All of ours have a few thousand."""
-MOST_TOML = 1 << 14
+MAX_TOML_BYTES = 1 << 14
 """Most bytes of one TOML text. Its parser's time grows with the square of a dotted key's length."""
-DEEPEST = 16
+MAX_NESTING = 16
 """How deep objects and lists may lie in each other; ours need six."""
-LARGEST_WHOLE = 2**63 - 1
+MAX_INTEGER = 2**63 - 1
 """Largest whole number, as 64 bits hold it."""
 
 _NO_TEXT = re.compile("[\0\ud800-\udfff]")
@@ -52,19 +52,19 @@ def open_file(path: str | Path, what: str = "") -> IO[bytes]:
     )
 
 
-def shown(value: Any) -> str:
+def quote(value: Any) -> str:
     """A value as a message can quote it: its begin where it is long, and nothing in it that is no text."""
     return printable(_QUOTES.repr(value))
 
 
-def read_json(path: str | Path, what: str = "", most: int = MOST_JSON) -> dict:
+def read_json(path: str | Path, what: str = "", most: int = MAX_JSON_BYTES) -> dict:
     """The object in a JSON file; ``what`` as for `open_file`, ``most`` as for `json_object`.
 
     Raises:
         LodgsError: the file cannot be read, or as `json_object`.
     """
     what = what or printable(path)
-    return json_object(_read(path, what, most), what, most)
+    return parse_json(_read(path, what, most), what, most)
 
 
 def read_toml(path: str | Path, what: str = "") -> dict:
@@ -75,14 +75,14 @@ def read_toml(path: str | Path, what: str = "") -> dict:
     """
     what = what or printable(path)
     try:
-        table = tomllib.loads(_text(_read(path, what, MOST_TOML), MOST_TOML))
-        _check(table, DEEPEST)
+        table = tomllib.loads(_text(_read(path, what, MAX_TOML_BYTES), MAX_TOML_BYTES))
+        _check(table, MAX_NESTING)
     except (ValueError, RecursionError) as error:
         raise _not_valid(what, error) from error
     return table
 
 
-def json_object(text: str | bytes, what: str, most: int = MOST_JSON) -> dict:
+def parse_json(text: str | bytes, what: str, most: int = MAX_JSON_BYTES) -> dict:
     """The JSON object that a text is.
 
     Args:
@@ -97,7 +97,7 @@ def json_object(text: str | bytes, what: str, most: int = MOST_JSON) -> dict:
         values = json.loads(_text(text, most), parse_int=_whole)
         if not isinstance(values, dict):
             raise ValueError("it is no object")
-        _check(values, DEEPEST)
+        _check(values, MAX_NESTING)
     except (ValueError, RecursionError) as error:
         raise _not_valid(what, error) from error
     return values
@@ -125,7 +125,7 @@ def _check(value: Any, room: int, key: str = "a value") -> None:
     """
     match value:
         case dict() | list() if room == 0:
-            raise ValueError(f"it nests deeper than {DEEPEST} levels")
+            raise ValueError(f"it nests deeper than {MAX_NESTING} levels")
         case dict():
             for name, inside in value.items():
                 _check(name, room - 1, "a key")
@@ -135,7 +135,7 @@ def _check(value: Any, room: int, key: str = "a value") -> None:
                 _check(inside, room - 1, key)
         case float() if not math.isfinite(value):
             raise ValueError(f"{key[:200]} = {value} is not a finite number")
-        case int() if abs(value) > LARGEST_WHOLE:
+        case int() if abs(value) > MAX_INTEGER:
             raise ValueError(f"{key[:200]} has too many digits")
         case str() if _NO_TEXT.search(value):
             raise ValueError(f"{key[:200]} holds characters that are none")

@@ -3,7 +3,7 @@
 import errno
 import re
 
-MOST_TEXT = 1000
+MAX_TEXT = 1000
 """Characters of a sentence, which may quote what others have written; the middle of more is left out."""
 _NO_TEXT = re.compile("[\0\ud800-\udfff]")
 
@@ -27,12 +27,12 @@ def printable(text: object) -> str:
 
 
 def _shortened(text: str) -> str:
-    if len(text) <= MOST_TEXT:
+    if len(text) <= MAX_TEXT:
         return text
-    return f"{text[: MOST_TEXT // 2]} ... {text[-MOST_TEXT // 2 :]}"
+    return f"{text[: MAX_TEXT // 2]} ... {text[-MAX_TEXT // 2 :]}"
 
 
-def out_of_memory(error: BaseException) -> bool:
+def is_out_of_memory(error: BaseException) -> bool:
     """Whether an exception says that memory does not suffice: Python's, numpy's or torch's, of CPU or GPU."""
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return True

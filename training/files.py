@@ -17,7 +17,7 @@ from typing import IO, BinaryIO
 
 from .errors import LodgsError
 
-FULL = {errno.ENOSPC, errno.EDQUOT}
+DISK_FULL = {errno.ENOSPC, errno.EDQUOT}
 """What systems say of a disk that is full."""
 
 
@@ -59,7 +59,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         raise LodgsError(
             f"{path} could not be written: {error.strerror or error}.",
             "Free some space there or choose another folder."
-            if error.errno in FULL
+            if error.errno in DISK_FULL
             else "Choose another name or folder.",
         ) from error
     finally:
@@ -143,7 +143,7 @@ def try_lock(file: IO[bytes]) -> bool:
 
 
 @contextmanager
-def one_at_a_time(name: str) -> Iterator[None]:
+def exclusive(name: str) -> Iterator[None]:
     """Waits while another of this user's processes is in a block of this name.
 
     Where the cache folder cannot be written, nobody waits.

@@ -32,7 +32,7 @@ def lay_on_ground(root: bpy.types.Object, places: np.ndarray | None = None, flip
     """
     there, up = placement_of(root), np.array([0.0, 0.0, 1.0])
     if places is None:
-        normal, middle = find_ground(there.points(_places(root)), up)
+        normal, middle = find_ground(there.transform_points(_places(root)), up)
     else:
         normal, middle = plane_through(places, up)
     _leave_edit_mode()

@@ -13,7 +13,7 @@ from ...training.errors import LodgsError
 from ...training.lod.crop import kept
 from ...training.scenes.cameras import Camera
 from ...training.scenes.colmap import Scene
-from ...training.splats.dialects import Warn, silent
+from ...training.splats.dialects import Warn, ignore
 from ..attributes import HIDDEN, read_attribute
 from . import crops, selection
 from .objects import root_of
@@ -168,7 +168,7 @@ def look_through(context: bpy.types.Context, root: bpy.types.Object, step: int =
     return through(context, cameras[(index + step) % len(cameras)])
 
 
-def look_at_scene(context: bpy.types.Context, root: bpy.types.Object, warn: Warn = silent) -> None:
+def look_at_scene(context: bpy.types.Context, root: bpy.types.Object, warn: Warn = ignore) -> None:
     """Turns the window's viewports to a splat scene, to orbit there: as it was photographed, where that is
     known, else from where they look already, with most of it in sight. They see as far as its sky.
 

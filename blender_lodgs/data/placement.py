@@ -14,7 +14,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...training.errors import LodgsError
-from ...training.splats.placing import Placement, similarity
+from ...training.splats.similarity import Similarity, is_similarity
 
 SMALL = 1e-4
 """How large axes are drawn: nobody is to click them in place of the root."""
@@ -58,7 +58,7 @@ def matrix_of(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = No
     axes = axes_of(root)
     own = axes.evaluated_get(depsgraph) if depsgraph else axes
     matrix = np.array(own.matrix_world, np.float64)
-    if not similarity(_orthogonal(matrix)):
+    if not is_similarity(_orthogonal(matrix)):
         raise LodgsError(
             f"'{root.name}' is stretched, which no camera of its files can show.",
             "Give it one scale for all axes.",
@@ -66,22 +66,22 @@ def matrix_of(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = No
     return matrix
 
 
-def placement_of(root: bpy.types.Object) -> Placement:
+def placement_of(root: bpy.types.Object) -> Similarity:
     """The same as it is meant: at right angles to the last bit of float64.
 
     Raises:
         LodgsError: the root is stretched.
     """
-    return Placement.of(_orthogonal(matrix_of(root)))
+    return Similarity.from_matrix(_orthogonal(matrix_of(root)))
 
 
-def move(root: bpy.types.Object, further: Placement) -> None:
+def move(root: bpy.types.Object, further: Similarity) -> None:
     """Places a splat scene elsewhere in Blender's world; the root stays what it is.
 
     Raises:
         LodgsError: the root is stretched.
     """
-    there = further.after(placement_of(root))
+    there = further.compose(placement_of(root))
     axes_of(root).matrix_world = Matrix(there.matrix.tolist())
 
 

@@ -24,9 +24,9 @@ from ...training.lod.rule import Control, Tables, find_rule
 from ...training.lod.selection import complete, known_rule, not_alone, unknown_rule
 from ...training.lod.tree.paging import TreeFile, is_tree, read_within
 from ...training.methods import METHODS
-from ...training.scenes.cameras import Camera, extent_of
+from ...training.scenes.cameras import Camera, camera_extent
 from ...training.scenes.colmap import Scene, read_scene
-from ...training.scenes.formats import colmap_scene
+from ...training.scenes.formats import ensure_colmap_scene
 from ...training.scenes.undistort import already_undistorted
 from ...training.scenes.views import VIEWS, tables_of, views_in
 from ...training.scenes.views import placed as placed_views
@@ -123,7 +123,7 @@ def import_colmap(
     manager.progress_begin(0, 1)  # at the mouse pointer
     try:
         model, images = (Path(path) if path else None for path in (model, images))
-        folder = Path(folder) if model else colmap_scene(Path(folder), warn)
+        folder = Path(folder) if model else ensure_colmap_scene(Path(folder), warn)
         scene = read_scene(folder, model, images, manager.progress_update)
     finally:
         manager.progress_end()
@@ -282,7 +282,7 @@ def place_splats(
                 axes_of(root).rotation_quaternion = Matrix(bundle.up_rotation.tolist()).to_quaternion()
             _fill(root, file, made)
             if cameras:
-                _add_views(context, root, cameras, extent_of(cameras) or 1.0, near)
+                _add_views(context, root, cameras, camera_extent(cameras) or 1.0, near)
                 for facts in (view.data.lodgs for view in views(root)):
                     facts.held_out = cameras[facts.place].name in unseen
             root.lodgs.training.method = next(info.name for info in METHODS.values() if info.for_splats)

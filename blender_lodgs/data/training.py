@@ -8,8 +8,8 @@ from typing import Any
 import bpy
 
 from ...training.methods import METHODS, PRESETS, MethodInfo, method_info
-from ...training.runs.job import MOST_CELLS, Job
-from ...training.splats.bundle import MOST_LEVELS
+from ...training.runs.job import MAX_CELLS, Job
+from ...training.splats.bundle import MAX_LEVELS
 from . import crops, photographs, viewpoints
 
 _WHOLE_MOST, _MOST = 2**31 - 1, 3.4e38
@@ -181,8 +181,8 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
         name="Level Distances",
         description="From how far away a level is shown, in median depths: half of all that photographs show "
         "is nearer than 1. The coarser a level, the farther away; 0 has training find it",
-        size=MOST_LEVELS - 1,
-        default=[3.0 * 2.0**place for place in range(MOST_LEVELS - 1)],
+        size=MAX_LEVELS - 1,
+        default=[3.0 * 2.0**place for place in range(MAX_LEVELS - 1)],
         min=0.0,
         soft_max=100.0,
         step=50,
@@ -270,7 +270,7 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
         default=1,
         min=1,
         soft_max=8,
-        max=MOST_CELLS,
+        max=MAX_CELLS,
         options=set(),
     )
     rows: bpy.props.IntProperty(
@@ -279,7 +279,7 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
         default=1,
         min=1,
         soft_max=8,
-        max=MOST_CELLS,
+        max=MAX_CELLS,
         options=set(),
     )
     polish: bpy.props.IntProperty(
@@ -298,7 +298,7 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
         default=1,
         min=1,
         soft_max=8,
-        max=MOST_CELLS,
+        max=MAX_CELLS,
         options=set(),
     )
     show_cells: bpy.props.BoolProperty(

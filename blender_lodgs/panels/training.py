@@ -11,7 +11,7 @@ from ...training.methods import method_info
 from .. import extension
 from ..data import scenes, viewpoints
 from ..data.training import ALL_OFFER, chooses_distances, hold_out, level_distances, offered
-from ..runs import environment, jobs
+from ..runs import environment, job_settings, run_folders
 from ..runs.messages import measured_on, progress_facts, short_level_line
 from ..runs.watch import Watch, watch_of
 from .parts import Panel, draw_environment, draw_views, say, scene_length, split_column
@@ -113,7 +113,7 @@ def _draw_choices(
         if settings.start_from == "FILE":
             column.prop(settings, "base")
     try:
-        parameters = jobs.parameters(settings)
+        parameters = job_settings.current_parameters(settings)
         levels = parameters.levels  # 0: the scene decides
         text = f" in {levels} levels" if levels > 1 else ""
         text += f", {settings.columns * settings.rows} cells" if settings.grid and not without_photos else ""
@@ -135,7 +135,7 @@ def _draw_choices(
         draw_environment(layout, error.what)
         return
     if not bpy.data.is_saved and not settings.output:
-        text = f"This file is not saved. The run is written to {jobs.runs_folder(root)}."
+        text = f"This file is not saved. The run is written to {run_folders.runs_parent(root)}."
         say(layout, text, "INFO")
     if resumable:
         layout.operator("lodgs.train", text="Train Again", icon="FILE_REFRESH")

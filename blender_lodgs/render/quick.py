@@ -14,7 +14,7 @@ import gpu
 import numpy as np
 
 from ...training.errors import LodgsError
-from ...training.render.picture import Picture
+from ...training.render.image import RenderedImage
 from ..data import shown
 from ..data.cameras import scene_camera
 from ..viewport import views
@@ -111,7 +111,7 @@ def _frame(
     if projection[3][3] == 0:  # perspective: to any depth, as F12 has it
         projection[2][2], projection[2][3] = -1.0, -2.0 * camera.data.clip_start
     background = None if settings.film_transparent else tuple(scene.lodgs_render.background)
-    result = Picture.empty(width, height, background)
+    result = RenderedImage.empty(width, height, background)
     view, screen = views.ViewState(), gpu.types.GPUOffScreen(width, height)
     with screen.bind():  # type: ignore[attr-defined]
         gpu.state.active_framebuffer_get().clear(color=(0, 0, 0, 0), depth=1.0)

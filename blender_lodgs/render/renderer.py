@@ -27,7 +27,7 @@ from ...training.editing.look import Looks, looks_as_dicts
 from ...training.errors import LodgsError
 from ...training.lod.query import Choice
 from ...training.render import wire
-from ...training.scenes.cameras import Camera, camera_as_dict
+from ...training.scenes.cameras import Camera, camera_to_dict
 from ...training.splats.gaussians import Splats
 from .. import extension
 from ..data.changes import Version
@@ -134,7 +134,7 @@ class Renderer:
         self._answers: queue.SimpleQueue[dict | None] = queue.SimpleQueue()
         command = [str(python), "-m", "training", "serve", str(self._folder)]
         try:
-            self.process = processes.converse(
+            self.process = processes.spawn_piped(
                 [*command, "--backend", extension.preferences().backend], self._log
             )
         except OSError as error:
@@ -176,7 +176,7 @@ class Renderer:
         try:
             old, named = dict(self._known), self._write_sets(sets)
             self._send(
-                frame=frame, out=out.name, sets=named, camera=camera_as_dict(camera, near),
+                frame=frame, out=out.name, sets=named, camera=camera_to_dict(camera, near),
                 background=background, depth=depth, levels=levels, window=window,
                 photograph=str(photograph) if photograph else None, mask=str(mask) if mask else None,
                 holdout=str(holdout) if holdout else None,

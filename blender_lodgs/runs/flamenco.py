@@ -24,7 +24,7 @@ from ...training.errors import LodgsError, printable
 from ...training.runs.folder import RunFolder
 from .. import extension
 from ..data import viewpoints
-from . import jobs
+from . import job_settings, run_folders
 
 JOB_TYPE = "lodgs-blocks"
 """What the manager makes of the name of our script."""
@@ -164,10 +164,10 @@ def prepare(root: bpy.types.Object, folder: str = "") -> Submission:
             "This file is not saved, so it is not known where the farm's run is to lie.",
             "Save it where all workers see it, or set Run Folders In.",
         )
-    out = Path(bpy.path.abspath(folder)).resolve() if folder else jobs.new_folder(root)
+    out = Path(bpy.path.abspath(folder)).resolve() if folder else run_folders.new_run_folder(root)
     if RunFolder(out).state() != "empty":
         raise LodgsError(f"{out} already holds a run.", "Choose another folder.")
-    job = jobs.make_job(root, out, {})
+    job = job_settings.make_job(root, out, {})
     job = job.with_cells(job.cells or "1x1")
     columns, rows = job.grid
     return Submission(manager, root.name, {

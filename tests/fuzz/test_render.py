@@ -16,7 +16,7 @@ from training.lod.crop import Crop
 from training.render import wire
 from training.render.requests import FrameRequest, parse_line, parse_request
 from training.render.scene import Instance, SplatSet, draw
-from training.scenes.cameras import MOST_PIXELS, Camera, camera_as_dict
+from training.scenes.cameras import MAX_PIXELS, Camera, camera_to_dict
 from training.splats.dialects import drop_undrawable
 from training.splats.gaussians import Splats
 
@@ -26,7 +26,7 @@ ONE = {"file": "set-1", "count": 20, "matrix": np.diag([2.0, 1.0, 1.0, 1.0]).tol
 LOOKS = looks_as_dicts([(None, Look(0.5)), (Crop.sphere((0, 0, 0), 1), Look(opacity=0.5))])
 REQUEST = {
     "frame": 7, "out": "frame-7", "background": [0.1, 0.2, 0.3], "depth": True, "levels": True,
-    "camera": camera_as_dict(Camera("", 32, 24, 30.0, 30.0, 16.0, 12.0, POSE), 0.1),
+    "camera": camera_to_dict(Camera("", 32, 24, 30.0, 30.0, 16.0, 12.0, POSE), 0.1),
     "window": [2, 3, 20, 16], "photograph": None, "mask": None, "holdout": None,
     "sets": [ONE | {"looks": LOOKS}, ONE | {"matrix": np.eye(4).tolist(), "level": 0}],
 }  # fmt: skip
@@ -51,7 +51,7 @@ def answer(request, splats: Splats) -> None:
         width, height = (
             request.window[2:] if request.window else (request.camera.width, request.camera.height)
         )
-        assert 1 <= width * height <= MOST_PIXELS
+        assert 1 <= width * height <= MAX_PIXELS
         if width * height <= 10_000:
             held = SplatSet(splats, backend="cpu")
             instances = [Instance(held, one.matrix, one.level, looks=one.looks) for one in request.sets]

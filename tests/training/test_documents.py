@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from training.documents import (
-    DEEPEST,
-    LARGEST_WHOLE,
-    MOST_JSON,
-    MOST_TOML,
-    json_object,
+    MAX_INTEGER,
+    MAX_JSON_BYTES,
+    MAX_NESTING,
+    MAX_TOML_BYTES,
     open_file,
+    parse_json,
     read_json,
     read_toml,
 )
@@ -28,8 +28,8 @@ def nested(depth: int, inner: str = "1") -> str:
 
 def test_what_json_holds_comes_out_as_it_is():
     text = b'{"a": [1, -2.5e-3, true, null, "\\u00fc\\ud83d\\ude00"], "b": {"c": "/x"}}'
-    assert json_object(text, "It") == {"a": [1, -0.0025, True, None, "ü😀"], "b": {"c": "/x"}}
-    assert json_object("\ufeff".encode() + text, "It") == json_object(text, "It")  # as some editors begin
+    assert parse_json(text, "It") == {"a": [1, -0.0025, True, None, "ü😀"], "b": {"c": "/x"}}
+    assert parse_json("\ufeff".encode() + text, "It") == parse_json(text, "It")  # as some editors begin
 
 
 @pytest.mark.parametrize(
@@ -42,24 +42,24 @@ def test_what_json_holds_comes_out_as_it_is():
         (b'{"a": NaN}', "a = nan is not a finite number"),
         (b'{"a": [-Infinity]}', "a = -inf is not"),
         (b'{"a": 1e400}', "a = inf is not"),
-        (b'{"a": %d}' % (LARGEST_WHOLE + 1), "too many digits"),
+        (b'{"a": %d}' % (MAX_INTEGER + 1), "too many digits"),
         (b'{"a": 1%s}' % (b"0" * 5000), "too many digits"),
         (b'{"a": "\\u0000"}', "characters that are none"),
         (b'{"\\ud800": 1}', "characters that are none"),
-        (nested(DEEPEST + 1).encode(), "nests deeper than 16"),
+        (nested(MAX_NESTING + 1).encode(), "nests deeper than 16"),
         (nested(400_000).encode(), "nests too deep"),
-        (b'{"a": "' + b"x" * MOST_JSON + b'"}', "longer than 1,048,576 bytes"),
+        (b'{"a": "' + b"x" * MAX_JSON_BYTES + b'"}', "longer than 1,048,576 bytes"),
     ],
 )
 def test_what_is_not_plain_json_is_one_sentence(text, reason):
     with pytest.raises(LodgsError, match=r"^The camera c is not valid: ") as told:
-        json_object(text, "The camera c")
+        parse_json(text, "The camera c")
     assert reason in told.value.what
 
 
 def test_the_bounds_themselves_are_within():
-    assert json_object(nested(DEEPEST), "It")
-    assert json_object(f'{{"a": {-LARGEST_WHOLE}}}', "It") == {"a": -LARGEST_WHOLE}
+    assert parse_json(nested(MAX_NESTING), "It")
+    assert parse_json(f'{{"a": {-MAX_INTEGER}}}', "It") == {"a": -MAX_INTEGER}
 
 
 def test_a_toml_file_is_read_as_editors_of_any_system_write_it(tmp_path):
@@ -75,7 +75,10 @@ def test_a_toml_file_is_read_as_editors_of_any_system_write_it(tmp_path):
         ("a = 1" + "0" * 400, "too many digits"),
         ("a = " + "[" * 7000 + "]" * 7000, "nests too deep"),
         ("a." * 20 + "a = 1", "nests deeper than 16"),
-        ("a." * 100_000 + "a = 1", f"longer than {MOST_TOML:,} bytes"),  # some minutes of the parser's time
+        (
+            "a." * 100_000 + "a = 1",
+            f"longer than {MAX_TOML_BYTES:,} bytes",
+        ),  # some minutes of the parser's time
         ("a = 2026-01-01", "a is a date"),
         ("a = 1\na = 2", "Cannot overwrite"),
     ],

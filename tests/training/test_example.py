@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from examples import rig
-from training.evaluate.aside import VEIL
+from training.evaluate.offset_views import VEIL_DEPTH
 from training.optimize.support import halfway
 from training.scenes.aside import read_aside
 from training.scenes.colmap import read_scene
@@ -128,7 +128,7 @@ def test_the_walk_has_things_close_by_but_nothing_hangs_before_the_scene():
     near = np.linalg.norm(scene.points[None] - eyes[:, None], axis=2) < 2.5
     quarters = [{tuple(side) for side in found[close]} for found, close in zip(sides, near, strict=True)]
     assert np.mean([len(found) == 4 for found in quarters]) > 0.5
-    limit = VEIL * scene.median_depth()
+    limit = VEIL_DEPTH * scene.median_depth()
     for place in halfway(scene.cameras):  # so that what an evaluation calls a veil is one
         seen = place.sees(scene.points)
         assert (place.view_space(scene.points)[seen, 2] > limit).mean() > 0.99

@@ -66,10 +66,10 @@ def test_blocks_of_a_name_are_entered_one_after_the_other(tmp_path, monkeypatch)
     done = []
 
     def second():
-        with files.one_at_a_time("work"):
+        with files.exclusive("work"):
             done.append("second")
 
-    with files.one_at_a_time("work"):
+    with files.exclusive("work"):
         other = Thread(target=second)
         other.start()
         other.join(0.3)
@@ -81,5 +81,5 @@ def test_blocks_of_a_name_are_entered_one_after_the_other(tmp_path, monkeypatch)
 def test_nobody_waits_where_nothing_can_be_written(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     monkeypatch.setattr(files, "cache_folder", lambda: tmp_path / "file")
-    with files.one_at_a_time("work"), files.one_at_a_time("work"):
+    with files.exclusive("work"), files.exclusive("work"):
         pass

@@ -12,16 +12,16 @@ from ..files import atomic_write
 from ..lod.colors import level_color
 from ..scenes.images import write_png
 
-SIZE = 960, 540
+PLOT_SIZE = 960, 540
 """Width and height of the plot in pixels."""
-FINENESS = 2
+OVERSAMPLING = 2
 """It is drawn so many times larger, then averaged."""
 _LEFT, _RIGHT, _TOP, _BOTTOM = 80, 200, 64, 64
 _PAPER, _GRID, _TEXT = (24, 24, 24), (58, 58, 58), (225, 225, 225)
 
 
 @dataclass(frozen=True)
-class Curve:
+class CostCurve:
     """What a level's distance would have cost.
 
     Attributes:
@@ -43,14 +43,14 @@ class Curve:
         return float(self.distances[place]), float(self.costs[place])
 
 
-def cost_curves(meta: dict) -> list[Curve]:
+def cost_curves(meta: dict) -> list[CostCurve]:
     """The curves that a bundle's meta has under ``costs``, finest level first; what is odd is passed over."""
     entries = meta.get("costs")
     found = map(_curve, entries if isinstance(entries, list) else [])
     return [curve for curve in found if curve is not None]
 
 
-def _curve(entry: object) -> Curve | None:
+def _curve(entry: object) -> CostCurve | None:
     match entry:
         case {"level": int(level), "distances": list(distances), "costs": list(costs), **rest} if level > 0:
             try:
@@ -59,7 +59,9 @@ def _curve(entry: object) -> Curve | None:
                 return None
             if rows.ndim == 2 and rows.shape[1] and np.isfinite(rows).all():
                 before = rest.get("before")
-                return Curve(level, rows[0], rows[1], before if isinstance(before, (int, float)) else None)
+                return CostCurve(
+                    level, rows[0], rows[1], before if isinstance(before, (int, float)) else None
+                )
     return None
 
 
@@ -86,9 +88,9 @@ def write_cost_plot(path: Path, meta: dict) -> None:
     from PIL import Image, ImageDraw, ImageFont
 
     curves = cost_curves(meta)
-    width, height = (FINENESS * side for side in SIZE)
-    left, right, top, bottom = (FINENESS * side for side in (_LEFT, _RIGHT, _TOP, _BOTTOM))
-    font, small = (ImageFont.load_default(size=FINENESS * points) for points in (16, 13))
+    width, height = (OVERSAMPLING * side for side in PLOT_SIZE)
+    left, right, top, bottom = (OVERSAMPLING * side for side in (_LEFT, _RIGHT, _TOP, _BOTTOM))
+    font, small = (ImageFont.load_default(size=OVERSAMPLING * points) for points in (16, 13))
     sheet = Image.new("RGB", (width, height), _PAPER)
     draw = ImageDraw.Draw(sheet)
     xs = _ticks(max(curve.distances.max() for curve in curves))
@@ -101,13 +103,13 @@ def write_cost_plot(path: Path, meta: dict) -> None:
     title = "Splats that a tile of 16x16 pixels looks at, by the distance from which a level is shown"
     draw.text((left, top / 2), title, _TEXT, font, anchor="lm")
     for x in xs:
-        draw.line([place(x, 0), place(x, ys[-1])], _GRID, FINENESS)
+        draw.line([place(x, 0), place(x, ys[-1])], _GRID, OVERSAMPLING)
         at = place(x, 0)
-        draw.text((at[0], at[1] + 8 * FINENESS), f"{x:g}", _TEXT, small, anchor="mt")
+        draw.text((at[0], at[1] + 8 * OVERSAMPLING), f"{x:g}", _TEXT, small, anchor="mt")
     for y in ys:
-        draw.line([place(0, y), place(xs[-1], y)], _GRID, FINENESS)
+        draw.line([place(0, y), place(xs[-1], y)], _GRID, OVERSAMPLING)
         at = place(0, y)
-        draw.text((at[0] - 8 * FINENESS, at[1]), f"{y:g}", _TEXT, small, anchor="rm")
+        draw.text((at[0] - 8 * OVERSAMPLING, at[1]), f"{y:g}", _TEXT, small, anchor="rm")
     draw.text(
         ((left + width - right) / 2, height - bottom / 4),
         "distance in scene units",
@@ -118,22 +120,22 @@ def write_cost_plot(path: Path, meta: dict) -> None:
     for row, curve in enumerate(curves):
         color = tuple(round(255 * value) for value in level_color(curve.level))
         points = [place(*each) for each in zip(curve.distances, curve.costs, strict=True)]
-        draw.line(points, color, 3 * FINENESS, joint="curve")
+        draw.line(points, color, 3 * OVERSAMPLING, joint="curve")
         for x, y in points:
-            _dot(draw, x, y, 3.5 * FINENESS, color)
+            _dot(draw, x, y, 3.5 * OVERSAMPLING, color)
         distance, cost = curve.chosen
-        _dot(draw, *place(distance, cost), 8 * FINENESS, _TEXT)
-        _dot(draw, *place(distance, cost), 5.5 * FINENESS, color)
-        at = width - right + 20 * FINENESS, top + row * 54 * FINENESS
+        _dot(draw, *place(distance, cost), 8 * OVERSAMPLING, _TEXT)
+        _dot(draw, *place(distance, cost), 5.5 * OVERSAMPLING, color)
+        at = width - right + 20 * OVERSAMPLING, top + row * 54 * OVERSAMPLING
         draw.text(at, f"level {curve.level}", color, font, anchor="lt")
         text = f"from {distance:.3g}: {cost:.0f}"
-        draw.text((at[0], at[1] + 24 * FINENESS), text, _TEXT, small, anchor="lt")
+        draw.text((at[0], at[1] + 24 * OVERSAMPLING), text, _TEXT, small, anchor="lt")
         if curve.before is not None:
             line = np.linspace(0, xs[-1], 60)
             for a, b in zip(line[::2], line[1::2], strict=True):
-                draw.line([place(a, curve.before), place(b, curve.before)], color, FINENESS)
+                draw.line([place(a, curve.before), place(b, curve.before)], color, OVERSAMPLING)
     with atomic_write(path) as temporary:
-        write_png(temporary, np.asarray(sheet.resize(SIZE, Image.Resampling.BOX)))
+        write_png(temporary, np.asarray(sheet.resize(PLOT_SIZE, Image.Resampling.BOX)))
 
 
 def _dot(draw, x: float, y: float, radius: float, color: tuple[int, ...]) -> None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import torch
 
-MOST_PSNR = 100.0
+MAX_PSNR = 100.0
 """What equal images count as, in dB, so that means over views stay numbers."""
 
 
-COUNTS = 0.5
+MASK_THRESHOLD = 0.5
 """Pixels whose mask is above this count."""
 
 
@@ -26,10 +26,10 @@ def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = 
     from torchmetrics.functional.image import peak_signal_noise_ratio
 
     image, target = map(to_8_bit, _counted(image, target, mask))
-    return min(float(peak_signal_noise_ratio(image, target, data_range=1.0)), MOST_PSNR)
+    return min(float(peak_signal_noise_ratio(image, target, data_range=1.0)), MAX_PSNR)
 
 
-def exposed_as(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
+def fit_exposure(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
     """An image (H, W, 3) with the gain and offset of each channel that bring it closest to a target.
 
     Least squares; what ``optimize.exposure`` learns of a training view, found for one that was held out.
@@ -53,7 +53,7 @@ def ssim(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = 
     from torchmetrics.functional.image import structural_similarity_index_measure
 
     if mask is not None:
-        image = torch.where((mask > COUNTS)[..., None], image, target)
+        image = torch.where((mask > MASK_THRESHOLD)[..., None], image, target)
     pair = [to_8_bit(each).permute(2, 0, 1)[None] for each in (image, target)]
     return float(structural_similarity_index_measure(*pair, data_range=1.0))  # type: ignore[arg-type]
 
@@ -62,6 +62,6 @@ def _counted(
     image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Of two images (H, W, 3) the pixels that count, (P, 3)."""
-    if mask is not None and bool((mask > COUNTS).any()):
-        return image[mask > COUNTS], target[mask > COUNTS]
+    if mask is not None and bool((mask > MASK_THRESHOLD).any()):
+        return image[mask > MASK_THRESHOLD], target[mask > MASK_THRESHOLD]
     return image.reshape(-1, 3), target.reshape(-1, 3)

@@ -4,30 +4,30 @@ from __future__ import annotations
 
 import torch
 
-from ..scenes.cameras import evenly
+from ..scenes.cameras import pick_evenly
 from ..splats.bundle import Bundle
-from .aside import oversized, veil
-from .metrics import exposed_as, psnr
-from .views import MOST_TRAINING_VIEWS, Evaluation, shown_at
+from .metrics import fit_exposure, psnr
+from .offset_views import count_oversized, measure_veil
+from .views import MAX_TRAINING_VIEWS, Evaluation, full_detail_selector
 
 
-def summary(evaluation: Evaluation, bundle: Bundle) -> dict:
+def summarize(evaluation: Evaluation, bundle: Bundle) -> dict:
     """Measures of a bundle's finest level, as its cameras are shown it.
 
     Returns:
         ``train_psnr``: dB, mean over training views, ``MOST_TRAINING_VIEWS`` at most; ``veil`` and
-        ``oversized``, see ``evaluate.aside``; where views are held out ``worst``, the ``view`` of the lowest
+        ``oversized``, see ``evaluate.offset_views``; where views are held out ``worst``, the ``view`` of the lowest
         ``psnr``, and ``fitted_psnr``, the mean over them where each picture has its photograph's exposure.
     """
-    data, shown = evaluation.data, shown_at(bundle, bundle.levels[-1])
-    train = evaluation.psnrs(evenly(data.train, MOST_TRAINING_VIEWS), shown)
+    data, shown = evaluation.data, full_detail_selector(bundle, bundle.levels[-1])
+    train = evaluation.compare_views(pick_evenly(data.train, MAX_TRAINING_VIEWS), shown)
     found = {
         "train_psnr": round(float(train.mean()), 3),
-        "veil": veil(evaluation, shown),
-        "oversized": oversized(data, shown),
+        "veil": measure_veil(evaluation, shown),
+        "oversized": count_oversized(data, shown),
     }
     if data.test:
-        quality, fitted = evaluation.psnrs(data.test, shown, _as_it_is_and_exposed).T
+        quality, fitted = evaluation.compare_views(data.test, shown, _as_it_is_and_exposed).T
         found["fitted_psnr"] = round(float(fitted.mean()), 3)
         worst = int(quality.argmin())
         found["worst"] = {"view": data.test[worst].name, "psnr": round(float(quality[worst]), 3)}
@@ -38,4 +38,4 @@ def _as_it_is_and_exposed(
     image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None
 ) -> tuple[float, float]:
     """The PSNR of a picture, and of the same with its photograph's exposure."""
-    return psnr(image, target, mask), psnr(exposed_as(image, target, mask), target, mask)
+    return psnr(image, target, mask), psnr(fit_exposure(image, target, mask), target, mask)

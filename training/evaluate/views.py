@@ -15,7 +15,7 @@ from ..lod.selection import Choice, complete, settings
 from ..optimize.training_data import TrainingData
 from ..rasterize import Gaussians, Rendering, Target, rasterize, tensor_device
 from ..rasterize.resident import ResidentBundle, SplatSet, WeightedSet, draw
-from ..scenes.cameras import Camera, evenly
+from ..scenes.cameras import Camera, pick_evenly
 from ..splats.bundle import Bundle, Level
 from ..splats.gaussians import Splats
 from .metrics import psnr, ssim
@@ -81,7 +81,7 @@ class Evaluation:
     def __init__(self, data: TrainingData, backend: str = "auto", antialias: bool = False) -> None:
         self.data, self.backend, self.device = data, backend, tensor_device(backend)
         self.antialias = antialias
-        self.cameras = data.test or evenly(data.train, MAX_TRAINING_VIEWS)
+        self.cameras = data.test or pick_evenly(data.train, MAX_TRAINING_VIEWS)
         self.prefix = "" if data.test else "train_"
 
     def target(self, camera: Camera) -> Target:
@@ -200,7 +200,7 @@ class Evaluation:
     def frame_times(self, draws: Mapping[str, Callable[[Camera], object]]) -> dict[str, float]:
         """Seconds a frame of several ways to draw, by name: the median over views, drawn in turn."""
         found: dict[str, list[float]] = {name: [] for name in draws}
-        for camera in evenly(self.cameras, MAX_TRAINING_VIEWS):
+        for camera in pick_evenly(self.cameras, MAX_TRAINING_VIEWS):
             for _ in range(REPEATS):
                 for name, one in draws.items():
                     started = time.perf_counter()

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..documents import shown
+from ..documents import quote
 from ..errors import LodgsError
 
 SHAPES = ("BOX", "SPHERE")
@@ -116,7 +116,7 @@ class Crop:
                     rows = (tuple(numbers[at : at + 4]) for at in (0, 4, 8))
                     return cls(name.upper(), tuple(rows))
         raise LodgsError(
-            f"{shown(text)} is no box and no sphere.",
+            f"{quote(text)} is no box and no sphere.",
             "Give box X Y Z X Y Z (two opposite corners), or sphere X Y Z RADIUS.",
         )
 

@@ -19,8 +19,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ..errors import LodgsError
-from ..splats.placing import Place
 from ..splats.ply import Columns
+from ..splats.similarity import AxisNames
 
 STEP = 1.25
 """Factor by which a viewer's budget raises a control at a time."""
@@ -128,7 +128,7 @@ class Rule(ABC):
     columns: ClassVar[tuple[str, ...]] = ()
     tables: ClassVar[tuple[str, ...]] = ()
     lengths: ClassVar[tuple[str, ...]] = ()
-    places: ClassVar[tuple[Place, ...]] = ()
+    places: ClassVar[tuple[AxisNames, ...]] = ()
     related: ClassVar[bool] = False
     always: ClassVar[bool] = False
     apart: ClassVar[bool] = True

@@ -9,7 +9,7 @@ from typing import Any
 
 from ..documents import quote
 from ..errors import LodgsError
-from ..scenes.depths import KINDS
+from ..scenes.depths import DEPTH_KINDS
 
 MARGIN_SHARE, MARGIN_SPLATS = 0.1, 4000
 """The most of all splats that may continue photographs beyond their edges, and the most at all."""
@@ -115,7 +115,7 @@ class Parameters:
         "(relative) or of inverse depth (inverse) of which scale and shift are found by the scene's points, "
         "view by view; or only these points themselves (points).",
         label="Depth Is",
-        choices=KINDS,
+        choices=DEPTH_KINDS,
     )
     match_exposure: bool = parameter(
         True,

@@ -1,9 +1,9 @@
-"""Splats to pixels and back: one meaning, several backends.
+"""Rasterize Gaussian splats and differentiate the result, with one interface for several backends.
 
-``reference`` (plain torch) is the definition, ``cpu`` (Numba, gradients by hand) the fast path on any
-computer, ``cuda`` (gsplat) that on NVIDIA graphics cards, ``gpu`` (compute shaders) runs on graphics cards of
-any make. A backend is a module with ``rasterize``, ``contributions`` and ``photometric_loss`` of the
-reference's signatures, imported when it is first used.
+``reference`` (plain torch) is the definition. ``cpu`` (Numba kernels with analytic gradients) is fast on any
+computer, ``cuda`` (gsplat) on NVIDIA GPUs, and ``gpu`` (compute shaders) runs on GPUs of any vendor. A
+backend is a module that implements ``rasterize``, ``contributions`` and ``photometric_loss`` with the
+reference's signatures. It is imported on first use.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, MutableMapp
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
+from types import ModuleType
 from typing import Any, Protocol
 
 import numpy as np
@@ -25,19 +26,27 @@ from ..splats.sh import degree_from_count
 from .adam import Adam
 from .features import depths, normals
 from .gaussians import Gaussians
-from .rendering import OUTPUTS, Contributions, KernelCamera, RasterSettings, Rendering, Target
+from .rendering import (
+    OUTPUTS,
+    BackendOutput,
+    Contributions,
+    KernelCamera,
+    RasterSettings,
+    Rendering,
+    Target,
+)
 
 __all__ = [
     "BACKENDS", "OUTPUTS", "Adam", "Contributions", "DeviceModel", "Gaussians", "Rendering", "Target",
-    "contributions", "cpu_fallback_reason", "make_device_model", "photometric_loss", "rasterize", "rasterize_strips",
-    "render", "resolve_backend", "tensor_device", "warm_up",
+    "contributions", "cpu_fallback_reason", "make_device_model", "photometric_loss", "rasterize",
+    "rasterize_strips", "render", "resolve_backend", "tensor_device", "warm_up",
 ]  # fmt: skip
 
 BACKENDS = ("cpu", "cuda", "gpu", "reference")
-"""Backends by name; :func:`resolve_backend` says which one ``auto`` is."""
+"""Names of the backends; :func:`resolve_backend` resolves ``auto``."""
 
 STRIP = 1 << 21
-"""Pixels that :func:`rasterize_strips` draws at a time: a Full HD frame at once, an 8k frame in sixteen strips."""
+"""Pixels in a strip of :func:`rasterize_strips`: a Full HD image is one strip, an 8K image is sixteen."""
 
 
 def rasterize(
@@ -57,58 +66,48 @@ def rasterize(
     rows: torch.Tensor | None = None,
     backend: str = "auto",
 ) -> Rendering:
-    """Draw N Gaussians as a camera sees them; differentiable by every tensor given.
+    """Render N Gaussians from a camera, differentiable with respect to every input tensor.
 
-    Projection, alpha and blending are those of 3D Gaussian Splatting (Kerbl et al. 2023); the constants are
-    in :mod:`.rendering`. The view direction's part of the gradient reaches the means.
+    Projection, alpha and blending follow 3D Gaussian Splatting (Kerbl et al. 2023); :mod:`.rendering` holds
+    the constants. Gradients of the view-dependent colour reach the means too.
 
     Args:
-        gaussians: in the world.
-        camera: the view; any pinhole, any principal point.
-        weights: (N,) at least 0 on the opacities, or None for ones. A splat of weight 0 is dropped before
-            projection.
-        background: colour behind everything.
-        sh_degree: use the coefficients up to this degree only (the others get a gradient of zero); None: all.
-        min_scale: added to every standard deviation, and so its lower bound, in world units (FLoD, Eq. 4).
-        near: a splat is drawn where its mean lies deeper than this, in world units.
-        antialias: instead of 3DGS's dilation, filter with :data:`..lod.unfiltered.MIP_VARIANCE` and give what
-            a splat gains in area back in opacity, sqrt(det before / det after) (Mip-Splatting, Yu et al.
-            2024, Eq. 10). Or (N,) bool, for each splat whether it is so.
-        outputs: of :data:`OUTPUTS`, what :class:`Rendering` shall have besides; differentiable, too.
-        features: (N, F) further values of each splat, blended as colours are over zero.
-        limit: (H, W), for each pixel a depth along the camera's z axis, in world units: splats whose means
-            lie beyond it have no part in the pixel, whatever is asked for. For pictures only: without
-            gradients.
-        window: left, top, width and height in pixels of the part of the camera's image to draw; None: all.
-        rows: (M,) int32, ascending, those of the N that are looked at, as if the others had weight 0; None:
-            all. What is known to be out of sight costs nothing then.
-        backend: one of :data:`BACKENDS`, or "auto": cuda for tensors on a GPU, else cpu.
+        gaussians: splats in world coordinates.
+        camera: any pinhole camera, with any principal point.
+        weights: (N,) non-negative factors of the opacities; None means 1. Splats of weight 0 are dropped
+            before projection.
+        background: colour behind all splats.
+        sh_degree: highest degree of the coefficients to use; higher coefficients get zero gradients. None
+            uses all.
+        min_scale: length added to every standard deviation, in world units. It is thus their lower bound
+            (FLoD, Eq. 4).
+        near: depth in world units. Splats whose mean lies at or in front of it are not drawn.
+        antialias: replace 3DGS's dilation by the 2D Mip filter of variance
+            :data:`..lod.unfiltered.MIP_VARIANCE`, and scale opacity by sqrt(det before / det after)
+            (Mip-Splatting, Yu et al. 2024, Eq. 10). An (N,) bool tensor selects it per splat.
+        outputs: names from :data:`OUTPUTS` of further differentiable outputs in :class:`Rendering`.
+        features: (N, F) values per splat, blended like colours over zero.
+        limit: (H, W) maximum depth per pixel along the camera's z axis, in world units. A splat does not
+            contribute to pixels whose limit is less than the depth of its mean. Not differentiable.
+        window: left, top, width and height in pixels of the image region to draw. None draws the whole image.
+        rows: (M,) int32, ascending indices of the splats to consider, as if all others had weight 0. None
+            considers all. Splats that are known to be invisible then cost nothing.
+        backend: one of :data:`BACKENDS`, or "auto": cuda for tensors on a GPU, otherwise cpu.
 
     Raises:
-        ValueError: for tensors whose shapes do not belong together, an output that does not exist, or a limit
-            where gradients are wanted.
-        LodgsError: for a backend that does not exist, or does not work on this computer.
+        ValueError: shapes do not match, an output does not exist, or a limit is combined with gradients.
+        LodgsError: the backend does not exist or does not work on this computer.
     """
-    count, means, view = len(gaussians), gaussians.means, KernelCamera.of(camera, near, window)
-    _check_weights(weights, count)
-    _check_antialias(antialias, count)
+    view = KernelCamera.of(camera, near, window)
+    _check_inputs(gaussians, view, weights, antialias, outputs, features, limit)
     gaussians = replace(gaussians, sh=_coefficients(gaussians.sh))
-    if not set(outputs) <= set(OUTPUTS):
-        raise ValueError(f"outputs can be {', '.join(OUTPUTS)}, not {', '.join(outputs)}")
-    if features is not None and (features.ndim != 2 or len(features) != count):
-        raise ValueError(f"features must have shape ({count}, F), not {tuple(features.shape)}")
-    if limit is not None:
-        if limit.shape != (view.height, view.width):
-            raise ValueError(f"limit must have shape {(view.height, view.width)}, not {tuple(limit.shape)}")
-        leaves = *vars(gaussians).values(), weights, features
-        if torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in leaves):
-            raise ValueError("a limit is for pictures: it has no gradients")
+    means = gaussians.means
+    planes = [name for name in ("depth", "inverse_depth") if name in outputs]
     blended = [] if features is None else [features]
-    plain = [name for name in ("depth", "inverse_depth") if name in outputs]
-    if plain:
+    if planes:
         depth = depths(means, view)[:, None]
         values = {"depth": depth, "inverse_depth": 1 / depth.clamp_min(view.near or 1e-6)}
-        blended += [values[name] for name in plain]
+        blended += [values[name] for name in planes]
     if "normals" in outputs:
         blended.append(normals(gaussians, view))
     red, green, blue = (float(value) for value in background)
@@ -116,25 +115,33 @@ def rasterize(
         view, float(min_scale), antialias, (red, green, blue), _degree(gaussians.sh, sh_degree),
         median="median_depth" in outputs, absolute="absgrad2d" in outputs, limit=limit, rows=rows,
     )  # fmt: skip
-    drawn = _backend(backend, means).rasterize(
-        gaussians, weights, torch.cat(blended, 1) if blended else means.new_zeros(count, 0), settings
+    output = _backend(backend, means).rasterize(
+        gaussians, weights, torch.cat(blended, 1) if blended else means.new_zeros(len(means), 0), settings
     )
+    rendering = _name_outputs(output, outputs, planes, None if features is None else features.shape[1])
+    if output.median is not None:
+        padded = torch.cat([depths(means, view), means.new_zeros(1)])  # index -1 selects the zero
+        rendering.median_depth = padded[output.median.long()]
+    return rendering
+
+
+def _name_outputs(
+    output: BackendOutput, outputs: Collection[str], planes: Sequence[str], feature_count: int | None
+) -> Rendering:
+    """Split the blended features into caller features, depth planes and normals."""
     rendering = Rendering(
-        drawn.image, drawn.alpha, drawn.radii, drawn.grad2d, drawn.tile_counts, drawn.absgrad2d
+        output.image, output.alpha, output.radii, output.grad2d, output.tile_counts, output.absgrad2d
     )
-    given = 0 if features is None else features.shape[1]
-    if features is not None:
-        rendering.features = drawn.features[..., :given]
-    planes = dict(zip(plain, drawn.features[..., given:].unbind(-1), strict=False))
+    first = feature_count or 0
+    if feature_count is not None:
+        rendering.features = output.features[..., :first]
+    by_name = dict(zip(planes, output.features[..., first:].unbind(-1), strict=False))
     if "depth" in outputs:
-        nothing = drawn.alpha == 0
-        rendering.depth = torch.where(nothing, 0, planes["depth"] / drawn.alpha.masked_fill(nothing, 1))
-    rendering.inverse_depth = planes.get("inverse_depth")
+        empty = output.alpha == 0
+        rendering.depth = torch.where(empty, 0, by_name["depth"] / output.alpha.masked_fill(empty, 1))
+    rendering.inverse_depth = by_name.get("inverse_depth")
     if "normals" in outputs:
-        rendering.normals = drawn.features[..., -3:]
-    if drawn.median is not None:
-        padded = torch.cat([depths(means, view), means.new_zeros(1)])  # -1 is the last
-        rendering.median_depth = padded[drawn.median.long()]
+        rendering.normals = output.features[..., -3:]
     return rendering
 
 
@@ -148,15 +155,15 @@ def rasterize_strips(
     strip: int = STRIP,
     **options: Any,
 ) -> Iterator[tuple[int, Rendering]]:
-    """Draw a picture strip by strip, from the top: nothing is kept for gradients or between strips.
+    """Render an image in horizontal strips from top to bottom, without gradients.
 
     Args:
-        limit: of the window's pixels.
-        strip: pixels to draw at a time, about.
-        gaussians, camera, window, options: as for :func:`rasterize`.
+        limit: maximum depth of the window's pixels.
+        strip: approximate number of pixels in a strip.
+        gaussians, camera, window, options: see :func:`rasterize`.
 
     Yields:
-        The first row of a strip in the window, and what it shows.
+        The first row of a strip within the window, and the strip's rendering.
     """
     left, above, width, height = window or (0, 0, camera.width, camera.height)
     if limit is not None and limit.shape != (height, width):
@@ -164,8 +171,8 @@ def rasterize_strips(
     rows = max(strip // width // 16 * 16, 16)
     for top in range(0, height, rows):
         part = left, above + top, width, min(rows, height - top)
-        hidden = None if limit is None else limit[top : top + rows]
-        yield top, rasterize(gaussians, camera, limit=hidden, window=part, **options)
+        part_limit = None if limit is None else limit[top : top + rows]
+        yield top, rasterize(gaussians, camera, limit=part_limit, window=part, **options)
 
 
 @torch.no_grad()
@@ -177,28 +184,28 @@ def render(
     strip: int = STRIP,
     **options: Any,
 ) -> Iterator[np.ndarray]:
-    """Draw pictures, one camera after the other: nothing is kept for gradients.
+    """Render one image per camera, without gradients.
 
-    Large images are drawn in strips, so that beyond the picture itself little memory is used.
+    Large images are rendered in strips, so little memory is used besides the image itself.
 
     Args:
-        dtype: "uint8" (colours clamped to 0 to 1, rounded), "float16" or "float32".
-        strip: pixels to draw at a time, about.
-        gaussians, options: as for :func:`rasterize`.
+        dtype: "uint8" (colours clamped to 0 to 1 and rounded), "float16" or "float32".
+        strip: approximate number of pixels in a strip.
+        gaussians, options: see :func:`rasterize`.
 
     Yields:
-        (H, W, 4) of this type: the colour over the background, and alpha.
+        Array (H, W, 4) of this type: colour over the background, and alpha.
     """
     if dtype not in ("uint8", "float16", "float32"):
-        raise ValueError(f'dtype can be "uint8", "float16" or "float32", not "{dtype}"')
+        raise ValueError(f'dtype must be "uint8", "float16" or "float32", not "{dtype}"')
     for camera in cameras:
-        picture = np.empty((camera.height, camera.width, 4), dtype)
-        for top, drawn in rasterize_strips(gaussians, camera, strip=strip, **options):
-            pixels = torch.cat([drawn.image, drawn.alpha[..., None]], 2)
+        image = np.empty((camera.height, camera.width, 4), dtype)
+        for top, rendering in rasterize_strips(gaussians, camera, strip=strip, **options):
+            pixels = torch.cat([rendering.image, rendering.alpha[..., None]], 2)
             if dtype == "uint8":
                 pixels = pixels.clamp_(0, 1).mul_(255).round_()
-            picture[top : top + len(pixels)] = pixels.cpu().numpy()
-        yield picture
+            image[top : top + len(pixels)] = pixels.cpu().numpy()
+        yield image
 
 
 @torch.no_grad()
@@ -213,25 +220,52 @@ def contributions(
     rows: torch.Tensor | None = None,
     backend: str = "auto",
 ) -> Contributions:
-    """What each splat gives to the pixels of some views; no picture is kept, nothing is differentiated.
+    """Measure how much each splat contributes to the pixels of several views, without gradients.
 
-    Args: as for :func:`rasterize`, which draws the same splats with the same weights in a pixel. Colours do
-    not matter.
+    Args: see :func:`rasterize`, which blends the same splats with the same weights. Colours are ignored.
     """
-    count, device = len(gaussians), gaussians.means.device
+    count = len(gaussians)
+    device = gaussians.means.device
     _check_weights(weights, count)
     _check_antialias(antialias, count)
     largest, total, radius = (torch.zeros(count, dtype=torch.float32, device=device) for _ in range(3))
     pixels, views = (torch.zeros(count, dtype=torch.int64, device=device) for _ in range(2))
     for camera in cameras:
         settings = RasterSettings(KernelCamera.of(camera, near), float(min_scale), antialias, rows=rows)
-        found = _backend(backend, gaussians.means).contributions(gaussians, weights, settings)
-        largest = torch.maximum(largest, found[0])
-        total += found[1]
-        pixels += found[2]
-        views += found[3] > 0
-        radius = torch.maximum(radius, found[3])
+        view_largest, view_total, view_pixels, view_radius = _backend(backend, gaussians.means).contributions(
+            gaussians, weights, settings
+        )
+        largest = torch.maximum(largest, view_largest)
+        total += view_total
+        pixels += view_pixels
+        views += view_radius > 0
+        radius = torch.maximum(radius, view_radius)
     return Contributions(largest, total, pixels, views, radius)
+
+
+def _check_inputs(
+    gaussians: Gaussians,
+    view: KernelCamera,
+    weights: torch.Tensor | None,
+    antialias: bool | torch.Tensor,
+    outputs: Collection[str],
+    features: torch.Tensor | None,
+    limit: torch.Tensor | None,
+) -> None:
+    """Check the shapes of the inputs of :func:`rasterize`; raise ValueError otherwise."""
+    count = len(gaussians)
+    _check_weights(weights, count)
+    _check_antialias(antialias, count)
+    if not set(outputs) <= set(OUTPUTS):
+        raise ValueError(f"outputs must be among {', '.join(OUTPUTS)}, not {', '.join(outputs)}")
+    if features is not None and (features.ndim != 2 or len(features) != count):
+        raise ValueError(f"features must have shape ({count}, F), not {tuple(features.shape)}")
+    if limit is not None:
+        if limit.shape != (view.height, view.width):
+            raise ValueError(f"limit must have shape {(view.height, view.width)}, not {tuple(limit.shape)}")
+        leaves = *vars(gaussians).values(), weights, features
+        if torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in leaves):
+            raise ValueError("limit is not differentiable; use torch.no_grad() or detached tensors")
 
 
 def _check_weights(weights: torch.Tensor | None, count: int) -> None:
@@ -245,30 +279,33 @@ def _check_antialias(antialias: bool | torch.Tensor, count: int) -> None:
 
 
 def _coefficients(sh: torch.Tensor) -> torch.Tensor:
-    """Plain colours (N, 3) as the coefficients (N, 1, 3) that give them; coefficients as they are."""
+    """Convert plain colours (N, 3) to coefficients (N, 1, 3) of degree 0; return coefficients unchanged."""
     return ((sh - 0.5) / SH_C0)[:, None] if sh.ndim == 2 else sh
 
 
 def _degree(sh: torch.Tensor, active: int | None) -> int:
-    """The degree to draw with; ValueError unless sh (N, K, 3) is of that degree at least."""
+    """Return the active degree, or the degree of sh (N, K, 3) if None; ValueError if sh has less."""
     degree = degree_from_count(sh.shape[1])
     if active is not None and active > degree:
-        raise ValueError(f"sh has degree {degree}, sh_degree asks for {active}")
+        raise ValueError(f"sh_degree {active} exceeds degree {degree} of sh")
     return degree if active is None else active
 
 
 def photometric_loss(
     image: torch.Tensor, target: Target, ssim_weight: float = 0.2, *, backend: str = "auto"
 ) -> torch.Tensor:
-    """(1 − ssim_weight) L1 + ssim_weight (1 − SSIM), as 3DGS (Eq. 7): a scalar, differentiable by the image.
+    """Compute (1 − ssim_weight) L1 + ssim_weight (1 − SSIM) as in 3DGS (Eq. 7).
 
-    SSIM has an 11x11 Gaussian window of sigma 1.5 and zeros outside the image. Where the target has a mask m,
-    m·image + (1 − m)·photograph is compared, so that what is masked out costs nothing, nor do its neighbours
-    for its sake.
+    SSIM uses an 11x11 Gaussian window of sigma 1.5 and zeros outside the image. If the target has a mask m,
+    m·image + (1 − m)·photo is compared with the photo. Masked pixels then add nothing to the loss, and do not
+    affect their neighbours' SSIM.
 
     Args:
         image: (H, W, 3), a rendering.
-        target: the photograph; keep it from step to step, its moments are computed once.
+        target: the photo. Reuse it between steps, because its local moments are cached in it.
+
+    Returns:
+        Scalar, differentiable with respect to the image.
     """
     if image.shape != target.image.shape:
         raise ValueError(f"image {tuple(image.shape)} and target {tuple(target.image.shape)} differ in shape")
@@ -279,10 +316,11 @@ def photometric_loss(
 
 
 class DeviceModel(Protocol):
-    """Splats that a backend trains where it draws them: what is here in the meantime is what they were.
+    """Splats that a backend trains in device memory.
 
-    Whatever is asked of it raises LodgsError where the device was lost, or has too little memory. Where that
-    would have changed splats, they are lost with it: the run goes on from its last checkpoint.
+    The host's tensors are out of date until :meth:`copy_to_host`. Every method raises LodgsError if the
+    device was lost or has too little memory. If the method modifies splats, they are then lost, and training
+    has to continue from the last checkpoint.
     """
 
     def __len__(self) -> int: ...
@@ -300,74 +338,76 @@ class DeviceModel(Protocol):
         min_scale: float = 0.0,
         shrink: float | None = None,
     ) -> float:
-        """One step of Adam by :func:`photometric_loss` of one picture; its loss.
+        """Make one Adam step with :func:`photometric_loss` of one image, and return the loss.
 
         Args:
-            target: opaque, and without a mask.
-            shrink: the statistics are added up, of a photograph so many times smaller; None: they are not.
-            camera, near, sh_degree, background, weights, min_scale: as of :func:`rasterize`.
+            target: opaque photo without a mask.
+            shrink: factor by which the photo was downscaled; used to scale the density statistics. None
+                collects no statistics.
+            camera, near, sh_degree, background, weights, min_scale: see :func:`rasterize`.
 
         Raises:
-            LodgsError: the device was lost, or has too little memory. The splats are lost with it.
+            LodgsError: the device was lost or has too little memory. The splats are lost with it.
         """
         ...
 
     def last_image(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """The last step's picture (H, W, 3), and its alpha (H, W)."""
+        """Return the last step's image (H, W, 3) and alpha (H, W)."""
         ...
 
     def read(self, name: str) -> torch.Tensor:
-        """A tensor's values, or a statistic's, as they are now; all others stay where they are."""
+        """Return the current values of one tensor or statistic."""
         ...
 
     def read_rows(self, index: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Tensors' values at indices (M,), by name."""
+        """Return the tensors' values at indices (M,), by name."""
         ...
 
     def select(self, index: torch.Tensor) -> None:
-        """Only the splats at indices (M,), at least one, stay, in this order."""
+        """Keep only the splats at indices (M,), at least one, in this order."""
 
     def append(self, rows: Mapping[str, torch.Tensor]) -> None:
-        """Adds splats at the end, at least one, with moments and statistics of zero."""
+        """Append at least one splat, with zero moments and statistics."""
 
     def assign(self, name: str, values: torch.Tensor) -> None:
-        """Gives a tensor new values and zero moments."""
+        """Replace a tensor's values and reset its moments to zero."""
 
     def reset_stats(self) -> None:
-        """Begins anew with what is added up."""
+        """Reset all statistics to zero."""
 
     def raise_log_scales(self, minimum: torch.Tensor) -> None:
-        """No log-scale of a splat is below its least one (N,) from here."""
+        """Raise every log-scale of a splat to at least its minimum (N,)."""
 
     def copy_to_host(self) -> None:
-        """Makes of what is here what has become of it: other tensors in the same places."""
+        """Replace the host's tensors, moments and statistics by the device's values."""
 
 
 def make_device_model(
     backend: str, adam: Adam, stats: MutableMapping[str, torch.Tensor], *, antialias: bool = False
 ) -> DeviceModel | None:
-    """What a model trains, where a backend can train it by itself; None where it cannot.
+    """Copy a model to a backend that trains in device memory; return None if the backend cannot.
 
     Args:
-        adam: of means, quats, log_scales, opacity_logits and sh; what else it has stays as it is.
+        adam: optimizer of means, quats, log_scales, opacity_logits and sh. Its other tensors stay unchanged.
         stats: (N,) statistics of density control, by name (``optimize.model``).
-        antialias: as of :func:`rasterize`.
+        antialias: see :func:`rasterize`.
 
     Raises:
-        LodgsError: the device was lost, or has too little memory.
+        LodgsError: the device was lost or has too little memory.
     """
     make = getattr(_backend(backend, adam.tensors["means"]), "make_device_model", None)
     return make and make(adam, stats, antialias)
 
 
 def resolve_backend(backend: str) -> str:
-    """The backend that a name means on this computer: ``auto`` is cuda where that works, else cpu.
+    """Return the backend that will be used for a name on this computer.
 
-    ``gpu`` is cpu where the graphics device does not draw what the reference draws, which is tried before the
-    device is first used (:func:`cpu_fallback_reason` says so).
+    ``auto`` becomes cuda if that works, otherwise cpu. ``gpu`` becomes cpu if the graphics device fails its
+    self-test, which runs before the first use of a device. :func:`cpu_fallback_reason` then reports the
+    cause.
 
     Raises:
-        LodgsError: for a backend that does not exist, or does not work on this computer.
+        LodgsError: the backend does not exist or does not work on this computer.
     """
     from . import cuda
 
@@ -375,7 +415,7 @@ def resolve_backend(backend: str) -> str:
         return "cpu" if cuda.problem() else "cuda"
     if backend not in BACKENDS:
         raise LodgsError(
-            f'There is no rasterizer backend "{backend}".', f"Choose auto or one of {', '.join(BACKENDS)}."
+            f'Unknown rasterizer backend "{backend}".', f"Choose auto or one of {', '.join(BACKENDS)}."
         )
     if backend == "cuda" and (problem := cuda.problem()):
         raise problem
@@ -388,10 +428,10 @@ def resolve_backend(backend: str) -> str:
 
 
 def cpu_fallback_reason(backend: str) -> str:
-    """Why the cpu draws where a GPU was asked for, or could be; nothing where there is no reason to say so.
+    """Return why the cpu backend replaces an available or requested GPU; empty if there is nothing to report.
 
     Raises:
-        LodgsError: as :func:`resolve_backend`.
+        LodgsError: see :func:`resolve_backend`.
     """
     from . import cuda
 
@@ -401,30 +441,27 @@ def cpu_fallback_reason(backend: str) -> str:
         from .gpu.default_device import default_adapter
         from .self_test import failure
 
-        device = chosen()
-        return (
-            f"{device.name} is not used: {difference(device)}. The processor takes its place; a newer "
-            "driver may help."
-        )
+        adapter = default_adapter()
+        reason = failure(adapter)
+        return f"{adapter.name} is not used: {reason}. The CPU is used instead; a newer driver may help."
     return ""
 
 
 def tensor_device(backend: str) -> torch.device:
-    """Where the tensors live that a backend draws; LodgsError as :func:`resolve_backend`."""
+    """Return the torch device of a backend's input tensors; LodgsError as in :func:`resolve_backend`."""
     from . import cuda
 
     return torch.device(cuda.DEVICE if resolve_backend(backend) == "cuda" else "cpu")
 
 
 def warm_up(backend: str = "auto") -> None:
-    """Make one step on one splat, so that kernels are compiled: the first time on a computer this takes some
-    seconds on the cpu and some minutes with cuda; later they are read from a cache.
+    """Compile all kernels by making one step on one splat.
 
-    Numba makes millions of objects on the way; looking among them for garbage, again and again, would take a
-    fifth of the time.
+    The first time on a computer this takes some seconds with cpu and some minutes with cuda. Later runs read
+    the kernels from a cache.
     """
-    collects = gc.isenabled()
-    gc.disable()
+    gc_enabled = gc.isenabled()
+    gc.disable()  # Numba allocates millions of objects; collecting garbage would take a fifth of the time
     try:
         if resolve_backend(backend) == "cpu":
             from .cpu.compile import compile_in_two_processes
@@ -432,21 +469,21 @@ def warm_up(backend: str = "auto") -> None:
             compile_in_two_processes(partial(_step, "cpu"))
         _step(backend)
     finally:
-        if collects:
+        if gc_enabled:
             gc.enable()
 
 
 def _step(backend: str) -> None:
-    one = [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0, 0.0]], [[0.0] * 3], [0.0], [[[0.0] * 3]]
+    values = [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0, 0.0]], [[0.0] * 3], [0.0], [[[0.0] * 3]]
     device = tensor_device(backend)
-    gaussians = Gaussians(*(torch.tensor(values, device=device, requires_grad=True) for values in one))
+    gaussians = Gaussians(*(torch.tensor(value, device=device, requires_grad=True) for value in values))
     camera = Camera("", 16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
-    drawn = rasterize(gaussians, camera, backend=backend)
-    photometric_loss(drawn.image, Target(torch.zeros(16, 16, 3)), backend=backend).backward()
+    rendering = rasterize(gaussians, camera, backend=backend)
+    photometric_loss(rendering.image, Target(torch.zeros(16, 16, 3)), backend=backend).backward()
     Adam(vars(gaussians), dict.fromkeys(vars(gaussians), 0.0)).step()
 
 
-def _backend(name: str, tensor: torch.Tensor):
-    if name == "auto":  # whoever made the tensors has chosen
+def _backend(name: str, tensor: torch.Tensor) -> ModuleType:
+    if name == "auto":  # the device of the tensors already decides
         name = "cuda" if tensor.is_cuda else "cpu"
     return import_module(f".{resolve_backend(name)}", __package__)

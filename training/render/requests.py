@@ -16,7 +16,7 @@ from ..lod.crop import SHAPES, Crop
 from ..lod.query import Choice
 from ..lod.rule import EVERYTHING, Rule, fact_names, find_rule
 from ..lod.rules.cut import RULE as CUT
-from ..scenes.cameras import FARTHEST, Camera, camera_from_dict, check_size
+from ..scenes.cameras import MAX_COORDINATE, Camera, camera_from_dict, check_render_size
 
 MAX_BACKGROUND = 1e6
 """No colour of a background is larger."""
@@ -117,7 +117,7 @@ def parse_request(values: dict) -> FrameRequest | CancelRequest:
     frame = _whole(values, "frame")
     camera, near = camera_from_dict(_of_kind(values, "camera", dict))
     window = _window(values, camera)
-    check_size(*(window[2:] if window else (camera.width, camera.height)))
+    check_render_size(*(window[2:] if window else (camera.width, camera.height)))
     photograph, background = _path(values, "photograph"), None
     if photograph and window:
         raise _refused("photograph", "given beside a window")
@@ -146,7 +146,7 @@ def _named_set(values: Any) -> SetRequest:
     matrix = np.array(_of_kind(values, "matrix", list), object)
     if matrix.shape != (4, 4):
         raise _refused("matrix", values["matrix"])
-    matrix = np.reshape(_numbers({"matrix": matrix.ravel().tolist()}, "matrix", 16, FARTHEST), (4, 4))
+    matrix = np.reshape(_numbers({"matrix": matrix.ravel().tolist()}, "matrix", 16, MAX_COORDINATE), (4, 4))
     if matrix[3].tolist() != [0, 0, 0, 1]:
         raise _refused("matrix", values["matrix"])
     tree = _path(values, "tree")
@@ -179,7 +179,7 @@ def _choice(values: dict) -> Choice:
     rule = find_rule(name) if name else EVERYTHING
     if rule is None:
         raise _refused("rule", name)
-    x, y, z = _numbers(values, "eye", 3, FARTHEST)
+    x, y, z = _numbers(values, "eye", 3, MAX_COORDINATE)
     (focal_px,) = _numbers({"focal_px": [values.get("focal_px")]}, "focal_px", 1, MAX_NUMBER)
     controls = _by_name(values, "values", [control.name for control in rule.controls])
     for control in rule.controls:  # the ends of a slider, as single precision has them, are possible

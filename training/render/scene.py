@@ -14,7 +14,7 @@ from ..errors import LodgsError, is_out_of_memory
 from ..lod.query import Choice
 from ..rasterize import Gaussians, rasterize_strips
 from ..rasterize.resident import SplatSet, WeightedSet, combine_visible
-from ..scenes.cameras import Camera, check_size
+from ..scenes.cameras import Camera, check_render_size
 from ..splats.sh import basis, degree_from_count
 from ..splats.similarity import is_similarity
 from .image import NO_DEPTH, RenderedImage
@@ -82,7 +82,7 @@ def draw(
         LodgsError: a set's transform is flat, the picture too large, or there is not enough memory.
     """
     width, height = window[2:] if window else (camera.width, camera.height)
-    check_size(width, height)
+    check_render_size(width, height)
     for one in instances:
         linear = one.matrix[:3, :3]
         if not np.isfinite(one.matrix).all() or np.linalg.cond(linear) > MAX_CONDITION or not linear.any():

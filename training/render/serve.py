@@ -48,7 +48,7 @@ from ..evaluate.metrics import psnr
 from ..lod.tree.paging import TreeFile
 from ..rasterize import cpu_fallback_reason, resolve_backend
 from ..runs.events import event_line
-from ..scenes.cameras import camera_as_dict
+from ..scenes.cameras import camera_to_dict
 from ..scenes.images import load_image, load_mask
 from ..splats.dialects import drop_undrawable
 from ..splats.similarity import is_similarity
@@ -217,7 +217,7 @@ class _Server:
         if is_similarity(one.matrix):
             camera, unit = request.camera.within(one.matrix)
         near = request.near / unit
-        where = None if camera is None else json.dumps(camera_as_dict(camera, near))
+        where = None if camera is None else json.dumps(camera_to_dict(camera, near))
 
         def read() -> list[tuple[int, SplatSet]]:
             cut = file.cut(choice, camera, near)

@@ -29,7 +29,7 @@ _WIDTHS = (3, 4, 3, 1, 1)
 _TERMS = {1, 4, 9, 16, 25}
 
 
-def claim(folder: Path) -> None:
+def claim_folder(folder: Path) -> None:
     """Makes a folder for arrays, or takes one that is empty or claimed already, and marks it.
 
     Raises:
@@ -51,7 +51,7 @@ def claim(folder: Path) -> None:
         ) from error
 
 
-def release(folder: Path) -> None:
+def release_folder(folder: Path) -> None:
     """Removes a claimed folder with the files in it; folders in it stay, and any folder without the mark."""
     with suppress(OSError):
         if (folder / MARK).is_file():
@@ -61,7 +61,7 @@ def release(folder: Path) -> None:
             folder.rmdir()
 
 
-def packed(splats: Splats, weights: np.ndarray | None) -> list[np.ndarray]:
+def pack_set(splats: Splats, weights: np.ndarray | None) -> list[np.ndarray]:
     """The columns of a set in the order of its file, float32, extras included; weights of None are ones."""
     ones = np.ones(len(splats), np.float32) if weights is None else weights
     columns = (

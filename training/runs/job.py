@@ -1,4 +1,4 @@
-"""A job: everything that decides a run, as a TOML or JSON file. No torch: Blender writes and reads jobs."""
+"""Jobs: all settings of a run, as a TOML or JSON file. Imports no torch: Blender reads and writes jobs."""
 
 from __future__ import annotations
 
@@ -17,63 +17,60 @@ from .folder import RunFolder
 
 BACKENDS = ("auto", "cpu", "cuda", "gpu", "reference")
 CHANGEABLE = ("backend", "out", "photo_memory", "splat_memory")
-"""The keys that a run may go on with other values of: they say where it is trained, not what."""
+"""Keys that may change when a run is resumed, because they do not change what is trained."""
 MAX_STOPS = 32
-"""Most stops that a job lightens or darkens linear images by."""
+"""Maximum exposure change of linear images, in stops."""
 DOME = "dome"
-"""What ``capture`` is for views from all around."""
+"""Value of ``capture`` for views from all directions."""
 VIEWS, VIEW_WIDTHS = (2, 2000), (32, 8192)
-"""Bounds of how many views a dome has, and of the pixels that their pictures are wide."""
+"""Limits of the number of views of a dome, and of their image width in pixels."""
 POLISH_STEPS = 300
-"""Steps that fit a cell's borders to the cells beside it, if nothing is said."""
+"""Default number of steps that fit a cell's borders to its neighbours."""
 MAX_CELLS = 256
-"""Most cells of a scene."""
+"""Maximum number of cells of a scene."""
 MAX_PATH = 2000
-"""Most characters of a path, so that a job with all of its paths is within the bounds of a TOML file."""
+"""Maximum length of a path, so that a job with all of its paths fits the size limit of a TOML file."""
 _KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
-    "str": (str, "a text; give it in quotation marks"),
+    "str": (str, "a text in quotation marks"),
     "int": (int, "a whole number"),
     "float": ((int, float), "a number"),
     "bool": (bool, "true or false"),
-    "dict": (dict, "a table; write it below a line with its name in brackets"),
+    "dict": (dict, "a table below a line with its name in brackets"),
 }
-"""What a key of each type takes, and how a message says it."""
+"""Accepted types by annotation of a key, and their names in messages."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """What to train, from what, into which folder.
+    """Scene, method, settings and output folder of a run.
 
     Attributes:
-        scene: folder of the COLMAP scene; "" where there is none: see ``capture``.
-        out: the run's folder; made if it does not exist.
-        method, preset: names from ``training.methods``, METHODS and PRESETS.
-        base: a run, a bundle or a PLY of splats to begin with instead of the scene's points, for methods that
-            can; "" for none.
-        capture: where there is no scene, from where the base is drawn, so that its pictures are the
-            photographs: DOME, from all around, or a folder of camera files; "" for nowhere.
-        views, view_width: how many views a dome has, and the width of their pictures in pixels.
-        seed: makes two runs of one job equal to the bit on one machine, but not with the cuda backend.
-        backend: rasterizer, one of BACKENDS; auto is cuda where that works, else cpu. A run may go on with
-            another one.
-        image_scale: training image size over the photograph's, 0 < s <= 1.
-        test_every: every n-th view by name is held out to measure quality; 0 trains on all.
-        validation: hold out other views instead and leave those out altogether: who tries settings measures
-            them so, and the views that report quality have had no part in it.
-        exposure: stops added to linear (EXR) images before they are trained on.
-        photo_memory: megabytes of photographs that are kept; others are read ahead while steps go on. 0: a
-            quarter of the memory that is free, 2 GB at most. What is trained does not depend on it.
-        splat_memory: megabytes of splats, with what training keeps of each, that are in memory at a time,
-            where a method can have the others in a file (tree). 0: half of the memory that is free. With less
-            than all need, what is trained depends on it a little.
-        region: what of the scene is trained in detail, in its coordinates, as ``Crop.from_text`` has it; or,
-            of a part of a scene in cells, the file of ``scenes.regions`` that says what it is trained on; ""
-            for all.
-        cells: how many cells on the ground are trained one by one, "COLUMNSxROWS", and then put together; ""
-            for the scene as a whole.
-        polish: steps that fit each cell's borders to the cells beside it, once all are trained; 0 for none.
-        model, images: the COLMAP model's and the photographs' folder where they are not found by themselves.
-        parameters: changes to the preset's parameters by name.
+        scene: folder of the COLMAP scene; "" if there is none, see ``capture``.
+        out: run folder; created if it does not exist.
+        method, preset: names from METHODS and PRESETS of ``training.methods``.
+        base: run, bundle or PLY of splats to start from instead of the scene's points, for methods that
+            support it; "" for none.
+        capture: viewpoints for rendering the base as training images if there is no scene: DOME, or a folder
+            of camera files; "" if there is a scene.
+        views, view_width: number of views of a dome, and their image width in pixels.
+        seed: random seed. Runs of the same job on one machine are bit-identical, except with cuda.
+        backend: rasterizer, one of BACKENDS; auto is cuda if available, else cpu. May change on resume.
+        image_scale: training image size relative to the photo, 0 < s <= 1.
+        test_every: every n-th view by name is held out to measure quality; 0 trains on all views.
+        validation: hold out the views between the test views instead, and exclude the test views, so that
+            choosing settings does not use the views that report quality.
+        exposure: stops added to linear (EXR) images before training.
+        photo_memory: megabytes for decoded photos; further ones are decoded in the background. 0 is a quarter
+            of the free memory, at most 2 GB. Does not change the result.
+        splat_memory: megabytes for splats and their optimizer state, for methods that keep the others on disk
+            (tree). 0 is half of the free memory. If not all fit, the result depends on it slightly.
+        region: part of the scene to train in detail, in scene coordinates, see ``Crop.from_text``; for a part
+            of a scene in cells, its region file (``scenes.regions``); "" for the full scene.
+        cells: number of cells on the ground that are trained separately and merged, "COLUMNSxROWS"; "" for
+            none.
+        polish: steps that fit each cell's borders to its neighbours after training; 0 disables.
+        model, images: folders of the COLMAP model and of the photos, if they are not in the usual place.
+        parameters: changed parameters of the preset, by name.
     """
 
     scene: str
@@ -101,19 +98,19 @@ class Job:
 
     @classmethod
     def from_file(cls, path: Path) -> Job:
-        """Reads a job; relative paths in it are relative to its folder.
+        """Read and check a job; relative paths are relative to its folder.
 
-        A run is its folder, wherever that lies: one that has begun goes on there, whatever its job says.
+        A started run stays in its folder even if that was moved: the job's ``out`` is ignored then.
 
         Raises:
-            LodgsError: if the file cannot be read, or a key or value in it is not possible.
+            LodgsError: the file cannot be read, or a key or value is invalid.
         """
         path = Path(path)
         kind = path.suffix.lower()
         if kind not in (".toml", ".json") and path.exists():
             raise LodgsError(
-                f"{path} is neither a job file (.toml or .json) nor the folder of a scene.",
-                "Name one of these; unpack an archive first.",
+                f"Cannot read {path}: it is neither a job file (.toml or .json) nor a scene folder.",
+                "Choose one of these; unpack archives first.",
             )
         read = read_json if kind == ".json" else read_toml
         values = read(path, f"The job file {path}")
@@ -142,7 +139,7 @@ class Job:
         values = {"scene": "", **values} if values.get("capture") else dict(values)
         for key in ("out",) if values.get("capture") else ("scene", "out"):
             if not values.get(key):
-                raise LodgsError(f"The job does not say '{key}'.", f'Add a line: {key} = "..."')
+                raise LodgsError(f"The job has no key '{key}'.", f'Add a line: {key} = "..."')
         for key in ("scene", "out", "base", "capture", "model", "images", "region"):
             value = values.get(key)
             if not value or (key, value) == ("capture", DOME):
@@ -160,16 +157,16 @@ class Job:
                 raise LodgsError(f"{key.name} = {quote(value)} is not {name}.")
         if not (0 <= self.seed < 2**31 and 0 <= self.test_every < 2**31) or self.test_every == 1:
             raise LodgsError(
-                f"seed = {self.seed!r}, test_every = {self.test_every!r} is not possible.",
-                f"Both are whole numbers from 0 to {2**31 - 1}, and test_every is not 1.",
+                f"Invalid job keys seed = {self.seed!r}, test_every = {self.test_every!r}.",
+                f"Give whole numbers from 0 to {2**31 - 1}; test_every must not be 1.",
             )
         if not 0 < self.image_scale <= 1:
             raise LodgsError(
-                f"image_scale = {self.image_scale!r} is not possible.", "Give a number above 0, at most 1."
+                f"Invalid job key image_scale = {self.image_scale!r}.", "Give a number above 0, at most 1."
             )
         if not abs(self.exposure) <= MAX_STOPS:
             raise LodgsError(
-                f"exposure = {self.exposure!r} is not possible.",
+                f"Invalid job key exposure = {self.exposure!r}.",
                 f"Give stops from {-MAX_STOPS} to {MAX_STOPS}.",
             )
         for key, what in (("photo_memory", "megabytes"), ("splat_memory", "megabytes"), ("polish", "steps")):
@@ -201,13 +198,13 @@ class Job:
     def _check_capture(self) -> None:
         if not self.base:
             raise LodgsError(
-                "There are no splats to capture views of.", "Say 'base', or leave out 'capture'."
+                "Cannot capture views: the job has no base.", "Add 'base', or remove 'capture'."
             )
         for key in ("scene", "model", "images"):
             if getattr(self, key):
                 raise LodgsError(
-                    f"The job says both 'capture' and '{key}'.",
-                    "Leave out one of them: photographs are taken, or they are there.",
+                    f"The job has both 'capture' and '{key}'.",
+                    "Remove 'capture' to train on photos, or the other key to train on captured views.",
                 )
         check_views(self.views, self.view_width)
 
@@ -215,23 +212,23 @@ class Job:
         columns, rows = self.grid
         if not 0 < columns * rows <= MAX_CELLS:
             raise LodgsError(
-                f"cells = {self.cells!r} is not possible.",
-                f"Say columns and rows, such as 2x4, {MAX_CELLS} cells at most.",
+                f"Invalid job key cells = {self.cells!r}.",
+                f"Give columns and rows such as 2x4, at most {MAX_CELLS} cells.",
             )
         for key in ("base", "capture", "region"):
             if getattr(self, key):
-                raise LodgsError(f"The job says both 'cells' and '{key}'.", "Leave out one of them.")
+                raise LodgsError(f"The job has both 'cells' and '{key}'.", "Remove one of them.")
         if not method_info(self.method).in_cells:
             raise LodgsError(
-                f"The method '{self.method}' cannot train cells one by one.",
-                "Choose another method, or leave out 'cells'.",
+                f"The method '{self.method}' cannot train a scene in cells.",
+                "Choose another method, or remove 'cells'.",
             )
 
     def with_cells(self, cells: str) -> Job:
-        """The same job in cells.
+        """Return the same job with another number of cells.
 
         Raises:
-            LodgsError: it cannot be divided so.
+            LodgsError: the job cannot be divided into these cells.
         """
         job = replace(self, cells=cells)
         job._check_cells()
@@ -239,22 +236,22 @@ class Job:
 
     @property
     def crop(self) -> Crop | None:
-        """What is trained in detail; None for all."""
+        """Region that is trained in detail; None for the full scene."""
         return Crop.from_text(self.region) if is_text_of_crop(self.region) else None
 
     @property
     def cell(self) -> str:
-        """The file of the cell that this job trains; "" where it trains none."""
+        """Region file of the cell that this job trains; "" if it is not a cell's job."""
         return "" if is_text_of_crop(self.region) else self.region
 
     @property
     def grid(self) -> tuple[int, int]:
-        """Columns and rows of ``cells``; (0, 0) where it says none."""
+        """Columns and rows of ``cells``; (0, 0) without cells."""
         columns, _, rows = self.cells.lower().partition("x")
         return (int(columns), int(rows)) if columns.isdecimal() and rows.isdecimal() else (0, 0)
 
     def resolved_parameters(self) -> Parameters:
-        """The preset's parameters with this job's changes."""
+        """Return the preset's parameters with this job's changes."""
         return self._parameters
 
     @cached_property
@@ -263,22 +260,22 @@ class Job:
         return parameters_of(self.method, self.preset, {**captured, **self.parameters})
 
     def resolved(self) -> Job:
-        """The same job with every parameter written out, so that a later version repeats it unchanged."""
-        told, known = self.resolved_parameters(), method_info(self.method).fields
-        values = {each.name: getattr(told, each.name) for each in known}
+        """Return the same job with all parameters explicit, so that later versions repeat it unchanged."""
+        resolved = self.resolved_parameters()
+        values = {field.name: getattr(resolved, field.name) for field in method_info(self.method).fields}
         return replace(
             self, parameters={k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
         )
 
     def write(self, path: Path) -> None:
-        """Writes the job as TOML; in its own run, it says that it is there, and so is what lies in it."""
+        """Write the job as TOML; in its own run folder, paths inside the run are written as relative."""
         values = asdict(self)
         if Path(self.out) == path.parent:
             values["out"] = "."
             for key in ("base", "capture", "region"):
                 if values[key] != DOME and path.parent in Path(values[key]).parents:
                     values[key] = f"./{Path(values[key]).relative_to(path.parent).as_posix()}"
-            if self.cell and Path(self.base).parent == path.parent.parent:  # both are parts of one run
+            if self.cell and Path(self.base).parent == path.parent.parent:  # both belong to one run
                 values["base"] = f"../{Path(self.base).name}"
         table = values.pop("parameters")
         lines = [_toml_line(name, value) for name, value in values.items()]
@@ -288,31 +285,35 @@ class Job:
 
 
 def save_job(job: Job, folder: RunFolder) -> None:
-    """Writes a resolved job into its run, which keeps to the one that it began with, but for CHANGEABLE.
+    """Write a resolved job into its run folder. Only CHANGEABLE keys may differ from an existing job.
 
     Raises:
-        LodgsError: the folder is of another job.
-        OSError: it cannot be written.
+        LodgsError: the folder belongs to another job.
+        OSError: the job cannot be written.
     """
     if folder.job.exists():
-        before = asdict(Job.from_file(folder.job).resolved())
-        other = [key for key, value in asdict(job).items() if before[key] != value]
-        changed = [key for key in other if key not in CHANGEABLE]
-        if changed:
+        existing = asdict(Job.from_file(folder.job).resolved())
+        differing = [key for key, value in asdict(job).items() if existing[key] != value]
+        conflicts = [key for key in differing if key not in CHANGEABLE]
+        if conflicts:
             raise LodgsError(
-                f"The run folder {folder.path} belongs to another job (different: {', '.join(changed)}).",
-                "Choose another run folder, or start the run's own job.toml to resume it.",
+                f"The run folder {folder.path} belongs to another job (different: {', '.join(conflicts)}).",
+                "Choose another run folder, or resume the run with its own job.toml.",
             )
-        if not set(other) - {"out"}:
+        if not set(differing) - {"out"}:
             return
     job.write(folder.job)
 
 
 def check_views(views: int, width: int) -> None:
-    """Raises LodgsError where so many views, or pictures so many pixels wide, are not captured."""
+    """Check number and image width of captured views.
+
+    Raises:
+        LodgsError: a value is outside VIEWS or VIEW_WIDTHS.
+    """
     for name, value, (low, high) in (("views", views, VIEWS), ("view_width", width, VIEW_WIDTHS)):
         if not low <= value <= high:
-            raise LodgsError(f"{name} = {value} is not possible.", f"Give a number from {low} to {high}.")
+            raise LodgsError(f"Invalid {name} = {value}.", f"Give a number from {low} to {high}.")
 
 
 def _path(key: str, value: object, folder: Path) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..errors import LodgsError
-from ..splats.placing import Placement
+from ..splats.similarity import Similarity
 
 FLAT = 1e-3
 """Places along a line are spread less than this share of its length beside it."""
@@ -116,7 +116,7 @@ def about_cameras(places: np.ndarray, center: np.ndarray, depth: float) -> np.nd
     return near if len(near) > FEW else places
 
 
-def level_at_zero(normal: np.ndarray, middle: np.ndarray) -> Placement:
+def level_at_zero(normal: np.ndarray, middle: np.ndarray) -> Similarity:
     """What makes a plane z = 0 with its normal (3,) up: turned as little as possible about its point (3,),
     and moved up or down."""
     z = np.array([0.0, 0.0, 1.0])
@@ -126,10 +126,10 @@ def level_at_zero(normal: np.ndarray, middle: np.ndarray) -> Placement:
     else:
         cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
         rotation = np.eye(3) + cross + cross @ cross / (1 + cosine)
-    return Placement(rotation, 1.0, middle * (1, 1, 0) - rotation @ middle)
+    return Similarity(rotation, 1.0, middle * (1, 1, 0) - rotation @ middle)
 
 
-def scaled_about(place: np.ndarray, scale: float) -> Placement:
+def scaled_about(place: np.ndarray, scale: float) -> Similarity:
     """What scales about a place (3,), which stays."""
     place = np.asarray(place, np.float64)
-    return Placement(np.eye(3), scale, place - scale * place)
+    return Similarity(np.eye(3), scale, place - scale * place)

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..documents import open_file
 from ..errors import LodgsError, printable
-from ..splats.placing import Placement
+from ..splats.similarity import Similarity
 
 DAMAGED = "Copy the model again, or write it anew with COLMAP's model_converter."
 
@@ -245,7 +245,7 @@ def write_model(
             struct.pack("<iQQ", model_id, lens.width, lens.height) + lens.parameters.astype("<f8").tobytes()
         )
         number = numbers.setdefault(camera, len(numbers) + 1)
-        values = *Placement(pose[:3, :3], 1.0, pose[:3, 3]).quat, *pose[:3, 3]
+        values = *Similarity(pose[:3, :3], 1.0, pose[:3, 3]).quat, *pose[:3, 3]
         text = name.encode("utf-8", "surrogateescape")
         images.append(struct.pack("<i7di", place, *values, number) + text + b"\0" + struct.pack("<Q", 0))
     cameras = [struct.pack("<i", number) + camera for camera, number in numbers.items()]

@@ -13,8 +13,8 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from ..errors import LodgsError
-from ..splats.placing import Placement
 from ..splats.ply import Columns
+from ..splats.similarity import Similarity
 from .cameras import Camera, camera_from_dict
 
 VIEWS, NAMES = "views", "view_names"
@@ -78,7 +78,7 @@ def views_in(tables: dict[str, Columns]) -> tuple[list[Camera], float, set[str]]
         ) from error
 
 
-def placed(views: Columns, placement: Placement) -> Columns:
+def placed(views: Columns, placement: Similarity) -> Columns:
     """The table ``views`` of a scene that stands elsewhere: the pictures stay the same."""
     found, (turn, shift) = dict(views), (placement.rotation, placement.translation)
     poses = np.stack([views[name] for name in _POSE], axis=1).astype(np.float64).reshape(-1, 3, 4)

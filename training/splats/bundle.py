@@ -18,29 +18,39 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..documents import json_object, read_json, shown
+from ..documents import parse_json, quote, read_json
 from ..errors import LodgsError
 from ..files import atomic_write
-from .dialects import FARTHEST, Warn, as_3dgs, comments_of, drawable, in_3dgs, left_out, meta_of, silent
+from .dialects import (
+    MAX_COORDINATE,
+    Warn,
+    comments_from_meta,
+    drawable_3dgs,
+    drop_undrawable,
+    dropped_message,
+    ignore,
+    meta_from_comments,
+    to_3dgs,
+)
 from .gaussians import SplatRows, Splats
 from .ply import (
-    AT_ONCE,
+    BATCH_ROWS,
     Columns,
     Element,
-    columns_of,
-    columns_of_extras,
-    let_go,
+    extra_columns,
     read_comments,
     read_elements,
     read_ply,
-    splats_from,
+    release_pages,
+    splat_columns,
+    splats_from_rows,
     write_elements,
 )
 
 FORMAT_VERSION = 2
-MOST_LEVELS = 12
+MAX_LEVELS = 12
 """Levels that a job may ask for, or get from its scene: a header has no room for many more."""
-MOST_LEVELS_READ = 64
+MAX_READ_LEVELS = 64
 """Levels that are read of a file of anybody's making."""
 ORDERS = ("finest_first", "stream")
 TABLES_FILE = "tables.ply"
@@ -71,18 +81,18 @@ class Level:
         number: 1 is the coarsest.
         splats: the level's splats with final scales and opacities.
         facts: numbers of this level by name that its rule needs, such as FLoD's ``s_min``.
-        elsewhere: the splats, where they are not in memory but read a few at a time to be written.
+        on_disk: the splats, where they are not in memory but read a few at a time to be written.
     """
 
     number: int
     splats: Splats
     facts: dict[str, float] = field(default_factory=dict)
-    elsewhere: SplatRows | None = None
+    on_disk: SplatRows | None = None
 
     @property
     def rows(self) -> SplatRows:
         """The splats, wherever they are."""
-        return self.splats if self.elsewhere is None else self.elsewhere
+        return self.splats if self.on_disk is None else self.on_disk
 
     @property
     def sh_degree(self) -> int:
@@ -127,17 +137,17 @@ class Bundle:
         return bool(self.meta.get("antialias"))
 
     @property
-    def upright(self) -> np.ndarray:
+    def up_rotation(self) -> np.ndarray:
         """(3, 3) float64, the rotation that turns the scene upright, z up: as ``meta`` says, or else from -y,
         which is up in most files of splats."""
         return np.array(self.meta.get("up_rotation", ((1, 0, 0), (0, 0, 1), (0, -1, 0))), np.float64)
 
     @property
-    def elsewhere(self) -> bool:
+    def on_disk(self) -> bool:
         """Whether splats of a level are not in memory."""
-        return any(level.elsewhere is not None for level in self.levels)
+        return any(level.on_disk is not None for level in self.levels)
 
-    def upto(self, number: int) -> list[Level]:
+    def drawn_levels(self, number: int) -> list[Level]:
         """The levels that are drawn at a level: it, and where levels add up the coarser ones before it."""
         return [
             level
@@ -164,17 +174,17 @@ def write_bundle(path: str | Path, bundle: Bundle, order: str = "finest_first") 
     if order == "stream" or bundle.cumulative:
         levels.reverse()
     if bundle.cumulative:
-        elements = [Element.of_splats("vertex", [level.rows for _, level in levels], columns_of)]
+        elements = [Element.of_splats("vertex", [level.rows for _, level in levels], splat_columns)]
     else:
         names = ["vertex", *(f"lod_{lod}_vertex" for lod, _ in levels[1:])]
         elements = [
-            Element.of_splats(name, [level.rows], columns_of)
+            Element.of_splats(name, [level.rows], splat_columns)
             for name, (_, level) in zip(names, levels, strict=True)
         ]
     extras = {
-        lod: Element.of_splats(f"lod_extra_{lod}", [level.rows], columns_of_extras)
+        lod: Element.of_splats(f"lod_extra_{lod}", [level.rows], extra_columns)
         for lod, level in levels
-        if columns_of_extras(level.rows.select(slice(0, 0)))
+        if extra_columns(level.rows.select(slice(0, 0)))
     }
     comments = [_comment(_head(bundle, order=order))]
     offset = 0
@@ -193,15 +203,15 @@ def write_bundle(path: str | Path, bundle: Bundle, order: str = "finest_first") 
             "Keep meta to a few numbers and names.",
         )
     everything = [*elements, *extras.values(), *_table_elements(bundle)]
-    write_elements(path, everything, comments + comments_of(bundle.meta))
+    write_elements(path, everything, comments + comments_from_meta(bundle.meta))
 
 
-RowsOf = Callable[[Bundle], Mapping[int, np.ndarray]]
+RowSelector = Callable[[Bundle], Mapping[int, np.ndarray]]
 """Of a bundle with its tables, but without splats yet: which rows (M,) of each level to read, by number;
 those beyond its last one do not count."""
 
 
-def read_bundle(path: str | Path, warn: Warn = silent, rows_of: RowsOf | None = None) -> Bundle:
+def read_bundle(path: str | Path, warn: Warn = ignore, rows_of: RowSelector | None = None) -> Bundle:
     """Read a bundle as it was written, bit for bit; any other 3DGS PLY reads as one level of unknown method.
 
     Splats that cannot be drawn are left out (`dialects.drawable`).
@@ -218,22 +228,22 @@ def read_bundle(path: str | Path, warn: Warn = silent, rows_of: RowsOf | None = 
     elements, comments = read_elements(path)
     bundle, lines = _parse(comments, path)
     if bundle is None:
-        splats = as_3dgs(splats_from(elements["vertex"], path), path, warn)
-        return Bundle("", [Level(1, splats)], meta=meta_of(comments))
+        splats = drawable_3dgs(splats_from_rows(elements["vertex"], path), path, warn)
+        return Bundle("", [Level(1, splats)], meta=meta_from_comments(comments))
     rows = _rows_of_levels(bundle, lines, elements, path)
     try:
         wanted = {} if rows_of is None else rows_of(bundle)
         for level in bundle.levels:
             found, some = rows[level.number], wanted.get(level.number, slice(None))
             some = some if isinstance(some, slice) else some[some < len(found)]
-            level.splats = drawable(found.select(some), path, warn)
+            level.splats = drop_undrawable(found.select(some), path, warn)
         return bundle
     except _CONTRADICTIONS as error:
         raise _contradiction(path, error) from error
 
 
 @dataclass(frozen=True)
-class Rows:
+class FileRows:
     """A level's splats in a file.
 
     Attributes:
@@ -256,7 +266,7 @@ class Rows:
             there = () if rows is None else rows.dtype.names or ()
             found |= {name: np.array(rows[name][some]) for name in names if name in there}  # type: ignore[index]
             if rows is not None:
-                let_go(rows)
+                release_pages(rows)
         return found
 
     def select(self, some: slice | np.ndarray) -> Splats:
@@ -265,13 +275,13 @@ class Rows:
         Raises:
             LodgsError: as ``splats_from``.
         """
-        splats = splats_from(self.vertices[some], self.path)
+        splats = splats_from_rows(self.vertices[some], self.path)
         if self.extras is not None:
             extras = self.extras[some]
             splats.extras |= {column: np.array(extras[column]) for column in extras.dtype.names or ()}
-        let_go(self.vertices)
+        release_pages(self.vertices)
         if self.extras is not None:
-            let_go(self.extras)
+            release_pages(self.extras)
         return splats
 
 
@@ -284,32 +294,32 @@ class DrawableRows:
         warn: as for `read_ply`.
     """
 
-    def __init__(self, rows: Rows, warn: Warn = silent) -> None:
+    def __init__(self, rows: FileRows, warn: Warn = ignore) -> None:
         self._rows, self._kept = rows, None
         kept, tell = [], warn
-        for begin in range(0, len(rows), AT_ONCE):
-            splats = self._meant(slice(begin, begin + AT_ONCE), tell)
+        for begin in range(0, len(rows), BATCH_ROWS):
+            splats = self._meant(slice(begin, begin + BATCH_ROWS), tell)
             splats.extras = {_ROW: begin + np.arange(len(splats))}
-            kept.append(drawable(splats, rows.path).extras[_ROW])
-            tell = silent
+            kept.append(drop_undrawable(splats, rows.path).extras[_ROW])
+            tell = ignore
         missing = len(rows) - sum(map(len, kept))
         if missing:
             self._kept = np.concatenate(kept)
-            warn(left_out(missing, rows.path))
+            warn(dropped_message(missing, rows.path))
 
     def __len__(self) -> int:
         return len(self._rows) if self._kept is None else len(self._kept)
 
     def select(self, some: slice | np.ndarray, /) -> Splats:
         """The splats of a range of rows, or of some rows (M,) ascending."""
-        return drawable(self._meant(some if self._kept is None else self._kept[some]), self._rows.path)
+        return drop_undrawable(self._meant(some if self._kept is None else self._kept[some]), self._rows.path)
 
-    def _meant(self, some: slice | np.ndarray, warn: Warn = silent) -> Splats:
+    def _meant(self, some: slice | np.ndarray, warn: Warn = ignore) -> Splats:
         splats = self._rows.select(some)
-        return splats if self._rows.extras is not None else in_3dgs(splats, self._rows.path, warn)
+        return splats if self._rows.extras is not None else to_3dgs(splats, self._rows.path, warn)
 
 
-def open_bundle(path: str | Path) -> tuple[Bundle, dict[int, Rows]]:
+def open_bundle(path: str | Path) -> tuple[Bundle, dict[int, FileRows]]:
     """A bundle with its tables, but without splats, and each level's by number to read of, as they stand
     there: of a binary file nothing else is read. Any other PLY is one level of unknown method.
 
@@ -319,23 +329,23 @@ def open_bundle(path: str | Path) -> tuple[Bundle, dict[int, Rows]]:
     elements, comments = read_elements(path)
     bundle, lines = _parse(comments, path)
     if bundle is None:
-        bundle = Bundle("", [Level(1, NO_SPLATS)], meta=meta_of(comments))
-        return bundle, {1: Rows(elements["vertex"], None, path)}
+        bundle = Bundle("", [Level(1, NO_SPLATS)], meta=meta_from_comments(comments))
+        return bundle, {1: FileRows(elements["vertex"], None, path)}
     return bundle, _rows_of_levels(bundle, lines, elements, path)
 
 
-def open_ply(path: str | Path) -> Rows:
+def open_ply(path: str | Path) -> FileRows:
     """The splats of a plain PLY to read of, as they stand in the file.
 
     Raises:
         LodgsError: as ``read_elements``.
     """
-    return Rows(read_elements(path)[0]["vertex"], None, path)
+    return FileRows(read_elements(path)[0]["vertex"], None, path)
 
 
 def _rows_of_levels(
     bundle: Bundle, lines: list[dict], elements: dict[str, np.ndarray], path: str | Path
-) -> dict[int, Rows]:
+) -> dict[int, FileRows]:
     """Where each level's splats are; the bundle gets its tables.
 
     Raises:
@@ -355,7 +365,7 @@ def _rows_of_levels(
             extras = apart.pop(line["extras"]) if "extras" in line else None
             if len(rows) != count or (extras is not None and len(extras) != count):
                 raise ValueError(f"level {line['level']} should have {count} splats")
-            found[line["level"]] = Rows(rows, extras, path)
+            found[line["level"]] = FileRows(rows, extras, path)
         for name in of_levels:
             if begin[name] != len(elements[name]):
                 raise ValueError(f"{name} has more splats than its levels")
@@ -364,7 +374,7 @@ def _rows_of_levels(
         raise _contradiction(path, error) from error
 
 
-def read_head(path: str | Path) -> Bundle:
+def read_header(path: str | Path) -> Bundle:
     """What a bundle says of its levels, in the time that its header takes: the levels are without splats.
 
     Any other 3DGS PLY is one level of unknown method.
@@ -373,7 +383,7 @@ def read_head(path: str | Path) -> Bundle:
         LodgsError: as `read_bundle`.
     """
     comments = read_comments(path)
-    return _parse(comments, path)[0] or Bundle("", [Level(1, NO_SPLATS)], meta=meta_of(comments))
+    return _parse(comments, path)[0] or Bundle("", [Level(1, NO_SPLATS)], meta=meta_from_comments(comments))
 
 
 def read_tables(path: str | Path) -> dict[str, Columns]:
@@ -402,7 +412,7 @@ def write_folder(folder: str | Path, bundle: Bundle) -> None:
     """
     _check(bundle)
     folder = Path(folder)
-    first, *others = [columns_of_extras(level.rows.select(slice(0, 0))) for level in bundle.levels]
+    first, *others = [extra_columns(level.rows.select(slice(0, 0))) for level in bundle.levels]
     shared = {
         name
         for name, column in first.items()
@@ -416,13 +426,13 @@ def write_folder(folder: str | Path, bundle: Bundle) -> None:
         for lod, level in enumerate(reversed(bundle.levels)):
             path = folder / f"lod{lod}.ply"
             temporary = stack.enter_context(atomic_write(path))
-            drawn = bundle.upto(level.number)
+            drawn = bundle.drawn_levels(level.number)
             element = Element.of_splats(
                 "vertex",
                 [x.rows for x in drawn],
-                lambda some: columns_of(some) | {name: some.extras[name] for name in sorted(shared)},
+                lambda some: splat_columns(some) | {name: some.extras[name] for name in sorted(shared)},
             )
-            write_elements(temporary, [element], comments_of(bundle.meta))
+            write_elements(temporary, [element], comments_from_meta(bundle.meta))
             with open(temporary, "rb") as file:
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
             manifest["levels"].append(
@@ -433,14 +443,14 @@ def write_folder(folder: str | Path, bundle: Bundle) -> None:
                     "bytes": temporary.stat().st_size,
                     "sha256": digest,
                 }
-                | {"bounds": bounds_of([x.rows for x in drawn])}
+                | {"bounds": bounding_box([x.rows for x in drawn])}
             )
         if bundle.tables:
             temporary = stack.enter_context(atomic_write(folder / TABLES_FILE))
-            no_splats = Element.of("vertex", columns_of(NO_SPLATS))
+            no_splats = Element.of("vertex", splat_columns(NO_SPLATS))
             write_elements(temporary, [no_splats, *_table_elements(bundle)])
         manifest_file.write_text(
-            json.dumps(manifest, indent=1, default=as_plain, allow_nan=False) + "\n", "ascii"
+            json.dumps(manifest, indent=1, default=json_default, allow_nan=False) + "\n", "ascii"
         )
     unused = [
         file
@@ -452,7 +462,7 @@ def write_folder(folder: str | Path, bundle: Bundle) -> None:
             file.unlink()
 
 
-def read_folder(folder: str | Path, warn: Warn = silent) -> Bundle:
+def read_folder(folder: str | Path, warn: Warn = ignore) -> Bundle:
     """Read a folder of levels: by its ``manifest.json``, or any one series ``lodN.ply`` or ``NAME_lodN.ply``.
 
     Where levels add up, each is what its file has after the rows of the next coarser one.
@@ -473,13 +483,13 @@ def read_folder(folder: str | Path, warn: Warn = silent) -> Bundle:
             begin = 0
             for level, line in zip(bundle.levels, lines, strict=True):
                 file = folder / Path(line["file"]).name
-                splats = splats_from(read_elements(file)[0]["vertex"], file)
+                splats = splats_from_rows(read_elements(file)[0]["vertex"], file)
                 if not begin <= line["count"] == len(splats):
                     raise ValueError(f"level {level.number} should have {line['count']} splats")
                 if bundle.cumulative:
                     splats = splats.select(slice(begin, None))
                     begin = line["count"]
-                level.splats = drawable(splats, file, warn)
+                level.splats = drop_undrawable(splats, file, warn)
             if lines_of_tables := _of_kind(manifest.get("tables", []), list, "tables"):
                 bundle.tables = _read_tables(lines_of_tables, read_elements(folder / TABLES_FILE)[0])
             return bundle
@@ -495,12 +505,12 @@ def read_folder(folder: str | Path, warn: Warn = silent) -> Bundle:
             "Choose a folder with one series, or a single PLY.",
         )
     coarse_first = [file for _, file in sorted(next(iter(series.values())), reverse=True)]
-    if len(coarse_first) > MOST_LEVELS_READ:
+    if len(coarse_first) > MAX_READ_LEVELS:
         raise LodgsError(
-            f"{folder} has {len(coarse_first)} levels.", f"Leave at most {MOST_LEVELS_READ} of them there."
+            f"{folder} has {len(coarse_first)} levels.", f"Leave at most {MAX_READ_LEVELS} of them there."
         )
     levels = [Level(i, read_ply(file, warn)) for i, file in enumerate(coarse_first, 1)]
-    return Bundle("", levels, meta=read_head(coarse_first[-1]).meta)
+    return Bundle("", levels, meta=read_header(coarse_first[-1]).meta)
 
 
 def _check(bundle: Bundle) -> None:
@@ -543,7 +553,7 @@ def _read_tables(lines: list[dict], elements: dict[str, np.ndarray]) -> dict[str
     for line in lines:
         name = _of_kind(line["table"], str, "table")
         if line["element"] != f"lod_{name}":
-            raise ValueError(f"the table {shown(name)} is in another element")
+            raise ValueError(f"the table {quote(name)} is in another element")
         rows = elements.pop(line["element"])
         tables[name] = {column: np.array(rows[column]) for column in rows.dtype.names or ()}
     return tables
@@ -555,7 +565,7 @@ def _parse(comments: list[str], path: str | Path) -> tuple[Bundle | None, list[d
     if not ours:
         return None, []
     try:
-        head, *lines = [json_object(text, f"A comment of {path}") for text in ours]
+        head, *lines = [parse_json(text, f"A comment of {path}") for text in ours]
         meta = next((line["meta"] for line in lines if "meta" in line), {})
         return _bundle(head, [line for line in lines if "level" in line], meta, path), lines
     except _CONTRADICTIONS as error:
@@ -571,10 +581,14 @@ def _bundle(head: dict, lines: list[dict], meta: dict, path: str | Path) -> Bund
     for name, shape in META_SHAPES.items():
         if name in meta:
             values = np.asarray(meta[name])
-            if values.shape != shape or values.dtype.kind not in "if" or (np.abs(values) > FARTHEST).any():
+            if (
+                values.shape != shape
+                or values.dtype.kind not in "if"
+                or (np.abs(values) > MAX_COORDINATE).any()
+            ):
                 raise ValueError(f"{name} is not {shape} numbers")
     _of_kind(meta.get("antialias", False), bool, "antialias")
-    if not 1 <= len(_of_kind(lines, list, "levels")) <= MOST_LEVELS_READ:
+    if not 1 <= len(_of_kind(lines, list, "levels")) <= MAX_READ_LEVELS:
         raise ValueError(f"{len(lines)} levels")
     for line in lines:
         _whole(line["count"], "count")
@@ -603,14 +617,14 @@ def _bundle(head: dict, lines: list[dict], meta: dict, path: str | Path) -> Bund
 def _of_kind(value: Kind, kind: type[Kind], name: str) -> Kind:
     """The value, or a TypeError where it is of another kind."""
     if not isinstance(value, kind):
-        raise TypeError(f"{name} = {shown(value)} is no {kind.__name__}")
+        raise TypeError(f"{name} = {quote(value)} is no {kind.__name__}")
     return value
 
 
 def _whole(value: int, name: str) -> int:
     """The value, or an error where it is no count."""
     if type(value) is not int or value < 0:
-        raise ValueError(f"{name} = {shown(value)} is no whole number")
+        raise ValueError(f"{name} = {quote(value)} is no whole number")
     return value
 
 
@@ -650,7 +664,7 @@ def _numbers(values: dict) -> dict[str, float]:
     """Facts as they are; ValueError or TypeError where one is no number that single precision holds."""
     for name, value in _of_kind(values, dict, "facts").items():
         if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > _LARGEST_FACT:
-            raise ValueError(f"{name} = {shown(value)} is no such number")
+            raise ValueError(f"{name} = {quote(value)} is no such number")
     return dict(values)
 
 
@@ -662,12 +676,12 @@ def _contradiction(path: str | Path, error: Exception) -> LodgsError:
     )
 
 
-def bounds_of(sets: Sequence[SplatRows]) -> list[list[float]]:
+def bounding_box(sets: Sequence[SplatRows]) -> list[list[float]]:
     """Smallest and largest x, y, z of the means that are numbers, of all sets of splats together."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for rows in sets:
-        for begin in range(0, len(rows), AT_ONCE):
-            means = rows.select(slice(begin, begin + AT_ONCE)).means
+        for begin in range(0, len(rows), BATCH_ROWS):
+            means = rows.select(slice(begin, begin + BATCH_ROWS)).means
             means = means[np.isfinite(means).all(axis=1)]
             low = np.minimum(low, means.min(axis=0, initial=np.inf))
             high = np.maximum(high, means.max(axis=0, initial=-np.inf))
@@ -675,12 +689,12 @@ def bounds_of(sets: Sequence[SplatRows]) -> list[list[float]]:
 
 
 def _comment(facts: dict) -> str:
-    text = json.dumps(facts, separators=(",", ":"), default=as_plain, allow_nan=False)
+    text = json.dumps(facts, separators=(",", ":"), default=json_default, allow_nan=False)
     for word in _FORBIDDEN:  # such words only occur inside JSON strings, where an escape means the same
         text = text.replace(word, f"{word[:-1]}\\u{ord(word[-1]):04x}")
     return _TAG + text
 
 
-def as_plain(value):
+def json_default(value):
     """A numpy scalar or array as json knows it: its ``default``."""
     return value.tolist()

@@ -18,7 +18,7 @@ from .gaussians import Splats
 Warn = Callable[[str], object]
 """Receives one sentence for each thing that was left out or is shown otherwise than its maker shows it."""
 
-FARTHEST, BRIGHTEST = 1e12, 1e6
+MAX_COORDINATE, MAX_COEFFICIENT = 1e12, 1e6
 """The largest coordinate and size, and the largest coefficient of a colour, that are read of a splat: single
 precision then holds whatever a renderer makes of them."""
 
@@ -30,11 +30,11 @@ _TEMPORAL = {"trbf_center", "trbf_scale", "motion_0", "scale_t", "scale_t_0", "t
 _MIP = "SplatRenderMode: mip"
 
 
-def silent(message: str) -> None:
+def ignore(message: str) -> None:
     """Warnings that nobody asked for."""
 
 
-def refuse(columns: Collection[str], comments: Iterable[str], path: str | Path) -> None:
+def reject_unsupported(columns: Collection[str], comments: Iterable[str], path: str | Path) -> None:
     """Raise a LodgsError for a dialect that cannot be drawn as it was meant; ``path`` is for the message.
 
     Args:
@@ -46,13 +46,13 @@ def refuse(columns: Collection[str], comments: Iterable[str], path: str | Path) 
         raise LodgsError(f"{path} {what}", remedy)
 
 
-def as_3dgs(splats: Splats, path: str | Path, warn: Warn = silent) -> Splats:
+def drawable_3dgs(splats: Splats, path: str | Path, warn: Warn = ignore) -> Splats:
     """`in_3dgs`, without what cannot be drawn (`drawable`)."""
-    return drawable(in_3dgs(splats, path, warn), path, warn)
+    return drop_undrawable(to_3dgs(splats, path, warn), path, warn)
 
 
 @np.errstate(all="ignore")  # what is no number stays none
-def in_3dgs(splats: Splats, path: str | Path, warn: Warn = silent) -> Splats:
+def to_3dgs(splats: Splats, path: str | Path, warn: Warn = ignore) -> Splats:
     """Splats of any dialect that `refuse` lets pass, in the meaning of the 3DGS columns.
 
     The columns that are worked into others are gone, so that nothing is applied twice when the splats are
@@ -78,13 +78,13 @@ def in_3dgs(splats: Splats, path: str | Path, warn: Warn = silent) -> Splats:
     return replace(splats, extras=extras)
 
 
-def left_out(count: int, path: str | Path) -> str:
+def dropped_message(count: int, path: str | Path) -> str:
     """What to say of so many splats that `drawable` has left out."""
     return f"{count:,} splats of {path} have values that are no numbers, or too large to draw: left out."
 
 
 @np.errstate(invalid="ignore")
-def drawable(splats: Splats, path: str | Path, warn: Warn = silent) -> Splats:
+def drop_undrawable(splats: Splats, path: str | Path, warn: Warn = ignore) -> Splats:
     """The splats that can be drawn; the others are left out with a warning.
 
     Those have a place, shape or colour that is no number or beyond FARTHEST and BRIGHTEST, or an opacity that
@@ -97,17 +97,19 @@ def drawable(splats: Splats, path: str | Path, warn: Warn = silent) -> Splats:
     for start in range(0, len(splats), _BLOCK):  # what is compared takes little memory then
         block = slice(start, start + _BLOCK)
         quats = np.abs(splats.quats[block])
-        kept[block] = (np.abs(splats.means[block]) <= FARTHEST).all(1) & (quats <= FARTHEST).all(1)
-        kept[block] &= (splats.log_scales[block] <= np.log(FARTHEST)).all(1)
+        kept[block] = (np.abs(splats.means[block]) <= MAX_COORDINATE).all(1) & (quats <= MAX_COORDINATE).all(
+            1
+        )
+        kept[block] &= (splats.log_scales[block] <= np.log(MAX_COORDINATE)).all(1)
         kept[block] &= ~np.isnan(splats.opacity_logits[block])
-        kept[block] &= (np.abs(splats.sh[block]) <= BRIGHTEST).all((1, 2))
-        turned[block] = (quats > 1 / FARTHEST).any(1)
+        kept[block] &= (np.abs(splats.sh[block]) <= MAX_COEFFICIENT).all((1, 2))
+        turned[block] = (quats > 1 / MAX_COORDINATE).any(1)
     if not (turned | ~kept).all():
         quats = np.where((turned | ~kept)[:, None], splats.quats, np.array([1, 0, 0, 0], np.float32))
         splats = replace(splats, quats=quats)
     if kept.all():
         return splats
-    warn(left_out(int(np.count_nonzero(~kept)), path))
+    warn(dropped_message(int(np.count_nonzero(~kept)), path))
     return splats.select(kept)
 
 
@@ -130,7 +132,7 @@ def _smoothed(
     return (log_scales + grown).astype(np.float32), np.minimum(logits, opacity_logits).astype(np.float32)
 
 
-def meta_of(comments: Iterable[str]) -> dict:
+def meta_from_comments(comments: Iterable[str]) -> dict:
     """What the comments of a foreign PLY say of how it is drawn, as a bundle's meta has it.
 
     ``{"antialias": True}`` for splats that were trained with Mip-Splatting's 2D filter (Brush, Postshot).
@@ -138,7 +140,7 @@ def meta_of(comments: Iterable[str]) -> dict:
     return {"antialias": True} if _render_mode(comments) == "mip" else {}
 
 
-def comments_of(meta: dict) -> list[str]:
+def comments_from_meta(meta: dict) -> list[str]:
     """The comments by which other programs know what `meta_of` read."""
     return [_MIP] if meta.get("antialias") else []
 

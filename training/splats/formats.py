@@ -24,10 +24,10 @@ import numpy as np
 from ..documents import open_file, read_json
 from ..errors import LodgsError
 from ..files import atomic_write
-from .bundle import MOST_LEVELS_READ, Bundle, write_folder
-from .dialects import comments_of
+from .bundle import MAX_READ_LEVELS, Bundle, write_folder
+from .dialects import comments_from_meta
 from .gaussians import SH_C0, SplatRows, Splats
-from .ply import AT_ONCE, write_ply
+from .ply import BATCH_ROWS, write_ply
 
 PROGRAM = "splat-transform"
 INSTALL = (
@@ -138,7 +138,7 @@ def write_splats(path: Path, splats: SplatRows, meta: dict) -> Iterator[str]:
     """
     kind = format_of(path)
     if kind is PLY:
-        write_ply(path, splats, comments_of(meta))
+        write_ply(path, splats, comments_from_meta(meta))
         return
     if kind is SPLAT:
         write_splat(path, splats)
@@ -152,7 +152,7 @@ def write_splats(path: Path, splats: SplatRows, meta: dict) -> Iterator[str]:
     program()  # before anything is written
     with tempfile.TemporaryDirectory(prefix="lodgs-") as folder:
         plain, made = Path(folder, "splats.ply"), Path(folder, f"made{kind.suffix}")
-        write_ply(plain, splats, comments_of(meta))
+        write_ply(plain, splats, comments_from_meta(meta))
         yield from transformed([str(plain), str(made)])
         with atomic_write(path) as temporary:
             shutil.move(made, temporary)
@@ -168,7 +168,9 @@ def write_streamed(folder: Path, bundle: Bundle) -> Iterator[str]:
         LodgsError: as :func:`write_splats`; the folder holds something else, or no level has a splat.
     """
     there = folder / STREAMED
-    shown = [level for level in bundle.levels if any(len(each.rows) for each in bundle.upto(level.number))]
+    shown = [
+        level for level in bundle.levels if any(len(each.rows) for each in bundle.drawn_levels(level.number))
+    ]
     if not shown:
         raise LodgsError("There are no splats to write.", "Show some of them.")
     bundle = replace(bundle, levels=shown)
@@ -305,7 +307,7 @@ def is_ply(path: Path) -> bool:
 
 def _count_of_lods(path: Path) -> int:
     levels = read_json(path).get("lodLevels")
-    if type(levels) is not int or not 1 <= levels <= MOST_LEVELS_READ:
+    if type(levels) is not int or not 1 <= levels <= MAX_READ_LEVELS:
         raise LodgsError(f"{path} is no description of streamed levels.", "Choose another file.")
     return levels
 
@@ -321,8 +323,8 @@ def write_splat(path: Path, splats: SplatRows) -> None:
         LodgsError: the file cannot be written.
     """
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
-        for begin in range(0, len(splats), AT_ONCE):
-            some = splats.select(slice(begin, begin + AT_ONCE))
+        for begin in range(0, len(splats), BATCH_ROWS):
+            some = splats.select(slice(begin, begin + BATCH_ROWS))
             rows = np.empty(len(some), _ROW)
             rows["mean"], rows["scale"] = some.means, np.exp(some.log_scales)
             opacity = 1 / (1 + np.exp(-some.opacity_logits.astype(np.float64)))

@@ -23,10 +23,10 @@ from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 from ..documents import open_file
 from ..errors import LodgsError
 from ..files import atomic_write
-from .dialects import Warn, as_3dgs, refuse, silent
+from .dialects import Warn, drawable_3dgs, ignore, reject_unsupported
 from .gaussians import SplatRows, Splats
 
-MOST_HEADER, MOST_COLUMNS = 1 << 20, 1000
+MAX_HEADER_BYTES, MAX_COLUMNS = 1 << 20, 1000
 """Most bytes of a header, and most columns of all elements; ours have 70 columns a level."""
 NORMALS = ("nx", "ny", "nz")
 # PLY names its types as C does; viewers know no others.
@@ -42,13 +42,13 @@ _TYPES = {
 }
 # Rows are moved between a file's records and our columns in blocks that stay in the processor's cache.
 _BLOCK = 4096
-AT_ONCE = 1 << 15
+BATCH_ROWS = 1 << 15
 """Rows that are in memory at a time, of splats that are not."""
 
 Columns = dict[str, np.ndarray]
 
 
-class Part(NamedTuple):
+class ElementPart(NamedTuple):
     """Some rows of an element: how many, and what gives the columns of a range of them."""
 
     count: int
@@ -60,19 +60,22 @@ class Element:
     """One element of a PLY: rows of named columns, given in parts that follow one another."""
 
     name: str
-    parts: Sequence[Part]
+    parts: Sequence[ElementPart]
 
     @classmethod
     def of(cls, name: str, columns: Columns) -> Element:
         """The element of columns (N,) in memory."""
         count = len(next(iter(columns.values())))
-        return cls(name, [Part(count, lambda some: {key: rows[some] for key, rows in columns.items()})])
+        return cls(
+            name, [ElementPart(count, lambda some: {key: rows[some] for key, rows in columns.items()})]
+        )
 
     @classmethod
     def of_splats(cls, name: str, sets: Sequence[SplatRows], columns: Callable[[Splats], Columns]) -> Element:
         """The element of columns of splats, of one set after the other."""
         return cls(
-            name, [Part(len(rows), lambda some, rows=rows: columns(rows.select(some))) for rows in sets]
+            name,
+            [ElementPart(len(rows), lambda some, rows=rows: columns(rows.select(some))) for rows in sets],
         )
 
     @cached_property
@@ -91,7 +94,7 @@ class Element:
         return self.count * self.dtype.itemsize
 
 
-def read_ply(path: str | Path, warn: Warn = silent) -> Splats:
+def read_ply(path: str | Path, warn: Warn = ignore) -> Splats:
     """Read the element ``vertex`` of any 3DGS PLY.
 
     Ascii, little- or big-endian, SH degree 0 to 4, columns in any order and of any scalar type. Missing
@@ -106,7 +109,7 @@ def read_ply(path: str | Path, warn: Warn = silent) -> Splats:
         LodgsError: not a PLY, cut short, without the columns of splats, or of a dialect that cannot be read.
     """
     elements, _ = read_elements(path)
-    return as_3dgs(splats_from(elements["vertex"], path), path, warn)
+    return drawable_3dgs(splats_from_rows(elements["vertex"], path), path, warn)
 
 
 def write_ply(path: str | Path, splats: SplatRows, comments: Sequence[str] = ()) -> None:
@@ -122,7 +125,7 @@ def write_ply(path: str | Path, splats: SplatRows, comments: Sequence[str] = ())
     write_elements(path, [Element.of_splats("vertex", [splats], all_columns)], comments)
 
 
-def columns_of(splats: Splats) -> Columns:
+def splat_columns(splats: Splats) -> Columns:
     """The 3DGS columns in their order, as views (N,) into the arrays of ``splats``."""
     zero = np.broadcast_to(np.float32(0), len(splats))
     rest = splats.sh.shape[1] - 1
@@ -139,15 +142,15 @@ def columns_of(splats: Splats) -> Columns:
 
 def all_columns(splats: Splats) -> Columns:
     """The 3DGS columns, and the extras."""
-    return columns_of(splats) | columns_of_extras(splats)
+    return splat_columns(splats) | extra_columns(splats)
 
 
-def columns_of_extras(splats: Splats) -> Columns:
+def extra_columns(splats: Splats) -> Columns:
     """The extras that are columns of their own (normals have their place in the 3DGS layout)."""
     return {name: column for name, column in splats.extras.items() if name not in NORMALS}
 
 
-def records_of(columns: Columns) -> np.ndarray:
+def to_records(columns: Columns) -> np.ndarray:
     """Columns (N,) as rows of a file, (N,) structured: packed and little-endian."""
     records = np.empty(len(next(iter(columns.values()))), _row_of(columns))
     for block in _blocks(len(records)):
@@ -156,7 +159,7 @@ def records_of(columns: Columns) -> np.ndarray:
     return records
 
 
-def splats_from(rows: np.ndarray, path: str | Path) -> Splats:
+def splats_from_rows(rows: np.ndarray, path: str | Path) -> Splats:
     """Splats from the structured rows of an element that has the 3DGS columns; ``path`` is for the message.
 
     Raises:
@@ -171,7 +174,7 @@ def splats_from(rows: np.ndarray, path: str | Path) -> Splats:
             "0, 9, 24, 45 or 72 belong to degree 0 to 4; export the splats again.",
         )
     splats = _empty_splats(len(rows), degree)
-    columns = {name: column for name, column in columns_of(splats).items() if name not in NORMALS}
+    columns = {name: column for name, column in splat_columns(splats).items() if name not in NORMALS}
     missing = [name for name in columns if name not in names]
     if missing:
         raise LodgsError(
@@ -231,7 +234,7 @@ def read_elements(path: str | Path) -> tuple[dict[str, np.ndarray], list[str]]:
     return elements, _comments(header)
 
 
-def let_go(rows: np.ndarray) -> None:
+def release_pages(rows: np.ndarray) -> None:
     """Gives back the pages of a mapped file that have been read, which count as the process's own memory."""
     base = rows
     while isinstance(base, np.ndarray):
@@ -272,8 +275,8 @@ def write_elements(path: str | Path, elements: Iterable[Element], comments: Sequ
         file.write("\n".join(lines).encode("ascii"))
         for element in elements:
             for part in element.parts:
-                for some in _blocks(part.count, AT_ONCE):
-                    file.write(records_of(part.columns(some)).data)
+                for some in _blocks(part.count, BATCH_ROWS):
+                    file.write(to_records(part.columns(some)).data)
 
 
 def _row_of(columns: Columns) -> np.dtype:
@@ -301,15 +304,15 @@ def _read_header(file: IO[bytes], path: Path) -> tuple[PlyData, list[int]]:
     Raises:
         LodgsError: as `read_comments`.
     """
-    start = file.read(MOST_HEADER)
+    start = file.read(MAX_HEADER_BYTES)
     begin = re.match(rb"ply[ \t]*(\r\n|\n|\r)", start)
     if begin is None:
         raise LodgsError(f"{path} is not a PLY file.", "Choose a .ply of Gaussian splats.")
     end = re.search(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)", start)
     if end is None:
-        if len(start) == MOST_HEADER:
+        if len(start) == MAX_HEADER_BYTES:
             raise LodgsError(
-                f"{path} has a header of more than {MOST_HEADER:,} bytes.",
+                f"{path} has a header of more than {MAX_HEADER_BYTES:,} bytes.",
                 "Export it again, with less in it.",
             )
         raise LodgsError(f"{path} is cut short: its header does not end.", "Export or copy it again.")
@@ -324,8 +327,8 @@ def _read_header(file: IO[bytes], path: Path) -> tuple[PlyData, list[int]]:
                         raise ValueError(f"{line[:200]!r} says no number of rows")
                     counts.append(int(count[0]))
                     lines[place] = f"element {name} 0"  # plyfile reads a header only together with rows
-        if sum(line.lstrip().startswith("property") for line in lines) > MOST_COLUMNS:
-            raise ValueError(f"it has more than {MOST_COLUMNS:,} columns")
+        if sum(line.lstrip().startswith("property") for line in lines) > MAX_COLUMNS:
+            raise ValueError(f"it has more than {MAX_COLUMNS:,} columns")
         header = PlyData.read(io.BytesIO("\n".join(lines).encode("ascii", "replace")))
     except (PlyParseError, ValueError) as error:
         raise LodgsError(
@@ -336,8 +339,8 @@ def _read_header(file: IO[bytes], path: Path) -> tuple[PlyData, list[int]]:
     vertex = header["vertex"]
     if _has_lists(vertex):
         raise LodgsError(f"{path} has lists in its vertices.", "Choose a .ply of Gaussian splats.")
-    refuse([column.name for column in vertex.properties], _comments(header), path)
-    splats_from(vertex.data, path)
+    reject_unsupported([column.name for column in vertex.properties], _comments(header), path)
+    splats_from_rows(vertex.data, path)
     return header, counts
 
 

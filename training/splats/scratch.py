@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import LodgsError
 from .gaussians import Splats
-from .ply import all_columns, records_of, splats_from
+from .ply import all_columns, splats_from_rows, to_records
 
 _PAGE = 64
 """Rows that are read together where some of them are wanted."""
@@ -20,7 +20,7 @@ _RUN = 1 << 15
 """Most rows that are read together."""
 
 
-class Scratch:
+class ScratchFile:
     """Splats of the same columns, in a file that goes when it is closed, or the process ends.
 
     The file is read and written by explicit calls: a mapped page would count as the process's own memory.
@@ -38,7 +38,7 @@ class Scratch:
         with self._telling():
             self._file = tempfile.TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115
 
-    def __enter__(self) -> Scratch:
+    def __enter__(self) -> ScratchFile:
         return self
 
     def __exit__(self, *_) -> None:
@@ -57,7 +57,7 @@ class Scratch:
         Raises:
             LodgsError: the disk is full, or the file cannot be written.
         """
-        records = records_of(all_columns(splats))
+        records = to_records(all_columns(splats))
         self._row = self._row if self._row.names else records.dtype
         assert records.dtype == self._row, "splats of other columns"
         self._count = max(self._count, begin + len(splats))
@@ -83,7 +83,7 @@ class Scratch:
         """
         if isinstance(rows, slice):
             begin, end, _ = rows.indices(self._count)
-            return splats_from(self._read(begin, max(begin, end)), "")
+            return splats_from_rows(self._read(begin, max(begin, end)), "")
         order = np.argsort(rows, kind="stable")
         whole = np.dtype((np.void, self._row.itemsize))  # which numpy copies faster than field by field
         rows, found = rows[order], np.empty(len(rows), whole)
@@ -93,7 +93,7 @@ class Scratch:
             if begin < end:
                 part = self._read(int(rows[begin]), int(rows[end - 1]) + 1).view(whole)
                 found[order[begin:end]] = part[rows[begin:end] - rows[begin]]
-        return splats_from(found.view(self._row), "")
+        return splats_from_rows(found.view(self._row), "")
 
     def _read(self, begin: int, end: int) -> np.ndarray:
         records = np.empty(end - begin, self._row)

@@ -17,15 +17,15 @@ C4 = (
 )  # fmt: skip
 
 
-def coefficients(degree: int) -> int:
+def coefficient_count(degree: int) -> int:
     """How many coefficients a colour channel has up to ``degree``."""
     return (degree + 1) * (degree + 1)
 
 
-def degree_of(count: int) -> int:
+def degree_from_count(count: int) -> int:
     """The degree that ``count`` coefficients a channel make; ValueError where they make none of 0 to 4."""
     for degree in range(MAX_DEGREE + 1):
-        if coefficients(degree) == count:
+        if coefficient_count(degree) == count:
             return degree
     raise ValueError(f"{count} SH coefficients a channel are no whole degree from 0 to {MAX_DEGREE}")
 

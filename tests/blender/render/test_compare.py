@@ -97,7 +97,7 @@ def measured(bpy, lodgs, tmp_path):
         weights = choice.weights(camera.center, camera.focal, values)
         counts = np.unique(np.repeat([1, 2, 3], 300)[weights > 0], return_counts=True)
         assert min(counts[1]) > 20 and len(counts[0]) == 3  # every level has its part
-        (psnr,) = evaluation.psnrs([camera], lambda camera: (choice.splats, weights))
+        (psnr,) = evaluation.compare_views([camera], lambda camera: (choice.splats, weights))
         root = lodgs("data.scenes").import_colmap(bpy.context, folder, photographs=False)
         lodgs("data.scenes").set_bundle_facts(root, bundle)
         for level in levels:

@@ -40,7 +40,7 @@ def test_what_is_odd_is_passed_over(odd):
 def test_the_plot_has_its_points_where_the_numbers_are(tmp_path):
     write_cost_plot(tmp_path / "costs.png", {"costs": FOUND})
     pixels = np.asarray(Image.open(tmp_path / "costs.png"))
-    width, height = costs.SIZE
+    width, height = costs.PLOT_SIZE
     assert pixels.shape == (height, width, 3)
     for entry in FOUND:
         color = np.round(255 * np.array(level_color(entry["level"])))

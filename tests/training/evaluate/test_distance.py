@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from training.evaluate.distance import farther, jumps, pulled_back
-from training.evaluate.metrics import MOST_PSNR
+from training.evaluate.distance import measure_farther_views, measure_popping, pull_back
+from training.evaluate.metrics import MAX_PSNR
 from training.evaluate.views import Evaluation
 from training.lod.selection import complete, select, settings
 from training.scenes.cameras import Camera
@@ -52,7 +52,7 @@ def test_what_lies_at_the_depth_is_so_many_times_as_far(camera):
     view = Camera("a", 64, 64, 100.0, 100.0, 32.0, 32.0, pose)
     target = np.linalg.inv(pose) @ [0, 0, 5, 1]  # straight ahead
     for factor in (1, 2, 8):
-        back = pulled_back(view, factor, 5.0)
+        back = pull_back(view, factor, 5.0)
         assert np.linalg.norm(target[:3] - back.center) == pytest.approx(5 * factor)
         assert np.allclose((back.world_to_camera @ target)[:2], 0)
 
@@ -81,20 +81,20 @@ def test_a_level_comes_with_all_coarser_ones_only_where_they_add_up(bundle):
 
 @pytest.mark.slow
 def test_fewer_splats_are_drawn_from_farther_away(bundle, evaluation):
-    rows = farther(evaluation, bundle, settings(bundle, {}))
+    rows = measure_farther_views(evaluation, bundle, settings(bundle, {}))
     assert [row["factor"] for row in rows] == [1, 2, 4, 8]
     drawn = [row["drawn"] for row in rows]
-    assert drawn[0] == rows[0]["drawn_full"] and rows[0]["psnr"] == MOST_PSNR
+    assert drawn[0] == rows[0]["drawn_full"] and rows[0]["psnr"] == MAX_PSNR
     assert drawn[0] > drawn[2] > drawn[3]
     assert all(np.isfinite(row["psnr"]) for row in rows[2:])
 
 
 def test_fading_takes_the_jumps_away(bundle, evaluation, camera):
-    found = jumps(evaluation, bundle, settings(bundle, {}), camera)
+    found = measure_popping(evaluation, bundle, settings(bundle, {}), camera)
     assert found["faded"] < found["hard"]
 
 
 def test_where_nothing_is_seen_nothing_jumps(bundle, evaluation, camera):
     for level in bundle.levels:
         level.splats.opacity_logits[:] = -20
-    assert jumps(evaluation, bundle, settings(bundle, {}), camera) == {"faded": 0, "hard": 0}
+    assert measure_popping(evaluation, bundle, settings(bundle, {}), camera) == {"faded": 0, "hard": 0}

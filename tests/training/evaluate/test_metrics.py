@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from training.evaluate.metrics import MOST_PSNR, exposed_as, psnr, ssim, to_8_bit
+from training.evaluate.metrics import MAX_PSNR, fit_exposure, psnr, ssim, to_8_bit
 from training.lod.selection import select, settings
 from training.splats.bundle import Bundle, Level
 from training.splats.gaussians import Splats
@@ -22,28 +22,28 @@ def test_images_are_clamped_and_rounded_to_8_bits_first():
     image = torch.tensor([[[-0.2, 0.5003, 1.7]]])
     assert (to_8_bit(image) * 255).tolist() == [[[0, 128, 255]]]
     nearly = torch.full((8, 8, 3), 0.5) + 0.0004  # rounds to the same byte as 0.5
-    assert psnr(nearly, torch.full((8, 8, 3), 0.5)) == MOST_PSNR == 100
+    assert psnr(nearly, torch.full((8, 8, 3), 0.5)) == MAX_PSNR == 100
 
 
 def test_a_fitted_exposure_is_the_lines_of_least_squares():
     rng = np.random.default_rng(1)
     image, noise = (torch.from_numpy(rng.uniform(size=(9, 7, 3)).astype(np.float32)) for _ in range(2))
     gains, offsets = torch.tensor([0.5, 1.3, 0.9]), torch.tensor([0.1, -0.05, 0.0])
-    torch.testing.assert_close(exposed_as(image, image * gains + offsets), image * gains + offsets)
+    torch.testing.assert_close(fit_exposure(image, image * gains + offsets), image * gains + offsets)
     target = image * gains + offsets + 0.1 * noise
     expected = np.empty((9, 7, 3))
     for channel in range(3):
         x, y = (each[..., channel].numpy().ravel() for each in (image, target))
         expected[..., channel] = np.polyval(np.polyfit(x, y, 1), x).reshape(9, 7)
-    np.testing.assert_allclose(exposed_as(image, target), expected, atol=1e-5)
+    np.testing.assert_allclose(fit_exposure(image, target), expected, atol=1e-5)
     mask = torch.zeros(9, 7)
     mask[:5] = 1
     target[5:] = 0  # what does not count
     upper = np.polyfit(image[:5, :, 1].numpy().ravel(), target[:5, :, 1].numpy().ravel(), 1)
-    fitted = exposed_as(image, target, mask)[..., 1]
+    fitted = fit_exposure(image, target, mask)[..., 1]
     np.testing.assert_allclose(fitted, np.polyval(upper, image[..., 1].numpy()), atol=1e-5)
     flat = torch.full((9, 7, 3), 0.25)  # no gain makes anything of one colour into another picture
-    torch.testing.assert_close(exposed_as(flat, target), target.mean((0, 1)).expand(9, 7, 3))
+    torch.testing.assert_close(fit_exposure(flat, target), target.mean((0, 1)).expand(9, 7, 3))
 
 
 def test_ssim_is_one_for_equal_images_and_falls_with_noise():

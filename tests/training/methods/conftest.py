@@ -9,7 +9,7 @@ import torch
 
 from training.optimize.method import Method
 from training.splats.bundle import Level
-from training.splats.ply import columns_of, columns_of_extras
+from training.splats.ply import extra_columns, splat_columns
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def check_resumed() -> Callable[[Callable[[], Method], int], None]:
         after = before + _train(second, stop)
         assert [level.number for level in after] == [level.number for level in levels] != []
         for one, other in zip(levels, after, strict=True):
-            columns, theirs = (columns_of(x.splats) | columns_of_extras(x.splats) for x in (one, other))
+            columns, theirs = (splat_columns(x.splats) | extra_columns(x.splats) for x in (one, other))
             assert one.facts == other.facts and columns.keys() == theirs.keys()
             for name, column in columns.items():
                 np.testing.assert_array_equal(column, theirs[name])

@@ -14,7 +14,7 @@ from training.lod.rule import NO_FINER, fact_names, rules
 from training.lod.rules.chunks import TABLE, member_columns
 from training.render.requests import parse_request
 from training.render.scene import Instance, SplatSet, draw
-from training.scenes.cameras import camera_as_dict
+from training.scenes.cameras import camera_to_dict
 from training.splats.gaussians import Splats
 
 COUNT = 400
@@ -141,7 +141,7 @@ def test_a_choice_travels_as_json(camera):
     for name in rules():
         choice = choice_of(name, (0.1, -2, 3))
         one = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "choice": choice.as_dict()}
-        asked = {"frame": 1, "out": "o", "camera": camera_as_dict(camera, 0.1), "sets": [one]}
+        asked = {"frame": 1, "out": "o", "camera": camera_to_dict(camera, 0.1), "sets": [one]}
         found = parse_request(asked).sets[0].choice
         assert found.as_dict() == choice.as_dict()
         assert found.region() == choice.region()
@@ -150,7 +150,7 @@ def test_a_choice_travels_as_json(camera):
         choice = replace(choice, crops=crops)
         one = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "choice": choice.as_dict()}
         asked = json.loads(
-            json.dumps({"frame": 1, "out": "o", "camera": camera_as_dict(camera, 0.1), "sets": [one]})
+            json.dumps({"frame": 1, "out": "o", "camera": camera_to_dict(camera, 0.1), "sets": [one]})
         )
         assert parse_request(asked).sets[0].choice == choice
 
@@ -158,7 +158,7 @@ def test_a_choice_travels_as_json(camera):
 def test_looks_travel_as_json(camera):
     looks = ((None, Look(0.5, 5000, (1, 0.5, 0.2), 0.8, 0.9)), (Crop.sphere((1, 2, 3), 4), Look(opacity=0.1)))
     one = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "looks": looks_as_dicts(looks)}
-    asked = {"frame": 1, "out": "o", "camera": camera_as_dict(camera, 0.1), "sets": [one]}
+    asked = {"frame": 1, "out": "o", "camera": camera_to_dict(camera, 0.1), "sets": [one]}
     assert parse_request(json.loads(json.dumps(asked))).sets[0].looks == looks
 
 
@@ -181,7 +181,7 @@ def test_impossible_looks_are_a_sentence(camera, looks, said):
 
     one = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "looks": looks}
     with pytest.raises(LodgsError, match=said):
-        parse_request({"frame": 1, "out": "o", "camera": camera_as_dict(camera, 0.1), "sets": [one]})
+        parse_request({"frame": 1, "out": "o", "camera": camera_to_dict(camera, 0.1), "sets": [one]})
 
 
 def low(values: dict) -> dict:
@@ -211,7 +211,7 @@ def test_impossible_choices_are_a_sentence(camera, change):
     choice |= change(choice) if callable(change) else change
     one = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "choice": choice}
     with pytest.raises(LodgsError, match="is not valid"):
-        parse_request({"frame": 1, "out": "o", "camera": camera_as_dict(camera, 0.1), "sets": [one]})
+        parse_request({"frame": 1, "out": "o", "camera": camera_to_dict(camera, 0.1), "sets": [one]})
 
 
 @pytest.mark.parametrize("name", sorted(rules()))
@@ -221,5 +221,5 @@ def test_the_ends_of_sliders_are_possible(camera, name):
         ends = {control.name: float(np.float32(getattr(control, end))) for control in rules()[name].controls}
         choice = choice_of(name, (0, 0, 0), **ends).as_dict()
         one = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "choice": choice}
-        asked = {"frame": 1, "out": "o", "camera": camera_as_dict(camera, 0.1), "sets": [one]}
+        asked = {"frame": 1, "out": "o", "camera": camera_to_dict(camera, 0.1), "sets": [one]}
         assert parse_request(asked).sets[0].choice.as_dict() == choice

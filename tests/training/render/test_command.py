@@ -18,7 +18,7 @@ from training.lod.rules.chunks import member_columns
 from training.lod.selection import select
 from training.rasterize import Gaussians, render
 from training.runs.job import Job
-from training.scenes.cameras import camera_as_dict, read_camera, write_camera
+from training.scenes.cameras import camera_to_dict, read_camera, write_camera
 from training.splats.bundle import Bundle, Level, write_bundle
 from training.splats.ply import write_ply
 
@@ -43,7 +43,7 @@ def expected(splats, camera, near=0.01, **options):
 def test_a_camera_survives_its_file(camera, tmp_path):
     write_camera(tmp_path / "camera.json", camera, 0.25)
     again, near = read_camera(tmp_path / "camera.json")
-    assert near == 0.25 and camera_as_dict(again, near) == camera_as_dict(camera, near)
+    assert near == 0.25 and camera_to_dict(again, near) == camera_to_dict(camera, near)
 
 
 def test_levels_of_a_bundle(bundle, camera, tmp_path):
@@ -182,7 +182,7 @@ def test_a_holdout(bundle, camera, tmp_path):
         (["--size", "99999999x9"], "A picture of 99999999x9 pixels is not drawn."),
         (["--size", "32768x32768"], "A picture of 32768x32768 pixels is not drawn."),
         (["--size", "1" + 400 * "0" + "x9"], "is not drawn."),
-        (["--backend", "magic"], 'There is no rasterizer backend "magic".'),
+        (["--backend", "magic"], 'Unknown rasterizer backend "magic".'),
     ],
 )
 def test_mistakes_are_told(bundle, camera, tmp_path, monkeypatch, capsys, options, sentence):
@@ -214,7 +214,7 @@ def test_mistakes_are_told(bundle, camera, tmp_path, monkeypatch, capsys, option
 )
 def test_impossible_cameras_are_told(bundle, camera, tmp_path, capsys, change, sentence):
     file = tmp_path / "camera.json"
-    file.write_text(json.dumps(camera_as_dict(camera, 0.01) | change))
+    file.write_text(json.dumps(camera_to_dict(camera, 0.01) | change))
     assert main(["render", str(bundle[0]), "--camera", str(file), "--out", str(tmp_path / "a.png")]) == 2
     assert sentence in capsys.readouterr().err
     file.write_text(json.dumps({"width": 3}))
@@ -234,7 +234,7 @@ def test_little_memory_is_a_sentence(bundle, camera, tmp_path, capsys, monkeypat
         str(tmp_path / "a.png"),
     ]
     torchs = RuntimeError("[enforce fail at alloc_cpu.cpp:117] DefaultCPUAllocator: can't allocate memory: 9")
-    for place in ("picture.Picture.empty", "picture.Picture.eight_bit", "scene.rasterize_strips", "command.ResidentBundle"):
+    for place in ("image.RenderedImage.empty", "image.RenderedImage.eight_bit", "scene.rasterize_strips", "command.ResidentBundle"):
         for error in (MemoryError(), torchs):
 
             def fail(*_, error=error, **__):

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from training.errors import LodgsError
 from training.rasterize import Gaussians, rasterize
-from training.render.picture import NOTHING
+from training.render.image import NO_DEPTH
 from training.render.scene import Instance, SplatSet, draw
 from training.splats.gaussians import Splats
 
@@ -46,7 +46,7 @@ def test_one_set_looks_the_same_wherever_it_stands(make_splats, camera):
     here = draw([Instance(placed)], camera, depth=True)
     there = draw([Instance(placed, matrix)], moved(camera, matrix), near=0.03, depth=True)
     np.testing.assert_allclose(there.image, here.image, atol=2e-5)
-    covered = here.depth < NOTHING
+    covered = here.depth < NO_DEPTH
     assert covered.any()
     np.testing.assert_allclose(there.depth[covered], 3 * here.depth[covered], rtol=1e-3)
 
@@ -127,7 +127,7 @@ def test_a_set_that_is_no_longer_similar_has_the_covariances_of_its_transform(ma
     whole = np.eye(4)
     whole[:3, :3] = linear
     splats = make_splats(50)
-    there = SplatSet(splats).in_world(whole)
+    there = SplatSet(splats).transformed(whole)
     means, quats, log_scales = there.means, there.quats, there.log_scales
 
     def covariances(quats, log_scales):
@@ -171,7 +171,7 @@ def test_meshes_hold_out_what_is_behind_them(camera, background, scale):
     """A red wall of alpha a quarter at 2, a green one at 6, a mesh at 3 on the left, a nearer one below. One
     scale brings the walls to their places from a space of other units."""
     camera = replace(camera, world_to_camera=np.eye(4))
-    limit = np.full((48, 64), NOTHING, np.float32)
+    limit = np.full((48, 64), NO_DEPTH, np.float32)
     limit[:, :32], limit[40:] = 3, 1
     matrix = np.diag([scale, scale, scale, 1])
 
@@ -189,7 +189,7 @@ def test_meshes_hold_out_what_is_behind_them(camera, background, scale):
     np.testing.assert_allclose(
         picture.image[right], np.array([*full, 0]) + np.multiply(0.0075, behind), atol=2e-3
     )
-    assert (picture.image[below] == 0).all() and picture.depth[below] == np.float32(NOTHING)
+    assert (picture.image[below] == 0).all() and picture.depth[below] == np.float32(NO_DEPTH)
     at_right = pytest.approx(0.9925, abs=1e-3) if background is None else 1
     assert (picture.alpha[left], picture.alpha[right]) == (pytest.approx(0.25, abs=2e-3), at_right)
     assert picture.alpha[below] == 0
@@ -206,12 +206,12 @@ def test_nothing_to_draw_is_the_background(camera, make_splats):
     for placed in ([], [nothing]):
         picture = draw(placed, camera, background=(0.1, 0.2, 0.3), depth=True, levels=True)
         assert picture.image[5, 5] == pytest.approx((0.1, 0.2, 0.3))
-        assert (picture.depth == NOTHING).all() and (picture.level == 0).all()
+        assert (picture.depth == NO_DEPTH).all() and (picture.level == 0).all()
         assert (draw(placed, camera, background=None).alpha == 0).all()
 
 
 def test_it_ends_when_it_is_no_longer_wanted(make_splats, camera, monkeypatch):
-    monkeypatch.setattr("training.render.scene.STRIP", 1)
+    monkeypatch.setattr("training.render.scene.STRIP_PIXELS", 1)
     told = []
     picture = draw([Instance(SplatSet(make_splats(5)))], camera, progress=lambda share: told.append(share))
     assert picture is None and told == [pytest.approx(16 / 48)]

@@ -14,7 +14,7 @@ from training.lod.query import Choice
 from training.lod.rule import rules
 from training.render import wire
 from training.render.scene import Instance, SplatSet, draw
-from training.scenes.cameras import camera_as_dict
+from training.scenes.cameras import camera_to_dict
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -56,7 +56,7 @@ def client(tmp_path):
 
 
 def request(camera, sets, frame=1, **more) -> dict:
-    return {"frame": frame, "out": "frame", "camera": camera_as_dict(camera, 0.01), "sets": sets, **more}
+    return {"frame": frame, "out": "frame", "camera": camera_to_dict(camera, 0.01), "sets": sets, **more}
 
 
 def test_frames_are_what_draw_draws(client, make_splats, camera):

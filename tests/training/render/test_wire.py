@@ -7,8 +7,8 @@ import pytest
 
 from training.errors import LodgsError
 from training.render import wire
-from training.render.requests import Cancel, frame_of, read_line, read_request
-from training.scenes.cameras import camera_as_dict
+from training.render.requests import CancelRequest, frame_number, parse_line, parse_request
+from training.scenes.cameras import camera_to_dict
 
 
 def test_only_what_was_claimed_is_removed(tmp_path):
@@ -17,34 +17,34 @@ def test_only_what_was_claimed_is_removed(tmp_path):
     theirs.mkdir()
     (theirs / "a.jpg").write_text("dear")
     with pytest.raises(LodgsError, match="is not empty"):
-        wire.claim(theirs)
-    wire.release(theirs)
+        wire.claim_folder(theirs)
+    wire.release_folder(theirs)
     assert [path.name for path in theirs.iterdir()] == ["a.jpg"]
     for folder in (tmp_path / "new", tmp_path / "empty"):
         if folder.name == "empty":
             folder.mkdir()
-        wire.claim(folder)
+        wire.claim_folder(folder)
         (folder / "set-1").write_bytes(b"1234")
-        wire.claim(folder)  # whose it is already
+        wire.claim_folder(folder)  # whose it is already
         (folder / "theirs").mkdir()
         (folder / "theirs" / "b.jpg").write_text("dear")
-        wire.release(folder)
+        wire.release_folder(folder)
         assert [path.name for path in folder.iterdir()] == ["theirs"]
-    wire.claim(tmp_path / "gone")
-    wire.release(tmp_path / "gone")
+    wire.claim_folder(tmp_path / "gone")
+    wire.release_folder(tmp_path / "gone")
     assert not (tmp_path / "gone").exists()
     with pytest.raises(LodgsError, match="cannot be made"):
-        wire.claim(theirs / "a.jpg")
+        wire.claim_folder(theirs / "a.jpg")
 
 
 def test_a_set_has_the_columns_that_it_is_said_to_have(make_splats, tmp_path):
     splats = make_splats(5)
     splats.extras |= {"lod_bias": np.arange(5, dtype=np.float32), "sigma_d": np.ones(5, np.float32)}
-    columns = wire.packed(splats, None)
+    columns = wire.pack_set(splats, None)
     wire.write_set(tmp_path / "set", columns)
     again, weights = wire.read_set(tmp_path / "set", 5, list(splats.extras))
     assert again.extras.keys() == splats.extras.keys() and (weights == 1).all()
-    for there, here in zip(wire.packed(again, weights), columns, strict=True):
+    for there, here in zip(wire.pack_set(again, weights), columns, strict=True):
         np.testing.assert_array_equal(there, here)
     with pytest.raises(LodgsError, match="does not hold"):
         wire.read_set(tmp_path / "set", 5, ["lod_bias"])
@@ -59,7 +59,7 @@ def test_a_set_is_of_its_size(make_splats, tmp_path):
     path = tmp_path / "set"
     for count, degree in ((5, 3), (1, 0), (0, 0)):
         splats, weights = make_splats(count, degree), np.linspace(0, 1, count, dtype=np.float32)
-        wire.write_set(path, wire.packed(splats, weights))
+        wire.write_set(path, wire.pack_set(splats, weights))
         again, same = wire.read_set(path, count)
         np.testing.assert_array_equal(again.means, splats.means)
         assert np.array_equal(same, weights) and again.sh.shape[0] == count
@@ -77,18 +77,18 @@ def test_a_set_is_of_its_size(make_splats, tmp_path):
 @pytest.fixture
 def good(camera) -> dict:
     one = {"file": "set-1", "count": 3, "matrix": np.eye(4).tolist(), "level": 2}
-    return {"frame": 1, "out": "frame-1", "camera": camera_as_dict(camera, 0.1), "sets": [one]}
+    return {"frame": 1, "out": "frame-1", "camera": camera_to_dict(camera, 0.1), "sets": [one]}
 
 
 def test_a_request_is_what_was_asked(good, camera):
-    found = read_request(
-        read_line(json.dumps(good | {"window": [1, 2, 3, 4], "background": [0, 1, 2]}).encode())
+    found = parse_request(
+        parse_line(json.dumps(good | {"window": [1, 2, 3, 4], "background": [0, 1, 2]}).encode())
     )
     assert found.window == (1, 2, 3, 4) and found.background == (0.0, 1.0, 2.0) and found.near == 0.1
     assert found.sets[0].file == "set-1" and found.sets[0].level == 2 and not found.depth
-    assert camera_as_dict(found.camera, 0.1) == camera_as_dict(camera, 0.1)
-    assert read_request({"cancel": 3}) == Cancel(3)
-    assert frame_of(good) == 1 and frame_of({"frame": []}) is None
+    assert camera_to_dict(found.camera, 0.1) == camera_to_dict(camera, 0.1)
+    assert parse_request({"cancel": 3}) == CancelRequest(3)
+    assert frame_number(good) == 1 and frame_number({"frame": []}) is None
 
 
 @pytest.mark.parametrize(
@@ -104,7 +104,7 @@ def test_a_request_is_what_was_asked(good, camera):
 )  # fmt: skip
 def test_impossible_requests_are_a_sentence(good, change):
     with pytest.raises(LodgsError, match="is not valid"):
-        read_request(good | change)
+        parse_request(good | change)
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_impossible_requests_are_a_sentence(good, change):
 def test_impossible_sets_are_a_sentence(good, change):
     good["sets"][0] |= change
     with pytest.raises(LodgsError, match="is not valid"):
-        read_request(good)
+        parse_request(good)
 
 
 @pytest.mark.parametrize(
@@ -129,4 +129,4 @@ def test_impossible_sets_are_a_sentence(good, change):
 )
 def test_lines_that_are_no_request(line):
     with pytest.raises(LodgsError, match="A request is not valid"):
-        read_line(line)
+        parse_line(line)

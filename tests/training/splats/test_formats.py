@@ -258,5 +258,5 @@ def test_one_command_writes_all_forms_alike(tmp_path, monkeypatch, capsys, cumul
     finest = np.concatenate(want) if cumulative else want[-1]
     assert np.allclose(one.means, finest, atol=1e-5)
     assert np.array_equal(read_splat(tmp_path / "one.splat").means, one.means)
-    assert np.array_equal(out.upright, np.eye(3))
+    assert np.array_equal(out.up_rotation, np.eye(3))
     assert main(["edit", "in.ply"]) == 2  # nothing to write

@@ -7,7 +7,7 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from training.errors import LodgsError
-from training.splats.ply import read_elements, read_ply, splats_from, write_ply
+from training.splats.ply import read_elements, read_ply, splats_from_rows, write_ply
 
 # Degree 1, two splats; value = splat / 2 + place of the column.
 GOLDEN_COLUMNS = [
@@ -225,7 +225,7 @@ def test_ascii_of_several_elements_with_any_line_ends(tmp_path):
     for ends in (b"\n", b"\r\n", b"\r"):
         (tmp_path / "a.ply").write_bytes(data.replace(b"\n", ends))
         elements, _ = read_elements(tmp_path / "a.ply")
-        check_golden(splats_from(elements["vertex"], "a"))
+        check_golden(splats_from_rows(elements["vertex"], "a"))
         assert (elements["other"]["a"].tolist(), elements["third"]["b"].tolist()) == ([7], [8, 9])
         assert list(elements) == ["vertex", "other", "third"]
 

@@ -8,8 +8,8 @@ import pytest
 from training.errors import LodgsError
 from training.splats.bundle import NO_SPLATS, Bundle, Level, open_bundle, open_ply, write_bundle
 from training.splats.gaussians import Splats
-from training.splats.ply import AT_ONCE, read_ply, write_ply
-from training.splats.scratch import Scratch
+from training.splats.ply import BATCH_ROWS, read_ply, write_ply
+from training.splats.scratch import ScratchFile
 
 
 def random_splats(count, seed=0):
@@ -31,7 +31,7 @@ def same(one, other):
 def test_rows_come_back_in_any_order(tmp_path):
     splats = random_splats(40_000)
     splats.extras["kind"] = splats.extras["kind"].astype(np.uint8)
-    with Scratch(tmp_path) as file:
+    with ScratchFile(tmp_path) as file:
         file.write(30_000, splats.select(slice(30_000, None)))
         file.write(0, splats.select(slice(0, 17)))
         file.write(17, splats.select(slice(17, 30_000)))
@@ -47,12 +47,12 @@ def test_rows_come_back_in_any_order(tmp_path):
 
 def test_a_folder_that_takes_no_file_is_a_sentence(tmp_path):
     with pytest.raises(LodgsError, match="could not be read or written"):
-        Scratch(tmp_path / "none")
+        ScratchFile(tmp_path / "none")
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no such device here")
 def test_a_full_disk_is_a_sentence(tmp_path):
-    with Scratch(tmp_path) as file:
+    with ScratchFile(tmp_path) as file:
         file.append(splats := random_splats(5))
         file._file.close()
         file._file = open("/dev/full", "r+b", buffering=0)  # noqa: SIM115
@@ -61,7 +61,7 @@ def test_a_full_disk_is_a_sentence(tmp_path):
 
 
 def test_levels_that_are_elsewhere_are_written_as_those_in_memory(tmp_path):
-    levels = [random_splats(700, 1), random_splats(AT_ONCE + 900, 2)]
+    levels = [random_splats(700, 1), random_splats(BATCH_ROWS + 900, 2)]
     for each in levels:
         each.extras["kind"] = each.extras["kind"].astype(np.int16)
     for number, each in enumerate(levels, 1):
@@ -69,7 +69,7 @@ def test_levels_that_are_elsewhere_are_written_as_those_in_memory(tmp_path):
     for cumulative in (False, True):
         known = Bundle("a", [Level(n, each) for n, each in enumerate(levels, 1)], cumulative=cumulative)
         write_bundle(tmp_path / "whole.ply", known)
-        found = [Level(n, NO_SPLATS, elsewhere=open_ply(tmp_path / f"{n}.ply")) for n in (1, 2)]
+        found = [Level(n, NO_SPLATS, on_disk=open_ply(tmp_path / f"{n}.ply")) for n in (1, 2)]
         write_bundle(tmp_path / "parts.ply", Bundle("a", found, cumulative=cumulative))
         assert (tmp_path / "whole.ply").read_bytes() == (tmp_path / "parts.ply").read_bytes()
     _, rows = open_bundle(tmp_path / "parts.ply")

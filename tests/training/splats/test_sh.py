@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from training.splats.sh import basis, basis_gradient, coefficients, degree_of
+from training.splats.sh import basis, basis_gradient, coefficient_count, degree_from_count
 
 
 def directions(count: int) -> np.ndarray:
@@ -36,7 +36,7 @@ def test_signs_and_order_are_those_of_3dgs():
 
 @pytest.mark.parametrize("degree", range(5))
 def test_derivatives_are_autograds(degree):
-    count = coefficients(degree)
+    count = coefficient_count(degree)
     points = torch.tensor(directions(20), requires_grad=True)
     values = [None] * count
     basis(*points.unbind(1), degree, values)
@@ -50,6 +50,6 @@ def test_derivatives_are_autograds(degree):
 
 
 def test_coefficients_that_make_no_degree_are_refused():
-    assert [degree_of(n) for n in (1, 4, 9, 16, 25)] == [0, 1, 2, 3, 4]
+    assert [degree_from_count(n) for n in (1, 4, 9, 16, 25)] == [0, 1, 2, 3, 4]
     with pytest.raises(ValueError, match="12"):
-        degree_of(12)
+        degree_from_count(12)

@@ -7,7 +7,7 @@ from math import inf
 
 import numpy as np
 
-from ...splats.dialects import FARTHEST
+from ...splats.dialects import MAX_COORDINATE
 from ..rule import NO_COLUMNS, NO_FINER, NO_TABLES, Control, Region, Rule, Tables, Values, distances
 
 COLUMNS = ("x", "y", "z", "radius")
@@ -86,7 +86,7 @@ class Chunks(Rule):
             raise ValueError(f"its table '{TABLE}' has no {', '.join(missing)}")
         if _rows(tables) > MOST_CHUNKS:
             raise ValueError(f"there are {_rows(tables):,} chunks, of at most {MOST_CHUNKS}")
-        if not all((np.abs(table[name]) <= FARTHEST).all() for name in COLUMNS if table):
+        if not all((np.abs(table[name]) <= MAX_COORDINATE).all() for name in COLUMNS if table):
             raise ValueError("a chunk is nowhere")
 
     def region(self, eye, values: Values, tables: Tables) -> Region | None:

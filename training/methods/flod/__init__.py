@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from ...errors import LodgsError
 from ...optimize.method_info import MethodInfo
 from ...optimize.parameters import PAPER, STANDARD, DensityParameters, parameter
-from ...splats.bundle import MOST_LEVELS
+from ...splats.bundle import MAX_LEVELS
 
 PAPER_FOOTPRINT = 40.0
 """Pixels that the paper's lambda, 0.2 COLMAP units, covers at the median depth of its scenes, about."""
@@ -21,7 +21,7 @@ PAPER_REACH = PAPER_FOOTPRINT / 4**3
 class FlodParameters(DensityParameters):
     """A tuple has one entry for each level, coarse to fine. ``max_splats`` is the last level's."""
 
-    levels: int = parameter(5, "Number of levels (FLoD: L_max).", low=1, high=MOST_LEVELS)
+    levels: int = parameter(5, "Number of levels (FLoD: L_max).", low=1, high=MAX_LEVELS)
     rho: float = parameter(
         4.0, "Factor between the smallest sizes of two neighbouring levels (FLoD: rho).", above=1
     )

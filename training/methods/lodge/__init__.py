@@ -6,7 +6,7 @@ from itertools import pairwise
 from ...errors import LodgsError
 from ...optimize.method_info import MethodInfo
 from ...optimize.parameters import PAPER, STANDARD, parameter
-from ...splats.bundle import MOST_LEVELS
+from ...splats.bundle import MAX_LEVELS
 from ..threedgs import ThreedgsParameters
 
 ROUNDS = (0.2, 0.6, 1.0)
@@ -20,7 +20,7 @@ class LodgeParameters(ThreedgsParameters):
     A tuple has one entry for each level, coarse to fine.
     """
 
-    levels: int = parameter(3, "Number of levels, the finest among them.", low=1, high=MOST_LEVELS)
+    levels: int = parameter(3, "Number of levels, the finest among them.", low=1, high=MAX_LEVELS)
     distances: tuple[float, ...] = parameter(
         (0.0,) * 3,
         "Distance from which on each level is shown, in median depths of the scene, falling to 0 for the "

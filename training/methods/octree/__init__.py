@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from ...errors import LodgsError
 from ...optimize.method_info import MethodInfo
 from ...optimize.parameters import AS_PUBLISHED, STANDARD, Parameters, parameter
-from ...splats.bundle import MOST_LEVELS
+from ...splats.bundle import MAX_LEVELS
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class OctreeParameters(Parameters):
     levels: int = parameter(
         0,
         "Number of levels (Octree-GS: K); 0 takes it from the range of distances (Eq. 3).",
-        high=MOST_LEVELS,
+        high=MAX_LEVELS,
     )
     nearest: float = parameter(
         0.05,

@@ -13,8 +13,8 @@ from math import floor, log2
 import numpy as np
 
 from ...errors import LodgsError
-from ...scenes.cameras import Camera, evenly
-from ...splats.bundle import MOST_LEVELS
+from ...scenes.cameras import Camera, pick_evenly
+from ...splats.bundle import MAX_LEVELS
 
 POINTS, VIEWS = 50_000, 500
 """About so many points and views tell how far views see."""
@@ -88,14 +88,14 @@ def build(
     Raises:
         LodgsError: if no view sees a point.
     """
-    some = points[:: max(1, len(points) // POINTS)], evenly(cameras, VIEWS)
+    some = points[:: max(1, len(points) // POINTS)], pick_evenly(cameras, VIEWS)
     distances = np.concatenate(view_distances(*some, focal_px))
     if not len(distances):
         raise LodgsError(
             "No training view sees any of the scene's points.", "Check that both are of one model."
         )
     d_min, d_max = np.quantile(distances, quantiles)
-    levels = levels or min(floor(log2(d_max / d_min)) + 1 + coarser, MOST_LEVELS)
+    levels = levels or min(floor(log2(d_max / d_min)) + 1 + coarser, MAX_LEVELS)
     coarser = min(coarser, levels - 1)
     d_max = float(d_max) * 2**coarser
     return Octree(levels, d_max, focal_px, footprint * d_max / focal_px, points.min(axis=0) - 1e-6)

@@ -416,7 +416,11 @@ class Method(method.Method[NeuralOctreeParameters, Drawing]):
         Gaussians of no opacity in the median view are left out.
         """
         p, count = self.parameters, len(self.model)
-        places, columns, terms = self.model["means"], self.model.columns, harmonics.coefficients(p.sh_degree)
+        places, columns, terms = (
+            self.model["means"],
+            self.model.columns,
+            harmonics.coefficient_count(p.sh_degree),
+        )
 
         def zeros(*shape: int) -> torch.Tensor:
             return torch.zeros(count, *shape, device=self.device)

@@ -18,7 +18,7 @@ from training.methods.threedgs.train import WEIGHED_AT
 from training.optimize.parameters import override
 from training.rasterize import Gaussians, contributions, rasterize
 from training.scenes.cameras import Camera
-from training.splats.bundle import MOST_LEVELS, Bundle, Level, read_bundle, write_bundle
+from training.splats.bundle import MAX_LEVELS, Bundle, Level, read_bundle, write_bundle
 from training.splats.gaussians import Splats
 
 
@@ -256,7 +256,7 @@ def test_the_distance_found_is_the_cheapest_that_was_tried(data, base):
         assert lodge.d_l[cost["level"]] == cost["distances"][int(np.argmin(cost["costs"]))]
 
 
-@pytest.mark.parametrize("count", [MOST_CURVES, MOST_LEVELS])
+@pytest.mark.parametrize("count", [MOST_CURVES, MAX_LEVELS])
 def test_the_head_of_a_bundle_has_room_for_what_was_tried(data, base, tmp_path, count):
     lodge = make(data, base, levels=count)
     odd = [123.4] * TRIED

@@ -12,8 +12,8 @@ from training.errors import LodgsError
 from training.rasterize import Gaussians, rasterize
 from training.scenes.cameras import Camera
 from training.splats.gaussians import Splats
-from training.splats.placing import PlacedRows, Placement
-from training.splats.sh import basis, coefficients
+from training.splats.sh import basis, coefficient_count
+from training.splats.similarity import Similarity, TransformedRows
 
 
 def some_splats(count: int, degree: int, seed: int = 0) -> Splats:
@@ -23,7 +23,7 @@ def some_splats(count: int, degree: int, seed: int = 0) -> Splats:
         quats=rng.normal(size=(count, 4)).astype(np.float32),
         log_scales=rng.normal(-2.5, 0.6, (count, 3)).astype(np.float32),
         opacity_logits=rng.normal(0.5, 2, count).astype(np.float32),
-        sh=rng.normal(0, 0.4, (count, coefficients(degree), 3)).astype(np.float32),
+        sh=rng.normal(0, 0.4, (count, coefficient_count(degree), 3)).astype(np.float32),
     )
 
 
@@ -49,22 +49,22 @@ def drawn(splats: Splats, camera: Camera, near: float) -> np.ndarray:
 @pytest.mark.parametrize("scale", [1.0, 0.37, 12.5])
 def test_the_turned_scene_is_what_the_turned_camera_sees(degree, scale):
     """At least 50 dB, where harmonics that stay behind have less than 30."""
-    splats, placement = some_splats(300, degree), Placement.of(matrix_of(degree, scale))
+    splats, placement = some_splats(300, degree), Similarity.from_matrix(matrix_of(degree, scale))
     camera = Camera("", 96, 72, 90.0, 80.0, 50.0, 33.0, look_at((2.5, 0.4, 1.5)))
     there, unit = camera.within(np.linalg.inv(placement.matrix))
     assert unit == pytest.approx(1 / scale)
     before = drawn(splats, camera, 0.01)
-    after = drawn(placement.splats(splats), there, 0.01 * scale)
+    after = drawn(placement.transform_splats(splats), there, 0.01 * scale)
     assert before.std() > 0.1
     assert -10 * np.log10(np.square(after - before).mean()) > 50
-    left = drawn(replace(placement.splats(splats), sh=splats.sh), there, 0.01 * scale)
+    left = drawn(replace(placement.transform_splats(splats), sh=splats.sh), there, 0.01 * scale)
     assert -10 * np.log10(np.square(left - before).mean()) < 30
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_colours_covariances_and_places_go_along(seed):
     splats, matrix = some_splats(50, 4, seed), matrix_of(seed, 2.5)
-    placed, linear = Placement.of(matrix).splats(splats), matrix[:3, :3]
+    placed, linear = Similarity.from_matrix(matrix).transform_splats(splats), matrix[:3, :3]
     np.testing.assert_allclose(placed.means, splats.means @ linear.T + matrix[:3, 3], atol=1e-6)
     np.testing.assert_allclose(
         covariances(placed), linear @ covariances(splats) @ linear.T, rtol=1e-4, atol=1e-6
@@ -84,14 +84,14 @@ def test_colours_covariances_and_places_go_along(seed):
 
 def test_the_identity_changes_nothing():
     splats = some_splats(20, 3)
-    placed = Placement.of(np.eye(4)).splats(splats)
+    placed = Similarity.from_matrix(np.eye(4)).transform_splats(splats)
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
         np.testing.assert_array_equal(getattr(placed, name), getattr(splats, name))
 
 
 def test_back_again_is_where_it_was():
     splats, matrix = some_splats(50, 3), matrix_of(4, 0.2)
-    again = Placement.of(np.linalg.inv(matrix)).splats(Placement.of(matrix).splats(splats))
+    again = Similarity.from_matrix(np.linalg.inv(matrix)).transform_splats(Similarity.from_matrix(matrix).transform_splats(splats))
     for name in ("means", "log_scales", "sh"):
         np.testing.assert_allclose(getattr(again, name), getattr(splats, name), atol=2e-5)
     sign = np.sign((again.quats * splats.quats).sum(axis=1, keepdims=True))  # q and -q are one rotation
@@ -104,7 +104,7 @@ def test_further_columns_go_along_as_what_they_are():
     splats.extras = columns | {"nx": np.float32([1, 0, 0]), "ny": np.float32([0, 1, 0])}
     splats.extras |= {"nz": np.float32([0, 0, 1]), "far": np.float32([3e38, 0, 1])}
     quarter = np.array([[0, -2, 0, 10], [2, 0, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1.0]])
-    placed = Placement.of(quarter).splats(splats, ("size",), (("px", "py", "pz"),)).extras
+    placed = Similarity.from_matrix(quarter).transform_splats(splats, ("size",), (("px", "py", "pz"),)).extras
     assert placed["size"].tolist() == [2, 4, 6] and placed["weight"].tolist() == [1, 2, 3]
     assert [placed[name].tolist() for name in ("px", "py", "pz")] == [[8, 6, 4], [2, 4, 6], [2, 4, 6]]
     normals = np.stack([placed[name] for name in ("nx", "ny", "nz")], axis=1)
@@ -119,20 +119,20 @@ def test_a_rotation_as_a_quaternion(seed):
         turn = Rotation.from_rotvec(np.pi * np.eye(3)[seed])
     matrix = np.eye(4)
     matrix[:3, :3] = turn.as_matrix()
-    quat, wanted = Placement.of(matrix).quat, turn.as_quat()[[3, 0, 1, 2]]
+    quat, wanted = Similarity.from_matrix(matrix).quat, turn.as_quat()[[3, 0, 1, 2]]
     assert abs(quat @ wanted) == pytest.approx(1, abs=1e-12)
 
 
 def test_angles_are_those_of_scipy_about_fixed_axes():
-    placement = Placement.composed((20, -50, 130), 2.5, (1, 2, 3))
+    placement = Similarity.from_angles((20, -50, 130), 2.5, (1, 2, 3))
     wanted = Rotation.from_euler("xyz", (20, -50, 130), degrees=True).as_matrix()
     np.testing.assert_allclose(placement.matrix[:3, :3], 2.5 * wanted, atol=1e-12)
     assert placement.matrix[:3, 3].tolist() == [1, 2, 3]
     with pytest.raises(LodgsError, match="scale of 0"):
-        Placement.composed(scale=0.0)
-    first, points = Placement.of(matrix_of(1, 3.0)), np.eye(3)
+        Similarity.from_angles(scale=0.0)
+    first, points = Similarity.from_matrix(matrix_of(1, 3.0)), np.eye(3)
     np.testing.assert_allclose(
-        placement.after(first).points(points), placement.points(first.points(points)), atol=1e-12
+        placement.compose(first).transform_points(points), placement.transform_points(first.transform_points(points)), atol=1e-12
     )
 
 
@@ -150,12 +150,12 @@ def test_what_is_no_placement_is_refused(linear):
     matrix = np.eye(4)
     matrix[:3, :3] = linear
     with pytest.raises(LodgsError, match=r"stretches|no transform"):
-        Placement.of(matrix)
+        Similarity.from_matrix(matrix)
 
 
 def test_rows_in_a_file_are_placed_as_they_are_read():
-    splats, placement = some_splats(30, 1), Placement.of(matrix_of(1, 3.0))
-    rows = PlacedRows(splats, placement.splats, {"mine": np.arange(30, dtype=np.float32)})
-    some, whole = rows.select(slice(10, 20)), placement.splats(splats)
+    splats, placement = some_splats(30, 1), Similarity.from_matrix(matrix_of(1, 3.0))
+    rows = TransformedRows(splats, placement.transform_splats, {"mine": np.arange(30, dtype=np.float32)})
+    some, whole = rows.select(slice(10, 20)), placement.transform_splats(splats)
     assert len(rows) == 30 and torch.equal(torch.from_numpy(some.means), torch.from_numpy(whole.means[10:20]))
     np.testing.assert_array_equal(some.extras["mine"], np.arange(10, 20))

@@ -15,7 +15,7 @@ from ..scenes.color import linear_from_srgb
 from ..scenes.exr import read_parts, write_exr
 from ..scenes.images import write_png
 
-NOTHING = 1e10
+NO_DEPTH = 1e10
 """Depth where a pixel shows nothing, as Blender's renderers say it."""
 
 _DEPTH = re.compile(r"(.*\.)?depth(\.[a-z])?|z|v", re.IGNORECASE)
@@ -29,7 +29,7 @@ _CLEAR = 0.02
 
 
 @dataclass
-class Picture:
+class RenderedImage:
     """What a camera sees.
 
     Attributes:
@@ -57,7 +57,7 @@ class Picture:
         background: tuple[float, float, float] | None,
         depth: bool = False,
         levels: list[int] | None = None,
-    ) -> Picture:
+    ) -> RenderedImage:
         """A picture of nothing but the background."""
         shape = height, width
         image = np.empty((*shape, 3), np.float32)
@@ -65,7 +65,7 @@ class Picture:
         return cls(
             image=image,
             alpha=np.full(shape, 0.0 if background is None else 1.0, np.float32),
-            depth=np.full(shape if depth else (0, 0), NOTHING, np.float32),
+            depth=np.full(shape if depth else (0, 0), NO_DEPTH, np.float32),
             levels=levels or [],
             masks=np.zeros((len(levels or []), *shape), np.float32),
         )
@@ -130,7 +130,7 @@ def _clear(values: np.ndarray) -> np.ndarray:
     return (codes + np.where(rest >= 0, np.maximum(_CLEAR - rest, 0), np.minimum(-_CLEAR - rest, 0))) / 255
 
 
-def write_picture(path: Path, picture: Picture) -> None:
+def write_image(path: Path, picture: RenderedImage) -> None:
     """Writes a PNG, or a multilayer EXR with every pass, by the file's ending.
 
     Raises:
@@ -172,7 +172,7 @@ def read_depth(path: Path, width: int, height: int, window: tuple[int, int, int,
         raise LodgsError(
             f"{path.name} has no Depth pass.", "Tick Depth among its view layer's passes and render it anew."
         )
-    depth = np.nan_to_num(np.fmin.reduce(found), nan=NOTHING, posinf=NOTHING)  # half floats have no 1e10
+    depth = np.nan_to_num(np.fmin.reduce(found), nan=NO_DEPTH, posinf=NO_DEPTH)  # half floats have no 1e10
     left, top, across, up = window or (0, 0, width, height)
     if depth.shape == (height, width):
         return depth[top : top + up, left : left + across]
@@ -184,5 +184,5 @@ def read_depth(path: Path, width: int, height: int, window: tuple[int, int, int,
     )
 
 
-def _write_exr(path: Path, picture: Picture) -> None:
+def _write_exr(path: Path, picture: RenderedImage) -> None:
     write_exr(path, {f"LODGS.{name}": plane for name, plane in picture.passes().items()})

@@ -13,13 +13,13 @@ from . import sh as harmonics
 from .gaussians import SplatRows, Splats
 from .ply import NORMALS, Columns
 
-Place = tuple[str, str, str]
+AxisNames = tuple[str, str, str]
 """Names of the columns of x, y and z."""
 _DIRECTIONS = 200
 """Directions on which harmonics are compared: several times as many as the 9 of degree 4."""
 
 
-def similarity(matrix: np.ndarray) -> bool:
+def is_similarity(matrix: np.ndarray) -> bool:
     """Whether a transform (4, 4) is a rotation, one scale for all axes, and a translation."""
     linear = matrix[:3, :3]
     square = linear.T @ linear
@@ -28,7 +28,7 @@ def similarity(matrix: np.ndarray) -> bool:
 
 
 @dataclass(frozen=True)
-class Placement:
+class Similarity:
     """Where splats stand: x' = scale · rotation x + translation.
 
     Attributes:
@@ -42,7 +42,7 @@ class Placement:
     translation: np.ndarray
 
     @classmethod
-    def of(cls, matrix: np.ndarray) -> Placement:
+    def from_matrix(cls, matrix: np.ndarray) -> Similarity:
         """The placement that a matrix (4, 4) is.
 
         Raises:
@@ -51,7 +51,7 @@ class Placement:
         matrix = np.asarray(matrix, np.float64)
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or (matrix[3] != (0, 0, 0, 1)).any():
             raise LodgsError("This is no transform.", "Give 4 rows of 4 numbers, the last of them 0 0 0 1.")
-        if not matrix[:3, :3].any() or not similarity(matrix):
+        if not matrix[:3, :3].any() or not is_similarity(matrix):
             raise LodgsError(
                 "The transform stretches, shears or mirrors the splats, which no file of splats can hold.",
                 "Give it one scale for all axes, above 0.",
@@ -61,12 +61,12 @@ class Placement:
         return cls(left @ right, scale, matrix[:3, 3])
 
     @classmethod
-    def composed(
+    def from_angles(
         cls,
         degrees: Sequence[float] = (0, 0, 0),
         scale: float = 1.0,
         translation: Sequence[float] = (0, 0, 0),
-    ) -> Placement:
+    ) -> Similarity:
         """Of angles about x, then y, then z, as Blender's XYZ Euler angles are.
 
         Raises:
@@ -82,11 +82,11 @@ class Placement:
             raise LodgsError(f"A scale of {scale:g} is not possible.", "Give a number above 0.")
         found[:3, :3] *= scale
         found[:3, 3] = translation
-        return cls.of(found)
+        return cls.from_matrix(found)
 
-    def after(self, first: Placement) -> Placement:
+    def compose(self, first: Similarity) -> Similarity:
         """This placement of what another one has placed before."""
-        return Placement.of(self.matrix @ first.matrix)
+        return Similarity.from_matrix(self.matrix @ first.matrix)
 
     @property
     def matrix(self) -> np.ndarray:
@@ -109,7 +109,7 @@ class Placement:
         row = squares[np.argmax(np.diag(squares))]
         return row / np.linalg.norm(row)
 
-    def axes(self, places: Iterable[np.ndarray], shift: bool = True) -> list[np.ndarray]:
+    def transform_axes(self, places: Iterable[np.ndarray], shift: bool = True) -> list[np.ndarray]:
         """Where places are then, axis by axis, (N,) float32 each: equal places to the bit at equal ones.
 
         Args:
@@ -124,11 +124,13 @@ class Placement:
             for (a, b, c), t in zip(rows, moved.tolist(), strict=True)
         ]
 
-    def points(self, points: np.ndarray) -> np.ndarray:
+    def transform_points(self, points: np.ndarray) -> np.ndarray:
         """Where places (N, 3) are then, (N, 3) float64."""
         return self.scale * np.asarray(points, np.float64) @ self.rotation.T + self.translation
 
-    def columns(self, columns: Columns, lengths: Collection[str], places: Sequence[Place]) -> Columns:
+    def transform_columns(
+        self, columns: Columns, lengths: Collection[str], places: Sequence[AxisNames]
+    ) -> Columns:
         """Columns by name of which some are lengths, and some the axes of places; others stay as they are."""
         found = dict(columns)
         for name in lengths:
@@ -137,7 +139,7 @@ class Placement:
                     found[name] = (found[name] * np.float64(self.scale)).astype(found[name].dtype)
         for place in places:
             if all(name in found for name in place):
-                axes = self.axes(found[name] for name in place)
+                axes = self.transform_axes(found[name] for name in place)
                 found |= {n: axis.astype(found[n].dtype) for n, axis in zip(place, axes, strict=True)}
         return found
 
@@ -152,21 +154,23 @@ class Placement:
         height = 1 - (2 * np.arange(_DIRECTIONS) + 1) / _DIRECTIONS
         turn, ring = np.arange(_DIRECTIONS) * np.pi * (3 - np.sqrt(5)), np.sqrt(1 - height**2)
         directions = np.stack([ring * np.cos(turn), ring * np.sin(turn), height])
-        before, after = np.empty((2, harmonics.coefficients(harmonics.MAX_DEGREE), _DIRECTIONS))
+        before, after = np.empty((2, harmonics.coefficient_count(harmonics.MAX_DEGREE), _DIRECTIONS))
         for values, (x, y, z) in ((before, directions), (after, self.rotation @ directions)):
             harmonics.basis(x, y, z, harmonics.MAX_DEGREE, values)
         bands = [slice(degree**2, (degree + 1) ** 2) for degree in range(1, harmonics.MAX_DEGREE + 1)]
         return [np.linalg.lstsq(after[band].T, before[band].T, rcond=None)[0] for band in bands]
 
-    def harmonics(self, sh: np.ndarray) -> np.ndarray:
+    def rotate_harmonics(self, sh: np.ndarray) -> np.ndarray:
         """Coefficients (N, (degree + 1)², 3) float32 as they are seen from turned directions."""
         turned = sh.copy()
-        for degree in range(1, harmonics.degree_of(sh.shape[1]) + 1):
+        for degree in range(1, harmonics.degree_from_count(sh.shape[1]) + 1):
             band = slice(degree**2, (degree + 1) ** 2)
             turned[:, band] = np.matmul(self._bands[degree - 1], sh[:, band])
         return turned
 
-    def splats(self, splats: Splats, lengths: Collection[str] = (), places: Sequence[Place] = ()) -> Splats:
+    def transform_splats(
+        self, splats: Splats, lengths: Collection[str] = (), places: Sequence[AxisNames] = ()
+    ) -> Splats:
         """Splats that look the same where they stand then, as new arrays.
 
         Means, rotations, scales, harmonics and normals go along; so do further columns that are said to.
@@ -175,17 +179,17 @@ class Placement:
             lengths: names of further columns that are lengths.
             places: of further columns that are places.
         """
-        extras = self.columns(splats.extras, lengths, places)
+        extras = self.transform_columns(splats.extras, lengths, places)
         if all(name in extras for name in NORMALS):
-            normals = self.axes((extras[name] for name in NORMALS), shift=False)
+            normals = self.transform_axes((extras[name] for name in NORMALS), shift=False)
             extras |= dict(zip(NORMALS, normals, strict=True))
         turned = not np.array_equal(self.rotation, np.eye(3))
         return replace(
             splats,
-            means=np.stack(self.axes(splats.means.T), axis=1),
+            means=np.stack(self.transform_axes(splats.means.T), axis=1),
             quats=self._turned(splats.quats) if turned else splats.quats.copy(),
             log_scales=splats.log_scales + np.float32(np.log(self.scale)),
-            sh=self.harmonics(splats.sh) if turned else splats.sh.copy(),
+            sh=self.rotate_harmonics(splats.sh) if turned else splats.sh.copy(),
             extras=extras,
         )
 
@@ -197,7 +201,7 @@ class Placement:
 
 
 @dataclass(frozen=True)
-class PlacedRows:
+class TransformedRows:
     """Splats in a file as they are where they stand then, a few rows at a time.
 
     Attributes:

@@ -8,13 +8,13 @@ import pytest
 from PIL import Image
 
 from training.errors import LodgsError
-from training.render.picture import NOTHING, Picture, read_depth, write_picture
+from training.render.image import NO_DEPTH, RenderedImage, read_depth, write_image
 
 
-def picture(image, alpha=None, **passes) -> Picture:
+def picture(image, alpha=None, **passes) -> RenderedImage:
     alpha = np.ones(image.shape[:2], np.float32) if alpha is None else alpha
     empty = {"depth": np.zeros((0, 0), np.float32), "levels": [], "masks": np.zeros((0, *alpha.shape))}
-    return Picture(image.astype(np.float32), alpha, **(empty | passes))
+    return RenderedImage(image.astype(np.float32), alpha, **(empty | passes))
 
 
 def coded(linear: np.ndarray) -> np.ndarray:
@@ -39,7 +39,7 @@ def test_strips_change_nothing(monkeypatch):
     alpha = rng.uniform(0, 1, (31, 17)).astype(np.float32)
     shown = picture(rng.uniform(0, 1, (31, 17, 3)) * alpha[..., None], alpha)
     whole = shown.eight_bit(), shown.linear()
-    monkeypatch.setattr("training.render.picture._STRIP", 50)
+    monkeypatch.setattr("training.render.image._STRIP", 50)
     for now, before in zip((shown.eight_bit(), shown.linear()), whole, strict=True):
         assert now.dtype == before.dtype
         np.testing.assert_array_equal(now, before)
@@ -68,7 +68,7 @@ def test_a_png_is_what_pillow_reads(tmp_path):
     for alpha in (None, rng.uniform(0.2, 1, (7, 5)).astype(np.float32)):
         image = rng.uniform(0, 1, (7, 5, 3)) * (1 if alpha is None else alpha[..., None])
         shown = picture(image, alpha)
-        write_picture(tmp_path / "a.png", shown)
+        write_image(tmp_path / "a.png", shown)
         with Image.open(tmp_path / "a.png") as file:
             assert file.mode == ("RGB" if alpha is None else "RGBA")
             np.testing.assert_array_equal(np.asarray(file), shown.eight_bit())
@@ -80,7 +80,7 @@ def test_an_exr_has_every_pass(tmp_path):
     masks[:, 0, 0] = 0
     depth = rng.uniform(1, 9, (6, 4)).astype(np.float32)
     shown = picture(rng.uniform(size=(6, 4, 3)), depth=depth, levels=[2, 5], masks=masks)
-    write_picture(tmp_path / "a.exr", shown)
+    write_image(tmp_path / "a.exr", shown)
     with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
         planes = {name: channel.pixels for name, channel in file.channels().items()}
     np.testing.assert_array_equal(planes["LODGS.Depth.Z"], depth)
@@ -119,7 +119,7 @@ def test_a_depth_is_found_by_its_channel(tmp_path, parts):
 
 def test_halfs_have_nothing_as_infinity(tmp_path):
     path = write_exr(tmp_path / "a.exr", ("", {"Depth.Z": np.float16([[2, np.inf, np.nan]])}))
-    np.testing.assert_array_equal(read_depth(path, 3, 1, None), np.float32([[2, NOTHING, NOTHING]]))
+    np.testing.assert_array_equal(read_depth(path, 3, 1, None), np.float32([[2, NO_DEPTH, NO_DEPTH]]))
 
 
 def test_what_is_no_depth_is_told(tmp_path):
@@ -140,5 +140,5 @@ def test_what_is_no_depth_is_told(tmp_path):
 
 def test_other_endings_are_refused(tmp_path):
     with pytest.raises(LodgsError, match=r"neither .png nor .exr"):
-        write_picture(tmp_path / "a.jpg", picture(np.zeros((2, 2, 3))))
+        write_image(tmp_path / "a.jpg", picture(np.zeros((2, 2, 3))))
     assert list(tmp_path.iterdir()) == []

@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from training.evaluate.aside import MOST_PLACES, VEIL, oversized, veil
+from training.evaluate.offset_views import MAX_POSITIONS, VEIL_DEPTH, count_oversized, measure_veil
 from training.evaluate.views import Evaluation
 from training.optimize.support import halfway
 from training.rasterize import Gaussians, rasterize
-from training.scenes.cameras import Camera, evenly
+from training.scenes.cameras import Camera, pick_evenly
 from training.splats.gaussians import Splats
 
 MEDIAN_DEPTH = 10.0
@@ -70,12 +70,12 @@ def test_two_cameras_have_one_place_between_them_each():
 
 
 def test_at_most_so_many_places_of_every_kind_are_chosen():
-    chosen = evenly(range(3 * MOST_PLACES), MOST_PLACES)  # as of so many cameras
-    assert len(chosen) == len(set(chosen)) == MOST_PLACES
-    assert (chosen[0], chosen[-1]) == (0, 3 * MOST_PLACES - 1)
+    chosen = pick_evenly(range(3 * MAX_POSITIONS), MAX_POSITIONS)  # as of so many cameras
+    assert len(chosen) == len(set(chosen)) == MAX_POSITIONS
+    assert (chosen[0], chosen[-1]) == (0, 3 * MAX_POSITIONS - 1)
     kinds = np.bincount(np.array(chosen) % 3)
-    assert kinds.min() >= MOST_PLACES / 4
-    assert evenly([7, 8, 9], 5) == [7, 8, 9] and evenly([], 5) == []
+    assert kinds.min() >= MAX_POSITIONS / 4
+    assert pick_evenly([7, 8, 9], 5) == [7, 8, 9] and pick_evenly([], 5) == []
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,7 @@ def test_at_most_so_many_places_of_every_kind_are_chosen():
     ],
 )
 def test_the_veil_of_a_wall_is_the_share_of_the_view_that_it_covers(splats, share):
-    found = veil(evaluation(camera(-1), camera(1)), lambda place: (splats, None))
+    found = measure_veil(evaluation(camera(-1), camera(1)), lambda place: (splats, None))
     assert found["mean"] == found["max"] == pytest.approx(share, abs=0.03)  # its edge is half a splat soft
 
 
@@ -111,9 +111,9 @@ def test_a_veiled_pixel_has_its_median_depth_before_the_limit():
         Gaussians.of(splats), camera(0), near=here.data.near, outputs=("median_depth",), backend="reference"
     ).median_depth
     assert depth is not None
-    share = float(((depth > 0) & (depth < VEIL * MEDIAN_DEPTH)).float().mean())
+    share = float(((depth > 0) & (depth < VEIL_DEPTH * MEDIAN_DEPTH)).float().mean())
     assert 0.05 < share < 0.95
-    assert veil(here, lambda place: (splats, None))["mean"] == pytest.approx(share, abs=1e-3)
+    assert measure_veil(here, lambda place: (splats, None))["mean"] == pytest.approx(share, abs=1e-3)
 
 
 def test_weights_count_and_are_those_of_the_place():
@@ -124,14 +124,14 @@ def test_weights_count_and_are_those_of_the_place():
         asked.append(float(place.center[0]))
         return splats, np.full(len(splats), 0.0 if len(asked) % 2 else 1.0, np.float32)
 
-    found = veil(evaluation(camera(-1), camera(1)), shown)
+    found = measure_veil(evaluation(camera(-1), camera(1)), shown)
     assert asked == [0, 0] and found == {"mean": 0.5, "max": 1.0}
 
 
 def test_mean_and_maximum_are_over_places():
     # places: 0 and 49 from -1, 0 and 50 from 1, 100 and 50 from 99, 100 and 51 from 101; the wall is at 0
     places = evaluation(camera(-1), camera(1), camera(99), camera(101))
-    assert veil(places, lambda place: (wall(0.5), None)) == {"mean": 0.25, "max": 1.0}
+    assert measure_veil(places, lambda place: (wall(0.5), None)) == {"mean": 0.25, "max": 1.0}
 
 
 def test_oversized_are_opaque_splats_among_the_cameras_larger_than_half_the_median_depth():
@@ -151,6 +151,6 @@ def test_oversized_are_opaque_splats_among_the_cameras_larger_than_half_the_medi
         log_scales=np.stack([scale - 3, scale, scale - 1], 1),
     )
     data = evaluation(camera(-1), camera(1)).data
-    assert oversized(data, lambda place: (splats, None)) == 2
+    assert count_oversized(data, lambda place: (splats, None)) == 2
     weights = np.float32([1.0, 0.9, 1, 1, 1])  # 0.9 of 0.525 is not opaque
-    assert oversized(data, lambda place: (splats, weights)) == 1
+    assert count_oversized(data, lambda place: (splats, weights)) == 1
