@@ -8,7 +8,7 @@ import bpy
 
 from ...training.errors import LodgsError
 from ..data import cells, scenes
-from ..runs import jobs
+from ..runs import job_settings, jobs, run_folders
 from ..runs.watch import Watch, root_by_uid, watch_of
 from .base import SceneOperator, report_errors, show_image
 from .modal import SteppedOperator
@@ -77,7 +77,7 @@ class LODGS_OT_plan_cells(SceneOperator, SteppedOperator, bpy.types.Operator):
         root = scenes.active_root(context)
         uid = root.session_uid
         limits = root.lodgs.training.limits
-        job = jobs.make_job(root, jobs.runs_folder(root), {})
+        job = job_settings.make_job(root, run_folders.runs_parent(root), {})
         reader = ThreadPoolExecutor(1, "lodgs-plan")
         try:
             reading = reader.submit(cells.plan_cells, job, *limits)
@@ -169,11 +169,11 @@ class LODGS_OT_show_log(SceneOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        jobs.log_text(scenes.active_root(context))
+        run_folders.log_text(scenes.active_root(context))
         return {"FINISHED"}
 
     def draw(self, context):
-        text = bpy.data.texts.get(jobs.LOG)
+        text = bpy.data.texts.get(run_folders.LOG)
         for line in (text.lines if text else [])[-20:]:
             self.layout.label(text=line.body)
 
@@ -185,7 +185,7 @@ class LODGS_OT_show_costs(SceneOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        plot = jobs.cost_plot(scenes.active_root(context))
+        plot = run_folders.cost_plot(scenes.active_root(context))
         if plot is None:
             raise LodgsError(
                 "Cannot show the cost curve: the open run has none.", "Open the run of these levels."

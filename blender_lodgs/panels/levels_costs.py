@@ -6,7 +6,7 @@ import bpy
 
 from ...training.evaluate.costs import cost_lines
 from ..data import scenes, selection
-from ..runs import jobs
+from ..runs import run_folders
 from .parts import LevelsPanel, scene_length
 
 
@@ -26,7 +26,7 @@ class LODGS_PT_costs(LevelsPanel):
         column.label(text="Splats per Image Tile")
         for line in _lines(context, root):
             column.label(text=line)
-        if jobs.cost_plot(root) is not None:
+        if run_folders.cost_plot(root) is not None:
             self.layout.operator("lodgs.show_costs", icon="GRAPH")
 
 

@@ -7,7 +7,7 @@ import bpy
 from ...training.errors import LodgsError
 from ...training.lod.colors import level_color
 from ..data import cells, scenes, viewpoints
-from ..runs import jobs
+from ..runs import job_settings, run_folders
 from ..runs.watch import Part, Watch, watch_of
 from .parts import Panel, say, split_column
 
@@ -101,7 +101,7 @@ def _draw_settings(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
     column.prop(settings, "at_once")
     column.prop(settings, "polish")
     try:
-        job = jobs.make_job(root, jobs.runs_folder(root), {})
+        job = job_settings.make_job(root, run_folders.runs_parent(root), {})
     except LodgsError as error:
         say(layout, str(error), "ERROR")
         return

@@ -6,7 +6,7 @@ import bpy
 
 from ...training.methods import method_info
 from ..data import scenes
-from ..runs import jobs
+from ..runs import run_folders
 
 VERBS = (
     ("lodgs.train", "lodgs.resume_training", "lodgs.cancel_training", "lodgs.open_run", "lodgs.add_region",
@@ -43,8 +43,8 @@ class LODGS_MT_runs(bpy.types.Menu):
 
     def draw(self, context):
         root = scenes.active_root(context)
-        runs = jobs.runs_of(root) if root is not None else []
-        current = jobs.run_folder(root) if root is not None else None
+        runs = run_folders.find_runs(root) if root is not None else []
+        current = run_folders.run_folder(root) if root is not None else None
         for run in runs:
             text = (
                 f"{run.folder.path.name}: {method_info(run.job.method).label}, {run.job.preset}, {run.state}"

@@ -1,1 +1,1 @@
-"""What works beside Blender: the trainer's Python, its runs, and how Blender looks after them."""
+"""Programs that run beside Blender: the trainer, its environment, captures and photo preparation."""

@@ -1,4 +1,4 @@
-"""Capturing the Blender scene from the panel: another Blender renders its views in background."""
+"""Capture of the Blender scene from the panel: a second Blender renders the views in background."""
 
 from __future__ import annotations
 
@@ -13,86 +13,100 @@ from ...training.scenes.rendered import CAMERAS
 from .. import extension
 from ..data import viewpoints
 from . import environment, processes
-from .messages import duration
+from .messages import format_duration
 
 
-class Capturing:
-    """A Blender that renders views, and what the panel shows of it.
+class BackgroundCapture:
+    """A background Blender that renders views, with its progress for the panel.
 
     Attributes:
-        folder: the COLMAP scene that it makes.
-        message: what it is doing.
-        fraction: how much is done, 0 to 1.
-        problem: why it failed; empty when it did not.
-        running: whether it is still at work.
+        folder: folder of the COLMAP scene that it creates.
+        message: current step, or the result.
+        fraction: progress, 0 to 1.
+        problem: reason of a failure. Empty otherwise.
+        running: whether the program is running.
     """
 
     def __init__(self, folder: Path, count: int, process: subprocess.Popen, log: Path, copy: Path) -> None:
-        self.folder, self.message, self.fraction, self.problem = folder, "Opening the scene", 0.0, ""
+        self.folder = folder
+        self.message = "Opening the scene"
+        self.fraction = 0.0
+        self.problem = ""
         self.running = True
-        self._count, self._process, self._log, self._copy = count, process, log, copy
+        self._count = count
+        self._process = process
+        self._log = log
+        self._copy = copy
         self._cancelled = False
-        self._began, self._before = time.monotonic(), self._there()
+        self._start_time = time.monotonic()
+        self._start_count = self._rendered_count()
 
     def cancel(self) -> None:
-        """Stops it; the same capture goes on from there."""
+        """Stop the program. Starting the same capture again continues it."""
         self._cancelled = True
         self._process.terminate()
 
     def step(self) -> bool:
-        """For ``processes.follow``: show what is new; return whether it goes on."""
-        code, there = self._process.poll(), self._there()
-        self.running, self.fraction = code is None, there / self._count
-        if there > self._before:
-            left = (time.monotonic() - self._began) / (there - self._before) * (self._count - there)
-            self.message = f"View {min(there + 1, self._count)} of {self._count}, {duration(left)} left"
-        if there == self._count:
+        """Update the progress. Return whether the program is running, for ``processes.follow``."""
+        code = self._process.poll()
+        rendered = self._rendered_count()
+        self.running = code is None
+        self.fraction = rendered / self._count
+        if rendered > self._start_count:
+            seconds_per_view = (time.monotonic() - self._start_time) / (rendered - self._start_count)
+            time_left = format_duration(seconds_per_view * (self._count - rendered))
+            self.message = f"View {min(rendered + 1, self._count)} of {self._count}, {time_left} left"
+        if rendered == self._count:
             self.message = "Finding points"
         if code is not None:
             self._copy.unlink(missing_ok=True)
-            self.message = "Captured" if code == 0 else f"Stopped after {there} of {self._count} views"
-            self.problem = "" if code == 0 or self._cancelled else self._why(code, there)
+            self.message = "Captured" if code == 0 else f"Stopped after {rendered} of {self._count} views"
+            self.problem = "" if code == 0 or self._cancelled else self._failure_reason(code, rendered)
         extension.redraw()
         return self.running
 
-    def _why(self, code: int, there: int) -> str:
-        if there == self._before and not 0 <= code < 256:  # which only the system gives
+    def _failure_reason(self, code: int, rendered: int) -> str:
+        if rendered == self._start_count and not 0 <= code < 256:  # the system killed the program
             return (
-                "Blender crashed at the first view. EEVEE and Workbench need graphics, in background too. "
-                f"Where there are none choose Cycles; {self._log} tells more."
+                "Blender crashed at the first view. EEVEE and Workbench need a graphics card, even in "
+                f"background. Choose Cycles if this computer has none. See {self._log}."
             )
-        return processes.problem_of(self._log, code)
+        return processes.failure_reason(self._log, code)
 
-    def _there(self) -> int:
+    def _rendered_count(self) -> int:
         return len(list((self.folder / CAMERAS).glob("*.json")))
 
 
-current: Capturing | None = None
-"""The capture that is at work, or was last."""
+current: BackgroundCapture | None = None
+"""The running or last capture."""
 
 
-def folder_of(scene: bpy.types.Scene) -> Path:
-    """Where a Blender scene is captured to.
+def capture_folder(scene: bpy.types.Scene) -> Path:
+    """Return the output folder for captures of a Blender scene.
 
     Raises:
-        LodgsError: no folder is chosen, and the .blend is not saved.
+        LodgsError: no folder is chosen, and the .blend file is not saved.
     """
     folder = scene.lodgs_capture.folder
     if not folder and not bpy.data.filepath:
-        raise LodgsError("The .blend is not saved yet.", "Save it, or choose a folder for the capture.")
+        raise LodgsError(
+            "Cannot choose a folder for the capture: the .blend file is not saved.",
+            "Save it, or choose a folder.",
+        )
     return Path(bpy.path.abspath(folder or "//lodgs_capture")).resolve()
 
 
-def start(context: bpy.types.Context) -> Capturing:
-    """Begin to capture the Blender scene as it is now, or go on with it.
+def start(context: bpy.types.Context) -> BackgroundCapture:
+    """Start to capture the current Blender scene, or continue an earlier capture.
 
     Raises:
-        LodgsError: one is at work, no trainer, no such views, or the folder cannot be written.
+        LodgsError: a capture is running, the trainer is missing, the views are invalid, or the folder is not
+            writable.
     """
     global current
     if current is not None and current.running:
-        raise LodgsError("A capture is at work already.", "Wait for it or cancel it.")
-    folder = folder_of(context.scene)
+        raise LodgsError("A capture is already running.", "Wait for it or cancel it.")
+    folder = capture_folder(context.scene)
     count = len(viewpoints.of_scene(context, *viewpoints.size(context.scene, context.scene.lodgs_capture)))
     environment.require(environment.trainer_python())
     copy, log = folder / "capture.blend", folder / "capture.log"
@@ -100,7 +114,7 @@ def start(context: bpy.types.Context) -> Capturing:
         folder.mkdir(parents=True, exist_ok=True)
         log.unlink(missing_ok=True)
         bpy.ops.wm.save_as_mainfile(filepath=str(copy), copy=True, check_existing=False)
-        trusted = [] if bpy.app.autoexec_fail else ["--enable-autoexec"]  # as it is here
+        trusted = [] if bpy.app.autoexec_fail else ["--enable-autoexec"]  # as in this Blender
         command = [
             bpy.app.binary_path,
             *trusted,
@@ -113,13 +127,13 @@ def start(context: bpy.types.Context) -> Capturing:
         ]
         process = processes.spawn(command, log=log, output=folder / "capture.out")
     except (OSError, RuntimeError) as error:
-        why = getattr(error, "strerror", None) or str(error).strip()
-        raise LodgsError(f"{folder} cannot be captured to: {why}.", "Choose another folder.") from error
-    current = Capturing(folder, count, process, log, copy)
+        reason = getattr(error, "strerror", None) or str(error).strip()
+        raise LodgsError(f"Cannot capture to {folder}: {reason}.", "Choose another folder.") from error
+    current = BackgroundCapture(folder, count, process, log, copy)
     return current
 
 
 def unregister() -> None:
-    """A capture ends with Blender: another one goes on with it."""
+    """Cancel the capture when Blender exits. It can be continued later."""
     if current is not None and current.running:
         current.cancel()

@@ -1,4 +1,4 @@
-"""The Python outside Blender that has PyTorch: which one it is, and whether it can train."""
+"""The trainer's Python environment: selection and checks of the Python that has PyTorch."""
 
 from __future__ import annotations
 
@@ -17,26 +17,30 @@ from .. import extension
 from . import processes
 
 VARIABLE = "LODGS_TRAINER_PYTHON"
-"""Environment variable that names the trainer's Python, before the preferences: for pipelines and tests."""
+"""Environment variable with the path of the trainer's Python. It overrides the preferences."""
 
 VERSIONS = ((3, 11), (3, 14))
-"""Oldest and newest Python that the pinned packages exist for."""
+"""Oldest and newest Python version that the pinned packages support."""
+
+TIMEOUT = 60.0
+"""Seconds after which a check is abandoned."""
 
 READY = "lodgs-ready.json"
-"""File in an environment that was made to the end and has been tried: without it, it is none."""
+"""File in an environment that is completely installed and tested."""
 
-_REMEDY = "Make an environment in the preferences of LODGS, or choose another Python there."
+_REMEDY = "Press Install Trainer in the preferences of LODGS, or choose another Python there."
 
 
 @dataclass
-class Report:
-    """What is known of a trainer's Python.
+class EnvironmentReport:
+    """Result of checking a trainer's Python.
 
     Attributes:
-        problems: a sentence for each.
-        versions: by package.
-        graphics: name of the graphics card that it would train on, where there is one.
-        devices: what trains on this computer, and what might be faster; empty where that was not asked.
+        python: path of the Python.
+        problems: one sentence per problem.
+        versions: package versions by package.
+        graphics: name of the graphics card used for training. Empty if there is none.
+        devices: sentence on the device that trains and on faster alternatives. Empty if not checked.
     """
 
     python: str
@@ -50,110 +54,112 @@ class Report:
         return not self.problems
 
 
-report: Report | None = None
-"""The last check, for the preferences; None before there was one of this environment."""
+report: EnvironmentReport | None = None
+"""Result of the last check, shown in the preferences. None if this environment is not checked yet."""
 
 
-def folder() -> Path:
-    """Where the environments lie that the extension makes, in numbered folders (``environment_setup``)."""
+def environments_folder() -> Path:
+    """Return the folder of the managed environments, which are numbered folders (``environment_setup``)."""
     return extension.user_folder("trainer")
 
 
-def made() -> list[Path]:
-    """The environments that the extension has made, newest first: that one serves."""
-    numbered = [path for path in folder().glob("[0-9]*") if path.name.isdecimal()]
+def ready_environments() -> list[Path]:
+    """Return the usable managed environments, newest first. The newest one is used."""
+    numbered = [path for path in environments_folder().glob("[0-9]*") if path.name.isdecimal()]
     return sorted((p for p in numbered if (p / READY).exists()), key=lambda p: int(p.name), reverse=True)
 
 
 def trainer_python() -> Path:
-    """The Python that trains: the one in $LODGS_TRAINER_PYTHON, in the preferences, or the one made here.
+    """Return the trainer's Python: from $LODGS_TRAINER_PYTHON, the preferences, or a managed environment.
 
     Raises:
-        LodgsError: none is set up.
+        LodgsError: no Python is set up.
     """
     path = os.environ.get(VARIABLE) or extension.preferences().python
     if path:
         return Path(bpy.path.abspath(path))
-    for newest in made()[:1]:
+    for newest in ready_environments()[:1]:
         return python_of(newest)
     raise LodgsError(
-        "Training and rendering need a Python with PyTorch, and none is set up.",
-        "Make an environment in the preferences.",
+        "The trainer is not installed.",
+        "Press Install Trainer in the preferences of LODGS.",
     )
 
 
-def check(python: Path) -> Report:
-    """Ask a Python whether it can train (``python -m training check``). Takes about half a second."""
-    report = Report(str(python))
+def check(python: Path) -> EnvironmentReport:
+    """Check whether a Python can train (``python -m training check``). Takes about half a second."""
+    report = EnvironmentReport(str(python))
     try:
-        answer = _ask(python, "-m", "training", "check")
-        found = json.loads(answer.stdout.strip().splitlines()[-1])
-        report.problems = [str(problem) for problem in found.pop("problems")]
-        report.versions = {k: v for k, v in found.items() if isinstance(v, str)}
+        process = _run(python, "-m", "training", "check")
+        answer = json.loads(process.stdout.strip().splitlines()[-1])
+        report.problems = [str(problem) for problem in answer.pop("problems")]
+        report.versions = {k: v for k, v in answer.items() if isinstance(v, str)}
     except FileNotFoundError:
-        report.problems = [f"There is no program {python}."]
+        report.problems = [f"Python {python} does not exist."]
     except PermissionError:
-        report.problems = [f"{python} is not a program that may be run."]
+        report.problems = [f"Python {python} is not executable."]
     except subprocess.TimeoutExpired:
-        report.problems = [f"{python} did not answer."]
+        report.problems = [f"Python {python} did not answer within {TIMEOUT:.0f} s."]
     except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError):
-        report.problems = [_why_no_answer(python)]
-    ours = extension.user_folder()
-    there = next(place for place in (ours, *ours.parents) if place.exists())
-    if not os.access(there, os.W_OK):
-        report.problems.append(f"The folder {ours} cannot be written.")
+        report.problems = [_failed_check_reason(python)]
+    folder = extension.user_folder()
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    if not os.access(existing, os.W_OK):
+        report.problems.append(f"Cannot write to the folder {folder}.")
     return report
 
 
 def require(python: Path, at_once: int = 1) -> None:
-    """Make sure that a Python can train.
+    """Raise an error if a Python cannot train.
 
     Args:
-        at_once: how many cells of a large scene at a time.
+        python: path of the Python.
+        at_once: number of cells of a large scene to train at the same time.
 
     Raises:
-        LodgsError: it cannot; says what is missing.
+        LodgsError: a package is missing, or another problem.
     """
     report = check(python)
     if not report.ok:
         raise LodgsError(report.problems[0], _REMEDY)
     if at_once > 1 and "distributed" not in report.versions:
         raise LodgsError(
-            f"Training {at_once} cells at once needs Dask, which {python} does not have.",
-            "Make an environment in the preferences of LODGS, install requirements/cluster.txt there, or set "
-            "Cells at Once to 1.",
+            f"Cannot train {at_once} cells at once: {python} has no Dask.",
+            "Press Install Trainer in the preferences of LODGS, install requirements/cluster.txt there, "
+            "or set Cells at Once to 1.",
         )
 
 
-def check_now() -> Report:
-    """Check the trainer's Python and keep the result for the preferences.
+def check_current() -> EnvironmentReport:
+    """Check the trainer's Python. Store the result for the preferences.
 
     Raises:
-        LodgsError: none is set up.
+        LodgsError: no Python is set up.
     """
     global report
     report = check(trainer_python())
     if report.ok:
-        _ask_devices(report)
+        _add_devices(report)
     return report
 
 
-def _ask_devices(report: Report) -> None:
-    """Adds what this computer can train on (``python -m training devices --json``); takes some seconds."""
+def _add_devices(report: EnvironmentReport) -> None:
+    """Add the devices that train (``python -m training devices --json``). Takes some seconds."""
     with suppress(OSError, ValueError, IndexError, AttributeError, subprocess.TimeoutExpired):
-        answer = _ask(Path(report.python), "-m", "training", "devices", "--json")
-        found = json.loads(answer.stdout.strip().splitlines()[-1])
-        report.graphics, report.devices = str(found.get("graphics", "")), str(found.get("sentence", ""))
+        process = _run(Path(report.python), "-m", "training", "devices", "--json")
+        answer = json.loads(process.stdout.strip().splitlines()[-1])
+        report.graphics = str(answer.get("graphics", ""))
+        report.devices = str(answer.get("sentence", ""))
 
 
 def python_of(environment: Path) -> Path:
-    """The Python of an environment by its folder."""
+    """Return the path of the Python in an environment's folder."""
     if sys.platform == "win32":
         return environment / "Scripts" / "python.exe"
     return environment / "bin" / "python"
 
 
-def _ask(python: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+def _run(python: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [str(python), *arguments],
         cwd=extension.FOLDER,
@@ -163,26 +169,26 @@ def _ask(python: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
         text=True,
         encoding="utf-8",
         errors="replace",
-        timeout=60,
+        timeout=TIMEOUT,
         check=False,
         creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
     )
 
 
-def version_of(python: Path) -> tuple[int, int]:
-    """(major, minor), or (0, 0) if it is no Python."""
+def python_version(python: Path) -> tuple[int, int]:
+    """Return (major, minor), or (0, 0) if the program is no Python."""
     try:
-        answer = _ask(python, "-c", "import sys; print(*sys.version_info[:2])").stdout.split()
+        answer = _run(python, "-c", "import sys; print(*sys.version_info[:2])").stdout.split()
         return int(answer[0]), int(answer[1])
     except (OSError, ValueError, IndexError, subprocess.TimeoutExpired):
         return 0, 0
 
 
-def _why_no_answer(python: Path) -> str:
-    major, minor = version = version_of(python)
+def _failed_check_reason(python: Path) -> str:
+    major, minor = version = python_version(python)
     if version == (0, 0):
-        return f"{python} is no Python."
+        return f"{python} is not a Python interpreter."
     if version < VERSIONS[0]:
         oldest = ".".join(map(str, VERSIONS[0]))
-        return f"{python} is Python {major}.{minor}; training needs {oldest} or newer."
+        return f"{python} is Python {major}.{minor}, but training needs {oldest} or newer."
     return f"{python} cannot run the trainer."

@@ -1,6 +1,6 @@
-"""What is done to photographs before they are trained on: programs beside Blender, one after the other.
+"""Preparation of photos for training by background programs that run one after the other.
 
-Frames are taken from a video, cameras are found, lenses are straightened.
+Steps: extract frames from a video, find the cameras of the photos, undistort the photos.
 """
 
 from __future__ import annotations
@@ -21,48 +21,57 @@ from ..data import photographs, scenes
 from . import environment, processes
 from .watch import root_by_uid
 
-_TOLD = re.compile(r"(.*?) (\d+) of (\d+)$")
+_PROGRESS = re.compile(r"(.*?) (\d+) of (\d+)$")
 
 
-class Preparing:
-    """Programs at work, and what the panel shows of them.
+class PhotoPreparation:
+    """A sequence of background programs, with its progress for the panel.
 
     Attributes:
-        message: what is done, or how it went.
-        fraction: how much of that is done, 0 to 1.
-        problem: why it failed; empty when it did not.
-        running: whether it is still at work.
-        root: the splat scene that it is for; at first None, where it is to be imported.
-        warnings: a sentence for each thing that is odd.
-        told: what each program said at its end, without the name of its folder.
+        message: current step, or the result.
+        fraction: progress of the current step, 0 to 1.
+        problem: reason of a failure. Empty otherwise.
+        running: whether a program is running.
+        root: scene root that the photos belong to. None until a new scene is imported.
+        warnings: one sentence per warning.
+        results: last output line of each finished program, without the folder name.
     """
 
     def __init__(
-        self, log: Path, commands: list[list[str]], finish: Callable[[Preparing], None], message: str
+        self, log: Path, commands: list[list[str]], finish: Callable[[PhotoPreparation], None], message: str
     ) -> None:
-        self.message, self.fraction, self.problem = message, 0.0, ""
-        self.running, self.warnings, self.told = True, list[str](), list[str]()
+        self.message = message
+        self.fraction = 0.0
+        self.problem = ""
+        self.running = True
+        self.warnings: list[str] = []
+        self.results: list[str] = []
         self.root: bpy.types.Object | None = None
-        self._log, self._commands, self._finish, self._cancelled = log, commands, finish, False
+        self._log = log
+        self._commands = commands
+        self._finish = finish
+        self._cancelled = False
         self._log.unlink(missing_ok=True)
         self._process = self._next()
 
     def cancel(self) -> None:
-        """Stops it; the same again goes on from there."""
+        """Stop the current program. Starting the same preparation again continues it."""
         self._cancelled = True
         self._process.terminate()
 
     def step(self) -> bool:
-        """For ``processes.follow``: show what is new, finish at the end; return whether it goes on."""
-        code, last = self._process.poll(), processes.last_lines(self._log)[-1:]
+        """Update the progress. Return whether a program is running, for ``processes.follow``."""
+        code = self._process.poll()
+        last = processes.last_lines(self._log)[-1:]
         if code == 0:
-            said = processes.last_lines(self._log.with_suffix(".out"))
-            self.told.append(said[-1].partition(": ")[2] if said else "")
+            output = processes.last_lines(self._log.with_suffix(".out"))
+            self.results.append(output[-1].partition(": ")[2] if output else "")
         if code == 0 and self._commands and not self._cancelled:
             self._process, code = self._next(), None
         self.running = code is None
-        if code is None and last and (told := _TOLD.match(last[0])):
-            self.message, self.fraction = last[0], int(told[2]) / max(int(told[3]), 1)
+        if code is None and last and (progress := _PROGRESS.match(last[0])):
+            self.message = last[0]
+            self.fraction = int(progress[2]) / max(int(progress[3]), 1)
         elif code == 0:
             self.fraction = 1.0
             try:
@@ -71,8 +80,8 @@ class Preparing:
             except LodgsError as error:
                 self.problem = str(error)
         elif code is not None:
-            self.message = "Stopped; the same again goes on from there"
-            self.problem = "" if self._cancelled else processes.problem_of(self._log, code)
+            self.message = "Stopped; start it again to continue"
+            self.problem = "" if self._cancelled else processes.failure_reason(self._log, code)
         extension.redraw()
         return self.running
 
@@ -80,26 +89,31 @@ class Preparing:
         return processes.spawn(self._commands.pop(0), self._log, self._log.with_suffix(".out"))
 
 
-current: Preparing | None = None
-"""What is at work, or was last."""
+current: PhotoPreparation | None = None
+"""The running or last preparation."""
 
 
 def find_cameras(
     photos: Path, folder: Path, preset: str = "draft", ordered: bool = False, lens: str = ""
-) -> Preparing:
-    """Begin to find the cameras of photographs, or go on with it; at the end the scene is imported.
+) -> PhotoPreparation:
+    """Find the cameras of photos, then import the scene. Continue if this was started before.
 
     Args:
-        photos: their folder, or a video, of which frames are taken first.
-        folder: that becomes the COLMAP scene.
-        preset, ordered, lens: see ``reconstruct``.
+        photos: folder of photos, or a video whose frames are extracted first.
+        folder: folder of the new COLMAP scene.
+        preset: see ``reconstruct``.
+        ordered: see ``reconstruct``.
+        lens: see ``reconstruct``.
 
     Raises:
-        LodgsError: something is at work, there is no trainer, or the folder cannot be written.
+        LodgsError: a preparation is running, the trainer is missing, or the folder is not writable.
     """
     commands = []
     if photos.is_file():
-        video, photos, ordered, lens = photos, folder / "images", True, "one"
+        video = photos
+        photos = folder / "images"
+        ordered = True
+        lens = "one"
         commands.append(
             [bpy.app.binary_path, "--command", "lodgs", "frames", str(video), "--out", str(photos)]
         )
@@ -107,48 +121,50 @@ def find_cameras(
     commands.append(["scene", "--photos", str(photos), "--out", str(folder), *options])
     commands.append(["undistort", str(folder)])
 
-    def finish(work: Preparing) -> None:
-        first = not scenes.roots(bpy.context.scene)
+    def finish(work: PhotoPreparation) -> None:
+        is_first = not scenes.roots(bpy.context.scene)
         work.root = scenes.import_colmap(bpy.context, folder, warn=work.warnings.append)
-        if first:  # otherwise the artist is looking at something
+        if is_first:  # otherwise keep the view of the scene that is open
             photographs.look_at_scene(bpy.context, work.root, work.warnings.append)
-        work.message = work.told[-2]
+        work.message = work.results[-2]
         extension.undo_step("Import Photographs")
 
     environment.require(environment.trainer_python())
-    return _start(folder / "colmap.log", commands, finish, "Looking at the photographs")
+    return _start(folder / "colmap.log", commands, finish, "Reading the photos")
 
 
-def straighten(root: bpy.types.Object, warn: Warn) -> None:
-    """Undo the lens distortion of a scene's photographs, in a window while the user works on; at the end its
-    views show them so. Without a trainer, or where that cannot be, there is a warning.
+def undistort_photos(root: bpy.types.Object, warn: Warn) -> None:
+    """Undistort the photos of a scene and show the results in its views.
+
+    With a window, this runs in the background. Problems, such as a missing trainer, are reported as warnings.
     """
-    bent = [view for view in photographs.views(root) if view.data.lodgs.distorted]
-    if not bent:
+    distorted = [view for view in photographs.views(root) if view.data.lodgs.distorted]
+    if not distorted:
         return
-    uid, told = root.session_uid, root.lodgs.training
+    uid = root.session_uid
+    settings = root.lodgs.training
     scene = Path(bpy.path.abspath(root.lodgs.scene_folder))
-    given = {"--model": told.model, "--images": told.images}
-    options = [part for name, path in given.items() if path for part in (name, path)]
+    paths = {"--model": settings.model, "--images": settings.images}
+    options = [argument for name, path in paths.items() if path for argument in (name, path)]
     log = extension.user_folder("logs") / "undistort.log"
 
-    def finish(work: Preparing) -> None:
+    def finish(work: PhotoPreparation) -> None:
         root = root_by_uid(uid)
-        if root is None:  # another file is open by now
+        if root is None:  # another file has been opened
             return
-        whole = _read(root)
-        found = already_undistorted(whole)
-        if found is not None:
-            photographs.show_undistorted(bpy.context, root, whole.names, found)
-        work.message = f"{len(bent)} photographs were straightened"
+        scene = _read_scene(root)
+        undistorted = already_undistorted(scene)
+        if undistorted is not None:
+            photographs.show_undistorted(bpy.context, root, scene.names, undistorted)
+        work.message = f"{len(distorted)} photos were undistorted"
 
     try:
         work = _start(
-            log, [["undistort", str(scene), *options]], finish, f"Straightening {len(bent)} photographs"
+            log, [["undistort", str(scene), *options]], finish, f"Undistorting {len(distorted)} photos"
         )
     except LodgsError as error:
         warn(
-            f"{len(bent)} views have lens distortion: their photographs fit the points only roughly here. "
+            f"{len(distorted)} views have lens distortion, so photos and points do not match exactly. "
             f"Training undistorts them. {error.what}"
         )
         return
@@ -158,39 +174,41 @@ def straighten(root: bpy.types.Object, warn: Warn) -> None:
         warn(work.problem)
 
 
-def _read(root: bpy.types.Object) -> Scene:
-    told = root.lodgs.training
-    model, images = (Path(path) if path else None for path in (told.model, told.images))
+def _read_scene(root: bpy.types.Object) -> Scene:
+    settings = root.lodgs.training
+    model, images = (Path(path) if path else None for path in (settings.model, settings.images))
     return read_scene(Path(bpy.path.abspath(root.lodgs.scene_folder)), model, images)
 
 
 def _start(
-    log: Path, commands: list[list[str]], finish: Callable[[Preparing], None], message: str
-) -> Preparing:
-    """Has commands done; those without a program are the trainer's."""
+    log: Path, commands: list[list[str]], finish: Callable[[PhotoPreparation], None], message: str
+) -> PhotoPreparation:
+    """Run commands one after the other. Commands that do not start Blender are arguments of the trainer."""
     global current
     if current is not None and current.running:
-        raise LodgsError("Other photographs are being prepared.", "Wait for that or cancel it.")
-    ours = [str(environment.trainer_python()), "-m", "training"]
+        raise LodgsError("Other photos are already being prepared.", "Wait for them or cancel it.")
+    trainer = [str(environment.trainer_python()), "-m", "training"]
     try:
         log.parent.mkdir(parents=True, exist_ok=True)
-        whole = [each if each[0] == bpy.app.binary_path else [*ours, *each] for each in commands]
-        current = Preparing(log, whole, finish, message)
+        programs = [
+            command if command[0] == bpy.app.binary_path else [*trainer, *command] for command in commands
+        ]
+        current = PhotoPreparation(log, programs, finish, message)
     except OSError as error:
         raise LodgsError(
-            f"{log.parent} cannot be written: {error.strerror or error}.", "Choose another folder."
+            f"Cannot write to {log.parent}: {error.strerror or error}.", "Choose another folder."
         ) from error
     return current
 
 
-def forget() -> None:
-    """How the last work went is told no longer: another scene is looked at."""
+def clear_result() -> None:
+    """Clear the last result, so that the panel does not show it for another scene."""
     global current
     if current is not None and not current.running:
         current = None
 
 
 def unregister() -> None:
-    """It ends with Blender: another one goes on with it."""
+    """Cancel the preparation when Blender exits. It can be continued later."""
     if current is not None and current.running:
         current.cancel()

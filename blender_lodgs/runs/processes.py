@@ -1,4 +1,4 @@
-"""Programs that work beside Blender: how they are started, and how Blender looks after them."""
+"""Starting and following programs that run beside Blender."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ if sys.platform != "win32":
     import fcntl
 
 INTERVAL = 0.1
-"""Seconds between two looks at a program."""
+"""Seconds between two polls of a program."""
 
 LOG_END = 1 << 14
-"""Bytes of a log that are looked at."""
+"""Bytes that are read from the end of a log."""
 
 MARK = "lodgs-in-use"
-"""File in an environment that the extension makes: locked by whatever is at work in it."""
+"""Lock file in a managed environment. Programs that use the environment hold its lock."""
 
 
 def environment() -> dict[str, str]:
-    """This process's environment for another Python: without what Blender set for its own.
+    """Return environment variables for another Python, without those that Blender set for its own.
 
-    Compiled code goes to the user's folder, because the extension's may be read-only.
+    Compiled code goes to the user's folder, because the extension's folder may be read-only.
     """
     values = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "__PYVENV_LAUNCHER__"))}
     cache = extension.user_folder("cache")
@@ -40,12 +40,12 @@ def environment() -> dict[str, str]:
 
 
 def spawn(command: list[str], log: Path, output: Path) -> subprocess.Popen:
-    """Start a program that outlives Blender, in the extension's folder.
+    """Start a program that may outlive Blender, in the extension's folder.
 
     Args:
         command: program and arguments.
-        log: file to which its standard error is appended.
-        output: file that takes its standard output; what was there before is dropped.
+        log: file to which standard error is appended.
+        output: file that standard output overwrites.
 
     Raises:
         OSError: the program or a file cannot be opened.
@@ -54,14 +54,14 @@ def spawn(command: list[str], log: Path, output: Path) -> subprocess.Popen:
         return _start(command, stdin=subprocess.DEVNULL, stdout=stdout, stderr=errors)
 
 
-def converse(command: list[str], log: Path) -> subprocess.Popen[str]:
-    """Start a program that ends with Blender, in the extension's folder, and speak with it line by line.
+def spawn_piped(command: list[str], log: Path) -> subprocess.Popen[str]:
+    """Start a program in the extension's folder with text pipes for standard input and output.
 
-    It must end when its standard input does: that happens however Blender ends.
+    The program must exit when its standard input is closed, which also happens if Blender crashes.
 
     Args:
         command: program and arguments.
-        log: file to which its standard error is appended.
+        log: file to which standard error is appended.
 
     Raises:
         OSError: the program or the file cannot be opened.
@@ -72,13 +72,12 @@ def converse(command: list[str], log: Path) -> subprocess.Popen[str]:
 
 
 @contextmanager
-def using(folder: Path) -> Iterator[tuple[int, ...]]:
-    """Hold the mark of an environment that the extension made, so that it is not removed.
+def hold_environment(folder: Path) -> Iterator[tuple[int, ...]]:
+    """Hold the lock of a managed environment within the block, so that it is not removed.
 
     Yields:
-        Descriptors that hold it as well for as long as a program lives that inherits them, also when Blender
-        has ended: none on Windows, which by itself keeps folders where a program runs or a file is open, and
-        none for a folder without the mark.
+        File descriptors that keep the lock in programs that inherit them, even after Blender has ended. Empty
+        on Windows, which protects folders of running programs itself, and for folders without a lock file.
     """
     try:
         mark = os.open(folder / MARK, os.O_RDONLY)
@@ -95,8 +94,8 @@ def using(folder: Path) -> Iterator[tuple[int, ...]]:
         os.close(mark)
 
 
-def in_use(folder: Path) -> bool:
-    """Whether anything holds an environment's mark; not on Windows, where it cannot be renamed then."""
+def is_in_use(folder: Path) -> bool:
+    """Return whether a program holds the lock of an environment. On Windows always False."""
     if sys.platform == "win32":
         return False
     try:
@@ -104,13 +103,13 @@ def in_use(folder: Path) -> bool:
             fcntl.flock(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
-    except OSError:  # it has none: a part of one
+    except OSError:  # no lock file: an incomplete environment
         return False
     return False
 
 
 def last_lines(log: Path) -> list[str]:
-    """Lines of a program's log, or of its end where that is long; none where there is none yet."""
+    """Return the lines of a log, or of its last LOG_END bytes. A missing log has no lines."""
     try:
         with open(log, "rb") as file:
             file.seek(max(file.seek(0, 2) - LOG_END, 0))
@@ -119,17 +118,17 @@ def last_lines(log: Path) -> list[str]:
         return []
 
 
-def problem_of(log: Path, code: int) -> str:
-    """Why a program of ours that ended with a code did so, by what it said last."""
+def failure_reason(log: Path, code: int) -> str:
+    """Return why a LODGS program failed: its last error line, or else its exit code and log."""
     errors = [line for line in last_lines(log) if line.lower().startswith("error: ")]
-    return errors[-1][7:] if errors else f"It has ended with {code}; {log} tells more."
+    return errors[-1][7:] if errors else f"The program ended with exit code {code}. See {log}."
 
 
 def follow(step: Callable[[], bool]) -> None:
     """Call ``step`` about ten times a second until it returns False.
 
-    In a window a timer does that while the user works on, and goes on over undo and the loading of files; in
-    background, where Blender runs no timers, it happens here and this returns when all is over.
+    With a window, a timer calls it, and survives undo and the loading of files. In background, where Blender
+    runs no timers, this function blocks until ``step`` returns False.
     """
     if bpy.app.background:
         while step():
@@ -139,11 +138,11 @@ def follow(step: Callable[[], bool]) -> None:
 
 
 def _start(command: list[str], **streams: Any) -> subprocess.Popen:
-    """A program beside Blender: Ctrl-C is for Blender, which may cancel politely."""
+    """Start a program that Ctrl-C does not reach, so that Blender can cancel it cleanly."""
     detached: dict[str, Any] = {"start_new_session": True}
     if sys.platform == "win32":
         detached = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
-    with using(Path(command[0]).parent.parent) as inherited:
+    with hold_environment(Path(command[0]).parent.parent) as inherited:
         return subprocess.Popen(
             command, cwd=extension.FOLDER, env=environment(), pass_fds=inherited, **streams, **detached
         )

@@ -144,12 +144,12 @@ def test_points_make_way_for_the_first_level(bpy, lodgs, mini):
 def test_training_takes_the_model_and_photographs_of_the_import(bpy, lodgs, mini, tmp_path):
     found = read_scene(mini)
     root = lodgs("data.scenes").import_colmap(bpy.context, mini)
-    job = lodgs("runs.jobs").make_job(root, tmp_path, {})
+    job = lodgs("runs.job_settings").make_job(root, tmp_path, {})
     assert (job.model, job.images) == ("", "")
     root = lodgs("data.scenes").import_colmap(
         bpy.context, mini, model=found.model, images=str(found.images_folder), photographs=False
     )
-    job = lodgs("runs.jobs").make_job(root, tmp_path, {})
+    job = lodgs("runs.job_settings").make_job(root, tmp_path, {})
     assert (Path(job.model), Path(job.images)) == (found.model, found.images_folder)
 
 

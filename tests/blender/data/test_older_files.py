@@ -77,7 +77,7 @@ def trainings(bpy):
 
 
 def test_the_training_panel_keeps_what_was_set(lodgs, trainings):
-    changes = lodgs("runs.jobs").changes
+    changes = lodgs("runs.job_settings").changed_parameters
     found = trainings(OLD / "training.blend")
     assert {name: (t.method, t.preset, t.seed, changes(t)) for name, t in found.items()} == {
         "changed": ("octree", "standard", 3, {"levels": 7, "max_splats": 50_000}),
@@ -93,4 +93,6 @@ def test_what_is_taken_over_stays_as_it_is_changed_then(bpy, lodgs, trainings, t
     settings = trainings(OLD / "training.blend")["changed"]
     settings.parameters.use_levels, settings.parameters.max_splats = False, 9
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "now.blend"), check_existing=False)
-    assert lodgs("runs.jobs").changes(trainings(tmp_path / "now.blend")["changed"]) == {"max_splats": 9}
+    assert lodgs("runs.job_settings").changed_parameters(trainings(tmp_path / "now.blend")["changed"]) == {
+        "max_splats": 9
+    }

@@ -117,11 +117,12 @@ def test_photographs_are_held_out_where_there_are_enough(lodgs, photographed, co
 
 
 def test_what_is_held_out_is_the_jobs(lodgs, photographed, tmp_path):
-    root, jobs = photographed(40), lodgs("runs.jobs")
+    root = photographed(40)
+    job_settings = lodgs("runs.job_settings")
     root.lodgs.scene_folder = str(tmp_path)
-    assert jobs.make_job(root, tmp_path, {}).test_every == 8
+    assert job_settings.make_job(root, tmp_path, {}).test_every == 8
     cameras = root.lodgs.cameras.objects
     cameras.unlink(cameras[0])
-    assert jobs.make_job(root, tmp_path, {}).test_every == 0
+    assert job_settings.make_job(root, tmp_path, {}).test_every == 0
     root.lodgs.training.test_every = 4
-    assert jobs.make_job(root, tmp_path, {}).test_every == 4
+    assert job_settings.make_job(root, tmp_path, {}).test_every == 4

@@ -82,13 +82,14 @@ def test_splats_alone_ask_for_views_of_them(bpy, lodgs, root, draw, fake):
 
 
 def test_depth_in_the_loss_is_set_as_any_parameter(lodgs, root):
-    jobs, settings = lodgs("runs.jobs"), root.lodgs.training
+    job_settings = lodgs("runs.job_settings")
+    settings = root.lodgs.training
     for settings.method in ("flod", "3dgs", "tree"):
-        assert not jobs.changes(settings)
+        assert not job_settings.changed_parameters(settings)
         settings.parameters.use_depth_weight = True
         settings.parameters.depth_weight, settings.parameters.depth = 0.3, "points"
-        assert jobs.changes(settings) == {"depth_weight": 0.3, "depth": "points"}
-        assert jobs.parameters(settings).depth_weight == 0.3
+        assert job_settings.changed_parameters(settings) == {"depth_weight": 0.3, "depth": "points"}
+        assert job_settings.current_parameters(settings).depth_weight == 0.3
 
 
 def test_a_parameter_shows_the_presets_number_until_it_is_set(root, draw):
@@ -119,7 +120,7 @@ def test_distances_can_be_given_by_hand(bpy, lodgs, root, draw, fake):
     settings, panel = root.lodgs.training, "LODGS_PT_training_advanced"
     assert not any("distances" in name for name in draw(panel).properties)
     settings.method = "lodge"
-    changes = lodgs("runs.jobs").changes
+    changes = lodgs("runs.job_settings").changed_parameters
     assert "find_distances" in draw(panel).properties and "distances" not in changes(settings)
     settings.find_distances = False
     assert [name for name in draw(panel).properties if name.startswith("distances")] == [
@@ -134,7 +135,7 @@ def test_distances_can_be_given_by_hand(bpy, lodgs, root, draw, fake):
         "distances[2] Level 1 From", "distances[1] Level 2 From", "distances[0] Level 3 From",
     ]  # fmt: skip
     assert draw(panel).texts[-1].endswith("is nearer than 1, which is 1.5 m.")
-    assert lodgs("runs.jobs").parameters(settings).distances == (12.0, 6.0, 2.6, 0.0)
+    assert lodgs("runs.job_settings").current_parameters(settings).distances == (12.0, 6.0, 2.6, 0.0)
     settings.distances[1] = 30.0
     assert any("Give falling numbers" in text for text in draw().texts)
     settings.distances[1] = 0.0  # which training finds
@@ -153,7 +154,7 @@ def test_without_a_trainer_one_sentence_and_one_button(root, draw, monkeypatch):
     monkeypatch.delenv("LODGS_TRAINER_PYTHON", raising=False)
     notes = draw()
     assert notes.operators == ["lodgs.make_environment"]
-    assert "Training and rendering need a Python with PyTorch, and none is set up." in notes.texts
+    assert "The trainer is not installed." in notes.texts
 
 
 def test_making_the_environment_is_shown_where_it_is_missing(lodgs, root, draw, monkeypatch):

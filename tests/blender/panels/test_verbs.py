@@ -108,7 +108,9 @@ def test_the_status_bar_tells_of_work_and_for_a_while_of_its_end(bpy, lodgs, wor
         == [each.text for each in status.visible_work(111.0)]
     )
     assert timers == [(status.extension.redraw, status.NOTICE)], "it goes by itself"
-    assert status.visible_work(110.0 + status.NOTICE - 1) and not status.visible_work(110.0 + status.NOTICE + 1)
+    assert status.visible_work(110.0 + status.NOTICE - 1) and not status.visible_work(
+        110.0 + status.NOTICE + 1
+    )
     work.running, work.message, work.fraction = True, "Again", 0.1
     monkeypatch.setattr(status.time, "monotonic", lambda: 300.0)
     notes = Notes()
@@ -141,8 +143,9 @@ def test_runs_of_a_scene_are_listed_and_opened(bpy, lodgs, tmp_path, fake):
     fake()
     root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
     jobs = lodgs("runs.jobs")
+    run_folders = lodgs("runs.run_folders")
     root.lodgs.training.output = str(tmp_path / "runs")
-    assert jobs.runs_of(root) == []
+    assert run_folders.find_runs(root) == []
     for _ in range(2):
         jobs.follow(jobs.start(root))
     other = tmp_path / "runs" / "other"
@@ -150,12 +153,14 @@ def test_runs_of_a_scene_are_listed_and_opened(bpy, lodgs, tmp_path, fake):
     (other / "job.toml").write_text('scene = "/nowhere"\nout = "."\nmethod = "flod"\n')
     (tmp_path / "runs" / "broken").mkdir()
     (tmp_path / "runs" / "broken" / "job.toml").write_text("]")
-    first, second = jobs.runs_of(root)
-    assert first.state == second.state == "done" and second.folder.path == jobs.run_folder(root).path
+    first, second = run_folders.find_runs(root)
+    assert first.state == second.state == "done" and second.folder.path == run_folders.run_folder(root).path
     notes = Notes()
     lodgs("panels.verbs").LODGS_MT_runs.draw(SimpleNamespace(layout=notes), bpy.context)
     (name, text, icon, chosen), (_, _, icon_of_second, _) = notes.operators
     assert name == "lodgs.open_run" and "FLoD" in text and "done" in text
     assert (icon, icon_of_second) == ("RADIOBUT_OFF", "RADIOBUT_ON")
     assert bpy.ops.lodgs.open_run(directory=chosen.directory) == {"FINISHED"}
-    assert jobs.run_folder(root).path == first.folder.path and any(item.exists for item in root.lodgs.levels)
+    assert run_folders.run_folder(root).path == first.folder.path and any(
+        item.exists for item in root.lodgs.levels
+    )

@@ -223,9 +223,9 @@ def test_two_sets_and_an_instance(bpy, lodgs, scene, bundle, tmp_path):
 def test_an_animation_starts_the_renderer_once(bpy, lodgs, scene, tmp_path, monkeypatch):
     renderer, started = lodgs("render.renderer"), []
     renderer.close()
-    converse = lodgs("runs.processes").converse
+    spawn_piped = lodgs("runs.processes").spawn_piped
     monkeypatch.setattr(
-        lodgs("runs.processes"), "converse", lambda *a: started.append(converse(*a)) or started[-1]
+        lodgs("runs.processes"), "spawn_piped", lambda *a: started.append(spawn_piped(*a)) or started[-1]
     )
     written = []
     write_set = renderer.wire.write_set

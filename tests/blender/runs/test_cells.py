@@ -20,6 +20,11 @@ def jobs(lodgs):
 
 
 @pytest.fixture
+def job_settings(lodgs):
+    return lodgs("runs.job_settings")
+
+
+@pytest.fixture
 def root(bpy):
     bpy.ops.lodgs.import_colmap(directory=str(GARDEN), photographs=False)
     (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
@@ -43,11 +48,11 @@ def _states(watch):
 # -- planned -----------------------------------------------------------------------------------------------
 
 
-def test_a_plan_says_what_the_trainer_will_do(bpy, lodgs, jobs, root):
+def test_a_plan_says_what_the_trainer_will_do(bpy, lodgs, job_settings, root):
     settings = root.lodgs.training
     settings.rows, settings.method, settings.test_every = 2, "3dgs", 4
     assert bpy.ops.lodgs.plan_cells() == {"FINISHED"}
-    job, scene = jobs.make_job(root, Path("/run"), {}), read_scene(GARDEN)
+    job, scene = job_settings.make_job(root, Path("/run"), {}), read_scene(GARDEN)
     assert job.cells == "2x2"
     names = [camera.name for camera in scene.cameras]
     truth = plan(job, scene)
@@ -93,12 +98,12 @@ def test_outlines_meet_on_the_ground_and_hold_their_cameras(bpy, lodgs, root):
         assert set(np.flatnonzero(around(outer, centers))) <= set(json.loads(cell.places))
 
 
-def test_a_plan_is_for_the_settings_that_it_was_made_with(bpy, lodgs, jobs, root, tmp_path):
+def test_a_plan_is_for_the_settings_that_it_was_made_with(bpy, lodgs, job_settings, root, tmp_path):
     cells, settings = lodgs("data.cells"), root.lodgs.training
     bpy.ops.lodgs.plan_cells()
 
     def fits():
-        return cells.is_planned(settings, jobs.make_job(root, tmp_path, {}))
+        return cells.is_planned(settings, job_settings.make_job(root, tmp_path, {}))
 
     assert fits()
     settings.seed = 9
@@ -246,9 +251,9 @@ def test_a_second_cancel_ends_every_cells_trainer(lodgs, jobs, fake, root, tmp_p
     assert watch.state == "interrupted"
 
 
-def test_the_panel_shows_a_jobs_cells(lodgs, jobs, root, tmp_path):
+def test_the_panel_shows_a_jobs_cells(lodgs, job_settings, root, tmp_path):
     job = lodgs("training.runs.job").Job("/scene", "/run", "3dgs", cells="3x2")
-    jobs.show(root.lodgs.training, job)
-    assert jobs.make_job(root, tmp_path, {}).cells == "3x2"
-    jobs.show(root.lodgs.training, lodgs("training.runs.job").Job("/scene", "/run"))
-    assert jobs.make_job(root, tmp_path, {}).cells == ""
+    job_settings.apply_job(root.lodgs.training, job)
+    assert job_settings.make_job(root, tmp_path, {}).cells == "3x2"
+    job_settings.apply_job(root.lodgs.training, lodgs("training.runs.job").Job("/scene", "/run"))
+    assert job_settings.make_job(root, tmp_path, {}).cells == ""

@@ -1,4 +1,4 @@
-"""The trainer's Python: which one it is, and whether it can train."""
+"""Selection and checks of the trainer's Python."""
 
 import json
 from pathlib import Path
@@ -9,7 +9,7 @@ import pytest
 @pytest.fixture
 def environment(lodgs, tmp_path, monkeypatch):
     module = lodgs("runs.environment")
-    monkeypatch.setattr(module, "folder", lambda: tmp_path / "trainer")
+    monkeypatch.setattr(module, "environments_folder", lambda: tmp_path / "trainer")
     monkeypatch.setattr(module, "report", None)
     monkeypatch.delenv(module.VARIABLE, raising=False)
     return module
@@ -17,10 +17,10 @@ def environment(lodgs, tmp_path, monkeypatch):
 
 @pytest.fixture
 def preferences(lodgs, environment):
-    found = lodgs("extension").preferences()
-    found.python = ""
-    yield found
-    found.python = ""
+    preferences = lodgs("extension").preferences()
+    preferences.python = ""
+    yield preferences
+    preferences.python = ""
 
 
 def _program(path: Path, script: str) -> Path:
@@ -29,8 +29,8 @@ def _program(path: Path, script: str) -> Path:
     return path
 
 
-def test_the_variable_comes_before_the_preferences(environment, preferences, monkeypatch):
-    with pytest.raises(Exception, match="none is set up"):
+def test_environment_variable_overrides_preferences(environment, preferences, monkeypatch):
+    with pytest.raises(Exception, match="not installed"):
         environment.trainer_python()
     preferences.python = "/preferred/python"
     assert environment.trainer_python() == Path("/preferred/python")
@@ -38,23 +38,23 @@ def test_the_variable_comes_before_the_preferences(environment, preferences, mon
     assert environment.trainer_python() == Path("/pipeline/python")
 
 
-def test_the_newest_environment_that_is_ready_serves(environment, preferences, tmp_path):
+def test_newest_ready_environment_is_used(environment, preferences, tmp_path):
     for number in (2, 9, 10, 11):
         (tmp_path / "trainer" / str(number)).mkdir(parents=True)
-        if number != 11:  # still being made
+        if number != 11:  # being installed
             (tmp_path / "trainer" / str(number) / environment.READY).touch()
-    assert [path.name for path in environment.made()] == ["10", "9", "2"]
+    assert [path.name for path in environment.ready_environments()] == ["10", "9", "2"]
     assert environment.trainer_python().relative_to(tmp_path / "trainer").parts[0] == "10"
 
 
-def test_check_says_what_is_wrong(environment, tmp_path):
-    assert environment.check(tmp_path / "none").problems == [f"There is no program {tmp_path / 'none'}."]
+def test_check_reports_problems(environment, tmp_path):
+    assert environment.check(tmp_path / "none").problems == [f"Python {tmp_path / 'none'} does not exist."]
     (tmp_path / "text").write_text("no program")
-    assert "not a program that may be run" in environment.check(tmp_path / "text").problems[0]
+    assert "is not executable" in environment.check(tmp_path / "text").problems[0]
     ls = environment.check(_program(tmp_path / "ls", "echo hello"))
-    assert ls.problems == [f"{tmp_path / 'ls'} is no Python."]
+    assert ls.problems == [f"{tmp_path / 'ls'} is not a Python interpreter."]
     old = environment.check(_program(tmp_path / "old", '[ "$1" = -c ] && echo 3 8 || exit 1'))
-    assert old.problems == [f"{tmp_path / 'old'} is Python 3.8; training needs 3.11 or newer."]
+    assert old.problems == [f"{tmp_path / 'old'} is Python 3.8, but training needs 3.11 or newer."]
     odd = environment.check(_program(tmp_path / "odd", '[ "$1" = -c ] && echo 3 12 || exit 1'))
     assert odd.problems == [f"{tmp_path / 'odd'} cannot run the trainer."]
     missing = environment.check(
@@ -64,7 +64,7 @@ def test_check_says_what_is_wrong(environment, tmp_path):
 
 
 def test_check_of_an_environment_without_torch(environment, tmp_path):
-    """A real one: this Python, which in Blender 5.2's environment has no torch, else a bare one."""
+    """Use a real virtual environment without packages."""
     import venv
 
     venv.create(tmp_path / "bare", with_pip=False)
@@ -73,16 +73,15 @@ def test_check_of_an_environment_without_torch(environment, tmp_path):
 
 
 def test_check_without_write_access(environment, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        environment.os, "access", lambda path, mode: False
-    )  # the superuser may write anywhere
+    # the superuser may write anywhere
+    monkeypatch.setattr(environment.os, "access", lambda path, mode: False)
     problems = environment.check(tmp_path / "none").problems
-    assert problems[-1].startswith("The folder ") and problems[-1].endswith(" cannot be written.")
+    assert problems[-1].startswith("Cannot write to the folder ")
 
 
 def test_operator_reports_the_check(bpy, environment, preferences, tmp_path):
     preferences.python = str(tmp_path / "none")
-    with pytest.raises(RuntimeError, match="There is no program"):
+    with pytest.raises(RuntimeError, match="does not exist"):
         bpy.ops.lodgs.check_environment()
     answer = json.dumps({"ok": True, "problems": [], "torch": "2.13.0"})
     preferences.python = str(_program(tmp_path / "good", f"echo '{answer}'"))
@@ -90,22 +89,24 @@ def test_operator_reports_the_check(bpy, environment, preferences, tmp_path):
     assert environment.report.ok and environment.report.versions["torch"] == "2.13.0"
 
 
-def test_the_check_tells_what_trains_here(bpy, lodgs, environment, preferences, tmp_path):
-    found = json.dumps({"graphics": "Radeon 780M", "sentence": "Automatic trains on the processor."})
+def test_check_reports_devices(bpy, lodgs, environment, preferences, tmp_path):
+    devices = json.dumps({"graphics": "Radeon 780M", "sentence": "Automatic trains on the processor."})
     ready = json.dumps({"ok": True, "problems": [], "torch": "2.13.0"})
-    script = f"""if [ "$3" = devices ]; then echo '{found}'; else echo '{ready}'; fi"""
+    script = f"""if [ "$3" = devices ]; then echo '{devices}'; else echo '{ready}'; fi"""
     preferences.python = str(_program(tmp_path / "good", script))
     bpy.ops.lodgs.check_environment()
     assert environment.report.devices == "Automatic trains on the processor."
     backends = lodgs("panels.preferences")._backends(None, None)
     assert [(name, label) for name, label, *_ in backends][-1] == ("gpu", "GPU (Radeon 780M)")
-    assert [number for *_, number in backends] == [0, 1, 2, 3], "as files have saved them"
-    preferences.python = str(_program(tmp_path / "older", f"echo '{ready}'"))  # knows of no devices
+    assert [number for *_, number in backends] == [0, 1, 2, 3], "numbers are stored in .blend files"
+    preferences.python = str(
+        _program(tmp_path / "older", f"echo '{ready}'")
+    )  # an older trainer without the command
     bpy.ops.lodgs.check_environment()
     assert environment.report.ok and environment.report.devices == ""
 
 
-def test_blender_is_left_out_of_the_trainers_environment(lodgs, monkeypatch):
+def test_blender_variables_are_removed_from_the_trainers_environment(lodgs, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", "/blender")
     monkeypatch.setenv("PYTHONHOME", "/blender")
     monkeypatch.setenv("KEPT", "1")

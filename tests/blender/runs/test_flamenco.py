@@ -142,7 +142,7 @@ def test_what_the_farm_compiles_of_it_is_the_job_that_training_here_has(lodgs, m
         "--polish", str(said["polish"]), *shlex.split(said["options"]),
     ]  # fmt: skip
     there = options.job_from_options(parser.parse_args(command))
-    here = lodgs("runs.jobs").make_job(root, tmp_path / "runs" / "tiny", {})
+    here = lodgs("runs.job_settings").make_job(root, tmp_path / "runs" / "tiny", {})
     assert there.resolved() == here.resolved()
 
 

@@ -20,6 +20,11 @@ def jobs(lodgs):
 
 
 @pytest.fixture
+def job_settings(lodgs):
+    return lodgs("runs.job_settings")
+
+
+@pytest.fixture
 def watch_of(lodgs):
     return lodgs("runs.watch").watch_of
 
@@ -99,11 +104,11 @@ def test_settings_become_the_job(bpy, lodgs, jobs, fake, root, tmp_path):
     assert job.parameters["footprint"] == 16.0  # not set: the preset's
 
 
-def test_numbers_are_what_was_typed(jobs, root):
+def test_numbers_are_what_was_typed(job_settings, root):
     settings = root.lodgs.training
     settings.image_scale, settings.parameters.footprint = 0.3, 8.3
-    assert jobs.changes(settings) == {"footprint": 8.3}
-    assert jobs.make_job(root, Path("/run"), {}).image_scale == 0.3
+    assert job_settings.changed_parameters(settings) == {"footprint": 8.3}
+    assert job_settings.make_job(root, Path("/run"), {}).image_scale == 0.3
 
 
 @pytest.mark.parametrize("budget", [3 * LEAVES, 2 * LEAVES - 2, 2000])
@@ -141,9 +146,9 @@ def from_base(lodgs, monkeypatch):
 
 
 def test_training_starts_from_points_this_run_or_a_file(
-    bpy, lodgs, jobs, fake, root, tmp_path, from_base, monkeypatch
+    bpy, lodgs, job_settings, fake, root, tmp_path, from_base, monkeypatch
 ):
-    settings, base = root.lodgs.training, lambda: jobs.make_job(root, Path("/run"), {}).base
+    settings, base = root.lodgs.training, lambda: job_settings.make_job(root, Path("/run"), {}).base
     error = lodgs("training.errors").LodgsError
     assert base() == ""
     settings.start_from = "RUN"
@@ -174,37 +179,37 @@ def test_training_starts_from_points_this_run_or_a_file(
     settings = bpy.data.objects["tiny"].lodgs.training
     settings.base = "//splats.ply"
     root = bpy.data.objects["tiny"]
-    assert jobs.make_job(root, Path("/run"), {}).base == str(tmp_path / "splats.ply")
+    assert job_settings.make_job(root, Path("/run"), {}).base == str(tmp_path / "splats.ply")
     settings.method = "octree"  # which cannot
-    assert jobs.make_job(root, Path("/run"), {}).base == ""
+    assert job_settings.make_job(root, Path("/run"), {}).base == ""
 
 
-def test_the_panel_shows_a_job(lodgs, jobs, root, from_base):
+def test_the_panel_shows_a_job(lodgs, job_settings, root, from_base):
     settings = root.lodgs.training
     settings.parameters.max_splats = 5
     parameters = {"levels": 2, "footprint": 9.5, "steps": [10, 20]}
     job = lodgs("training.runs.job").Job(
         "/scene", "/run", "flod", "standard", base="/before", seed=9, parameters=parameters
     )
-    jobs.show(settings, job)
-    assert jobs.changes(settings) == {"levels": 2, "footprint": 9.5}
+    job_settings.apply_job(settings, job)
+    assert job_settings.changed_parameters(settings) == {"levels": 2, "footprint": 9.5}
     root.lodgs.scene_folder = "/scene"
-    again = jobs.make_job(root, Path("/run"), {"steps": [10, 20]})
+    again = job_settings.make_job(root, Path("/run"), {"steps": [10, 20]})
     assert again == job
-    jobs.show(settings, job.resolved())  # as a run keeps it
-    assert jobs.changes(settings) == {"levels": 2, "footprint": 9.5}
+    job_settings.apply_job(settings, job.resolved())  # as a run keeps it
+    assert job_settings.changed_parameters(settings) == {"levels": 2, "footprint": 9.5}
 
 
-def test_the_panel_shows_a_jobs_distances(lodgs, jobs, root):
+def test_the_panel_shows_a_jobs_distances(lodgs, job_settings, root):
     settings, job = root.lodgs.training, lodgs("training.runs.job").Job
     given = {"levels": 4, "distances": [9.0, 0.0, 2.5, 0.0]}
-    jobs.show(settings, job("/scene", "/run", "lodge", "draft", parameters=given))
+    job_settings.apply_job(settings, job("/scene", "/run", "lodge", "draft", parameters=given))
     assert not settings.find_distances
-    assert jobs.changes(settings) == {"levels": 4, "distances": (9.0, 0.0, 2.5, 0.0)}
-    jobs.show(settings, job("/scene", "/run", "lodge", "draft"))
-    assert settings.find_distances and jobs.changes(settings) == {}
-    jobs.show(settings, job("/scene", "/run", "flod", "draft"))
-    assert jobs.changes(settings) == {}
+    assert job_settings.changed_parameters(settings) == {"levels": 4, "distances": (9.0, 0.0, 2.5, 0.0)}
+    job_settings.apply_job(settings, job("/scene", "/run", "lodge", "draft"))
+    assert settings.find_distances and job_settings.changed_parameters(settings) == {}
+    job_settings.apply_job(settings, job("/scene", "/run", "flod", "draft"))
+    assert job_settings.changed_parameters(settings) == {}
 
 
 @pytest.mark.parametrize("backend", ["auto", "cpu", "cuda", "gpu"])
@@ -243,7 +248,7 @@ def test_a_dead_trainer_is_reported_and_resumed(bpy, jobs, watch_of, fake, root,
         assert _levels(root) == {1: COUNTS[1]}  # what was trained is there
     if mode == "crash":
         assert bpy.ops.lodgs.show_log() == {"FINISHED"}
-        assert "RuntimeError" in bpy.data.texts[jobs.LOG].as_string()
+        assert "RuntimeError" in bpy.data.texts["LODGS trainer log"].as_string()
     fake()
     assert bpy.ops.lodgs.resume_training() == {"FINISHED"}
     assert watch_of(root).problem == "" and _levels(root) == COUNTS
@@ -588,7 +593,7 @@ def test_mistakes_are_sentences(bpy, jobs, fake, root, tmp_path, monkeypatch):
     with pytest.raises(RuntimeError, match="torch is missing"):
         bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
     monkeypatch.delenv("LODGS_TRAINER_PYTHON")
-    with pytest.raises(RuntimeError, match="none is set up"):
+    with pytest.raises(RuntimeError, match="not installed"):
         bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
     root.lodgs.scene_folder = ""
     with pytest.raises(RuntimeError, match="not imported from photographs"):

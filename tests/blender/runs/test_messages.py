@@ -1,4 +1,4 @@
-"""Events in words."""
+"""Readable texts for events."""
 
 import pytest
 
@@ -7,5 +7,5 @@ import pytest
     ("seconds", "text"),
     [(0.4, "0 s"), (89, "89 s"), (150, "2 min"), (3600, "1 h 00 min"), (7500, "2 h 05 min")],
 )
-def test_durations_read_well(lodgs, seconds, text):
-    assert lodgs("runs.messages").duration(seconds) == text
+def test_duration_format(lodgs, seconds, text):
+    assert lodgs("runs.messages").format_duration(seconds) == text

@@ -23,7 +23,7 @@ def root(bpy, lodgs):
 
 
 def job_of(lodgs, root, tmp_path):
-    return lodgs("runs.jobs").make_job(root, tmp_path / "run", {})
+    return lodgs("runs.job_settings").make_job(root, tmp_path / "run", {})
 
 
 def test_what_lies_in_the_box_is_what_the_job_says(bpy, lodgs, root, tmp_path):
@@ -55,12 +55,12 @@ def test_what_lies_in_the_box_is_what_the_job_says(bpy, lodgs, root, tmp_path):
 def test_the_panel_shows_a_jobs_region(bpy, lodgs, root, tmp_path, region):
     """As ``blender --command lodgs train --region`` leaves it in the .blend."""
     job, settings = replace(job_of(lodgs, root, tmp_path), region=region), root.lodgs.training
-    lodgs("runs.jobs").show(settings, job)
+    lodgs("runs.job_settings").apply_job(settings, job)
     bpy.context.view_layer.update()
     found = job_of(lodgs, root, tmp_path).crop
     assert found.shape == job.crop.shape and settings.region.name.startswith("Region")
     np.testing.assert_allclose(found.to_own, job.crop.to_own, atol=1e-4)
-    lodgs("runs.jobs").show(settings, replace(job, region=""))
+    lodgs("runs.job_settings").apply_job(settings, replace(job, region=""))
     assert settings.region is None
 
 
