@@ -13,8 +13,9 @@ from pathlib import Path
 import bpy
 
 from ..training.cli.info import describe
-from ..training.cli.job_options import add_options, job_from_options, parse_size
+from ..training.cli.job_options import add_options, job_from_options
 from ..training.cli.methods import describe_method, describe_methods
+from ..training.cli.options import parse_size
 from ..training.editing.bake_filter import without_filter
 from ..training.editing.edit import Joined, finish
 from ..training.errors import LodgsError

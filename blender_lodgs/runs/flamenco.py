@@ -173,7 +173,7 @@ def prepare(root: bpy.types.Object, folder: str = "") -> Submission:
     return Submission(manager, root.name, {
         "scene": job.scene, "output": job.out, "columns": columns, "rows": rows, "method": job.method,
         "preset": job.preset, "image_scale": job.image_scale, "polish": job.polish,
-        "options": shlex.join(options_of(job, but=(*_KEYS, *_WHERE))),
+        "options": shlex.join(options_of(job, exclude=(*_KEYS, *_WHERE))),
     })  # fmt: skip
 
 

@@ -1,7 +1,8 @@
-"""What files of splats hold, in words: ``lodgs info``."""
+"""``lodgs info``: describe a file of splats."""
 
 from __future__ import annotations
 
+import argparse
 import json
 from pathlib import Path
 
@@ -10,8 +11,20 @@ from ..splats.bundle import Bundle, DrawableRows, bounding_box, json_default, op
 from ..splats.ply import Element, all_columns
 
 
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("file", type=Path, help="bundle, folder of levels, or any 3DGS PLY")
+
+
+def run(options: argparse.Namespace) -> int:
+    from ..splats.formats import as_ply
+
+    with as_ply(options.file) as path:
+        print(describe(path).replace(str(path), str(options.file)))
+    return 0
+
+
 def describe(path: str | Path) -> str:
-    """What a bundle, a plain PLY or a folder of levels holds, as a few lines of text.
+    """Return a few lines of text about a bundle, a plain PLY or a folder of levels.
 
     Raises:
         LodgsError: as `read_bundle` and `read_folder`.
@@ -32,7 +45,7 @@ def describe(path: str | Path) -> str:
     lines = [
         f"{path}: {bundle.method or 'plain 3DGS PLY'}, {count} level{'s'[: count > 1]}, "
         f"{_completeness(bundle)}, SH degree {bundle.levels[0].sh_degree}",
-        f"chosen by the rule {bundle.rule}" if bundle.rule else "not made for distances",
+        f"levels selected by the rule {bundle.rule}" if bundle.rule else "no selection by camera distance",
         f"bounds  ({low}) to ({high})",
         f"{'level':>5}  {'splats':>10}  {'MB':>8}  {''.join(f'{name:>10}  ' for name in names)}extras",
     ]
@@ -44,15 +57,15 @@ def describe(path: str | Path) -> str:
         extras = ", ".join(level.rows.select(slice(0, 0)).extras) or "-"
         lines.append(f"{level.number:>5}  {len(level.rows):>10,}  {size:>8.2f}  {facts}{extras}")
     for name, table in bundle.tables.items():
-        rows_of_table = len(next(iter(table.values()), ()))
-        lines.append(f"table {name}: {rows_of_table:,} rows of {', '.join(table)}")
-    said = {**bundle.facts, **bundle.controls, **bundle.meta}
-    lines += [f"{name}: {json.dumps(value, default=json_default)}" for name, value in said.items()]
+        row_count = len(next(iter(table.values()), ()))
+        lines.append(f"table {name}: {row_count:,} rows of {', '.join(table)}")
+    header = {**bundle.facts, **bundle.controls, **bundle.meta}
+    lines += [f"{name}: {json.dumps(value, default=json_default)}" for name, value in header.items()]
     return "\n".join([*lines, *warnings])
 
 
 def _completeness(bundle: Bundle) -> str:
     rule = find_rule(bundle.rule)
     if rule is not None and not rule.complete and len(bundle.levels) > 1:
-        return "the finest complete, coarser ones to choose from"
-    return "each adding to the coarser ones" if bundle.cumulative else "each complete"
+        return "only the finest complete"
+    return "each level adds to the coarser ones" if bundle.cumulative else "each level complete"

@@ -1,7 +1,8 @@
-"""Methods and their parameters as text: ``lodgs methods``. No torch."""
+"""``lodgs methods``: list methods and their parameters. Needs no torch."""
 
 from __future__ import annotations
 
+import argparse
 import json
 from textwrap import fill
 
@@ -11,27 +12,36 @@ from ..optimize.parameters import possible
 _WIDTH = 110
 
 
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", nargs="?", metavar="NAME", help="method whose parameters to list")
+
+
+def run(options: argparse.Namespace) -> int:
+    print(describe_method(options.name) if options.name else describe_methods())
+    return 0
+
+
 def describe_methods() -> str:
-    """A line for each method: its name for jobs and commands, and what it makes."""
-    widest = max(map(len, METHODS))
-    return "\n".join(f"{m.name:<{widest}}  {m.label}: {m.about}" for m in METHODS.values())
+    """Return a line for each method: its name in jobs and commands, its label, its result."""
+    width = max(map(len, METHODS))
+    return "\n".join(f"{m.name:<{width}}  {m.label}: {m.about}" for m in METHODS.values())
 
 
 def describe_method(name: str) -> str:
-    """What a method makes, its presets, and each parameter's possible values, presets and help.
+    """Return a method's result, its presets, and the values and help of each parameter.
 
     Raises:
-        LodgsError: there is no such method.
+        LodgsError: unknown method.
     """
     method = method_info(name)
-    lines = [f"{method.label}: {method.about}.", f"Begins with points{' or a base' * method.from_base}.", ""]
+    lines = [f"{method.label}: {method.about}.", f"Starts from points{' or a base' * method.from_base}.", ""]
     lines += [f"  {preset:<9} {text}" for preset, text in PRESETS.items()]
     for field in method.fields:
         unit = f" ({field.metadata['unit']})" if field.metadata["unit"] else ""
-        each = ", for each level" if isinstance(field.default, tuple) else ""
+        per_level = ", for each level" if isinstance(field.default, tuple) else ""
         values = {preset: json.dumps(getattr(method.preset(preset), field.name)) for preset in PRESETS}
-        alike = len(set(values.values())) == 1
-        shown = values["draft"] if alike else ", ".join(f"{key} {value}" for key, value in values.items())
-        lines += ["", f"{field.name}: {possible(field)}{unit}{each}", f"    {shown}"]
+        equal = len(set(values.values())) == 1
+        text = values["draft"] if equal else ", ".join(f"{key} {value}" for key, value in values.items())
+        lines += ["", f"{field.name}: {possible(field)}{unit}{per_level}", f"    {text}"]
         lines += [fill(field.metadata["about"], _WIDTH, initial_indent="    ", subsequent_indent="    ")]
     return "\n".join(lines)

@@ -62,7 +62,7 @@ def test_options_go_before_what_the_file_says(tmp_path):
 )  # fmt: skip
 def test_a_job_is_what_its_options_say(given):
     assert job(*options_of(given)) == given
-    assert job("--scene", "/x", *options_of(given, but=("scene",))) == replace(given, scene="/x")
+    assert job("--scene", "/x", *options_of(given, exclude=("scene",))) == replace(given, scene="/x")
 
 
 def test_a_word_needs_no_quotation_marks():

@@ -1,0 +1,94 @@
+"""``lodgs blocks``: divide a scene that is too large for one run into cells, and train them."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ..errors import LodgsError
+from . import PROGRAM
+from .job_options import add_options, job_from_options, parse_resources
+from .options import parse_positive
+from .train import train_job
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
+    plan = actions.add_parser(
+        "plan", help="divide a job into blocks, each a run of its own, and estimate the work for each"
+    )
+    add_options(plan)
+    plan.add_argument(
+        "--block-splats", type=parse_positive, default=0, metavar="N",
+        help="instead of --cells: use as few cells as have at most N splats each",
+    )  # fmt: skip
+    plan.add_argument(
+        "--block-memory", type=parse_positive, default=0, metavar="MB",
+        help="instead of --cells: use as few cells as need at most this much memory each (estimated)",
+    )  # fmt: skip
+    train = actions.add_parser("run", help="train or resume the blocks of a plan, and merge them")
+    train.add_argument("run", type=Path, help="run folder of the plan")
+    train.add_argument(
+        "--on", default="here", metavar="WHERE",
+        help="here, one at a time (default); local:N, N at a time; or a Dask scheduler, tcp://HOST:8786",
+    )  # fmt: skip
+    train.add_argument(
+        "--only", metavar="PART",
+        help="train only this part on this computer: coarse, block-3 or seam-3. Succeeds if there is no "
+        "such part",
+    )  # fmt: skip
+    train.add_argument(
+        "--takes", action="append", default=[], metavar="NAME=NUMBER",
+        help="Dask resources that each block needs, such as GPU=1",
+    )  # fmt: skip
+
+
+def run(options: argparse.Namespace) -> int:
+    return _plan(options) if options.action == "plan" else _train(options)
+
+
+def _plan(options: argparse.Namespace) -> int:
+    from ..runs.blocks.plan import choose_cells, plan, plan_table, read_planned_scene, write_plan
+    from ..runs.folder import RunFolder
+    from ..runs.job import save_job
+
+    job = job_from_options(options).resolved()
+    scene = read_planned_scene(job)
+    if options.block_splats or options.block_memory:
+        if job.cells:
+            raise LodgsError(
+                "Cannot combine --cells with --block-splats or --block-memory.", "Use only one of them."
+            )
+        job = job.with_cells(choose_cells(job, options.block_splats, options.block_memory * 10**6, scene))
+    if not job.cells:
+        raise LodgsError(
+            "Cannot plan blocks: the number of cells is missing.",
+            "Add --cells 2x4, for 2 columns of 4 cells, or --block-splats 1000000.",
+        )
+    planned = plan(job, scene)
+    folder = RunFolder(job.out)
+    folder.create()
+    if folder.job.exists():  # refuses a folder with another job before the plan is written
+        save_job(job, folder)
+    write_plan(job, folder, scene, planned)
+    save_job(job, folder)
+    print(plan_table(planned))
+    print(f"Train them with: {PROGRAM} blocks run {folder.path}", flush=True)
+    return 0
+
+
+def _train(options: argparse.Namespace) -> int:
+    from ..runs.blocks.plan import read_plan, read_planned_job
+    from ..runs.blocks.train import prepare_part
+    from ..runs.folder import RunFolder
+
+    if not options.only:
+        return train_job(
+            lambda: read_planned_job(options.run), on=options.on, resources=parse_resources(options.takes)
+        )
+    division = read_plan(RunFolder(options.run))
+    part = division.part(options.only)
+    if part is None:
+        return 0
+    prepare_part(division, part)
+    return train_job(lambda: part.job)

@@ -1,0 +1,20 @@
+"""``lodgs devices``: list and test the devices that this computer can train on."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--time", action="store_true", help="also time a training step on each device")
+    parser.add_argument(
+        "--json", action="store_true", help="print only the drivers' answers, as JSON, without tests"
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    from ..rasterize.devices import Devices, describe
+
+    print(json.dumps(Devices.found().as_json()) if options.json else describe(options.time))
+    return 0

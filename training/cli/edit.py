@@ -1,0 +1,179 @@
+"""``lodgs edit``: write a copy of splats that is cleaned up, recoloured or moved."""
+
+from __future__ import annotations
+
+import argparse
+from math import inf
+from pathlib import Path
+from typing import Any
+
+from ..editing.look import RANGES, Look
+from ..errors import LodgsError
+from ..lod.crop import Crop
+from ..splats.formats import FORMATS
+from .options import SOURCE_HELP, add_placement, placement_of, warn
+
+_LIMITS = "max_size", "min_opacity", "max_distance", "min_views", "gap", "share"
+"""Options that are numbers from 0 on; names of ``Cleaning``'s attributes."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Edits every level in the same way; levels can still be selected by distance. Positions and "
+        "lengths of crops and limits are in the splats' units before the edit (lodgs info prints the "
+        "bounds). Remaining splats are rotated, then scaled, then translated. Write negative numbers with "
+        "=, as in --translate=-1,0,2."
+    )
+    parser.add_argument(
+        "source", type=Path,
+        help=f"{SOURCE_HELP}; with splat-transform also .spz, .sog and others: see docs/formats.md",
+    )  # fmt: skip
+    _add_outputs(parser)
+    _add_cleaning(parser)
+    placement = parser.add_argument_group("placement of the remaining splats")
+    add_placement(placement)
+    placement.add_argument(
+        "--ground", action="store_true", help="first detect the ground, and put it upright at z = 0"
+    )
+    _add_look(parser)
+
+
+def _add_outputs(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type=Path, help="file or folder to write, in the format of the source")
+    parser.add_argument(
+        "--plain", type=Path, action="append", default=[], metavar="FILE",
+        help="file for the finest level only: " + ", ".join(kind.suffix for kind in FORMATS),
+    )  # fmt: skip
+    parser.add_argument("--folder", type=Path, metavar="DIR", help="folder of levels to write")
+    parser.add_argument(
+        "--streamed", type=Path, metavar="DIR", help="folder of levels to write for streaming in browsers"
+    )
+    parser.add_argument(
+        "--antialiased", action="store_true",
+        help="keep opacities as trained in --plain and --streamed, for viewers with Mip-Splatting's filter",
+    )  # fmt: skip
+
+
+def _add_cleaning(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--crop-box", type=float, nargs=6, action="append", default=[], metavar="N",
+        help="two opposite corners of a box, X Y Z X Y Z; repeatable. Crops are combined by union",
+    )  # fmt: skip
+    parser.add_argument(
+        "--crop-sphere", type=float, nargs=4, action="append", default=[], metavar="N",
+        help="centre and radius of a sphere, X Y Z R; repeatable",
+    )  # fmt: skip
+    parser.add_argument(
+        "--keep", choices=("inside", "outside", "all"), default="inside",
+        help="side of the crops to keep (default: inside); all: keep everything, and apply the look only "
+        "inside them",
+    )  # fmt: skip
+    parser.add_argument(
+        "--max-size", type=float, metavar="N", help="remove splats with a larger standard deviation"
+    )
+    parser.add_argument(
+        "--min-opacity", type=float, metavar="N", help="remove splats with a lower opacity, 0 to 1"
+    )
+    parser.add_argument("--drop-floaters", action="store_true", help="remove small isolated clusters")
+    parser.add_argument(
+        "--gap", type=float, metavar="N",
+        help="minimum distance of floaters from other splats (default: from the density of splats)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--share", type=float, metavar="N",
+        help="maximum size of a floater, as a fraction of all splats (default 0.001)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--scene", type=Path, metavar="DIR",
+        help="COLMAP folder of the photos, for --max-distance, --min-views and --ground",
+    )  # fmt: skip
+    parser.add_argument(
+        "--max-distance", type=float, metavar="N", help="remove splats farther from every photo's camera"
+    )
+    parser.add_argument(
+        "--min-views", type=int, metavar="N", help="remove splats inside the frames of fewer photos"
+    )
+
+
+def _add_look(parser: argparse.ArgumentParser) -> None:
+    look = parser.add_argument_group("look, of all splats or with --keep all of those inside the crops")
+    look.add_argument("--exposure", type=float, metavar="N", help="stops; 1 doubles the light")
+    look.add_argument(
+        "--temperature", type=float, metavar="K",
+        help="white balance: temperature in kelvins of the light to make white; above 6500 is warmer",
+    )  # fmt: skip
+    look.add_argument("--tint", type=float, nargs=3, metavar="N", help="colour that white turns into, 0 to 1")
+    look.add_argument("--saturation", type=float, metavar="N", help="0 is grey, 1 is unchanged")
+    look.add_argument("--opacity", type=float, metavar="N", help="opacity factor, 0 to 1")
+
+
+def run(options: argparse.Namespace) -> int:
+    from ..editing.cleaning import Cleaning
+    from ..editing.edit import edit
+    from ..runs.folder import RunFolder
+    from ..splats.formats import as_ply
+
+    limits: dict[str, Any] = _limits(options)
+    crops = _crops(options)
+    look = _look(options)
+    look_crops: list[Crop | None] = [None]
+    if options.keep == "all":
+        if crops and look is None:
+            raise LodgsError("--keep all removes nothing inside the crops.", "Add a look to apply there.")
+        look_crops = [*crops] or [None]
+        crops = []
+    if limits.keys() & {"max_distance", "min_views"} and options.scene is None:
+        raise LodgsError(
+            "Cannot test splats against photos: their scene is missing.", "Add its folder with --scene."
+        )
+    points = None
+    if options.scene is not None:
+        from ..scenes.colmap import read_scene
+
+        scene = read_scene(options.scene)
+        limits["cameras"] = tuple(scene.cameras)
+        points = scene.points
+    if not (options.out or options.plain or options.folder or options.streamed):
+        raise LodgsError(
+            "Cannot write the edited splats: no output.", "Add --out, --plain, --folder or --streamed."
+        )
+    cleaning = Cleaning(tuple(crops), drop_floaters=options.drop_floaters, **limits)
+    folder = RunFolder(options.source)
+    with as_ply(folder.bundle if folder.bundle.exists() else folder.path) as source:
+        print(
+            edit(
+                source, options.out, cleaning, warn,
+                placement=placement_of(options), upright=options.upright, ground=options.ground,
+                points=points, looks=[(crop, look) for crop in look_crops] if look else (),
+                plain=options.plain, folder=options.folder, streamed=options.streamed,
+                antialiased=options.antialiased,
+            )
+        )  # fmt: skip
+    return 0
+
+
+def _limits(options: argparse.Namespace) -> dict[str, float]:
+    """Return the limits that the user set, by name.
+
+    Raises:
+        LodgsError: a limit is negative or not finite.
+    """
+    limits = {name: value for name in _LIMITS if (value := getattr(options, name)) is not None}
+    for name, value in limits.items():
+        if not 0 <= value < inf:
+            raise LodgsError(f"--{name.replace('_', '-')} cannot be {value:g}.", "Use a number from 0 on.")
+    return limits
+
+
+def _crops(options: argparse.Namespace) -> list[Crop]:
+    outside = options.keep == "outside"
+    boxes = [Crop.box(box[:3], box[3:], outside) for box in options.crop_box]
+    return boxes + [Crop.sphere(sphere[:3], sphere[3], outside) for sphere in options.crop_sphere]
+
+
+def _look(options: argparse.Namespace) -> Look | None:
+    """Return the look that the user set; None without any option of it."""
+    values = {name: value for name in RANGES if (value := getattr(options, name)) is not None}
+    if "tint" in values:
+        values["tint"] = tuple(values["tint"])
+    return Look(**values) if values else None

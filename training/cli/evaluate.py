@@ -1,0 +1,25 @@
+"""``lodgs evaluate``: measure a finished run."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from .options import add_controls, control_values, warn
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", type=Path, help="run folder")
+    add_controls(parser)
+    parser.add_argument("--picture", type=Path, help="PNG to write: the levels side by side from one view")
+    parser.add_argument(
+        "--far", action="store_true", help="also measure levels from 2, 4 and 8 times the distance"
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    from ..runs.measure import evaluate_run, format_report
+
+    report = evaluate_run(options.run, control_values(options), options.picture, options.far, warn)
+    print(format_report(report))
+    return 0

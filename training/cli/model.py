@@ -1,0 +1,18 @@
+"""``lodgs model``: write the COLMAP model of views that Blender captured."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", type=Path, help="folder that `blender --command lodgs capture` filled")
+
+
+def run(options: argparse.Namespace) -> int:
+    from ..scenes.rendered_views import write_rendered_model
+
+    views, points = write_rendered_model(options.folder)
+    print(f"{options.folder}: {views} views, {points:,} points")
+    return 0

@@ -1,0 +1,118 @@
+"""Options that several commands share. Needs no torch: Blender's command line imports it."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..errors import LodgsError
+from ..lod.rule import every_control
+
+if TYPE_CHECKING:
+    from ..splats.similarity import Similarity
+
+BACKEND_HELP = "rasterizer backend: auto, cpu, cuda, gpu or reference"
+SOURCE_HELP = "bundle, folder of levels, run folder, or any 3DGS PLY"
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Parse width and height in pixels, such as 640x480."""
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise argparse.ArgumentTypeError(f"{text} is not WIDTHxHEIGHT, such as 640x480")
+    return int(width), int(height)
+
+
+def parse_positive(text: str) -> int:
+    """Parse a whole number from 1 to 2^31 - 1."""
+    if text.isdecimal() and 0 < int(text) < 2**31:
+        return int(text)
+    raise argparse.ArgumentTypeError(f"{text} is not a whole number from 1 to {2**31 - 1}")
+
+
+def parse_numbers(count: int) -> Callable[[str], tuple[float, ...]]:
+    """Return a parser of ``count`` numbers separated by commas."""
+
+    def parse(text: str) -> tuple[float, ...]:
+        try:
+            numbers = tuple(map(float, text.split(",")))
+        except ValueError:
+            numbers = ()
+        if len(numbers) != count:
+            raise argparse.ArgumentTypeError(f"{text} is not {count} numbers separated by commas")
+        return numbers
+
+    return parse
+
+
+def parse_color(text: str) -> tuple[float, float, float] | None:
+    """Parse a display-coded colour R,G,B from 0 to 1; None for "transparent"."""
+    if text == "transparent":
+        return None
+    try:
+        red, green, blue = map(float, text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"{text} is neither a colour R,G,B, such as 0,0.5,1, nor transparent"
+        ) from None
+    if not all(0 <= value <= 1 for value in (red, green, blue)):
+        raise argparse.ArgumentTypeError(f"{text} has a value outside 0 to 1")
+    return red, green, blue
+
+
+def add_controls(parser: argparse.ArgumentParser) -> None:
+    """Add an option for each control that any rule has."""
+    group = parser.add_argument_group("level of detail by camera distance, depending on the method's rule")
+    for control in every_control().values():
+        default = "" if control.follows else f" (default: the file's, else {control.default:g})"
+        group.add_argument(
+            f"--{control.name.replace('_', '-')}", type=int if control.whole else float, metavar="N",
+            help=control.about.replace("%", "%%") + default,
+        )  # fmt: skip
+
+
+def control_values(options: argparse.Namespace) -> dict[str, float]:
+    """Return the control values that the user set, by name."""
+    values = {name: getattr(options, name) for name in every_control()}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def add_placement(parser: argparse._ActionsContainer) -> None:
+    """Add the options that turn, scale and move splats."""
+    parser.add_argument("--upright", action="store_true", help="first apply the file's upright orientation")
+    parser.add_argument(
+        "--rotate", type=parse_numbers(3), default=(0, 0, 0), metavar="X,Y,Z",
+        help="degrees about x, then y, then z, like Blender's XYZ Euler angles",
+    )  # fmt: skip
+    parser.add_argument("--scale", type=float, default=1.0, metavar="N", help="scale factor")
+    parser.add_argument(
+        "--translate", type=parse_numbers(3), default=(0, 0, 0), metavar="X,Y,Z",
+        help="translation, in the scaled units",
+    )  # fmt: skip
+    parser.add_argument(
+        "--matrix", type=parse_numbers(16), metavar="A,B,...",
+        help="4x4 matrix, row by row, instead of these three options; no shear, mirroring or uneven scale",
+    )  # fmt: skip
+
+
+def placement_of(options: argparse.Namespace) -> Similarity | None:
+    """Return the transform of :func:`add_placement`'s options without --upright; None without any."""
+    from ..splats.similarity import Similarity
+
+    unmoved = (options.rotate, options.scale, options.translate) == ((0, 0, 0), 1.0, (0, 0, 0))
+    if options.matrix is None:
+        return None if unmoved else Similarity.from_angles(options.rotate, options.scale, options.translate)
+    if not unmoved:
+        raise LodgsError(
+            "Cannot combine --matrix with --rotate, --scale or --translate.", "Use only one of these ways."
+        )
+    return Similarity.from_matrix(np.reshape(options.matrix, (4, 4)))
+
+
+def warn(message: str) -> None:
+    """Print a warning to standard error."""
+    print(f"warning: {message}", file=sys.stderr)

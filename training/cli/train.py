@@ -1,0 +1,55 @@
+"""``lodgs train``: train splats, or resume a run."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from ..errors import LodgsError
+from . import check
+from .job_options import add_options, job_from_options
+
+if TYPE_CHECKING:
+    from ..runs.job import Job
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = "Prints events as JSON, one per line."
+    add_options(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    return train_job(lambda: job_from_options(options))
+
+
+def train_job(make_job: Callable[[], Job], **placement: Any) -> int:
+    """Train a job and report errors in it as events.
+
+    Args:
+        make_job: returns the job; may raise a LodgsError.
+        placement: arguments of ``runs.train.train``.
+
+    Returns:
+        Exit code.
+    """
+    for name in ("SIGINT", "SIGTERM", "SIGBREAK"):  # SIGBREAK: Windows' CTRL_BREAK_EVENT
+        if hasattr(signal, name):  # also interrupts the import of torch, which takes seconds
+            signal.signal(getattr(signal, name), signal.default_int_handler)
+    from ..runs.events import event_line
+
+    try:
+        job = make_job()
+        problems = check.environment()["problems"]
+        if problems:
+            raise LodgsError(problems[0], check.INSTALL)
+        from ..runs.train import train
+    except LodgsError as error:
+        print(event_line("error", what=error.what, remedy=error.remedy), flush=True)
+        return 2
+    except KeyboardInterrupt:
+        print(event_line("cancelled", message="Stopped before training began."), flush=True)
+        return 3
+    return train(job, sys.stdout, **placement)
