@@ -13,8 +13,8 @@ from PIL import Image
 from ..errors import LodgsError
 from ..rasterize import Gaussians, cpu_fallback_reason, rasterize
 from ..scenes.cameras import Camera, read_camera_folder
-from ..scenes.viewpoints import dome
-from ..scenes.write_colmap import write_seen
+from ..scenes.viewpoints import dome_views
+from ..scenes.write_colmap import write_visible_points
 from ..splats.dialects import Warn, ignore
 from ..splats.gaussians import Splats
 from .base import read_base
@@ -58,7 +58,7 @@ def capture(
         warn(problem)
     splats, antialias = read_base(base, warn)
     if source == DOME:
-        cameras, near = dome(splats, views, width, round(width * 2 / 3))
+        cameras, near = dome_views(splats, views, width, round(width * 2 / 3))
     else:
         cameras, near = read_camera_folder(Path(source))
     return len(cameras), write_scene(
@@ -147,7 +147,7 @@ def _write(
         x, y = x[depth[y, x] > 0], y[depth[y, x] > 0]
         positions.append(view.unproject(np.column_stack([x, y]) + 0.5, depth[y, x]))
         colors.append(image[y, x])
-    return write_seen(
+    return write_visible_points(
         scene, views, lambda number: np.load(scene / "depths" / f"{number}.npy"),
         np.concatenate(positions), np.concatenate(colors),
     )  # fmt: skip

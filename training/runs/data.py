@@ -18,8 +18,8 @@ from ..scenes.depths import DepthPriors, add_depth_points
 from ..scenes.exposures import exposure_gains
 from ..scenes.images import check_image, check_mask
 from ..scenes.regions import Region
-from ..scenes.rendered import even
-from ..scenes.undistort import cache_of, undistorted
+from ..scenes.rendered_views import thin_evenly
+from ..scenes.undistort import undistort_cache, undistort_scene
 from .capture import capture
 from .folder import RunFolder
 from .job import Job
@@ -51,7 +51,7 @@ def training_data(
     model, images = (Path(path) if path else None for path in (job.model, job.images))
     full_scene = read_scene(_scene_folder(job, folder, report), model=model, images=images)
     region = Region.read(Path(job.cell)) if job.cell else None
-    scene = full_scene if region is None else region.views_of(full_scene)
+    scene = full_scene if region is None else region.select_views(full_scene)
     if pixels:
         scene = exclude_views(scene, _undecodable(scene.cameras))
         for camera in scene.cameras:
@@ -60,7 +60,7 @@ def training_data(
     warnings = list(scene.warnings)
     if scene.distorted:
         report("status", message=f"Undistorting {len(scene.distorted)} views")
-        scene = undistorted(scene, cache_of(scene, folder.undistorted))
+        scene = undistort_scene(scene, undistort_cache(scene, folder.undistorted))
     parameters = job.resolved_parameters()
     depths = None
     if pixels and parameters.depth == "metric" and region is None and not job.cells:
@@ -73,7 +73,9 @@ def training_data(
     if pixels and parameters.match_exposure:
         report("status", message="Comparing exposure of the photos")
         trained = {camera.name for camera in full_scene.split(job.test_every, job.validation)[0]}
-        gains = exposure_gains(scene, [camera for camera in scene.cameras if camera.name in trained], job.exposure)
+        gains = exposure_gains(
+            scene, [camera for camera in scene.cameras if camera.name in trained], job.exposure
+        )
         if gains:
             largest = max(abs(np.log(gain)).max() for gain in gains.values())
             report("status", message=f"Compensating exposure differences of up to {np.expm1(largest):.0%}")
@@ -83,7 +85,7 @@ def training_data(
     for warning in warnings:
         report("warning", message=warning)
     if region is not None:
-        inside = region.points_of(full_scene)
+        inside = region.start_points(full_scene)
         scene = replace(scene, points=full_scene.points[inside], point_colors=full_scene.point_colors[inside])
     return TrainingData(
         scene, job.image_scale, job.test_every, job.exposure, job.validation,
@@ -117,7 +119,7 @@ def thin_outside_region(scene: Scene, region: Crop, limit: int) -> Scene:
     if len(outside) > limit:
         points = scene.points[outside]
         distances = np.linalg.norm(points - scene.center, axis=1)
-        outside = outside[even(points, distances, limit, np.random.default_rng(0))]
+        outside = outside[thin_evenly(points, distances, limit, np.random.default_rng(0))]
     rows = np.sort(np.concatenate([np.flatnonzero(inside), outside]))
     return replace(
         scene, points=scene.points[rows], point_colors=scene.point_colors[rows],

@@ -125,17 +125,15 @@ class Job:
 
     @classmethod
     def from_dict(cls, values: dict, folder: Path = Path()) -> Job:
-        """Makes a job from the keys of a job file, checked.
+        """Create a job from the keys of a job file, and check it.
 
         Raises:
-            LodgsError: on an unknown, missing or impossible key.
+            LodgsError: a key is unknown, missing or invalid.
         """
-        known = [f.name for f in fields(cls)]
-        unknown = sorted(set(values) - set(known))
+        keys = [key.name for key in fields(cls)]
+        unknown = sorted(set(values) - set(keys))
         if unknown:
-            raise LodgsError(
-                f"The job has the unknown key {quote(unknown[0])}.", f"Known are: {', '.join(known)}."
-            )
+            raise LodgsError(f"Unknown key in job: {quote(unknown[0])}.", f"Use one of: {', '.join(keys)}.")
         values = {"scene": "", **values} if values.get("capture") else dict(values)
         for key in ("out",) if values.get("capture") else ("scene", "out"):
             if not values.get(key):
@@ -154,7 +152,7 @@ class Job:
         for key in fields(self):
             value, (kind, name) = getattr(self, key.name), _KINDS[str(key.type)]
             if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-                raise LodgsError(f"{key.name} = {quote(value)} is not {name}.")
+                raise LodgsError(f"Invalid job key {key.name} = {quote(value)}.", f"Give {name}.")
         if not (0 <= self.seed < 2**31 and 0 <= self.test_every < 2**31) or self.test_every == 1:
             raise LodgsError(
                 f"Invalid job keys seed = {self.seed!r}, test_every = {self.test_every!r}.",
@@ -169,24 +167,24 @@ class Job:
                 f"Invalid job key exposure = {self.exposure!r}.",
                 f"Give stops from {-MAX_STOPS} to {MAX_STOPS}.",
             )
-        for key, what in (("photo_memory", "megabytes"), ("splat_memory", "megabytes"), ("polish", "steps")):
+        for key, unit in (("photo_memory", "megabytes"), ("splat_memory", "megabytes"), ("polish", "steps")):
             if not 0 <= getattr(self, key) < 2**31:
                 raise LodgsError(
-                    f"{key} = {getattr(self, key)!r} is not possible.", f"Give {what}, or 0 to let it be."
+                    f"Invalid job key {key} = {getattr(self, key)!r}.", f"Give {unit} from 0 to {2**31 - 1}."
                 )
         if self.backend not in BACKENDS:
             raise LodgsError(
-                f"There is no backend {quote(self.backend)}.", f"Choose one of: {', '.join(BACKENDS)}."
+                f"Unknown backend: {quote(self.backend)}.", f"Use one of: {', '.join(BACKENDS)}."
             )
-        goes_on = self.resolved_parameters().goes_on
-        if goes_on and not self.base:
+        continues = self.resolved_parameters().goes_on
+        if continues and not self.base:
             raise LodgsError(
-                "The job does not say which levels to go on from.", "Say 'base', or begin with level 1."
+                "Cannot continue with finer levels: the job has no base.", "Add 'base', or start at level 1."
             )
-        if self.base and not (goes_on or method_info(self.method).from_base):
+        if self.base and not (continues or method_info(self.method).from_base):
             raise LodgsError(
-                f"The method '{self.method}' cannot begin with the splats of another run.",
-                "Leave out 'base', or choose another method.",
+                f"The method '{self.method}' cannot start from a base.",
+                "Remove 'base', or choose another method.",
             )
         if is_text_of_crop(self.region):
             Crop.from_text(self.region)
@@ -197,9 +195,7 @@ class Job:
 
     def _check_capture(self) -> None:
         if not self.base:
-            raise LodgsError(
-                "Cannot capture views: the job has no base.", "Add 'base', or remove 'capture'."
-            )
+            raise LodgsError("Cannot capture views: the job has no base.", "Add 'base', or remove 'capture'.")
         for key in ("scene", "model", "images"):
             if getattr(self, key):
                 raise LodgsError(
@@ -262,7 +258,7 @@ class Job:
     def resolved(self) -> Job:
         """Return the same job with all parameters explicit, so that later versions repeat it unchanged."""
         resolved = self.resolved_parameters()
-        values = {field.name: getattr(resolved, field.name) for field in method_info(self.method).fields}
+        values = {key.name: getattr(resolved, key.name) for key in method_info(self.method).fields}
         return replace(
             self, parameters={k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
         )
@@ -317,15 +313,17 @@ def check_views(views: int, width: int) -> None:
 
 
 def _path(key: str, value: object, folder: Path) -> str:
-    """An absolute path; relative ones are relative to ``folder``."""
+    """Return an absolute path; relative paths are relative to ``folder``."""
     if not isinstance(value, str):
-        raise LodgsError(f"{key} = {quote(value)} is not a path.", "Give it in quotation marks.")
+        raise LodgsError(f"Invalid path {key} = {quote(value)}.", "Give a path in quotation marks.")
     try:
         path = str((folder / value).expanduser().resolve())
-    except (OSError, ValueError, RuntimeError) as error:  # a NUL, an unknown ~name, links in a circle
-        raise LodgsError(f"{key} = {quote(value)} is not a path: {error}.", "Correct it.") from error
+    except (OSError, ValueError, RuntimeError) as error:  # NUL, unknown ~name, link cycle
+        raise LodgsError(f"Invalid path {key} = {quote(value)}: {error}.", "Correct the path.") from error
     if len(path) > MAX_PATH:
-        raise LodgsError(f"{key} is a path of {len(path)} characters.", f"Give at most {MAX_PATH}.")
+        raise LodgsError(
+            f"The path {key} has {len(path)} characters.", f"Give at most {MAX_PATH} characters."
+        )
     return path
 
 

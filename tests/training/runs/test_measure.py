@@ -61,7 +61,7 @@ def finished(scene, splats, tmp_path):
 def test_of_a_tree_the_finest_level_alone_is_measured(finished, splats, tmp_path):
     run = finished(test_every=4)
     write_bundle(RunFolder(run).bundle, tree_of(splats))
-    report = evaluate_run(run, {"pixels": 2.0}, picture=tmp_path / "levels.png")
+    report = evaluate_run(run, {"pixels": 2.0}, image=tmp_path / "levels.png")
     (row,) = report["levels"]
     assert (row["level"], row["splats"]) == (2, len(splats)) and row["veil"] == report["veil"]
     assert [row["pixels"] for row in report["curve"]] == [0.5, 1, 2, 4, 8, 16]
@@ -73,7 +73,7 @@ def test_of_a_large_tree_the_same_is_measured_in_parts(finished, splats, tmp_pat
     write_bundle(RunFolder(run).bundle, tree_of(splats))
     expected = evaluate_run(run, far=True)
     monkeypatch.setattr(on_disk, "IN_MEMORY", 100)
-    report = evaluate_run(run, picture=tmp_path / "levels.png", far=True)
+    report = evaluate_run(run, image=tmp_path / "levels.png", far=True)
     assert (tmp_path / "levels.png").is_file()
     assert [row["set"] for row in report["selective"]] == ["per view"]
     assert report["levels"][0]["splats"] == len(splats)
@@ -117,7 +117,7 @@ def test_training_views_and_the_worst_held_out_one(finished, scene, splats):
 def test_without_held_out_views_quality_is_of_training_views_and_is_called_so(
     finished, scene, splats, tmp_path
 ):
-    report = evaluate_run(finished(test_every=0), picture=tmp_path / "levels.png")
+    report = evaluate_run(finished(test_every=0), image=tmp_path / "levels.png")
     assert report["test_views"] == [] and not {"worst", "fitted_psnr"} & report.keys()
     mean = np.mean([quality(splats, camera) for camera in read_scene(scene).cameras])
     assert report["train_psnr"] == pytest.approx(mean, abs=0.02)

@@ -27,7 +27,7 @@ from training.runs.folder import RunFolder
 from training.runs.job import Job
 from training.scenes.colmap import read_scene
 from training.scenes.orientation import up_rotation
-from training.scenes.views import views_in
+from training.scenes.view_tables import read_view_tables
 from training.splats.bundle import NO_SPLATS, read_bundle
 from training.splats.ply import read_ply
 from training.splats.scratch import ScratchFile
@@ -144,7 +144,7 @@ def test_levels_and_bundle_agree_and_record_the_constraint(unbroken):
 
 
 def test_the_bundle_tells_where_the_scene_was_photographed_from(unbroken):
-    cameras, near, unseen = views_in(read_bundle(RunFolder(unbroken["keys"]["out"]).bundle).tables)
+    cameras, near, unseen = read_view_tables(read_bundle(RunFolder(unbroken["keys"]["out"]).bundle).tables)
     scene = read_scene(Path(unbroken["keys"]["scene"]))
     assert [camera.name for camera in cameras] == [camera.name for camera in scene.cameras]
     for camera, view in zip(cameras, scene.cameras, strict=True):
@@ -491,7 +491,7 @@ def test_an_unexpected_error_is_an_event_and_its_details_go_to_the_log(
     def broken(*_):
         raise RuntimeError("a bug")
 
-    monkeypatch.setattr(training_loop._Run, "to_the_end", broken)
+    monkeypatch.setattr(training_loop._TrainingRun, "run", broken)
     code, events = run_in_process({**unbroken["keys"], "out": str(tmp_path / "run")})
     assert code == 1
     assert events[-1]["event"] == "error" and "a bug" in events[-1]["what"]

@@ -85,13 +85,13 @@ def write_surroundings(division: Division, seam: Block) -> None:
         meta = {}
         for block in division.blocks:
             assert block.region is not None
-            if not seam.region.meets(block.region):
+            if not seam.region.overlaps(block.region):
                 continue
             head, rows = open_bundle(block.folder.bundle)
             meta |= head.meta
             for level in head.drawn_levels(max(rows)):
                 for splats in _pieces(rows[level.number]):
-                    around = seam.region.surrounds(splats.means)
+                    around = seam.region.in_enlarged_cell(splats.means)
                     chosen = around & block.region.contains(splats.means)
                     if block.number == seam.number:
                         chosen |= ~around
@@ -106,12 +106,12 @@ class _Fitted:
         assert seam.region is not None
         self._path, self._region, self._taken = seam.folder.path, seam.region, 0
         _, rows = open_bundle(seam.folder.bundle)
-        parts = [splats.select(seam.region.borders(splats.means)) for splats in _pieces(rows[max(rows)])]
+        parts = [splats.select(seam.region.near_border(splats.means)) for splats in _pieces(rows[max(rows)])]
         self._splats = Splats.concatenated(parts)
 
     def fit(self, splats: Splats) -> Splats:
         """The next splats of the cell, with fitted opacities and colours."""
-        where = np.flatnonzero(self._region.borders(splats.means))
+        where = np.flatnonzero(self._region.near_border(splats.means))
         found = self._splats.select(slice(self._taken, self._taken + len(where)))
         self._taken += len(where)
         if not np.array_equal(found.means, splats.means[where]):

@@ -174,7 +174,7 @@ def plan(job: Job, scene: Scene | None = None) -> list[PlannedCell]:
     pixels = float(np.mean([camera.width * camera.height for camera in scene.cameras])) * job.image_scale**2
     found = []
     for number, region in enumerate(plan_cells(scene, *job.grid), 1):
-        views, points = len(training & set(region.views)), int(region.points_of(scene).sum())
+        views, points = len(training & set(region.views)), int(region.start_points(scene).sum())
         if views < 2 or not points:
             what = f"{views} views and {points} points"
             raise LodgsError(f"Cell {number} has {what}, too little to train on.", "Ask for fewer cells.")
@@ -240,7 +240,7 @@ def write_plan(
                 for each in made:
                     path = there.blocks / str(each.number)
                     _write_part(each.job, path, each.region, there.coarse if coarse else None)
-                    seam = each.region.at_seam(scene)
+                    seam = each.region.as_seam(scene)
                     if _polishes(job) and len(training & set(seam.views)) > 1:
                         path = there.seams / str(each.number)
                         _write_part(_seam_job(job), path, seam, RunFolder(path).base)
