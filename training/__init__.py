@@ -1,7 +1,7 @@
-"""Splats with levels of detail: files, rules, scenes and the trainer. Never imports bpy.
+"""Gaussian splats with levels of detail: files, rules, scenes and the trainer. Never imports bpy.
 
-``splats``, ``lod``, ``scenes`` and the folder side of ``runs`` are numpy only, so that Blender can load
-them; ``rasterize``, ``methods`` and ``evaluate`` need the trainer's environment (torch, numba).
+Blender loads ``splats``, ``lod``, ``editing``, ``scenes`` and the file handling of ``runs``, which need only
+numpy. ``rasterize``, ``methods`` and ``evaluate`` need the trainer's environment (torch, numba).
 """
 
 VERSION = "0.1.0"

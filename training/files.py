@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and files that are really files."""
+"""Atomic file writes, checked file access and locks."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from typing import IO, BinaryIO
 from .errors import LodgsError
 
 DISK_FULL = {errno.ENOSPC, errno.EDQUOT}
-"""What systems say of a disk that is full."""
+"""Error codes of a full disk or an exceeded quota."""
 
 
 def cache_folder() -> Path:
-    """Where this user's programs may keep what they can make again."""
+    """Return the user's cache folder for data that can be computed again."""
     if sys.platform == "win32":
         base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
     elif sys.platform == "darwin":
@@ -34,14 +34,14 @@ def cache_folder() -> Path:
 
 @contextmanager
 def atomic_write(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``; what the block writes there becomes ``path`` when it ends well.
+    """Yield a temporary path next to ``path``, and rename it to ``path`` when the block succeeds.
 
-    The file is flushed to the disk and then moved into place, so whoever looks finds the old file or the new
-    one, never a part. When the block raises, the temporary file is removed and ``path`` stays as it was. The
-    parent folder is made if it is missing. A link is followed: what it points to is replaced.
+    The file is flushed to the disk before it is renamed, so other programs see the old file or the new one,
+    never a part of it. If the block raises, the temporary file is removed and ``path`` stays unchanged. A
+    missing parent folder is created. If ``path`` is a symbolic link, its target is replaced.
 
     Raises:
-        LodgsError: the disk is full, or the place cannot be written.
+        LodgsError: the disk is full, or the location is not writable.
     """
     path = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
@@ -57,7 +57,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         if error.filename is not None and Path(error.filename) not in (temporary, path, *path.parents):
             raise
         raise LodgsError(
-            f"{path} could not be written: {error.strerror or error}.",
+            f"Cannot write {path}: {error.strerror or error}.",
             "Free some space there or choose another folder."
             if error.errno in DISK_FULL
             else "Choose another name or folder.",
@@ -68,7 +68,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
 
 def remove_temporaries(folder: Path) -> None:
-    """Removes what killed processes left of :func:`atomic_write` in a folder. Nobody may be writing there."""
+    """Remove the temporary files that killed processes left in a folder. No process may be writing there."""
     for path in folder.glob(".*.tmp"):
         if re.fullmatch(r"\..+\.[0-9a-f]{8}\.tmp", path.name):
             with suppress(OSError):
@@ -76,10 +76,12 @@ def remove_temporaries(folder: Path) -> None:
 
 
 def link_or_copy(source: Path, target: Path) -> None:
-    """Makes ``target``, if it is not there, the same file where the disk can have one twice; else a copy.
+    """Create ``target`` as a hard link to ``source``, or as a copy if the disk has no hard links.
+
+    An existing ``target`` stays unchanged.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the target cannot be written.
     """
     if target.exists():
         return
@@ -87,32 +89,34 @@ def link_or_copy(source: Path, target: Path) -> None:
     try:
         os.link(source, target)
     except OSError:
-        beside = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.tmp")
+        temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.tmp")
         try:
-            shutil.copyfile(source, beside)
-            os.replace(beside, target)
+            shutil.copyfile(source, temporary)
+            os.replace(temporary, target)
         finally:
-            beside.unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
 
 
 def check_folder(folder: Path, remedy: str) -> None:
-    """Raises LodgsError, with that remedy, where there is no such folder."""
+    """Raise LodgsError, with the given remedy, unless the folder exists."""
     if folder.is_file():
-        packed = folder.suffix.lower() in (".zip", ".r3d", ".7z", ".rar", ".tar", ".gz")
-        raise LodgsError(f"{folder} is a file, not a folder.", "Unpack it first." if packed else remedy)
+        is_archive = folder.suffix.lower() in (".zip", ".r3d", ".7z", ".rar", ".tar", ".gz")
+        raise LodgsError(f"{folder} is a file, not a folder.", "Unpack it first." if is_archive else remedy)
     if not folder.is_dir():
-        raise LodgsError(f"There is no folder {folder}.", remedy)
+        raise LodgsError(f"The folder {folder} does not exist.", remedy)
 
 
 def open_regular(path: str | Path, writing: bool = False) -> BinaryIO:
-    """Opens a file for reading, or for writing as well; unlike ``open`` it never waits for a pipe's other
-    end, or reads a device.
+    """Open a regular file. Unlike ``open``, neither wait for the other end of a pipe nor read a device.
+
+    Args:
+        writing: open for writing as well as for reading.
 
     Raises:
-        OSError: it cannot be read, or is no file.
+        OSError: the file cannot be opened, or is not a regular file.
     """
-    how = os.O_RDWR if writing else os.O_RDONLY
-    descriptor = os.open(path, how | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    flags = os.O_RDWR if writing else os.O_RDONLY
+    descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise OSError(errno.EINVAL, "not a file", str(path))
@@ -120,23 +124,26 @@ def open_regular(path: str | Path, writing: bool = False) -> BinaryIO:
 
 
 def try_lock(file: IO[bytes]) -> bool:
-    """Locks the file, open for writing, for this process if nobody else has; released when it is closed.
+    """Lock a file that is open for writing, until it is closed.
+
+    Returns:
+        False if another process holds the lock.
 
     Raises:
-        OSError: it is open for reading alone, where that is not enough (NFS).
+        OSError: the file is open for reading only and the file system (NFS) requires write access.
     """
     try:
         if os.name == "nt":
             import msvcrt
 
-            file.seek(1 << 30)  # what is locked cannot be read there, and the beginning says who holds it
+            file.seek(1 << 30)  # Windows blocks reading of a locked range; the owner's name is at the start
             msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
         else:
             import fcntl
 
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
-        if error.errno == errno.EBADF:  # on NFS a lock is a write: nobody knows whether it is locked
+        if error.errno == errno.EBADF:  # NFS locks only files open for writing, so the state is unknown
             raise
         return False
     return True
@@ -144,9 +151,9 @@ def try_lock(file: IO[bytes]) -> bool:
 
 @contextmanager
 def exclusive(name: str) -> Iterator[None]:
-    """Waits while another of this user's processes is in a block of this name.
+    """Run a block while no other process of this user runs a block of the same name.
 
-    Where the cache folder cannot be written, nobody waits.
+    Without a writable cache folder, blocks do not wait for one another.
     """
     try:
         cache_folder().mkdir(parents=True, exist_ok=True)
@@ -161,7 +168,7 @@ def exclusive(name: str) -> Iterator[None]:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make the rename itself durable; Windows has no such call and needs none."""
+    """Flush a folder, which makes a rename durable. Windows needs no such call."""
     if os.name != "posix":
         return
     descriptor = os.open(folder, os.O_RDONLY)

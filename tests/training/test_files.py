@@ -1,4 +1,4 @@
-"""Atomic writes: the old file or the new one, never a part. Blocks that are entered one after the other."""
+"""Atomic writes and named locks."""
 
 import errno
 import os
@@ -11,8 +11,8 @@ from training.errors import LodgsError
 from training.files import atomic_write
 
 
-def test_appears_whole_and_leaves_nothing_beside(tmp_path):
-    path = tmp_path / "made" / "a.txt"
+def test_file_appears_complete_and_temporary_is_removed(tmp_path):
+    path = tmp_path / "folder" / "a.txt"
     with atomic_write(path) as temporary:
         assert temporary.parent == path.parent
         temporary.write_text("new")
@@ -21,7 +21,7 @@ def test_appears_whole_and_leaves_nothing_beside(tmp_path):
     assert os.listdir(path.parent) == ["a.txt"]
 
 
-def test_a_failure_keeps_the_old_file(tmp_path):
+def test_failure_keeps_old_file(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("old")
     with pytest.raises(KeyError), atomic_write(path) as temporary:
@@ -31,22 +31,22 @@ def test_a_failure_keeps_the_old_file(tmp_path):
     assert os.listdir(tmp_path) == ["a.txt"]
 
 
-def test_a_full_disk_is_one_sentence(tmp_path):
+def test_full_disk_raises_one_sentence(tmp_path):
     with (
-        pytest.raises(LodgsError, match=r"a\.txt could not be written: No space left.* Free some space"),
+        pytest.raises(LodgsError, match=r"Cannot write .*a\.txt: No space left.* Free some space"),
         atomic_write(tmp_path / "a.txt"),
     ):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert os.listdir(tmp_path) == []
 
 
-def test_a_place_that_is_a_file_is_one_sentence(tmp_path):
+def test_parent_that_is_a_file_raises_one_sentence(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(LodgsError, match="could not be written"), atomic_write(tmp_path / "file" / "a.txt"):
+    with pytest.raises(LodgsError, match="Cannot write"), atomic_write(tmp_path / "file" / "a.txt"):
         pass
 
 
-def test_space_does_not_help_where_a_folder_has_the_name(tmp_path):
+def test_path_that_is_a_folder_asks_for_another_name(tmp_path):
     (tmp_path / "a.ply").mkdir()
     with (
         pytest.raises(LodgsError, match=r"Is a directory\. Choose another name or folder"),
@@ -56,29 +56,29 @@ def test_space_does_not_help_where_a_folder_has_the_name(tmp_path):
     assert os.listdir(tmp_path) == ["a.ply"]
 
 
-def test_an_error_about_another_file_passes_through(tmp_path):
+def test_error_about_another_file_passes_through(tmp_path):
     with pytest.raises(FileNotFoundError), atomic_write(tmp_path / "a.txt"):
-        (tmp_path / "elsewhere" / "missing.txt").read_bytes()
+        (tmp_path / "folder" / "missing.txt").read_bytes()
 
 
-def test_blocks_of_a_name_are_entered_one_after_the_other(tmp_path, monkeypatch):
+def test_blocks_of_one_name_run_in_turn(tmp_path, monkeypatch):
     monkeypatch.setattr(files, "cache_folder", lambda: tmp_path / "cache")
-    done = []
+    order = []
 
-    def second():
+    def run_second():
         with files.exclusive("work"):
-            done.append("second")
+            order.append("second")
 
     with files.exclusive("work"):
-        other = Thread(target=second)
-        other.start()
-        other.join(0.3)
-        done.append("first")
-    other.join(10)
-    assert done == ["first", "second"]
+        thread = Thread(target=run_second)
+        thread.start()
+        thread.join(0.3)
+        order.append("first")
+    thread.join(10)
+    assert order == ["first", "second"]
 
 
-def test_nobody_waits_where_nothing_can_be_written(tmp_path, monkeypatch):
+def test_blocks_do_not_wait_without_a_writable_cache_folder(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     monkeypatch.setattr(files, "cache_folder", lambda: tmp_path / "file")
     with files.exclusive("work"), files.exclusive("work"):

@@ -15,7 +15,7 @@ from ..runs.folder import RunFolder
 from ..runs.job import Job
 from ..scenes.cameras import Camera
 from ..scenes.colmap import read_scene
-from ..scenes.views import views_in
+from ..scenes.view_tables import read_view_tables
 from ..splats.bundle import Bundle, read_folder, read_header, read_tables
 from ..splats.dialects import Warn, ignore
 from .image import read_depth, write_image
@@ -75,7 +75,7 @@ class RenderSource:
             there, near = cameras.cameras, cameras.near()
         else:
             tables = self.levels.tables if isinstance(self.levels, Bundle) else read_tables(self.levels)
-            there, near, _ = views_in(tables)
+            there, near, _ = read_view_tables(tables)
         if not there and self.run is not None:
             data = training_data(Job.from_file(self.run.job), self.run, pixels=False)
             there, near = data.scene.cameras, data.near

@@ -141,13 +141,13 @@ def _in_one_frame(
     world one of its units is."""
     first = instances[0].matrix
     if is_similarity(first) and all(np.array_equal(one.matrix, first) for one in instances):
-        camera, unit = camera.within(first)
+        camera, unit = camera.in_object_space(first)
         chosen = [WeightedSet(one.splats, one.choice) for one in instances]
         gaussians, rows, weights = combine_visible(chosen, camera, near / unit)
         return gaussians, rows, weights, [len(one.splats) for one in instances], camera, near / unit, unit
     there, weights = [], []
     for one in instances:
-        inside, unit = camera.within(one.matrix) if is_similarity(one.matrix) else (None, 1.0)
+        inside, unit = camera.in_object_space(one.matrix) if is_similarity(one.matrix) else (None, 1.0)
         rows, weight = (torch.from_numpy(each) for each in one.splats.select_visible(one.choice, inside, near / unit))
         there.append(_in_world(one, camera, rows.long()))
         weights.append(weight.to(there[-1].means))

@@ -215,7 +215,7 @@ class _Server:
             self._trees[path] = stamp, TreeFile(path)
         file = self._trees[path][1]
         if is_similarity(one.matrix):
-            camera, unit = request.camera.within(one.matrix)
+            camera, unit = request.camera.in_object_space(one.matrix)
         near = request.near / unit
         where = None if camera is None else json.dumps(camera_to_dict(camera, near))
 

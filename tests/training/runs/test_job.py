@@ -111,7 +111,7 @@ def test_what_lies_in_the_run_is_found_where_the_run_lies(tmp_path):
         ),
         ('scene = "a"\nout = "b"\npreset = {}\n', "preset = {} is not a text"),
         ('scene = "a"\nout = "b"\nparameters = 3\n', "parameters = 3 is not a table"),
-        ('scene = "a\\u0000b"\nout = "b"\n', "scene holds characters that are none"),
+        ('scene = "a\\u0000b"\nout = "b"\n', "scene contains invalid characters"),
         ('scene = "a"\nout = "b"\n[parameters]\nlr_sh = 1e300\n', "lr_sh = 1e\\+300 is more than any use"),
         (
             'scene = "a"\nout = "b"\n[parameters]\nmax_splats = 2147483648\n',

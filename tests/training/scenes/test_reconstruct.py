@@ -16,17 +16,17 @@ from training.scenes.cameras import look_at
 from training.scenes.colmap import read_scene
 from training.scenes.exr import write_exr
 from training.scenes.images import load_image, write_png
-from training.scenes.reconstruct import _masks, pairs_picture, reconstruct
+from training.scenes.reconstruct import _link_masks, draw_pairs, reconstruct
 
 from .synthetic import noise, write_image
-from .walls import EYES, HEIGHT, WIDTH, photograph
+from .walls import CAMERA_POSITIONS, HEIGHT, WIDTH, render_photo
 
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("photos")
-    for number, eye in enumerate(EYES):
-        write_png(folder / f"{number}.png", photograph(eye))
+    for number, eye in enumerate(CAMERA_POSITIONS):
+        write_png(folder / f"{number}.png", render_photo(eye))
     return folder
 
 
@@ -44,11 +44,11 @@ def test_all_cameras_are_where_they_were(made):
     assert found.words == "All 6 photographs found their place."
     scene = read_scene(found.folder)
     eyes = np.array([camera.center for camera in scene.cameras])
-    apart, truly = (np.linalg.norm(each[:, None] - each[None], axis=2) for each in (eyes, EYES))
+    apart, truly = (np.linalg.norm(each[:, None] - each[None], axis=2) for each in (eyes, CAMERA_POSITIONS))
     scale = apart.sum() / truly.sum()
     np.testing.assert_allclose(apart / scale, truly, atol=0.03)
     turned = [camera.world_to_camera[:3, :3] for camera in scene.cameras]
-    truth = [look_at(eye, np.array([0.0, 0.6, 0.4]), (0, 0, 1))[:3, :3] for eye in EYES]
+    truth = [look_at(eye, np.array([0.0, 0.6, 0.4]), (0, 0, 1))[:3, :3] for eye in CAMERA_POSITIONS]
     for n in range(1, 6):  # angles between views
         expected, angle = (np.trace(each[0] @ each[n].T) for each in (truth, turned))
         assert angle == pytest.approx(expected, abs=0.03)
@@ -109,7 +109,7 @@ def test_masks_of_webp_photographs_have_the_names_that_these_had(tmp_path):
         masks = tmp_path / name.replace(".", "-")
         masks.mkdir()
         write_png(masks / name, np.zeros((30, 40, 3), np.uint8))
-        there = _masks(masks, tmp_path, {"b.webp": "b.webp.png"}, masks / "out")
+        there = _link_masks(masks, tmp_path, {"b.webp": "b.webp.png"}, masks / "out")
         assert [path.name for path in there.iterdir()] == ["b.webp.png.png"]
 
 
@@ -117,10 +117,10 @@ def test_masks_of_webp_photographs_have_the_names_that_these_had(tmp_path):
 def test_folders_of_a_rig_are_a_lens_each(tmp_path):
     """Of twelve places: each lens is found by as many photographs as the one above."""
     for number, along in enumerate(np.linspace(0, 5, 12)):
-        eye = [np.interp(along, range(6), axis) for axis in EYES.T]
+        eye = [np.interp(along, range(6), axis) for axis in CAMERA_POSITIONS.T]
         place = tmp_path / "photos" / ("left" if number % 2 else "right") / f"{number}.png"
         place.parent.mkdir(parents=True, exist_ok=True)
-        write_png(place, photograph(np.array(eye)))
+        write_png(place, render_photo(np.array(eye)))
     found = reconstruct(tmp_path / "photos", tmp_path / "out", lens="folder")
     assert len(found.placed) == 12
     cameras = read_scene(found.folder).cameras
@@ -195,7 +195,7 @@ def test_what_cannot_be(photos, tmp_path):
     (tmp_path / "photos.zip").write_bytes(b"PK")
     with pytest.raises(LodgsError, match=r"photos.zip is a file, not a folder\. Unpack it first\."):
         reconstruct(tmp_path / "photos.zip", tmp_path / "out")
-    with pytest.raises(LodgsError, match="There is no folder"):
+    with pytest.raises(LodgsError, match="does not exist"):
         reconstruct(tmp_path / "nowhere", tmp_path / "out")
     write_image(tmp_path / "few" / "a.png", noise())
     with pytest.raises(LodgsError, match="holds 1 photographs that can be read"):
@@ -223,7 +223,7 @@ def test_what_cannot_be(photos, tmp_path):
 
 
 def test_pairs_picture():
-    codes = pairs_picture(["a", "b", "c"], [["a", "b", 99], ["b", "c", 9]], ["a", "b"])
+    codes = draw_pairs(["a", "b", "c"], [["a", "b", 99], ["b", "c", 9]], ["a", "b"])
     assert codes.shape == (720, 720, 3)
     a, b, c = 120, 360, 600
     assert (codes[a, b] == 255).all() and (codes[b, a] == 255).all() and (codes[a, a] == 80).sum() == 0

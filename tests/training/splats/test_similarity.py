@@ -51,7 +51,7 @@ def test_the_turned_scene_is_what_the_turned_camera_sees(degree, scale):
     """At least 50 dB, where harmonics that stay behind have less than 30."""
     splats, placement = some_splats(300, degree), Similarity.from_matrix(matrix_of(degree, scale))
     camera = Camera("", 96, 72, 90.0, 80.0, 50.0, 33.0, look_at((2.5, 0.4, 1.5)))
-    there, unit = camera.within(np.linalg.inv(placement.matrix))
+    there, unit = camera.in_object_space(np.linalg.inv(placement.matrix))
     assert unit == pytest.approx(1 / scale)
     before = drawn(splats, camera, 0.01)
     after = drawn(placement.transform_splats(splats), there, 0.01 * scale)
