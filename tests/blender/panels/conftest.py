@@ -1,12 +1,12 @@
-"""A layout that takes notes of what panels draw into it."""
+"""A layout that records the texts, properties and operators that panels draw."""
 
 from types import SimpleNamespace
 
 import pytest
 
 
-class Notes:
-    """A layout that remembers its texts and operators and is its own row, column and box."""
+class RecordingLayout:
+    """A layout that records its texts and operators and is its own row, column and box."""
 
     def __init__(self):
         self.texts: list[str] = []
@@ -15,7 +15,7 @@ class Notes:
         self.colors: list[tuple[float, ...]] = []
         self.properties: list[str] = []
         self.sliders: list[str] = []
-        self.folded: list[str] = []
+        self.collapsed: list[str] = []
 
     def row(self, **_):
         return self
@@ -24,7 +24,7 @@ class Notes:
 
     def panel(self, name, default_closed=False):
         if default_closed:
-            self.folded.append(name)
+            self.collapsed.append(name)
         return self, self
 
     def label(self, text="", **_):
@@ -64,15 +64,16 @@ class Notes:
 
 @pytest.fixture
 def draw_panel(bpy, lodgs, monkeypatch):
-    """``draw_panel("levels", "LODGS_PT_detail")``: the notes of what a panel of that module draws now."""
+    """``draw_panel("levels", "LODGS_PT_detail")``: draw a panel of a module and return its layout."""
 
-    def drawn(name, panel):
-        module, notes = lodgs(f"panels.{name}"), Notes()
-        for place in (module, lodgs("panels.parts")):
+    def draw(name, panel):
+        module = lodgs(f"panels.{name}")
+        layout = RecordingLayout()
+        for patched in (module, lodgs("panels.parts")):
             monkeypatch.setattr(
-                place, "say", lambda layout, text, icon: layout.label(text=text), raising=False
+                patched, "say", lambda layout, text, icon: layout.label(text=text), raising=False
             )
-        getattr(module, panel).draw(SimpleNamespace(layout=notes), bpy.context)
-        return notes
+        getattr(module, panel).draw(SimpleNamespace(layout=layout), bpy.context)
+        return layout
 
-    return drawn
+    return draw

@@ -1,4 +1,4 @@
-"""What the Detail panel offers for every rule, and says where there is none; and what it says of chunks."""
+"""The Levels, Detail, Distances and Streaming panels, for every rule and without a rule."""
 
 import json
 
@@ -14,11 +14,11 @@ from training.splats.gaussians import Splats
 
 @pytest.fixture
 def root(bpy, lodgs, tmp_path):
-    """``root(rule)``: a scene of one splat whose rule has that name."""
+    """Return a function that imports a scene of one splat with a rule of the given name."""
     bundles, gaussians = lodgs("training.splats.bundle"), lodgs("training.splats.gaussians")
-    one = np.zeros((1, 3), np.float32)
+    zeros = np.zeros((1, 3), np.float32)
     splats = gaussians.Splats(
-        means=one, quats=np.float32([[1, 0, 0, 0]]), log_scales=one, opacity_logits=one[:, 0],
+        means=zeros, quats=np.float32([[1, 0, 0, 0]]), log_scales=zeros, opacity_logits=zeros[:, 0],
         sh=np.zeros((1, 1, 3), np.float32),
     )  # fmt: skip
 
@@ -43,30 +43,29 @@ def draw(draw_panel):
 
 
 @pytest.mark.parametrize("name", sorted(rules()))
-def test_every_control_is_offered_as_what_it_is(root, draw, name):
-    made = root(name)
-    made.lodgs.mode = "SELECTIVE"
-    notes, controls = draw(), rules()[name].controls
-    assert notes.properties == ["mode", *(control.name for control in controls), "eye", "freeze"]
-    assert notes.sliders == [control.name for control in controls if control.soft]
-    kinds = {p.identifier: p.type for p in made.lodgs.controls.bl_rna.properties}
+def test_every_control_of_a_rule_has_a_property_of_its_type(root, draw, name):
+    scene_root = root(name)
+    scene_root.lodgs.mode = "SELECTIVE"
+    layout, controls = draw(), rules()[name].controls
+    assert layout.properties == ["mode", *(control.name for control in controls), "eye", "freeze"]
+    assert layout.sliders == [control.name for control in controls if control.soft]
+    properties = scene_root.lodgs.controls.bl_rna.properties
     for control in controls:
         kind = "BOOLEAN" if control.flag else "INT" if control.whole else "FLOAT"
-        assert kinds[control.name] == kind
+        assert properties[control.name].type == kind
         if control.whole and not control.flag:
-            assert made.lodgs.controls.bl_rna.properties[control.name].step == control.step
+            assert properties[control.name].step == control.step
 
 
 @pytest.mark.parametrize("name", sorted(rules()))
-def test_one_level_says_where_it_is_not_what_was_trained(root, draw, name):
-    made = root(name)
-    made.lodgs.mode = "SINGLE"
-    notes = draw()
-    assert notes.properties == ["mode", "single_level"]
-    assert any("too opaque" in text for text in notes.texts) == rules()[name].always
+def test_one_level_warns_if_splats_are_trained_for_distances(root, draw, name):
+    root(name).lodgs.mode = "SINGLE"
+    layout = draw()
+    assert layout.properties == ["mode", "single_level"]
+    assert any("too opaque" in text for text in layout.texts) == rules()[name].always
 
 
-def test_what_has_no_known_rule_is_shown_level_by_level_and_says_so(root, draw):
+def test_levels_without_a_known_rule_cause_a_hint(root, draw):
     root("")
     assert "These levels are not made for distances." in draw().texts
     root("weave")
@@ -75,7 +74,7 @@ def test_what_has_no_known_rule_is_shown_level_by_level_and_says_so(root, draw):
 
 @pytest.fixture
 def town(bpy, lodgs):
-    """A level of 1000 splats for all distances below 20, one for the rest, and two chunks."""
+    """A scene with a level of 1000 splats for distances below 20, a level of 10 beyond, and two chunks."""
     scenes, sets = lodgs("data.scenes"), np.zeros((2, 1000), bool)
     sets[0, :100] = sets[1, 50:300] = True
     splats = Splats(
@@ -87,17 +86,17 @@ def town(bpy, lodgs):
     table = {"x": [0, 10], "y": [0, 0], "z": [0, 0], "radius": [10, 10]}
     table = {name: np.float32(values) for name, values in table.items()}
     with scenes._new_scene(bpy.context, "town") as root:
-        for one in levels:
-            scenes._put_level(root, one)
+        for level in levels:
+            scenes._put_level(root, level)
         scenes.set_bundle_facts(root, Bundle("lodge", levels, "chunks"))
         scenes.set_tables(root, {"chunks": table})
     root.lodgs.mode, root.lodgs.eye = "SELECTIVE", "TRAINING"
     return root
 
 
-def test_chunks_are_told_with_what_is_loaded_and_what_is_drawn(bpy, lodgs, town, draw):
-    def told(eye, **controls):
-        town.lodgs.camera_center = eye
+def test_chunk_of_the_camera_and_loaded_splats_are_shown(bpy, lodgs, town, draw):
+    def draw_at(camera, **controls):
+        town.lodgs.camera_center = camera
         for name, value in controls.items():
             setattr(town.lodgs.controls, name, value)
         bpy.context.view_layer.update()
@@ -105,23 +104,23 @@ def test_chunks_are_told_with_what_is_loaded_and_what_is_drawn(bpy, lodgs, town,
 
     megabytes = lodgs("data.objects").megabytes
     size = sum(megabytes(item.object.data) for item in town.lodgs.levels)
-    each = size / 1010
-    texts = told((2.5, 0, 0))
+    per_splat = size / 1010
+    texts = draw_at((2.5, 0, 0))
     assert "Chunks 0 and 1, 25 %" in texts and "310 of 1,010 splats shown" in texts
-    assert f"310 loaded, {310 * each:.1f} MB" in texts
+    assert f"310 loaded, {310 * per_splat:.1f} MB" in texts
     assert any("sets of chunks are fixed" in text for text in texts)
-    texts = told((0, -11.25, 0))
+    texts = draw_at((0, -11.25, 0))
     assert "Chunk 0, 50 % outside" in texts and f"1,010 loaded, {size:.1f} MB" in texts
     assert not any("fixed" in text for text in texts)
-    texts = told((-1, 0, 0))
+    texts = draw_at((-1, 0, 0))
     assert "Chunk 0" in texts and "110 of 1,010 splats shown" in texts
-    assert f"110 loaded, {110 * each:.1f} MB" in texts
-    texts = told((-1, 0, 0), chunks=False)
+    assert f"110 loaded, {110 * per_splat:.1f} MB" in texts
+    texts = draw_at((-1, 0, 0), chunks=False)
     assert not any("Chunk" in text or "loaded" in text for text in texts)
     assert "Only chunks fade into each other." in texts
 
 
-def test_what_is_loaded_is_counted_anew_when_the_splats_change(bpy, lodgs, town):
+def test_loaded_splats_are_counted_again_when_splats_change(bpy, lodgs, town):
     loaded, cloud = lodgs("data.loaded"), town.lodgs.levels[1].object.data
     bpy.context.view_layer.update()
     choice = loaded.chosen(bpy.context, town)
@@ -132,22 +131,21 @@ def test_what_is_loaded_is_counted_anew_when_the_splats_change(bpy, lodgs, town)
     assert loaded.count_loaded(town, choice)[0] == 1010
 
 
-def test_the_chunks_can_be_shown_and_told_by_colour(town, draw, draw_panel, root):
+def test_chunks_can_be_shown_as_spheres_and_colours(town, draw, draw_panel, root):
     assert "hide_viewport" in draw().properties
     assert "tell CHUNKS" in draw_panel("viewport", "LODGS_PT_viewport").properties
     town.lodgs.tell = "CHUNKS"
     assert not draw_panel("viewport", "LODGS_PT_viewport").colors
 
 
-def test_splats_without_chunks_say_so(bpy, root, draw):
-    made = root("chunks")
-    made.lodgs.mode = "SELECTIVE"
+def test_splats_without_chunks_cause_a_hint(bpy, root, draw):
+    root("chunks").lodgs.mode = "SELECTIVE"
     bpy.context.view_layer.update()
-    notes = draw()
-    assert "These splats have no chunks." in notes.texts and "hide_viewport" not in notes.properties
+    layout = draw()
+    assert "These splats have no chunks." in layout.texts and "hide_viewport" not in layout.properties
 
 
-def test_distances_and_what_they_cost_are_told_in_blenders_units(bpy, lodgs, draw_panel, tmp_path):
+def test_distances_and_costs_are_shown_in_blender_units(bpy, lodgs, draw_panel, tmp_path):
     from training.scenes.images import write_png
 
     collection = bpy.data.collections.new("town")
@@ -163,8 +161,8 @@ def test_distances_and_what_they_cost_are_told_in_blenders_units(bpy, lodgs, dra
     meta = {"costs": [{"level": 2, "distances": [3, 7.1], "costs": [812, 301], "before": 900}]}
     root.lodgs.meta = json.dumps(meta)
     assert panel.poll(bpy.context)
-    notes = draw_panel("levels_costs", "LODGS_PT_costs")
-    assert notes.texts[1:] == ["Level 2 from 14.2 m: 900 → 301"] and not notes.operators
+    layout = draw_panel("levels_costs", "LODGS_PT_costs")
+    assert layout.texts[1:] == ["Level 2 from 14.2 m: 900 → 301"] and not layout.operators
     with pytest.raises(RuntimeError, match="cost curve"):
         bpy.ops.lodgs.show_costs()
     root.lodgs.training.run = str(tmp_path)
@@ -176,21 +174,21 @@ def test_distances_and_what_they_cost_are_told_in_blenders_units(bpy, lodgs, dra
 
 @pytest.fixture
 def tree(bpy, lodgs, tmp_path):
-    """A scene of a small tree of splats."""
+    """A scene with a small tree of splats."""
     bundle = tree_of(random_leaves(50, np.random.default_rng(1)))
     lodgs("training.splats.bundle").write_bundle(tmp_path / "tree.ply", bundle)
     return lodgs("data.scenes").import_splats(bpy.context, tmp_path / "tree.ply")
 
 
-def test_panels_say_what_a_trees_coarser_level_is(tree, draw_panel):
+def test_panels_explain_the_coarse_level_of_a_tree(tree, draw_panel):
     texts = draw_panel("levels", "LODGS_PT_levels").texts
-    assert any("Splats of level 1 stand for groups of level 2's" in text for text in texts)
+    assert any("Level 1 holds coarse nodes of a tree" in text for text in texts)
     tree.lodgs.tell = "LEVELS"
-    notes = draw_panel("viewport", "LODGS_PT_viewport")
-    assert not notes.colors and any("half as large" in text for text in notes.texts)
+    layout = draw_panel("viewport", "LODGS_PT_viewport")
+    assert not layout.colors and any("half as large" in text for text in layout.texts)
 
 
-def test_what_is_read_from_a_file_is_told(bpy, lodgs, draw, draw_panel, tmp_path, monkeypatch):
+def test_state_of_streaming_is_shown(bpy, lodgs, draw, draw_panel, tmp_path, monkeypatch):
     bundles, tree = lodgs("training.splats.bundle"), tree_of(random_leaves(3000, np.random.default_rng(0)))
     bundles.write_bundle(tmp_path / "town.ply", tree)
     panel = lodgs("panels.levels").LODGS_PT_stream
@@ -204,14 +202,14 @@ def test_what_is_read_from_a_file_is_told(bpy, lodgs, draw, draw_panel, tmp_path
         return draw_panel("levels", "LODGS_PT_stream").texts
 
     views, streaming = lodgs("viewport.views"), lodgs("viewport.streaming")
-    assert texts() == ["499 of 5,999 splats in memory", "Finer ones are read when drawn"]
+    assert texts() == ["499 of 5,999 splats in memory", "Streams when the viewport draws splats"]
     monkeypatch.setattr(streaming.Stream, "_open", lambda self: None)
     stream = streaming.Stream(lodgs("data.streams").source_of(root))
     monkeypatch.setitem(views._streams, root.session_uid, stream)
-    assert texts()[1:] == ["Reading finer ones…"]
+    assert texts()[1:] == ["Loading finer splats…"]
     stream.problem = "The disk is gone."
     assert "The disk is gone." in " ".join(texts())
     root.lodgs.mode = "SINGLE"
     assert "By Distance" in " ".join(texts())
     bpy.data.objects.remove(root.lodgs.levels[0].object)
-    assert "drawn as they are" in " ".join(texts())
+    assert "no longer match the file" in " ".join(texts())

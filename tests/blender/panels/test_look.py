@@ -1,4 +1,4 @@
-"""The Look panel: everywhere, in regions, and in a crop that is selected."""
+"""The Look panel: the scene, its regions and a selected crop."""
 
 import numpy as np
 
@@ -7,19 +7,19 @@ from training.editing.look import RANGES
 from training.splats.bundle import write_bundle
 
 
-def test_the_look_of_the_scene_of_regions_and_of_a_selected_crop(bpy, lodgs, draw_panel, tmp_path):
+def test_looks_of_the_scene_of_regions_and_of_a_selected_crop(bpy, lodgs, draw_panel, tmp_path):
     write_bundle(tmp_path / "in.ply", bundle_of("bands", np.random.default_rng(0)))
     root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "in.ply")
-    seen = draw_panel("look", "LODGS_PT_look")
-    assert seen.properties == list(RANGES) and "lodgs.reset_look" in seen.operators
+    layout = draw_panel("look", "LODGS_PT_look")
+    assert layout.properties == list(RANGES) and "lodgs.reset_look" in layout.operators
 
-    def in_regions():
+    def draw_regions():
         return draw_panel("look", "LODGS_PT_look_regions")
 
-    assert not in_regions().properties and in_regions().operators == ["lodgs.add_crop"] * 2
+    assert not draw_regions().properties and draw_regions().operators == ["lodgs.add_crop"] * 2
     bpy.ops.lodgs.add_crop(shape="BOX", keep="ALL")
-    assert in_regions().properties == ["use", "name", *RANGES, "outside"]
+    assert draw_regions().properties == ["use", "name", *RANGES, "outside"]
     bpy.ops.lodgs.add_crop(shape="SPHERE", keep="INSIDE")
-    assert in_regions().properties.count("exposure") == 2
+    assert draw_regions().properties.count("exposure") == 2
     bpy.context.view_layer.objects.active = root
-    assert in_regions().properties.count("exposure") == 1
+    assert draw_regions().properties.count("exposure") == 1

@@ -1,4 +1,4 @@
-"""What the panels of the scene, of comparing, of the viewport and of rendering say and offer."""
+"""The Scene, Compare, Viewport and Rendering panels."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +15,7 @@ GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
 
 @pytest.fixture
 def root(bpy, lodgs):
-    """The example's views, with two levels."""
+    """The example scene with two levels."""
     scenes = lodgs("data.scenes")
     root = scenes.import_colmap(bpy.context, GARDEN, photographs=False)
     scenes.set_bundle_facts(root, Bundle("flod", [], "bands"))
@@ -24,117 +24,116 @@ def root(bpy, lodgs):
     return root
 
 
-def test_held_out_views_have_a_mean_of_their_own(bpy, lodgs, root, draw_panel):
+def test_held_out_views_have_a_separate_mean(bpy, lodgs, root, draw_panel):
     photographs = lodgs("data.photographs")
     views = photographs.views(root)
     for number, view in enumerate(views):
         view.data.lodgs.psnr = 20.0 if number % 8 == 0 else 30.0 + number % 2
     trained = [30.0 + n % 2 for n in range(len(views)) if n % 8]
-    both = trained + [20.0] * (len(views) - len(trained))
-    assert (
-        f"Mean: {np.mean(both):.1f} dB ({len(both)} views)" in draw_panel("compare", "LODGS_PT_compare").texts
-    )
+    measured = trained + [20.0] * (len(views) - len(trained))
+    texts = draw_panel("compare", "LODGS_PT_compare").texts
+    assert f"Mean: {np.mean(measured):.1f} dB ({len(measured)} views)" in texts
     lodgs("data.scenes").set_bundle_facts(root, Bundle("flod", [], "bands", meta={"held_out": [0, 8]}))
     texts = draw_panel("compare", "LODGS_PT_compare").texts
     assert f"Held out: 20.0 dB ({len(views) - len(trained)} views)" in texts
-    assert f"Trained on: {np.mean(trained):.1f} dB ({len(trained)} views)" in texts
+    assert f"Training: {np.mean(trained):.1f} dB ({len(trained)} views)" in texts
 
 
-def test_how_an_import_went_is_told_until_there_is_another(bpy, lodgs, draw_panel, monkeypatch, tmp_path):
+def test_result_of_an_import_is_shown_until_the_next_import(bpy, lodgs, draw_panel, monkeypatch, tmp_path):
     photo_preparation = lodgs("runs.photo_preparation")
     write_bundle(tmp_path / "splats.ply", Bundle("flod", [Level(1, splats(5), {})], "bands"))
     imports = (
         lambda: bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "splats.ply")),
         lambda: bpy.ops.lodgs.import_colmap(directory=str(GARDEN), photographs=False),
     )
-    for again in imports:
+    for next_import in imports:
         work = SimpleNamespace(running=False, message="All 9 found their place", problem="", root=None)
         monkeypatch.setattr(photo_preparation, "current", work)
         assert "All 9 found their place" in draw_panel("scene", "LODGS_PT_scene").texts
-        assert again() == {"FINISHED"}
+        assert next_import() == {"FINISHED"}
         assert "All 9 found their place" not in draw_panel("scene", "LODGS_PT_scene").texts
 
 
 def test_colours_have_a_legend(root, draw_panel):
     assert draw_panel("viewport", "LODGS_PT_viewport").colors == []
     root.lodgs.tell = "LEVELS"
-    notes = draw_panel("viewport", "LODGS_PT_viewport")
-    assert notes.colors == [(*level_color(1), 1), (*level_color(2), 1)] and notes.texts[:3] == [
+    layout = draw_panel("viewport", "LODGS_PT_viewport")
+    assert layout.colors == [(*level_color(1), 1), (*level_color(2), 1)] and layout.texts[:3] == [
         "Colours",
         "1",
         "2",
     ]
 
 
-def test_without_a_trainer_only_what_works_is_offered(bpy, lodgs, root, draw_panel, fake, monkeypatch):
+def test_without_a_trainer_only_viewport_quality_is_offered(bpy, lodgs, root, draw_panel, fake, monkeypatch):
     lodgs("render.engine").use(bpy.context.scene)
     fake()
-    everything = draw_panel("rendering", "LODGS_PT_rendering")
-    assert {"render.render", "lodgs.render_quick"} <= set(everything.operators)
-    assert "use_pass_levels" in everything.properties
+    layout = draw_panel("rendering", "LODGS_PT_rendering")
+    assert {"render.render", "lodgs.render_quick"} <= set(layout.operators)
+    assert "use_pass_levels" in layout.properties
     monkeypatch.delenv("LODGS_TRAINER_PYTHON")
-    notes = draw_panel("rendering", "LODGS_PT_rendering")
-    assert notes.operators[:3] == ["lodgs.make_environment", "lodgs.render_quick", "lodgs.render_quick"]
-    assert "render.render" not in notes.operators and "use_pass_levels" not in notes.properties
+    layout = draw_panel("rendering", "LODGS_PT_rendering")
+    assert layout.operators[:3] == ["lodgs.make_environment", "lodgs.render_quick", "lodgs.render_quick"]
+    assert "render.render" not in layout.operators and "use_pass_levels" not in layout.properties
 
 
-def test_combining_with_meshes_shows_and_can_be_taken_back(bpy, lodgs, root, draw_panel, fake):
+def test_combining_with_meshes_is_shown_and_can_be_removed(bpy, lodgs, root, draw_panel, fake):
     fake()
     lodgs("render.engine").use(bpy.context.scene)
     assert "lodgs.separate_meshes" not in draw_panel("rendering", "LODGS_PT_rendering").operators
     assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
-    notes = draw_panel("rendering", "LODGS_PT_rendering")
-    assert "Meshes: 'Scene Meshes'" in notes.texts and "samples" in notes.properties
-    assert "lodgs.separate_meshes" in notes.operators
+    layout = draw_panel("rendering", "LODGS_PT_rendering")
+    assert "Meshes: 'Scene Meshes'" in layout.texts and "samples" in layout.properties
+    assert "lodgs.separate_meshes" in layout.operators
 
 
 @pytest.mark.parametrize("instance", [True, False])
-def test_a_linked_scene_says_where_its_settings_are(bpy, lodgs, root, draw_panel, tmp_path, instance):
-    """Its splats can be switched off and rendered here; what would change it is not offered."""
+def test_a_linked_scene_can_be_rendered_but_not_changed(bpy, lodgs, root, draw_panel, tmp_path, instance):
     name = root.users_collection[0].name
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "garden.blend"))
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     scenes, scene = lodgs("data.scenes"), bpy.context.scene
     panels = [lodgs("panels.viewport").LODGS_PT_viewport, lodgs("panels.rendering").LODGS_PT_rendering]
     assert not any(panel.poll(bpy.context) for panel in panels)
-    with bpy.data.libraries.load(str(tmp_path / "garden.blend"), link=True) as (_, into):
-        into.collections = [name]
+    with bpy.data.libraries.load(str(tmp_path / "garden.blend"), link=True) as (_, linked):
+        linked.collections = [name]
     if instance:
-        carrier = bpy.data.objects.new("carrier", None)
-        carrier.instance_type, carrier.instance_collection = "COLLECTION", into.collections[0]
-        scene.collection.objects.link(carrier)
-        bpy.context.view_layer.objects.active = carrier
+        empty = bpy.data.objects.new("instance", None)
+        empty.instance_type = "COLLECTION"
+        empty.instance_collection = linked.collections[0]
+        scene.collection.objects.link(empty)
+        bpy.context.view_layer.objects.active = empty
     else:
-        scene.collection.children.link(into.collections[0])
+        scene.collection.children.link(linked.collections[0])
     bpy.context.view_layer.update()
     assert all(panel.poll(bpy.context) for panel in panels)
-    notes = draw_panel("scene", "LODGS_PT_scene")
-    assert scenes.LINKED in notes.texts
+    layout = draw_panel("scene", "LODGS_PT_scene")
+    assert scenes.LINKED in layout.texts
     for operator in ("remove_scene", "show_only_level", "train"):
         assert not getattr(bpy.ops.lodgs, operator).poll()
     assert "splats" in draw_panel("viewport", "LODGS_PT_viewport").properties
 
 
-def test_a_scene_of_this_files_own_is_not_called_linked(lodgs, root, draw_panel):
-    notes = draw_panel("scene", "LODGS_PT_scene")
-    assert lodgs("data.scenes").LINKED not in notes.texts and "lodgs.remove_scene" in notes.operators
+def test_a_local_scene_has_no_hint_about_linking(lodgs, root, draw_panel):
+    layout = draw_panel("scene", "LODGS_PT_scene")
+    assert lodgs("data.scenes").LINKED not in layout.texts and "lodgs.remove_scene" in layout.operators
 
 
-def test_what_came_is_said(bpy, lodgs, capfd, tmp_path):
-    """As an operator's report, which Blender prints in background."""
+def test_import_reports_the_imported_objects(bpy, lodgs, capfd, tmp_path):
+    """Background Blender prints the operator's report."""
     write_bundle(tmp_path / "b.ply", Bundle("flod", [Level(1, splats(1)), Level(2, splats(1234))]))
     assert bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "b.ply")) == {"FINISHED"}
     assert "'b': 2 levels, 1,235 splats" in capfd.readouterr().out
     assert bpy.ops.lodgs.import_colmap(directory=str(GARDEN)) == {"FINISHED"}
     scene = lodgs("training.scenes.colmap").read_scene(GARDEN)
-    truth = f"{len(scene.cameras)} photographs, {len(scene.points):,} points"
-    assert f"'lantern_garden': {truth}" in capfd.readouterr().out
+    counts = f"{len(scene.cameras)} photographs, {len(scene.points):,} points"
+    assert f"'lantern_garden': {counts}" in capfd.readouterr().out
 
 
-def test_what_is_about_splats_waits_for_them(bpy, lodgs):
+def test_panels_for_splats_are_hidden_until_a_scene_has_levels(bpy, lodgs):
     scenes = lodgs("data.scenes")
-    found = [getattr(lodgs(f"panels.{name}"), f"LODGS_PT_{name}") for name in ("viewport", "rendering")]
+    panels = [getattr(lodgs(f"panels.{name}"), f"LODGS_PT_{name}") for name in ("viewport", "rendering")]
     root = scenes.import_colmap(bpy.context, GARDEN, photographs=False)
-    assert not any(panel.poll(bpy.context) for panel in found)
+    assert not any(panel.poll(bpy.context) for panel in panels)
     scenes.set_level(root, Level(1, splats(5)))
-    assert all(panel.poll(bpy.context) for panel in found)
+    assert all(panel.poll(bpy.context) for panel in panels)
