@@ -20,8 +20,8 @@ import pycolmap
 from PIL import Image
 
 from training.scenes.cameras import Camera, write_camera
-from training.scenes.visibility import visible_in
-from training.scenes.write_colmap import thinned, write_colmap
+from training.scenes.visibility import visible_points
+from training.scenes.write_colmap import thin_tracks, write_colmap
 
 from . import rig
 
@@ -79,11 +79,11 @@ def write_model(rendered: Path, scene: Path, cameras: str, quality: int) -> pyco
     ]
 
     points = sample_points(positions)
-    seen = [visible_in(depths_of(p, view), view, points) for p, view in zip(positions, views, strict=True)]
+    seen = [visible_points(depths_of(p, view), view, points) for p, view in zip(positions, views, strict=True)]
     pixels, visible = map(np.stack, zip(*seen, strict=True))  # (V, N, 2), (V, N)
     kept = visible.sum(axis=0) >= SHORTEST_TRACK
     points, pixels = points[kept], pixels[:, kept]
-    visible = thinned(visible[:, kept], LONGEST_TRACK)
+    visible = thin_tracks(visible[:, kept], LONGEST_TRACK)
     colors = np.zeros((len(points), 3))
     for picture, place, sees in zip(pictures, pixels, visible, strict=True):
         x, y = np.floor(place[sees].T).astype(int)

@@ -39,7 +39,7 @@ from training.optimize.parameters import override
 from training.optimize.training_data import TrainingData
 from training.rasterize import Gaussians, rasterize
 from training.rasterize.sequential_point_tree import image_borders
-from training.scenes.cameras import read_views, write_camera
+from training.scenes.cameras import read_camera_folder, write_camera
 from training.scenes.colmap import Scene
 from training.scenes.images import write_png
 from training.splats.gaussians import Splats
@@ -62,7 +62,7 @@ PHOTOGRAPHS = 100 << 20
 
 def method_in(folder: Path, options: argparse.Namespace) -> Method:
     """A run whose files are in a folder, before a tree is in it."""
-    cameras, near = read_views(folder)  # a plan of the town would take memory
+    cameras, near = read_camera_folder(folder)  # a plan of the town would take memory
     cameras = [replace(camera, image=folder / f"{camera.name}.png") for camera in cameras]
     scene = Scene(folder, folder, folder, cameras, np.zeros((4, 3), np.float32), np.zeros((4, 3), np.uint8))
     data = TrainingData(

@@ -27,9 +27,9 @@ from training.rasterize import Gaussians, rasterize  # noqa: E402
 from training.runs.data import training_data  # noqa: E402
 from training.runs.folder import RunFolder  # noqa: E402
 from training.runs.job import Job  # noqa: E402
-from training.scenes.aside import read_aside  # noqa: E402
 from training.scenes.cameras import Camera  # noqa: E402
-from training.scenes.write_colmap import visible_in  # noqa: E402
+from training.scenes.offset_views import read_offset_views  # noqa: E402
+from training.scenes.visibility import visible_points  # noqa: E402
 from training.splats.bundle import read_bundle  # noqa: E402
 
 SEEN = 2
@@ -72,7 +72,7 @@ def pixels(
                           outputs=("median_depth",), backend=evaluation.backend)  # fmt: skip
         assert drawn.median_depth is not None
         difference = to_8_bit(drawn.image.cpu()) - evaluation.target(camera).image
-        views = np.sum([visible_in(depths, view, places.reshape(-1, 3))[1] for view, depths in train], axis=0)
+        views = np.sum([visible_points(depths, view, places.reshape(-1, 3))[1] for view, depths in train], axis=0)
         depths = drawn.median_depth.cpu().numpy() / depths_of(places, camera)
         yield difference.square().mean(2).numpy().ravel(), views, depths.ravel()
 
@@ -90,7 +90,7 @@ def report(run: Path, rendered: Path) -> Iterator[str]:
     evaluation = Evaluation(training_data(job, folder), job.backend, bundle.antialias)
     everything, _ = full_detail_selector(bundle, bundle.levels[-1])(evaluation.data.train[0])
     splats = evaluation.load(everything)
-    aside = [camera.scaled(job.image_scale) for camera in read_aside(Path(job.scene))]
+    aside = [camera.scaled(job.image_scale) for camera in read_offset_views(Path(job.scene))]
     for name, cameras in (("off the path", aside), ("on the path", evaluation.data.test)):
         found = list(pixels(evaluation, splats, cameras, rendered))
         whole = np.mean([decibels(errors) for errors, _, _ in found])

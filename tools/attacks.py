@@ -43,7 +43,7 @@ from training.runs.events import EventWriter  # noqa: E402
 from training.runs.folder import RunFolder  # noqa: E402
 from training.runs.job import Job  # noqa: E402
 from training.runs.outcome import run_outcome  # noqa: E402
-from training.scenes.undistort import CACHE  # noqa: E402
+from training.scenes.undistort import CACHE_FOLDER  # noqa: E402
 from training.splats.gaussians import Splats  # noqa: E402
 from training.splats.ply import write_ply  # noqa: E402
 
@@ -142,7 +142,7 @@ class Bench:
     def __init__(self, work: Path, chance: random.Random) -> None:
         self.work, self.chance = work, chance
         self.scene = write_tiny_scene(work / "scene")
-        (self.scene / CACHE).touch()  # no folder: each run has to straighten photographs for itself
+        (self.scene / CACHE_FOLDER).touch()  # no folder: each run has to straighten photographs for itself
         model = self.scene / "sparse" / "0"
         camera = f"1 SIMPLE_RADIAL {WIDTH} {HEIGHT} {FOCAL} {WIDTH / 2} {HEIGHT / 2} 0.02\n"
         (model / "cameras.txt").write_text(camera)

@@ -86,5 +86,5 @@ def view_from(
     """
     obj = obj or scene_camera(depsgraph.scene)
     camera, near = view_of(obj.evaluated_get(depsgraph), depsgraph, width, height)
-    inside, unit = camera.within(matrix_of(root, depsgraph))
+    inside, unit = camera.in_object_space(matrix_of(root, depsgraph))
     return inside, near / unit

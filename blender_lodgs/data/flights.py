@@ -9,8 +9,8 @@ import numpy as np
 from mathutils import Matrix
 
 from ...training.errors import LodgsError
-from ...training.scenes.cameras import evenly
-from ...training.scenes.path import smoothed
+from ...training.scenes.camera_path import smooth_path
+from ...training.scenes.cameras import pick_evenly
 from .objects import all_or_nothing
 from .photographs import bounds_of_most, views
 from .placement import axes_of
@@ -30,7 +30,7 @@ def path(context: bpy.types.Context, root: bpy.types.Object) -> bpy.types.Object
     Raises:
         LodgsError: there are no two views, or all are at one place.
     """
-    found = evenly(views(root), MOST_KEYS)
+    found = pick_evenly(views(root), MOST_KEYS)
     if len(found) < 2:
         raise LodgsError(
             f"'{root.name}' has {len(found)} camera(s), and a path takes two.", "Import a COLMAP folder."
@@ -45,7 +45,7 @@ def path(context: bpy.types.Context, root: bpy.types.Object) -> bpy.types.Object
     camera.parent, camera.rotation_mode = axes_of(root), "QUATERNION"
     camera.lodgs.flight_of = root
     begin, end = context.scene.frame_start, context.scene.frame_end
-    for place, turn, time in zip(*smoothed(np.array(places), np.array(turns)), strict=True):
+    for place, turn, time in zip(*smooth_path(np.array(places), np.array(turns)), strict=True):
         camera.location, camera.rotation_quaternion = place, turn
         for name in ("location", "rotation_quaternion"):
             camera.keyframe_insert(name, frame=begin + float(time) * (end - begin))

@@ -6,7 +6,13 @@ import bpy
 import numpy as np
 
 from ...training.errors import LodgsError
-from ...training.scenes.ground import about_cameras, find_ground, level_at_zero, plane_through, scaled_about
+from ...training.scenes.ground import (
+    find_ground,
+    fit_plane,
+    ground_placement,
+    points_near_cameras,
+    scaling_about,
+)
 from ..attributes import BASE, read_attribute
 from .photographs import views
 from .placement import axes_of, move, placement_of
@@ -34,10 +40,10 @@ def lay_on_ground(root: bpy.types.Object, places: np.ndarray | None = None, flip
     if places is None:
         normal, middle = find_ground(there.transform_points(_places(root)), up)
     else:
-        normal, middle = plane_through(places, up)
+        normal, middle = fit_plane(places, up)
     _leave_edit_mode()
     up = -normal if flip else normal
-    move(root, level_at_zero(up, middle))
+    move(root, ground_placement(up, middle))
     return float(np.degrees(np.arccos(np.clip(up[2], -1, 1))))
 
 
@@ -50,7 +56,7 @@ def scale(root: bpy.types.Object, factor: float) -> None:
     """
     _leave_edit_mode()
     x, y, _ = root.matrix_world.translation
-    move(root, scaled_about(np.array([x, y, 0.0]), factor))
+    move(root, scaling_about(np.array([x, y, 0.0]), factor))
     for view in views(root):
         if view.data.lodgs.width:
             for name in ("clip_start", "clip_end", "display_size"):
@@ -118,6 +124,6 @@ def _places(root: bpy.types.Object) -> np.ndarray:
     base = read_attribute(obj.data, BASE)
     places = places if base is None else places[base[:, 3] > 0.5]
     depth = root.lodgs.training.median_depth or read_json(root.lodgs.meta).get("median_depth", 0)
-    return about_cameras(
+    return points_near_cameras(
         places, np.array(root.lodgs.camera_center), depth if isinstance(depth, int | float) else 0
     )

@@ -14,7 +14,7 @@ import numpy as np
 from ...training.lod.partial_read import BLOCKS
 from ...training.lod.rule import Tables, find_rule
 from ...training.lod.rules.chunks import COLUMNS as SPHERE
-from ...training.scenes.views import TABLES as VIEWS
+from ...training.scenes.view_tables import VIEW_TABLES as VIEWS
 from ..attributes import COLUMN
 from .objects import read_column, write_column
 from .placement import axes_of

@@ -12,7 +12,16 @@ from mathutils import Matrix
 from ...training.errors import LodgsError
 from ...training.runs.job import VIEW_WIDTHS, VIEWS, Job
 from ...training.scenes.cameras import Camera
-from ...training.scenes.viewpoints import DOMES, NEAR, OPAQUE, above, along, dome_around, opaque, walk
+from ...training.scenes.viewpoints import (
+    DOMES,
+    NEAR_SHARE,
+    OPAQUE,
+    aerial_views,
+    dome_views_around,
+    opaque_means,
+    views_along,
+    walk_views,
+)
 from ...training.splats.gaussians import Splats
 from .. import attributes
 from . import changes
@@ -134,10 +143,10 @@ def placed(context: bpy.types.Context, root: bpy.types.Object, splats: Splats) -
         case "CURVE":
             into = np.linalg.inv(matrix_of(root))
             way = _way(settings.curve) @ into[:3, :3].T + into[:3, 3]
-            views, near = walk(splats, way, into[:3, 2], settings.views, width, height)
+            views, near = walk_views(splats, way, into[:3, 2], settings.views, width, height)
             return [(view, near) for view in views]
         case "GRID":
-            views, near = _above(root, opaque(splats), settings, width, height)
+            views, near = _above(root, opaque_means(splats), settings, width, height)
             return [(view, near) for view in views]
     return []
 
@@ -197,13 +206,13 @@ def placed_in_scene(
     settings = context.scene.lodgs_capture
     match settings.views_from:
         case "DOME":
-            return dome_around(_corners(context), settings.views, width, height, UP, LOWEST)
+            return dome_views_around(_corners(context), settings.views, width, height, UP, LOWEST)
         case "GRID":
-            return above(_corners(context), settings.views, width, height, settings.height)
+            return aerial_views(_corners(context), settings.views, width, height, settings.height)
         case "CURVE":
             way = _way(settings.curve)
             apart = float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()) / settings.views
-            views = along(way, np.array(UP), settings.views, width, height)
+            views = views_along(way, np.array(UP), settings.views, width, height)
             return views, min(CLIP_START, apart / 4)
     return [], 0.0
 
@@ -284,7 +293,7 @@ def placed_of(root: bpy.types.Object) -> list[Camera]:
         case "CURVE":
             into = np.linalg.inv(matrix_of(root))
             way = _way(settings.curve) @ into[:3, :3].T + into[:3, 3]
-            return along(way, into[:3, 2], settings.views, 3, 2)
+            return views_along(way, into[:3, 2], settings.views, 3, 2)
     return []
 
 
@@ -296,8 +305,8 @@ def dome_of(root: bpy.types.Object) -> tuple[list[Camera], tuple[float, float]]:
         LodgsError: there is no opaque splat to look at.
     """
     count = root.lodgs.training.views
-    views, near = _keep("dome", (*_cloud_of(root)[1:], count), lambda: dome_around(_sample_of(root), count))
-    return views, (DOMES[0] * near / NEAR, DOMES[1] * near / NEAR)
+    views, near = _keep("dome", (*_cloud_of(root)[1:], count), lambda: dome_views_around(_sample_of(root), count))
+    return views, (DOMES[0] * near / NEAR_SHARE, DOMES[1] * near / NEAR_SHARE)
 
 
 def _cloud_of(root: bpy.types.Object) -> tuple[bpy.types.PointCloud, int, changes.Version]:
@@ -321,10 +330,10 @@ def _above(
 ) -> tuple[list[Camera], float]:
     """Views above places (N, 3) of a root, by Blender's up, and their near depth: in the root's own world."""
     matrix = matrix_of(root)
-    views, near = above(
+    views, near = aerial_views(
         places @ matrix[:3, :3].T + matrix[:3, 3], settings.views, width, height, settings.height
     )
-    inside, units = zip(*[view.within(matrix) for view in views], strict=True)
+    inside, units = zip(*[view.in_object_space(matrix) for view in views], strict=True)
     return list(inside), near / units[0]
 
 

@@ -1,6 +1,6 @@
 """A Blender scene as a COLMAP scene: pictures and depths by its own engine, exact cameras, a model of them.
 
-What is rendered lies in a folder as ``training.scenes.rendered`` has it, view by view, whole or not at all:
+What is rendered lies in a folder as ``training.scenes.rendered_views`` has it, view by view, whole or not at all:
 the same call goes on where one stopped, and several may work on ranges of the views at a time. This happens
 in a Blender of its own, in background (``blender --command lodgs capture``), because it changes the scene.
 """
@@ -16,9 +16,9 @@ import numpy as np
 
 from ...training.errors import LodgsError
 from ...training.files import atomic_write
-from ...training.scenes.cameras import Camera, check_size, read_camera, write_camera
+from ...training.scenes.cameras import Camera, check_render_size, read_camera, write_camera
 from ...training.scenes.images import image_size
-from ...training.scenes.rendered import CAMERAS, DEPTHS, IMAGES
+from ...training.scenes.rendered_views import CAMERAS, DEPTHS, IMAGES
 from .. import compat, extension
 from ..data import photographs, scenes, viewpoints
 from ..data.cameras import scene_camera, view_of
@@ -53,7 +53,7 @@ def render_views(
     Raises:
         LodgsError: as ``viewpoints.of_scene``; the folder holds other views, or cannot be written.
     """
-    check_size(width, height)
+    check_render_size(width, height)
     _check(context.scene)
     shots = viewpoints.of_scene(context, width, height)
     names = [f"view_{number:04d}" for number in range(1, len(shots) + 1)]

@@ -9,7 +9,7 @@ from pathlib import Path
 import bpy
 
 from ...training.errors import LodgsError
-from ...training.scenes.rendered import CAMERAS
+from ...training.scenes.rendered_views import CAMERAS
 from .. import extension
 from ..data import viewpoints
 from . import environment, processes

@@ -17,7 +17,7 @@ from gpu_extras.batch import batch_for_shader
 from mathutils import Matrix
 
 from ...training.scenes.cameras import Camera
-from ...training.scenes.rendered import coverage
+from ...training.scenes.rendered_views import sample_coverage
 from ..data import viewpoints
 
 ENOUGH = 3
@@ -83,7 +83,7 @@ def measure(context: bpy.types.Context) -> Coverage:
     finally:
         window.progress_end()
         screen.free()
-    _current = Coverage(*coverage([view for view, _ in views], depths, MOST), _settings(scene))
+    _current = Coverage(*sample_coverage([view for view, _ in views], depths, MOST), _settings(scene))
     return _current
 
 

@@ -14,7 +14,7 @@ from tests.fuzz.doors import attempt
 from tests.fuzz.mutations import spoiled, spoiled_value
 from tests.training.scenes.synthetic import noise, write_image
 from training.scenes.colmap import read_scene
-from training.scenes.formats import convert
+from training.scenes.formats import convert_export
 
 POSE = np.diag([1.0, -1.0, -1.0, 1.0])
 TRANSFORMS = {
@@ -89,7 +89,7 @@ def check(folder, name: str, content: bytes) -> None:
     path = folder / name
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(content)
-    made = attempt(f"export {path.suffix}", lambda: convert(folder), (name, content))
+    made = attempt(f"export {path.suffix}", lambda: convert_export(folder), (name, content))
     if made is None:
         assert not (folder / "sparse" / "0").exists()
     else:

@@ -12,7 +12,7 @@ from PIL import Image
 from tests.fuzz.doors import attempt
 from tests.fuzz.mutations import spoiled
 from training.render.image import read_depth
-from training.scenes.images import MOST_PIXELS, check_image, image_size, load_image
+from training.scenes.images import MAX_PIXELS, check_image, image_size, load_image
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_images(folder, seeds, data, size):
     path = folder / "tried"
     path.write_bytes(content)
     found = attempt("image size", lambda: image_size(path), content)
-    assert found is None or 1 <= found[0] * found[1] <= MOST_PIXELS
+    assert found is None or 1 <= found[0] * found[1] <= MAX_PIXELS
     attempt("image", lambda: check_image(path), content)
     pixels = attempt("image", lambda: load_image(path, *size), content)
     if pixels is not None:

@@ -84,7 +84,7 @@ def check_region(path, given: object) -> None:
     """A region that is taken can be written, and asked for points."""
     if region := attempt("region", lambda: Region.read(path), given):
         region.write(path)
-        region.borders(np.zeros((3, 3), np.float32))
+        region.near_border(np.zeros((3, 3), np.float32))
 
 
 @given(data=st.data())

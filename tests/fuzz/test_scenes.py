@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from tests.fuzz.doors import attempt
 from tests.fuzz.mutations import spoiled, spoiled_value
 from tests.training.scenes import synthetic
-from training.scenes.cameras import FARTHEST, Camera, camera_as_dict, read_camera
+from training.scenes.cameras import MAX_COORDINATE, Camera, camera_to_dict, read_camera
 from training.scenes.colmap import read_scene
 
-CAMERA = camera_as_dict(Camera("a.png", 96, 72, 80.0, 82.0, 47.0, 37.0, np.eye(4)), 0.1)
+CAMERA = camera_to_dict(Camera("a.png", 96, 72, 80.0, 82.0, 47.0, 37.0, np.eye(4)), 0.1)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,8 @@ def check(scene, model, given: object) -> None:
     if found is not None:
         assert found.cameras and all(camera.image.is_file() and not camera.flaw for camera in found.cameras)
         assert (
-            len(found.points) == len(found.point_colors) and np.abs(found.points).max(initial=0) <= FARTHEST
+            len(found.points) == len(found.point_colors)
+            and np.abs(found.points).max(initial=0) <= MAX_COORDINATE
         )
         assert np.isfinite(found.extent() if len(found.points) else found.center).all()
         assert np.isfinite(found.up_rotation()).all()

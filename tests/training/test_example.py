@@ -13,8 +13,8 @@ from PIL import Image
 from examples import rig
 from training.evaluate.offset_views import VEIL_DEPTH
 from training.optimize.support import halfway
-from training.scenes.aside import read_aside
 from training.scenes.colmap import read_scene
+from training.scenes.offset_views import read_offset_views
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 GARDEN, WALK = EXAMPLES / "lantern_garden", EXAMPLES / "lantern_walk"
@@ -84,7 +84,7 @@ def test_the_photographs_show_the_lantern_where_the_script_put_it(name):
 
 
 def test_views_off_the_path_are_a_step_aside_and_no_photographs_of_the_model():
-    views = read_aside(GARDEN)
+    views = read_offset_views(GARDEN)
     poses, path = rig.world_to_cameras("aside"), rig.world_to_cameras("view")
     assert [view.name for view in views] == [f"{rig.view_name('aside', i)}.jpg" for i in range(len(poses))]
     np.testing.assert_allclose([view.world_to_camera for view in views], poses, atol=1e-12)
@@ -104,7 +104,7 @@ def test_views_off_the_path_show_the_same_garden():
     """Colours of the model's points where they are projected; some of them stand behind something there."""
     points = list(pycolmap.Reconstruction(GARDEN / "sparse" / "0").points3D.values())
     xyz, color = np.array([point.xyz for point in points]), np.array([point.color for point in points], float)
-    views = [(camera, pixels(GARDEN / "aside" / camera.name)) for camera in read_aside(GARDEN)]
+    views = [(camera, pixels(GARDEN / "aside" / camera.name)) for camera in read_offset_views(GARDEN)]
 
     def difference(shift: float) -> float:
         found = []

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..scenes.cameras import Camera, evenly
-from ..scenes.views import views_in
+from ..scenes.cameras import Camera, pick_evenly
+from ..scenes.view_tables import read_view_tables
 from ..splats.bundle import NO_SPLATS, Bundle, Level
 from ..splats.gaussians import SplatRows, Splats
 
@@ -36,12 +36,12 @@ def without_filter(bundle: Bundle) -> Bundle:
     Raises:
         LodgsError: its views are damaged.
     """
-    views, near, _ = views_in(bundle.tables)
+    views, near, _ = read_view_tables(bundle.tables)
     if not (bundle.antialias and views):
         return bundle
     focal = float(np.median([view.focal for view in views]))
     share = float(bundle.meta.get("focal_px", focal)) / focal  # views are of the photographs' own size
-    views = [view.scaled(share).widened(MARGIN) for view in evenly(views, MOST_VIEWS)]
+    views = [view.scaled(share).widened(MARGIN) for view in pick_evenly(views, MOST_VIEWS)]
     levels = [
         Level(level.number, NO_SPLATS, level.facts, Unfiltered(level.rows, views, near))
         for level in bundle.levels

@@ -20,7 +20,7 @@ from ..lod.rules.cut import PARENT, PARENT_SIZE
 from ..lod.selection import unknown_rule
 from ..lod.tree.paging import COLUMNS, Standing, is_tree, table_of_pages
 from ..scenes.cameras import Camera
-from ..scenes.views import TABLES
+from ..scenes.view_tables import VIEW_TABLES
 from ..splats.bundle import Bundle
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.ply import BATCH_ROWS
@@ -193,7 +193,7 @@ def without(bundle: Bundle, masks: Masks, family: Family | None = None) -> Bundl
         LodgsError: nothing is left, or the levels have tables of a rule that is not known here.
     """
     rule = find_rule(bundle.rule)
-    if bundle.rule and rule is None and bundle.tables.keys() - set(TABLES):
+    if bundle.rule and rule is None and bundle.tables.keys() - set(VIEW_TABLES):
         raise LodgsError(*unknown_rule(bundle.rule))
     changed: dict[int, dict[str, np.ndarray]] = {}
     if is_tree(bundle):

@@ -12,8 +12,8 @@ from ..lod.partial_read import BLOCKS
 from ..lod.rule import Rule, find_rule
 from ..lod.selection import columns_of, unknown_rule
 from ..lod.tree.paging import BOUNDS, table_of_pages
-from ..scenes import views
-from ..scenes.ground import about_cameras, find_ground, level_at_zero
+from ..scenes import view_tables
+from ..scenes.ground import find_ground, ground_placement, points_near_cameras
 from ..splats.bundle import META_LENGTHS, NO_SPLATS, Bundle, Level
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.ply import BATCH_ROWS, Columns
@@ -54,8 +54,8 @@ def placed(bundle: Bundle, placement: Similarity) -> Bundle:
     for name in rule.tables if rule else ():
         if name in tables:
             tables[name] = placement.transform_columns(tables[name], lengths, places)
-    if views.VIEWS in tables:
-        tables[views.VIEWS] = views.placed(tables[views.VIEWS], placement)
+    if view_tables.VIEWS in tables:
+        tables[view_tables.VIEWS] = view_tables.transform_views(tables[view_tables.VIEWS], placement)
     if BOUNDS[0] in tables.get(BLOCKS, {}):
         tables[BLOCKS] = table_of_pages({x.number: c for x, c in zip(bundle.levels, remade, strict=True)})
     meta = _meta(bundle.meta, placement)
@@ -81,14 +81,14 @@ def standing(
     meta, places = bundle.meta, _opaque(bundle.levels[-1].rows) if points is None else points
     center, depth = meta.get("camera_center"), meta.get("median_depth", 0)
     if center is not None and isinstance(depth, int | float):
-        places = about_cameras(places, np.asarray(center), depth)
+        places = points_near_cameras(places, np.asarray(center), depth)
     try:
         plane = find_ground(stands.transform_points(places), np.array([0.0, 0.0, 1.0]))
     except LodgsError as error:
         raise LodgsError(
             error.what, "Name its photographs' folder with --scene, or place it by --rotate and --translate."
         ) from error
-    return level_at_zero(*plane).compose(stands)
+    return ground_placement(*plane).compose(stands)
 
 
 def _opaque(rows: SplatRows) -> np.ndarray:

@@ -14,7 +14,7 @@ import torch
 from scipy.ndimage import gaussian_filter, maximum_filter
 
 from ..rasterize import Gaussians, rasterize
-from ..scenes.cameras import Camera, evenly
+from ..scenes.cameras import Camera, pick_evenly
 from ..splats.gaussians import SH_C0
 
 VIEWS = 32
@@ -49,7 +49,7 @@ class Margins:
     """
 
     def __init__(self, cameras: Sequence[Camera], share: float, near: float, backend: str) -> None:
-        self._cameras = evenly(cameras, VIEWS)
+        self._cameras = pick_evenly(cameras, VIEWS)
         self._share, self._near, self._backend = share, near, backend
 
     def continued(self, gaussians: Gaussians, most: int) -> Gaussians:

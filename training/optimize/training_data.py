@@ -15,10 +15,10 @@ import torch
 from ..errors import LodgsError
 from ..lod.crop import Crop
 from ..rasterize import Target
-from ..scenes.cameras import Camera, evenly
+from ..scenes.cameras import Camera, pick_evenly
 from ..scenes.colmap import Scene
-from ..scenes.depths import Depths
-from ..scenes.exposures import evened
+from ..scenes.depths import DepthPriors
+from ..scenes.exposures import remove_gain
 from ..scenes.images import load_image, load_mask
 from .image_cache import Targets, default_budget
 from .memory import TARGET_BYTES
@@ -87,7 +87,7 @@ class TrainingData:
         splat_memory: int | None = None,
         scratch: Path | None = None,
         whole: Scene | None = None,
-        depths: Depths | None = None,
+        depths: DepthPriors | None = None,
         region: Crop | None = None,
         gains: Mapping[str, np.ndarray] | None = None,
     ) -> None:
@@ -186,7 +186,7 @@ class TrainingData:
     @cached_property
     def transparent(self) -> bool:
         """Whether photographs have alpha that counts: one of TRIED training views is not opaque."""
-        for camera in evenly(self.train, TRIED):
+        for camera in pick_evenly(self.train, TRIED):
             if camera.image is not None:
                 with suppress(LodgsError):  # which the step that needs it tells
                     pixels = load_image(camera.image, camera.width, camera.height, alpha=True)
@@ -231,7 +231,7 @@ class TrainingData:
         size, alpha = (camera.width, camera.height), self.transparent
         image = load_image(camera.image, *size, exposure=self.exposure, alpha=alpha)
         if camera.name in self._gains:
-            image[..., :3] = evened(image[..., :3], self._gains[camera.name])
+            image[..., :3] = remove_gain(image[..., :3], self._gains[camera.name])
         planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))
         mask = None if camera.mask is None else load_mask(camera.mask, *size)
         known = self.depths.inverse(camera) if self.depths and camera.name in self._trained else None

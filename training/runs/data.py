@@ -13,7 +13,7 @@ from ..errors import LodgsError
 from ..lod.crop import Crop
 from ..optimize.training_data import TrainingData
 from ..scenes.cameras import Camera
-from ..scenes.colmap import Scene, read_scene, exclude_views
+from ..scenes.colmap import Scene, exclude_views, read_scene
 from ..scenes.depths import DepthPriors, add_depth_points
 from ..scenes.exposures import exposure_gains
 from ..scenes.images import check_image, check_mask

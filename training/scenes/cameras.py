@@ -14,11 +14,11 @@ from ..documents import read_json
 from ..errors import LodgsError
 from ..files import atomic_write
 
-LARGEST = 32768
+MAX_SIDE = 32768
 """Pixels on the longest side of an image that is drawn."""
-MOST_PIXELS = 1 << 27
+MAX_PIXELS = 1 << 27
 """Pixels of a picture, or of the window of one, that is drawn: a 16k frame has fewer."""
-FARTHEST = 1e12
+MAX_COORDINATE = 1e12
 """No coordinate is larger, in any unit: float32 holds the squares of such lengths."""
 _FOCALS = 1e-3, 1e6
 """Focal lengths that there are, in the longer side of their image."""
@@ -62,8 +62,8 @@ class Camera:
     def flaw(self) -> str:
         """Why there can be no such camera, as what follows "its"; "" where there can."""
         pose, side = self.world_to_camera, max(self.width, self.height)
-        if not (np.isfinite(pose).all() and np.abs(pose).max() <= FARTHEST):
-            return f"pose has a number beyond {FARTHEST:g}"
+        if not (np.isfinite(pose).all() and np.abs(pose).max() <= MAX_COORDINATE):
+            return f"pose has a number beyond {MAX_COORDINATE:g}"
         rotation = pose[:3, :3]
         turns = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
         if not turns or not np.allclose(pose[3], (0, 0, 0, 1)):
@@ -133,7 +133,7 @@ class Camera:
             cx=self.cx + across, cy=self.cy + down, image=None, mask=None, depth=None,
         )  # fmt: skip
 
-    def within(self, matrix: np.ndarray) -> tuple[Camera, float]:
+    def in_object_space(self, matrix: np.ndarray) -> tuple[Camera, float]:
         """This view of a world as seen from inside an object in it: pixels stay the same.
 
         Args:
@@ -168,14 +168,14 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray | tuple[float, f
 T = TypeVar("T")
 
 
-def extent_of(cameras: Sequence[Camera]) -> float:
+def camera_extent(cameras: Sequence[Camera]) -> float:
     """1.1 x the largest distance of a camera from the cameras' mean, as 3DGS has it; 0 where all stand in one
     place."""
     centers = np.array([camera.center for camera in cameras])
     return 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
 
 
-def evenly(cameras: Sequence[T], most: int) -> list[T]:
+def pick_evenly(cameras: Sequence[T], most: int) -> list[T]:
     """At most so many of the cameras (or of anything), evenly chosen, the first and the last among them."""
     chosen = np.linspace(0, len(cameras) - 1, min(most, len(cameras)))
     return [cameras[place] for place in chosen.round().astype(int)]
@@ -188,10 +188,10 @@ def write_camera(path: Path, camera: Camera, near: float) -> None:
         LodgsError: the file cannot be written.
     """
     with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(camera_as_dict(camera, near), indent=1) + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps(camera_to_dict(camera, near), indent=1) + "\n", encoding="utf-8")
 
 
-def camera_as_dict(camera: Camera, near: float) -> dict:
+def camera_to_dict(camera: Camera, near: float) -> dict:
     """A view as JSON knows it; :func:`camera_from_dict` is the inverse, to the bit."""
     names = ("name", "width", "height", "fx", "fy", "cx", "cy")
     values = {name: getattr(camera, name) for name in names}
@@ -211,7 +211,7 @@ def read_camera(path: Path) -> tuple[Camera, float]:
         raise LodgsError(f"{path}: {error.what}", error.remedy) from error
 
 
-def read_views(folder: Path) -> tuple[list[Camera], float]:
+def read_camera_folder(folder: Path) -> tuple[list[Camera], float]:
     """The views of a folder of camera files, by name, and the depth at which drawing begins in all of them.
 
     Raises:
@@ -247,22 +247,22 @@ def camera_from_dict(values: dict) -> tuple[Camera, float]:
         raise LodgsError(f"The camera is not valid: {str(error)[:200]}.", remedy) from error
     if camera.world_to_camera.shape != (4, 4):
         raise LodgsError("The camera's world_to_camera is no 4x4 matrix of numbers.", remedy)
-    if not (0 < camera.width <= LARGEST and 0 < camera.height <= LARGEST):
+    if not (0 < camera.width <= MAX_SIDE and 0 < camera.height <= MAX_SIDE):
         raise LodgsError(
             f"The camera's image of {camera.width}x{camera.height} pixels cannot be drawn.",
-            f"Choose from 1 to {LARGEST} pixels a side.",
+            f"Choose from 1 to {MAX_SIDE} pixels a side.",
         )
     if flaw := camera.flaw:
         raise LodgsError(f"The camera's {flaw}.", remedy)
-    if not 0 <= near <= FARTHEST:
+    if not 0 <= near <= MAX_COORDINATE:
         raise LodgsError(f"The camera's near depth of {near:g} is impossible.", "Give 0 or more.")
     return camera, near
 
 
-def check_size(width: int, height: int) -> None:
+def check_render_size(width: int, height: int) -> None:
     """Raises LodgsError where a picture of so many pixels is not drawn."""
-    if not (0 < width <= LARGEST and 0 < height <= LARGEST and width * height <= MOST_PIXELS):
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= MAX_PIXELS):
         raise LodgsError(
             f"A picture of {width}x{height} pixels is not drawn.",
-            f"Choose at most {LARGEST} pixels a side, and {MOST_PIXELS:,} in all.",
+            f"Choose at most {MAX_SIDE} pixels a side, and {MAX_PIXELS:,} in all.",
         )

@@ -12,33 +12,33 @@ import numpy as np
 
 from ..errors import LodgsError, printable
 from ..files import check_folder
-from .cameras import FARTHEST, Camera, evenly, extent_of
-from .images import image_size, quarter_turns
-from .model import (
-    DAMAGED,
+from .cameras import MAX_COORDINATE, Camera, camera_extent, pick_evenly
+from .colmap_model import (
+    DAMAGED_REMEDY,
     Intrinsics,
     Pose,
+    count_images,
     model_suffix,
     read_cameras,
     read_observations,
     read_points,
     read_poses,
-    registered,
 )
+from .image_files import ImageFiles, SidecarFiles, find_image_folder
+from .images import image_size, quarter_turns
 from .orientation import up_rotation
-from .photographs import Beside, Photographs, image_folder
 
-ASTRAY = 1000
+OUTLIER_FACTOR = 1000
 """What lies so many times as far from the middle of the cameras as most cameras or points is an error."""
 MASKS, DEPTHS = "masks", "depths"
 """Folders beside that of the photographs, or in the scene's where they are that."""
 DEPTH_SUFFIXES = ".exr", ".png", ".npy"
 """How names of depth maps end."""
-MOST_EYES = 500
+MAX_DEPTH_CAMERAS = 500
 """Cameras, evenly chosen, that tell the median depth."""
-NAMED = 5
+MAX_NAMED = 5
 """Of so many views that are odd in one way each is named; more are summed up."""
-MOST_FOLDERS = 20_000
+MAX_FOLDERS = 20_000
 """Folders that models are looked for in."""
 
 Progress = Callable[[float], object]
@@ -96,42 +96,59 @@ class Scene:
         """Rotation from this world to a z-up world, (3, 3) float64, see ``orientation.up_rotation``."""
         return up_rotation(self.cameras)
 
-    def extent(self) -> float:
-        """1.1 x the largest distance of a camera from the cameras' mean, in COLMAP units (as 3DGS has it).
+    def extent(self, default: float | None = None) -> float:
+        """Return 1.1 x the largest distance of a camera from the mean camera position, in COLMAP units.
 
-        Where all cameras stand in one place, that is nothing to measure by: then the median depth.
-        """
-        return extent_of(self.cameras) or self.median_depth()
+        3DGS defines it so. If all cameras have the same position, return the median depth.
 
-    def median_depth(self) -> float:
-        """The median over the cameras of the median depth of the points that each sees, in COLMAP units.
-
-        A camera sees what lies in front of it and within its image. At most 50,000 points, evenly taken from
-        the model's order, are looked at, from MOST_EYES cameras.
-
-        Raises:
-            LodgsError: no camera sees a point.
-        """
-        return self._median_depth
-
-    @cached_property
-    def _median_depth(self) -> float:
-        points = self.points[:: max(1, len(self.points) // 50_000)].astype(np.float64)
-        medians = []
-        for camera in evenly(self.cameras, MOST_EYES):
-            depths = camera.view_space(points)[camera.sees(points), 2]
-            if len(depths):
-                medians.append(np.median(depths))
-        if not medians:
-            raise LodgsError(f"No camera of {self.model} sees a point.", "Reconstruct the scene with points.")
-        return float(np.median(medians))
-
-    def near(self) -> float:
-        """The depth from which on splats are drawn, in COLMAP units: a hundredth of the median depth.
+        Args:
+            default: value if there is no median depth either; None: raise an error.
 
         Raises:
             LodgsError: as :meth:`median_depth`.
         """
+        return camera_extent(self.cameras) or self.median_depth(default)
+
+    def median_depth(self, default: float | None = None) -> float:
+        """Return the median over the cameras of the median depth of their visible points, in COLMAP units.
+
+        A camera sees the points in front of it and inside its image. Uses at most 50,000 points, evenly
+        spaced in the model's order, and at most MAX_DEPTH_CAMERAS cameras.
+
+        Args:
+            default: value if no camera sees a point; None: raise an error.
+
+        Raises:
+            LodgsError: no camera sees a point.
+        """
+        if np.isfinite(self._median_depth):
+            return self._median_depth
+        if default is None:
+            raise LodgsError(f"No camera of {self.model} sees a point.", "Reconstruct the scene with points.")
+        return default
+
+    @cached_property
+    def _median_depth(self) -> float:
+        """NaN if no camera sees a point."""
+        points = self.points[:: max(1, len(self.points) // 50_000)].astype(np.float64)
+        medians = []
+        for camera in pick_evenly(self.cameras, MAX_DEPTH_CAMERAS):
+            depths = camera.view_space(points)[camera.sees(points), 2]
+            if len(depths):
+                medians.append(np.median(depths))
+        return float(np.median(medians)) if medians else float("nan")
+
+    def near(self, default: float | None = None) -> float:
+        """Return the depth where rendering begins, in COLMAP units: a hundredth of the median depth.
+
+        Args:
+            default: value if no camera sees a point; None: raise an error.
+
+        Raises:
+            LodgsError: as :meth:`median_depth`.
+        """
+        if default is not None and not np.isfinite(self._median_depth):
+            return default
         return 0.01 * self.median_depth()
 
 
@@ -151,12 +168,12 @@ def find_models(folder: Path) -> list[Path]:
     around = [str(parent) for parent in Path(os.path.realpath(folder)).parents]
     seen.update(around)  # a link upwards leads out of the scene
     for depth in range(5):
-        found += [(-registered(here), depth, here.parts, here) for here in level if model_suffix(here)]
+        found += [(-count_images(here), depth, here.parts, here) for here in level if model_suffix(here)]
         below = []
         for here in level if depth < 4 else ():
             for path in _subfolders(here):
                 real = os.path.realpath(path)
-                if real not in seen and len(seen) < MOST_FOLDERS:
+                if real not in seen and len(seen) < MAX_FOLDERS:
                     seen.add(real)
                     below.append(path)
         level = below
@@ -207,16 +224,18 @@ def read_scene(
             raise LodgsError(
                 f"{model / f'cameras{model_suffix(model)}'} lacks camera {pose.camera_id}, "
                 f"which {_shown(pose.name)} uses.",
-                DAMAGED,
+                DAMAGED_REMEDY,
             )
     if images is None:
-        images = image_folder(folder, model, [pose.name for pose in poses])
+        images = find_image_folder(folder, model, [pose.name for pose in poses])
     images = _absolute(images)
     if not images.is_dir():
         raise LodgsError(f"There is no image folder {images}.", "Choose the folder of the photographs.")
     beside = folder if images == folder else images.parent
     views = _Views(
-        Photographs(images, folder), Beside(beside / MASKS, ".png"), Beside(beside / DEPTHS, *DEPTH_SUFFIXES)
+        ImageFiles(images, folder),
+        SidecarFiles(beside / MASKS, ".png"),
+        SidecarFiles(beside / DEPTHS, *DEPTH_SUFFIXES),
     )
     for number, pose in enumerate(poses):
         if progress and number % 50 == 0:
@@ -232,12 +251,12 @@ def read_scene(
     points, colors, ids = read_points(model)
     if not len(points):
         warnings.append(f"{model} has no points in points3D{model_suffix(model)}: the scene has no points.")
-    possible = (np.abs(points) <= FARTHEST).all(axis=1)
+    possible = (np.abs(points) <= MAX_COORDINATE).all(axis=1)
     far, cameras = _astray(points[possible], views.cameras)
     possible[possible] = ~far
     if not possible.all():
         warnings.append(
-            f"{np.sum(~possible):,} points of {model} have no place, or lie over {ASTRAY:,} times as far "
+            f"{np.sum(~possible):,} points of {model} have no place, or lie over {OUTLIER_FACTOR:,} times as far "
             "off as most, and are left out."
         )
     views.keep(cameras)
@@ -257,7 +276,7 @@ def read_scene(
     )
 
 
-def without(scene: Scene, reasons: dict[str, str]) -> Scene:
+def exclude_views(scene: Scene, reasons: dict[str, str]) -> Scene:
     """The scene without some of its views, and a warning of them.
 
     Args:
@@ -278,7 +297,7 @@ def without(scene: Scene, reasons: dict[str, str]) -> Scene:
         scene,
         cameras=kept,
         distorted=[name for name in scene.distorted if name not in reasons],
-        warnings=[*scene.warnings, *told(list(reasons.items()))],
+        warnings=[*scene.warnings, *exclusion_messages(list(reasons.items()))],
     )
 
 
@@ -295,7 +314,7 @@ def observations(scene: Scene, names: Collection[str]) -> dict[str, np.ndarray]:
     return found if any(map(len, found.values())) else {}
 
 
-def observed(scene: Scene, names: Collection[str]) -> np.ndarray:
+def observed_points(scene: Scene, names: Collection[str]) -> np.ndarray:
     """Which of the scene's points some of its views, by name, observe, (P,).
 
     Where the model does not tell, as of points that come from elsewhere, those count that a view could see.
@@ -331,7 +350,7 @@ def _largest_model(folder: Path, warnings: list[str]) -> Path:
             "Choose a folder with sparse/0/cameras.bin, images.bin and points3D.bin (or .txt), or make one "
             "of another program's export: lodgs scene --from DIR --out DIR.",
         )
-    views = [registered(model) for model in models]
+    views = [count_images(model) for model in models]
     for model, count in zip(models, views, strict=True):
         if count < views[0]:
             warnings.append(f"{model} is a smaller model of {count} views, not read.")
@@ -345,7 +364,7 @@ class _Views:
         left_out: names, and a sentence each.
     """
 
-    def __init__(self, files: Photographs, masks: Beside, depths: Beside) -> None:
+    def __init__(self, files: ImageFiles, masks: SidecarFiles, depths: SidecarFiles) -> None:
         self._files, self._masks, self._depths = files, masks, depths
         self._missing: list[str] = []
         self._reshaped: list[str] = []
@@ -393,39 +412,40 @@ class _Views:
         """Leaves out the cameras that are astray, all but ``which`` (V,)."""
         astray = [camera.name for camera, kept in zip(self.cameras, which, strict=True) if not kept]
         self.left_out += [
-            (name, f"it stands over {ASTRAY:,} times as far off as most of the model.") for name in astray
+            (name, f"it stands over {OUTLIER_FACTOR:,} times as far off as most of the model.")
+            for name in astray
         ]
         self.cameras = [camera for camera in self.cameras if camera.name not in astray]
         self.distorted = [name for name in self.distorted if name not in astray]
 
     def warnings(self, folder: Path) -> list[str]:
         """What is odd, in few sentences however many views there are."""
-        found = told(self.left_out)
+        found = exclusion_messages(self.left_out)
         match self._missing:
             case []:
                 pass
             case [name]:
                 found.append(f"{_shown(name)} is left out: there is no such file in {folder}.")
             case names:
-                more = ", ..." if len(names) > NAMED else ""
+                more = ", ..." if len(names) > MAX_NAMED else ""
                 found.append(
                     f"{len(names):,} views are left out: {folder} has no files of their names "
-                    f"({', '.join(map(_shown, names[:NAMED]))}{more})."
+                    f"({', '.join(map(_shown, names[:MAX_NAMED]))}{more})."
                 )
         for what, beside in ("mask", self._masks), ("depth", self._depths):
             if all(getattr(camera, what) is None for camera in self.cameras):
                 found += filter(None, [beside.misnamed(_shown(self.cameras[0].name))])
-        found += self._reshaped[:NAMED]
-        if len(self._reshaped) > NAMED:
-            found.append(f"{len(self._reshaped) - NAMED:,} more photographs have other proportions.")
+        found += self._reshaped[:MAX_NAMED]
+        if len(self._reshaped) > MAX_NAMED:
+            found.append(f"{len(self._reshaped) - MAX_NAMED:,} more photographs have other proportions.")
         return found
 
 
-def told(left_out: Sequence[tuple[str, str]]) -> list[str]:
+def exclusion_messages(left_out: Sequence[tuple[str, str]]) -> list[str]:
     """Names and reasons as sentences; many are summed up."""
-    found = [f"{_shown(name)} is left out: {why}" for name, why in left_out[:NAMED]]
-    if len(left_out) > NAMED:
-        found.append(f"{len(left_out) - NAMED:,} more views are left out for reasons like these.")
+    found = [f"{_shown(name)} is left out: {why}" for name, why in left_out[:MAX_NAMED]]
+    if len(left_out) > MAX_NAMED:
+        found.append(f"{len(left_out) - MAX_NAMED:,} more views are left out for reasons like these.")
     return found
 
 
@@ -442,4 +462,4 @@ def _astray(points: np.ndarray, cameras: Sequence[Camera]) -> tuple[np.ndarray, 
     reach = max(np.median(eyes_away), np.median(away) if len(away) else 0.0)
     if reach == 0:
         return np.zeros(len(points), bool), np.ones(len(cameras), bool)
-    return away > ASTRAY * reach, eyes_away <= ASTRAY * reach
+    return away > OUTLIER_FACTOR * reach, eyes_away <= OUTLIER_FACTOR * reach

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LodgsError
-from .cameras import FARTHEST, Camera, evenly
+from .cameras import MAX_COORDINATE, Camera, pick_evenly
 from .colmap import Scene, observations
 from .exr import MAGIC
-from .images import alike, area_average, check_size, load_image
-from .rendered import SKY, read_depth, surface_points
+from .images import area_average, check_image_size, load_image, same_proportions
+from .rendered_views import SKY_DEPTH, read_exr_depth, sample_surfaces
 
-KINDS = ("metric", "relative", "inverse", "points")
+DEPTH_KINDS = ("metric", "relative", "inverse", "points")
 """What is known: depth in the scene's unit; depth, or inverse depth, of which scale and shift are each view's
 own; or only where the model's points are."""
 UNIT = 1e-3
@@ -40,7 +40,7 @@ STEPS = 0.3, 1000
 """What is shown is so many times as far away as the next photograph, or maps are in another unit."""
 
 
-class Depths:
+class DepthPriors:
     """What a scene knows of the depth in its photographs.
 
     Args:
@@ -57,7 +57,7 @@ class Depths:
         self._maps = [camera for camera in scene.cameras if camera.depth is not None]
         asked = scene.cameras if kind == "points" else self._maps
         if kind == "metric":
-            asked = evenly(asked, TRIED)
+            asked = pick_evenly(asked, TRIED)
         self._seen = observations(scene, [camera.name for camera in asked]) if asked else {}
         known = self._seen if kind == "points" else self._maps
         if not known:
@@ -88,20 +88,20 @@ class Depths:
             return None
         values = _read_map(camera)
         if self.kind == "inverse":
-            found = averaged(values, camera.width, camera.height)
+            found = resample_known(values, camera.width, camera.height)
         else:
-            found = averaged(1 / values, camera.width, camera.height)
+            found = resample_known(1 / values, camera.width, camera.height)
         return found if self.kind == "metric" else self._fitted(camera, found)
 
     def _fits(self) -> bool:
         """Whether maps and points agree, as far as points tell; a sentence where they do not."""
-        tried = evenly(self._maps, TRIED)
+        tried = pick_evenly(self._maps, TRIED)
         if self.kind in ("relative", "inverse"):
             if any(self._inverse(camera) is not None for camera in tried):
                 return True
             self.warnings.append(
                 "The depth maps are not used: they do not go with the scene's points, whatever their scale "
-                f"and shift. Say what they are with depth ({', '.join(KINDS[:3])})."
+                f"and shift. Say what they are with depth ({', '.join(DEPTH_KINDS[:3])})."
             )
             return False
         if self.kind == "points" or not self._seen:
@@ -145,7 +145,7 @@ class Depths:
         there = values[y, x]
         known = np.isfinite(there)
         depth = self.kind == "relative"
-        found = scale_and_shift(1 / there[known] if depth else there[known], z[known], depth)
+        found = fit_scale_and_shift(1 / there[known] if depth else there[known], z[known], depth)
         if found is None:
             return None
         scale, shift = found
@@ -154,7 +154,7 @@ class Depths:
         return np.where(inverse > 0, inverse, np.nan).astype(np.float32)
 
 
-def scale_and_shift(values: np.ndarray, z: np.ndarray, depth: bool) -> tuple[float, float] | None:
+def fit_scale_and_shift(values: np.ndarray, z: np.ndarray, depth: bool) -> tuple[float, float] | None:
     """(scale, shift) that bring a view's values (M,) closest to depths z (M,); None where they do not go
     together.
 
@@ -176,7 +176,7 @@ def scale_and_shift(values: np.ndarray, z: np.ndarray, depth: bool) -> tuple[flo
     return (scale, shift) if scale > 0 and explained >= EXPLAINED else None
 
 
-def with_points(scene: Scene) -> Scene:
+def add_depth_points(scene: Scene) -> Scene:
     """A scene of few points with such as its metric depth maps show, as close as pixels are and
     coloured; with none of them where the maps are not those of the points that there are.
 
@@ -186,7 +186,7 @@ def with_points(scene: Scene) -> Scene:
     views = [camera for camera in scene.cameras if camera.depth is not None]
     if len(scene.points) >= FEW_POINTS or not views:
         return scene
-    depths = Depths(scene, "metric")
+    depths = DepthPriors(scene, "metric")
     if not depths:
         return replace(scene, warnings=[*scene.warnings, *depths.warnings])
 
@@ -198,9 +198,9 @@ def with_points(scene: Scene) -> Scene:
             picture = load_image(camera.image, camera.width, camera.height)
             depth = _read_map(camera, camera.width, camera.height)
             medians.append(np.median(depth[np.isfinite(depth)]) if np.isfinite(depth).any() else np.nan)
-            yield camera, np.where(np.isfinite(depth), depth, FARTHEST), picture
+            yield camera, np.where(np.isfinite(depth), depth, MAX_COORDINATE), picture
 
-    points, colors, _ = surface_points(shown(), len(views), MOST_POINTS, np.random.default_rng(0))
+    points, colors, _ = sample_surfaces(shown(), len(views), MOST_POINTS, np.random.default_rng(0))
     told = [f"{len(points):,} points to begin with are taken from the depth maps."]
     times = float(np.nanmedian(medians)) / _apart(views) if len(points) else np.nan
     if times < STEPS[0] or times > STEPS[1]:
@@ -219,13 +219,13 @@ def with_points(scene: Scene) -> Scene:
 
 def _apart(views: list[Camera]) -> float:
     """How far views are from the next one, by the median; NaN where all stand in one place."""
-    eyes = np.array([camera.center for camera in evenly(views, 500)])
+    eyes = np.array([camera.center for camera in pick_evenly(views, 500)])
     apart = np.linalg.norm(eyes[:, None] - np.array([camera.center for camera in views]), axis=2)
     nearest = np.where(apart > 0, apart, np.inf).min(axis=1)
     return float(np.median(nearest)) if np.isfinite(nearest).all() else np.nan
 
 
-def read_map(path: Path) -> np.ndarray:
+def read_depth_map(path: Path) -> np.ndarray:
     """The values of a depth map, (H, W) float64, NaN where there are none (0, or the sky of a renderer).
 
     An EXR's are as they are stored: the nearest of its layers' Depth.Z, or what else is depth there. So are a
@@ -238,15 +238,15 @@ def read_map(path: Path) -> np.ndarray:
         with open(path, "rb") as file:
             head = file.read(6)
         if head[:4] == MAGIC:
-            depth = read_depth(path)
-            return np.where(depth < FARTHEST, depth, np.nan)
+            depth = read_exr_depth(path)
+            return np.where(depth < MAX_COORDINATE, depth, np.nan)
         if head == b"\x93NUMPY":
             values = _of_numpy(path)
         else:
             from PIL import Image
 
             with Image.open(path, formats=("PNG",)) as image:
-                check_size(path, image.size)
+                check_image_size(path, image.size)
                 if image.mode not in ("I;16", "I", "L"):
                     raise LodgsError(
                         f"{path} is a picture in colours, not a depth map.",
@@ -259,7 +259,7 @@ def read_map(path: Path) -> np.ndarray:
         raise LodgsError(
             f"{path} cannot be read as a depth map: {error}.", "Write it again, or take it away."
         ) from error
-    return np.where((values > 0) & (values < SKY), values, np.nan)
+    return np.where((values > 0) & (values < SKY_DEPTH), values, np.nan)
 
 
 def _of_numpy(path: Path) -> np.ndarray:
@@ -271,11 +271,11 @@ def _of_numpy(path: Path) -> np.ndarray:
             f"{path} holds {stored.dtype} of shape {stored.shape}, not a depth map.",
             "Save an array of height x width numbers.",
         )
-    check_size(path, (stored.shape[1], stored.shape[0]))
+    check_image_size(path, (stored.shape[1], stored.shape[0]))
     return np.asarray(stored, np.float64) * (1 if stored.dtype.kind == "f" else UNIT)
 
 
-def averaged(values: np.ndarray, width: int, height: int) -> np.ndarray:
+def resample_known(values: np.ndarray, width: int, height: int) -> np.ndarray:
     """Values (H, W) at another size, (height, width) float32: the means of what is known; NaN where less than
     half is."""
     known = np.isfinite(values)
@@ -288,11 +288,11 @@ def averaged(values: np.ndarray, width: int, height: int) -> np.ndarray:
 def _read_map(camera: Camera, width: int = 0, height: int = 0) -> np.ndarray:
     """A view's map as it is, or depths at a size."""
     assert camera.depth is not None
-    values = read_map(camera.depth)
+    values = read_depth_map(camera.depth)
     high, wide = values.shape
-    if not alike(wide, high, camera.width, camera.height):
+    if not same_proportions(wide, high, camera.width, camera.height):
         raise LodgsError(
             f"{camera.depth} is {wide}x{high}, of other proportions than its photograph.",
             "Write it again, or take it away.",
         )
-    return 1 / averaged(1 / values, width, height) if width else values
+    return 1 / resample_known(1 / values, width, height) if width else values

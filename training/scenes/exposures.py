@@ -34,7 +34,7 @@ ROUGH = 0.03
 """Residuals, in logarithms, from which on they count by their size, not by their square."""
 
 
-def own_gains(scene: Scene, cameras: Sequence[Camera], exposure: float = 0.0) -> dict[str, np.ndarray]:
+def exposure_gains(scene: Scene, cameras: Sequence[Camera], exposure: float = 0.0) -> dict[str, np.ndarray]:
     """How many times as bright a photograph is as it were if it were exposed as those beside it.
 
     Args:
@@ -71,7 +71,7 @@ def own_gains(scene: Scene, cameras: Sequence[Camera], exposure: float = 0.0) ->
     _, point = np.unique(point[shared], return_inverse=True)
     gains = relative_gains(view, point, values[shared])
     those = [cameras[i] for i in which]
-    own = gains - smooth(
+    own = gains - smooth_gains(
         gains,
         np.array([camera.center for camera in those]) / scene.extent(),
         np.array([camera.world_to_camera[2, :3] for camera in those]),
@@ -82,7 +82,7 @@ def own_gains(scene: Scene, cameras: Sequence[Camera], exposure: float = 0.0) ->
     return {camera.name: factor for camera, factor in zip(those, factors, strict=True)}
 
 
-def evened(image: np.ndarray, gain: np.ndarray) -> np.ndarray:
+def remove_gain(image: np.ndarray, gain: np.ndarray) -> np.ndarray:
     """A photograph (H, W, 3) without its own gain (3,); what is white stays so: it may have been brighter."""
     image = image.astype(np.float32)
     white = np.clip((image - BRIGHTEST) / (1 - BRIGHTEST), 0, 1)
@@ -113,7 +113,7 @@ def relative_gains(view: np.ndarray, point: np.ndarray, values: np.ndarray) -> n
     return gains
 
 
-def smooth(gains: np.ndarray, places: np.ndarray, directions: np.ndarray) -> np.ndarray:
+def smooth_gains(gains: np.ndarray, places: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """The part of the views' gains (V, 3) that changes smoothly with place and direction, or with order.
 
     A Gaussian process of the two and of noise, whose three variances and two lengths are the most likely ones

@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import LodgsError
 
 MAGIC = b"\x76\x2f\x31\x01"
-MOST_BYTES = 2 << 30
+MAX_BYTES = 2 << 30
 """Memory that all channels of a file may take."""
 
 
@@ -85,9 +85,9 @@ def read_parts(path: Path) -> list[tuple[str, dict, dict[str, np.ndarray]]]:
     with OpenEXR.File(str(path), header_only=True) as file:
         needed = sum(_bytes_of(part.header) for part in file.parts)
         promised = [len(part.header["channels"]) for part in file.parts]
-    if needed > MOST_BYTES:
+    if needed > MAX_BYTES:
         raise LodgsError(
-            f"{path} holds {needed / 2**30:.1f} GiB of pixels; {MOST_BYTES >> 30} are read at most.",
+            f"{path} holds {needed / 2**30:.1f} GiB of pixels; {MAX_BYTES >> 30} are read at most.",
             "Make it smaller, or leave out passes.",
         )
     with OpenEXR.File(str(path), separate_channels=True) as file:

@@ -26,7 +26,7 @@ FEWEST = 0.02
 """A ground has at least this share of the places."""
 
 
-def plane_through(places: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def fit_plane(places: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The plane that fits places (P, 3) best, by least squares of the distances from it.
 
     Args:
@@ -65,7 +65,7 @@ def find_ground(places: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndar
         up: (3,) about which way is up.
 
     Returns:
-        As :func:`plane_through`.
+        As :func:`fit_plane`.
 
     Raises:
         LodgsError: no plane has as many places as a ground has.
@@ -98,14 +98,14 @@ def find_ground(places: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndar
             normal, middle = best
             for _ in range(5):
                 on = np.abs((places - middle) @ normal) <= thick
-                normal, middle = plane_through(places[on], up)
+                normal, middle = fit_plane(places[on], up)
             return normal, middle
     raise LodgsError(
         "No plane lies under this scene.", "Select points of its ground in Edit Mode, or empties on it."
     )
 
 
-def about_cameras(places: np.ndarray, center: np.ndarray, depth: float) -> np.ndarray:
+def points_near_cameras(places: np.ndarray, center: np.ndarray, depth: float) -> np.ndarray:
     """Those of places (P, 3) among which a ground is looked for: land rises farther away.
 
     Args:
@@ -116,7 +116,7 @@ def about_cameras(places: np.ndarray, center: np.ndarray, depth: float) -> np.nd
     return near if len(near) > FEW else places
 
 
-def level_at_zero(normal: np.ndarray, middle: np.ndarray) -> Similarity:
+def ground_placement(normal: np.ndarray, middle: np.ndarray) -> Similarity:
     """What makes a plane z = 0 with its normal (3,) up: turned as little as possible about its point (3,),
     and moved up or down."""
     z = np.array([0.0, 0.0, 1.0])
@@ -129,7 +129,7 @@ def level_at_zero(normal: np.ndarray, middle: np.ndarray) -> Similarity:
     return Similarity(rotation, 1.0, middle * (1, 1, 0) - rotation @ middle)
 
 
-def scaled_about(place: np.ndarray, scale: float) -> Similarity:
+def scaling_about(place: np.ndarray, scale: float) -> Similarity:
     """What scales about a place (3,), which stays."""
     place = np.asarray(place, np.float64)
     return Similarity(np.eye(3), scale, place - scale * place)

@@ -18,10 +18,10 @@ from ..errors import LodgsError
 from .color import srgb_from_linear
 from .exr import MAGIC, Truncated, exr_size, read_parts
 
-MOST_PIXELS = 178_956_970
+MAX_PIXELS = 178_956_970
 """Pixels of an image that is read: Pillow opens no larger ones, which take it 4 bytes a pixel."""
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 """How names of photographs end, in lower case; beside ``.exr``, which only renderers write."""
 
 _LARGE = 1 << 25
@@ -51,7 +51,7 @@ def image_size(path: Path) -> tuple[int, int]:
     """
     with open_file(path) as file:
         try:
-            return check_size(path, _size(path, file))
+            return check_image_size(path, _size(path, file))
         except OSError as error:
             raise LodgsError(
                 f"{path} cannot be read: {error.strerror}.", "Check the image folder."
@@ -78,7 +78,7 @@ def _size(path: Path, file: IO[bytes]) -> tuple[int, int]:
     raise LodgsError(f"{path} is not a JPEG, PNG, TIFF, WebP or EXR image.", "Convert it to one of these.")
 
 
-def check_size(path: Path, size: tuple[int, int]) -> tuple[int, int]:
+def check_image_size(path: Path, size: tuple[int, int]) -> tuple[int, int]:
     """The size, where it is one that is read.
 
     Raises:
@@ -87,9 +87,9 @@ def check_size(path: Path, size: tuple[int, int]) -> tuple[int, int]:
     width, height = size
     if width < 1 or height < 1:
         raise LodgsError(f"{path} has no pixels.", "Export the image again.")
-    if width * height > MOST_PIXELS:
+    if width * height > MAX_PIXELS:
         raise LodgsError(
-            f"{path} has {width}x{height} pixels; {MOST_PIXELS:,} are read at most.", "Make it smaller."
+            f"{path} has {width}x{height} pixels; {MAX_PIXELS:,} are read at most.", "Make it smaller."
         )
     return size
 
@@ -269,14 +269,14 @@ def check_mask(path: Path, width: int, height: int) -> None:
         LodgsError: it is no image, or has other proportions.
     """
     wide, high = image_size(path)
-    if not alike(wide, high, width, height):
+    if not same_proportions(wide, high, width, height):
         raise LodgsError(
             f"The mask {path} is {wide}x{high}, of other proportions than its photograph.",
             "Write it again, or take it away.",
         )
 
 
-def alike(wide: int, high: int, width: int, height: int) -> bool:
+def same_proportions(wide: int, high: int, width: int, height: int) -> bool:
     """Whether two sizes are of the same proportions; sides are whole pixels."""
     least = min(wide, high, width, height)
     return bool(abs(np.log(wide * height / (high * width))) <= 0.01 + 1 / least)
@@ -362,7 +362,7 @@ def _exr(path: Path, alpha: bool) -> _Source:
     (left, above), _ = header["dataWindow"]
     low, high = (np.asarray(corner) for corner in header["displayWindow"])
     across, down = high - low + 1
-    width, height = check_size(path, (int(across), int(down)))
+    width, height = check_image_size(path, (int(across), int(down)))
     x, y = int(left - low[0]), int(above - low[1])
     names = _rgb_names(channels)
     planes = [channels[name] for name in names]
@@ -381,7 +381,7 @@ def _exr(path: Path, alpha: bool) -> _Source:
     return _Source(width, height, rows, len(planes), linear=True)
 
 
-def exr_light(path: Path) -> np.ndarray:
+def load_exr(path: Path) -> np.ndarray:
     """The light of an EXR over its display window, and alpha, by which it is multiplied: (H, W, 4) float32.
 
     Raises:

@@ -23,10 +23,10 @@ import numpy as np
 
 from ..errors import LodgsError
 from ..files import atomic_write, check_folder, link_or_copy
-from . import apart
-from .colmap import MASKS, find_models, told
-from .images import SUFFIXES, check_mask, image_size, load_image, write_png
-from .photographs import Beside
+from . import pycolmap_process
+from .colmap import MASKS, exclusion_messages, find_models
+from .image_files import SidecarFiles
+from .images import IMAGE_SUFFIXES, check_mask, image_size, load_image, write_png
 
 PRESETS = {"draft": (1000, 2048), "standard": (1600, 4096)}
 """Pixels of the longer side in which features are looked for, and at most so many of a photograph."""
@@ -58,7 +58,7 @@ Tell = Callable[[str, int, int], object]
 
 
 @dataclass(frozen=True)
-class Reconstructed:
+class ReconstructionResult:
     """What came of it.
 
     Attributes:
@@ -89,7 +89,7 @@ def reconstruct(
     lens: str = "",
     masks: Path | None = None,
     tell: Tell = lambda what, done, of: None,
-) -> Reconstructed:
+) -> ReconstructionResult:
     """Finds cameras and points of photographs, and writes the scene. Given again, it goes on where it was.
 
     Args:
@@ -114,7 +114,7 @@ def reconstruct(
     if len(names) < FEWEST:
         raise LodgsError(
             f"{photos} holds {len(names)} photographs that can be read; a scene takes {FEWEST}."
-            + "".join(f" {sentence}" for sentence in told(left_out)[:1]),
+            + "".join(f" {sentence}" for sentence in exclusion_messages(left_out)[:1]),
             "Choose the folder of the photographs.",
         )
     work = out / "colmap"
@@ -148,19 +148,19 @@ def reconstruct(
             names = [_taken_over(photos, name, images) for name in given]
         asked = settings | {
             "photos": str(images), "names": names, "ordered": ordered, "work": str(work),
-            "masks": str(_masks(masks, photos, dict(zip(given, names, strict=True)), out)) if masks else "",
+            "masks": str(_link_masks(masks, photos, dict(zip(given, names, strict=True)), out)) if masks else "",
         }  # fmt: skip
         with progress:
-            problem = apart.run_apart("sfm", asked, work, hear)
+            problem = pycolmap_process.run_program("sfm", asked, work, hear)
         if problem:
             raise LodgsError(
                 f"COLMAP has ended without a scene: {problem}", "Do it again: it goes on where it was."
             )
         with atomic_write(work / "pairs.png") as temporary:
-            write_png(temporary, pairs_picture(names, found["pairs"], found["placed"]))
+            write_png(temporary, draw_pairs(names, found["pairs"], found["placed"]))
         if len(found["placed"]) < FEWEST:
             what, remedy = _nothing(names, found, work)
-            raise LodgsError(" ".join([what, *told(left_out)]), remedy)
+            raise LodgsError(" ".join([what, *exclusion_messages(left_out)]), remedy)
         (out / "sparse").mkdir(exist_ok=True)
         shutil.rmtree(out / "sparse" / "0", ignore_errors=True)
         os.replace(work / "model", out / "sparse" / "0")
@@ -171,12 +171,12 @@ def reconstruct(
             "Free some space there or choose another folder.",
         ) from error
     words = _words(names, found)
-    return Reconstructed(
-        out, len(names), found["placed"], found["points"], found["error"], words, told(left_out)
+    return ReconstructionResult(
+        out, len(names), found["placed"], found["points"], found["error"], words, exclusion_messages(left_out)
     )
 
 
-def pairs_picture(names: Sequence[str], pairs: Sequence[Sequence], placed: Sequence[str]) -> np.ndarray:
+def draw_pairs(names: Sequence[str], pairs: Sequence[Sequence], placed: Sequence[str]) -> np.ndarray:
     """Which photographs show the same, (S, S, 3) uint8: a row and a column of each, by name.
 
     A square is as bright as the logarithm of the number of features that two have in common, and what has
@@ -251,7 +251,7 @@ def _photographs(
         if not any(part.startswith(".") for part in path.relative_to(photos).parts)
         and not any(path.is_relative_to(other) for other in others)
     ]
-    taken = [path for path in files if path.suffix.lower() in SUFFIXES]
+    taken = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
     taken = taken or [path for path in files if path.suffix.lower() == ".exr"]  # else they are depth maps
     known = {path.with_suffix("") for path in taken}
     for path in files:
@@ -296,11 +296,11 @@ def _begin(work: Path, settings: Mapping[str, object]) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def _masks(masks: Path, photos: Path, names: Mapping[str, str], out: Path) -> Path:
+def _link_masks(masks: Path, photos: Path, names: Mapping[str, str], out: Path) -> Path:
     """A folder of masks of photographs as COLMAP names them, whose names there are by those that they had."""
     there = out / MASKS
     for given, name in names.items():
-        found = Beside(masks, ".png").find(given)
+        found = SidecarFiles(masks, ".png").find(given)
         if found is not None:
             check_mask(found, *image_size(photos / given))
             link_or_copy(found, there / f"{name}.png")

@@ -17,11 +17,11 @@ from ..documents import read_json
 from ..errors import LodgsError
 from ..files import atomic_write
 from .cameras import Camera
-from .colmap import Scene, observed
+from .colmap import Scene, observed_points
 
-ENLARGED = 0.2
+CELL_MARGIN = 0.2
 """Share of a cell's side by which it is enlarged on each side for what it is trained on."""
-IN_SIGHT = 0.25
+MIN_IMAGE_SHARE = 0.25
 """A view that stands elsewhere belongs to a cell that covers more than this share of its image."""
 _RAYS = 16, 12
 """Over an image, across and down, to tell which share of it a box covers."""
@@ -49,7 +49,7 @@ class Region:
     views: tuple[str, ...]
     seam: bool = False
 
-    def views_of(self, scene: Scene) -> Scene:
+    def select_views(self, scene: Scene) -> Scene:
         """The scene with the region's views alone.
 
         Raises:
@@ -61,23 +61,23 @@ class Region:
             raise LodgsError(f"{scene.folder} has none of the region's views.", "Write the plan again.")
         return replace(scene, cameras=cameras, distorted=[name for name in scene.distorted if name in names])
 
-    def points_of(self, scene: Scene) -> np.ndarray:
+    def start_points(self, scene: Scene) -> np.ndarray:
         """Which of the points (P,) training begins with: those around it, and what its views observe."""
-        return self.surrounds(scene.points) | observed(scene, frozenset(self.views))
+        return self.in_enlarged_cell(scene.points) | observed_points(scene, frozenset(self.views))
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Which of points (P, 3) are the cell's, (P,); of all cells of a plan exactly one has each."""
         return _within(_on_ground(self.ground, points), self.cell)
 
-    def surrounds(self, points: np.ndarray) -> np.ndarray:
+    def in_enlarged_cell(self, points: np.ndarray) -> np.ndarray:
         """Which of points (P, 3) lie in the enlarged cell, (P,)."""
         return _within(_on_ground(self.ground, points), self.area)
 
-    def borders(self, points: np.ndarray) -> np.ndarray:
+    def near_border(self, points: np.ndarray) -> np.ndarray:
         """Which of points (P, 3) are the cell's and as near to another as the cell is enlarged, (P,)."""
         return self.contains(points) & ~_within(_on_ground(self.ground, points), self._inside)
 
-    def at_seam(self, scene: Scene) -> Region:
+    def as_seam(self, scene: Scene) -> Region:
         """The same cell to be fitted to those beside it, by its views that stand at its borders, on either
         side."""
         eyes = _on_ground(self.ground, np.array([camera.center for camera in scene.cameras]))
@@ -86,7 +86,7 @@ class Region:
         views = tuple(name for name in self.views if name in names)
         return replace(self, views=views, seam=True)
 
-    def meets(self, other: Region) -> bool:
+    def overlaps(self, other: Region) -> bool:
         """Whether another cell has a part of the enlarged one."""
         return bool(
             (
@@ -165,9 +165,9 @@ def plan_cells(scene: Scene, columns: int, rows: int) -> list[Region]:
         if not (cell[:, 0] < cell[:, 1]).all():
             raise LodgsError("Too many views stand in one place for so many cells.", "Ask for fewer cells.")
         finite = np.where(np.isfinite(cell), cell, outermost)
-        area = cell + ENLARGED * np.ptp(finite, axis=1)[:, None] * [-1, 1]
+        area = cell + CELL_MARGIN * np.ptp(finite, axis=1)[:, None] * [-1, 1]
         box = np.concatenate([np.clip(area, *_around(outermost)), [[*heights]]])
-        seen = np.array([_share_of_image(camera, ground, box) > IN_SIGHT for camera in cameras])
+        seen = np.array([_share_of_image(camera, ground, box) > MIN_IMAGE_SHARE for camera in cameras])
         belongs = seen | _within(eyes, area) | standing
         names = tuple(camera.name for camera, its in zip(cameras, belongs, strict=True) if its)
         regions.append(Region(ground, cell, area, names))
@@ -194,7 +194,7 @@ def _parts(
 
 def _around(outermost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Bounds (2, 1) each of what counts as the scene: the cameras' rectangle (2, 2), enlarged."""
-    reach = ENLARGED * np.ptp(outermost, axis=1)[:, None]
+    reach = CELL_MARGIN * np.ptp(outermost, axis=1)[:, None]
     return outermost[:, :1] - reach, outermost[:, 1:] + reach
 
 

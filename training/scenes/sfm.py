@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from . import apart
-from .apart import say
+from . import pycolmap_process
+from .pycolmap_process import send
 
 if TYPE_CHECKING:
     import pycolmap
@@ -34,11 +34,11 @@ _SAMPLED = 60_000
 
 
 def _main() -> None:
-    asked = apart.request()
-    apart.load_pycolmap().set_random_seed(0)
+    asked = pycolmap_process.read_request()
+    pycolmap_process.load_pycolmap().set_random_seed(0)
     work = Path(asked["work"])
     database = work / "database.db"
-    say(stage="features", done=0, of=len(asked["names"]))
+    send(stage="features", done=0, of=len(asked["names"]))
     _extract(asked, database)
     _match(asked, work, database)
     best = _place(asked, work, database)
@@ -78,15 +78,15 @@ def _match(asked: dict, work: Path, database: Path) -> None:
         options.overlap = OVERLAP
         if count > 4 * OVERLAP:
             options.vocab_tree_path, options.loop_detection = _vocabulary(work, database), True
-        say(stage="pairs", done=0, of=count * (OVERLAP + 4))
+        send(stage="pairs", done=0, of=count * (OVERLAP + 4))
         pycolmap.match_sequential(database, pairing_options=options, device=cpu)
     elif count <= EXHAUSTIVE:
-        say(stage="pairs", done=0, of=count * (count - 1) // 2)
+        send(stage="pairs", done=0, of=count * (count - 1) // 2)
         pycolmap.match_exhaustive(database, device=cpu)
     else:
         options = pycolmap.VocabTreePairingOptions()
         options.num_images, options.vocab_tree_path = ALIKE, _vocabulary(work, database)
-        say(stage="pairs", done=0, of=count * ALIKE * 2 // 3)  # about: many are each other's
+        send(stage="pairs", done=0, of=count * ALIKE * 2 // 3)  # about: many are each other's
         pycolmap.match_vocabtree(database, pairing_options=options, device=cpu)
 
 
@@ -97,7 +97,7 @@ def _vocabulary(work: Path, database: Path) -> Path:
     path = work / "vocabulary.bin"
     if path.exists():
         return path
-    say(stage="vocabulary", done=0, of=1)
+    send(stage="vocabulary", done=0, of=1)
     rng, found = np.random.default_rng(0), []
     with closing(pycolmap.Database.open(database)) as known:
         images = known.read_all_images()
@@ -125,7 +125,7 @@ def _place(asked: dict, work: Path, database: Path) -> pycolmap.Reconstruction |
     count, models = len(asked["names"]), work / "models"
     shutil.rmtree(models, ignore_errors=True)
     models.mkdir()
-    say(stage="cameras", done=0, of=count)
+    send(stage="cameras", done=0, of=count)
     best = None
     if count > GLOBAL_FROM:
         options = pycolmap.GlobalPipelineOptions()
@@ -139,7 +139,7 @@ def _place(asked: dict, work: Path, database: Path) -> pycolmap.Reconstruction |
 
         def one_more() -> None:
             placed[0] = min(placed[0] + 1, count)
-            say(stage="cameras", done=placed[0], of=count)
+            send(stage="cameras", done=placed[0], of=count)
 
         found = pycolmap.incremental_mapping(
             database, asked["photos"], models, options, next_image_callback=one_more
@@ -167,7 +167,7 @@ def _report(database: Path, best: pycolmap.Reconstruction | None) -> None:
         if inliers and one in names and other in names
     ]
     placed = [] if best is None else [best.images[number].name for number in best.reg_image_ids()]
-    say(
+    send(
         result={
             "features": features, "pairs": common, "placed": sorted(placed),
             "points": 0 if best is None else best.num_points3D(),

@@ -16,14 +16,14 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LodgsError
-from . import apart
+from . import pycolmap_process
 from .cameras import Camera
 from .colmap import DEPTHS, MASKS, Scene, read_scene
-from .depths import read_map
+from .depths import read_depth_map
 from .exr import write_exr
-from .images import exr_light, load_image, load_mask, write_png
+from .images import load_exr, load_image, load_mask, write_png
 
-CACHE = ".undistorted"
+CACHE_FOLDER = ".undistorted"
 """Folder in a scene's of what is made of it once, for all runs and for Blender."""
 _VERSION = b"4"  # of what is kept in the cache
 _BENT = "bent"
@@ -32,7 +32,7 @@ _LEFT = 86_400.0
 """Seconds after which what is half done in a cache is nobody's."""
 
 
-def undistorted(scene: Scene, cache: Path) -> Scene:
+def undistort_scene(scene: Scene, cache: Path) -> Scene:
     """The scene with every lens undone: all views pinhole, `distorted` empty, the world unchanged.
 
     Photographs and model are written into a folder of `cache` that is named after them, and taken from there
@@ -58,9 +58,9 @@ def undistorted(scene: Scene, cache: Path) -> Scene:
     return _read(target, scene)
 
 
-def cache_of(scene: Scene, otherwise: Path) -> Path:
+def undistort_cache(scene: Scene, otherwise: Path) -> Path:
     """The cache beside a scene's photographs; another folder, where that may not be written to."""
-    cache = scene.folder / CACHE
+    cache = scene.folder / CACHE_FOLDER
     try:
         cache.mkdir(exist_ok=True)
         with tempfile.TemporaryFile(dir=cache):
@@ -69,8 +69,8 @@ def cache_of(scene: Scene, otherwise: Path) -> Path:
         return otherwise
 
 
-def already_undistorted(scene: Scene) -> Scene | None:
-    """As :func:`undistorted`, where that was done before and is kept with the scene; else None.
+def cached_undistorted_scene(scene: Scene) -> Scene | None:
+    """As :func:`undistort_scene`, where that was done before and is kept with the scene; else None.
 
     Raises:
         LodgsError: what is kept is damaged.
@@ -78,7 +78,7 @@ def already_undistorted(scene: Scene) -> Scene | None:
     if not scene.distorted:
         return scene
     try:
-        target = scene.folder / CACHE / _key(scene)
+        target = scene.folder / CACHE_FOLDER / _key(scene)
         return _read(target, scene) if target.is_dir() else None
     except OSError:
         return None
@@ -133,7 +133,7 @@ def _undistort_into(target: Path, scene: Scene) -> None:
                 path = masks / f"{camera.name}.png"
                 path.parent.mkdir(parents=True, exist_ok=True)
                 write_png(path, np.repeat(np.rint(255 * light).astype(np.uint8)[..., None], 3, axis=2))
-        problem = apart.run_apart("undistort", request, Path(work))
+        problem = pycolmap_process.run_program("undistort", request, Path(work))
         if problem:
             raise LodgsError(
                 f"The lens distortion of {scene.folder} could not be undone: {problem}",
@@ -173,14 +173,14 @@ def _straighten_here(camera: Camera, places: np.ndarray, out: Path) -> None:
     if camera.depth is not None:
         path = out / DEPTHS / f"{camera.name}.exr"
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_exr(path, {"Z": at(np.nan_to_num(read_map(camera.depth)), order=0)})
+        write_exr(path, {"Z": at(np.nan_to_num(read_depth_map(camera.depth)), order=0)})
     if camera.image is None or not _is_foreign(camera):
         return
     path = out / "images" / camera.name
     path.parent.mkdir(parents=True, exist_ok=True)
     linear = camera.name.lower().endswith(".exr")
     pixels = (
-        exr_light(camera.image)
+        load_exr(camera.image)
         if linear
         else load_image(camera.image, camera.width, camera.height, alpha=True)
     )
@@ -195,8 +195,8 @@ def _straighten_here(camera: Camera, places: np.ndarray, out: Path) -> None:
 
 
 def _main() -> None:
-    request = apart.request()
-    pycolmap = apart.load_pycolmap()
+    request = pycolmap_process.read_request()
+    pycolmap = pycolmap_process.load_pycolmap()
     model = pycolmap.Reconstruction(request["model"])
     sizes = defaultdict(set)
     for image in model.images.values():

@@ -15,7 +15,7 @@ DOMES = (1.1, 2.2)
 """Radii of a dome's two shells, in multiples of the distance from which the splats fill the picture."""
 UP = (0.0, -1.0, 0.0)
 """As in most COLMAP worlds."""
-NEAR = 0.01
+NEAR_SHARE = 0.01
 """Depth at which drawing begins, as a share of the distance to the splats' middle."""
 FOCAL = 1.2
 """Focal length of the views, in heights of their picture."""
@@ -27,7 +27,7 @@ TURNS = (0, 60, -60, 180, 120, -120)
 """Where views along a way look, one after the other, in degrees from ahead: together all around."""
 
 
-def dome(splats: Splats, count: int, width: int = 960, height: int = 640) -> tuple[list[Camera], float]:
+def dome_views(splats: Splats, count: int, width: int = 960, height: int = 640) -> tuple[list[Camera], float]:
     """Views of splats from all around, on two shells, and the depth at which drawing begins.
 
     Which way is up, and whether splats are to be seen from inside, they do not say: for a room or a street
@@ -36,10 +36,10 @@ def dome(splats: Splats, count: int, width: int = 960, height: int = 640) -> tup
     Raises:
         LodgsError: there is no opaque splat to look at.
     """
-    return dome_around(opaque(splats), count, width, height)
+    return dome_views_around(opaque_means(splats), count, width, height)
 
 
-def dome_around(
+def dome_views_around(
     places: np.ndarray,
     count: int,
     width: int = 960,
@@ -47,7 +47,7 @@ def dome_around(
     up: tuple[float, float, float] = UP,
     lowest: float = -1.0,
 ) -> tuple[list[Camera], float]:
-    """As :func:`dome`, of places (N, 3) float64: of opaque splats or some of them, or of a thing's corners.
+    """As :func:`dome_views`, of places (N, 3) float64: of opaque splats or some of them, or of a thing's corners.
 
     Args:
         up: what is up in the pictures, along an axis.
@@ -69,10 +69,10 @@ def dome_around(
     eyes = middle + fills * np.where(number % 2, *DOMES)[:, None] * away
     lens = _lens(width, height)
     views = [Camera(f"dome_{n:04d}", *lens, look_at(eye, middle, up)) for n, eye in enumerate(eyes)]
-    return views, NEAR * fills
+    return views, NEAR_SHARE * fills
 
 
-def above(
+def aerial_views(
     places: np.ndarray, count: int, width: int = 960, height: int = 640, raised: float = 0.0
 ) -> tuple[list[Camera], float]:
     """Views of an area as a drone takes them: at one height, evenly spread, straight down and from four sides
@@ -107,10 +107,10 @@ def above(
         Camera(f"above_{n:04d}", *lens, look_at(eye, target, (0.0, 0.0, 1.0)))
         for n, (eye, target) in enumerate(zip(eyes, targets, strict=True))
     ]
-    return views, NEAR * raised
+    return views, NEAR_SHARE * raised
 
 
-def walk(
+def walk_views(
     splats: Splats, way: np.ndarray, up: np.ndarray, count: int, width: int = 960, height: int = 640
 ) -> tuple[list[Camera], float]:
     """Views evenly along a way, level, that look ahead, to both sides and back in turn.
@@ -123,16 +123,18 @@ def walk(
         The views and, as for a dome, the depth at which drawing begins.
 
     Raises:
-        LodgsError: as :func:`along`, or there is no opaque splat to look at.
+        LodgsError: as :func:`views_along`, or there is no opaque splat to look at.
     """
-    views = along(way, up, count, width, height)
+    views = views_along(way, up, count, width, height)
     eyes = np.array([view.center for view in views])
-    away = np.linalg.norm(opaque(splats) - np.median(eyes, axis=0), axis=1)
-    return views, NEAR * float(np.median(away))
+    away = np.linalg.norm(opaque_means(splats) - np.median(eyes, axis=0), axis=1)
+    return views, NEAR_SHARE * float(np.median(away))
 
 
-def along(way: np.ndarray, up: np.ndarray, count: int, width: int = 960, height: int = 640) -> list[Camera]:
-    """The views of :func:`walk`, whatever there is to see.
+def views_along(
+    way: np.ndarray, up: np.ndarray, count: int, width: int = 960, height: int = 640
+) -> list[Camera]:
+    """The views of :func:`walk_views`, whatever there is to see.
 
     Raises:
         LodgsError: the way has no length or leads straight up.
@@ -160,7 +162,7 @@ def along(way: np.ndarray, up: np.ndarray, count: int, width: int = 960, height:
     ]
 
 
-def opaque(splats: Splats) -> np.ndarray:
+def opaque_means(splats: Splats) -> np.ndarray:
     """Where opaque splats are, (N, 3) float64.
 
     Raises:

@@ -9,7 +9,7 @@ from .cameras import Camera
 DEPTH_TOLERANCE = 0.01  # relative: a point this much behind the surface that a view sees is hidden there
 
 
-def visible_in(depths: np.ndarray, camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def visible_points(depths: np.ndarray, camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where a view sees points (N, 3): pixels (N, 2) and whether it does (N,).
 
     The pixel that a point falls on must lie at its depth, and none of the pixels about it before it, but for

@@ -10,7 +10,7 @@ import pycolmap
 
 from ..errors import LodgsError
 from .cameras import Camera
-from .visibility import visible_in
+from .visibility import visible_points
 
 SHORTEST_TRACK, LONGEST_TRACK = 2, 4
 """Views that see a point: it is left out below the first, and no more than the last are recorded."""
@@ -18,13 +18,13 @@ _BLOCK = 1 << 24
 """Pairs of a view and a point that are thinned at a time; each takes some 30 bytes."""
 
 
-def thinned(visible: np.ndarray, longest: int) -> np.ndarray:
+def thin_tracks(visible: np.ndarray, longest: int) -> np.ndarray:
     """At most so many views, at random, of the views (V, N) that see each point: it keeps models small."""
     lottery = np.where(visible, np.random.default_rng(1).random(visible.shape), np.inf)
     return visible & (lottery.argsort(axis=0).argsort(axis=0) < longest)
 
 
-def write_seen(
+def write_visible_points(
     scene: Path,
     cameras: Sequence[Camera],
     depths: Callable[[int], np.ndarray],
@@ -34,7 +34,7 @@ def write_seen(
     """As :func:`write_colmap`, of those points that SHORTEST_TRACK views see, by their depths.
 
     Args:
-        depths: those of a view, by its number, as :func:`visible_in` takes them: one is in memory at a time.
+        depths: those of a view, by its number, as :func:`visible_points` takes them: one is in memory at a time.
 
     Returns:
         How many points that are.
@@ -42,12 +42,12 @@ def write_seen(
     Raises:
         LodgsError: there are none.
     """
-    visible = np.stack([visible_in(depths(n), view, points)[1] for n, view in enumerate(cameras)])
+    visible = np.stack([visible_points(depths(n), view, points)[1] for n, view in enumerate(cameras)])
     kept = visible.sum(axis=0) >= SHORTEST_TRACK
     if not kept.any():
         raise LodgsError("No two views see the same.", "Give more views, or nearer ones.")
     blocks = np.array_split(visible[:, kept], -(-visible.size // _BLOCK), axis=1)
-    visible = np.concatenate([thinned(block, LONGEST_TRACK) for block in blocks], axis=1)
+    visible = np.concatenate([thin_tracks(block, LONGEST_TRACK) for block in blocks], axis=1)
     write_colmap(scene, cameras, points[kept], visible, colors[kept])
     return int(kept.sum())
 

@@ -9,7 +9,7 @@ from tests.blender.fake_trainer import splats
 from training.editing.bake_filter import without_filter
 from training.scenes.cameras import Camera, look_at
 from training.scenes.colmap import read_scene
-from training.scenes.views import tables_of, views_in
+from training.scenes.view_tables import make_view_tables, read_view_tables
 from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
 from training.splats.similarity import Similarity
 
@@ -36,7 +36,7 @@ def views(count=6):
 
 @pytest.fixture
 def root(bpy, lodgs, tmp_path):
-    bundle = Bundle("made", [Level(1, splats(30))], tables=tables_of(views(), 0.02, {"v2.jpg"}))
+    bundle = Bundle("made", [Level(1, splats(30))], tables=make_view_tables(views(), 0.02, {"v2.jpg"}))
     # counted with a view that has no photograph; trained at a fortieth of the size
     bundle.meta |= {"held_out": [3, 9], "focal_px": 12.5}
     write_bundle(tmp_path / "in.ply", bundle)
@@ -79,11 +79,11 @@ def test_views_are_in_the_bundle_again_where_the_scene_stands(bpy, root, tmp_pat
     root.location, root.scale = (1, 2, 3), (2, 2, 2)
     bpy.context.view_layer.update()
     assert bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"), placed=placed) == {"FINISHED"}
-    cameras, near, held_out = views_in(read_bundle(tmp_path / "out.ply").tables)
+    cameras, near, held_out = read_view_tables(read_bundle(tmp_path / "out.ply").tables)
     assert held_out == {"v2.jpg"} and near == pytest.approx(0.04 if placed else 0.02)
     if placed:
         there = Similarity.from_matrix(np.array(root.lodgs.axes.matrix_world, np.float64).round(6))
-        cameras = [camera.within(there.matrix)[0] for camera in cameras]
+        cameras = [camera.in_object_space(there.matrix)[0] for camera in cameras]
     check(cameras, views())
 
 
@@ -94,7 +94,7 @@ def test_a_trained_scene_takes_its_photographs_views_along(bpy, lodgs):
     made = {name: getattr(splats(9), name) for name in names}
     level = lodgs("training.splats.gaussians").Splats(**made)
     scenes.set_level(root, lodgs("training.splats.bundle").Level(1, level))
-    cameras, near, _ = views_in(scenes.read_levels(root).tables)
+    cameras, near, _ = read_view_tables(scenes.read_levels(root).tables)
     scene = read_scene(GARDEN)
     check(cameras, scene.cameras)
     assert near == pytest.approx(scene.near())

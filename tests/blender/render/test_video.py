@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.training.scenes.walls import EYES, photograph
+from tests.training.scenes.walls import CAMERA_POSITIONS, render_photo
 from training.scenes.images import write_png
 
 BLURRED = (1, 2, 4, 7, 8, 10, 11)
@@ -24,9 +24,9 @@ def blurred(pixels: np.ndarray) -> np.ndarray:
 @pytest.fixture(scope="module")
 def drawn() -> list[np.ndarray]:
     """Twelve frames of a walk along EYES; some are blurred."""
-    along = np.linspace(0, len(EYES) - 1, 12)
-    eyes = np.stack([np.interp(along, range(len(EYES)), column) for column in EYES.T], axis=1)
-    frames = [photograph(eye) for eye in eyes]
+    along = np.linspace(0, len(CAMERA_POSITIONS) - 1, 12)
+    eyes = np.stack([np.interp(along, range(len(CAMERA_POSITIONS)), column) for column in CAMERA_POSITIONS.T], axis=1)
+    frames = [render_photo(eye) for eye in eyes]
     return [blurred(frame) if number in BLURRED else frame for number, frame in enumerate(frames)]
 
 

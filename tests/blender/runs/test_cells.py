@@ -63,7 +63,7 @@ def test_a_plan_says_what_the_trainer_will_do(bpy, lodgs, job_settings, root):
         assert (cell.views, cell.splats, cell.steps) == (
             len(trained & set(region.views)), p.max_splats, p.total_steps,
         )  # fmt: skip
-        assert cell.points == region.points_of(scene).sum()
+        assert cell.points == region.start_points(scene).sum()
         assert cell.megabytes == pytest.approx(planned.memory / 1e6)
         assert [names[place] for place in json.loads(cell.places)] == list(region.views)
         eyes, frames = lodgs("data.cells").eyes(root, cell)
@@ -151,7 +151,7 @@ def test_cells_are_trained_and_followed(bpy, lodgs, jobs, fake, root, tmp_path):
     watch = jobs.start(root, str(tmp_path / "run"))
     assert lodgs("training.runs.job").Job.from_file(tmp_path / "run" / "job.toml").cells == "2x1"
     _wait(watch, lambda: [block["step"] for block in watch.blocks] == [STEPS // 2] * 2)
-    assert _states(watch) == ["running"] * 2 and watch.share == 0.5
+    assert _states(watch) == ["running"] * 2 and watch.fraction == 0.5
     assert len(settings.planned_cells) == 2, "for the list, though nothing was planned"
     (tmp_path / "run" / "go on").touch()
     jobs.follow(watch)

@@ -5,20 +5,20 @@ import time
 import numpy as np
 import pytest
 
-from tests.training.scenes.walls import EYES, photograph
+from tests.training.scenes.walls import CAMERA_POSITIONS, render_photo
 from training.scenes.cameras import look_at
 from training.scenes.colmap import read_scene
+from training.scenes.colmap_model import make_intrinsics, write_model
 from training.scenes.images import write_png
-from training.scenes.model import make_intrinsics, write_model
-from training.scenes.undistort import already_undistorted
+from training.scenes.undistort import cached_undistorted_scene
 
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory):
     folder = tmp_path_factory.mktemp("walk") / "photos"
     folder.mkdir()
-    for number, eye in enumerate(EYES):
-        write_png(folder / f"{number}.png", photograph(eye))
+    for number, eye in enumerate(CAMERA_POSITIONS):
+        write_png(folder / f"{number}.png", render_photo(eye))
     return folder
 
 
@@ -34,7 +34,7 @@ def test_photos_become_a_scene(bpy, lodgs, photos):
         obj.matrix_world.translation for obj in sorted(root.lodgs.cameras.objects, key=lambda o: o.name)
     ])  # fmt: skip
     distances, expected = (
-        np.linalg.norm(positions[:, None] - positions[None], axis=2) for positions in (cameras, EYES)
+        np.linalg.norm(positions[:, None] - positions[None], axis=2) for positions in (cameras, CAMERA_POSITIONS)
     )
     np.testing.assert_allclose(distances / distances.sum() * expected.sum(), expected, atol=0.05)
 
@@ -69,10 +69,10 @@ def distorted(tmp_path):
     """A scene with lens distortion."""
     names, random = ("a.png", "b.png", "c.png"), np.random.default_rng(0)
     lens = make_intrinsics("OPENCV", 320, 240, np.array([260.0, 262.0, 158.0, 121.0, 0.1, -0.02, 0.005, -0.004]))
-    poses = [look_at(eye, np.array([0.0, 0.6, 0.4]), (0, 0, 1)) for eye in EYES]
+    poses = [look_at(eye, np.array([0.0, 0.6, 0.4]), (0, 0, 1)) for eye in CAMERA_POSITIONS]
     (tmp_path / "distorted" / "images").mkdir(parents=True)
-    for name, eye in zip(names, EYES, strict=False):
-        write_png(tmp_path / "distorted" / "images" / name, photograph(eye))
+    for name, eye in zip(names, CAMERA_POSITIONS, strict=False):
+        write_png(tmp_path / "distorted" / "images" / name, render_photo(eye))
     write_model(
         tmp_path / "distorted" / "sparse" / "0", [lens] * 3, list(zip(names, poses, strict=False)),
         random.normal(size=(50, 3)), np.full((50, 3), 99, np.uint8),
@@ -85,7 +85,7 @@ def test_distorted_scene_shows_undistorted_photos(bpy, lodgs, distorted):
         assert bpy.ops.lodgs.import_colmap(directory=str(distorted), upright=False) == {"FINISHED"}
         root = lodgs("data.scenes").active_root(bpy.context)
         scene = read_scene(distorted)
-        straight = already_undistorted(scene)
+        straight = cached_undistorted_scene(scene)
         assert scene.distorted and straight is not None and not straight.distorted
         views = lodgs("data.photographs").views(root)
         assert len(views) == len(straight.cameras) == 3

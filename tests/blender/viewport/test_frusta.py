@@ -26,7 +26,7 @@ def test_it_is_the_dome_that_training_places(lodgs, root):
     viewpoints, settings = lodgs("data.viewpoints"), root.lodgs.training
     settings.views = 10
     views, shells = viewpoints.dome_of(root)
-    placed, _ = lodgs("training.scenes.viewpoints").dome(splats, 10)
+    placed, _ = lodgs("training.scenes.viewpoints").dome_views(splats, 10)
     assert len(views) == 10
     middle = np.median(splats.means[splats.opacity_logits > 0], axis=0)
     for view, truth in zip(views, placed, strict=True):

@@ -13,7 +13,7 @@ from training.editing.cleaning import Cleaning
 from training.editing.edit import edit
 from training.rasterize import Gaussians, rasterize
 from training.scenes.cameras import Camera, look_at
-from training.scenes.views import tables_of
+from training.scenes.view_tables import make_view_tables
 from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
 from training.splats.formats import open_as_ply
 from training.splats.gaussians import Splats
@@ -44,7 +44,7 @@ def bundle() -> Bundle:
     )  # fmt: skip
     views = [view(name, eye, 3) for name, eye in EYES.items()]
     meta = {"antialias": True, "focal_px": FOCAL}
-    return Bundle("3dgs", [Level(1, splats)], meta=meta, tables=tables_of(views, 0.05))
+    return Bundle("3dgs", [Level(1, splats)], meta=meta, tables=make_view_tables(views, 0.05))
 
 
 def error(shown: Bundle, truth: Bundle) -> float:
@@ -73,7 +73,7 @@ def test_it_looks_about_as_the_filter_shows_it(bundle):
 def test_opacities_are_what_the_filter_leaves_in_a_view(bundle):
     """Of one view: the alpha in the middle of a splat that is drawn alone."""
     eye = EYES["a"]
-    alone = replace(bundle, tables=tables_of([view("a", eye, 3)], 0.05))
+    alone = replace(bundle, tables=make_view_tables([view("a", eye, 3)], 0.05))
     found = without_filter(alone).levels[0].rows.select(np.array([1, 4, 900]))
     own = bundle.levels[0].splats.select(np.array([1, 4, 900]))
     for row in range(3):

@@ -17,7 +17,7 @@ from training.rasterize import Gaussians, rasterize
 from training.runs.job import Job
 from training.runs.train import train
 from training.scenes.colmap import read_scene
-from training.scenes.depths import Depths
+from training.scenes.depths import DepthPriors
 from training.scenes.images import write_png
 from training.splats.bundle import read_bundle
 
@@ -34,7 +34,7 @@ def scene(walls, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def data(scene):
-    return TrainingData(scene, image_scale=0.25, test_every=3, depths=Depths(scene, "metric"))
+    return TrainingData(scene, image_scale=0.25, test_every=3, depths=DepthPriors(scene, "metric"))
 
 
 def made(name: str, data: TrainingData, weight: float):
@@ -84,7 +84,7 @@ def test_masked_out_and_held_out_depths_do_not_count(scene, data, tmp_path):
     for number in range(6):
         write_png(tmp_path / "scene" / "masks" / f"{number}.png", half)
     masked = read_scene(tmp_path / "scene")
-    known = TrainingData(masked, 0.25, 3, depths=Depths(masked, "metric")).target(0).inverse_depth
+    known = TrainingData(masked, 0.25, 3, depths=DepthPriors(masked, "metric")).target(0).inverse_depth
     assert known is not None
     assert known[:, :40].isnan().all() and known[:, 40:].isfinite().all()
 

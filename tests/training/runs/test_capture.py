@@ -14,10 +14,10 @@ from training.rasterize import Gaussians, rasterize
 from training.runs import capture
 from training.runs.capture import write_scene
 from training.runs.folder import RunFolder
-from training.scenes.cameras import read_views, write_camera
+from training.scenes.cameras import read_camera_folder, write_camera
 from training.scenes.colmap import read_scene
 from training.scenes.images import load_image
-from training.scenes.viewpoints import above, dome, walk
+from training.scenes.viewpoints import aerial_views, dome_views, walk_views
 from training.splats.bundle import read_bundle
 from training.splats.gaussians import Splats
 from training.splats.ply import write_ply
@@ -38,7 +38,7 @@ def ball() -> Splats:
 
 
 def test_a_dome_shows_all_that_is_not_astray_from_all_sides(ball):
-    views, near = dome(ball, 24, 96, 64)
+    views, near = dome_views(ball, 24, 96, 64)
     eyes = np.array([view.center for view in views]) - [5, -1, 3]
     assert np.linalg.norm(eyes.mean(axis=0)) < 0.25 * np.linalg.norm(eyes, axis=1).mean()
     for view in views:
@@ -47,7 +47,7 @@ def test_a_dome_shows_all_that_is_not_astray_from_all_sides(ball):
 
 
 def test_the_scene_has_the_splats_own_pictures_and_points_on_them(ball, tmp_path):
-    views, near = dome(ball, 12, 96, 64)
+    views, near = dome_views(ball, 12, 96, 64)
     count = write_scene(tmp_path / "scene", ball, views, near, points=2000)
     scene = read_scene(tmp_path / "scene")
     assert len(scene.points) == count > 100 and len(scene.cameras) == 12
@@ -61,7 +61,7 @@ def test_the_scene_has_the_splats_own_pictures_and_points_on_them(ball, tmp_path
 
 
 def test_pictures_of_antialiased_splats_are_so(ball, tmp_path):
-    views, near = dome(ball, 6, 96, 64)
+    views, near = dome_views(ball, 6, 96, 64)
     small = replace(ball, log_scales=ball.log_scales - np.float32(1))
     for view in views:
         write_camera(tmp_path / "cameras" / f"{view.name}.json", view, near)
@@ -83,7 +83,7 @@ def test_pictures_of_antialiased_splats_are_so(ball, tmp_path):
 
 
 def test_nothing_is_overwritten_and_nothing_half_is_left(ball, tmp_path):
-    views, near = dome(ball, 4, 48, 32)
+    views, near = dome_views(ball, 4, 48, 32)
     (tmp_path / "there").mkdir()
     with pytest.raises(LodgsError, match="exists already"):
         write_scene(tmp_path / "there", ball, views, near)
@@ -93,12 +93,12 @@ def test_nothing_is_overwritten_and_nothing_half_is_left(ball, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["there"] and not any((tmp_path / "there").iterdir())
     faint = Splats(**{**vars(ball), "opacity_logits": np.full(600, -3, np.float32)})
     with pytest.raises(LodgsError, match="no opaque splat"):
-        dome(faint, 4)
+        dome_views(faint, 4)
 
 
 def test_views_along_a_way_are_level_and_look_all_around(ball):
     way = np.array([[0, 0, 0], [3, 0, 0], [3, 0, 0], [3, 0.6, 9]], float)  # -y is up: it leads down a little
-    views, near = walk(ball, way, np.array([0.0, -2, 0]), 24, 96, 64)
+    views, near = walk_views(ball, way, np.array([0.0, -2, 0]), 24, 96, 64)
     eyes = np.array([view.center for view in views])
     on_first = eyes[:, 2] < 1e-9
     np.testing.assert_allclose(eyes[on_first, 1:], 0, atol=1e-9)
@@ -116,12 +116,12 @@ def test_views_along_a_way_are_level_and_look_all_around(ball):
     assert turned[1] < 0 < near < 1
     for odd in (way[:1], np.array([[0, 0, 0], [0, 5, 0]], float)):
         with pytest.raises(LodgsError, match="no length, or leads straight up"):
-            walk(ball, odd, np.array([0.0, -1, 0]), 6)
+            walk_views(ball, odd, np.array([0.0, -1, 0]), 6)
 
 
 def test_views_above_show_all_of_an_area_from_all_sides():
     ground = np.array([(x, y, z) for x in (-30, 30) for y in (5, 35) for z in (1, 4)], float)
-    views, near = above(ground, 200, 96, 64)
+    views, near = aerial_views(ground, 200, 96, 64)
     eyes = np.array([view.center for view in views])
     raised = eyes[0, 2] - 4
     np.testing.assert_allclose(eyes[:, 2], 4 + raised)
@@ -136,18 +136,18 @@ def test_views_above_show_all_of_an_area_from_all_sides():
     np.testing.assert_allclose(np.abs(looks[:, 2]), np.where(np.abs(looks[:, 2]) > 0.9, 1, np.sqrt(0.5)))
     places = np.random.default_rng(0).uniform((-30, 5, 1), (30, 35, 4), (300, 3))
     assert np.sum([view.sees(places) for view in views], axis=0).min() >= 4
-    assert above(ground, 200, raised=11.0)[0][7].center[2] == pytest.approx(15)
-    line, _ = above(np.array([[0, 0, 0], [0, 9, 0]], float), 9)
+    assert aerial_views(ground, 200, raised=11.0)[0][7].center[2] == pytest.approx(15)
+    line, _ = aerial_views(np.array([[0, 0, 0], [0, 9, 0]], float), 9)
     np.testing.assert_allclose(np.ptp([view.center[2] for view in line]), 0, atol=1e-9)
     for odd, says in ((ground[:0], "no opaque"), (ground[:1], "no extent")):
         with pytest.raises(LodgsError, match=says):
-            above(odd, 9)
+            aerial_views(odd, 9)
 
 
 @pytest.fixture
 def cameras(ball, tmp_path):
     """A folder of camera files, of two lenses."""
-    views, near = dome(ball, 8, 96, 64)
+    views, near = dome_views(ball, 8, 96, 64)
     for number, view in enumerate(views):
         write_camera(
             tmp_path / "cameras" / f"{view.name}.json", view.resized(48, 32) if number % 2 else view, near
@@ -156,7 +156,7 @@ def cameras(ball, tmp_path):
 
 
 def test_views_may_have_lenses_of_their_own(ball, cameras, tmp_path):
-    views, near = read_views(cameras)
+    views, near = read_camera_folder(cameras)
     assert near > 0 and len({view.focal for view in views}) == 2
     assert write_scene(tmp_path / "scene", ball, views, near, points=2000) > 10
     for view, camera in zip(views, read_scene(tmp_path / "scene").cameras, strict=True):

@@ -13,11 +13,11 @@ from training.scenes.cameras import Camera, look_at
 from training.scenes.images import write_png
 from training.scenes.write_colmap import write_colmap
 
-from .walls import EYES, FOCAL, HEIGHT, WIDTH, photograph
+from .walls import CAMERA_POSITIONS, FOCAL, HEIGHT, WIDTH, render_photo
 
 
 def view(number: int) -> Camera:
-    pose = look_at(EYES[number], np.array([0.0, 0.6, 0.4]), (0, 0, 1))
+    pose = look_at(CAMERA_POSITIONS[number], np.array([0.0, 0.6, 0.4]), (0, 0, 1))
     name = f"{number}.png"
     return Camera(name, WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose)
 
@@ -39,7 +39,7 @@ def write_walls(folder: Path) -> Path:
     (folder / "images").mkdir()
     views, points = [view(number) for number in range(6)], []
     for camera in views:
-        write_png(folder / "images" / camera.name, photograph(camera.center))
+        write_png(folder / "images" / camera.name, render_photo(camera.center))
         pixels = rng.integers([WIDTH, HEIGHT], size=(50, 2))
         points.append(camera.unproject(pixels + 0.5, depth_of(camera)[pixels[:, 1], pixels[:, 0]]))
     places = np.concatenate(points)

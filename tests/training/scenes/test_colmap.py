@@ -13,9 +13,9 @@ import pytest
 from tests.training.scenes import synthetic
 from training.errors import LodgsError
 from training.scenes import colmap
-from training.scenes import model as model_files
-from training.scenes.colmap import find_models, read_scene, without
-from training.scenes.undistort import undistorted
+from training.scenes import colmap_model as model_files
+from training.scenes.colmap import exclude_views, find_models, read_scene
+from training.scenes.undistort import undistort_scene
 
 SCENES = ("fox", "saharov", "caliterra")
 VARIANTS = (
@@ -382,8 +382,8 @@ def test_a_photograph_that_gets_lost_moves_no_other_one_in_or_out_of_training(tm
     synthetic.write_scene(tmp_path, lens=synthetic.camera(lens), names=[f"{i}.png" for i in range(9)])
     (tmp_path / "images" / "1.png").unlink()
     scene = read_scene(tmp_path)
-    scene = undistorted(scene, tmp_path / "cache") if scene.distorted else scene
-    found = scene, without(scene, {"4.png": "it is damaged."})
+    scene = undistort_scene(scene, tmp_path / "cache") if scene.distorted else scene
+    found = scene, exclude_views(scene, {"4.png": "it is damaged."})
     for one in found:
         train, test = one.split(4)
         names = [camera.name for camera in test]

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from training.errors import LodgsError
 from training.scenes.colmap import read_scene
-from training.scenes.ground import find_ground, level_at_zero, plane_through, scaled_about
+from training.scenes.ground import find_ground, fit_plane, ground_placement, scaling_about
 
 UP = np.array([0.0, 0.0, 1.0])
 GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
@@ -61,12 +61,12 @@ def test_a_scene_without_a_ground_is_refused_in_a_sentence():
 
 
 def test_three_places_make_their_plane_and_more_the_one_with_least_squares():
-    normal, middle = plane_through([[0, 0, 1], [1, 0, 2], [0, 1, 1]], UP)
+    normal, middle = fit_plane([[0, 0, 1], [1, 0, 2], [0, 1, 1]], UP)
     np.testing.assert_allclose(normal, np.array([-1, 0, 1]) / np.sqrt(2), atol=1e-12)
     np.testing.assert_allclose(middle, [1 / 3, 1 / 3, 4 / 3])
     rng = np.random.default_rng(0)
     places = rng.normal(size=(40, 3)) * (3, 2, 0.1) @ Rotation.random(random_state=0).as_matrix()
-    normal, middle = plane_through(places, UP)
+    normal, middle = fit_plane(places, UP)
     least = np.square((places - middle) @ normal).sum()
     for _ in range(300):  # no plane nearby is nearer
         other = normal + rng.normal(0, 0.02, 3)
@@ -81,7 +81,7 @@ def test_three_places_make_their_plane_and_more_the_one_with_least_squares():
 )  # fmt: skip
 def test_what_makes_no_plane_is_refused(places, words):
     with pytest.raises(LodgsError, match=words):
-        plane_through(places, UP)
+        fit_plane(places, UP)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -89,8 +89,8 @@ def test_a_plane_becomes_level_at_zero_about_its_point(seed):
     rng = np.random.default_rng(seed)
     normal = rng.normal(size=3) if seed else -UP
     normal, middle = normal / np.linalg.norm(normal), rng.normal(size=3)
-    placement = level_at_zero(normal, middle)
+    placement = ground_placement(normal, middle)
     np.testing.assert_allclose(placement.rotation @ normal, UP, atol=1e-12)
     np.testing.assert_allclose(placement.rotation @ placement.rotation.T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(placement.points(middle[None])[0], [*middle[:2], 0], atol=1e-12)
-    np.testing.assert_allclose(scaled_about(middle, 3.0).points([middle, middle + 1]), [middle, middle + 3])
+    np.testing.assert_allclose(scaling_about(middle, 3.0).points([middle, middle + 1]), [middle, middle + 3])

@@ -10,7 +10,7 @@ from training.errors import LodgsError
 from training.optimize.training_data import TrainingData
 from training.scenes.colmap import read_scene
 from training.scenes.images import load_image, load_mask, write_png
-from training.scenes.undistort import undistorted
+from training.scenes.undistort import undistort_scene
 
 from . import synthetic
 
@@ -62,7 +62,7 @@ def test_they_are_straightened_like_their_photographs(tmp_path):
     (tmp_path / "masks").mkdir()
     for name in ("a.png", "b.png"):
         write_png(tmp_path / "masks" / name, halves()[::2, ::2])  # of another size
-    scene = undistorted(read_scene(tmp_path), tmp_path / "cache")
+    scene = undistort_scene(read_scene(tmp_path), tmp_path / "cache")
     assert [camera.mask is None for camera in scene.cameras] == [False, False, True]
     for camera in scene.cameras[:2]:
         assert camera.image is not None and camera.mask is not None

@@ -8,8 +8,8 @@ import pytest
 
 from training.errors import LodgsError
 from training.scenes.cameras import Camera, look_at
-from training.scenes.colmap import Scene, observed, read_scene
-from training.scenes.regions import ENLARGED, IN_SIGHT, Region, plan_cells
+from training.scenes.colmap import Scene, observed_points, read_scene
+from training.scenes.regions import CELL_MARGIN, MIN_IMAGE_SHARE, Region, plan_cells
 
 from .synthetic import write_scene
 
@@ -54,18 +54,18 @@ def test_cells_have_equally_many_views_and_rows_stand_within_their_column(grid):
 
 def test_a_cell_is_enlarged_by_a_fifth_of_its_side(grid):
     left = min(plan_cells(grid, 2, 1), key=lambda region: eyes_in(region, grid)[:, 0].max())
-    around = left.surrounds(grid.points)
-    np.testing.assert_array_equal(around, grid.points[:, 0] < 15 + ENLARGED * 15)
+    around = left.in_enlarged_cell(grid.points)
+    np.testing.assert_array_equal(around, grid.points[:, 0] < 15 + CELL_MARGIN * 15)
 
 
 def test_borders_are_what_lies_within_a_fifth_of_the_side_of_another_cell(grid):
     """The left cell ends at 15 and is 15 wide, so 3 of it; the right one is as wide as its views, too."""
     left, right = sorted(plan_cells(grid, 2, 1), key=lambda region: eyes_in(region, grid)[:, 0].max())
     x = grid.points[:, 0]
-    np.testing.assert_array_equal(left.borders(grid.points), (x >= 12) & (x < 15))
-    np.testing.assert_array_equal(right.borders(grid.points), (x >= 15) & (x < 18))
+    np.testing.assert_array_equal(left.near_border(grid.points), (x >= 12) & (x < 15))
+    np.testing.assert_array_equal(right.near_border(grid.points), (x >= 15) & (x < 18))
     (alone,) = plan_cells(grid, 1, 1)
-    assert not alone.borders(grid.points).any() and not alone.at_seam(grid).views
+    assert not alone.near_border(grid.points).any() and not alone.as_seam(grid).views
 
 
 def test_a_seam_has_the_views_that_stand_at_borders_on_either_side(tmp_path):
@@ -73,7 +73,7 @@ def test_a_seam_has_the_views_that_stand_at_borders_on_either_side(tmp_path):
     points = np.random.default_rng(0).uniform((-9, -9, 0), (30, 9, 1), (500, 3))
     scene = scene_of(cameras, points, tmp_path)
     left = min(plan_cells(scene, 2, 1), key=lambda region: eyes_in(region, scene)[:, 0].max())
-    seam = left.at_seam(scene)  # the border lies at 9, and 9 wide is the cell: 1.8 on either side
+    seam = left.as_seam(scene)  # the border lies at 9, and 9 wide is the cell: 1.8 on either side
     assert seam.views == ("08", "10") and seam.seam and not left.seam
     np.testing.assert_array_equal(seam.cell, left.cell)
     seam.write(tmp_path / "region.json")
@@ -86,7 +86,7 @@ def test_cells_meet_those_beside_them_alone(tmp_path):
     regions = plan_cells(scene_of(cameras, points, tmp_path), 4, 1)
     for i, one in enumerate(regions):
         for j, other in enumerate(regions):
-            assert one.meets(other) == (abs(i - j) <= 1)
+            assert one.overlaps(other) == (abs(i - j) <= 1)
 
 
 def eyes_in(region, scene):
@@ -118,7 +118,7 @@ def test_a_share_of_an_image_is_that_of_a_box_worked_by_hand():
     assert _share_of_image(view, np.eye(3), part) == pytest.approx(0.25, abs=0.01)
     assert _share_of_image(view, np.eye(3), part * [[-1], [1], [1]]) == 0, "behind"
     assert _share_of_image(view, np.eye(3), np.array([[-1, 1]] * 3)) == 1, "from within"
-    assert 0 < IN_SIGHT < 1
+    assert 0 < MIN_IMAGE_SHARE < 1
 
 
 @pytest.mark.parametrize("text", [False, True])
@@ -138,15 +138,17 @@ def test_which_points_views_observe_is_what_pycolmap_says(tmp_path, text):
             if any(element.image_id in ids for element in point.track.elements)
         }
         if seen:
-            np.testing.assert_array_equal(observed(scene, names), np.isin(scene.point_ids, sorted(seen)))
+            np.testing.assert_array_equal(
+                observed_points(scene, names), np.isin(scene.point_ids, sorted(seen))
+            )
             assert 0 < len(seen) < len(scene.points)
         else:
-            assert not observed(scene, names).any()
+            assert not observed_points(scene, names).any()
     assert pycolmap.__version__
 
 
 def test_without_tracks_those_points_count_that_a_view_could_see(grid):
-    seen = observed(grid, ["00"])
+    seen = observed_points(grid, ["00"])
     np.testing.assert_array_equal(seen, grid.cameras[0].sees(grid.points))
     assert 0 < seen.sum() < len(seen)
 

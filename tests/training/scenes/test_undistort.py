@@ -15,11 +15,11 @@ import pytest
 
 from tests.training.scenes import synthetic
 from training.errors import LodgsError
-from training.scenes import apart
+from training.scenes import pycolmap_process
 from training.scenes.colmap import read_scene
 from training.scenes.color import linear_from_srgb
 from training.scenes.images import load_image
-from training.scenes.undistort import undistorted
+from training.scenes.undistort import undistort_scene
 
 
 def ramps() -> np.ndarray:
@@ -34,7 +34,7 @@ def test_every_model_becomes_the_pinhole_that_the_picture_shows(tmp_path, model)
     lens = synthetic.camera(model)
     synthetic.write_scene(tmp_path, lens, names=["a.png"], pixels=ramps())
     scene = read_scene(tmp_path)
-    result = undistorted(scene, tmp_path / "cache")
+    result = undistort_scene(scene, tmp_path / "cache")
     assert result.distorted == [] and result.warnings == []
     (camera,) = result.cameras
     np.testing.assert_allclose(camera.world_to_camera, scene.cameras[0].world_to_camera, atol=1e-12)
@@ -54,7 +54,7 @@ def test_an_ideal_fisheye_is_undone_too(tmp_path):
     """COLMAP itself copies a fisheye whose further distortion is zero."""
     lens = synthetic.camera("OPENCV_FISHEYE", [0, 0, 0, 0])
     synthetic.write_scene(tmp_path, lens, names=["a.png"], pixels=ramps())
-    result = undistorted(read_scene(tmp_path), tmp_path / "cache")
+    result = undistort_scene(read_scene(tmp_path), tmp_path / "cache")
     (camera,) = result.cameras
     assert result.distorted == []
     # r = f atan(tan) against r = f tan, at a pixel away from the middle
@@ -72,7 +72,7 @@ def test_kinds_that_pycolmap_does_not_read_are_straightened_like_a_png(tmp_path,
     synthetic.write_scene(
         tmp_path, synthetic.camera("OPENCV"), names=["a.png"], pixels=grey if suffix == "tiff" else ramps()
     )
-    (plain,) = undistorted(read_scene(tmp_path), tmp_path / "cache").cameras
+    (plain,) = undistort_scene(read_scene(tmp_path), tmp_path / "cache").cameras
     model, path = pycolmap.Reconstruction(tmp_path / "sparse/0"), tmp_path / "images" / f"a.{suffix}"
     (image,) = model.images.values()
     image.name = path.name
@@ -89,7 +89,7 @@ def test_kinds_that_pycolmap_does_not_read_are_straightened_like_a_png(tmp_path,
             f"Image.open(sys.argv[1]).{change}.save(sys.argv[2], lossless=True, tiffinfo={{274: 6}})"
         )
         subprocess.run([sys.executable, "-c", program, tmp_path / "images" / "a.png", path], check=True)
-    (camera,) = undistorted(read_scene(tmp_path), tmp_path / "cache").cameras
+    (camera,) = undistort_scene(read_scene(tmp_path), tmp_path / "cache").cameras
     assert camera.image is not None and plain.image is not None and camera.image.name == path.name
     assert (camera.width, camera.height, camera.fx) == (plain.width, plain.height, plain.fx)
     size = camera.width, camera.height
@@ -106,7 +106,7 @@ def test_names_sizes_and_missing_images(tmp_path):
         synthetic.write_image(tmp_path / "images" / name, ramps()[::2, ::2])
     (tmp_path / "images" / "c" / "absent.png").unlink()
     scene = read_scene(tmp_path)
-    result = undistorted(scene, tmp_path / "cache")
+    result = undistort_scene(scene, tmp_path / "cache")
     assert [camera.name for camera in result.cameras] == [names[0], names[1], names[3]]
     assert result.warnings == scene.warnings and len(scene.warnings) == 1
     for camera in result.cameras:
@@ -118,21 +118,21 @@ def test_the_cache_is_known_by_content(tmp_path, monkeypatch):
     synthetic.write_scene(tmp_path, synthetic.camera("RADIAL"))
     cache = tmp_path / "cache"
     scene = read_scene(tmp_path)
-    first = undistorted(scene, cache)
+    first = undistort_scene(scene, cache)
     assert [path.name for path in cache.iterdir()] == [first.folder.name]  # and nothing half done beside it
 
     synthetic.write_image(tmp_path / "images" / "a.png", ramps())
-    second = undistorted(read_scene(tmp_path), cache)
+    second = undistort_scene(read_scene(tmp_path), cache)
     assert second.folder != first.folder
 
     monkeypatch.setattr(subprocess, "Popen", None)  # whatever starts a process now, fails
-    assert undistorted(read_scene(tmp_path), cache).cameras[0].image == second.cameras[0].image
+    assert undistort_scene(read_scene(tmp_path), cache).cameras[0].image == second.cameras[0].image
 
 
 def test_a_pinhole_scene_is_returned_as_it_is(tmp_path):
     synthetic.write_scene(tmp_path)
     scene = read_scene(tmp_path)
-    assert undistorted(scene, tmp_path / "cache") is scene
+    assert undistort_scene(scene, tmp_path / "cache") is scene
     assert not (tmp_path / "cache").exists()
 
 
@@ -146,7 +146,7 @@ def test_pinhole_views_beside_distorted_ones(tmp_path):
     (model / "points3D.txt").write_text("")
     scene = read_scene(tmp_path, model=model)
     assert scene.distorted == ["b.png"]
-    kept, undone = undistorted(scene, tmp_path / "cache").cameras
+    kept, undone = undistort_scene(scene, tmp_path / "cache").cameras
     assert (kept.width, kept.height, kept.fx, kept.fy, kept.cx, kept.cy) == (96, 72, 80, 82, 47, 37)
     np.testing.assert_array_equal(load_image(kept.image, 96, 72), synthetic.noise().astype(np.float32) / 255)
     assert (undone.width, undone.height) != (96, 72)
@@ -157,16 +157,16 @@ def test_failures_are_a_sentence_and_leave_nothing(tmp_path):
     synthetic.write_scene(tmp_path, synthetic.camera("RADIAL"))
     synthetic.write_image(tmp_path / "images" / "a.png", synthetic.noise(48, 36))
     with pytest.raises(LodgsError, match="several sizes"):
-        undistorted(read_scene(tmp_path), tmp_path / "cache")
+        undistort_scene(read_scene(tmp_path), tmp_path / "cache")
     synthetic.write_image(tmp_path / "images" / "a.png", synthetic.noise())
     (tmp_path / "sparse" / "0" / "points3D.bin").unlink()
     with pytest.raises(LodgsError, match="could not be undone") as error:
-        undistorted(read_scene(tmp_path), tmp_path / "cache")
+        undistort_scene(read_scene(tmp_path), tmp_path / "cache")
     assert "Traceback" not in str(error.value) and error.value.remedy
     assert os.listdir(tmp_path / "cache") == []
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(LodgsError, match="could not be undone"):
-        undistorted(read_scene(tmp_path), tmp_path / "file")
+        undistort_scene(read_scene(tmp_path), tmp_path / "file")
 
 
 def test_real_lens_keeps_points_on_their_features(shared_scenes, tmp_path):
@@ -174,7 +174,7 @@ def test_real_lens_keeps_points_on_their_features(shared_scenes, tmp_path):
     scene = read_scene(shared_scenes / "variants" / "distorted_simple_radial")
     truth = pycolmap.Reconstruction(str(scene.model))
     views = {image.name: image for image in truth.images.values()}
-    result = undistorted(scene, tmp_path)
+    result = undistort_scene(scene, tmp_path)
     assert len(result.cameras) == 32 and not result.distorted
     for camera in result.cameras[::8]:
         view = views[camera.name]
@@ -194,10 +194,10 @@ def test_a_program_that_hangs_on_a_full_disk_is_ended_and_that_is_said(monkeypat
     synthetic.write_scene(tmp_path, synthetic.camera("OPENCV"), names=["a.png"], pixels=ramps())
     scene = read_scene(tmp_path)
     assert scene.distorted
-    real, room = subprocess.Popen, apart._require_room
+    real, room = subprocess.Popen, pycolmap_process._require_room
     hangs = [sys.executable, "-c", "import sys, time; sys.stdin.readline(); time.sleep(600)"]
-    monkeypatch.setattr(apart.subprocess, "Popen", lambda _, **settings: real(hangs, **settings))
-    monkeypatch.setattr(apart, "LOOKS", 0.05)
+    monkeypatch.setattr(pycolmap_process.subprocess, "Popen", lambda _, **settings: real(hangs, **settings))
+    monkeypatch.setattr(pycolmap_process, "CHECK_SECONDS", 0.05)
     full = []
 
     def looks(folder):
@@ -206,9 +206,9 @@ def test_a_program_that_hangs_on_a_full_disk_is_ended_and_that_is_said(monkeypat
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         room(folder)
 
-    monkeypatch.setattr(apart, "_require_room", looks)
+    monkeypatch.setattr(pycolmap_process, "_require_room", looks)
     with pytest.raises(LodgsError, match="No space left on device"):
-        undistorted(scene, tmp_path / "cache")
+        undistort_scene(scene, tmp_path / "cache")
     assert not list((tmp_path / "cache").iterdir())
 
 
@@ -222,8 +222,8 @@ def test_nobody_undistorts_for_a_process_that_was_killed(tmp_path):
         os.link(tmp_path / "large.png", tmp_path / "images" / name)
     program = (
         "import sys; from pathlib import Path; from training.scenes.colmap import read_scene;"
-        "from training.scenes.undistort import undistorted;"
-        "undistorted(read_scene(Path(sys.argv[1])), Path(sys.argv[1]) / 'cache')"
+        "from training.scenes.undistort import undistort_scene;"
+        "undistort_scene(read_scene(Path(sys.argv[1])), Path(sys.argv[1]) / 'cache')"
     )
     parent = subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], cwd=Path(__file__).parents[3])
     while not (made := list(tmp_path.glob("cache/undistorting-*/undistorted/images/*"))):

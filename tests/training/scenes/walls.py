@@ -7,11 +7,11 @@ import numpy as np
 from training.scenes.cameras import look_at
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
-EYES = np.array([(0.45 * n - 1.2, -3.2 + 0.1 * (n % 3), 1.2 + 0.15 * (n % 2)) for n in range(6)])
+CAMERA_POSITIONS = np.array([(0.45 * n - 1.2, -3.2 + 0.1 * (n % 3), 1.2 + 0.15 * (n % 2)) for n in range(6)])
 FLOOR, WALL = (np.random.default_rng(number).random((640, 640)) for number in (1, 2))
 
 
-def photograph(eye: np.ndarray) -> np.ndarray:
+def render_photo(eye: np.ndarray) -> np.ndarray:
     """A floor at z = 0 and a wall at y = 1, both of random squares, seen from an eye: (H, W, 3) uint8."""
     pose = look_at(eye, np.array([0.0, 0.6, 0.4]), (0, 0, 1))
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ...scenes.views import TABLES
+from ...scenes.view_tables import VIEW_TABLES
 from ...splats.bundle import MAX_LEVELS, Bundle, Level
 from ...splats.gaussians import Splats
 from ..rules.bands import RULE as BANDS
@@ -212,6 +212,6 @@ def complete_levels(bundle: Bundle) -> Bundle:
         Level(number, splats.select((own <= size) & (above > size)), {"s_min": size})
         for number, size in enumerate(reversed(cuts), 1)
     ]
-    tables = {name: table for name, table in bundle.tables.items() if name in TABLES}
+    tables = {name: table for name, table in bundle.tables.items() if name in VIEW_TABLES}
     controls = {"gamma": bundle.controls.get("pixels", RULE.controls[0].default), "first": 1}
     return replace(bundle, levels=levels, rule=BANDS.name, controls=controls, tables=tables)

@@ -25,7 +25,7 @@ from ...optimize.schedules import log_linear
 from ...optimize.training_data import TrainingData
 from ...rasterize import Gaussians, contributions
 from ...rasterize.adam import LearningRate
-from ...scenes.cameras import Camera, evenly
+from ...scenes.cameras import Camera, pick_evenly
 from ...splats.bundle import Level
 from . import FlodParameters
 
@@ -191,7 +191,7 @@ def _views_drawing(
     """In how many of VIEWS_COUNTED training views each of a level's splats (N,) is drawn."""
     places = means.cpu().numpy()
     views = np.zeros(len(places), np.int64)
-    for camera in evenly(data.train, VIEWS_COUNTED):
+    for camera in pick_evenly(data.train, VIEWS_COUNTED):
         shown = _weights(places, number, s_min, camera, values) > 0
         views += shown & camera.sees(places, data.near)
     return views

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ...rasterize import rasterize
-from ...scenes.cameras import Camera, evenly
+from ...scenes.cameras import Camera, pick_evenly
 from .composite import IndexedLevel, Rows, Stack, filtered, rows_seen
 
 MOST_CURVES = 5
@@ -44,7 +44,7 @@ class Thresholds:
         std: Callable[[float], float],
         antialias: bool = False,
     ) -> None:
-        self._cameras = evenly(cameras, VIEWS)
+        self._cameras = pick_evenly(cameras, VIEWS)
         self._near, self._backend, self._prune_weight, self._std = near, backend, prune_weight, std
         self._antialias = antialias
 

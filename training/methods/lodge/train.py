@@ -20,7 +20,7 @@ from ...optimize.model import NAMES
 from ...optimize.pruning import least_importance, room_taken_over
 from ...optimize.training_data import TrainingView
 from ...rasterize import Gaussians, photometric_loss
-from ...scenes.cameras import evenly
+from ...scenes.cameras import pick_evenly
 from ...splats.bundle import Level
 from ...splats.gaussians import Splats
 from ...splats.ply import Columns
@@ -198,7 +198,7 @@ class Method(Refining):
         level, near = self._smoothed(number), self.data.near
         levels = {**self.finished, number: level}
         views, finest, others = np.zeros(len(level), np.int64), 0, 0
-        for camera in evenly(self.data.train, VIEWS_COUNTED):
+        for camera in pick_evenly(self.data.train, VIEWS_COUNTED):
             alone = self.finished[self.levels]
             finest += camera.sees(alone.means[alone.in_view(camera, near)], near).sum()
             for each, rows in rows_seen(levels, self.d_l, camera, near).items():

@@ -18,22 +18,22 @@ import numpy as np
 from ...errors import LodgsError
 from ...files import check_folder, link_or_copy
 from ..cameras import Camera
-from ..colmap import DEPTHS, MASKS, find_models, told
-from ..images import alike, image_size
-from ..model import write_model
-from ..photographs import image_folder
+from ..colmap import DEPTHS, MASKS, exclusion_messages, find_models
+from ..colmap_model import write_model
+from ..image_files import find_image_folder
+from ..images import image_size, same_proportions
 from . import bundler, metashape, openmvg, polycam, record3d, transforms
-from .views import Exported, View
+from .exported import ExportedScene, ExportedView
 
 FORMATS = transforms, polycam, record3d, metashape, openmvg, bundler
 """The first that finds itself in a folder is taken."""
 RANDOM_POINTS = 30_000
 """So many are put where cameras look, if a program tells of no points."""
-NAMES = ", ".join(each.NAME for each in FORMATS)
+FORMAT_NAMES = ", ".join(each.NAME for each in FORMATS)
 
 
 @dataclass(frozen=True)
-class Converted:
+class ConvertedScene:
     """A COLMAP scene that has been made.
 
     Attributes:
@@ -68,19 +68,19 @@ def find_export(folder: Path) -> tuple[ModuleType, Path] | None:
     return found[0] if len(found) == 1 else None
 
 
-def colmap_scene(folder: Path, warn: Callable[[str], object]) -> Path:
+def ensure_colmap_scene(folder: Path, warn: Callable[[str], object]) -> Path:
     """The folder itself; what another program has exported there is a COLMAP scene from then on.
 
     Raises:
-        LodgsError: as :func:`convert`.
+        LodgsError: as :func:`convert_export`.
     """
     if folder.is_dir() and not find_models(folder) and find_export(folder):
-        for message in convert(folder).warnings:
+        for message in convert_export(folder).warnings:
             warn(message)
     return folder
 
 
-def convert(folder: Path, out: Path | None = None) -> Converted:
+def convert_export(folder: Path, out: Path | None = None) -> ConvertedScene:
     """Makes a COLMAP scene of what another program has exported: its model in ``sparse/0``.
 
     Args:
@@ -97,7 +97,9 @@ def convert(folder: Path, out: Path | None = None) -> Converted:
         is_scene = bool(find_models(folder))
         raise LodgsError(
             f"{folder} is a COLMAP scene as it is." if is_scene else f"{folder} is no export that is known.",
-            "Import it." if is_scene else f"Known are {NAMES}; or choose the folder of a COLMAP scene.",
+            "Import it."
+            if is_scene
+            else f"Known are {FORMAT_NAMES}; or choose the folder of a COLMAP scene.",
         )
     format_, path = found
     scene = folder if out is None else out
@@ -108,14 +110,14 @@ def convert(folder: Path, out: Path | None = None) -> Converted:
     if not views:
         why = f" {left_out[0][0]}: {left_out[0][1]}" if left_out else ""
         raise LodgsError(f"{path} has no view that can be used.{why}", "Check the photographs beside it.")
-    warnings = [*exported.warnings, *told(left_out)]
+    warnings = [*exported.warnings, *exclusion_messages(left_out)]
     if unmasked := [view.mask for view in views if view.mask is not None and not view.mask.is_file()]:
         warnings.append(f"{len(unmasked)} masks are missing, such as {unmasked[0]}: nothing is masked there.")
     points, colors = exported.points, exported.colors
     if not len(points) and all(view.has_depth for view in views):
         warnings.append(f"{format_.NAME} tells of no points here: training takes them from the depth maps.")
     elif not len(points):
-        points = random_points([view.camera(str(n)) for n, view in enumerate(views)])
+        points = random_start_points([view.camera(str(n)) for n, view in enumerate(views)])
         colors = np.full((len(points), 3), 128, np.uint8)
         warnings.append(
             f"{format_.NAME} tells of no points here: {len(points):,} stand at random where cameras look."
@@ -127,10 +129,10 @@ def convert(folder: Path, out: Path | None = None) -> Converted:
             f"The COLMAP scene {scene} could not be written: {error.strerror or error}.",
             "Choose another folder to write to (lodgs scene --from DIR --out DIR).",
         ) from error
-    return Converted(scene, format_.NAME, len(views), len(points), warnings)
+    return ConvertedScene(scene, format_.NAME, len(views), len(points), warnings)
 
 
-def random_points(cameras: list[Camera], count: int = RANDOM_POINTS) -> np.ndarray:
+def random_start_points(cameras: list[Camera], count: int = RANDOM_POINTS) -> np.ndarray:
     """Places (N, 3) that at least two views see, if any two see the same, to begin training with.
 
     They lie on random pixels' rays, about as far as what the cameras look at together: the place nearest to
@@ -162,7 +164,7 @@ def random_points(cameras: list[Camera], count: int = RANDOM_POINTS) -> np.ndarr
     return (shared if len(shared) >= count // 10 else points)[:count]
 
 
-def _usable(exported: Exported) -> tuple[list[View], list[tuple[str, str]]]:
+def _usable(exported: ExportedScene) -> tuple[list[ExportedView], list[tuple[str, str]]]:
     """Views with photographs and possible cameras, and why others are left out."""
     views, left_out = [], list(exported.left_out)
     for view in exported.views:
@@ -173,7 +175,7 @@ def _usable(exported: Exported) -> tuple[list[View], list[tuple[str, str]]]:
             left_out.append((name, error.what))
             continue
         lens = view.lens
-        if not alike(*size, lens.width, lens.height):
+        if not same_proportions(*size, lens.width, lens.height):
             shape = f"{lens.width}x{lens.height}: it was turned or cropped."
             left_out.append((name, f"it is {size[0]}x{size[1]}, and its camera's pictures are {shape}"))
             continue
@@ -185,7 +187,7 @@ def _usable(exported: Exported) -> tuple[list[View], list[tuple[str, str]]]:
     return views, left_out
 
 
-def _write(scene: Path, views: list[View], points: np.ndarray, colors: np.ndarray) -> None:
+def _write(scene: Path, views: list[ExportedView], points: np.ndarray, colors: np.ndarray) -> None:
     """The model whole or not at all; photographs first, where the scene is another folder than theirs."""
     sparse = scene / "sparse"
     try:
@@ -195,7 +197,7 @@ def _write(scene: Path, views: list[View], points: np.ndarray, colors: np.ndarra
     if not images.is_relative_to(scene):
         for view in views:
             link_or_copy(view.image, scene / "images" / view.image.relative_to(images))
-    elif image_folder(scene, sparse / "0", [view.image.name for view in views]) != images:
+    elif find_image_folder(scene, sparse / "0", [view.image.name for view in views]) != images:
         images = scene
     sparse.mkdir(parents=True, exist_ok=True)
     for view in views:

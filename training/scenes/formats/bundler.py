@@ -14,9 +14,9 @@ import numpy as np
 
 from ...documents import open_file
 from ...errors import LodgsError
+from ..colmap_model import make_intrinsics
 from ..images import image_size
-from ..model import intrinsics
-from .views import OPENGL, Exported, View, find_image, world_to_camera
+from .exported import OPENGL, ExportedScene, ExportedView, find_image, invert_pose
 
 NAME = "Bundler"
 MOST_BYTES = 1 << 28
@@ -34,7 +34,7 @@ def find(folder: Path) -> Path | None:
     return None
 
 
-def read(path: Path) -> Exported:
+def read(path: Path) -> ExportedScene:
     """Views and points.
 
     Raises:
@@ -62,13 +62,13 @@ def read(path: Path) -> Exported:
             if not focal > 0:
                 raise LodgsError("Bundler has found no camera of it.")
             width, height = image_size(image)
-            lens = intrinsics("RADIAL", width, height, np.array([focal, width / 2, height / 2, k1, k2]))
+            lens = make_intrinsics("RADIAL", width, height, np.array([focal, width / 2, height / 2, k1, k2]))
             matrix = np.eye(4)
             matrix[:3, :3], matrix[:3, 3] = np.reshape(pose[:9], (3, 3)), pose[9:]
-            views.append(View(image, lens, world_to_camera(np.linalg.inv(OPENGL @ matrix))))
+            views.append(ExportedView(image, lens, invert_pose(np.linalg.inv(OPENGL @ matrix))))
         except (LodgsError, ValueError, np.linalg.LinAlgError) as error:
             left_out.append((name, error.what if isinstance(error, LodgsError) else f"{error}."))
-    return Exported(views, places, colors.clip(0, 255).astype(np.uint8), left_out)
+    return ExportedScene(views, places, colors.clip(0, 255).astype(np.uint8), left_out)
 
 
 def _numbers(lines: Sequence[bytes], shape: tuple[int, int]) -> np.ndarray:

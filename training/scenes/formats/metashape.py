@@ -16,9 +16,17 @@ import numpy as np
 from ...documents import open_file
 from ...errors import LodgsError
 from ..colmap import MASKS
-from ..images import SUFFIXES
-from ..model import Intrinsics
-from .views import Exported, View, find_image, lens_of, number, numbers, world_to_camera
+from ..colmap_model import Intrinsics
+from ..images import IMAGE_SUFFIXES
+from .exported import (
+    ExportedScene,
+    ExportedView,
+    colmap_lens,
+    find_image,
+    get_number,
+    invert_pose,
+    parse_array,
+)
 
 NAME = "Metashape XML"
 MOST_BYTES = 1 << 26
@@ -40,7 +48,7 @@ def find(folder: Path) -> Path | None:
     return None
 
 
-def read(path: Path) -> Exported:
+def read(path: Path) -> ExportedScene:
     """Views of the first chunk, in the axes of its largest component, in metres where these are known.
 
     Other components, which Metashape has aligned by themselves, come along where it knows their place. The
@@ -81,12 +89,12 @@ def read(path: Path) -> Exported:
             lens = lenses.get(camera.get("sensor_id", ""))
             if not isinstance(lens, Intrinsics):
                 raise lens or LodgsError("it has no lens.")
-            pose = np.linalg.solve(place, its @ numbers(transform.split(), 4, 4))
+            pose = np.linalg.solve(place, its @ parse_array(transform.split(), 4, 4))
             pose[:3, 3] *= scale
-            views.append(View(files.find(camera), lens, world_to_camera(pose)))
+            views.append(ExportedView(files.find(camera), lens, invert_pose(pose)))
         except LodgsError as error:
             left_out.append((label, error.what))
-    return Exported(views, left_out=left_out)
+    return ExportedScene(views, left_out=left_out)
 
 
 def _parsed(path: Path) -> Element:
@@ -122,8 +130,8 @@ def _lens(sensor: Element) -> Intrinsics:
         raise LodgsError("its k4 is of a lens that COLMAP does not have; fix it at 0 in Metashape.")
     if abs(told.get("b2", 0.0)) > 0.5:
         raise LodgsError("its b2 is of a lens that COLMAP does not have; fix it at 0 in Metashape.")
-    focal = number(told, "f")
-    return lens_of(
+    focal = get_number(told, "f")
+    return colmap_lens(
         width, height, (focal + told.get("b1", 0.0), focal),
         (width / 2 + told.get("cx", 0.0), height / 2 + told.get("cy", 0.0)),
         tuple(told.get(name, 0.0) for name in ("k1", "k2", "k3", "k4")),
@@ -139,9 +147,9 @@ def _place(part: Element) -> np.ndarray | None:
     place = np.eye(4)
     try:
         scale = float(told.findtext("scale") or 1.0)
-        place[:3, :3] = scale * numbers((told.findtext("rotation") or "1 0 0 0 1 0 0 0 1").split(), 3, 3)
-        place[:3, 3] = numbers((told.findtext("translation") or "0 0 0").split(), 3)
-        world_to_camera(place)
+        place[:3, :3] = scale * parse_array((told.findtext("rotation") or "1 0 0 0 1 0 0 0 1").split(), 3, 3)
+        place[:3, 3] = parse_array((told.findtext("translation") or "0 0 0").split(), 3)
+        invert_pose(place)
     except (LodgsError, ValueError):
         return None
     return place
@@ -171,7 +179,7 @@ class _Files:
         if self._below is None:
             self._below = {}
             for file in sorted(self._folder.rglob("*")):
-                if file.suffix.lower() in SUFFIXES and not file.is_relative_to(self._folder / MASKS):
+                if file.suffix.lower() in IMAGE_SUFFIXES and not file.is_relative_to(self._folder / MASKS):
                     for name in (file.name, file.stem):
                         self._below.setdefault(name, []).append(file)
         found = self._below.get(label, [])

@@ -14,8 +14,17 @@ from typing import Any
 import numpy as np
 
 from ...errors import LodgsError
-from ..model import Intrinsics
-from .views import Exported, View, find_image, lens_of, number, numbers, read_document, world_to_camera
+from ..colmap_model import Intrinsics
+from .exported import (
+    ExportedScene,
+    ExportedView,
+    colmap_lens,
+    find_image,
+    get_number,
+    invert_pose,
+    parse_array,
+    read_document,
+)
 
 NAME = "OpenMVG"
 _POINTS = "structure"
@@ -27,7 +36,7 @@ def find(folder: Path) -> Path | None:
     return next((folder / name for name in names if (folder / name).is_file()), None)
 
 
-def read(path: Path) -> Exported:
+def read(path: Path) -> ExportedScene:
     """Views and points; points have no colours there.
 
     Raises:
@@ -39,7 +48,7 @@ def read(path: Path) -> Exported:
         poses = {entry["key"]: entry["value"] for entry in document["extrinsics"]}
         listed = [entry["value"]["ptr_wrapper"]["data"] for entry in document["views"]]
         where = [entry["value"]["X"] for entry in document.get(_POINTS) or []]
-        points = numbers(where, -1, 3) if where else np.zeros((0, 3))
+        points = parse_array(where, -1, 3) if where else np.zeros((0, 3))
         root = str(document.get("root_path", ""))
     except (KeyError, TypeError, AttributeError) as error:
         raise LodgsError(
@@ -55,12 +64,12 @@ def read(path: Path) -> Exported:
             if pose is None:
                 raise LodgsError("OpenMVG has found no pose of it.")
             lens = _lens(lenses.get(each.get("id_intrinsic")))
-            rotation, center = numbers(pose.get("rotation"), 3, 3), numbers(pose.get("center"), 3)
+            rotation, center = parse_array(pose.get("rotation"), 3, 3), parse_array(pose.get("center"), 3)
             image = _image(path.parent, root, str(each.get("local_path", "")), name)
-            views.append(View(image, lens, world_to_camera(np.column_stack([rotation.T, center]))))
+            views.append(ExportedView(image, lens, invert_pose(np.column_stack([rotation.T, center]))))
         except (LodgsError, AttributeError, TypeError) as error:
             left_out.append((name, error.what if isinstance(error, LodgsError) else "it is damaged."))
-    return Exported(views, points, np.full((len(points), 3), 128, np.uint8), left_out)
+    return ExportedScene(views, points, np.full((len(points), 3), 128, np.uint8), left_out)
 
 
 def _lens(told: Any) -> Intrinsics:
@@ -68,22 +77,24 @@ def _lens(told: Any) -> Intrinsics:
         raise LodgsError("it has no lens.")
     if "focal_length" not in told:  # the pinhole part, of those that distort
         told = {**told.get("value0", {}), **told}
-    center = numbers(told.get("principal_point"), 2)
-    focal = number(told, "focal_length")
-    size = number(told, "width"), number(told, "height")
+    center = parse_array(told.get("principal_point"), 2)
+    focal = get_number(told, "focal_length")
+    size = get_number(told, "width"), get_number(told, "height")
     radial, tangential, fisheye = (0.0,) * 3, (0.0, 0.0), False
     for name, values in told.items():
         match name:
             case "disto_k1":
-                radial = (float(numbers(values, 1)[0]), 0.0, 0.0)
+                radial = (float(parse_array(values, 1)[0]), 0.0, 0.0)
             case "disto_k3":
-                radial = tuple(numbers(values, 3).tolist())
+                radial = tuple(parse_array(values, 3).tolist())
             case "disto_t2":
-                *k, p1, p2 = numbers(values, 5).tolist()
+                *k, p1, p2 = parse_array(values, 5).tolist()
                 radial, tangential = tuple(k), (p1, p2)
             case "fisheye":
-                radial, fisheye = tuple(numbers(values, 4).tolist()), True
-    return lens_of(*size, (focal, focal), (float(center[0]), float(center[1])), radial, tangential, fisheye)
+                radial, fisheye = tuple(parse_array(values, 4).tolist()), True
+    return colmap_lens(
+        *size, (focal, focal), (float(center[0]), float(center[1])), radial, tangential, fisheye
+    )
 
 
 def _image(folder: Path, root: str, local: str, name: str) -> Path:

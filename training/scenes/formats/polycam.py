@@ -10,7 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import LodgsError
-from .views import Exported, View, find_image, lens_of, number, read_document, world_to_camera
+from .exported import (
+    ExportedScene,
+    ExportedView,
+    colmap_lens,
+    find_image,
+    get_number,
+    invert_pose,
+    read_document,
+)
 
 NAME = "Polycam raw data"
 LEAST_SHARP = 25.0
@@ -27,7 +35,7 @@ def find(folder: Path) -> Path | None:
     return None
 
 
-def read(path: Path) -> Exported:
+def read(path: Path) -> ExportedScene:
     """Views; Polycam's points are in depth maps, of millimetres.
 
     Raises:
@@ -38,17 +46,17 @@ def read(path: Path) -> Exported:
     for file in sorted(path.glob("*.json")):
         try:
             told = read_document(file)
-            if number(told, "blur_score", LEAST_SHARP) < LEAST_SHARP:
+            if get_number(told, "blur_score", LEAST_SHARP) < LEAST_SHARP:
                 raise LodgsError("it is blurred, says Polycam.")
-            width, height = number(told, "width"), number(told, "height")
-            lens = lens_of(
-                width, height, (number(told, "fx"), number(told, "fy")),
-                (number(told, "cx", width / 2), number(told, "cy", height / 2)),
+            width, height = get_number(told, "width"), get_number(told, "height")
+            lens = colmap_lens(
+                width, height, (get_number(told, "fx"), get_number(told, "fy")),
+                (get_number(told, "cx", width / 2), get_number(told, "cy", height / 2)),
             )  # fmt: skip
-            rows = [[number(told, f"t_{row}{column}") for column in range(4)] for row in range(3)]
-            pose = world_to_camera(np.array(rows), opengl=True)
+            rows = [[get_number(told, f"t_{row}{column}") for column in range(4)] for row in range(3)]
+            pose = invert_pose(np.array(rows), opengl=True)
             depth = path.parent / "depth" / f"{file.stem}.png"
-            views.append(View(find_image(images, file.stem), lens, pose, depth=depth))
+            views.append(ExportedView(find_image(images, file.stem), lens, pose, depth=depth))
         except LodgsError as error:
             left_out.append((file.name, error.what))
-    return Exported(views, left_out=left_out)
+    return ExportedScene(views, left_out=left_out)

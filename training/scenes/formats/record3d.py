@@ -10,9 +10,17 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import LodgsError
-from ..images import SUFFIXES
-from ..model import rotation_of
-from .views import Exported, View, lens_of, number, numbers, read_document, world_to_camera
+from ..colmap_model import rotation_matrix
+from ..images import IMAGE_SUFFIXES
+from .exported import (
+    ExportedScene,
+    ExportedView,
+    colmap_lens,
+    get_number,
+    invert_pose,
+    parse_array,
+    read_document,
+)
 
 NAME = "Record3D"
 
@@ -23,7 +31,7 @@ def find(folder: Path) -> Path | None:
     return next((path for path in there if path.is_file() and (folder / "rgb").is_dir()), None)
 
 
-def read(path: Path) -> Exported:
+def read(path: Path) -> ExportedScene:
     """Views: the n-th photograph by number has the n-th pose; if some are missing, the one of the number n.
 
     Raises:
@@ -31,12 +39,14 @@ def read(path: Path) -> Exported:
     """
     told = read_document(path)
     try:
-        poses = numbers(told.get("poses"), -1, 7)
-        focal_x, focal_y, *center = numbers(told.get("K"), 3, 3).T[[0, 1, 0, 1], [0, 1, 2, 2]]
-        lens = lens_of(number(told, "w"), number(told, "h"), (focal_x, focal_y), (center[0], center[1]))
+        poses = parse_array(told.get("poses"), -1, 7)
+        focal_x, focal_y, *center = parse_array(told.get("K"), 3, 3).T[[0, 1, 0, 1], [0, 1, 2, 2]]
+        lens = colmap_lens(
+            get_number(told, "w"), get_number(told, "h"), (focal_x, focal_y), (center[0], center[1])
+        )
     except LodgsError as error:
         raise LodgsError(f"{path} is damaged: {error.what}", "Export it again.") from error
-    files = [file for file in (path.parent / "rgb").iterdir() if file.suffix.lower() in SUFFIXES]
+    files = [file for file in (path.parent / "rgb").iterdir() if file.suffix.lower() in IMAGE_SUFFIXES]
     files.sort(key=lambda file: (len(file.stem), file.stem))
     by_number = dict(enumerate(files))
     if len(files) != len(poses):
@@ -53,10 +63,10 @@ def read(path: Path) -> Exported:
             left_out.append((f"frame {place}", "it has no photograph."))
             continue
         try:
-            views.append(View(file, lens, world_to_camera(_matrix(pose), opengl=True)))
+            views.append(ExportedView(file, lens, invert_pose(_matrix(pose), opengl=True)))
         except LodgsError as error:
             left_out.append((file.name, error.what))
-    return Exported(views, left_out=left_out)
+    return ExportedScene(views, left_out=left_out)
 
 
 def _matrix(pose: np.ndarray) -> np.ndarray:
@@ -67,4 +77,4 @@ def _matrix(pose: np.ndarray) -> np.ndarray:
     """
     if not pose[:4].any():
         raise LodgsError("its pose is no rotation and translation.")
-    return np.column_stack([rotation_of(pose[[3, 0, 1, 2]]), pose[4:]])
+    return np.column_stack([rotation_matrix(pose[[3, 0, 1, 2]]), pose[4:]])

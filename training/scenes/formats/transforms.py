@@ -12,8 +12,17 @@ from typing import Any
 
 from ...errors import LodgsError
 from ..images import image_size
-from .ply import read_points
-from .views import Exported, View, find_image, lens_of, number, numbers, read_document, world_to_camera
+from .exported import (
+    ExportedScene,
+    ExportedView,
+    colmap_lens,
+    find_image,
+    get_number,
+    invert_pose,
+    parse_array,
+    read_document,
+)
+from .point_cloud import read_points
 
 NAME = "transforms.json"
 _FILES = "transforms.json", "transforms_train.json"
@@ -25,7 +34,7 @@ def find(folder: Path) -> Path | None:
     return next((folder / name for name in _FILES if (folder / name).is_file()), None)
 
 
-def read(path: Path) -> Exported:
+def read(path: Path) -> ExportedScene:
     """Views, and points if a PLY is named.
 
     Of a scene in several files (train, val, test) the training views alone are read.
@@ -49,39 +58,39 @@ def read(path: Path) -> Exported:
     cloud = document.get("ply_file_path")
     if isinstance(cloud, str):
         try:
-            return Exported(views, *read_points(find_image(path.parent, cloud)), left_out)
+            return ExportedScene(views, *read_points(find_image(path.parent, cloud)), left_out)
         except LodgsError as error:
-            return Exported(views, left_out=left_out, warnings=[error.what])
-    return Exported(views, left_out=left_out)
+            return ExportedScene(views, left_out=left_out, warnings=[error.what])
+    return ExportedScene(views, left_out=left_out)
 
 
-def _view(folder: Path, told: Mapping[str, Any]) -> View:
+def _view(folder: Path, told: Mapping[str, Any]) -> ExportedView:
     if not isinstance(told.get("file_path"), str):
         raise LodgsError("it names no file.")
     image = find_image(folder, told["file_path"])
-    width, height = number(told, "w", 0), number(told, "h", 0)
+    width, height = get_number(told, "w", 0), get_number(told, "h", 0)
     if not (width > 0 and height > 0):
         width, height = image_size(image)
     if "fl_x" in told:
-        fx = number(told, "fl_x")
-        fy = number(told, "fl_y", fx)
+        fx = get_number(told, "fl_x")
+        fy = get_number(told, "fl_y", fx)
     else:
-        fx = _focal(number(told, "camera_angle_x"), width)
-        fy = _focal(number(told, "camera_angle_y"), height) if "camera_angle_y" in told else fx
-    center = number(told, "cx", width / 2), number(told, "cy", height / 2)
+        fx = _focal(get_number(told, "camera_angle_x"), width)
+        fy = _focal(get_number(told, "camera_angle_y"), height) if "camera_angle_y" in told else fx
+    center = get_number(told, "cx", width / 2), get_number(told, "cy", height / 2)
     kind = str(told.get("camera_model", "")).upper()
     if kind not in _PERSPECTIVE:
         raise LodgsError(f"its camera model {kind} is none that is known here.")
     fisheye = kind == "OPENCV_FISHEYE" or told.get("is_fisheye") is True
-    radial = tuple(number(told, f"k{n}", 0) for n in range(1, 7))
+    radial = tuple(get_number(told, f"k{n}", 0) for n in range(1, 7))
     if not fisheye and radial[3] and not any(radial[4:]):
         raise LodgsError("its k4 is of a lens that COLMAP does not have.")
-    tangential = (0.0, 0.0) if fisheye else (number(told, "p1", 0), number(told, "p2", 0))
-    lens = lens_of(width, height, (fx, fy), center, radial, tangential, fisheye)
-    pose = numbers(told.get("transform_matrix"), -1, 4)
+    tangential = (0.0, 0.0) if fisheye else (get_number(told, "p1", 0), get_number(told, "p2", 0))
+    lens = colmap_lens(width, height, (fx, fy), center, radial, tangential, fisheye)
+    pose = parse_array(told.get("transform_matrix"), -1, 4)
     beside = (told.get(name) for name in ("mask_path", "depth_file_path"))
     mask, depth = (find_image(folder, name) if isinstance(name, str) else None for name in beside)
-    return View(image, lens, world_to_camera(pose, opengl=True), mask, depth)
+    return ExportedView(image, lens, invert_pose(pose, opengl=True), mask, depth)
 
 
 def _focal(angle: float, size: float) -> float:

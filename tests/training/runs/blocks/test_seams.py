@@ -87,7 +87,7 @@ def test_colours_and_opacities_at_borders_come_from_seams_and_nothing_else_does(
     for seam in division.seams:
         write_surroundings(division, seam)
         begun = read_ply(seam.folder.base)
-        borders = seam.region.borders(begun.means)
+        borders = seam.region.near_border(begun.means)
         inside = np.abs(x_of(begun)[:, None] - [-0.3, 0.4]).min(axis=1) < 0.1
         np.testing.assert_array_equal(borders, inside & seam.region.contains(begun.means))
         moved = replace(

@@ -18,13 +18,15 @@ from ..splats.similarity import Similarity
 from .cameras import Camera, camera_from_dict
 
 VIEWS, NAMES = "views", "view_names"
-TABLES = (VIEWS, NAMES)
+VIEW_TABLES = (VIEWS, NAMES)
 """What no rule reads, and removing splats does not touch."""
 _POSE = tuple(f"w2c_{row}{column}" for row in range(3) for column in range(4))
 _LENS = ("fx", "fy", "cx", "cy")
 
 
-def tables_of(cameras: Sequence[Camera], near: float, held_out: Collection[str] = ()) -> dict[str, Columns]:
+def make_view_tables(
+    cameras: Sequence[Camera], near: float, held_out: Collection[str] = ()
+) -> dict[str, Columns]:
     """The tables of views by name; none where there are no views.
 
     Args:
@@ -47,8 +49,8 @@ def tables_of(cameras: Sequence[Camera], near: float, held_out: Collection[str] 
     return {VIEWS: views, NAMES: {"utf8": np.frombuffer(names, np.uint8)}}
 
 
-def views_in(tables: dict[str, Columns]) -> tuple[list[Camera], float, set[str]]:
-    """What :func:`tables_of` was told: the views of a bundle, the depth at which drawing begins, and which of
+def read_view_tables(tables: dict[str, Columns]) -> tuple[list[Camera], float, set[str]]:
+    """What :func:`make_view_tables` was told: the views of a bundle, the depth at which drawing begins, and which of
     them by name training did not see. No views where the tables are missing.
 
     Raises:
@@ -78,7 +80,7 @@ def views_in(tables: dict[str, Columns]) -> tuple[list[Camera], float, set[str]]
         ) from error
 
 
-def placed(views: Columns, placement: Similarity) -> Columns:
+def transform_views(views: Columns, placement: Similarity) -> Columns:
     """The table ``views`` of a scene that stands elsewhere: the pictures stay the same."""
     found, (turn, shift) = dict(views), (placement.rotation, placement.translation)
     poses = np.stack([views[name] for name in _POSE], axis=1).astype(np.float64).reshape(-1, 3, 4)

@@ -10,7 +10,16 @@ from training.__main__ import main
 from training.scenes.cameras import Camera, look_at, write_camera
 from training.scenes.colmap import read_scene
 from training.scenes.images import write_png
-from training.scenes.rendered import AWAY, SKY, Sky, coverage, even, read_depth, spread, write_model
+from training.scenes.rendered_views import (
+    MIN_SKY_DISTANCE,
+    SKY_DEPTH,
+    Sky,
+    read_exr_depth,
+    sample_coverage,
+    thin_by_grid,
+    thin_evenly,
+    write_rendered_model,
+)
 
 WIDTH, HEIGHT, NOTHING = 64, 48, 1e10
 
@@ -41,7 +50,7 @@ def seen(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         root = b**2 - a * (((eye - [0, 0, 1]) ** 2).sum() - 1)
         ball = np.where(root > 0, (-b - np.sqrt(root)) / a, NOTHING)
     color = np.select(
-        [ball[..., None] < ground[..., None], ground[..., None] < SKY], [[200, 0, 0], [0, 90, 0]], 60
+        [ball[..., None] < ground[..., None], ground[..., None] < SKY_DEPTH], [[200, 0, 0], [0, 90, 0]], 60
     )
     return np.minimum(ball, ground), color.astype(np.uint8)
 
@@ -74,7 +83,7 @@ def test_points_lie_on_what_is_seen_in_its_colours(tmp_path):
     assert ball.sum() > 100 and ground.sum() > 100
     sky = ~ball & ~ground
     away = np.linalg.norm(points[sky] - np.mean([camera.center for camera in cameras], axis=0), axis=1)
-    assert away == pytest.approx(AWAY * 5, rel=1e-5), "the sky is a sphere far beyond"
+    assert away == pytest.approx(MIN_SKY_DISTANCE * 5, rel=1e-5), "the sky is a sphere far beyond"
     assert 0 < sky.mean() <= 0.1 and (scene.point_colors[sky] == 60).all()
     assert 4 < scene.median_depth() < 7, "which is not what the scene is measured by"
     np.testing.assert_array_equal(scene.point_colors[ball & ~ground], [[200, 0, 0]] * (ball & ~ground).sum())
@@ -83,8 +92,8 @@ def test_points_lie_on_what_is_seen_in_its_colours(tmp_path):
 
 def test_coverage_counts_the_views_that_see_a_place():
     cameras = views()
-    depths = [np.where(depth < SKY, depth, 0) for depth, _ in map(seen, cameras)]
-    points, counts = coverage(cameras, depths, 3000)
+    depths = [np.where(depth < SKY_DEPTH, depth, 0) for depth, _ in map(seen, cameras)]
+    points, counts = sample_coverage(cameras, depths, 3000)
     assert 1000 < len(points) <= 3000 and counts.min() >= 1
     for kind in (np.abs(points[:, 2]) < 1e-6, np.abs(np.linalg.norm(points - [0, 0, 1], axis=1) - 1) < 1e-6):
         assert kind.sum() > 100
@@ -101,14 +110,14 @@ def test_coverage_counts_the_views_that_see_a_place():
         most += camera.sees(points) & (slack > -1)
     assert (counts <= most).all() and (counts >= least).all()
     assert least.max() >= 2 and most.min() <= 2, "there is something to tell apart"
-    assert len(coverage(cameras, [np.zeros((4, 6))] * len(cameras), 100)[0]) == 0
-    assert len(coverage([], [], 100)[0]) == 0
+    assert len(sample_coverage(cameras, [np.zeros((4, 6))] * len(cameras), 100)[0]) == 0
+    assert len(sample_coverage([], [], 100)[0]) == 0
 
 
 def test_a_model_is_made_anew_whole(tmp_path):
     draw(tmp_path, views())
-    _, before = write_model(tmp_path)
-    views_count, count = write_model(tmp_path, most=200)
+    _, before = write_rendered_model(tmp_path)
+    views_count, count = write_rendered_model(tmp_path, most=200)
     assert views_count == 6 and count <= 200 < before
     assert len(read_scene(tmp_path).points) == count
     assert {path.name for path in tmp_path.iterdir()} == {"cameras", "depths", "images", "sparse"}
@@ -119,9 +128,9 @@ def test_nothing_is_no_sky_where_pictures_are_transparent(tmp_path):
     draw(tmp_path, cameras)
     for camera in cameras:
         depth, color = seen(camera)
-        alpha = np.where(depth < SKY, 255, 0)[..., None].astype(np.uint8)
+        alpha = np.where(depth < SKY_DEPTH, 255, 0)[..., None].astype(np.uint8)
         write_png(tmp_path / "images" / f"{camera.name}.png", np.concatenate([color, alpha], axis=2))
-    write_model(tmp_path)
+    write_rendered_model(tmp_path)
     scene = read_scene(tmp_path)
     assert len(scene.points) > 1000 and np.abs(scene.points).max() < 9
     assert set(map(tuple, scene.point_colors)) == {(200, 0, 0), (0, 90, 0)}
@@ -132,8 +141,8 @@ def test_the_sky_is_behind_all_that_is_seen_in_every_view():
     sky = Sky(np.array([1.0, 2, 3]), 50.0)
     depth = np.where(rng.random((HEIGHT, WIDTH)) < 0.5, 3.0, NOTHING)
     filled = sky.behind(view, depth)
-    np.testing.assert_array_equal(filled[depth < SKY], 3)
-    y, x = np.nonzero(depth > SKY)
+    np.testing.assert_array_equal(filled[depth < SKY_DEPTH], 3)
+    y, x = np.nonzero(depth > SKY_DEPTH)
     places = view.unproject(np.column_stack([x, y]) + 0.5, filled[y, x])
     np.testing.assert_allclose(np.linalg.norm(places - sky.center, axis=1), 50, rtol=1e-9)
 
@@ -143,10 +152,10 @@ def test_points_are_as_far_apart_as_pixels_are_large():
     places = rng.uniform(0, 1, (80_000, 3)) * [1, 1, 0]
     places[40_000:, 0] += 10
     sizes = np.repeat([0.01, 0.04], 40_000)  # two octaves
-    kept = spread(places, sizes, 3000, rng)
+    kept = thin_by_grid(places, sizes, 3000, rng)
     near = (kept < 40_000).sum()
     assert 2000 < len(kept) <= 3000 and near / (len(kept) - near) == pytest.approx(16, rel=0.1)
-    few = spread(places, sizes, 10**6, rng)
+    few = thin_by_grid(places, sizes, 10**6, rng)
     assert sorted(few) == list(range(80_000))
 
 
@@ -157,7 +166,7 @@ def test_places_are_even_in_space_and_farther_apart_far_away():
     far = rng.uniform(0, 8, (40_000, 3)) * [1, 1, 0] + [100, 0, 0]
     points = np.concatenate([near, dense, far])
     depths = np.concatenate([np.full(80_000, 1.0), np.full(40_000, 8.5)])  # three octaves beyond
-    kept = even(points, depths, 2000, rng)
+    kept = thin_evenly(points, depths, 2000, rng)
     assert 1500 < len(kept) <= 2000 and len(np.unique(kept)) == len(kept)
     here = points[kept[kept < 80_000]]
     corner = (here < 0.1).all(axis=1).sum()
@@ -184,7 +193,7 @@ def test_places_are_even_in_space_and_farther_apart_far_away():
 )  # fmt: skip
 def test_what_is_missing_is_said_in_a_sentence(tmp_path, capsys, spoil, says):
     draw(tmp_path, views())
-    write_model(tmp_path)
+    write_rendered_model(tmp_path)
     spoil(tmp_path)
     assert main(["model", str(tmp_path)]) == 2
     said = capsys.readouterr().err
@@ -195,6 +204,6 @@ def test_what_is_missing_is_said_in_a_sentence(tmp_path, capsys, spoil, says):
 def test_depth_is_of_the_nearest_layer_and_nothing_is_far_away(tmp_path):
     view = views()[0]
     draw(tmp_path, [view])
-    depth, truth = read_depth(tmp_path / "depths" / f"{view.name}.exr"), seen(view)[0]
-    np.testing.assert_allclose(depth[truth < SKY], truth[truth < SKY], rtol=1e-6)
-    assert (depth[truth > SKY] > SKY).all() and (truth > SKY).any()
+    depth, truth = read_exr_depth(tmp_path / "depths" / f"{view.name}.exr"), seen(view)[0]
+    np.testing.assert_allclose(depth[truth < SKY_DEPTH], truth[truth < SKY_DEPTH], rtol=1e-6)
+    assert (depth[truth > SKY_DEPTH] > SKY_DEPTH).all() and (truth > SKY_DEPTH).any()

@@ -19,7 +19,7 @@ from ..documents import open_file
 from ..errors import LodgsError, printable
 from ..splats.similarity import Similarity
 
-DAMAGED = "Copy the model again, or write it anew with COLMAP's model_converter."
+DAMAGED_REMEDY = "Copy the model again, or write it anew with COLMAP's model_converter."
 
 _LARGEST_SIDE = 1 << 31
 """No image is so wide or high."""
@@ -115,7 +115,7 @@ def model_suffix(folder: Path) -> str:
     return ""
 
 
-def registered(model: Path) -> int:
+def count_images(model: Path) -> int:
     """How many images a model says or has; 0 where that cannot be read."""
     suffix = model_suffix(model)
     path = model / f"images{suffix}"
@@ -171,7 +171,7 @@ def _read(model: Path, name: str, parsers: dict):
     try:
         return parsers[suffix](data.removeprefix(_MARK) if suffix == ".txt" else data)
     except (ValueError, IndexError, KeyError, struct.error) as error:
-        raise LodgsError(f"{path} is damaged or cut short ({error}).", DAMAGED) from error
+        raise LodgsError(f"{path} is damaged or cut short ({error}).", DAMAGED_REMEDY) from error
 
 
 def _cameras_bin(data: bytes) -> dict[int, Intrinsics]:
@@ -208,7 +208,7 @@ def _intrinsics(lens: _Lens, width: int, height: int, parameters: np.ndarray) ->
     return Intrinsics(lens, width, height, parameters)
 
 
-def intrinsics(name: str, width: int, height: int, parameters: np.ndarray) -> Intrinsics:
+def make_intrinsics(name: str, width: int, height: int, parameters: np.ndarray) -> Intrinsics:
     """A record by the name of its lens.
 
     Raises:
@@ -328,11 +328,11 @@ def _pose(name: bytes, camera_id: int, pose: list[float]) -> Pose:
     if not (np.isfinite(pose).all() and quaternion.any()):
         raise ValueError(f"image {printable(text)} has no pose")
     world_to_camera = np.eye(4)
-    world_to_camera[:3, :3], world_to_camera[:3, 3] = rotation_of(quaternion), translation
+    world_to_camera[:3, :3], world_to_camera[:3, 3] = rotation_matrix(quaternion), translation
     return Pose(text, camera_id, world_to_camera)
 
 
-def rotation_of(quaternion: np.ndarray) -> np.ndarray:
+def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
     """(3, 3) of a quaternion wxyz (4,) of any length above 0."""
     # by a power of two, which rounds nothing, so that no square overflows
     quaternion = np.ldexp(quaternion, -np.frexp(np.abs(quaternion).max())[1])

@@ -1,6 +1,6 @@
 """pycolmap in a process of its own: it may end the process, and Pillow corrupts memory beside it.
 
-A module that is such a program begins with :func:`request` and says what it has to say in :func:`say`.
+A module that is such a program begins with :func:`read_request` and says what it has to say in :func:`send`.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from contextlib import suppress
 from pathlib import Path
 
 _ROOM = 1 << 18  # bytes that are still free on a disk that is not full
-LOOKS = 2.0
+CHECK_SECONDS = 2.0
 """Seconds between two looks at whether the disk is full."""
 
 
-def run_apart(module: str, request: dict, work: Path, hear: Callable[[dict], object] | None = None) -> str:
+def run_program(module: str, request: dict, work: Path, hear: Callable[[dict], object] | None = None) -> str:
     """Runs a module of this folder as a program to its end.
 
     It ends as soon as this process does, however that comes, and where the disk is full.
@@ -75,7 +75,7 @@ def run_apart(module: str, request: dict, work: Path, hear: Callable[[dict], obj
     return lines[-1]
 
 
-def request() -> dict:
+def read_request() -> dict:
     """What this program is to do; from then on it ends when who started it does."""
     found = json.loads(sys.stdin.readline())
 
@@ -100,7 +100,7 @@ def load_pycolmap():
     return pycolmap
 
 
-def say(**values: object) -> None:
+def send(**values: object) -> None:
     """An object for whoever started this program."""
     print(json.dumps(values), flush=True)
 
@@ -112,7 +112,7 @@ def _end_without_room(child: subprocess.Popen[str], folder: Path) -> None:
             _require_room(folder)
         except OSError:
             child.kill()
-        time.sleep(LOOKS)
+        time.sleep(CHECK_SECONDS)
 
 
 def _require_room(folder: Path) -> None:

@@ -9,10 +9,10 @@ import pytest
 
 from tests.training.scenes import synthetic
 from training.errors import LodgsError
-from training.scenes import colmap, model, photographs
-from training.scenes.aside import read_aside
-from training.scenes.cameras import camera_as_dict, write_camera
-from training.scenes.colmap import read_scene, without
+from training.scenes import colmap, colmap_model, image_files
+from training.scenes.cameras import camera_to_dict, write_camera
+from training.scenes.colmap import exclude_views, read_scene
+from training.scenes.offset_views import read_offset_views
 
 
 def write_text_model(folder: Path, images: str, points: str = "", cameras: str = "") -> Path:
@@ -86,7 +86,7 @@ def test_the_search_for_the_image_folder_looks_at_nothing_outside(scene, monkeyp
     looked_at, isfile = [], os.path.isfile
     names = ["a.png", "//server/share/a.png", "../../secret.png", "C:/a.png", "\\\\server\\a.png"]
     write_text_model(scene / "sparse" / "0", views(*names), grid())
-    monkeypatch.setattr(photographs.os.path, "isfile", lambda path: looked_at.append(path) or isfile(path))
+    monkeypatch.setattr(image_files.os.path, "isfile", lambda path: looked_at.append(path) or isfile(path))
     for folder in (scene, scene / "sparse" / "0", scene / "sparse"):
         assert len(read_scene(folder).cameras) == 1
     assert looked_at
@@ -124,12 +124,12 @@ def test_many_odd_photographs_are_few_warnings(scene):
 def test_views_are_taken_out_of_a_scene(scene):
     write_text_model(scene / "sparse", views("a.png", "b.png", "c.png"), grid())
     found = read_scene(scene)
-    assert without(found, {}) is found
-    less = without(found, {"b.png": "it is torn."})
+    assert exclude_views(found, {}) is found
+    less = exclude_views(found, {"b.png": "it is torn."})
     assert [camera.name for camera in less.cameras] == ["a.png", "c.png"]
     assert less.warnings == ["b.png is left out: it is torn."]
     with pytest.raises(LodgsError, match="it is torn"):
-        without(found, dict.fromkeys(("a.png", "b.png", "c.png"), "it is torn."))
+        exclude_views(found, dict.fromkeys(("a.png", "b.png", "c.png"), "it is torn."))
 
 
 def test_reading_tells_how_far_it_is(scene):
@@ -144,14 +144,14 @@ def test_a_picture_aside_lies_beside_its_camera(scene):
     camera = read_scene(scene).cameras[0]
     write_camera(scene / "aside" / "a.json", camera, 0.1)
     with pytest.raises(LodgsError, match="there is no such file"):
-        read_aside(scene)
+        read_offset_views(scene)
     (scene / "aside" / "a.png").write_bytes((scene / "images" / "a.png").read_bytes())
-    assert [view.image for view in read_aside(scene)] == [scene / "aside" / "a.png"]
+    assert [view.image for view in read_offset_views(scene)] == [scene / "aside" / "a.png"]
     text = (scene / "aside" / "a.json").read_text().replace('"a.png"', '"../images/a.png"')
     (scene / "aside" / "a.json").write_text(text)
     with pytest.raises(LodgsError, match="leads out"):
-        read_aside(scene)
-    assert camera_as_dict(camera, 0.1)["name"] == "a.png"
+        read_offset_views(scene)
+    assert camera_to_dict(camera, 0.1)["name"] == "a.png"
 
 
 # -- models --------------------------------------------------------------------------------------------------
@@ -200,15 +200,15 @@ def test_points_among_zeros_are_read_in_a_straight_line(scene):
 def test_records_are_followed_over_the_blocks_borders(monkeypatch):
     """Blocks of few records, records longer than a block."""
     random = np.random.default_rng(1)
-    monkeypatch.setattr(model, "_BLOCK", 200)
+    monkeypatch.setattr(colmap_model, "_BLOCK", 200)
     lengths = random.choice([0, 1, 2, 3, 18, 19, 20, 60], 500)
     records = [random.bytes(43) + struct.pack("<Q", n) + random.bytes(8 * int(n)) for n in lengths]
     body = np.frombuffer(b"".join(records), np.uint8)
     starts = np.concatenate([[0], np.cumsum(51 + 8 * lengths)[:-1]])
-    np.testing.assert_array_equal(model._point_starts(body), starts)
+    np.testing.assert_array_equal(colmap_model._point_starts(body), starts)
     for cut in (1, 30, 51, 60):
         with pytest.raises(ValueError, match="ends within point"):
-            model._point_starts(body[: -cut if lengths[-1] * 8 + 51 > cut else -(cut + 7)])
+            colmap_model._point_starts(body[: -cut if lengths[-1] * 8 + 51 > cut else -(cut + 7)])
 
 
 def test_points_astray_do_not_count(scene):

@@ -16,21 +16,21 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LodgsError
-from .cameras import FARTHEST, Camera, read_views
+from .cameras import MAX_COORDINATE, Camera, read_camera_folder
 from .colmap import DEPTHS
 from .exr import read_parts
 from .images import load_image
-from .visibility import visible_in
+from .visibility import visible_points
 
 IMAGES, CAMERAS = "images", "cameras"
 """The folders of what was drawn."""
-POINTS = 100_000
+MAX_POINTS = 100_000
 """At most so many points a model gets."""
-SKY = 1e9
+SKY_DEPTH = 1e9
 """Depths from here on are of nothing: renderers put 1e10 there."""
 SKY_SHARE = 0.1
 """At most so many of all points are of the sky."""
-BEYOND, AWAY = 2, 20
+SKY_FACTOR, MIN_SKY_DISTANCE = 2, 20
 """How many times as far the sky is as the farthest surface, and at least, as the cameras are apart."""
 _LOOKS = 10
 """Pixels that are looked at for each point, about."""
@@ -53,7 +53,7 @@ class Sky:
 
     def behind(self, view: Camera, depth: np.ndarray) -> np.ndarray:
         """A view's depths (H, W), where there is nothing the sphere's."""
-        y, x = np.nonzero(depth >= SKY)
+        y, x = np.nonzero(depth >= SKY_DEPTH)
         eye = view.center - self.center
         rays = view.unproject(np.column_stack([x, y]) + 0.5, np.ones(len(x))) - view.center
         a, b, c = (rays**2).sum(1), rays @ eye, eye @ eye - self.radius**2
@@ -62,7 +62,9 @@ class Sky:
         return filled
 
 
-def write_model(folder: Path, most: int = POINTS, tell: Tell = lambda number, count: None) -> tuple[int, int]:
+def write_rendered_model(
+    folder: Path, most: int = MAX_POINTS, tell: Tell = lambda number, count: None
+) -> tuple[int, int]:
     """Writes folder/sparse/0/*.bin: the cameras, and points at random pixels, as close as pixels are.
 
     Each has its pixel's colour, and a track of views that see it. Those of a sky that pictures show (not
@@ -75,9 +77,9 @@ def write_model(folder: Path, most: int = POINTS, tell: Tell = lambda number, co
     Raises:
         LodgsError: a view lacks a file or a depth, or no two views see the same.
     """
-    from .write_colmap import write_seen  # pycolmap, which reading lacks
+    from .write_colmap import write_visible_points  # pycolmap, which reading lacks
 
-    drawn, _ = read_views(folder / CAMERAS)
+    drawn, _ = read_camera_folder(folder / CAMERAS)
     views = [replace(view, name=f"{view.name}.png") for view in drawn]
     files = [folder / DEPTHS / f"{view.name}.exr" for view in drawn]
 
@@ -85,7 +87,7 @@ def write_model(folder: Path, most: int = POINTS, tell: Tell = lambda number, co
         for number, (view, file) in enumerate(zip(views, files, strict=True)):
             tell(number + 1, len(views))
             picture = load_image(folder / IMAGES / view.name, view.width, view.height, alpha=True)
-            depth = read_depth(file)
+            depth = read_exr_depth(file)
             if depth.shape != picture.shape[:2]:
                 raise LodgsError(
                     f"{file} is not of its camera's size of {view.width}x{view.height}.",
@@ -93,16 +95,16 @@ def write_model(folder: Path, most: int = POINTS, tell: Tell = lambda number, co
                 )
             yield view, depth, picture
 
-    points, colors, sky = surface_points(shown(), len(views), most, np.random.default_rng(0))
+    points, colors, sky = sample_surfaces(shown(), len(views), most, np.random.default_rng(0))
 
     def depth_of(number: int) -> np.ndarray:
-        depth = read_depth(files[number])
+        depth = read_exr_depth(files[number])
         return depth if sky is None else sky.behind(views[number], depth)
 
     beside = folder / ".model.tmp"
     try:
         shutil.rmtree(beside, ignore_errors=True)
-        count = write_seen(beside, views, depth_of, points, 255 * colors)
+        count = write_visible_points(beside, views, depth_of, points, 255 * colors)
         shutil.rmtree(folder / "sparse", ignore_errors=True)
         (beside / "sparse").rename(folder / "sparse")
     except OSError as error:
@@ -115,10 +117,10 @@ def write_model(folder: Path, most: int = POINTS, tell: Tell = lambda number, co
     return len(views), count
 
 
-def surface_points(
+def sample_surfaces(
     views: Iterable[tuple[Camera, np.ndarray, np.ndarray]], count: int, most: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, Sky | None]:
-    """Places (P, 3), at most so many, at random pixels, as close as these are, see :func:`spread`; and the
+    """Places (P, 3), at most so many, at random pixels, as close as these are, see :func:`thin_by_grid`; and the
     colours (P, 3) there.
 
     Args:
@@ -131,7 +133,7 @@ def surface_points(
     """
     found, sizes, colors, eyes = [], [], [], []
     for view, depth, picture in views:
-        there = depth < SKY
+        there = depth < SKY_DEPTH
         if picture.shape[2] == 4:
             there |= picture[..., 3] > 0.99
         y, x = np.nonzero(there)
@@ -146,22 +148,22 @@ def surface_points(
         eyes.append(view.center)
     points, size, color = map(np.concatenate, (found, sizes, colors))
     away = np.linalg.norm(points - (center := np.mean(eyes, axis=0)), axis=1)
-    above = away >= SKY
+    above = away >= SKY_DEPTH
     room = round(SKY_SHARE * most)
     kept = np.flatnonzero(~above)
-    kept = kept[spread(points[kept], size[kept], most - room if above.any() else most, rng)]
+    kept = kept[thin_by_grid(points[kept], size[kept], most - room if above.any() else most, rng)]
     if not above.any() or not len(kept):
         return points[kept], color[kept], None
     apart = np.linalg.norm(eyes - center, axis=1).max()
-    sky = Sky(center, max(BEYOND * float(away[~above].max()), AWAY * float(apart)))
+    sky = Sky(center, max(SKY_FACTOR * float(away[~above].max()), MIN_SKY_DISTANCE * float(apart)))
     high = np.flatnonzero(above)
     points[high] = center + sky.radius * (points[high] - center) / away[high, None]
-    high = high[spread(points[high], size[high], min(room, round(SKY_SHARE * len(kept))), rng)]
+    high = high[thin_by_grid(points[high], size[high], min(room, round(SKY_SHARE * len(kept))), rng)]
     kept = np.concatenate([kept, high])
     return points[kept], color[kept], sky
 
 
-def coverage(
+def sample_coverage(
     views: Sequence[Camera], depths: Sequence[np.ndarray], most: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Places (N, 3) on what V views show, at most so many, and how many views see each, (N,) from 1 on.
@@ -177,14 +179,14 @@ def coverage(
         found.append(view.unproject(pixels, depth[y, x]))
         away.append(depth[y, x])
     points, distances = np.concatenate(found), np.concatenate(away)
-    points = points[even(points, distances, most, np.random.default_rng(0))]
+    points = points[thin_evenly(points, distances, most, np.random.default_rng(0))]
     counts = np.zeros(len(points), np.int64)
     for view, depth in zip(views, depths, strict=True):
-        counts += visible_in(depth, view, points)[1]
+        counts += visible_points(depth, view, points)[1]
     return points[counts > 0], counts[counts > 0]
 
 
-def read_depth(file: Path) -> np.ndarray:
+def read_exr_depth(file: Path) -> np.ndarray:
     """Depths (H, W) float64 of an EXR, the nearest of its layers' Depth.Z; FARTHEST where there is nothing.
 
     Where there is none of that name: of channels that are called Z, depth or V.
@@ -202,16 +204,16 @@ def read_depth(file: Path) -> np.ndarray:
     if not layers:
         raise LodgsError(f"{file} holds no depth.", "Render with an engine that has the pass Depth.")
     nearest = np.min(layers, axis=0).astype(np.float64)
-    return np.where((nearest > 0) & (nearest < SKY), nearest, FARTHEST)
+    return np.where((nearest > 0) & (nearest < SKY_DEPTH), nearest, MAX_COORDINATE)
 
 
-def even(points: np.ndarray, depths: np.ndarray, most: int, rng: np.random.Generator) -> np.ndarray:
+def thin_evenly(points: np.ndarray, depths: np.ndarray, most: int, rng: np.random.Generator) -> np.ndarray:
     """Which of some points (N, 3) to keep, at most so many: even in space up to the median of their depths
     (N,), and beyond farther apart as they are deeper."""
-    return spread(points, np.maximum(depths, np.median(depths)) if len(depths) else depths, most, rng)
+    return thin_by_grid(points, np.maximum(depths, np.median(depths)) if len(depths) else depths, most, rng)
 
 
-def spread(points: np.ndarray, sizes: np.ndarray, most: int, rng: np.random.Generator) -> np.ndarray:
+def thin_by_grid(points: np.ndarray, sizes: np.ndarray, most: int, rng: np.random.Generator) -> np.ndarray:
     """Which of some points (N, 3) to keep, at most so many: one in each cube of a grid, at random.
 
     The cubes are the smallest that are few enough. They are as large as sizes (N,) are, those of the pixels

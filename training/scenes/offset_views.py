@@ -12,11 +12,11 @@ from pathlib import Path
 
 from ..errors import LodgsError, printable
 from .cameras import Camera, read_camera
+from .image_files import ImageFiles
 from .images import image_size
-from .photographs import Photographs
 
 
-def read_aside(scene: Path) -> list[Camera]:
+def read_offset_views(scene: Path) -> list[Camera]:
     """The views in a scene's folder ``aside`` by file name, at their pictures' size; none without the folder.
 
     Each is a JSON file as ``cameras.write_camera`` makes it, in the model's world; ``name`` is the picture's.
@@ -24,7 +24,7 @@ def read_aside(scene: Path) -> list[Camera]:
     Raises:
         LodgsError: a camera or its picture cannot be read.
     """
-    found, pictures = [], Photographs(scene / "aside", scene)
+    found, pictures = [], ImageFiles(scene / "aside", scene)
     for path in sorted((scene / "aside").glob("*.json")):
         camera, _ = read_camera(path)
         try:

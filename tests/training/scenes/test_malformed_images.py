@@ -106,9 +106,9 @@ def test_more_pixels_than_are_read_are_refused_by_the_header(tmp_path):
 def test_passes_of_an_exr_have_a_most_together(tmp_path, monkeypatch):
     write_exr(tmp_path / "a.exr")
     assert image_size(tmp_path / "a.exr") == (8, 6)
-    monkeypatch.setattr(exr, "MOST_BYTES", 4 * 3 * 8 * 6)
+    monkeypatch.setattr(exr, "MAX_BYTES", 4 * 3 * 8 * 6)
     assert load_image(tmp_path / "a.exr", 8, 6).shape == (6, 8, 3)
-    monkeypatch.setattr(exr, "MOST_BYTES", 4 * 3 * 8 * 6 - 1)
+    monkeypatch.setattr(exr, "MAX_BYTES", 4 * 3 * 8 * 6 - 1)
     with pytest.raises(LodgsError, match="GiB of pixels"):
         load_image(tmp_path / "a.exr", 8, 6)
 

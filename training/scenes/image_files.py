@@ -12,7 +12,7 @@ from ..errors import LodgsError
 _USUAL = ("images", "input", "image", "rgb", "photos")
 
 
-class Photographs:
+class ImageFiles:
     """The files of an image folder, by the names that a model gives them.
 
     Args:
@@ -32,7 +32,7 @@ class Photographs:
             LodgsError: the name is no text or leads out of the folder, or the file is a link that leads out;
                 ``what`` goes on after "it is left out:".
         """
-        relative = inside(name)
+        relative = relative_image_path(name)
         found = self._folder / name
         if not os.path.isfile(found):  # not Path.is_file, which raises for names too long
             if self._normal is None:
@@ -46,7 +46,7 @@ class Photographs:
         return found
 
 
-class Beside:
+class SidecarFiles:
     """What belongs to photographs, masks or depth maps, as COLMAP and nerfstudio name it.
 
     Args:
@@ -76,7 +76,7 @@ class Beside:
         return f"{self.folder} holds nothing for these photographs: of {name} it would be {file}."
 
 
-def inside(name: str) -> PurePosixPath:
+def relative_image_path(name: str) -> PurePosixPath:
     """An image's name as a path in the folder of the images, on every system.
 
     Raises:
@@ -92,7 +92,7 @@ def inside(name: str) -> PurePosixPath:
     return path
 
 
-def image_folder(folder: Path, model: Path, names: Sequence[str]) -> Path:
+def find_image_folder(folder: Path, model: Path, names: Sequence[str]) -> Path:
     """The folder where most of the model's names are files, looked for around the model in the scene."""
     roots = [folder, *(parent for parent in model.parents if folder in parent.parents)]
     if "sparse" in (folder.name, folder.parent.name):  # only the model was chosen: the scene is around it
@@ -109,7 +109,7 @@ def image_folder(folder: Path, model: Path, names: Sequence[str]) -> Path:
 
 def _is_inside(name: str) -> bool:
     try:
-        return bool(inside(name))
+        return bool(relative_image_path(name))
     except LodgsError:
         return False
 

@@ -10,7 +10,7 @@ SPREAD = 1.5
 """Standard deviation of the neighbours that count for a place, in photographs."""
 
 
-def smoothed(positions: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def smooth_path(positions: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Poses smoothed along their order by a Gaussian, narrower towards both ends, which stay where they are.
 
     Args:

@@ -10,7 +10,7 @@ from training.editing.placement import placed
 from training.errors import LodgsError
 from training.lod.crop import Crop
 from training.scenes.cameras import Camera, look_at
-from training.scenes.views import NAMES, VIEWS, tables_of, views_in
+from training.scenes.view_tables import NAMES, VIEWS, make_view_tables, read_view_tables
 from training.splats.bundle import Bundle, Level, read_bundle, read_folder, write_bundle, write_folder
 from training.splats.gaussians import Splats
 from training.splats.similarity import Similarity
@@ -37,11 +37,11 @@ def bundle_of(views, count=50):
         rng.normal(size=(count, 16, 3)).astype(np.float32),
     )  # fmt: skip
     levels = [Level(number, splats.select(slice(0, 10 * number))) for number in range(1, 6)]
-    return Bundle("3dgs", levels, tables=tables_of(views, 0.25, {views[1].name}))
+    return Bundle("3dgs", levels, tables=make_view_tables(views, 0.25, {views[1].name}))
 
 
 def check(found, views, near=0.25):
-    cameras, depth, held_out = views_in(found.tables)
+    cameras, depth, held_out = read_view_tables(found.tables)
     assert depth == near and held_out == {views[1].name}
     for camera, view in zip(cameras, views, strict=True):
         assert replace(camera, world_to_camera=None) == replace(view, world_to_camera=None)
@@ -61,7 +61,7 @@ def test_views_come_back_to_the_bit_and_the_header_stays_small(tmp_path, count):
 def test_views_of_a_placed_scene_see_the_same():
     views, rng = cameras(), np.random.default_rng(2)
     placement = Similarity.from_angles((20, 40, 60), 2.5, (1, -2, 3))
-    there, near, _ = views_in(placed(bundle_of(views), placement).tables)
+    there, near, _ = read_view_tables(placed(bundle_of(views), placement).tables)
     assert near == 0.625
     points = rng.normal(size=(20, 3))
     for before, after in zip(views, there, strict=True):
@@ -78,7 +78,7 @@ def test_cleaning_leaves_views_alone_whatever_the_rule():
 
 @pytest.mark.parametrize("name", ["names", "lacks", "pose"])
 def test_damaged_views_are_one_sentence(name):
-    tables = tables_of(cameras(), 0.1)
+    tables = make_view_tables(cameras(), 0.1)
     if name == "names":
         tables[NAMES] = {"utf8": tables[NAMES]["utf8"][:5]}
     elif name == "lacks":
@@ -86,9 +86,9 @@ def test_damaged_views_are_one_sentence(name):
     else:
         tables[VIEWS][POSE[0]] = np.full(3, np.nan)
     with pytest.raises(LodgsError):
-        views_in(tables)
+        read_view_tables(tables)
 
 
 def test_a_bundle_of_before_has_no_views():
-    assert views_in({}) == ([], 0.0, set())
-    assert tables_of([], 0.0) == {}
+    assert read_view_tables({}) == ([], 0.0, set())
+    assert make_view_tables([], 0.0) == {}
