@@ -46,7 +46,7 @@ def all_work() -> Iterator[Work]:
     for uid, watch in watches.items():
         root = root_by_uid(uid)
         name = "Splats" if root is None else root.name
-        yield Work(watch, f"{name}: {watch.message}", watch.share, watch.running, bool(watch.problem))
+        yield Work(watch, f"{name}: {watch.message}", watch.fraction, watch.running, bool(watch.problem))
     for job in (background_capture.current, photo_preparation.current, environment_setup.current):
         if job is not None:
             yield Work(job, job.message, job.fraction, job.running, bool(job.problem))

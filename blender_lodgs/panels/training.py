@@ -183,7 +183,7 @@ def _draw_distances(layout: bpy.types.UILayout, context: bpy.types.Context, root
 
 
 def _draw_running(layout: bpy.types.UILayout, watch: Watch, root: bpy.types.Object) -> None:
-    share = watch.share
+    share = watch.fraction
     row = layout.row(align=True)
     message, _, note = watch.message.partition(" (")  # the bar has room for a few words
     row.progress(text=f"{message} · {share:.0%}" if share else message, factor=share)

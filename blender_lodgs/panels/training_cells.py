@@ -8,7 +8,7 @@ from ...training.errors import LodgsError
 from ...training.lod.colors import level_color
 from ..data import cells, scenes, viewpoints
 from ..runs import job_settings, run_folders
-from ..runs.watch import Part, Watch, watch_of
+from ..runs.watch import RunPart, Watch, watch_of
 from .parts import Panel, say, split_column
 
 _NUMBER_WIDTH = 0.16
@@ -53,16 +53,16 @@ class LODGS_UL_blocks(bpy.types.UIList):
                 row.operator("lodgs.resume_block", text="", icon="PLAY", emboss=False).block = number
 
 
-def _draw_part(layout: bpy.types.UILayout, part: Part, stopping: bool = False) -> None:
-    share = f"{part.share:.0%}"
+def _draw_part(layout: bpy.types.UILayout, part: RunPart, stopping: bool = False) -> None:
+    share = f"{part.fraction:.0%}"
     if stopping and part.state == "waiting":  # the run reports it only when it reaches this cell
         layout.label(text="Cancelled", icon=_ICONS["cancelled"])
     elif stopping:
         layout.label(text=f"Stopping at {share}", icon="SORTTIME")
     elif part.state == "running":
-        layout.progress(text=f"Borders, {share}" if part.kind == "seam" else share, factor=part.share)
+        layout.progress(text=f"Borders, {share}" if part.kind == "seam" else share, factor=part.fraction)
     else:
-        suffix = f" at {share}" if part.share and part.state != "done" else ""
+        suffix = f" at {share}" if part.fraction and part.state != "done" else ""
         layout.label(text=f"{part.state.capitalize()}{suffix}", icon=_ICONS[part.state])
 
 

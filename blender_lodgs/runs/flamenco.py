@@ -1,7 +1,7 @@
-"""Cells on a render farm: a job for the manager of Flamenco, sent through its HTTP API.
+"""Training of cells on a Flamenco render farm: job submission through the manager's HTTP API.
 
-What the job does says ``farm/flamenco/lodgs_blocks.js``, which lies with the manager. API: the manager's
-``/api/v3/swagger-ui/``, operations getJobType and submitJob.
+The job type is ``farm/flamenco/lodgs_blocks.js``, a script to install with the manager. API reference:
+``/api/v3/swagger-ui/`` of the manager, operations getJobType and submitJob.
 """
 
 from __future__ import annotations
@@ -27,27 +27,27 @@ from ..data import viewpoints
 from . import job_settings, run_folders
 
 JOB_TYPE = "lodgs-blocks"
-"""What the manager makes of the name of our script."""
+"""Name of the job type, which the manager derives from the script's file name."""
 TIMEOUT = 10.0
-"""Seconds that the manager is waited for."""
+"""Seconds to wait for the manager."""
 SCRIPT = extension.FOLDER / "farm" / "flamenco" / "lodgs_blocks.js"
-_INSTALL = f"Put {SCRIPT} into the folder scripts beside the manager."
-MOST_BYTES = 1 << 20
-"""Most of an answer."""
+_INSTALL = f"Copy {SCRIPT} to the scripts folder of the manager."
+MAX_BYTES = 1 << 20
+"""Maximum size of a response."""
 _KEYS = ("scene", "out", "method", "preset", "image_scale", "cells", "polish")
-"""Keys of a job that the job type has settings for; the others are its options."""
-_WHERE = ("backend", "photo_memory", "splat_memory")
-"""Keys that say how this computer trains: each of the farm's decides by itself."""
+"""Job keys with a setting in the job type. The other keys are passed as command-line options."""
+_DEVICE_KEYS = ("backend", "photo_memory", "splat_memory")
+"""Job keys that depend on the computer. Each worker uses its own values."""
 
 
 @dataclass(frozen=True)
 class Submission:
-    """A job for a manager, which any thread may send.
+    """A job for a Flamenco manager. Any thread may send it.
 
     Attributes:
-        manager: its address.
-        name: what people know the job by.
-        settings: of the job type, by key.
+        manager: URL of the manager.
+        name: name of the job.
+        settings: settings of the job type by key.
     """
 
     manager: str
@@ -55,148 +55,152 @@ class Submission:
     settings: dict[str, str | int | float]
 
     def send(self) -> str:
-        """Submits it; returns the address of the page that shows how it gets on.
+        """Submit the job. Return the URL of its status page.
 
         Raises:
-            LodgsError: nobody answers, what answers is no manager, or it does not take the job.
+            LodgsError: there is no answer, the server is no Flamenco manager, or it rejects the job.
         """
-        known = self._ask(f"jobs/type/{JOB_TYPE}", None)
-        offered = known.get("settings")
-        if not isinstance(offered, list) or not all(isinstance(each, dict) for each in offered):
-            raise self._stranger()
-        defaults = {str(each.get("key")): each.get("default") for each in offered}
+        job_type = self._request(f"jobs/type/{JOB_TYPE}", None)
+        type_settings = job_type.get("settings")
+        if not isinstance(type_settings, list) or not all(isinstance(item, dict) for item in type_settings):
+            raise self._not_a_manager()
+        defaults = {str(item.get("key")): item.get("default") for item in type_settings}
         if missing := sorted(self.settings.keys() - defaults.keys()):
             raise LodgsError(
-                f"The manager's job type {JOB_TYPE} is of another version: it has no {missing[0]}.",
+                f"Cannot submit the job: the manager's job type {JOB_TYPE} has no setting {missing[0]}.",
                 _INSTALL,
             )
         settings = {key: value for key, value in defaults.items() if value is not None} | self.settings
         job = {
-            "name": self.name, "type": JOB_TYPE, "type_etag": known.get("etag", ""), "priority": 50,
+            "name": self.name, "type": JOB_TYPE, "type_etag": job_type.get("etag", ""), "priority": 50,
             "submitter_platform": platform.system().lower(), "settings": settings,
         }  # fmt: skip
-        made = self._ask("jobs", job).get("id")
-        if not isinstance(made, str):
-            raise self._stranger()
-        return printable(f"{self.manager}/app/jobs/{made[:100]}")
+        job_id = self._request("jobs", job).get("id")
+        if not isinstance(job_id, str):
+            raise self._not_a_manager()
+        return printable(f"{self.manager}/app/jobs/{job_id[:100]}")
 
-    def _ask(self, what: str, said: dict | None) -> dict:
-        """What the manager answers to a request, with a JSON object where something is said."""
-        data = None if said is None else json.dumps(said).encode()
+    def _request(self, path: str, body: dict | None) -> dict:
+        """Send a GET request, or a POST request with a JSON body. Return the JSON response."""
+        data = None if body is None else json.dumps(body).encode()
         headers = {"Content-Type": "application/json", "Accept": "application/json"}
-        request = urllib.request.Request(f"{self.manager}/api/v3/{what}", data, headers)
+        request = urllib.request.Request(f"{self.manager}/api/v3/{path}", data, headers)
         try:
-            with urllib.request.urlopen(request, timeout=TIMEOUT) as answer:
-                text = answer.read(MOST_BYTES)
+            with urllib.request.urlopen(request, timeout=TIMEOUT) as response:
+                text = response.read(MAX_BYTES)
         except urllib.error.HTTPError as error:
             with error:
-                raise self._refusal(error, known=said is not None) from error
+                raise self._rejection(error, is_submission=body is not None) from error
         except (OSError, http.client.HTTPException, ValueError) as error:
-            why = getattr(error, "reason", None) or error
+            reason = getattr(error, "reason", None) or error
             raise LodgsError(
-                f"No Flamenco manager answers at {self.manager}: {why}.",
+                f"Cannot reach a Flamenco manager at {self.manager}: {reason}.",
                 "Start it, or correct its address in the preferences of LODGS.",
             ) from error
         return self._read(text)
 
-    def _refusal(self, error: urllib.error.HTTPError, known: bool) -> LodgsError:
-        """Why it does not take the job, or does not have its type."""
+    def _rejection(self, error: urllib.error.HTTPError, is_submission: bool) -> LodgsError:
+        """Return the error for a rejected request."""
         try:
-            message = self._read(error.read(MOST_BYTES)).get("message")
+            message = self._read(error.read(MAX_BYTES)).get("message")
         except (LodgsError, OSError, http.client.HTTPException):
             message = None
         if not isinstance(message, str):
-            return self._stranger()
-        if error.code == 404 and not known:
+            return self._not_a_manager()
+        if error.code == 404 and not is_submission:
             return LodgsError(
-                f"The Flamenco manager at {self.manager} does not know the job type {JOB_TYPE}.",
+                f"Cannot submit the job: the Flamenco manager at {self.manager} has no job type {JOB_TYPE}.",
                 _INSTALL,
             )
         return LodgsError(
-            f"The Flamenco manager refused the job: {message.rstrip('.')}.", "Its log may tell more."
+            f"Cannot submit the job: the Flamenco manager reports: {message.rstrip('.')}.",
+            "See the log of the manager.",
         )
 
     def _read(self, text: bytes) -> dict:
         try:
             return parse_json(text.decode("utf-8", "replace"), "The answer")
         except LodgsError:
-            raise self._stranger() from None
+            raise self._not_a_manager() from None
 
-    def _stranger(self) -> LodgsError:
+    def _not_a_manager(self) -> LodgsError:
         return LodgsError(
-            f"What answers at {self.manager} is no Flamenco manager.",
+            f"The server at {self.manager} is not a Flamenco manager.",
             "Correct its address in the preferences of LODGS.",
         )
 
 
 def submit(root: bpy.types.Object, folder: str = "") -> str:
-    """Has a farm train a scene root with its settings (``root.lodgs.training``), in cells.
+    """Train a scene root with its settings (``root.lodgs.training``) in cells on a render farm.
 
     Args:
-        root: a scene root that was imported from a COLMAP folder.
-        folder: the run's folder; empty: a new one where the settings say. All workers have to see it.
+        root: scene root with photos.
+        folder: run folder, which all workers must see. Empty for a new folder in the location of the settings.
 
     Returns:
-        The address of the page that shows how the job gets on.
+        URL of the job's status page.
 
     Raises:
-        LodgsError: as :func:`prepare` and ``Submission.send``.
+        LodgsError: see :func:`prepare` and ``Submission.send``.
     """
     return prepare(root, folder).send()
 
 
 def prepare(root: bpy.types.Object, folder: str = "") -> Submission:
-    """What :func:`submit` sends; for the main thread.
+    """Prepare the job of :func:`submit`. Call this in the main thread.
 
     Raises:
-        LodgsError: there is no manager, Blender may not go online, or a setting is impossible.
+        LodgsError: no manager is set, online access is off, or a setting is invalid.
     """
-    manager = manager_of(extension.preferences().flamenco)
+    manager = manager_url(extension.preferences().flamenco)
     if not bpy.app.online_access:
         raise LodgsError(
-            "Submitting speaks with the Flamenco manager, and Blender may not go online.",
+            "Cannot reach the Flamenco manager: Blender's online access is off.",
             "Turn on Allow Online Access in the preferences, under System.",
         )
     if viewpoints.alone(root):
-        raise LodgsError(f"'{root.name}' has no photographs to train on.", "Import a COLMAP folder.")
+        raise LodgsError(
+            f"Cannot train '{root.name}' on a farm: it has no photos.", "Import a COLMAP folder."
+        )
     if not (folder or root.lodgs.training.output or bpy.data.is_saved):
         raise LodgsError(
-            "This file is not saved, so it is not known where the farm's run is to lie.",
-            "Save it where all workers see it, or set Run Folders In.",
+            "Cannot choose a run folder: the .blend file is not saved.",
+            "Save it in a folder that all workers see, or set Run Folders In.",
         )
     out = Path(bpy.path.abspath(folder)).resolve() if folder else run_folders.new_run_folder(root)
     if RunFolder(out).state() != "empty":
-        raise LodgsError(f"{out} already holds a run.", "Choose another folder.")
+        raise LodgsError(f"Cannot train in {out}: the folder contains a run.", "Choose another folder.")
     job = job_settings.make_job(root, out, {})
     job = job.with_cells(job.cells or "1x1")
     columns, rows = job.grid
     return Submission(manager, root.name, {
         "scene": job.scene, "output": job.out, "columns": columns, "rows": rows, "method": job.method,
         "preset": job.preset, "image_scale": job.image_scale, "polish": job.polish,
-        "options": shlex.join(options_of(job, exclude=(*_KEYS, *_WHERE))),
+        "options": shlex.join(options_of(job, exclude=(*_KEYS, *_DEVICE_KEYS))),
     })  # fmt: skip
 
 
-def manager_of(address: str) -> str:
-    """The address of a manager as it is asked.
+def manager_url(address: str) -> str:
+    """Return the base URL of a manager's address.
 
     Raises:
-        LodgsError: it is empty, or no address.
+        LodgsError: the address is empty or invalid.
     """
     address = address.strip()
     if not address:
         raise LodgsError(
-            "It is not said where the Flamenco manager is.",
-            "Give its address in the preferences of LODGS, such as http://farm:8080.",
+            "Cannot submit a job: no Flamenco manager is set.",
+            "Enter its address in the preferences of LODGS, such as http://farm:8080.",
         )
-    given = address if "://" in address else f"http://{address}"
+    url = address if "://" in address else f"http://{address}"
     try:
-        parts = urlsplit(given)
-        sound = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0
+        parts = urlsplit(url)
+        valid = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0
     except ValueError:
-        sound = False
-    if not sound or any(character.isspace() for character in given):
+        valid = False
+    if not valid or any(character.isspace() for character in url):
         raise LodgsError(
-            f"'{address}' is no address of a Flamenco manager.", "Give one such as http://farm:8080."
+            f"Invalid address of the Flamenco manager: '{address}'.",
+            "Enter an address such as http://farm:8080.",
         )
-    return given.rstrip("/")
+    return url.rstrip("/")

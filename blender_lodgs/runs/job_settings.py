@@ -25,14 +25,19 @@ if TYPE_CHECKING:
 
 
 def make_job(root: bpy.types.Object, out: Path, parameters: dict) -> Job:
-    """The job that the root's settings describe.
+    """Return the job for the training settings of a scene root.
+
+    Args:
+        root: scene root.
+        out: run folder.
+        parameters: additional method parameters by name.
 
     Raises:
-        LodgsError: the root has no COLMAP folder, nothing to start from, or a setting is impossible.
+        LodgsError: the root has no COLMAP folder, no splats to start from, or an invalid setting.
     """
     settings = root.lodgs.training
     values = {
-        **(_captured(root, out) if viewpoints.alone(root) else _photographed(root, out)),
+        **(_capture_keys(root, out) if viewpoints.alone(root) else _photo_keys(root, out)),
         "out": str(out),
         "method": settings.method,
         "preset": settings.preset,
@@ -48,18 +53,18 @@ def make_job(root: bpy.types.Object, out: Path, parameters: dict) -> Job:
     return Job.from_dict(values)
 
 
-def _photographed(root: bpy.types.Object, out: Path) -> dict:
-    """What a job says of a scene that was imported from photographs."""
+def _photo_keys(root: bpy.types.Object, out: Path) -> dict:
+    """Return the job keys for a scene that was imported from photos."""
     settings = root.lodgs.training
     if not root.lodgs.scene_folder:
         raise LodgsError(
-            f"'{root.name}' was not imported from photographs, so there is nothing to train on.",
+            f"Cannot train '{root.name}': it has no photos.",
             "Import a COLMAP folder.",
         )
     base = base_path(root, out)
     if base and settings.grid:
         raise LodgsError(
-            "Cells begin with the scene's points, not with splats.",
+            "Cannot train cells from splats: cells start from the points of the scene.",
             "Choose Points in Start From, or train one cell.",
         )
     return {
@@ -70,13 +75,14 @@ def _photographed(root: bpy.types.Object, out: Path) -> dict:
     }
 
 
-def _captured(root: bpy.types.Object, out: Path) -> dict:
-    """What a job says of splats alone."""
-    settings, run = root.lodgs.training, RunFolder(out)
+def _capture_keys(root: bpy.types.Object, out: Path) -> dict:
+    """Return the job keys for splats without photos, which are trained on rendered views of them."""
+    settings = root.lodgs.training
+    run = RunFolder(out)
     info = method_info(settings.method)
     if not info.from_base:
         raise LodgsError(
-            f"{info.label} needs photographs, and '{root.name}' has none.", "Choose the method LODGE."
+            f"Cannot train '{root.name}' with {info.label}: it has no photos.", "Choose the method LODGE."
         )
     return {
         "base": str(run.base),
@@ -87,24 +93,24 @@ def _captured(root: bpy.types.Object, out: Path) -> dict:
 
 
 def changed_parameters(settings: TrainingSettings) -> dict:
-    """The method's parameters that are set in the panel, by name; all others are the preset's."""
+    """Return the method parameters set in the panel, by name. The other values come from the preset."""
     group = settings.parameters
-    found = {
+    values = {
         f.name: _as_typed(getattr(group, f.name))
         for f in offered(settings.method)
         if group.is_property_set(f.name)
     }
     if chooses_distances(settings.method) and not settings.find_distances:
-        places = [place for _, place in level_distances(settings)]
-        found["distances"] = (*(_as_typed(settings.distances[place]) for place in places), 0.0)
-    return found
+        indices = [index for _, index in level_distances(settings)]
+        values["distances"] = (*(_as_typed(settings.distances[index]) for index in indices), 0.0)
+    return values
 
 
 def current_parameters(settings: TrainingSettings) -> Parameters:
-    """The parameters of the training that the panel describes; found anew only when a choice changes.
+    """Return all parameters for the settings in the panel. Results are cached.
 
     Raises:
-        LodgsError: a choice is impossible.
+        LodgsError: a setting is invalid.
     """
     return _parameters(settings.method, settings.preset, tuple(changed_parameters(settings).items()))
 
@@ -115,35 +121,40 @@ def _parameters(method: str, preset: str, changes: tuple[tuple[str, Any], ...]) 
 
 
 def _as_typed(value):
-    """A number as its artist typed it, such as 0.65: Blender keeps the nearest one of 32 bits."""
+    """Return a number as the user typed it, such as 0.65: Blender stores it rounded to 32 bits."""
     return float(str(np.float32(value))) if isinstance(value, float) else value
 
 
 def apply_job(settings: TrainingSettings, job: Job) -> None:
-    """Set the panel to what a job says, as far as the panel offers it."""
-    alike = {field.name for field in fields(Job)} - {"region"}
-    for name in alike.intersection(settings.bl_rna.properties.keys()):
+    """Copy the values of a job to the training settings that the panel has."""
+    names = {field.name for field in fields(Job)} - {"region"}
+    for name in names.intersection(settings.bl_rna.properties.keys()):
         setattr(settings, name, getattr(job, name))
     settings.region = crops.as_object(settings.id_data, job.crop) if job.crop else None
     settings.start_from = "FILE" if job.base else "POINTS"
     settings.columns, settings.rows = job.grid if job.cells else (1, 1)
-    preset, own = method_info(job.method).preset(job.preset), job.resolved_parameters()
+    preset = method_info(job.method).preset(job.preset)
+    parameters = job.resolved_parameters()
     for f in offered(job.method):
         settings.parameters.property_unset(f.name)
-        if getattr(own, f.name) != getattr(preset, f.name):
-            setattr(settings.parameters, f.name, getattr(own, f.name))
+        if getattr(parameters, f.name) != getattr(preset, f.name):
+            setattr(settings.parameters, f.name, getattr(parameters, f.name))
     settings.property_unset("distances")
-    settings.find_distances = not any(getattr(own, "distances", ()))
+    settings.find_distances = not any(getattr(parameters, "distances", ()))
     if chooses_distances(job.method) and not settings.find_distances:
-        for number, place in level_distances(settings):
-            settings.distances[place] = own.distances[number - 1]
+        for number, index in level_distances(settings):
+            settings.distances[index] = parameters.distances[number - 1]
 
 
 def base_path(root: bpy.types.Object, out: Path) -> str:
-    """What the root's next training begins with, as a job's ``base``; "" for the scene's points.
+    """Return the path of the splats that the next training starts from (``Job.base``).
 
     Args:
-        out: the folder of its run.
+        root: scene root.
+        out: folder of the new run.
+
+    Returns:
+        A path, or "" to start from the points of the scene.
 
     Raises:
         LodgsError: the root has no finished run, or no file is chosen.
@@ -154,7 +165,8 @@ def base_path(root: bpy.types.Object, out: Path) -> str:
     if settings.start_from == "FILE":
         if not settings.base:
             raise LodgsError(
-                "No splats are chosen to start from.", "Choose a PLY or a run's folder, or start from points."
+                "Cannot start from a file: no file is chosen.",
+                "Choose a PLY or a run folder, or start from points.",
             )
         return bpy.path.abspath(settings.base)
     if settings.start_from == "SCENE":
@@ -162,6 +174,7 @@ def base_path(root: bpy.types.Object, out: Path) -> str:
     run = run_folder(root)
     if run is None or run_state(run) != "done":
         raise LodgsError(
-            f"'{root.name}' has no finished run to start from.", "Finish one first, or start from points."
+            f"Cannot start from a run: '{root.name}' has no finished run.",
+            "Finish one first, or start from points.",
         )
     return str(run.path)

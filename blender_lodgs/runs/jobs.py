@@ -1,6 +1,6 @@
-"""Trainings from Blender: start, follow, cancel, resume and find again.
+"""Training runs from Blender: start, follow, cancel, resume and attach.
 
-A run goes on when Blender closes, and is found again by its folder when the .blend is opened.
+A run continues when Blender closes. Opening the .blend file attaches to it again by its folder.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import bpy
 
@@ -24,104 +23,106 @@ from ..data import cells, scenes, viewpoints
 from . import environment, processes
 from .job_settings import make_job
 from .run_folders import is_on_other_computer, link_run, new_run_folder, run_folder, run_state
-from .watch import Watch, begin, root_by_uid, watch_of, watches
-
-if TYPE_CHECKING:
-    pass
+from .watch import Watch, root_by_uid, start_watching, watch_of, watches
 
 
 def start(root: bpy.types.Object, folder: str = "", parameters: dict | None = None) -> Watch:
     """Train a scene root with its settings (``root.lodgs.training``) in a new run folder.
 
     Args:
-        root: a scene root that was imported from a COLMAP folder; or one with splats alone, which are handed
-            over as they are here, with the views of them that the settings ask for.
-        folder: the run's folder; empty makes a new one where the settings say.
-        parameters: further parameters of the method by name (``training.optimize.parameters``).
+        root: scene root with photos, or with splats only. Splats only are exported to the run, with the views
+            that the settings define.
+        folder: run folder. Empty for a new folder in the location of the settings.
+        parameters: additional method parameters by name (``training.optimize.parameters``).
 
     Raises:
-        LodgsError: no trainer, no scene, an impossible setting, or a folder that is taken.
+        LodgsError: the trainer is missing, a setting is invalid, or the folder is in use.
     """
     run = RunFolder(Path(bpy.path.abspath(folder)).resolve()) if folder else RunFolder(new_run_folder(root))
-    return _begin(root, run, make_job(root, run.path, parameters or {}))
+    return _start(root, run, make_job(root, run.path, parameters or {}))
 
 
-def _begin(root: bpy.types.Object, run: RunFolder, job: Job) -> Watch:
-    watch, state = watch_of(root), run_state(run)
+def _start(root: bpy.types.Object, run: RunFolder, job: Job) -> Watch:
+    watch = watch_of(root)
+    state = run_state(run)
     if watch is not None and watch.running:
-        raise LodgsError(f"'{root.name}' is being trained already.", "Wait for that, or cancel it.")
+        raise LodgsError(f"'{root.name}' is already being trained.", "Wait for the training or cancel it.")
     if state == "running":
         raise LodgsError(
-            f"Another training is already at work in {run.path}.",
+            f"Cannot train in {run.path}: another training is running there.",
             "Wait for it, cancel it, or choose another run folder.",
         )
     if state != "empty":
         raise LodgsError(
-            f"{run.path} already holds a run.", "Choose another folder, or open it as a run and resume it."
+            f"Cannot train in {run.path}: the folder contains a run.",
+            "Choose another folder, or open this run and resume it.",
         )
     root.lodgs.training.read = 0
-    return _launch(root, run, job, write=True, hand_over=Path(job.base) == run.base)
+    return _launch(root, run, job, write_job=True, export=Path(job.base) == run.base)
 
 
 def resume(root: bpy.types.Object) -> Watch:
-    """Go on with the root's newest run, with the settings that it was started with, on what trains now.
+    """Resume the root's newest run with its own settings, on the training device of the preferences.
 
     Raises:
-        LodgsError: there is no such run, or it is at work or finished.
+        LodgsError: the root has no run, or the run is running or finished.
     """
     run = run_folder(root)
     state = "empty" if run is None else run_state(run)
     if run is None or state == "empty":
-        raise LodgsError(f"'{root.name}' has no run to resume.", "Press Train, or open a run folder.")
+        raise LodgsError(
+            f"Cannot resume the training: '{root.name}' has no run.", "Press Train, or open a run folder."
+        )
     if state == "running":
-        raise LodgsError(f"The run in {run.path} is already at work.", "Wait for it or cancel it.")
+        raise LodgsError(f"Cannot resume the run in {run.path}: it is running.", "Wait for it or cancel it.")
     if state == "done":
-        raise LodgsError(f"The run in {run.path} is finished.", "Press Train for a new one.")
+        raise LodgsError(
+            f"Cannot resume the run in {run.path}: it is finished.", "Press Train for a new run."
+        )
     return _resume(root, run)
 
 
 def _resume(root: bpy.types.Object, run: RunFolder) -> Watch:
     job = replace(Job.from_file(run.job), out=str(run.path))
-    backend = extension.preferences().backend  # what this computer has, and what its user wants now
-    return _launch(root, run, replace(job, backend=backend), write=job.backend != backend)
+    backend = extension.preferences().backend  # the run may come from another computer
+    return _launch(root, run, replace(job, backend=backend), write_job=job.backend != backend)
 
 
 def start_or_resume(root: bpy.types.Object, job: Job) -> Watch:
-    """Begin a job, or go on with what the same job began: command lines are simply given again.
-
-    A finished run is loaded.
+    """Start a job, or resume its run, so that a command can be repeated. A finished run is loaded.
 
     Raises:
-        LodgsError: as :func:`start` and :func:`resume`, or the run was begun with other settings.
+        LodgsError: see :func:`start` and :func:`resume`, or the run has other settings.
     """
     run = RunFolder(Path(job.out))
     state = run_state(run)
     if state in {"empty", "running"}:
-        return _begin(root, run, job)
-    before, now = Job.from_file(run.job).resolved(), job.resolved()
+        return _start(root, run, job)
+    previous = Job.from_file(run.job).resolved()
+    current = job.resolved()
     names = [f.name for f in fields(Job) if f.name not in CHANGEABLE]
-    changed = [name for name in names if getattr(before, name) != getattr(now, name)]
+    changed = [name for name in names if getattr(previous, name) != getattr(current, name)]
     if changed:
         raise LodgsError(
-            f"The run in {run.path} was begun with other settings ({', '.join(changed)}).",
-            "Give the same ones to go on with it, or choose another folder.",
+            f"Cannot resume the run in {run.path}: these settings have changed: {', '.join(changed)}.",
+            "Use the same settings, or choose another folder.",
         )
     if state == "done":
         return attach(root, job.out)
     root.lodgs.training.read = 0
-    same = all(getattr(before, name) == getattr(job, name) for name in CHANGEABLE if name != "out")
-    return _launch(root, run, job, write=not same)
+    unchanged = all(getattr(previous, name) == getattr(job, name) for name in CHANGEABLE if name != "out")
+    return _launch(root, run, job, write_job=not unchanged)
 
 
 def cancel(root: bpy.types.Object) -> None:
-    """Ask the trainer to save and stop; asked again, end it (it can be resumed from its last checkpoint).
+    """Ask the trainer to save and stop. The second call kills it: its last checkpoint can be resumed.
 
     Raises:
-        LodgsError: nothing is running.
+        LodgsError: no training is running.
     """
     watch = watch_of(root)
     if watch is None or not watch.running:
-        raise LodgsError(f"No training of '{root.name}' is at work.")
+        raise LodgsError(f"Cannot cancel the training: no training of '{root.name}' is running.")
     if not watch.cancel_requested:
         watch.cancel_requested = True
         watch.message = "Saving and stopping"
@@ -129,15 +130,15 @@ def cancel(root: bpy.types.Object) -> None:
             watch.folder.request_cancel()
         except OSError as error:
             raise LodgsError(
-                f"{watch.folder.path} cannot be written: {error.strerror}.",
-                "Cancel again to end the trainer.",
+                f"Cannot write to {watch.folder.path}: {error.strerror}.",
+                "Cancel again to kill the trainer.",
             ) from error
     else:
         if watch.process is not None:
             watch.process.kill()
         else:
             watch.folder.kill()
-        for number in {each["block"] for each in watch.blocks}:  # with nobody to begin them again
+        for number in {block["block"] for block in watch.blocks}:
             part = watch.part(number)
             with suppress(LodgsError, OSError):
                 if part is not None:
@@ -146,25 +147,25 @@ def cancel(root: bpy.types.Object) -> None:
 
 
 def cancel_block(root: bpy.types.Object, number: int) -> None:
-    """Ask the training of one cell to save and stop, while the others go on.
+    """Ask the training of one cell to save and stop. Other cells continue.
 
     Raises:
-        LodgsError: it is not at work, nor to begin.
+        LodgsError: the cell is neither running nor waiting.
     """
     watch = watch_of(root)
     part = watch.part(number) if watch is not None and watch.running else None
     if watch is None or part is None or part.state not in {"waiting", "running"}:
-        raise LodgsError(f"Cell {number} of '{root.name}' is not being trained.")
-    _ask(part.folder.request_cancel)
+        raise LodgsError(f"Cannot cancel cell {number} of '{root.name}': it is not being trained.")
+    _request(part.folder.request_cancel)
     watch.stopping.add((part.kind, number))
     extension.redraw()
 
 
 def resume_block(root: bpy.types.Object, number: int) -> Watch:
-    """Go on with the training of one cell: beside the others where they are at work, else alone.
+    """Resume the training of one cell. If no other cell is running, only this cell is trained.
 
     Raises:
-        LodgsError: there is no such cell, or it is at work or finished.
+        LodgsError: the cell does not exist, or it is running or finished.
     """
     watch = watch_of(root)
     part = watch.part(number) if watch is not None else None
@@ -173,58 +174,60 @@ def resume_block(root: bpy.types.Object, number: int) -> Watch:
         or part is None
         or part.state in ({"waiting", "running", "done"} if watch.running else {"done"})
     ):
-        raise LodgsError(f"Cell {number} of '{root.name}' has nothing to go on with.")
-    _ask(part.folder.request_resume)
+        raise LodgsError(f"Cannot resume cell {number} of '{root.name}': it is not stopped.")
+    _request(part.folder.request_resume)
     return watch if watch.running else _resume(root, watch.folder)
 
 
-def _ask(request: Callable[[], None]) -> None:
+def _request(request: Callable[[], None]) -> None:
     try:
         request()
     except OSError as error:
         raise LodgsError(
-            f"{error.filename} cannot be written: {error.strerror}.", "Cancel the whole training."
+            f"Cannot write {error.filename}: {error.strerror}.", "Cancel the whole training."
         ) from error
 
 
-def attach(root: bpy.types.Object, folder: str, *, again: bool = True) -> Watch:
-    """Make the run in ``folder`` the root's own: load its levels, and follow it if it is at work.
+def attach(root: bpy.types.Object, folder: str, *, reload: bool = True) -> Watch:
+    """Make a run the root's newest run. Its levels are loaded by :func:`follow`.
 
     Args:
-        root: the scene root.
-        folder: a run's folder, also one that another Blender or a command line started.
-        again: load every level; False only those that came since this .blend last saw the run.
+        root: scene root.
+        folder: run folder, possibly of a run that another Blender or a command started.
+        reload: load every level, or else only the levels that this .blend file has not read yet.
 
     Raises:
-        LodgsError: there is no run in the folder.
+        LodgsError: the folder contains no run.
     """
     run = RunFolder(Path(bpy.path.abspath(folder)).resolve())
     if run_state(run) == "empty":
-        raise LodgsError(f"{run.path} holds no run.", "Choose a folder that has a job.toml in it.")
-    if again:
+        raise LodgsError(
+            f"Cannot open {run.path}: it contains no run.", "Choose a folder that contains a job.toml file."
+        )
+    if reload:
         root.lodgs.training.read = 0
     link_run(root, run)
-    watch = begin(Watch(run, root.session_uid, offset=root.lodgs.training.read))
+    watch = start_watching(Watch(run, root.session_uid, offset=root.lodgs.training.read))
     if watch.blocks and not root.lodgs.training.planned_for:
         cells.require(root.lodgs.training, watch.cells)
     return watch
 
 
 def follow(watch: Watch, show: Callable[[Watch], None] | None = None) -> None:
-    """Look after a run: by a timer in a window, here and now until it ends in background.
+    """Read the events of a run until it ends: by a timer with a window, blocking in background.
 
-    Ctrl-C in background asks the trainer to save and stop, and waits for that.
+    In background, Ctrl-C asks the trainer to save and stop, and waits for it.
 
     Args:
-        watch: what :func:`start`, :func:`resume` or :func:`attach` returned.
-        show: called after each look, to print progress.
+        watch: result of :func:`start`, :func:`resume` or :func:`attach`.
+        show: function called after each step, for example to print progress.
     """
 
     def step() -> bool:
-        more = watch.step()
+        unfinished = watch.step()
         if show:
             show(watch)
-        return more
+        return unfinished
 
     try:
         processes.follow(step)
@@ -235,8 +238,8 @@ def follow(watch: Watch, show: Callable[[Watch], None] | None = None) -> None:
         processes.follow(step)
 
 
-def _hand_over(root: bpy.types.Object, run: RunFolder, job: Job) -> None:
-    """Write into a run what it takes of this file: splats as they are now, and the views of them."""
+def _export_inputs(root: bpy.types.Object, run: RunFolder, job: Job) -> None:
+    """Write the current splats of a root to a run, and the views to render them from."""
     bundle = scenes.read_levels(root)
     views = []
     if job.capture:
@@ -248,38 +251,42 @@ def _hand_over(root: bpy.types.Object, run: RunFolder, job: Job) -> None:
 
 
 def _launch(
-    root: bpy.types.Object, run: RunFolder, job: Job, *, write: bool, hand_over: bool = False
+    root: bpy.types.Object, run: RunFolder, job: Job, *, write_job: bool, export: bool = False
 ) -> Watch:
-    python, at_once = environment.trainer_python(), root.lodgs.training.at_once if job.cells else 1
+    """Start the trainer, after writing the job and exporting the inputs if asked for."""
+    python = environment.trainer_python()
+    at_once = root.lodgs.training.at_once if job.cells else 1
     environment.require(python, at_once)
-    if hand_over:
-        _hand_over(root, run, job)
+    if export:
+        _export_inputs(root, run, job)
     run.create()
-    if write:
+    if write_job:
         job.resolved().write(run.job)
-    what = ["train", str(run.job), "--out", str(run.path)]
+    arguments = ["train", str(run.job), "--out", str(run.path)]
     if job.cells:
-        what = ["blocks", "run", str(run.path), "--on", f"local:{at_once}" if at_once > 1 else "here"]
+        workers = f"local:{at_once}" if at_once > 1 else "here"
+        arguments = ["blocks", "run", str(run.path), "--on", workers]
     try:
-        run.take_cancel()  # what was asked of an earlier trainer; from now on it is for this one
-        process = processes.spawn([str(python), "-m", "training", *what], log=run.log, output=run.output)
+        run.take_cancel()  # clear a request to an earlier trainer
+        command = [str(python), "-m", "training", *arguments]
+        process = processes.spawn(command, log=run.log, output=run.output)
     except OSError as error:
         raise LodgsError(
-            f"The trainer's Python {python} cannot be started: {error.strerror or error}.",
-            "Check it in the preferences of LODGS.",
+            f"Cannot start the trainer with {python}: {error.strerror or error}.",
+            "Check the trainer's Python in the preferences of LODGS.",
         ) from error
     link_run(root, run)
-    return begin(Watch(run, root.session_uid, process=process, offset=root.lodgs.training.read))
+    return start_watching(Watch(run, root.session_uid, process=process, offset=root.lodgs.training.read))
 
 
 def reattach() -> None:
-    """Attach to the run of every scene root that has one and is not watched: after loading, undo and redo."""
+    """Attach to the runs of all scene roots that are not watched: after loading a file, undo and redo."""
     for root in [obj for obj in bpy.data.objects if obj.lodgs.training.run and obj.is_editable]:
         if watch_of(root) is None and not is_on_other_computer(bpy.path.abspath(root.lodgs.training.run)):
-            with suppress(LodgsError):  # the folder is gone: the panel says so
-                watch = attach(root, root.lodgs.training.run, again=False)
+            with suppress(LodgsError):  # the panel reports a missing folder
+                watch = attach(root, root.lodgs.training.run, reload=False)
                 if bpy.app.background:
-                    watch.step()  # what is there; waiting for more is not what opening a file is for
+                    watch.step()  # read existing events only: opening a file must not wait for a training
                 else:
                     follow(watch)
 

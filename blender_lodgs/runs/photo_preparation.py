@@ -14,7 +14,7 @@ import bpy
 
 from ...training.errors import LodgsError
 from ...training.scenes.colmap import Scene, read_scene
-from ...training.scenes.undistort import already_undistorted
+from ...training.scenes.undistort import cached_undistorted_scene
 from ...training.splats.dialects import Warn
 from .. import extension
 from ..data import photographs, scenes
@@ -153,7 +153,7 @@ def undistort_photos(root: bpy.types.Object, warn: Warn) -> None:
         if root is None:  # another file has been opened
             return
         scene = _read_scene(root)
-        undistorted = already_undistorted(scene)
+        undistorted = cached_undistorted_scene(scene)
         if undistorted is not None:
             photographs.show_undistorted(bpy.context, root, scene.names, undistorted)
         work.message = f"{len(distorted)} photos were undistorted"

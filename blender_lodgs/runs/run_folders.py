@@ -19,7 +19,7 @@ LOG = "LODGS trainer log"
 
 @dataclass(frozen=True)
 class RunRecord:
-    """A run on disk: its folder, its job, and its state as ``RunFolder.state``."""
+    """A run on disk: its folder, its job, and its ``RunFolder.state``."""
 
     folder: RunFolder
     job: Job
@@ -27,42 +27,48 @@ class RunRecord:
 
 
 def run_folder(root: bpy.types.Object) -> RunFolder | None:
-    """The folder of the root's newest run, whether or not it is followed."""
+    """Return the folder of the root's newest run, watched or not."""
     run = root.lodgs.training.run
     return RunFolder(bpy.path.abspath(run)) if run else None
 
 
 def cost_plot(root: bpy.types.Object) -> Path | None:
-    """The picture of what finding the levels' distances has told, where the root's run has one."""
+    """Return the image file with the cost curve of the root's run, if it exists."""
     run = run_folder(root)
     return run.costs if run is not None and run.costs.is_file() else None
 
 
 def log_text(root: bpy.types.Object) -> bpy.types.Text:
-    """The end of the trainer's log, as a text block.
+    """Return the last lines of the trainer's log as a text block.
 
     Raises:
-        LodgsError: there is no run, or it has written no log.
+        LodgsError: the root has no run, or its log is empty.
     """
     run = run_folder(root)
     tail = run.log_tail(200) if run else ""
     if not tail.strip():
-        raise LodgsError("The trainer has written no log.")
+        raise LodgsError("Cannot show the log: the trainer has not written one.")
     text = bpy.data.texts.get(LOG) or bpy.data.texts.new(LOG)
     text.from_string(tail)
     return text
 
 
 def run_state(run: RunFolder) -> str:
+    """Return ``RunFolder.state``.
+
+    Raises:
+        LodgsError: the folder cannot be read.
+    """
     try:
         return run.state()
     except OSError as error:
         raise LodgsError(
-            f"The run folder {run.path} cannot be read: {error.strerror}.", "Choose another folder."
+            f"Cannot read the run folder {run.path}: {error.strerror}.", "Choose another folder."
         ) from error
 
 
 def link_run(root: bpy.types.Object, run: RunFolder) -> None:
+    """Store a run as the root's newest run, relative to the .blend file if possible."""
     path = str(run.path)
     if bpy.data.is_saved:
         with suppress(ValueError):  # another drive
@@ -71,7 +77,7 @@ def link_run(root: bpy.types.Object, run: RunFolder) -> None:
 
 
 def runs_parent(root: bpy.types.Object) -> Path:
-    """What holds the folders of a root's runs: where the settings say, else beside the .blend or at home."""
+    """Return the parent of the root's run folders: from the settings, next to the .blend file, or at home."""
     if root.lodgs.training.output:
         return Path(bpy.path.abspath(root.lodgs.training.output)).resolve()
     if bpy.data.is_saved:
@@ -80,25 +86,27 @@ def runs_parent(root: bpy.types.Object) -> Path:
 
 
 def find_runs(root: bpy.types.Object) -> list[RunRecord]:
-    """The runs of a root's photographs, or of its base, by name: where new ones would lie, and beside its
-    newest one."""
-    mine = run_folder(root)
-    places = {runs_parent(root), *([mine.path.parent] if mine else [])}
+    """Return the root's own run and all runs of its photos, sorted by path.
+
+    The parent of new run folders and the parent of the newest run are searched.
+    """
+    current = run_folder(root)
+    parents = {runs_parent(root), *([current.path.parent] if current else [])}
     scene = Path(bpy.path.abspath(root.lodgs.scene_folder)) if root.lodgs.scene_folder else None
-    found = {}
-    for place in places:
-        for file in place.glob("*/job.toml"):
+    records = {}
+    for parent in parents:
+        for file in parent.glob("*/job.toml"):
             with suppress(LodgsError, OSError):
                 run = RunFolder(file.parent)
                 job = Job.from_file(file)
-                here = mine is not None and run.path == mine.path
-                if here or (scene is not None and job.scene and Path(job.scene) == scene):
-                    found[run.path] = RunRecord(run, job, run.state())
-    return [found[path] for path in sorted(found)]
+                is_current = current is not None and run.path == current.path
+                if is_current or (scene is not None and job.scene and Path(job.scene) == scene):
+                    records[run.path] = RunRecord(run, job, run.state())
+    return [records[path] for path in sorted(records)]
 
 
 def new_run_folder(root: bpy.types.Object) -> Path:
-    """A folder for a run, not there yet."""
+    """Return an unused path for a run folder."""
     parent = runs_parent(root)
     name = bpy.path.clean_name(root.name)
     names = itertools.chain([name], (f"{name}-{n}" for n in itertools.count(2)))
@@ -106,9 +114,10 @@ def new_run_folder(root: bpy.types.Object) -> Path:
 
 
 def is_on_other_computer(folder: str) -> bool:
-    """Whether a folder is on another computer than the .blend: it is looked for there on request only.
+    """Return whether a folder is on a network share that does not hold the .blend file.
 
-    Opening somebody's file must not make Windows introduce itself to a computer of their choice.
+    Such a folder is read on request only: opening a stranger's file must not make Windows log in to the
+    computer that the file names.
     """
     share = PureWindowsPath(folder).drive
     return share.startswith(("\\\\", "//")) and share != PureWindowsPath(bpy.data.filepath).drive

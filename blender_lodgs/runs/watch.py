@@ -1,7 +1,6 @@
-"""What Blender knows of the runs that it follows: a :class:`Watch` reads a run's events as they come.
+"""Observation of training runs: a :class:`Watch` reads the events of a run and updates the scene.
 
-Everything that must last is in the run's folder; a level of splats becomes an object as soon as its file is
-there.
+A level of splats becomes an object as soon as its file exists. All permanent data is in the run folder.
 """
 
 from __future__ import annotations
@@ -24,51 +23,51 @@ from .. import extension
 from ..data import cells, scenes
 
 UNRESPONSIVE_AFTER = 60.0
-"""Seconds without an event after which the panel says that the trainer does not answer."""
+"""Seconds without an event after which the panel reports that the trainer does not respond."""
 
 
 @dataclass(frozen=True)
-class Part:
-    """What of a scene in cells is trained now: of the whole, or of one cell.
+class RunPart:
+    """Training state of one cell of a scene, or of the coarse levels that all cells share.
 
     Attributes:
-        folder: of its run.
-        number: of the cell; 0 for the whole.
-        kind, state: as ``progress`` events have them (``BLOCK_KINDS``, ``BLOCK_STATES``); ``stopped`` with
-            the run that it was trained by.
-        share: how much is done, 0 to 1, of a cell with its borders.
+        folder: run folder of the part.
+        number: number of the cell, or 0 for the coarse levels.
+        kind: current kind of training, one of ``BLOCK_KINDS`` of ``progress`` events.
+        state: one of ``BLOCK_STATES``, or ``stopped`` if the run was stopped during this part.
+        fraction: progress including border steps, 0 to 1.
     """
 
     folder: RunFolder
     number: int
     kind: str
     state: str
-    share: float
+    fraction: float
 
 
 @dataclass
 class Watch:
-    """What Blender knows of one run.
+    """State of one run, read from its events.
 
     Attributes:
-        folder: the run's folder.
-        root: ``session_uid`` of the scene root that receives the levels; it survives undo and renaming.
-        process: the trainer, when this Blender started it.
-        state: as ``RunFolder.state``.
-        message: what the trainer is doing, or how the run ended.
-        share: how much of that is done, 0 to 1.
-        problem: why the run failed, as a sentence with its remedy; empty when it did not.
-        progress: the newest ``progress`` event.
-        blocks: how each part of a scene in cells gets on, as a ``progress`` event says; see :meth:`part`.
-        levels: the newest ``level`` event of each level.
-        summary: of a finished run the ``done`` event, with what it is worth.
-        warnings: the warnings of this run.
-        cancel_requested: whether it was asked to stop.
-        stopping: kinds and cells' numbers of parts that were asked to stop by themselves.
-        method: what it trains.
-        last_event: when an event came last, in seconds since the epoch.
-        offset: bytes of the run's events that have been read.
-        reading: a finished tree that is larger than it may be in memory, while its top is read.
+        folder: run folder.
+        root: ``session_uid`` of the scene root that receives the levels. It survives undo and renaming.
+        process: trainer process, if this Blender started it.
+        state: see ``RunFolder.state``.
+        message: current step of the trainer, or the end of the run.
+        fraction: progress of the current step, 0 to 1.
+        problem: reason of a failure with its remedy. Empty otherwise.
+        progress: newest ``progress`` event.
+        blocks: state of each part of a scene in cells, from ``progress`` events. See :meth:`part`.
+        levels: newest ``level`` event of each level.
+        summary: ``done`` event of a finished run, with its quality.
+        warnings: warnings of the run.
+        cancel_requested: whether the run was asked to stop.
+        stopping: (kind, cell number) of parts that were asked to stop.
+        method: name of the trained method.
+        last_event: time of the last event, in seconds since the epoch.
+        offset: number of bytes read from the event file.
+        reading: top of a finished tree, being read. Set only if the tree does not fit into memory.
     """
 
     folder: RunFolder
@@ -76,7 +75,7 @@ class Watch:
     process: subprocess.Popen | None = None
     state: str = "running"
     message: str = "Starting the trainer"
-    share: float = 0.0
+    fraction: float = 0.0
     problem: str = ""
     progress: dict = field(default_factory=dict)
     blocks: list[dict] = field(default_factory=list)
@@ -96,54 +95,57 @@ class Watch:
 
     @property
     def unresponsive(self) -> bool:
-        """Whether a running trainer has sent no event for :data:`UNRESPONSIVE_AFTER` seconds."""
+        """Return whether a running trainer has sent no event for :data:`UNRESPONSIVE_AFTER` seconds."""
         return self.running and time.time() - self.last_event > UNRESPONSIVE_AFTER
 
     @property
     def cells(self) -> int:
-        """How many cells the run has, as far as it has said so."""
-        return sum(each["kind"] == "block" for each in self.blocks)
+        """Return the number of cells, or 0 if the run has not reported it yet."""
+        return sum(block["kind"] == "block" for block in self.blocks)
 
-    def part(self, number: int) -> Part | None:
-        """What is trained of a cell now, or last; or with 0 of the whole scene, before its cells. None where
-        nothing is known of such a part."""
-        mine = [each for each in self.blocks if each["block"] == number]
-        if not mine:
+    def part(self, number: int) -> RunPart | None:
+        """Return the current or last training of a cell, or of the coarse levels (number 0).
+
+        None if the run has not reported this part.
+        """
+        blocks = [block for block in self.blocks if block["block"] == number]
+        if not blocks:
             return None
-        now = next((each for each in mine if each["state"] != "done"), mine[-1])
-        state = "stopped" if now["state"] == "running" and not self.running else now["state"]
-        share = sum(each["step"] for each in mine) / max(sum(each["of"] for each in mine), 1)
+        current = next((block for block in blocks if block["state"] != "done"), blocks[-1])
+        state = "stopped" if current["state"] == "running" and not self.running else current["state"]
+        fraction = sum(block["step"] for block in blocks) / max(sum(block["of"] for block in blocks), 1)
         run = self.folder
-        places = {"coarse": run.coarse, "block": run.blocks / str(number), "seam": run.seams / str(number)}
-        return Part(RunFolder(places[now["kind"]]), number, now["kind"], state, min(share, 1.0))
+        paths = {"coarse": run.coarse, "block": run.blocks / str(number), "seam": run.seams / str(number)}
+        path = paths[current["kind"]]
+        return RunPart(RunFolder(path), number, current["kind"], state, min(fraction, 1.0))
 
     def step(self) -> bool:
-        """Handle the events since the last step; return whether there may be more.
+        """Handle the new events. Return whether more may come.
 
-        A level becomes an object at once. Never raises: what goes wrong becomes ``problem``.
+        This method never raises: errors become ``problem``.
         """
         root = root_by_uid(self.root)
         if watches.get(self.root) is not self:
             return False
-        if root is None:  # deleted or undone; redo finds the run again
+        if root is None:  # deleted or undone; redo attaches to the run again
             del watches[self.root]
             return False
         alive = True
         try:
-            alive = self._alive()  # asked first: the events before the end are then read below
+            alive = self._alive()  # before reading, so that the last events are not missed
             events, self.offset = self.folder.events(self.offset)
             for event in events:
                 self._handle_event(root, event)
             if self.reading is not None:
-                self._place(root, self.reading)
+                self._show_tree(root, self.reading)
                 return True
             if not alive:
                 self._set_end()
             if events or not alive:
                 extension.redraw()
         except Exception as error:
-            self.problem = self._trouble(error)
-            if not alive:  # nothing will say how it ended
+            self.problem = self._describe(error)
+            if not alive:
                 self.state, self.message = "interrupted", "Stopped"
         return alive
 
@@ -151,16 +153,16 @@ class Watch:
         self.last_event = time.time()
         try:
             self._apply(root, event)
-        except Exception as error:  # the next events are worth as much without this one
-            self.problem = self._trouble(error)
+        except Exception as error:  # continue with the next events
+            self.problem = self._describe(error)
 
-    def _trouble(self, error: Exception) -> str:
+    def _describe(self, error: Exception) -> str:
         if isinstance(error, LodgsError):
             return str(error)
         if isinstance(error, OSError):
-            return f"The run folder {self.folder.path} cannot be read: {error.strerror or error}."
+            return f"Cannot read the run folder {self.folder.path}: {error.strerror or error}."
         traceback.print_exc()
-        return f"What the trainer sent could not be shown: {error}."
+        return f"Cannot show the trainer's output: {error}."
 
     def _alive(self) -> bool:
         if self.process is not None and self.process.poll() is None:
@@ -174,13 +176,15 @@ class Watch:
                 self.method = event.get("method", "")
                 self.warnings.clear()
             case "status":
-                self.message, self.share = event["message"], _share(event)
+                self.message = event["message"]
+                self.fraction = _fraction(event)
             case "progress":
                 event = _with_blocks(event, self.blocks)
-                self.progress, self.message = event, event.get("stage", "").capitalize()
-                self.share = _share(event)
+                self.progress = event
+                self.message = event.get("stage", "").capitalize()
+                self.fraction = _fraction(event)
                 if "blocks" in event:
-                    self._take_blocks(root, event["blocks"])
+                    self._set_blocks(root, event["blocks"])
             case "warning":
                 self.warnings.append(event["message"])
             case "level":
@@ -189,10 +193,10 @@ class Watch:
                 self.summary = event
                 self._finish(root)
 
-    def _take_blocks(self, root: bpy.types.Object, blocks: list[dict]) -> None:
+    def _set_blocks(self, root: bpy.types.Object, blocks: list[dict]) -> None:
         self.blocks = blocks
         self.stopping &= {
-            (each["kind"], each["block"]) for each in blocks if each["state"] in ("waiting", "running")
+            (block["kind"], block["block"]) for block in blocks if block["state"] in ("waiting", "running")
         }
         cells.require(root.lodgs.training, self.cells)
 
@@ -202,33 +206,33 @@ class Watch:
             return
         level = self._read_level(event)
         with extension.in_window():
-            if not root.lodgs.training.read:  # what is here is not this run's, and two never mix
+            if not root.lodgs.training.read:  # never mix levels of two runs
                 scenes.make_room(root, event["level"])
             if "meta" in event:
-                scenes.set_bundle_facts(root, self._described(event))
+                scenes.set_bundle_facts(root, self._bundle_facts(event))
             scenes.set_level(root, level)
             root.lodgs.training.read = self.offset
-            if not event.get("more"):  # levels that come together are one step
+            if not event.get("more"):  # levels that arrive together are one undo step
                 extension.undo_step(f"Level {event['level']}")
         self.levels[event["level"]] = event
 
     def _stays_in_file(self, root: bpy.types.Object, event: dict) -> bool:
-        """Whether a level is of a tree larger than may be in memory, of which half are leaves."""
+        """Return whether a level's tree exceeds the memory budget: about half of its nodes are leaves."""
         return event.get("rule") == CUT.name and 2 * event["splats"] >= root.lodgs.stream.budget
 
     def _read_level(self, event: dict) -> Level:
         splats = read_ply(self.folder.find_file(event["path"]))
         return Level(event["level"], splats, event.get("facts", {}))
 
-    def _described(self, event: dict) -> Bundle:
-        """What a level's event says of all levels, without them."""
+    def _bundle_facts(self, event: dict) -> Bundle:
+        """Return the facts of a ``level`` event as a bundle without levels."""
         return Bundle(
             self.method, [], event.get("rule", ""), event.get("scene_facts", {}),
             event.get("controls", {}), event.get("cumulative", False), event["meta"],
         )  # fmt: skip
 
-    def _place(self, root: bpy.types.Object, reading: Future[scenes.SplatsFile]) -> None:
-        """Shows a finished tree as soon as its top has been read."""
+    def _show_tree(self, root: bpy.types.Object, reading: Future[scenes.SplatsFile]) -> None:
+        """Show a finished tree when its top has been read."""
         if not reading.done():
             return
         self.reading = None
@@ -238,7 +242,7 @@ class Watch:
                 root.lodgs.training.read = self.offset
                 extension.undo_step("Training finished")
         except Exception as error:
-            self.problem = self._trouble(error)
+            self.problem = self._describe(error)
 
     def _finish(self, root: bpy.types.Object) -> None:
         if any(self._stays_in_file(root, event) for event in self.levels.values()):
@@ -251,45 +255,45 @@ class Watch:
         head = read_header(self.folder.bundle)
         head.tables = read_tables(self.folder.bundle)
         with extension.in_window():
-            there = {item.number for item in root.lodgs.levels if item.exists}
-            for number in {level.number for level in head.levels} & self.levels.keys() - there:
-                scenes.set_level(root, self._read_level(self.levels[number]))  # an undo took it away
+            existing = {item.number for item in root.lodgs.levels if item.exists}
+            for number in {level.number for level in head.levels} & self.levels.keys() - existing:
+                scenes.set_level(root, self._read_level(self.levels[number]))  # removed by an undo
             scenes.set_bundle_facts(root, head)
             scenes.set_tables(root, head.tables)
             root.lodgs.training.read = self.offset
             extension.undo_step("Training finished")
 
     def _set_end(self) -> None:
-        """Say how the run ended."""
+        """Set the state, message and problem of a run that has ended."""
         code = None if self.process is None else self.process.poll()
         self.state, problem = run_outcome(self.folder, code)
         self.problem = problem or self.problem
         self.message = {
             "done": "Finished",
-            "cancelled": "Cancelled; it can be resumed",
-        }.get(self.state, "Stopped; it can be resumed")
+            "cancelled": "Cancelled; can be resumed",
+        }.get(self.state, "Stopped; can be resumed")
 
 
-def _share(event: dict) -> float:
+def _fraction(event: dict) -> float:
     return min(event.get("step", 0) / max(event.get("of", 0), 1), 1.0)
 
 
 watches: dict[int, Watch] = {}
-"""The newest run of each scene root, by the root's ``session_uid``."""
+"""Newest run of each scene root by its ``session_uid``."""
 
 
 def watch_of(root: bpy.types.Object | None) -> Watch | None:
-    """The run of a scene root that this Blender follows or followed, for the panel."""
+    """Return the watch of a scene root, including a finished one."""
     return None if root is None else watches.get(root.session_uid)
 
 
 def _with_blocks(event: dict, blocks: list[dict]) -> dict:
-    """A ``progress`` event with how each part of a scene in cells was last, where it leaves that out."""
+    """Add the last known state of each part to a ``progress`` event without it."""
     return {"blocks": blocks, **event} if blocks else event
 
 
-def begin(watch: Watch) -> Watch:
-    """Follows a run from now on, with what is known of it already."""
+def start_watching(watch: Watch) -> Watch:
+    """Register a watch for its root, with the progress, levels and summary from past events."""
     for event in watch.folder.events()[0]:
         if event["event"] == "progress":
             watch.progress = _with_blocks(event, watch.blocks)
@@ -303,5 +307,5 @@ def begin(watch: Watch) -> Watch:
 
 
 def root_by_uid(uid: int) -> bpy.types.Object | None:
-    """The object of a ``session_uid``; None where it was deleted or undone."""
+    """Return the object of a ``session_uid``, or None if it was deleted or undone."""
     return next((obj for obj in bpy.data.objects if obj.session_uid == uid), None)
