@@ -1,4 +1,4 @@
-"""``blender --command lodgs``: the same function, called as Blender calls it."""
+"""``blender --command lodgs``: its main function, called as Blender calls it."""
 
 import json
 import signal
@@ -28,13 +28,13 @@ def test_train_saves_and_exports(bpy, lodgs, lodgs_command, fake, tmp_path, capf
         "--export", bundle, "--image-scale", 0.25, "--seed", 3, "--set", "levels=2", "--set", "steps=[4, 5]",
     )  # fmt: skip
     assert code == 0
-    said = capfd.readouterr().err
+    output = capfd.readouterr().err
     for line in (
         "Level 1: 5 splats, 20.0 dB on held-out views",
         "Finished",
         "warning: One photograph is missing.",
     ):
-        assert line in said.splitlines()
+        assert line in output.splitlines()
     job = lodgs("training.runs.job").Job.from_file(run / "job.toml")
     assert (job.seed, job.image_scale, job.parameters["steps"]) == (3, 0.25, [4, 5])
 
@@ -46,16 +46,14 @@ def test_train_saves_and_exports(bpy, lodgs, lodgs_command, fake, tmp_path, capf
     assert {i.number: len(i.object.data.points) for i in root.lodgs.levels} == COUNTS
     assert [obj for obj in root.children_recursive if obj.type == "CAMERA"]
 
-    other = tmp_path / "again.ply"
-    assert lodgs_command("export", blend, other) == 0
-    assert other.read_bytes() == bundle.read_bytes()
+    second = tmp_path / "again.ply"
+    assert lodgs_command("export", blend, second) == 0
+    assert second.read_bytes() == bundle.read_bytes()
     assert lodgs_command("info", bundle) == 0
     assert "20" in capfd.readouterr().out
 
 
-def test_train_from_a_base_is_what_the_panel_then_shows(
-    bpy, lodgs, lodgs_command, fake, tmp_path, monkeypatch
-):
+def test_train_from_a_base_sets_the_panels_settings(bpy, lodgs, lodgs_command, fake, tmp_path, monkeypatch):
     methods = lodgs("training.methods").METHODS
     monkeypatch.setitem(methods, "flod", replace(methods["flod"], from_base=True))
     fake()
@@ -73,10 +71,10 @@ def test_train_from_a_base_is_what_the_panel_then_shows(
     settings = root.lodgs.training
     assert (settings.start_from, settings.parameters.max_splats) == ("FILE", 500)
     panels = lodgs("runs.job_settings").make_job(root, tmp_path / "second", {})
-    assert panels.resolved() == written, "the panel asks for the same"
+    assert panels.resolved() == written, "the panel makes the same job"
 
 
-def test_splats_alone_are_trained_in_one_command(bpy, lodgs, lodgs_command, fake, tmp_path, capfd):
+def test_splats_without_photos_are_trained_in_one_command(bpy, lodgs, lodgs_command, fake, tmp_path, capfd):
     fake("killed")
     bundles = lodgs("training.splats.bundle")
     bundles.write_bundle(tmp_path / "some.ply", bundles.Bundle("", [bundles.Level(1, splats(7))]))
@@ -90,22 +88,22 @@ def test_splats_alone_are_trained_in_one_command(bpy, lodgs, lodgs_command, fake
     (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
     assert {i.number: len(i.object.data.points) for i in root.lodgs.levels} == COUNTS
     assert (root.lodgs.training.views, root.lodgs.training.views_from) == (5, "DOME")
-    again = ("train", "--base", tmp_path / "run", "--capture", "dome", "--method", "lodge")
-    assert lodgs_command(*again, "--out", tmp_path / "next") == 0, "a finished run's finest level"
+    train = ("train", "--base", tmp_path / "run", "--capture", "dome", "--method", "lodge")
+    assert lodgs_command(*train, "--out", tmp_path / "next") == 0, "a finished run's finest level"
 
 
-def test_a_stopped_run_is_gone_on_with(lodgs_command, fake, tmp_path, capfd):
+def test_the_same_command_resumes_a_stopped_run(lodgs_command, fake, tmp_path, capfd):
     train = ("train", "--scene", SCENE, "--out", tmp_path / "run")
     fake("killed")
     assert lodgs_command(*train, "--blend", tmp_path / "part.blend") == 1
     assert "signal 9" in capfd.readouterr().err
-    assert (tmp_path / "part.blend").exists()  # with the level that there is
+    assert (tmp_path / "part.blend").exists()  # with the finished level
     fake("full")
     assert lodgs_command(*train) == 2
     assert "The disk is full" in capfd.readouterr().err
     fake()
     assert lodgs_command(*train, "--seed", 5) == 2
-    assert "begun with other settings (seed)" in capfd.readouterr().err
+    assert "seed" in capfd.readouterr().err
     assert lodgs_command(*train, "--export", tmp_path / "bundle.ply") == 0
     assert (tmp_path / "bundle.ply").exists()
     (tmp_path / "bundle.ply").unlink()
@@ -119,21 +117,21 @@ def test_a_stopped_run_is_gone_on_with(lodgs_command, fake, tmp_path, capfd):
 
 def test_train_has_the_trainers_options(lodgs, lodgs_command, capfd):
     assert lodgs_command("train", "--help") == 0
-    said = capfd.readouterr().out
+    output = capfd.readouterr().out
     names = {field.name for field in fields(lodgs("training.runs.job").Job)} - {"parameters"}
-    assert all(f"--{name.replace('_', '-')} " in said for name in names | {"set", "blend", "export"})
+    assert all(f"--{name.replace('_', '-')} " in output for name in names | {"set", "blend", "export"})
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (["train", "--scene", "nowhere", "--out", "run"], "nowhere"),
-        (["train", "--scene", SCENE, "--out", "run", "--set", "levels"], "--set levels is not NAME=VALUE"),
-        (["train", "--out", "run"], "the scene's folder"),
-        (["train", "--scene", SCENE, "--out", "run", "--set", "wings=2"], "unknown parameter 'wings'"),
+        (["train", "--scene", SCENE, "--out", "run", "--set", "levels"], "--set levels"),
+        (["train", "--out", "run"], "scene"),
+        (["train", "--scene", SCENE, "--out", "run", "--set", "wings=2"], "wings"),
         (["train", "--scene", SCENE, "--out", "run", "--method", "magic"], "magic"),
-        (["train", "--scene", SCENE, "--out", "run", "--image-scale", "7"], "image_scale = 7"),
-        (["train", "--scene", SCENE, "--out", "run", "--seed", "-1"], "-1 is no whole number from 0"),
+        (["train", "--scene", SCENE, "--out", "run", "--image-scale", "7"], "image_scale"),
+        (["train", "--scene", SCENE, "--out", "run", "--seed", "-1"], "-1"),
         (["train", "--scene", SCENE, "--out", "run", "--test-every", "1"], "test_every"),
         (["import", "nothing.ply", "--blend", "x.blend"], "nothing.ply"),
         (["export", "nothing.blend", "x.ply"], "nothing.blend"),
@@ -142,23 +140,23 @@ def test_train_has_the_trainers_options(lodgs, lodgs_command, capfd):
         ([], "required"),
     ],
 )
-def test_mistakes_end_with_a_sentence_and_two(
-    lodgs_command, fake, tmp_path, monkeypatch, capfd, arguments, says
+def test_input_errors_print_one_sentence_and_exit_with_2(
+    lodgs_command, fake, tmp_path, monkeypatch, capfd, arguments, message
 ):
     fake()
     monkeypatch.chdir(tmp_path)
     assert lodgs_command(*arguments) == 2
-    said = capfd.readouterr().err
-    assert says in said and "Traceback" not in said
+    output = capfd.readouterr().err
+    assert message in output and "Traceback" not in output
     assert not (tmp_path / "run").exists()
 
 
-def test_help_is_no_mistake(lodgs_command, capfd):
+def test_help_exits_with_0(lodgs_command, capfd):
     assert lodgs_command("--help") == 0
     assert "train" in capfd.readouterr().out
 
 
-def test_import_makes_a_blend(bpy, lodgs_command, tmp_path):
+def test_import_writes_a_blend_file(bpy, lodgs_command, tmp_path):
     assert lodgs_command("import", SCENE, "--blend", tmp_path / "scene.blend") == 0
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "scene.blend"))
     assert [obj for obj in bpy.data.objects if obj.lodgs.is_root]
@@ -175,8 +173,8 @@ os._exit(code)
 """
 
 
-def _started(run: Path) -> subprocess.Popen:
-    """A command in a process of its own, whose slow trainer is at work."""
+def _start_command(run: Path) -> subprocess.Popen:
+    """Start a command in a separate process and wait until its slow trainer runs."""
     process = subprocess.Popen(
         [sys.executable, "-c", COMMAND, "train", "--scene", str(SCENE), "--out", str(run)],
         stderr=subprocess.PIPE,
@@ -189,22 +187,22 @@ def _started(run: Path) -> subprocess.Popen:
     return process
 
 
-def test_ctrl_c_cancels_politely(bpy, fake, tmp_path):
-    """The signal goes to the command, which asks the trainer and waits for it."""
+def test_ctrl_c_cancels_the_run(bpy, fake, tmp_path):
+    """The command receives the signal, cancels the trainer and waits for it."""
     fake("slow")
-    with _started(tmp_path / "run") as process:
+    with _start_command(tmp_path / "run") as process:
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 3
         assert process.stderr is not None
-        said = process.stderr.read()
-    assert "Cancelled. The same command resumes." in said and "Traceback" not in said
+        output = process.stderr.read()
+    assert "Cancelled. The same command resumes." in output and "Traceback" not in output
     last = json.loads((tmp_path / "run" / "events.jsonl").read_text().splitlines()[-1])
     assert last["event"] == "cancelled"
 
 
-def test_the_trainer_outlives_blender(bpy, lodgs, fake, tmp_path):
+def test_the_trainer_continues_after_blender_is_killed(bpy, lodgs, fake, tmp_path):
     fake("slow")
-    with _started(tmp_path / "run") as process:
+    with _start_command(tmp_path / "run") as process:
         process.kill()
     run = lodgs("training.runs.folder").RunFolder(tmp_path / "run")
     step = run.last_event("progress")["step"]
@@ -217,7 +215,7 @@ def test_the_trainer_outlives_blender(bpy, lodgs, fake, tmp_path):
         time.sleep(0.05)
 
 
-def test_cells_are_trained_in_one_command(bpy, lodgs, lodgs_command, fake, tmp_path, capfd):
+def test_cells_are_trained_by_one_command(bpy, lodgs, lodgs_command, fake, tmp_path, capfd):
     fake()
     run, blend = tmp_path / "run", tmp_path / "out.blend"
     run.mkdir()
@@ -228,5 +226,5 @@ def test_cells_are_trained_in_one_command(bpy, lodgs, lodgs_command, fake, tmp_p
     assert lodgs("training.runs.job").Job.from_file(run / "job.toml").cells == "2x1"
     bpy.ops.wm.open_mainfile(filepath=str(blend))
     (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
-    assert (root.lodgs.training.columns, root.lodgs.training.rows) == (2, 1), "which the panel then shows"
+    assert (root.lodgs.training.columns, root.lodgs.training.rows) == (2, 1), "the panel shows the cells"
     assert lodgs_command(*command) == 0, "it is finished"

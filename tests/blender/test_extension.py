@@ -1,4 +1,4 @@
-"""The zip: what is in it, and that it installs and works where no checkout is."""
+"""The extension's zip: its contents, and its installation without a checkout."""
 
 import os
 import subprocess
@@ -43,7 +43,7 @@ def archive(tmp_path_factory) -> Path:
     return build(tmp_path_factory.mktemp("dist"))
 
 
-def test_zip_holds_what_it_needs_and_nothing_else(archive):
+def test_zip_contains_only_the_packages_and_their_files(archive):
     with zipfile.ZipFile(archive) as file:
         names = file.namelist()
     code = {
@@ -52,11 +52,11 @@ def test_zip_holds_what_it_needs_and_nothing_else(archive):
         for p in (REPOSITORY / r).rglob("*.*")
         if p.suffix in (".py", ".wgsl")
     }
-    others = {"__init__.py", "blender_manifest.toml", "LICENSE"}
-    others |= {"pyproject.toml", *(f"requirements/{name}.txt" for name in ("trainer", "cluster", "cuda"))}
-    others |= {p.relative_to(REPOSITORY).as_posix() for p in (REPOSITORY / "farm").rglob("*.js")}
+    data = {"__init__.py", "blender_manifest.toml", "LICENSE"}
+    data |= {"pyproject.toml", *(f"requirements/{name}.txt" for name in ("trainer", "cluster", "cuda"))}
+    data |= {p.relative_to(REPOSITORY).as_posix() for p in (REPOSITORY / "farm").rglob("*.js")}
     wheels = set(tomllib.loads((REPOSITORY / "blender_manifest.toml").read_text())["wheels"])
-    assert {n for n in names if not n.endswith("/")} == code | others | {w.removeprefix("./") for w in wheels}
+    assert {n for n in names if not n.endswith("/")} == code | data | {w.removeprefix("./") for w in wheels}
 
 
 def test_version_is_the_same_everywhere():
@@ -73,9 +73,9 @@ def test_zip_installs_and_imports(archive, tmp_path):
     write_ply(tmp_path / "some.ply", splats(20))
     environment = os.environ | {"BLENDER_USER_RESOURCES": str(tmp_path / "user")}
     (tmp_path / "user").mkdir()
-    answer = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", INSTALL, str(archive), str(tmp_path / "some.ply")],
         cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
-    assert "INSTALLED AND WORKING" in answer.stdout, answer.stdout + answer.stderr
-    assert "Traceback" not in answer.stderr
+    assert "INSTALLED AND WORKING" in process.stdout, process.stdout + process.stderr
+    assert "Traceback" not in process.stderr

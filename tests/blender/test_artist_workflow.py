@@ -1,7 +1,7 @@
-"""From photographs to what is handed on, as artists go: every level alike, the same by one command, and
-undone step by step.
+"""An artist's workflow from photos to exported files: the same edits at every level, the same result by one
+command, and undo step by step.
 
-``LODGS_WAY=DIR`` goes it with a COLMAP folder of your own and a whole draft, and prints what is left.
+``LODGS_WAY=DIR`` runs it on another COLMAP folder with a full draft training, and prints the splat counts.
 """
 
 import os
@@ -27,10 +27,10 @@ LENGTH = 3.0
 HARMONIC = 0.28209479177387814
 """Y of degree 0: 1 / (2 sqrt pi)."""
 SHARE = 0.01 if not OWN else 0.001
-"""Of floaters: few steps leave larger ones."""
+"""Largest cluster of floaters as a share of all splats; a short training leaves larger ones."""
 
 
-def test_the_way_from_photographs_to_what_is_handed_on(bpy, lodgs, tmp_path, monkeypatch, capfd):
+def test_workflow_from_photos_to_exported_files(bpy, lodgs, tmp_path, monkeypatch, capfd):
     python = os.environ.get("LODGS_TRAINER_PYTHON")
     if not python:
         pytest.skip("no trainer; set LODGS_TRAINER_PYTHON")
@@ -39,41 +39,39 @@ def test_the_way_from_photographs_to_what_is_handed_on(bpy, lodgs, tmp_path, mon
     way = Way(bpy, lodgs, tmp_path)
     bpy.ops.ed.undo_push(message="Start")
     states = [way.state()]
-    for step in (way.bring_in, way.train, way.crop, way.fit_crop, way.drop_floaters, way.ground, way.mark,
-                 way.scale, way.tint):  # fmt: skip
+    for step in (way.import_photos, way.train, way.crop, way.fit_crop, way.hide_floaters, way.ground,
+                 way.add_scale_marks, way.scale, way.tint):  # fmt: skip
         step()
         states.append(way.state())
         assert states[-1] != states[-2], step.__name__
     counts = way.assert_cropped()
     way.export(streams)
-    way.assert_the_same_by_one_command(python, streams, counts)
+    way.assert_equal_to_one_command(python, streams, counts)
     assert way.state() == states[-1], "exports change nothing"
 
-    undone = [way.back_to(bpy.ops.ed.undo, state) for state in states[-2::-1]]
-    levels = undone.pop(-2)  # each of them, some of them twice, the end, and Train
-    picks = (
-        [1] * 3 + [1 if way.ground_found else 2] + [1] * 4
-    )  # each step is one, picked ground has its empties
-    assert undone == picks and len(counts) + 2 <= levels <= 2 * len(counts) + 2
+    undo_counts = [way.step_until(bpy.ops.ed.undo, state) for state in states[-2::-1]]
+    levels = undo_counts.pop(-2)  # training: each level once or twice, the end, and Train
+    expected = [1] * 3 + [1 if way.ground_found else 2] + [1] * 4  # a picked ground adds its empties first
+    assert undo_counts == expected and len(counts) + 2 <= levels <= 2 * len(counts) + 2
     for state in states[1:]:
-        way.back_to(bpy.ops.ed.redo, state)
+        way.step_until(bpy.ops.ed.redo, state)
     assert way.assert_cropped() == counts
-    way.assert_comes_back(streams, counts)
+    way.assert_reimported(streams, counts)
     if OWN:
         with capfd.disabled():
             print(
                 f"\n{SCENE.name}:",
-                *(f"level {n}: {left:,} of {there:,} left" for n, (left, there) in counts.items()),
+                *(f"level {n}: {visible:,} of {total:,} splats" for n, (visible, total) in counts.items()),
                 sep="\n  ",
             )
 
 
 class Way:
-    """The artist's steps, each of which Blender can undo."""
+    """The workflow's steps, each of which Blender can undo."""
 
     def __init__(self, bpy, lodgs, folder: Path):
         self.bpy, self.lodgs, self.folder = bpy, lodgs, folder
-        self.sphere = np.zeros(3), 1.0  # in the scene's own space
+        self.sphere = np.zeros(3), 1.0  # in the scene's coordinates
         self.factor = 1.0
         self.ground_found = True
 
@@ -88,10 +86,10 @@ class Way:
         return crop
 
     def push(self, message: str):
-        """As the window does for what was dragged or typed."""
+        """Push an undo step, as the window does after a change."""
         self.bpy.ops.ed.undo_push(message=message)
 
-    def bring_in(self):
+    def import_photos(self):
         assert self.bpy.ops.lodgs.import_colmap("EXEC_DEFAULT", True, directory=str(SCENE)) == {"FINISHED"}
 
     def train(self):
@@ -117,36 +115,36 @@ class Way:
         assert self.bpy.ops.lodgs.add_crop("EXEC_DEFAULT", True, shape="SPHERE") == {"FINISHED"}
 
     def fit_crop(self):
-        """Moved to what was photographed, and scaled."""
-        eye, target = self.lodgs("data.photographs").photographed_from(self.root)
+        """Move the crop to the photographed subject and scale it."""
+        camera, target = self.lodgs("data.photographs").photographed_from(self.root)
         to_own = np.linalg.inv(self.to_world())
         centre = to_own[:3, :3] @ target + to_own[:3, 3]
-        radius = self.between_splats(centre, 0.5 * (eye - target).length)
+        radius = self.between_splats(centre, 0.5 * (camera - target).length)
         self.crop_object.location, self.crop_object.scale = target, [radius] * 3
         self.bpy.context.view_layer.update()
         self.sphere = centre, radius
         self.push("Scale")
 
     def between_splats(self, centre, radius: float) -> float:
-        """A radius about as large whose sphere no splat is on: rounding would say on which side that is."""
+        """Return a similar radius with a gap between the sphere and the splats, against rounding."""
         means = np.concatenate([level.splats.means for level in self.trained().levels])
-        away = np.sort(np.linalg.norm(means - centre, axis=1))
-        away = away[np.abs(away - radius) < 0.02 * radius]
-        widest = np.diff(away).argmax()
-        return float(away[widest : widest + 2].mean())
+        distances = np.sort(np.linalg.norm(means - centre, axis=1))
+        distances = distances[np.abs(distances - radius) < 0.02 * radius]
+        widest = np.diff(distances).argmax()
+        return float(distances[widest : widest + 2].mean())
 
-    def drop_floaters(self):
+    def hide_floaters(self):
         assert self.bpy.ops.lodgs.hide_splats("EXEC_DEFAULT", True, test="FLOATERS", share=100 * SHARE) == {
             "FINISHED"
         }
 
     def ground(self):
-        """Found; or where photographs show none, picked: level, under what is left."""
+        """Detect the ground; if the photos show none, pick a level plane under the remaining splats."""
         try:
             assert self.bpy.ops.lodgs.set_ground("EXEC_DEFAULT", True, by="FOUND") == {"FINISHED"}
             return
         except RuntimeError as error:
-            assert OWN and "No plane lies under this scene" in str(error)
+            assert OWN and "plane" in str(error)
         self.ground_found = False
         finest = self.trained().levels[-1].splats.means
         inside = finest[np.linalg.norm(finest - self.sphere[0], axis=1) < self.sphere[1]]
@@ -160,20 +158,20 @@ class Way:
         assert self.bpy.ops.lodgs.set_ground("EXEC_DEFAULT", True, by="SELECTION") == {"FINISHED"}
         assert abs(self.to_world() @ [*self.sphere[0], 1] - [*middle[:2], middle[2] - lowest, 1]).max() < 1e-4
 
-    def mark(self):
-        """Two empties, 2 apart."""
+    def add_scale_marks(self):
+        """Add two empties at a distance of 2."""
         self.add_mark("begin", (0, 0, 0))
         self.add_mark("end", (0, 2, 0))
         self.push("Add Empties")
 
-    def add_mark(self, name: str, place):
+    def add_mark(self, name: str, position):
         mark = self.bpy.data.objects.new(name, None)
-        mark.location = place
+        mark.location = position
         self.bpy.context.scene.collection.objects.link(mark)
         self.bpy.context.view_layer.update()
 
     def select(self, *names: str):
-        """Objects of these names, and the root, which becomes the active one."""
+        """Select the objects of these names and the root, and make the root active."""
         for obj in self.bpy.context.view_layer.objects:
             obj.select_set(obj.name.split(".")[0] in names or obj == self.root)
         self.bpy.context.view_layer.objects.active = self.root
@@ -192,7 +190,7 @@ class Way:
         return np.array(self.root.lodgs.axes.matrix_world, np.float64)
 
     def state(self) -> dict:
-        """Everything that the steps change, to the bit."""
+        """Return everything that the steps change, bit for bit."""
         self.bpy.context.view_layer.update()
         return {
             obj.name: (
@@ -210,21 +208,21 @@ class Way:
         }
 
     def points_of(self, cloud) -> dict[str, str]:
-        """A digest of each attribute of a point cloud."""
+        """Return a digest of each attribute of a point cloud."""
         read = self.lodgs("attributes").read_attribute
-        found = {attribute.name: read(cloud, attribute.name) for attribute in cloud.attributes}
-        return {name: sha256(values.tobytes()).hexdigest() for name, values in found.items()}
+        attributes = {attribute.name: read(cloud, attribute.name) for attribute in cloud.attributes}
+        return {name: sha256(values.tobytes()).hexdigest() for name, values in attributes.items()}
 
-    def back_to(self, step, state: dict) -> int:
-        """Undo or redo until all is as it was then; how many steps that takes."""
+    def step_until(self, step, state: dict) -> int:
+        """Undo or redo until the state is restored, and return the number of steps."""
         for count in range(1, 20):
             assert step() == {"FINISHED"}
             if self.state() == state:
                 return count
-        raise AssertionError("It is never again as it was.")
+        raise AssertionError("The state was not restored.")
 
     def assert_cropped(self) -> dict[int, tuple[int, int]]:
-        """What every level shows lies in the sphere, and is not hidden; how many of how many."""
+        """Check that each level shows the splats in the sphere that are not hidden; return the counts."""
         cleaning = self.lodgs("data.cleaning")
         centre, radius = self.sphere
         graph = self.bpy.context.evaluated_depsgraph_get()
@@ -232,10 +230,10 @@ class Way:
         for level, item in zip(self.trained().levels, self.root.lodgs.levels, strict=True):
             inside = np.linalg.norm(level.splats.means - centre, axis=1) < radius
             hidden = cleaning.hidden(item.object.data)
-            assert not hidden[~inside].any(), "floaters are looked for among what is left"
+            assert not hidden[~inside].any(), "floaters are detected among the cropped splats"
             assert counts[item.number] == (np.count_nonzero(inside & ~hidden), len(inside))
             assert counts[item.number][0] < len(inside)
-            assert counts[item.number][0] or OWN, "coarse levels of a draft may have nothing in a small crop"
+            assert counts[item.number][0] or OWN, "a small crop may exclude a draft's coarse levels"
             self.root.lodgs.mode, self.root.lodgs.single_level = "SINGLE", item.number
             self.bpy.context.view_layer.update()
             graph = self.bpy.context.evaluated_depsgraph_get()
@@ -255,7 +253,7 @@ class Way:
         if streams:
             assert operators.export_streamed(directory=str(self.folder / "web"), **settings) == {"FINISHED"}
 
-    def assert_the_same_by_one_command(self, python: str, streams: bool, counts: dict):
+    def assert_equal_to_one_command(self, python: str, streams: bool, counts: dict):
         centre, radius = self.sphere
         folder = self.folder
         placed = ["--ground", "--scale", self.factor]
@@ -268,10 +266,10 @@ class Way:
             "--crop-sphere", *centre, radius, "--drop-floaters", "--share", SHARE,
             "--scene", SCENE, *placed, "--tint", *TINT,
         ]  # fmt: skip
-        said = subprocess.run([str(part) for part in command], cwd=ROOT, capture_output=True, text=True)
-        assert said.returncode == 0, said.stderr
-        for number, (left, there) in counts.items():
-            assert f"level {number}: {left:,} of {there:,} splats" in said.stdout
+        process = subprocess.run([str(part) for part in command], cwd=ROOT, capture_output=True, text=True)
+        assert process.returncode == 0, process.stderr
+        for number, (visible, total) in counts.items():
+            assert f"level {number}: {visible:,} of {total:,} splats" in process.stdout
         ours, theirs = read_bundle(self.folder / "out.ply"), read_bundle(self.folder / "edited.ply")
         pairs = [(a.splats, b.splats) for a, b in zip(ours.levels, theirs.levels, strict=True)]
         pairs.append((read_ply(self.folder / "plain.ply"), read_ply(self.folder / "edited_plain.ply")))
@@ -283,36 +281,40 @@ class Way:
             dots = np.abs((_unit(blenders.quats) * _unit(edited.quats)).sum(axis=1))
             assert dots.min() > 1 - 1e-5
 
-    def assert_comes_back(self, streams: bool, counts: dict):
-        """Into Blender: every level where the scene stands, in the colours that it has there."""
+    def assert_reimported(self, streams: bool, counts: dict):
+        """Check that exported files import at the scene's location and with its colours."""
         to_world = self.to_world()
         trained = self.trained()
-        left = {}
+        remaining = {}
         for level, item in zip(trained.levels, self.root.lodgs.levels, strict=True):
             inside = np.linalg.norm(level.splats.means - self.sphere[0], axis=1) < self.sphere[1]
             hidden = self.lodgs("data.cleaning").hidden(item.object.data)
-            left[level.number] = level.splats.select(inside & ~hidden)
-        files = {"out.ply": list(left), "plain.ply": [max(left)], "web/lod-meta.json": list(left)}
+            remaining[level.number] = level.splats.select(inside & ~hidden)
+        files = {
+            "out.ply": list(remaining),
+            "plain.ply": [max(remaining)],
+            "web/lod-meta.json": list(remaining),
+        }
         for name, numbers in files.items():
             if name.startswith("web") and not streams:
                 continue
-            before = set(self.bpy.data.objects)
-            upright = name == "out.ply"  # which tells how its scene stands; other files cannot
-            done = self.bpy.ops.lodgs.import_splats(filepath=str(self.folder / name), upright=upright)
-            assert done == {"FINISHED"}
-            (root,) = [obj for obj in self.bpy.data.objects if obj.lodgs.is_root and obj not in before]
+            previous = set(self.bpy.data.objects)
+            upright = name == "out.ply"  # only bundles store the scene's orientation
+            result = self.bpy.ops.lodgs.import_splats(filepath=str(self.folder / name), upright=upright)
+            assert result == {"FINISHED"}
+            (root,) = [obj for obj in self.bpy.data.objects if obj.lodgs.is_root and obj not in previous]
             self.bpy.context.view_layer.update()
             for item, number in zip(root.lodgs.levels, numbers, strict=True):
-                truth, cloud = left[number], item.object.data
+                truth, cloud = remaining[number], item.object.data
                 assert len(cloud.points) == counts[number][0]
                 matrix, read = np.array(item.object.matrix_world), self.lodgs("attributes").read_attribute
-                places = read(cloud, "position") @ matrix[:3, :3].T + matrix[:3, 3]
-                wanted = truth.means @ to_world[:3, :3].T + to_world[:3, 3]
-                if name.startswith("web"):  # in an order of its own, and in fewer bits
-                    far = np.sort(places, axis=0) - np.sort(wanted, axis=0)
-                    assert abs(far).max() < 0.01 * self.sphere[1] * self.factor
+                positions = read(cloud, "position") @ matrix[:3, :3].T + matrix[:3, 3]
+                expected = truth.means @ to_world[:3, :3].T + to_world[:3, 3]
+                if name.startswith("web"):  # the format reorders and quantizes splats
+                    error = np.sort(positions, axis=0) - np.sort(expected, axis=0)
+                    assert abs(error).max() < 0.01 * self.sphere[1] * self.factor
                     continue
-                np.testing.assert_allclose(places, wanted, atol=1e-3)
+                np.testing.assert_allclose(positions, expected, atol=1e-3)
                 colours = np.array(TINT) * (0.5 + HARMONIC * truth.sh[:, 0])
                 base = read(cloud, "radiance:base")
                 np.testing.assert_allclose(0.5 + HARMONIC * base[:, :3], colours, atol=1e-4)
