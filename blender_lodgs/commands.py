@@ -26,7 +26,7 @@ from ..training.splats.bundle import write_bundle
 from ..training.splats.dialects import Warn
 from ..training.splats.formats import PLY, find_format, write_splats
 from . import extension
-from .data import scenes, viewpoints
+from .data import importing, scenes, viewpoints
 from .render.capture import noise, render_views, write_model
 from .render.video import MOST_FRAMES, extract_frames
 from .runs import environment, job_settings, jobs, photo_preparation
@@ -202,12 +202,12 @@ def _import_for(job: Job) -> bpy.types.Object:
     if not job.capture:
         return _import_photos(Path(job.scene), warn)
     run = RunFolder(job.base)
-    return scenes.import_splats(bpy.context, run.bundle if run.bundle.exists() else run.path, warn=warn)
+    return importing.import_splats(bpy.context, run.bundle if run.bundle.exists() else run.path, warn=warn)
 
 
 def _import_photos(folder: Path, warn: Warn) -> bpy.types.Object:
     """Import a COLMAP scene, undistort its photos if needed and return the scene root."""
-    root = scenes.import_colmap(bpy.context, folder, warn=warn)
+    root = importing.import_colmap(bpy.context, folder, warn=warn)
     photo_preparation.undistort_photos(root, warn)
     return root
 
@@ -222,7 +222,7 @@ def _import(args: argparse.Namespace) -> int:
     if args.source.is_dir():
         _import_photos(args.source.resolve(), lambda m: _print(f"warning: {m}"))
     else:
-        scenes.import_splats(bpy.context, args.source.resolve(), warn=lambda m: _print(f"warning: {m}"))
+        importing.import_splats(bpy.context, args.source.resolve(), warn=lambda m: _print(f"warning: {m}"))
     _save(args.blend)
     return DONE
 

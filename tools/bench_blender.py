@@ -93,7 +93,7 @@ def large_scene(bpy) -> None:
     with tempfile.TemporaryDirectory() as folder:
         write_large(Path(folder), *SCENE, PHOTOGRAPH.read_bytes())
         before, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
-        root = load("blender_lodgs.data.scenes").import_colmap(bpy.context, Path(folder))
+        root = load("blender_lodgs.data.importing").import_colmap(bpy.context, Path(folder))
         seconds, most = time.process_time() - began, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         points, views = len(root.lodgs.points.data.points), len(root.lodgs.cameras.objects)
         print(f"{points:,} points and {views:,} photographs: {seconds:.1f} s of the processor, "
@@ -104,7 +104,7 @@ def selection_seconds(bpy, path: Path) -> tuple[float, float]:
     """One evaluation after the eye moved, and numpy's way to the same splats' attributes."""
     splats = load("training.splats.ply").read_ply(path)
     camera = two_levels(bpy, splats)
-    root = load("blender_lodgs.data.scenes").roots(bpy.context.scene)[0]
+    root = load("blender_lodgs.data.roots").roots(bpy.context.scene)[0]
 
     def move() -> None:
         camera.location.x += 0.01
@@ -134,7 +134,7 @@ def two_levels(bpy, splats):
     camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
     bpy.context.scene.collection.objects.link(camera)
     bpy.context.scene.camera = camera
-    with scenes._new_scene(bpy.context, "bench") as root:
+    with load("blender_lodgs.data.importing").new_scene(bpy.context, "bench") as root:
         scenes.set_bundle_facts(root, bundle.Bundle("flod", [], "bands"))
         scenes.set_level(root, bundle.Level(1, splats, {"s_min": S_MIN}))
         scenes.set_level(root, bundle.Level(2, splats, {"s_min": 0.0}))
@@ -210,7 +210,7 @@ def clean_up(bpy, count: int) -> None:
     scenes, cleaning = load("blender_lodgs.data.scenes"), load("blender_lodgs.data.cleaning")
     bundle = load("training.splats.bundle")
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    with scenes._new_scene(bpy.context, "bench") as root:
+    with load("blender_lodgs.data.importing").new_scene(bpy.context, "bench") as root:
         scenes.set_bundle_facts(root, bundle.Bundle("flod", [], "bands"))
         for number in range(1, 6):
             scenes.set_level(
@@ -296,7 +296,7 @@ def streaming(bpy, path: Path, budget: int, frames: int = 100) -> None:
         load(f"blender_lodgs.{name}") for name in ("viewport.views", "viewport.eye", "data.shown")
     )
     begun = time.perf_counter()
-    root = load("blender_lodgs.data.scenes").import_splats(bpy.context, path, upright=False, budget=budget)
+    root = load("blender_lodgs.data.importing").import_splats(bpy.context, path, upright=False, budget=budget)
     imported = time.perf_counter() - begun
     means = load("blender_lodgs.data.objects").read_splats(root.lodgs.levels[-1].object).means
     low, high = np.quantile(means, (0.2, 0.8), axis=0)

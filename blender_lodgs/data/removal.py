@@ -11,7 +11,7 @@ import bpy
 
 from . import crops, photographs, tables
 from .placement import axes_of
-from .scenes import ABOUT
+from .importing import ABOUT
 
 
 def remove(root: bpy.types.Object) -> None:

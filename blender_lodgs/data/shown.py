@@ -13,7 +13,8 @@ import bpy
 import numpy as np
 
 from .. import attributes
-from . import looks, scenes, selection, streams
+from . import looks, selection, streams
+from . import roots as scenes
 from .placement import axes_of
 
 

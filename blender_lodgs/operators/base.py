@@ -7,7 +7,7 @@ import functools
 import bpy
 
 from ...training.errors import LodgsError
-from ..data import scenes
+from ..data import roots
 
 
 def report_errors(execute):
@@ -46,11 +46,11 @@ class SceneOperator:
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         if root is None:
             cls.poll_message_set("Select or import a splat scene first")  # type: ignore[attr-defined]
         elif not root.is_editable:
-            cls.poll_message_set(scenes.LINKED)  # type: ignore[attr-defined]
+            cls.poll_message_set(roots.LINKED)  # type: ignore[attr-defined]
         return root is not None and root.is_editable
 
 
@@ -71,7 +71,7 @@ class EditLevelsOperator(SceneOperator):
 
 
 def _has_levels(cls, context: bpy.types.Context) -> bool:
-    if scenes.root_with_levels(context) is None:
+    if roots.root_with_levels(context) is None:
         cls.poll_message_set("Select a splat scene with levels first")
         return False
     return True

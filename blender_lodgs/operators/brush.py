@@ -15,7 +15,7 @@ from gpu_extras.presets import draw_circle_2d
 from ...training.editing.brush import brushed, lassoed
 from ...training.errors import LodgsError
 from .. import extension
-from ..data import cleaning, painting, scenes
+from ..data import cleaning, painting, roots
 from ..viewport.strokes import Picture
 from .base import EditLevelsOperator, report_errors
 
@@ -64,7 +64,7 @@ class StrokeOperator(EditLevelsOperator):
 
     @report_errors
     def execute(self, context):
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         self.prepare(root)
         path = np.array([point.loc for point in self.path])
         picture = picture_of(context, root)
@@ -88,7 +88,7 @@ class StrokeOperator(EditLevelsOperator):
         for name in self.brush_settings:
             if not self.properties.is_property_set(name):
                 setattr(self, name, getattr(settings, name))
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         self.path.clear()
         self._picture = picture_of(context, root)
         self.prepare(root)
@@ -141,7 +141,7 @@ class StrokeOperator(EditLevelsOperator):
         Raises:
             LodgsError: a level was replaced.
         """
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         counts = {item.number: len(item.object.data.points) for item in cleaning.levels(root)}
         if counts != {number: len(hit) for number, hit in self._hits.items()}:
             raise LodgsError("Cannot finish the stroke: training replaced the levels.", "Draw it again.")
@@ -161,7 +161,7 @@ class StrokeOperator(EditLevelsOperator):
         return {"FINISHED"}
 
     def _stop(self, context):
-        self.end_preview(scenes.active_root(context))
+        self.end_preview(roots.active_root(context))
         extension.redraw()
         if self._lasso_handle is not None:
             context.space_data.draw_handler_remove(self._lasso_handle, "WINDOW")
@@ -312,14 +312,14 @@ class LODGS_OT_remove_paint(EditLevelsOperator, bpy.types.Operator):
     def poll(cls, context):
         if not super().poll(context):
             return False
-        painted = painting.is_painted(scenes.active_root(context))
+        painted = painting.is_painted(roots.active_root(context))
         if not painted:
             cls.poll_message_set("No splats are painted")
         return painted
 
     @report_errors
     def execute(self, context):
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         painting.write(root, {number: 0 * paint for number, paint in painting.read(root).items()})
         return {"FINISHED"}
 
@@ -342,7 +342,7 @@ class LODGS_OT_select_all_splats(EditLevelsOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         invert = self.action == "INVERT"
         cleaning.select(
             root,

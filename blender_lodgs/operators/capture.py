@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from .. import extension
-from ..data import scenes
+from ..data import importing, scenes
 from ..runs import background_capture, processes
 from ..viewport import coverage
 from .base import report_errors
@@ -80,7 +80,7 @@ class LODGS_OT_import_capture(bpy.types.Operator):
     @report_errors
     def execute(self, context):
         folder = background_capture.capture_folder(context.scene)
-        root = scenes.import_colmap(
+        root = importing.import_colmap(
             context, folder, upright=False, warn=lambda message: self.report({"WARNING"}, message)
         )
         self.report({"INFO"}, f"'{root.name}': {scenes.contents(root)}")

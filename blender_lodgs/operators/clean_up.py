@@ -7,7 +7,7 @@ from mathutils import Matrix
 
 from ...training.editing.cleaning import SHARE
 from ...training.errors import LodgsError
-from ..data import cleaning, crops, scenes
+from ..data import cleaning, crops, roots, scenes
 from .base import EditLevelsOperator, SceneOperator, report_errors
 from .brush import TOOLS
 
@@ -39,7 +39,7 @@ class LODGS_OT_add_crop(EditLevelsOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        add_crop(context, scenes.active_root(context), self.shape, self.keep)
+        add_crop(context, roots.active_root(context), self.shape, self.keep)
         return {"FINISHED"}
 
 
@@ -74,7 +74,7 @@ class LODGS_OT_add_region(SceneOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         root.lodgs.training.region = add_crop(context, root, "BOX", "ALL")
         return {"FINISHED"}
 
@@ -90,7 +90,7 @@ class LODGS_OT_remove_crop(EditLevelsOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         for crop in crops.crops_of(root):
             if crop.name == self.name:
                 active = context.active_object == crop
@@ -158,14 +158,14 @@ class LODGS_OT_hide_splats(EditLevelsOperator, bpy.types.Operator):
         layout.prop(self, "action")
 
     def invoke(self, context, event):
-        for name, value in cleaning.suggestions(context, scenes.active_root(context)).items():
+        for name, value in cleaning.suggestions(context, roots.active_root(context)).items():
             if not self.properties.is_property_set(name):
                 setattr(self, name, value)
         return self.execute(context)
 
     @report_errors
     def execute(self, context):
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         matches = self._matches(context, root)
         count = sum(int(mask.sum()) for mask in matches.values())
         by_level = ", ".join(f"level {number} {mask.sum():,}" for number, mask in matches.items())
@@ -201,7 +201,7 @@ class LODGS_OT_show_hidden_splats(EditLevelsOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        self.report({"INFO"}, f"{cleaning.show_all(scenes.active_root(context)):,} hidden splats shown")
+        self.report({"INFO"}, f"{cleaning.show_all(roots.active_root(context)):,} hidden splats shown")
         return {"FINISHED"}
 
 
@@ -214,7 +214,7 @@ class LODGS_OT_delete_left_out(EditLevelsOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         if context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
         if context.active_object in crops.crops_of(root):
@@ -254,7 +254,7 @@ def _object_of(test: str, name: str) -> str:
 
 
 def _menu(self, context):
-    if scenes.root_with_levels(context) is not None:
+    if roots.root_with_levels(context) is not None:
         self.layout.separator()
         self.layout.menu(LODGS_MT_clean_up.bl_idname)
 

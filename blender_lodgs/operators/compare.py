@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ...training.errors import LodgsError
-from ..data import photographs, scenes
+from ..data import photographs, roots
 from ..render import compare
 from ..runs import processes
 from .base import report_errors
@@ -16,7 +16,7 @@ class _ViewsOperator:
 
     @classmethod
     def poll(cls, context):
-        root = scenes.root_with_levels(context)
+        root = roots.root_with_levels(context)
         if root is None or not photographs.photographed(root):
             cls.poll_message_set("Select a splat scene with levels and photos first")
             return False
@@ -31,7 +31,7 @@ class LODGS_OT_measure_views(_ViewsOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        measurement = compare.measure(context, scenes.active_root(context))
+        measurement = compare.measure(context, roots.active_root(context))
         processes.follow(measurement.step)
         if measurement.problem:
             self.report({"ERROR"}, measurement.problem)
@@ -63,7 +63,7 @@ class _CompareOperator(_ViewsOperator):
 
     @report_errors
     def execute(self, context):
-        root, view = scenes.active_root(context), self.view(context)
+        root, view = roots.active_root(context), self.view(context)
         if view not in photographs.views(root):
             raise LodgsError(
                 "Cannot compare: the active camera is not a view of this splat scene.",
@@ -99,13 +99,13 @@ class LODGS_OT_compare_worst(_CompareOperator, bpy.types.Operator):
     def poll(cls, context):
         if not super().poll(context):
             return False
-        if compare.worst(scenes.active_root(context)) is None:
+        if compare.worst(roots.active_root(context)) is None:
             cls.poll_message_set("Press Measure first")
             return False
         return True
 
     def view(self, context):
-        return compare.worst(scenes.active_root(context))
+        return compare.worst(roots.active_root(context))
 
 
 CLASSES = (

@@ -22,7 +22,7 @@ from ...training.splats.formats import (
     write_splats,
     write_streamed_levels,
 )
-from ..data import scenes, selection
+from ..data import roots, scenes, selection
 from ..data.objects import megabytes, sh_degree
 from .base import ReadLevelsOperator, report_errors
 from .modal import BackgroundOperator
@@ -37,7 +37,7 @@ def _size(context: bpy.types.Context, kind: SplatFormat, level: int = 0) -> str:
         level: number of one level, with the coarser ones if levels add up; 0 for the visible splats, -1 for
             all levels.
     """
-    root = scenes.active_root(context)
+    root = roots.active_root(context)
     items = [item for item in root.lodgs.levels if item.exists]
     if not level:
         count = scenes.count_shown(context, root)[0]
@@ -91,7 +91,7 @@ class _FileExport(_ExportOperator, ExportHelper):
     suffix = ""
 
     def invoke(self, context, event):
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         name = bpy.path.clean_name(root.name) + self.suffix + self.filename_ext
         self.filepath = str(Path(bpy.data.filepath).parent / name) if bpy.data.filepath else name
         return super().invoke(context, event)
@@ -143,7 +143,7 @@ class LODGS_OT_export_bundle(_FileExport, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         if self.order == "stream" and not root.lodgs.complete:
             raise LodgsError(
                 "Cannot write the coarsest level first: in a tree it is not a complete scene.",
@@ -207,7 +207,7 @@ class LODGS_OT_export_plain(_ForeignExport, _FileExport, _ConvertingExport, bpy.
         layout.prop(self, "looked")
         row = layout.row()
         stores_filter = find_format(Path(f"splats{self.kind}")).antialiased
-        row.active = scenes.active_root(context).lodgs.antialias and not stores_filter
+        row.active = roots.active_root(context).lodgs.antialias and not stores_filter
         row.prop(self, "antialiased")
         layout.label(text="Format and Estimated Size")
         column = layout.column(align=True)
@@ -217,7 +217,7 @@ class LODGS_OT_export_plain(_ForeignExport, _FileExport, _ConvertingExport, bpy.
             column.prop_enum(self, "kind", kind.suffix, text=f"{kind.label}   {size}")
 
     def work(self, context):
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         if self.source == "LEVEL":
             splats = scenes.read_level(root, self.level, self.placed, self.looked)
         else:
@@ -259,7 +259,7 @@ class _FolderExport(_ExportOperator):
 
     def _bundle(self, context) -> Bundle:
         """Return the levels, each a complete scene."""
-        bundle = scenes.read_levels(scenes.active_root(context), self.placed, self.looked)
+        bundle = scenes.read_levels(roots.active_root(context), self.placed, self.looked)
         return complete_levels(bundle) if is_tree(bundle) else bundle
 
 

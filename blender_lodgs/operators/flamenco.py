@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 
 import bpy
 
-from ..data import scenes
+from ..data import roots
 from ..runs import flamenco
 from .base import SceneOperator
 from .modal import SteppedOperator
@@ -32,7 +32,7 @@ class LODGS_OT_submit_to_flamenco(SceneOperator, SteppedOperator, bpy.types.Oper
 
     def work(self, context):
         self._result = "The manager may have received the job"
-        submission = flamenco.prepare(scenes.active_root(context), self.folder)
+        submission = flamenco.prepare(roots.active_root(context), self.folder)
         sender = ThreadPoolExecutor(1, "lodgs-flamenco")
         try:
             sending = sender.submit(submission.send)

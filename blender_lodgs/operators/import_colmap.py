@@ -6,7 +6,7 @@ from pathlib import Path
 
 import bpy
 
-from ..data import photographs, scenes
+from ..data import importing, photographs, roots, scenes
 from ..runs import photo_preparation
 from .base import report_errors
 
@@ -43,8 +43,8 @@ class LODGS_OT_import_colmap(bpy.types.Operator):
         def warn(message: str) -> None:
             self.report({"WARNING"}, message)
 
-        first = not scenes.roots(context.scene)
-        root = scenes.import_colmap(
+        first = not roots.roots(context.scene)
+        root = importing.import_colmap(
             context,
             Path(bpy.path.abspath(self.directory)),
             upright=self.upright,

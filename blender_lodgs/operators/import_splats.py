@@ -8,7 +8,7 @@ from pathlib import Path
 import bpy
 
 from ...training.splats.formats import READABLE
-from ..data import photographs, scenes
+from ..data import importing, photographs, roots, scenes
 from ..runs import photo_preparation
 from .modal import BackgroundOperator
 
@@ -63,15 +63,15 @@ class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
         def warn(message: str) -> None:
             self.report({"WARNING"}, message)
 
-        first = not scenes.roots(context.scene)
+        first = not roots.roots(context.scene)
         reader = ThreadPoolExecutor(1, "lodgs-import")
         self._imported = []
         try:
             for path in self.paths():
-                read = reader.submit(scenes.read_splats_file, bpy.path.abspath(str(path)), self.budget)
+                read = reader.submit(importing.read_splats_file, bpy.path.abspath(str(path)), self.budget)
                 while self._modal and not read.done():
                     yield
-                root = yield from scenes.place_splats(context, read.result(), self.upright, warn)
+                root = yield from importing.place_splats(context, read.result(), self.upright, warn)
                 yield
                 if first:  # keep the view if the file already shows a splat scene
                     photographs.look_at_scene(context, root, warn)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..data import scenes
+from ..data import roots, scenes
 from .base import SceneOperator, report_errors
 
 
@@ -21,7 +21,7 @@ class LODGS_OT_show_only_level(SceneOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        scenes.show_only(scenes.active_root(context), self.level)
+        scenes.show_only(roots.active_root(context), self.level)
         return {"FINISHED"}
 
 

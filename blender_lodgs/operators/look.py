@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ...training.errors import LodgsError
-from ..data import crops, looks, scenes
+from ..data import crops, looks, roots
 from .base import SceneOperator, report_errors
 
 
@@ -22,7 +22,7 @@ class LODGS_OT_reset_look(SceneOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        reset_look(scenes.active_root(context), self.name)
+        reset_look(roots.active_root(context), self.name)
         return {"FINISHED"}
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..data import photographs, scenes
+from ..data import photographs, roots
 from .base import report_errors
 
 
@@ -23,12 +23,12 @@ class LODGS_OT_look_through(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         return root is not None and bool(photographs.views(root))
 
     @report_errors
     def execute(self, context):
-        photographs.look_through(context, scenes.active_root(context), self.step)
+        photographs.look_through(context, roots.active_root(context), self.step)
         if context.region_data is not None:
             context.region_data.view_perspective = "CAMERA"
         return {"FINISHED"}

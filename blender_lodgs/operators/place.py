@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..data import flights, ground, photographs, scenes
+from ..data import flights, ground, photographs, roots
 from .base import SceneOperator, report_errors
 
 
@@ -15,7 +15,7 @@ class LODGS_OT_frame_scene(SceneOperator, bpy.types.Operator):
     bl_label = "Frame Splat Scene"
 
     def execute(self, context):
-        photographs.frame(context, scenes.active_root(context))
+        photographs.frame(context, roots.active_root(context))
         return {"FINISHED"}
 
 
@@ -45,7 +45,7 @@ class LODGS_OT_set_ground(SceneOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         points = ground.picked(context) if self.by == "SELECTION" else None
         degrees = ground.lay_on_ground(root, points, self.flip)
         self.report({"INFO"}, f"Ground set to Z = 0: '{root.name}' rotated by {degrees:.1f}°")
@@ -82,7 +82,7 @@ class LODGS_OT_set_scale(SceneOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         factor = self.length / ground.measured(ground.picked(context))
         ground.scale(root, factor)
         unchanged = abs(factor - 1) < 1e-4
@@ -101,7 +101,7 @@ class LODGS_OT_camera_path(SceneOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        camera = flights.path(context, scenes.active_root(context))
+        camera = flights.path(context, roots.active_root(context))
         self.report({"INFO"}, f"'{camera.name}' is the active camera")
         return {"FINISHED"}
 
@@ -115,7 +115,7 @@ class LODGS_OT_turntable(SceneOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        camera = flights.turntable(context, scenes.active_root(context))
+        camera = flights.turntable(context, roots.active_root(context))
         self.report({"INFO"}, f"'{camera.name}' is the active camera")
         return {"FINISHED"}
 

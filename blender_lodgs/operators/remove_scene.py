@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..data import removal, scenes
+from ..data import removal, roots
 from ..runs.watch import watch_of
 from .base import SceneOperator
 
@@ -17,14 +17,14 @@ class LODGS_OT_remove_scene(SceneOperator, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def invoke(self, context, event):
-        name = scenes.active_root(context).name
+        name = roots.active_root(context).name
         return context.window_manager.invoke_confirm(
             self, event, title=f"Remove '{name}'?", confirm_text="Remove", icon="WARNING",
             message="Its levels, points and cameras are deleted. Photos and runs stay on disk.",
         )  # fmt: skip
 
     def execute(self, context):
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         name = root.name
         watch = watch_of(root)
         if context.mode != "OBJECT":

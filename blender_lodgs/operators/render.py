@@ -8,7 +8,7 @@ import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ...training.scenes.cameras import write_camera
-from ..data import cameras, scenes
+from ..data import cameras, roots
 from ..render import compositing, engine, quick
 from .base import report_errors, show_image
 from .modal import FrameOperator
@@ -115,7 +115,7 @@ class LODGS_OT_export_camera(bpy.types.Operator, ExportHelper):
 
     @classmethod
     def poll(cls, context):
-        if scenes.active_root(context) is None or context.scene.camera is None:
+        if roots.active_root(context) is None or context.scene.camera is None:
             cls.poll_message_set("Select a splat scene and add a camera first")
             return False
         return True
@@ -128,7 +128,7 @@ class LODGS_OT_export_camera(bpy.types.Operator, ExportHelper):
     def execute(self, context):
         width, height = engine.size(context.scene.render)
         camera, near = cameras.view_from(
-            scenes.active_root(context), context.evaluated_depsgraph_get(), width, height
+            roots.active_root(context), context.evaluated_depsgraph_get(), width, height
         )
         path = Path(bpy.path.abspath(self.filepath))
         write_camera(path, camera, near)

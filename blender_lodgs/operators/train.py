@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 import bpy
 
 from ...training.errors import LodgsError
-from ..data import cells, scenes
+from ..data import cells, roots
 from ..runs import job_settings, jobs, run_folders
 from ..runs.watch import Watch, root_by_uid, watch_of
 from .base import SceneOperator, report_errors, show_image
@@ -37,7 +37,7 @@ class LODGS_OT_train(SceneOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        return _follow(self, jobs.start(scenes.active_root(context), self.folder))
+        return _follow(self, jobs.start(roots.active_root(context), self.folder))
 
 
 class LODGS_OT_resume_training(SceneOperator, bpy.types.Operator):
@@ -48,7 +48,7 @@ class LODGS_OT_resume_training(SceneOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        return _follow(self, jobs.resume(scenes.active_root(context)))
+        return _follow(self, jobs.resume(roots.active_root(context)))
 
 
 class LODGS_OT_cancel_training(SceneOperator, bpy.types.Operator):
@@ -58,7 +58,7 @@ class LODGS_OT_cancel_training(SceneOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        jobs.cancel(scenes.active_root(context))
+        jobs.cancel(roots.active_root(context))
         return {"FINISHED"}
 
 
@@ -74,7 +74,7 @@ class LODGS_OT_plan_cells(SceneOperator, SteppedOperator, bpy.types.Operator):
         return self.execute(context) if bpy.app.background else self.start_modal(context)
 
     def work(self, context):
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         uid = root.session_uid
         limits = root.lodgs.training.limits
         job = job_settings.make_job(root, run_folders.runs_parent(root), {})
@@ -112,7 +112,7 @@ class LODGS_OT_cancel_block(_CellOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        jobs.cancel_block(scenes.active_root(context), self.block)
+        jobs.cancel_block(roots.active_root(context), self.block)
         return {"FINISHED"}
 
 
@@ -124,7 +124,7 @@ class LODGS_OT_resume_block(_CellOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         followed = watch_of(root)
         watch = jobs.resume_block(root, self.block)
         return {"FINISHED"} if watch is followed else _follow(self, watch)
@@ -151,7 +151,7 @@ class LODGS_OT_open_run(SceneOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        watch = jobs.attach(scenes.active_root(context), self.directory)
+        watch = jobs.attach(roots.active_root(context), self.directory)
         jobs.follow(watch)
         return {"FINISHED"}
 
@@ -169,7 +169,7 @@ class LODGS_OT_show_log(SceneOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        run_folders.log_text(scenes.active_root(context))
+        run_folders.log_text(roots.active_root(context))
         return {"FINISHED"}
 
     def draw(self, context):
@@ -185,7 +185,7 @@ class LODGS_OT_show_costs(SceneOperator, bpy.types.Operator):
 
     @report_errors
     def execute(self, context):
-        plot = run_folders.cost_plot(scenes.active_root(context))
+        plot = run_folders.cost_plot(roots.active_root(context))
         if plot is None:
             raise LodgsError(
                 "Cannot show the cost curve: the open run has none.", "Open the run of these levels."

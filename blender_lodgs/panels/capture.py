@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ...training.errors import LodgsError
-from ..data import scenes, viewpoints
+from ..data import roots, viewpoints
 from ..render.capture import noise
 from ..runs import background_capture, environment
 from ..viewport import coverage
@@ -19,7 +19,7 @@ class LODGS_PT_capture(Panel):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return scenes.active_root(context) is None and not scenes.linked(context)
+        return roots.active_root(context) is None and not roots.linked(context)
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, work = self.layout, background_capture.current

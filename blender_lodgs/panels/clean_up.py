@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..data import cleaning, crops, scenes
+from ..data import cleaning, crops, roots
 from .parts import LevelsPanel, say
 
 
@@ -12,7 +12,7 @@ class LODGS_PT_clean_up(LevelsPanel):
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context):
-        layout, root = self.layout, scenes.active_root(context)
+        layout, root = self.layout, roots.active_root(context)
         row = layout.row(align=True)
         for shape, icon in (("BOX", "MESH_CUBE"), ("SPHERE", "MESH_UVSPHERE")):
             row.operator("lodgs.add_crop", text=f"Crop {shape.title()}", icon=icon).shape = shape

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..data import photographs, scenes
+from ..data import photographs, roots
 from ..render import compare
 from ..viewport import wipe
 from .parts import Panel, say
@@ -20,7 +20,7 @@ class LODGS_UL_views(bpy.types.UIList):
 
     def draw_item(self, context, layout, data, item, icon, active_data, active_property, index=0, flt_flag=0):
         psnr = item.data.lodgs.psnr
-        root, is_camera = scenes.active_root(context), item == context.scene.camera
+        root, is_camera = roots.active_root(context), item == context.scene.camera
         held_out = root is not None and photographs.is_held_out(root, item)
         split = layout.split(factor=0.62)
         split.label(text=item.name, icon="VIEW_CAMERA" if is_camera else "CAMERA_DATA")
@@ -56,11 +56,11 @@ class LODGS_PT_compare(Panel):
 
     @classmethod
     def poll(cls, context):
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         return root is not None and bool(photographs.photographed(root))
 
     def draw(self, context):
-        layout, root = self.layout, scenes.active_root(context)
+        layout, root = self.layout, roots.active_root(context)
         settings, cameras = context.scene.lodgs_render, root.lodgs.cameras
         layout.template_list("LODGS_UL_views", "", cameras, "objects", root.lodgs, "active_view", rows=5)
         measurement = compare.measurement

@@ -6,7 +6,7 @@ import bpy
 
 from ...training.lod.rule import find_rule
 from ...training.lod.selection import unknown_rule
-from ..data import loaded, objects, scenes, selection, streams
+from ..data import loaded, objects, roots, scenes, selection, streams
 from ..viewport import views
 from .parts import LevelsPanel, say, split_column
 
@@ -53,7 +53,7 @@ class LODGS_PT_levels(LevelsPanel):
     bl_order = 2
 
     def draw(self, context):
-        settings = scenes.active_root(context).lodgs
+        settings = roots.active_root(context).lodgs
         rule = find_rule(settings.rule)
         row = self.layout.row(align=True)
         row.label(text="", icon="BLANK1")
@@ -75,7 +75,7 @@ class LODGS_PT_detail(LevelsPanel):
     bl_order = 3
 
     def draw(self, context):
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         settings, layout = root.lodgs, self.layout
         rule = find_rule(settings.rule)
         row = layout.row()
@@ -140,11 +140,11 @@ class LODGS_PT_stream(LevelsPanel):
 
     @classmethod
     def poll(cls, context):
-        root = scenes.root_with_levels(context)
+        root = roots.root_with_levels(context)
         return root is not None and streams.file_of(root) is not None
 
     def draw(self, context):
-        root, layout = scenes.active_root(context), self.layout
+        root, layout = roots.active_root(context), self.layout
         stream = views.stream(root)
         settings = root.lodgs.stream
         resident = settings.here + (stream.splats if stream is not None and stream.ready else 0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ...training.evaluate.costs import cost_lines
-from ..data import scenes, selection
+from ..data import roots, selection
 from ..runs import run_folders
 from .parts import LevelsPanel, scene_length
 
@@ -17,11 +17,11 @@ class LODGS_PT_costs(LevelsPanel):
 
     @classmethod
     def poll(cls, context):
-        root = scenes.root_with_levels(context)
+        root = roots.root_with_levels(context)
         return root is not None and bool(_lines(context, root))
 
     def draw(self, context):
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         column = self.layout.column(align=True)
         column.label(text="Splats per Image Tile")
         for line in _lines(context, root):

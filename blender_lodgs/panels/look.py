@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..data import crops, looks, scenes
+from ..data import crops, looks, roots
 from .parts import LevelsPanel, split_column
 
 
@@ -15,10 +15,10 @@ class LODGS_PT_look(LevelsPanel):
 
     @classmethod
     def poll(cls, context):
-        return super().poll(context) and scenes.active_root(context).is_editable
+        return super().poll(context) and roots.active_root(context).is_editable
 
     def draw(self, context):
-        layout, root = self.layout, scenes.active_root(context)
+        layout, root = self.layout, roots.active_root(context)
         _draw_look(layout, root)
         layout.operator("lodgs.reset_look", icon="LOOP_BACK")
 
@@ -43,7 +43,7 @@ class LODGS_PT_look_regions(LevelsPanel):
     bl_parent_id = "LODGS_PT_look"
 
     def draw(self, context):
-        layout, root = self.layout, scenes.active_root(context)
+        layout, root = self.layout, roots.active_root(context)
         row = layout.row(align=True)
         for shape, icon in (("BOX", "MESH_CUBE"), ("SPHERE", "MESH_UVSPHERE")):
             operator = row.operator("lodgs.add_crop", text=shape.title(), icon=icon)

@@ -6,7 +6,7 @@ import textwrap
 
 import bpy
 
-from ..data import scenes
+from ..data import roots
 from ..data.placement import axes_of
 from ..data.viewpoints import ViewsSettings
 from ..runs import environment_setup
@@ -25,7 +25,7 @@ class LevelsPanel(Panel):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return scenes.root_with_levels(context) is not None
+        return roots.root_with_levels(context) is not None
 
 
 def split_column(layout: bpy.types.UILayout, heading: str = "", align: bool = False) -> bpy.types.UILayout:

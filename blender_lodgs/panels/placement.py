@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..data import scenes
+from ..data import roots
 from .parts import Panel
 
 
@@ -15,7 +15,7 @@ class LODGS_PT_placement(Panel):
 
     @classmethod
     def poll(cls, context):
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         return root is not None and root.is_editable
 
     def draw(self, context):

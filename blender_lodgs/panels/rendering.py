@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ...training.errors import LodgsError
-from ..data import scenes
+from ..data import roots
 from ..render import engine
 from ..runs import environment
 from .parts import Panel, draw_environment, say, split_column
@@ -18,7 +18,7 @@ class LODGS_PT_rendering(Panel):
 
     @classmethod
     def poll(cls, context):
-        return scenes.shows_levels(context.scene)
+        return roots.shows_levels(context.scene)
 
     def draw(self, context):
         layout, scene = self.layout, context.scene

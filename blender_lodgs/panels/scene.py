@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..data import photographs, scenes
+from ..data import photographs, roots
 from ..runs import photo_preparation
 from .parts import Panel, say, split_column
 
@@ -14,12 +14,12 @@ class LODGS_PT_scene(Panel):
     bl_order = 0
 
     def draw(self, context):
-        layout, root = self.layout, scenes.active_root(context)
-        _draw_import(layout, another=scenes.shows_splats(context.scene))
-        if scenes.linked(context):
-            say(layout, scenes.LINKED, "LINKED")
+        layout, root = self.layout, roots.active_root(context)
+        _draw_import(layout, another=roots.shows_splats(context.scene))
+        if roots.linked(context):
+            say(layout, roots.LINKED, "LINKED")
         if root is None:
-            if scenes.roots(context.scene):
+            if roots.roots(context.scene):
                 layout.label(text="Select a splat scene", icon="INFO")
             return
         column = split_column(layout)

@@ -9,7 +9,7 @@ from ...training.evaluate.messages import summary_lines
 from ...training.lod.rules.cut import RULE as CUT
 from ...training.methods import method_info
 from .. import extension
-from ..data import scenes, viewpoints
+from ..data import roots, viewpoints
 from ..data.training import ALL_OFFER, chooses_distances, hold_out, level_distances, offered
 from ..runs import environment, job_settings, run_folders
 from ..runs.messages import measured_on, progress_facts, short_level_line
@@ -24,10 +24,10 @@ class LODGS_PT_training(Panel):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return scenes.active_root(context) is not None
+        return roots.active_root(context) is not None
 
     def draw(self, context: bpy.types.Context) -> None:
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         assert root is not None
         watch = watch_of(root)
         if watch is not None and watch.running:
@@ -43,7 +43,7 @@ class LODGS_PT_training(Panel):
             row.operator("lodgs.open_run", text="Open Run").directory = root.lodgs.training.run
         resumable = watch is not None and watch.state != "done"
         choices: bpy.types.UILayout | None = self.layout
-        if scenes.root_with_levels(context) is not None and root.lodgs.training.run:
+        if roots.root_with_levels(context) is not None and root.lodgs.training.run:
             header, choices = self.layout.panel("LODGS_train_anew", default_closed=True)
             header.label(text="Train Again")
         if choices is not None:
@@ -59,13 +59,13 @@ class LODGS_PT_training_advanced(Panel):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         watch = watch_of(root)
         trains = root is not None and (root.lodgs.scene_folder or viewpoints.alone(root))
         return bool(trains) and not (watch and watch.running)
 
     def draw(self, context: bpy.types.Context) -> None:
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         assert root is not None
         layout, settings = self.layout, root.lodgs.training
         layout.use_property_split = True

@@ -6,7 +6,7 @@ import bpy
 
 from ...training.errors import LodgsError
 from ...training.lod.colors import level_color
-from ..data import cells, scenes, viewpoints
+from ..data import cells, roots, viewpoints
 from ..runs import job_settings, run_folders
 from ..runs.watch import RunPart, Watch, watch_of
 from .parts import Panel, say, split_column
@@ -73,11 +73,11 @@ class LODGS_PT_training_cells(Panel):
 
     @classmethod
     def poll(cls, context):
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         return root is not None and bool(root.lodgs.scene_folder) and not viewpoints.alone(root)
 
     def draw(self, context):
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         layout, settings, watch = self.layout, root.lodgs.training, watch_of(root)
         if not (watch and watch.running):
             _draw_settings(layout, root)

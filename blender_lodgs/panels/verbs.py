@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ...training.methods import method_info
-from ..data import scenes
+from ..data import roots
 from ..runs import run_folders
 
 VERBS = (
@@ -39,10 +39,10 @@ class LODGS_MT_runs(bpy.types.Menu):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return scenes.active_root(context) is not None
+        return roots.active_root(context) is not None
 
     def draw(self, context):
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         runs = run_folders.find_runs(root) if root is not None else []
         current = run_folders.run_folder(root) if root is not None else None
         for run in runs:

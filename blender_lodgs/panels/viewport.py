@@ -7,7 +7,7 @@ import bpy
 from ...training.lod.colors import level_color
 from ...training.lod.rule import find_rule
 from .. import compat, viewport
-from ..data import scenes
+from ..data import roots
 from ..viewport import views
 from .parts import Panel, say, split_column
 
@@ -18,11 +18,11 @@ class LODGS_PT_viewport(Panel):
 
     @classmethod
     def poll(cls, context):
-        return scenes.shows_levels(context.scene)
+        return roots.shows_levels(context.scene)
 
     def draw(self, context):
         layout, settings = self.layout, context.scene.lodgs_viewport
-        root = scenes.active_root(context)
+        root = roots.active_root(context)
         column = split_column(layout)
         if not compat.NATIVE_SPLATS:
             column.prop(settings, "splats")
@@ -63,13 +63,13 @@ def _legend(layout, numbers):
 
 
 def _overlays(self, context):
-    if not scenes.shows_splats(context.scene):
+    if not roots.shows_splats(context.scene):
         return
     self.layout.label(text="LODGS")
     row = self.layout.row()
     if not compat.NATIVE_SPLATS:
         row.prop(context.scene.lodgs_viewport, "splats")
-    root = scenes.active_root(context)
+    root = roots.active_root(context)
     if root is not None and root.lodgs.cameras is not None:
         row.prop(
             root.lodgs.cameras, "hide_viewport", text="Training Cameras", toggle=True, invert_checkbox=True

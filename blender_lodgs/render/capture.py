@@ -20,7 +20,7 @@ from ...training.scenes.cameras import Camera, check_render_size, read_camera, w
 from ...training.scenes.images import image_size
 from ...training.scenes.rendered_views import CAMERAS, DEPTHS, IMAGES
 from .. import compat, extension
-from ..data import photographs, scenes, viewpoints
+from ..data import photographs, roots, viewpoints
 from ..data.cameras import scene_camera, view_of
 from ..runs import environment, processes
 from .engine import LodgsEngine
@@ -153,7 +153,7 @@ def _prepare(scene: bpy.types.Scene, width: int, height: int) -> None:
         for node in tree.nodes:
             if node.bl_idname == "CompositorNodeOutputFile":
                 node.mute = True
-    for root in scenes.roots(scene):
+    for root in roots.roots(scene):
         for obj in root.children_recursive:
             obj.driver_remove("hide_render")  # by which a level is shown alone
             obj.hide_render = True

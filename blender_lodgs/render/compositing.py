@@ -12,7 +12,7 @@ import bpy
 
 from ...training.errors import LodgsError
 from .. import compat
-from ..data import scenes, selection
+from ..data import roots, selection
 from ..data.cameras import scene_camera
 from . import engine
 
@@ -43,7 +43,7 @@ def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> 
     Raises:
         LodgsError: the scene has a compositor tree of the artist's own, or no splats.
     """
-    if not scenes.roots(scene):
+    if not roots.roots(scene):
         raise LodgsError(f"The scene '{scene.name}' has no splats.", "Import or train some first.")
     meshes = scene.lodgs_render.meshes
     tree, before = compat.compositor_tree(scene), _switched(scene)
@@ -194,7 +194,7 @@ def _match(scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:
             meshes.timeline_markers.new(marker.name, frame=marker.frame).camera = marker.camera
     left_out = {
         collection
-        for root in scenes.roots(scene)
+        for root in roots.roots(scene)
         for obj in (root, *(item.object for item in root.lodgs.levels if item.exists))
         for collection in obj.users_collection
     }

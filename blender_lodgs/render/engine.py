@@ -21,7 +21,7 @@ from ...training.errors import LodgsError
 from ...training.lod.rule import every_column
 from ...training.splats.gaussians import Splats
 from .. import attributes
-from ..data import changes, objects, scenes, selection, shown
+from ..data import changes, objects, roots, selection, shown
 from ..data.cameras import scene_camera, view_of
 from . import renderer
 
@@ -224,7 +224,7 @@ def border(render: bpy.types.RenderSettings, width: int, height: int) -> tuple[i
 
 def levels_in(scene: bpy.types.Scene) -> list[int]:
     """Numbers of the levels of all splat scenes in a scene."""
-    return sorted({item.number for root in scenes.roots(scene) for item in root.lodgs.levels})
+    return sorted({item.number for root in roots.roots(scene) for item in root.lodgs.levels})
 
 
 def use(scene: bpy.types.Scene) -> None:

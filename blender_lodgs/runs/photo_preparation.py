@@ -17,7 +17,7 @@ from ...training.scenes.colmap import Scene, read_scene
 from ...training.scenes.undistort import cached_undistorted_scene
 from ...training.splats.dialects import Warn
 from .. import extension
-from ..data import photographs, scenes
+from ..data import importing, photographs, roots
 from . import environment, processes
 from .watch import root_by_uid
 
@@ -122,8 +122,8 @@ def find_cameras(
     commands.append(["undistort", str(folder)])
 
     def finish(work: PhotoPreparation) -> None:
-        is_first = not scenes.roots(bpy.context.scene)
-        work.root = scenes.import_colmap(bpy.context, folder, warn=work.warnings.append)
+        is_first = not roots.roots(bpy.context.scene)
+        work.root = importing.import_colmap(bpy.context, folder, warn=work.warnings.append)
         if is_first:  # otherwise keep the view of the scene that is open
             photographs.look_at_scene(bpy.context, work.root, work.warnings.append)
         work.message = work.results[-2]

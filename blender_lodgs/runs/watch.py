@@ -20,7 +20,7 @@ from ...training.runs.outcome import run_outcome
 from ...training.splats.bundle import Bundle, Level, read_header, read_tables
 from ...training.splats.ply import read_ply
 from .. import extension
-from ..data import cells, scenes
+from ..data import cells, importing, scenes
 
 UNRESPONSIVE_AFTER = 60.0
 """Seconds without an event after which the panel reports that the trainer does not respond."""
@@ -87,7 +87,7 @@ class Watch:
     method: str = ""
     last_event: float = field(default_factory=time.time)
     offset: int = 0
-    reading: Future[scenes.SplatsFile] | None = None
+    reading: Future[importing.SplatsFile] | None = None
 
     @property
     def running(self) -> bool:
@@ -231,14 +231,14 @@ class Watch:
             event.get("controls", {}), event.get("cumulative", False), event["meta"],
         )  # fmt: skip
 
-    def _show_tree(self, root: bpy.types.Object, reading: Future[scenes.SplatsFile]) -> None:
+    def _show_tree(self, root: bpy.types.Object, reading: Future[importing.SplatsFile]) -> None:
         """Show a finished tree when its top has been read."""
         if not reading.done():
             return
         self.reading = None
         try:
             with extension.in_window():
-                scenes.refill(root, reading.result())
+                importing.refill(root, reading.result())
                 root.lodgs.training.read = self.offset
                 extension.undo_step("Training finished")
         except Exception as error:
@@ -248,7 +248,7 @@ class Watch:
         if any(self._stays_in_file(root, event) for event in self.levels.values()):
             reader = ThreadPoolExecutor(1, "lodgs-run")
             self.reading = reader.submit(
-                scenes.read_splats_file, self.folder.bundle, root.lodgs.stream.budget
+                importing.read_splats_file, self.folder.bundle, root.lodgs.stream.budget
             )
             reader.shutdown(wait=False)
             return

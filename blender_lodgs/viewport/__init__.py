@@ -17,7 +17,7 @@ import bpy
 
 from ...training.lod.colors import level_color
 from .. import compat, extension
-from ..data import scenes
+from ..data import roots as scenes
 from . import cells, coverage, discs, eye, frusta, splats, views
 
 if TYPE_CHECKING:

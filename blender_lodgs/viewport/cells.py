@@ -8,7 +8,8 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 
 from ...training.lod.colors import level_color
-from ..data import cells, scenes
+from ..data import cells
+from ..data import roots as scenes
 from ..data.placement import axes_of
 from . import frusta
 

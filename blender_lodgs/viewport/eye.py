@@ -14,7 +14,8 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
-from ..data import scenes, selection
+from ..data import roots as scenes
+from ..data import selection
 from ..data.placement import axes_of
 
 Place = tuple[float, float, float]

@@ -12,7 +12,8 @@ from mathutils import Matrix
 
 from ...training.errors import LodgsError
 from ...training.scenes.cameras import Camera
-from ..data import scenes, viewpoints
+from ..data import roots as scenes
+from ..data import viewpoints
 from ..data.placement import axes_of
 
 COLOR = (1.0, 0.75, 0.2, 1.0)

@@ -26,7 +26,8 @@ import numpy as np
 from mathutils import Matrix
 
 from .. import extension
-from ..data import changes, scenes, selection, shown
+from ..data import changes, selection, shown
+from ..data import roots as scenes
 from . import eye, resident, splats
 from .arranging import Arrangement, Placement, Request, arrange
 from .resident import Cloud, Reading, Resident, Store

@@ -10,7 +10,7 @@ import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
 
-from ..data import scenes
+from ..data import roots as scenes
 from . import eye
 
 _VERTEX = """

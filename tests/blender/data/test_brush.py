@@ -15,7 +15,7 @@ NAMES = ["bands", "octree", "chunks", "decay"]
 def scene_of(bpy, lodgs, tmp_path):
     def make(bundle):
         write_bundle(tmp_path / "in.ply", bundle)
-        root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "in.ply", upright=False)
+        root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "in.ply", upright=False)
         root.matrix_world = blender(PLACE)
         bpy.context.view_layer.objects.active = root
         bpy.context.view_layer.update()

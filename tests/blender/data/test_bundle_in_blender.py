@@ -65,7 +65,7 @@ def check(positions, values, splats):
 
 def test_a_level_that_comes_while_its_object_is_edited_takes_its_place(bpy, lodgs):
     scenes, bundles = lodgs("data.scenes"), lodgs("training.splats.bundle")
-    root = scenes.import_colmap(bpy.context, "examples/lantern_walk", photographs=False)
+    root = lodgs("data.importing").import_colmap(bpy.context, "examples/lantern_walk", photographs=False)
 
     def level(count):
         names = ("means", "quats", "log_scales", "opacity_logits", "sh")

@@ -49,7 +49,7 @@ def scene_of(bpy, lodgs, tmp_path):
 
     def make(bundle):
         write_bundle(tmp_path / "in.ply", bundle)
-        root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "in.ply", upright=False)
+        root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "in.ply", upright=False)
         root.matrix_world = blender(PLACE)
         bpy.context.view_layer.update()
         return root, read_bundle(tmp_path / "in.ply")
@@ -131,7 +131,7 @@ def test_what_is_shown_by_distance_is_what_the_export_shows(bpy, lodgs, cropped,
 
     exported = read_bundle(tmp_path / "out.ply")
     assert [len(level.splats) for level in exported.levels] == [mask.sum() for mask in stay.values()]
-    again = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "out.ply", upright=False)
+    again = lodgs("data.importing").import_splats(bpy.context, tmp_path / "out.ply", upright=False)
     again.lodgs.mode, again.lodgs.eye = "SELECTIVE", "TRAINING"
     again.lodgs.camera_center = (1.0, -2.0, 0.5)
     bpy.context.view_layer.update()
@@ -350,7 +350,7 @@ def test_nothing_left_is_said_and_half_a_tree_is_not_deleted(bpy, lodgs, scene_o
     assert not (tmp_path / "out.ply").exists() and len(root.lodgs.levels[0].object.data.points) == 700
 
     write_bundle(tmp_path / "tree.ply", tree_of(random_leaves(3000, np.random.default_rng(9))))
-    part = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "tree.ply", budget=2000)
+    part = lodgs("data.importing").import_splats(bpy.context, tmp_path / "tree.ply", budget=2000)
     assert lodgs("data.streams").file_of(part)
     with pytest.raises(RuntimeError, match="lodgs edit"):
         bpy.ops.lodgs.delete_left_out()
@@ -373,7 +373,7 @@ def test_selected_splats_are_hidden_and_found_ones_selected(bpy, lodgs, scene_of
 def test_views_of_photographs_are_the_cameras(bpy, lodgs):
     from training.scenes.colmap import read_scene
 
-    root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN)
+    root = lodgs("data.importing").import_colmap(bpy.context, GARDEN)
     root.matrix_world = blender(PLACE) @ root.matrix_world
     bpy.context.view_layer.update()
     found = lodgs("data.cleaning").cameras(bpy.context, root)
@@ -465,7 +465,7 @@ def test_levels_point_at_nothing_that_an_undo_may_take_away(bpy, lodgs, scene_of
 
 def test_hidden_views_are_where_they_stand(bpy, lodgs):
     """Blender does not follow hidden objects: the scene was made larger meanwhile."""
-    root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+    root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     before = [camera.center for camera in lodgs("data.cleaning").cameras(bpy.context, root)]
     root.lodgs.cameras.hide_viewport = True
     root.scale, root.location = (3, 3, 3), (1, 2, 3)

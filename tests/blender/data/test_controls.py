@@ -22,7 +22,7 @@ def made(bpy, lodgs, tmp_path):
         levels = [files.Level(number, splats, dict.fromkeys(rule.level_facts, 1.0)) for number in (1, 2)]
         bundle = files.Bundle("any", levels, rule.name, facts, controls, rule.cumulative)
         files.write_bundle(tmp_path / "b.ply", bundle)
-        return lodgs("data.scenes").import_splats(bpy.context, tmp_path / "b.ply")
+        return lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
 
     return make
 
@@ -82,9 +82,9 @@ def test_blender_begins_with_what_the_trainer_measures(bpy, lodgs, some, tmp_pat
         pytest.skip("there are no such levels")
     wanted = lodgs("training.lod.selection").settings(bundle, {})
     lodgs("training.splats.bundle").write_bundle(tmp_path / "b.ply", bundle)
-    assert in_use(scenes.import_splats(bpy.context, tmp_path / "b.ply")) == wanted
+    assert in_use(lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")) == wanted
 
-    with scenes._new_scene(bpy.context, "trained") as root:
+    with lodgs("data.importing").new_scene(bpy.context, "trained") as root:
         for level in bundle.levels:
             scenes.set_level(root, level)
         scenes.set_bundle_facts(root, bundle)
@@ -96,7 +96,7 @@ def test_blender_begins_with_what_the_trainer_measures(bpy, lodgs, some, tmp_pat
 
 def test_levels_in_use_go_along_until_somebody_sets_them(bpy, lodgs, some):
     scenes, bundle = lodgs("data.scenes"), some(6, {})
-    with scenes._new_scene(bpy.context, "trained") as root:
+    with lodgs("data.importing").new_scene(bpy.context, "trained") as root:
         scenes.set_bundle_facts(root, lodgs("training.splats.bundle").Bundle("flod", [], "bands"))
         for level in bundle.levels[:4]:
             scenes.set_level(root, level)
@@ -121,7 +121,7 @@ def test_levels_that_contradict_their_rule_are_refused_and_leave_nothing(bpy, lo
     files.write_bundle(tmp_path / "other.ply", bundle)
     before = len(bpy.data.objects)
     with pytest.raises(lodgs("training.errors").LodgsError, match=f"but by their rule '{rule.name}'"):
-        lodgs("data.scenes").import_splats(bpy.context, tmp_path / "other.ply")
+        lodgs("data.importing").import_splats(bpy.context, tmp_path / "other.ply")
     assert len(bpy.data.objects) == before
 
 

@@ -18,7 +18,7 @@ def tree():
 @pytest.fixture
 def root(bpy, lodgs, tree, tmp_path):
     lodgs("training.splats.bundle").write_bundle(tmp_path / "tree.ply", tree)
-    return lodgs("data.scenes").import_splats(bpy.context, tmp_path / "tree.ply")
+    return lodgs("data.importing").import_splats(bpy.context, tmp_path / "tree.ply")
 
 
 def shown_rows(bpy, lodgs, root):
@@ -96,7 +96,7 @@ def test_a_folder_gets_levels_that_are_scenes_by_themselves(bpy, lodgs, tree, ro
     again = lodgs("training.splats.bundle").read_folder(tmp_path / "levels")
     counts = [len(level.splats) for level in again.levels]
     assert again.rule == "bands" and counts[-1] == LEAVES and 500 <= counts[0] <= LEAVES / 4
-    levels = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "levels").lodgs.levels
+    levels = lodgs("data.importing").import_splats(bpy.context, tmp_path / "levels").lodgs.levels
     assert len(levels) == len(counts) == 2
 
 
@@ -113,7 +113,7 @@ def test_a_bundle_comes_back_as_the_same_tree(bpy, lodgs, tree, root, tmp_path):
 def test_the_top_of_a_tree_can_be_imported(bpy, lodgs, tree, root, tmp_path):
     """As a smaller tree: of each leaf and the nodes above it one is there, whatever the eye."""
     said, budget = [], 2000
-    root = lodgs("data.scenes").import_splats(
+    root = lodgs("data.importing").import_splats(
         bpy.context, tmp_path / "tree.ply", budget=budget, warn=said.append
     )
     counts = [len(item.object.data.points) for item in root.lodgs.levels]
@@ -125,9 +125,9 @@ def test_the_top_of_a_tree_can_be_imported(bpy, lodgs, tree, root, tmp_path):
     root.lodgs.mode = "SINGLE"
     assert [len(rows) for rows in shown_rows(bpy, lodgs, root)] == [0, counts[1]]
     bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "tree.ply"), budget=budget)
-    again = lodgs("data.scenes").active_root(bpy.context)
+    again = lodgs("data.roots").active_root(bpy.context)
     assert [len(item.object.data.points) for item in again.lodgs.levels] == counts
-    everything = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "tree.ply", budget=10**6)
+    everything = lodgs("data.importing").import_splats(bpy.context, tmp_path / "tree.ply", budget=10**6)
     assert [len(item.object.data.points) for item in everything.lodgs.levels] == [LEAVES - 1, LEAVES]
 
 

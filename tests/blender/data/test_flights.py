@@ -11,7 +11,7 @@ GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
 @pytest.fixture
 def root(bpy, lodgs):
     bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, 48
-    return lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+    return lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
 
 
 def seen_from(bpy, camera, frames):

@@ -18,7 +18,7 @@ HERE = Path(__file__).parents[3] / "build" / "interop" / "node_modules" / ".bin"
 def root(bpy, lodgs, tmp_path):
     levels = [Level(number, splats(40 * number), {"s_min": 0.1 * (2 - number)}) for number in (1, 2)]
     write_bundle(tmp_path / "in.ply", Bundle("made", levels, "bands"))
-    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "in.ply")
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "in.ply")
     bpy.context.view_layer.update()
     return root
 
@@ -37,7 +37,7 @@ def means(obj):
 
 
 def back(bpy, lodgs, path):
-    root = lodgs("data.scenes").import_splats(bpy.context, path)
+    root = lodgs("data.importing").import_splats(bpy.context, path)
     return [item.object for item in root.lodgs.levels]
 
 

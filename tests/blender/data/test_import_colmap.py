@@ -27,7 +27,7 @@ def test_cameras_see_points_where_colmap_does(bpy, lodgs, mini):
     from mathutils import Vector
 
     scene = read_scene(mini)
-    root = lodgs("data.scenes").import_colmap(bpy.context, mini)
+    root = lodgs("data.importing").import_colmap(bpy.context, mini)
     root.scale, root.location = (2, 2, 2), (1, 2, 3)
     bpy.context.view_layer.update()
     for camera in scene.cameras[::10]:
@@ -100,7 +100,7 @@ def test_operator_imports_everything_upright(bpy, mini):
 def test_looking_through_the_views(bpy, lodgs, shared_scenes):
     """One after the other by name, around the end, and the selected one; the render takes each one's size."""
     scene = read_scene(shared_scenes / "variants" / "multicam_subfolders")
-    lodgs("data.scenes").import_colmap(bpy.context, scene.folder, photographs=False)
+    lodgs("data.importing").import_colmap(bpy.context, scene.folder, photographs=False)
     sizes = {camera.name: (camera.width, camera.height) for camera in scene.cameras}
     names = sorted(sizes)
     assert len(set(sizes.values())) > 1
@@ -121,7 +121,7 @@ def test_looking_through_the_views(bpy, lodgs, shared_scenes):
 
 
 def test_points_make_way_for_the_first_level(bpy, lodgs, mini):
-    root = lodgs("data.scenes").import_colmap(bpy.context, mini)
+    root = lodgs("data.importing").import_colmap(bpy.context, mini)
     points, cameras = root.lodgs.points, root.lodgs.cameras
     assert points.type == "POINTCLOUD" and len(cameras.objects) == 32
     level = lodgs("training.splats.bundle").Level(
@@ -143,10 +143,10 @@ def test_points_make_way_for_the_first_level(bpy, lodgs, mini):
 
 def test_training_takes_the_model_and_photographs_of_the_import(bpy, lodgs, mini, tmp_path):
     found = read_scene(mini)
-    root = lodgs("data.scenes").import_colmap(bpy.context, mini)
+    root = lodgs("data.importing").import_colmap(bpy.context, mini)
     job = lodgs("runs.job_settings").make_job(root, tmp_path, {})
     assert (job.model, job.images) == ("", "")
-    root = lodgs("data.scenes").import_colmap(
+    root = lodgs("data.importing").import_colmap(
         bpy.context, mini, model=found.model, images=str(found.images_folder), photographs=False
     )
     job = lodgs("runs.job_settings").make_job(root, tmp_path, {})
@@ -158,7 +158,7 @@ def test_a_camera_that_is_there_stays(bpy, lodgs, mini):
     bpy.context.scene.collection.objects.link(mine)
     bpy.context.scene.camera = mine
     size = bpy.context.scene.render.resolution_x
-    lodgs("data.scenes").import_colmap(bpy.context, mini, upright=False, photographs=False)
+    lodgs("data.importing").import_colmap(bpy.context, mini, upright=False, photographs=False)
     assert bpy.context.scene.camera == mine and bpy.context.scene.render.resolution_x == size
     assert not bpy.data.images
 
@@ -171,7 +171,7 @@ def test_a_camera_that_is_there_stays(bpy, lodgs, mini):
 def test_odd_scenes_import(bpy, lodgs, shared_scenes, name):
     folder = shared_scenes / "variants" / name
     scene, told = read_scene(folder), []
-    root = lodgs("data.scenes").import_colmap(bpy.context, folder, warn=told.append)
+    root = lodgs("data.importing").import_colmap(bpy.context, folder, warn=told.append)
     assert len([o for o in root.children_recursive if o.type == "CAMERA"]) == len(scene.cameras) > 0
     assert bool([o for o in root.children_recursive if o.type == "POINTCLOUD"]) == bool(len(scene.points))
     assert all(message in told for message in scene.warnings)
@@ -214,7 +214,7 @@ def test_another_program_s_export(bpy, lodgs, tmp_path):
         frames.append({"file_path": f"{number}.png", "transform_matrix": pose.tolist()})
     (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": frames}))
     said = []
-    root = lodgs("data.scenes").import_colmap(bpy.context, tmp_path, upright=False, warn=said.append)
+    root = lodgs("data.importing").import_colmap(bpy.context, tmp_path, upright=False, warn=said.append)
     assert "at random" in said[0]
     bpy.context.view_layer.update()
     for number, pose in enumerate(poses):

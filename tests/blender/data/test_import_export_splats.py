@@ -112,7 +112,7 @@ def test_a_foreign_2d_filter_is_known_and_named_again_on_export(bpy, lodgs, bund
     splats = bundle.levels[0].splats
     lodgs("training.splats.ply").write_ply(tmp_path / "mip.ply", splats, ["SplatRenderMode: mip"])
     said = []
-    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "mip.ply", warn=said.append)
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "mip.ply", warn=said.append)
     assert said == [] and root.lodgs.antialias
     bpy.context.view_layer.objects.active = bpy.data.objects["mip"]
     for source in ("SHOWN", "LEVEL"):
@@ -121,7 +121,7 @@ def test_a_foreign_2d_filter_is_known_and_named_again_on_export(bpy, lodgs, bund
 
 
 def test_upright_turns_minus_y_up(bpy, lodgs, file):
-    root = lodgs("data.scenes").import_splats(bpy.context, file)
+    root = lodgs("data.importing").import_splats(bpy.context, file)
     bpy.context.view_layer.update()
     assert np.array(root.lodgs.axes.matrix_world)[:3, :3] @ [0, -1, 0] == pytest.approx([0, 0, 1], abs=1e-6)
 
@@ -130,7 +130,7 @@ def test_upright_is_as_the_bundle_says(bpy, lodgs, bundle, tmp_path):
     turned = np.array([[0, 0.6, 0.8], [1, 0, 0], [0, 0.8, -0.6]])  # a rotation
     bundle.meta["up_rotation"] = turned
     lodgs("training.splats.bundle").write_bundle(tmp_path / "b.ply", bundle)
-    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "b.ply")
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
     bpy.context.view_layer.update()
     assert np.array(root.lodgs.axes.matrix_world)[:3, :3] == pytest.approx(turned, abs=1e-6)
 
@@ -289,13 +289,13 @@ def test_imported_piece_by_piece_and_ended_early(bpy, lodgs, bundle, tmp_path):
             next(work)
         most = max(most, there()[1] - nothing[1])
         work.close()
-        assert there() == nothing and not scenes.roots(bpy.context.scene)
+        assert there() == nothing and not lodgs("data.roots").roots(bpy.context.scene)
     assert most == 3 and sum(1 for _ in begun()) > 3
-    (root,) = scenes.roots(bpy.context.scene)
+    (root,) = lodgs("data.roots").roots(bpy.context.scene)
     assert root.name == "b" and [item.object.name for item in root.lodgs.levels] == [
         f"b level {number}" for number in (1, 2, 3)
     ]
-    whole = scenes.read_levels(scenes.import_splats(bpy.context, path))
+    whole = scenes.read_levels(lodgs("data.importing").import_splats(bpy.context, path))
     for one, other in zip(scenes.read_levels(root).levels, whole.levels, strict=True):
         np.testing.assert_array_equal(one.splats.means, other.splats.means)
         np.testing.assert_array_equal(one.splats.extras["sigma"], other.splats.extras["sigma"])

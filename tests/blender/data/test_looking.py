@@ -29,7 +29,7 @@ def ball(count: int, outliers: int) -> Splats:
 
 def test_outliers_do_not_count_for_what_is_looked_at(bpy, lodgs, tmp_path):
     write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, ball(2000, 40))]))
-    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "b.ply", upright=False)
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply", upright=False)
     root.scale, root.location = (2, 2, 2), (0, 0, 5)
     assert lodgs("data.photographs").photographed_from(root) is None
     middle, size = lodgs("data.photographs").bounds_of_most(root)
@@ -43,7 +43,7 @@ def test_what_is_cropped_away_or_hidden_does_not_count_either(bpy, lodgs, tmp_pa
     from mathutils import Matrix
 
     write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, ball(2000, 40))]))
-    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "b.ply", upright=False)
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply", upright=False)
     bounds, cleaning = lodgs("data.photographs").bounds_of_most, lodgs("data.cleaning")
     corner = Matrix.Translation((9.5, 19.5, 29.5)) @ Matrix.Diagonal((0.5, 0.5, 0.5, 1))
     crop = lodgs("data.crops").new_crop(root, "BOX", corner)
@@ -60,7 +60,7 @@ def test_what_is_cropped_away_or_hidden_does_not_count_either(bpy, lodgs, tmp_pa
 
 
 def test_photographs_are_looked_at_from_the_view_in_the_middle(bpy, lodgs):
-    root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+    root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     root.location = (1, 2, 3)
     bpy.context.view_layer.update()
     eye, target = lodgs("data.photographs").photographed_from(root)
@@ -77,7 +77,7 @@ def test_photographs_are_looked_at_from_the_view_in_the_middle(bpy, lodgs):
 def test_what_stands_before_the_cameras_is_hidden_and_that_is_said(bpy, lodgs):
     """A new file's cube, in which some scenes were photographed, and before which others."""
     eye, target = lodgs("data.photographs").photographed_from(
-        lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+        lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     )
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     ahead = target - eye
@@ -95,14 +95,14 @@ def test_what_stands_before_the_cameras_is_hidden_and_that_is_said(bpy, lodgs):
     assert not cubes["about"].hide_render and not cubes["about"].hide_viewport
     told = []
     cubes["about"].hide_set(False)
-    root = lodgs("data.scenes").roots(bpy.context.scene)[0]
+    root = lodgs("data.roots").roots(bpy.context.scene)[0]
     lodgs("data.photographs").look_at_scene(bpy.context, root, told.append)
     assert told == ["'about' stands before the cameras and is hidden; Alt+H shows it."]
 
 
 def test_an_impossible_control_changes_nothing(bpy, lodgs, tmp_path):
     write_bundle(tmp_path / "b.ply", Bundle("mine", [Level(1, ball(5, 0))]))
-    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "b.ply")
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
     odd = Bundle("flod", [], "bands", controls={"gamma": -1.0}, meta={"a": 1})
     before = {name: getattr(root.lodgs, name) for name in ("method", "rule", "cumulative", "meta", "mode")}
     with pytest.raises(lodgs("training.errors").LodgsError, match="gamma = -1"):
@@ -115,7 +115,7 @@ def test_an_impossible_control_changes_nothing(bpy, lodgs, tmp_path):
 def test_too_little_memory_leaves_nothing(bpy, lodgs, monkeypatch, tmp_path, what, fails_at):
     """One sentence, and no half of a scene or of a level, whichever array is one too many."""
     write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, ball(5, 0))]))
-    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "b.ply")
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
     before = {kind: sorted(one.name for one in getattr(bpy.data, kind)) for kind in KINDS}
     objects, written = lodgs("data.objects"), []
     write = objects.write_attribute

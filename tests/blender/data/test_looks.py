@@ -126,7 +126,7 @@ def test_an_export_has_the_look_and_comes_back_equal(bpy, lodgs, looking, tmp_pa
         there, then = (1 / (1 + np.exp(-s.opacity_logits)) for s in (level.splats, before.splats))
         np.testing.assert_allclose(there, factor * then, rtol=1e-4, atol=1e-6)
         assert level.splats.extras.keys() == before.splats.extras.keys()
-    again = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "out.ply", upright=False)
+    again = lodgs("data.importing").import_splats(bpy.context, tmp_path / "out.ply", upright=False)
     for level, back in zip(
         found.levels, lodgs("data.scenes").read_levels(again, looked=True).levels, strict=True
     ):

@@ -33,7 +33,7 @@ def root(bpy, lodgs, tmp_path):
     camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
     scene.collection.objects.link(camera)
     scene.camera = camera
-    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "b.ply")
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
     root.lodgs.mode = "SELECTIVE"
     return root
 

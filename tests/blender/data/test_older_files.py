@@ -11,7 +11,7 @@ OLD = Path(__file__).parents[2] / "data" / "version_0_1_0"
 def test_a_blend_file_opens_with_the_same_splats_shown(bpy, lodgs):
     bpy.ops.wm.open_mainfile(filepath=str(OLD / "scenes.blend"))
     wanted = json.loads((OLD / "expected_blend.json").read_text())
-    roots = {root.name: root for root in lodgs("data.scenes").roots(bpy.context.scene)}
+    roots = {root.name: root for root in lodgs("data.roots").roots(bpy.context.scene)}
     assert roots.keys() == wanted.keys()
     assert {name: root.lodgs.rule for name, root in roots.items()} == {
         "flod": "bands", "octree": "octree", "plain": "",
@@ -36,7 +36,7 @@ def test_scenes_appended_from_one_choose_as_before(bpy, lodgs):
     with bpy.data.libraries.load(str(OLD / "scenes.blend")) as (_, wanted):
         wanted.collections = ["octree"]
     bpy.context.scene.collection.children.link(wanted.collections[0])
-    root = lodgs("data.scenes").roots(bpy.context.scene)[0]
+    root = lodgs("data.roots").roots(bpy.context.scene)[0]
     assert (root.lodgs.rule, root.lodgs.octree.offset) == ("octree", -0.75)
     assert not [group.name for group in bpy.data.node_groups if group.name.endswith("Octree Level")]
 
@@ -47,14 +47,14 @@ def test_what_is_linked_from_one_stays_and_stops_nothing(bpy, lodgs, capfd):
     bpy.context.scene.collection.children.link(wanted.collections[0])
     bpy.context.view_layer.update()
     lodgs("data.older_files")._on_load()
-    root = lodgs("data.scenes").roots(bpy.context.scene)[0]
+    root = lodgs("data.roots").roots(bpy.context.scene)[0]
     assert root.lodgs.rule == ""
     assert "Traceback" not in "".join(capfd.readouterr())
 
 
 def test_what_it_exports_has_a_rule(bpy, lodgs, tmp_path):
     bpy.ops.wm.open_mainfile(filepath=str(OLD / "scenes.blend"))
-    for root in lodgs("data.scenes").roots(bpy.context.scene):
+    for root in lodgs("data.roots").roots(bpy.context.scene):
         bundle = lodgs("data.scenes").read_levels(root)
         before = lodgs("training.splats.bundle").read_bundle(OLD / f"{root.name}.ply")
         assert (bundle.rule, bundle.facts, bundle.cumulative) == (

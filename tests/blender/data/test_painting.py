@@ -114,7 +114,7 @@ def test_files_that_keep_the_splats_as_trained_keep_their_paint_beside(bpy, lodg
     for level, before in zip(read_bundle(tmp_path / "trained.ply").levels, bundle.levels, strict=True):
         np.testing.assert_array_equal(level.splats.sh, before.splats.sh)
     scenes = lodgs("data.scenes")
-    again = scenes.import_splats(bpy.context, tmp_path / "trained.ply", upright=False)
+    again = lodgs("data.importing").import_splats(bpy.context, tmp_path / "trained.ply", upright=False)
     assert lodgs("data.looks").modifier_of(again.lodgs.levels[0].object) is not None
     for one in (root, again):
         for level in scenes.read_levels(one, looked=True).levels:
@@ -227,7 +227,7 @@ def test_a_tree_is_painted_node_by_node_and_half_a_tree_is_not(bpy, lodgs, paint
     for level in lodgs("data.scenes").read_levels(root, looked=True).levels:
         check(colors_of(level.splats), colors[level.number])
     write_in_pages(tmp_path / "paged.ply", tree_of(random_leaves(3000, np.random.default_rng(7))))
-    lodgs("data.scenes").import_splats(bpy.context, tmp_path / "paged.ply", budget=1500)
+    lodgs("data.importing").import_splats(bpy.context, tmp_path / "paged.ply", budget=1500)
     with pytest.raises(RuntimeError, match="Most of these splats are in paged"):
         stroke(bpy, (100, 100), radius=50, color=RED)
 

@@ -7,7 +7,7 @@ import pytest
 
 @pytest.fixture
 def saved(bpy, lodgs, tmp_path):
-    root = lodgs("data.scenes").import_colmap(bpy.context, "examples/lantern_walk", photographs=False)
+    root = lodgs("data.importing").import_colmap(bpy.context, "examples/lantern_walk", photographs=False)
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a" / "file.blend"))

@@ -40,7 +40,7 @@ def lodge() -> Bundle:
 @pytest.fixture
 def root(bpy, lodgs, tmp_path):
     write_bundle(tmp_path / "in.ply", lodge())
-    found = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "in.ply")
+    found = lodgs("data.importing").import_splats(bpy.context, tmp_path / "in.ply")
     bpy.context.view_layer.update()
     return found
 
@@ -69,7 +69,7 @@ def empties(bpy, root, places):
 @pytest.mark.parametrize("what", ["splats", "colmap"])
 def test_a_roots_transform_is_clean_and_clearing_it_takes_nothing_else(bpy, lodgs, root, what):
     if what == "colmap":
-        root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+        root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     assert root.rotation_mode == "XYZ" and np.array_equal(np.array(root.matrix_basis), np.eye(4))
     bpy.context.view_layer.update()
     part = root.lodgs.points or root.lodgs.levels[-1].object
@@ -141,7 +141,7 @@ def test_the_ground_through_three_empties_is_at_zero(bpy, root):
 
 
 def test_the_ground_through_points_that_are_selected_in_edit_mode(bpy, lodgs):
-    root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+    root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     bpy.context.view_layer.update()
     cloud = root.lodgs.points
     select(bpy, cloud)
@@ -167,7 +167,7 @@ def test_the_ground_through_points_that_are_selected_in_edit_mode(bpy, lodgs):
 
 def test_the_ground_is_found(bpy, lodgs, capfd):
     """The example's, which is z = 0 in its own coordinates; the root has been turned and moved away."""
-    root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+    root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     root.rotation_euler, root.location = (0.2, -0.1, 1.0), (0, 0, 5)
     bpy.context.view_layer.update()
     up = lodgs("data.placement").placement_of(root).rotation[:, 2]
@@ -181,7 +181,7 @@ def test_the_ground_is_found(bpy, lodgs, capfd):
 
 
 def test_the_scale_by_a_length_between_two_empties(bpy, lodgs):
-    root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+    root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     bpy.ops.lodgs.set_ground(by="FOUND")
     bpy.context.view_layer.update()
     view = root.lodgs.cameras.objects[0]
@@ -248,7 +248,7 @@ def test_a_bundle_as_placed_stands_there_when_it_is_imported(bpy, lodgs, root, t
         assert one.facts == pytest.approx(level.facts, rel=1e-12)
     for column in ("x", "radius"):
         np.testing.assert_allclose(found.tables["chunks"][column], wanted.tables["chunks"][column], rtol=1e-6)
-    again = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "out.ply")
+    again = lodgs("data.importing").import_splats(bpy.context, tmp_path / "out.ply")
     bpy.context.view_layer.update()
     np.testing.assert_allclose(world(again), np.eye(4), atol=1e-6)
     for one, before in zip(found.levels, lodge().levels, strict=True):

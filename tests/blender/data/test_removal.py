@@ -21,7 +21,7 @@ def root(bpy, lodgs):
     bpy.context.scene.collection.objects.link(bpy.data.objects.new("the artist's", None))
     garden = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
     scenes = lodgs("data.scenes")
-    root = scenes.import_colmap(bpy.context, garden)
+    root = lodgs("data.importing").import_colmap(bpy.context, garden)
     scenes.set_bundle_facts(root, Bundle("flod", [], "bands"))
     for number, s_min in ((1, 0.1), (2, 0.0)):
         scenes.set_level(root, Level(number, splats(number), {"s_min": s_min}))

@@ -40,7 +40,7 @@ def root(bpy, lodgs):
     camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
     scene.collection.objects.link(camera)
     scene.camera = camera
-    with lodgs("data.scenes")._new_scene(bpy.context, "scene") as root:
+    with lodgs("data.importing").new_scene(bpy.context, "scene") as root:
         lodgs("data.scenes").set_bundle_facts(root, bundle.Bundle("flod", [], "bands"))
         for level in levels:
             lodgs("data.scenes").set_level(root, level)

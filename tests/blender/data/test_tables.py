@@ -38,7 +38,7 @@ def file(bundle, tmp_path):
 
 @pytest.fixture
 def root(bpy, lodgs, file):
-    return lodgs("data.scenes").import_splats(bpy.context, file)
+    return lodgs("data.importing").import_splats(bpy.context, file)
 
 
 def check_tables(found, expected):
@@ -104,7 +104,7 @@ def test_chunks_are_spheres_that_nobody_trips_over(bpy, root):
 
 def test_two_scenes_of_one_file_have_their_own(bpy, lodgs, root, file, tmp_path):
     scenes = lodgs("data.scenes")
-    other = scenes.import_splats(bpy.context, file)
+    other = lodgs("data.importing").import_splats(bpy.context, file)
     scenes.set_tables(other, {"chunks": {name: values[::-1] for name, values in CHUNKS.items()}})
     assert exported(bpy, root, tmp_path / "out.ply") == file.read_bytes()
     for one in (root, other):
@@ -113,7 +113,7 @@ def test_two_scenes_of_one_file_have_their_own(bpy, lodgs, root, file, tmp_path)
         assert given == [one.lodgs.tables["chunks"].object] * 2
     assert other.lodgs.tables["chunks"].object != root.lodgs.tables["chunks"].object
     assert bpy.ops.lodgs.remove_scene() == {"FINISHED"}  # the one imported last is active no more
-    assert len(scenes.roots(bpy.context.scene)) == 1
+    assert len(lodgs("data.roots").roots(bpy.context.scene)) == 1
 
 
 def test_appended_they_come_along(bpy, root, file, tmp_path):
@@ -173,7 +173,7 @@ def test_what_earlier_versions_saved_goes_on(bpy, lodgs, tmp_path):
     levels = [Level(1, splats(30), {"d_l": 1.5}), Level(2, splats(90), {"d_l": 0.0})]
     bundle = Bundle("lodge", levels, "chunks", controls={"distance_scale": 2.0})
     write_bundle(tmp_path / "old.ply", bundle)
-    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "old.ply")
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "old.ply")
     root.lodgs.begun = json.dumps({"distance_scale": 2.0})
     root.lodgs.mode, root.lodgs.eye, root.lodgs.camera_center = "SELECTIVE", "TRAINING", (0, 0, 0)
     for item in root.lodgs.levels:
@@ -189,7 +189,7 @@ def test_what_earlier_versions_saved_goes_on(bpy, lodgs, tmp_path):
 
 def test_a_finished_run_brings_its_chunks_and_the_next_takes_them(bpy, lodgs, fake, tmp_path):
     scenes, watch = lodgs("data.scenes"), lodgs("runs.watch")
-    with scenes._new_scene(bpy.context, "town") as root:
+    with lodgs("data.importing").new_scene(bpy.context, "town") as root:
         root.lodgs.scene_folder = str(tmp_path / "scene")
     fake("chunks")
     assert bpy.ops.lodgs.train(folder=str(tmp_path / "run")) == {"FINISHED"}

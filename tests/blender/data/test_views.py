@@ -40,7 +40,7 @@ def root(bpy, lodgs, tmp_path):
     # counted with a view that has no photograph; trained at a fortieth of the size
     bundle.meta |= {"held_out": [3, 9], "focal_px": 12.5}
     write_bundle(tmp_path / "in.ply", bundle)
-    return lodgs("data.scenes").import_splats(bpy.context, tmp_path / "in.ply")
+    return lodgs("data.importing").import_splats(bpy.context, tmp_path / "in.ply")
 
 
 def check(cameras, wanted):
@@ -89,7 +89,7 @@ def test_views_are_in_the_bundle_again_where_the_scene_stands(bpy, root, tmp_pat
 
 def test_a_trained_scene_takes_its_photographs_views_along(bpy, lodgs):
     scenes = lodgs("data.scenes")
-    root = scenes.import_colmap(bpy.context, GARDEN, photographs=False)
+    root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     names = ("means", "quats", "log_scales", "opacity_logits", "sh")
     made = {name: getattr(splats(9), name) for name in names}
     level = lodgs("training.splats.gaussians").Splats(**made)

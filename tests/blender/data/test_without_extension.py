@@ -36,7 +36,7 @@ def test_the_finest_level_is_there_as_points(bpy, lodgs, tmp_path, cumulative):
     levels = [Level(number, splats(count), {"s_min": s_min[number]}) for number, count in COUNTS.items()]
     rule, facts = ("octree", {"d_max": 9.0, "d_max_focal": 500.0}) if cumulative else ("bands", {})
     write_bundle(tmp_path / "b.ply", Bundle("made", levels, rule, facts, cumulative=cumulative))
-    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "b.ply")
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
     root.lodgs.mode, root.lodgs.levels[2].show = "SELECTIVE", False
     bpy.context.view_layer.update()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "b.blend"))

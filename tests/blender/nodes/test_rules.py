@@ -142,9 +142,9 @@ def splat_scene(bpy, lodgs):
             levels.append(Level(number, splats, {fact: facts[fact] for fact in rule.level_facts}))
         scene = {fact: facts[fact] for fact in rule.scene_facts}
         bundle = Bundle("any", levels, name, scene, cumulative=rule.cumulative)
-        with scenes._new_scene(bpy.context, "any") as root:
+        with lodgs("data.importing").new_scene(bpy.context, "any") as root:
             for one in bundle.levels:
-                scenes._put_level(root, one)
+                scenes.put_level(root, one)
             scenes.set_bundle_facts(root, bundle)
         return root
 
@@ -311,7 +311,7 @@ def test_a_scene_gives_its_bundle_back(bpy, lodgs, splat_scene, name, tmp_path):
     root, scenes = splat_scene(name), lodgs("data.scenes")
     bundle = scenes.read_levels(root)
     lodgs("training.splats.bundle").write_bundle(tmp_path / "bundle.ply", bundle)
-    again = scenes.read_levels(scenes.import_splats(bpy.context, tmp_path / "bundle.ply"))
+    again = scenes.read_levels(lodgs("data.importing").import_splats(bpy.context, tmp_path / "bundle.ply"))
     assert (again.rule, again.facts, again.controls) == (name, bundle.facts, {})
     assert [level.facts for level in again.levels] == [level.facts for level in bundle.levels]
 
@@ -321,7 +321,7 @@ def test_an_unknown_rule_shows_the_finest_level_and_says_so(bpy, lodgs, splat_sc
     bundle = scenes.read_levels(splat_scene("bands"))
     bundle.rule = "telepathy"
     lodgs("training.splats.bundle").write_bundle(tmp_path / "bundle.ply", bundle)
-    root = scenes.import_splats(bpy.context, tmp_path / "bundle.ply", warn=said.append)
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "bundle.ply", warn=said.append)
     assert "telepathy" in said[0] and "Update LODGS" in said[0]
     root.lodgs.mode = "SELECTIVE"
     scenes.set_bundle_facts(root, bundle)

@@ -77,7 +77,7 @@ def test_progress_and_result_of_a_capture_are_shown(bpy, lodgs, draw, monkeypatc
 def test_the_panel_is_hidden_while_a_splat_scene_is_active(bpy, lodgs, draw):
     panel = lodgs("panels.capture").LODGS_PT_capture
     assert panel.poll(bpy.context)
-    with lodgs("data.scenes")._new_scene(bpy.context, "scene"):
+    with lodgs("data.importing").new_scene(bpy.context, "scene"):
         pass
     assert not panel.poll(bpy.context)
 

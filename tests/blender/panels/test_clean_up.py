@@ -8,7 +8,7 @@ from training.splats.bundle import write_bundle
 
 def test_crops_hiding_and_counts(bpy, lodgs, draw_panel, tmp_path):
     write_bundle(tmp_path / "in.ply", bundle_of("bands", np.random.default_rng(0)))
-    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "in.ply")
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "in.ply")
     layout = draw_panel("clean_up", "LODGS_PT_clean_up")
     assert "Level 1: 700 of 700 splats" in layout.texts
     assert layout.buttons.count("Floaters") == 1 and "lodgs.delete_left_out" in layout.operators

@@ -32,7 +32,7 @@ def root(bpy, lodgs, tmp_path):
         adds = bool(rule and rule.cumulative)
         bundle = bundles.Bundle("any", [bundles.Level(1, splats, facts[1])], name, facts[0], cumulative=adds)
         bundles.write_bundle(tmp_path / "b.ply", bundle)
-        return lodgs("data.scenes").import_splats(bpy.context, tmp_path / "b.ply")
+        return lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
 
     return make
 
@@ -85,9 +85,9 @@ def town(bpy, lodgs):
     levels = [Level(1, splats.select(slice(0, 10)), {"d_l": 20.0}), Level(2, splats, {"d_l": 0.0})]
     table = {"x": [0, 10], "y": [0, 0], "z": [0, 0], "radius": [10, 10]}
     table = {name: np.float32(values) for name, values in table.items()}
-    with scenes._new_scene(bpy.context, "town") as root:
+    with lodgs("data.importing").new_scene(bpy.context, "town") as root:
         for level in levels:
-            scenes._put_level(root, level)
+            scenes.put_level(root, level)
         scenes.set_bundle_facts(root, Bundle("lodge", levels, "chunks"))
         scenes.set_tables(root, {"chunks": table})
     root.lodgs.mode, root.lodgs.eye = "SELECTIVE", "TRAINING"
@@ -177,7 +177,7 @@ def tree(bpy, lodgs, tmp_path):
     """A scene with a small tree of splats."""
     bundle = tree_of(random_leaves(50, np.random.default_rng(1)))
     lodgs("training.splats.bundle").write_bundle(tmp_path / "tree.ply", bundle)
-    return lodgs("data.scenes").import_splats(bpy.context, tmp_path / "tree.ply")
+    return lodgs("data.importing").import_splats(bpy.context, tmp_path / "tree.ply")
 
 
 def test_panels_explain_the_coarse_level_of_a_tree(tree, draw_panel):
@@ -192,10 +192,10 @@ def test_state_of_streaming_is_shown(bpy, lodgs, draw, draw_panel, tmp_path, mon
     bundles, tree = lodgs("training.splats.bundle"), tree_of(random_leaves(3000, np.random.default_rng(0)))
     bundles.write_bundle(tmp_path / "town.ply", tree)
     panel = lodgs("panels.levels").LODGS_PT_stream
-    whole = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "town.ply")
+    whole = lodgs("data.importing").import_splats(bpy.context, tmp_path / "town.ply")
     assert not panel.poll(bpy.context)
     lodgs("data.removal").remove(whole)
-    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "town.ply", budget=2000)
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "town.ply", budget=2000)
     assert panel.poll(bpy.context) and not any("splats shown" in text for text in draw().texts)
 
     def texts():

@@ -9,7 +9,7 @@ from training.splats.bundle import write_bundle
 
 def test_looks_of_the_scene_of_regions_and_of_a_selected_crop(bpy, lodgs, draw_panel, tmp_path):
     write_bundle(tmp_path / "in.ply", bundle_of("bands", np.random.default_rng(0)))
-    root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "in.ply")
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "in.ply")
     layout = draw_panel("look", "LODGS_PT_look")
     assert layout.properties == list(RANGES) and "lodgs.reset_look" in layout.operators
 

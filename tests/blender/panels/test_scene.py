@@ -17,7 +17,7 @@ GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
 def root(bpy, lodgs):
     """The example scene with two levels."""
     scenes = lodgs("data.scenes")
-    root = scenes.import_colmap(bpy.context, GARDEN, photographs=False)
+    root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     scenes.set_bundle_facts(root, Bundle("flod", [], "bands"))
     for number in (1, 2):
         scenes.set_level(root, Level(number, splats(5), {"s_min": 0.1 if number == 1 else 0.0}))
@@ -92,7 +92,7 @@ def test_a_linked_scene_can_be_rendered_but_not_changed(bpy, lodgs, root, draw_p
     name = root.users_collection[0].name
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "garden.blend"))
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    scenes, scene = lodgs("data.scenes"), bpy.context.scene
+    roots, scene = lodgs("data.roots"), bpy.context.scene
     panels = [lodgs("panels.viewport").LODGS_PT_viewport, lodgs("panels.rendering").LODGS_PT_rendering]
     assert not any(panel.poll(bpy.context) for panel in panels)
     with bpy.data.libraries.load(str(tmp_path / "garden.blend"), link=True) as (_, linked):
@@ -108,7 +108,7 @@ def test_a_linked_scene_can_be_rendered_but_not_changed(bpy, lodgs, root, draw_p
     bpy.context.view_layer.update()
     assert all(panel.poll(bpy.context) for panel in panels)
     layout = draw_panel("scene", "LODGS_PT_scene")
-    assert scenes.LINKED in layout.texts
+    assert roots.LINKED in layout.texts
     for operator in ("remove_scene", "show_only_level", "train"):
         assert not getattr(bpy.ops.lodgs, operator).poll()
     assert "splats" in draw_panel("viewport", "LODGS_PT_viewport").properties
@@ -116,7 +116,7 @@ def test_a_linked_scene_can_be_rendered_but_not_changed(bpy, lodgs, root, draw_p
 
 def test_a_local_scene_has_no_hint_about_linking(lodgs, root, draw_panel):
     layout = draw_panel("scene", "LODGS_PT_scene")
-    assert lodgs("data.scenes").LINKED not in layout.texts and "lodgs.remove_scene" in layout.operators
+    assert lodgs("data.roots").LINKED not in layout.texts and "lodgs.remove_scene" in layout.operators
 
 
 def test_import_reports_the_imported_objects(bpy, lodgs, capfd, tmp_path):
@@ -133,7 +133,7 @@ def test_import_reports_the_imported_objects(bpy, lodgs, capfd, tmp_path):
 def test_panels_for_splats_are_hidden_until_a_scene_has_levels(bpy, lodgs):
     scenes = lodgs("data.scenes")
     panels = [getattr(lodgs(f"panels.{name}"), f"LODGS_PT_{name}") for name in ("viewport", "rendering")]
-    root = scenes.import_colmap(bpy.context, GARDEN, photographs=False)
+    root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     assert not any(panel.poll(bpy.context) for panel in panels)
     scenes.set_level(root, Level(1, splats(5)))
     assert all(panel.poll(bpy.context) for panel in panels)

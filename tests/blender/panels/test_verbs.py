@@ -86,7 +86,7 @@ def test_panels_of_the_current_step_are_open(bpy, lodgs, draw_panel, tmp_path, f
 
     assert open_panels() == {"Scene"} and draw_panel("scene", "LODGS_PT_scene").collapsed == []
     fake()
-    root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+    root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     assert open_panels() == {"Scene", "Training"}
     assert draw_panel("training", "LODGS_PT_training").collapsed == []
     root.lodgs.training.output = str(tmp_path / "runs")
@@ -138,7 +138,7 @@ def test_new_work_with_a_reused_id_has_no_notice(lodgs, work):
 
 def test_runs_of_a_scene_are_listed_and_opened(bpy, lodgs, tmp_path, fake):
     fake()
-    root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+    root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     jobs = lodgs("runs.jobs")
     run_folders = lodgs("runs.run_folders")
     root.lodgs.training.output = str(tmp_path / "runs")

@@ -91,7 +91,7 @@ def test_the_meshes_scene_has_the_cameras_of_markers_and_no_collection_that_is_l
 
 
 def test_splats_are_left_out_of_the_meshes_where_their_root_has_moved(bpy, lodgs, scene):
-    [root] = lodgs("data.scenes").roots(scene)
+    [root] = lodgs("data.roots").roots(scene)
     [collection] = root.users_collection
     scene.collection.objects.link(root)
     collection.objects.unlink(root)
@@ -110,7 +110,7 @@ def test_frames_of_viewport_quality_are_no_movie(bpy, lodgs, scene):
 
 
 def test_captures_leave_splats_out_whichever_level_is_shown(bpy, lodgs, scene):
-    [root] = lodgs("data.scenes").roots(scene)
+    [root] = lodgs("data.roots").roots(scene)
     assert [level.object.hide_render for level in root.lodgs.levels] == [False]
     lodgs("render.capture")._prepare(scene, 64, 48)
     bpy.context.view_layer.update()  # when drivers have their say

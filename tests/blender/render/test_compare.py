@@ -32,7 +32,7 @@ def haze(color: float) -> Splats:
 def root(bpy, lodgs, tmp_path):
     """The example's views with haze for splats."""
     write_bundle(tmp_path / "haze.ply", Bundle("flod", [Level(1, haze(0.4))]))
-    root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+    root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     root.lodgs.training.image_scale = 1.0
     lodgs("data.scenes").set_level(root, Level(1, haze(0.4)))
     bpy.context.view_layer.update()
@@ -98,7 +98,7 @@ def measured(bpy, lodgs, tmp_path):
         counts = np.unique(np.repeat([1, 2, 3], 300)[weights > 0], return_counts=True)
         assert min(counts[1]) > 20 and len(counts[0]) == 3  # every level has its part
         (psnr,) = evaluation.compare_views([camera], lambda camera: (choice.splats, weights))
-        root = lodgs("data.scenes").import_colmap(bpy.context, folder, photographs=False)
+        root = lodgs("data.importing").import_colmap(bpy.context, folder, photographs=False)
         lodgs("data.scenes").set_bundle_facts(root, bundle)
         for level in levels:
             lodgs("data.scenes").set_level(root, level)
@@ -239,7 +239,7 @@ def test_the_wipe_goes_with_its_panel(bpy, lodgs, root):
     wipe.show(bpy.context, wipe.Comparison(camera.session_uid, nothing, nothing, 20.0))
     assert wipe.shown(bpy.context) and panel.poll(bpy.context)
     write_bundle(Path(bpy.app.tempdir) / "haze.ply", Bundle("flod", [Level(1, haze(0.4))]))
-    other = lodgs("data.scenes").import_splats(bpy.context, Path(bpy.app.tempdir) / "haze.ply")
+    other = lodgs("data.importing").import_splats(bpy.context, Path(bpy.app.tempdir) / "haze.ply")
     assert bpy.context.view_layer.objects.active == other and not panel.poll(bpy.context)
     assert not wipe.shown(bpy.context)
     bpy.context.view_layer.objects.active = root
@@ -270,7 +270,7 @@ def test_views_without_a_photograph_are_counted_among_those_held_out(bpy, lodgs,
     names = [camera.name for camera in read_scene(GARDEN).cameras]
     scene = shutil.copytree(GARDEN, tmp_path / "scene")
     (scene / "images" / names[3]).unlink()
-    root = lodgs("data.scenes").import_colmap(bpy.context, scene, warn=lambda message: None)
+    root = lodgs("data.importing").import_colmap(bpy.context, scene, warn=lambda message: None)
     lodgs("data.scenes").set_bundle_facts(root, Bundle("flod", [], meta={"held_out": [0, 8]}))
     held_out = [view.name.split(".jpg")[0] for view in lodgs("data.photographs").held_out(root)]
     assert held_out == [name.removesuffix(".jpg") for name in names[::8]]

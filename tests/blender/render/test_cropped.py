@@ -29,7 +29,7 @@ def test_frames_show_what_is_left(bpy, lodgs, camera, tmp_path, name, mode):
     for level in bundle.levels:
         level.splats.sh[:] *= 0.2
     write_bundle(tmp_path / "in.ply", bundle)
-    scenes, engine = lodgs("data.scenes"), lodgs("render.engine")
+    importing, engine = lodgs("data.importing"), lodgs("render.engine")
 
     def frame(root):
         root.lodgs.mode, root.lodgs.single_level = mode, 3
@@ -39,7 +39,7 @@ def test_frames_show_what_is_left(bpy, lodgs, camera, tmp_path, name, mode):
         planes = engine.frame(depsgraph, 96, 64, (0, 0, 96, 64)).planes
         return np.stack([planes[f"Combined.{channel}"] for channel in "RGB"], axis=2)
 
-    root = scenes.import_splats(bpy.context, tmp_path / "in.ply", upright=False)
+    root = importing.import_splats(bpy.context, tmp_path / "in.ply", upright=False)
     whole = frame(root)
     bpy.ops.lodgs.add_crop(shape="SPHERE")
     crop = bpy.context.active_object
@@ -52,7 +52,7 @@ def test_frames_show_what_is_left(bpy, lodgs, camera, tmp_path, name, mode):
     np.testing.assert_array_equal(frame(root), cropped)
     bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"))
     lodgs("data.removal").remove(root)
-    alone = frame(scenes.import_splats(bpy.context, tmp_path / "out.ply", upright=False))
+    alone = frame(importing.import_splats(bpy.context, tmp_path / "out.ply", upright=False))
     np.testing.assert_allclose(cropped, alone, atol=1e-5)
     assert np.abs(whole - cropped).max() > 0.05 and np.abs(moved - cropped).max() > 0.05
 
@@ -60,7 +60,7 @@ def test_frames_show_what_is_left(bpy, lodgs, camera, tmp_path, name, mode):
 @pytest.mark.usefixtures("renderer")
 def test_a_tree_that_is_read_from_its_file_is_cropped(bpy, lodgs, camera, tmp_path):
     write_in_pages(tmp_path / "tree.ply", tree_of(random_leaves(6000, np.random.default_rng(3), degree=1)))
-    scenes, engine = lodgs("data.scenes"), lodgs("render.engine")
+    importing, engine = lodgs("data.importing"), lodgs("render.engine")
 
     def frame(root):
         root.lodgs.controls.pixels = 0.1  # leaves
@@ -71,7 +71,7 @@ def test_a_tree_that_is_read_from_its_file_is_cropped(bpy, lodgs, camera, tmp_pa
 
     pictures = []
     for budget in (3000, 0):
-        root = scenes.import_splats(bpy.context, tmp_path / "tree.ply", budget=budget, upright=False)
+        root = importing.import_splats(bpy.context, tmp_path / "tree.ply", budget=budget, upright=False)
         assert bool(lodgs("data.streams").file_of(root)) == bool(budget)
         whole = frame(root)
         bpy.ops.lodgs.add_crop(shape="BOX")

@@ -49,7 +49,7 @@ def bundle(tmp_path) -> Path:
 def scene(bpy, lodgs, bundle):
     """A bundle, turned and moved and scaled, and a camera before it; LODGS renders it to PNG."""
     scene = bpy.context.scene
-    root = lodgs("data.scenes").import_splats(bpy.context, bundle, upright=False)
+    root = lodgs("data.importing").import_splats(bpy.context, bundle, upright=False)
     root.location, root.scale = (1, 2, -0.5), (1.7,) * 3
     root.rotation_euler = (-1.2, 0.3, 0.4)
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
@@ -118,7 +118,7 @@ def test_f12_is_what_training_render_draws_to_the_bit(bpy, scene, bundle, tmp_pa
 
 def test_f12_of_antialiased_splats_is_what_training_render_draws(bpy, lodgs, scene, bundle, tmp_path):
     """By what the scene says, which its bundle then says as well."""
-    root = lodgs("data.scenes").roots(scene)[0]
+    root = lodgs("data.roots").roots(scene)[0]
     for item in root.lodgs.levels:
         for value in item.object.data.attributes["scale"].data:
             value.vector = [x / 10 for x in value.vector]
@@ -135,7 +135,7 @@ def test_f12_of_antialiased_splats_is_what_training_render_draws(bpy, lodgs, sce
 
 
 def test_levels_by_distance_are_what_training_render_chooses(bpy, lodgs, scene, bundle, tmp_path):
-    root = lodgs("data.scenes").roots(scene)[0]
+    root = lodgs("data.roots").roots(scene)[0]
     root.lodgs.mode, root.lodgs.bands.gamma = "SELECTIVE", 10
     shown = f12(bpy, tmp_path)
     camera = tmp_path / "camera.json"
@@ -152,9 +152,9 @@ def test_an_imported_view_is_the_photographs_camera(bpy, lodgs, bundle, tmp_path
     from training.scenes.colmap import read_scene
 
     folder = ROOT / "examples" / "lantern_garden"
-    photographed = lodgs("data.scenes").import_colmap(bpy.context, folder, photographs=False)
+    photographed = lodgs("data.importing").import_colmap(bpy.context, folder, photographs=False)
     photographed.lodgs.points.hide_render = True
-    root = lodgs("data.scenes").import_splats(bpy.context, bundle, upright=False)
+    root = lodgs("data.importing").import_splats(bpy.context, bundle, upright=False)
     bpy.context.view_layer.update()
     root.lodgs.axes.matrix_world = photographed.lodgs.axes.matrix_world
     bpy.context.scene.render.dither_intensity = 0
@@ -206,7 +206,7 @@ def test_background_colour(bpy, scene, tmp_path):
 def test_two_sets_and_an_instance(bpy, lodgs, scene, bundle, tmp_path):
     """A second import and a copy of a collection, each elsewhere: all are in the picture."""
     alone = passes(bpy, lodgs)["Level.X"] > 0
-    left = lodgs("data.scenes").import_splats(bpy.context, bundle)
+    left = lodgs("data.importing").import_splats(bpy.context, bundle)
     left.location = (-1.5, 2, 0)
     instance = bpy.data.objects.new("instance", None)
     instance.instance_type = "COLLECTION"
@@ -247,7 +247,7 @@ def test_an_animation_starts_the_renderer_once(bpy, lodgs, scene, tmp_path, monk
 
 def test_what_changes_is_handed_over(bpy, lodgs, scene, tmp_path):
     before = f12(bpy, tmp_path)
-    cloud = lodgs("data.scenes").roots(scene)[0].lodgs.levels[1].object.data
+    cloud = lodgs("data.roots").roots(scene)[0].lodgs.levels[1].object.data
     base = lodgs("attributes").read_attribute(cloud, "radiance:base")
     base[:, :3] = 0
     lodgs("attributes").write_attribute(
@@ -274,7 +274,7 @@ def by_distance(bpy, lodgs, scene, tmp_path):
     def made(name):
         scene.render.resolution_percentage = 25
         bpy.context.view_layer.update()
-        before = lodgs("data.scenes").roots(scene)[0]
+        before = lodgs("data.roots").roots(scene)[0]
         middle = (before.lodgs.axes.matrix_world.inverted() @ scene.camera.matrix_world.translation).length
         focal = before.lodgs.focal_px
         of_scene, coarse, fine = {
@@ -298,7 +298,7 @@ def by_distance(bpy, lodgs, scene, tmp_path):
         bundle = Bundle("any", levels, name, facts=of_scene, cumulative=name == "octree")
         write_bundle(tmp_path / "levels.ply", bundle)
         bpy.data.batch_remove([obj for obj in bpy.data.objects if obj.type == "POINTCLOUD"])
-        root = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "levels.ply")
+        root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "levels.ply")
         root.lodgs.axes.matrix_world = before.lodgs.axes.matrix_world
         root.lodgs.mode = "SELECTIVE"
         bpy.context.view_layer.update()
@@ -357,7 +357,7 @@ def test_what_modifiers_change_is_handed_over_as_they_leave_it(bpy, lodgs, scene
 
 def test_what_no_viewport_shows_is_read_at_every_frame(bpy, lodgs, scene, tmp_path, written):
     """Blender does not tell when it changes."""
-    level = lodgs("data.scenes").roots(scene)[0].lodgs.levels[1].object
+    level = lodgs("data.roots").roots(scene)[0].lodgs.levels[1].object
     level.driver_remove("hide_viewport")
     level.hide_viewport = True
     before = f12(bpy, tmp_path)
@@ -442,7 +442,7 @@ def test_other_lenses_are_refused(bpy, scene):
 def test_nothing_to_see_is_the_background(bpy, lodgs, scene, tmp_path):
     for obj in bpy.data.objects:
         obj.hide_render = obj.type != "CAMERA"
-    lodgs("data.scenes").roots(scene)[0].lodgs.levels[1].show = False
+    lodgs("data.roots").roots(scene)[0].lodgs.levels[1].show = False
     assert f12(bpy, tmp_path)[..., :3].max() == 0
 
 
@@ -456,7 +456,7 @@ from tools.blender_module import EXTENSION, start_blender
 bpy = start_blender()
 bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
 load = lambda name: importlib.import_module(EXTENSION + ".blender_lodgs." + name)
-load("data.scenes").import_splats(bpy.context, {str(bundle)!r})
+load("data.importing").import_splats(bpy.context, {str(bundle)!r})
 camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
 bpy.context.scene.collection.objects.link(camera)
 bpy.context.scene.camera = camera
@@ -497,7 +497,7 @@ def flat_wall(y: float, color: tuple[float, float, float], logit: float = 10.0) 
 
 def import_wall(bpy, lodgs, path: Path, *wall):
     write_bundle(path, Bundle("", [Level(1, flat_wall(*wall))]))
-    return lodgs("data.scenes").import_splats(bpy.context, path, upright=False)
+    return lodgs("data.importing").import_splats(bpy.context, path, upright=False)
 
 
 def add_red_cube(bpy):

@@ -50,10 +50,10 @@ def with_looks(bpy, root):
 @pytest.mark.parametrize("mode", ["SINGLE", "SELECTIVE"])
 @pytest.mark.parametrize("moved", [False, True])
 def test_frames_show_what_is_exported(bpy, lodgs, seen, tmp_path, mode, moved):
-    scenes = lodgs("data.scenes")
+    importing = lodgs("data.importing")
 
     def imported(path):
-        root = scenes.import_splats(bpy.context, path, upright=False)
+        root = importing.import_splats(bpy.context, path, upright=False)
         root.lodgs.mode, root.lodgs.single_level = mode, 3
         root.location, root.rotation_euler = (1, 2, 0), (0.1, 0.2, 0.7)
         if moved:  # each set by itself
@@ -79,7 +79,7 @@ def test_frames_show_what_is_exported(bpy, lodgs, seen, tmp_path, mode, moved):
 
 @pytest.mark.usefixtures("renderer", "camera")
 def test_the_frame_is_the_colour_mapped_frame(bpy, lodgs, seen, tmp_path):
-    root = lodgs("data.scenes").import_splats(bpy.context, file_of(tmp_path), upright=False)
+    root = lodgs("data.importing").import_splats(bpy.context, file_of(tmp_path), upright=False)
     before, look = seen(), Look(0.3, 5000, (1.0, 0.9, 0.7), 0.6)
     give(root.lodgs_look, look)
     np.testing.assert_allclose(seen(), before @ look.matrix.T, atol=2e-4)
@@ -87,8 +87,8 @@ def test_the_frame_is_the_colour_mapped_frame(bpy, lodgs, seen, tmp_path):
 
 @pytest.mark.usefixtures("camera", "frame")
 def test_viewports_draw_what_is_exported(bpy, lodgs, seen, tmp_path):
-    quick, scenes = lodgs("render.quick")._frame, lodgs("data.scenes")
-    root = scenes.import_splats(bpy.context, file_of(tmp_path), upright=False)
+    quick, importing = lodgs("render.quick")._frame, lodgs("data.importing")
+    root = importing.import_splats(bpy.context, file_of(tmp_path), upright=False)
     root.location, root.rotation_euler = (1, 2, 0), (0.1, 0.2, 0.7)
     before = seen(quick)
     ball, views = with_looks(bpy, root), lodgs("viewport.views")
@@ -109,7 +109,7 @@ def test_viewports_draw_what_is_exported(bpy, lodgs, seen, tmp_path):
         root.hide_viewport = True
         for item in root.lodgs.levels:
             item.show = False
-        alone = scenes.import_splats(bpy.context, tmp_path / "out.ply", upright=False)
+        alone = importing.import_splats(bpy.context, tmp_path / "out.ply", upright=False)
         alone.location, alone.rotation_euler = (1, 2, 0), (0.1, 0.2, 0.7)
         np.testing.assert_allclose(seen(quick), picture, atol=0.01)
         lodgs("data.removal").remove(alone)
@@ -133,7 +133,7 @@ def half_painted(lodgs, root, share=0.7):
 @pytest.mark.parametrize("mode", ["SINGLE", "SELECTIVE"])
 def test_frames_show_paint_as_what_is_exported_with_it(bpy, lodgs, seen, tmp_path, mode):
     scenes = lodgs("data.scenes")
-    root = scenes.import_splats(bpy.context, file_of(tmp_path), upright=False)
+    root = lodgs("data.importing").import_splats(bpy.context, file_of(tmp_path), upright=False)
     root.lodgs.mode, root.lodgs.single_level = mode, 3
     before = seen()
     lodgs("data.painting").write(root, half_painted(lodgs, root))
@@ -142,7 +142,7 @@ def test_frames_show_paint_as_what_is_exported_with_it(bpy, lodgs, seen, tmp_pat
     copy = scenes.shown_splats(bpy.context, root, looked=True)
     bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"))
     lodgs("data.removal").remove(root)
-    again = scenes.import_splats(bpy.context, tmp_path / "out.ply", upright=False)
+    again = lodgs("data.importing").import_splats(bpy.context, tmp_path / "out.ply", upright=False)
     again.lodgs.mode, again.lodgs.single_level = mode, 3
     np.testing.assert_allclose(seen(), painted, atol=1e-4)
     np.testing.assert_allclose(scenes.shown_splats(bpy.context, again).sh, copy.sh, atol=1e-6)
@@ -152,8 +152,8 @@ def test_frames_show_paint_as_what_is_exported_with_it(bpy, lodgs, seen, tmp_pat
 @pytest.mark.parametrize("modifier", [False, True])
 def test_viewports_show_paint_at_once_and_read_no_splat_anew(bpy, lodgs, seen, tmp_path, modifier):
     """But of those that a modifier of somebody's own changes."""
-    quick, scenes, views = lodgs("render.quick")._frame, lodgs("data.scenes"), lodgs("viewport.views")
-    root = scenes.import_splats(bpy.context, file_of(tmp_path), upright=False)
+    quick, importing, views = lodgs("render.quick")._frame, lodgs("data.importing"), lodgs("viewport.views")
+    root = importing.import_splats(bpy.context, file_of(tmp_path), upright=False)
     root.lodgs.mode, root.lodgs.single_level = "SINGLE", 3
     if modifier:
         nodes = bpy.data.node_groups.new("own", "GeometryNodeTree")
@@ -181,7 +181,7 @@ def test_viewports_show_paint_at_once_and_read_no_splat_anew(bpy, lodgs, seen, t
     painting.write(root, {number: 0 * each for number, each in there.items()})
     np.testing.assert_array_equal(seen(quick), before)
     lodgs("data.removal").remove(root)
-    again = scenes.import_splats(bpy.context, tmp_path / "out.ply", upright=False)
+    again = importing.import_splats(bpy.context, tmp_path / "out.ply", upright=False)
     again.lodgs.mode, again.lodgs.single_level = "SINGLE", 3
     np.testing.assert_allclose(seen(quick), painted, atol=0.01)
 
@@ -191,7 +191,7 @@ def test_a_tree_that_is_read_from_its_file_has_its_look(bpy, lodgs, seen, tmp_pa
     write_in_pages(tmp_path / "tree.ply", tree_of(random_leaves(6000, np.random.default_rng(3), degree=1)))
     pictures = []
     for budget in (3000, 0):
-        root = lodgs("data.scenes").import_splats(
+        root = lodgs("data.importing").import_splats(
             bpy.context, tmp_path / "tree.ply", budget=budget, upright=False
         )
         assert bool(lodgs("data.streams").file_of(root)) == bool(budget)
@@ -224,7 +224,7 @@ def test_ellipsoids_have_the_look_s_colour_and_opacity(bpy, lodgs, tmp_path):
         path = tmp_path / ("in.ply" if first else "out.ply")
         if first:
             write_bundle(path, Bundle("", [Level(1, splats())]))
-        root = lodgs("data.scenes").import_splats(bpy.context, path, upright=False)
+        root = lodgs("data.importing").import_splats(bpy.context, path, upright=False)
         if first:
             give(root.lodgs_look, EVERYWHERE)
         pictures.append(rendered(bpy, tmp_path / "picture.png"))

@@ -43,8 +43,8 @@ def frame(bpy, lodgs):
 
 def test_frames_show_what_the_file_has(bpy, lodgs, path, camera, frame):
     """Wherever the viewport has looked from, and whatever its budget."""
-    scenes = lodgs("data.scenes")
-    root = scenes.import_splats(bpy.context, path, budget=BUDGET)
+    importing = lodgs("data.importing")
+    root = importing.import_splats(bpy.context, path, budget=BUDGET)
     assert sum(len(item.object.data.points) for item in root.lodgs.levels) <= BUDGET
     assert root.lodgs.eye == "VIEW"
     lodgs("data.selection").hold(root, (500, 500, 500), 20.0)
@@ -52,7 +52,7 @@ def test_frames_show_what_the_file_has(bpy, lodgs, path, camera, frame):
     root.lodgs.stream.file = ""
     held = frame(root, 1.0)
     lodgs("data.removal").remove(root)
-    whole = scenes.import_splats(bpy.context, path)
+    whole = importing.import_splats(bpy.context, path)
     assert (whole.lodgs.eye, whole.lodgs.stream.file) == ("CAMERA", "")
     for pixels, picture in pictures.items():
         np.testing.assert_allclose(picture, frame(whole, pixels), atol=1e-4)
@@ -60,9 +60,9 @@ def test_frames_show_what_the_file_has(bpy, lodgs, path, camera, frame):
 
 
 def test_a_held_eye_stays_where_it_is(bpy, lodgs, path, camera, frame):
-    scenes, found = lodgs("data.scenes"), []
+    importing, found = lodgs("data.importing"), []
     for budget in (BUDGET, 0):
-        root = scenes.import_splats(bpy.context, path, budget=budget)
+        root = importing.import_splats(bpy.context, path, budget=budget)
         root.lodgs.eye, root.lodgs.freeze = "CAMERA", True
         lodgs("data.selection").hold(root, (9, 9, 1), 100.0)
         found.append(frame(root, 2.0))
@@ -71,7 +71,7 @@ def test_a_held_eye_stays_where_it_is(bpy, lodgs, path, camera, frame):
 
 
 def test_a_file_that_is_gone_is_a_sentence(bpy, lodgs, path, camera, frame):
-    root = lodgs("data.scenes").import_splats(bpy.context, path, budget=BUDGET)
+    root = lodgs("data.importing").import_splats(bpy.context, path, budget=BUDGET)
     path.rename(path.with_name("elsewhere.ply"))
     with pytest.raises(lodgs("training.errors").LodgsError, match=r"town\.ply cannot be read.*Streaming"):
         frame(root)
@@ -86,7 +86,7 @@ def test_viewport_quality_waits_for_what_it_needs(bpy, lodgs, path, camera, fram
         pytest.skip("no graphics in background before Blender 5.2")
     views, pictures = lodgs("viewport.views"), []
     for budget in (16_000, 0):
-        root = lodgs("data.scenes").import_splats(bpy.context, path, budget=budget)
+        root = lodgs("data.importing").import_splats(bpy.context, path, budget=budget)
         frame(root, 20.0)
         lodgs("render.quick").render(bpy.context)
         if budget:

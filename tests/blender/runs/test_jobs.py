@@ -122,7 +122,7 @@ def test_a_tree_larger_than_the_budget_stays_in_its_file(bpy, lodgs, jobs, fake,
     streams, fits = lodgs("data.streams"), budget > 2 * LEAVES
     assert max(counts) <= (2 * LEAVES - 1 if fits else budget // 4)
     found = lodgs("data.scenes").read_levels(root)
-    whole = lodgs("data.scenes").import_splats(bpy.context, tmp_path / "run" / "bundle.ply", budget=budget)
+    whole = lodgs("data.importing").import_splats(bpy.context, tmp_path / "run" / "bundle.ply", budget=budget)
     expected = lodgs("data.scenes").read_levels(whole)
     for one, other in zip(found.levels, expected.levels, strict=True):
         np.testing.assert_array_equal(np.sort(one.splats.means, axis=0), np.sort(other.splats.means, axis=0))

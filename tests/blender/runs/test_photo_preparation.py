@@ -26,7 +26,7 @@ def test_photos_become_a_scene(bpy, lodgs, photos):
     assert bpy.ops.lodgs.find_cameras(directory=str(photos)) == {"FINISHED"}
     work = lodgs("runs.photo_preparation").current
     assert "All 6 " in work.message and work.fraction == 1
-    (root,) = lodgs("data.scenes").roots(bpy.context.scene)
+    (root,) = lodgs("data.roots").roots(bpy.context.scene)
     assert root == work.root and len(root.lodgs.cameras.objects) == 6
     assert root.lodgs.scene_folder == str(photos.parent / "photos_scene")
     bpy.context.view_layer.update()
@@ -34,7 +34,8 @@ def test_photos_become_a_scene(bpy, lodgs, photos):
         obj.matrix_world.translation for obj in sorted(root.lodgs.cameras.objects, key=lambda o: o.name)
     ])  # fmt: skip
     distances, expected = (
-        np.linalg.norm(positions[:, None] - positions[None], axis=2) for positions in (cameras, CAMERA_POSITIONS)
+        np.linalg.norm(positions[:, None] - positions[None], axis=2)
+        for positions in (cameras, CAMERA_POSITIONS)
     )
     np.testing.assert_allclose(distances / distances.sum() * expected.sum(), expected, atol=0.05)
 
@@ -52,7 +53,7 @@ def test_stopped_preparation_continues(bpy, lodgs, photos, tmp_path):
     while work.step():
         time.sleep(0.02)
     assert "start it again" in work.message and not work.problem
-    assert not lodgs("data.scenes").roots(bpy.context.scene)
+    assert not lodgs("data.roots").roots(bpy.context.scene)
     assert bpy.ops.lodgs.find_cameras(directory=str(photos), out=str(tmp_path / "out")) == {"FINISHED"}
 
 
@@ -61,14 +62,16 @@ def test_folder_without_photos_is_reported(bpy, lodgs, tmp_path):
     with pytest.raises(RuntimeError, match="holds 0 photographs that can be read"):
         bpy.ops.lodgs.find_cameras(directory=str(tmp_path / "photos"))
     work = lodgs("runs.photo_preparation").current
-    assert work.problem and not work.running and not lodgs("data.scenes").roots(bpy.context.scene)
+    assert work.problem and not work.running and not lodgs("data.roots").roots(bpy.context.scene)
 
 
 @pytest.fixture
 def distorted(tmp_path):
     """A scene with lens distortion."""
     names, random = ("a.png", "b.png", "c.png"), np.random.default_rng(0)
-    lens = make_intrinsics("OPENCV", 320, 240, np.array([260.0, 262.0, 158.0, 121.0, 0.1, -0.02, 0.005, -0.004]))
+    lens = make_intrinsics(
+        "OPENCV", 320, 240, np.array([260.0, 262.0, 158.0, 121.0, 0.1, -0.02, 0.005, -0.004])
+    )
     poses = [look_at(eye, np.array([0.0, 0.6, 0.4]), (0, 0, 1)) for eye in CAMERA_POSITIONS]
     (tmp_path / "distorted" / "images").mkdir(parents=True)
     for name, eye in zip(names, CAMERA_POSITIONS, strict=False):
@@ -83,7 +86,7 @@ def distorted(tmp_path):
 def test_distorted_scene_shows_undistorted_photos(bpy, lodgs, distorted):
     for _ in range(2):  # the second time, undistorted photos exist
         assert bpy.ops.lodgs.import_colmap(directory=str(distorted), upright=False) == {"FINISHED"}
-        root = lodgs("data.scenes").active_root(bpy.context)
+        root = lodgs("data.roots").active_root(bpy.context)
         scene = read_scene(distorted)
         straight = cached_undistorted_scene(scene)
         assert scene.distorted and straight is not None and not straight.distorted
@@ -108,7 +111,7 @@ def test_distorted_scene_shows_undistorted_photos(bpy, lodgs, distorted):
 def test_missing_trainer_gives_a_warning(bpy, lodgs, distorted, monkeypatch):
     monkeypatch.delenv("LODGS_TRAINER_PYTHON", raising=False)
     warnings = []
-    root = lodgs("data.scenes").import_colmap(bpy.context, distorted)
+    root = lodgs("data.importing").import_colmap(bpy.context, distorted)
     lodgs("runs.photo_preparation").undistort_photos(root, warnings.append)
     (warning,) = warnings
     assert "3 views have lens distortion" in warning and "not installed" in warning

@@ -16,7 +16,7 @@ def root(bpy, lodgs):
     """Points alone, moved, turned and scaled."""
     from mathutils import Matrix
 
-    root = lodgs("data.scenes").import_colmap(bpy.context, GARDEN, photographs=False)
+    root = lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
     root.matrix_world = Matrix.Translation((3, -2, 1)) @ Matrix.Rotation(0.7, 4, "Z") @ Matrix.Scale(2.5, 4)
     bpy.context.view_layer.update()
     return root

@@ -30,7 +30,7 @@ def path(tree, tmp_path):
 def root(bpy, lodgs, path, monkeypatch):
     """A tree of which the top is here; pages come a few at a time."""
     monkeypatch.setattr(lodgs("training.lod.tree.paging"), "AT_ONCE", 4)
-    root = lodgs("data.scenes").import_splats(bpy.context, path, upright=False, budget=BUDGET)
+    root = lodgs("data.importing").import_splats(bpy.context, path, upright=False, budget=BUDGET)
     yield root
     lodgs("viewport.views").clear()
     lodgs("viewport.views").close_streams()
@@ -118,7 +118,7 @@ def test_it_is_the_picture_of_the_whole_file(bpy, lodgs, path, root, look):
     pictures = [look(root, view, eye, 30.0, wait=True) for eye in EYES]
     lodgs("viewport.views").clear()
     lodgs("data.removal").remove(root)
-    whole = lodgs("data.scenes").import_splats(bpy.context, path, upright=False)
+    whole = lodgs("data.importing").import_splats(bpy.context, path, upright=False)
     assert lodgs("data.streams").source_of(whole) is None
     view = lodgs("viewport.views").ViewState()
     for eye, picture in zip(EYES, pictures, strict=True):
@@ -206,7 +206,7 @@ def test_a_saved_file_goes_on(bpy, lodgs, root, path, tmp_path):
     assert streams.file_of(root) == path
     (tmp_path / "a").mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
-    again = lodgs("data.scenes").import_splats(bpy.context, path, budget=BUDGET)
+    again = lodgs("data.importing").import_splats(bpy.context, path, budget=BUDGET)
     assert again.lodgs.stream.file == "//town.ply" and streams.file_of(again) == path
     bpy.ops.wm.save_mainfile()
     for name in ("scene.blend", "town.ply"):
