@@ -127,7 +127,7 @@ def find_cameras(
         if is_first:  # otherwise keep the view of the scene that is open
             photographs.look_at_scene(bpy.context, work.root, work.warnings.append)
         work.message = work.results[-2]
-        extension.undo_step("Import Photographs")
+        extension.undo_step("Import Photos")
 
     environment.require(environment.trainer_python())
     return _start(folder / "colmap.log", commands, finish, "Reading the photos")

@@ -192,9 +192,9 @@ def test_state_of_streaming_is_shown(bpy, lodgs, draw, draw_panel, tmp_path, mon
     bundles, tree = lodgs("training.splats.bundle"), tree_of(random_leaves(3000, np.random.default_rng(0)))
     bundles.write_bundle(tmp_path / "town.ply", tree)
     panel = lodgs("panels.levels").LODGS_PT_stream
-    whole = lodgs("data.importing").import_splats(bpy.context, tmp_path / "town.ply")
+    in_memory = lodgs("data.importing").import_splats(bpy.context, tmp_path / "town.ply")
     assert not panel.poll(bpy.context)
-    lodgs("data.removal").remove(whole)
+    lodgs("data.removal").remove(in_memory)
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "town.ply", budget=2000)
     assert panel.poll(bpy.context) and not any("splats shown" in text for text in draw().texts)
 

@@ -1,11 +1,11 @@
-"""A drawing that fails: the panel says so, Blender goes on, and the next one tries anew."""
+"""Errors while drawing the viewport: the panel shows them, and the next redraw tries again."""
 
 import pytest
 
 
 @pytest.fixture
 def viewport(bpy, lodgs, monkeypatch):
-    """The module, with what it does around drawing: no graphics are needed."""
+    """The viewport module without GPU state, so that the tests need no graphics."""
     module = lodgs("viewport")
     monkeypatch.setattr(module.splats, "reset_state", lambda: None)
     yield module
@@ -16,31 +16,31 @@ def fails(context):
     raise RuntimeError("no more memory on the card")
 
 
-def test_a_failure_is_told_and_ends_that_drawing_only(bpy, viewport, draw_panel, monkeypatch, capsys):
-    other = bpy.data.scenes.new("other")
+def test_an_error_is_shown_until_the_next_redraw_succeeds(bpy, viewport, draw_panel, monkeypatch, capsys):
+    second_scene = bpy.data.scenes.new("other")
     monkeypatch.setattr(viewport, "_draw_view", fails)
     for _ in range(3):
         viewport._draw()
-    said = [text for text in draw_panel("viewport", "LODGS_PT_viewport").texts if "memory" in text]
-    assert said == [
+    messages = [text for text in draw_panel("viewport", "LODGS_PT_viewport").texts if "memory" in text]
+    assert messages == [
         "The viewport could not be drawn (RuntimeError: no more memory on the card). "
         "Untick Gaussian Splats for points."
     ]
     assert capsys.readouterr().err.count("Traceback") == 1
-    assert bpy.context.scene.lodgs_viewport.splats and other.lodgs_viewport.splats
+    assert bpy.context.scene.lodgs_viewport.splats and second_scene.lodgs_viewport.splats
     monkeypatch.setattr(viewport, "_draw_view", lambda context: None)
     viewport._draw()
     assert not any("memory" in text for text in draw_panel("viewport", "LODGS_PT_viewport").texts)
 
 
-def test_another_file_begins_without_it(bpy, viewport, monkeypatch):
+def test_a_new_file_has_no_error(bpy, viewport, monkeypatch):
     monkeypatch.setattr(viewport, "_draw_view", fails)
     viewport._draw()
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     assert viewport.problem == ""
 
 
-def test_a_broken_off_drawing_leaves_the_state_as_it_was(bpy, lodgs, frame):
+def test_an_aborted_draw_restores_the_gpu_state(bpy, lodgs, frame):
     import gpu
 
     def break_off():

@@ -27,7 +27,7 @@ def test_menus_list_every_operator(bpy, lodgs):
         for cls in getattr(module, "CLASSES", ())
         if "_OT_" in cls.__name__ and "INTERNAL" not in getattr(cls, "bl_options", ())
     }
-    listed = [name for group in lodgs("panels.verbs").VERBS for name in group]
+    listed = [name for group in lodgs("panels.menus").OPERATORS for name in group]
     assert len(listed) == len(set(listed)) and not set(listed) & OTHER_MENUS
     assert set(listed) | OTHER_MENUS == public
     labels = [label_of(bpy, name) for name in listed]
@@ -145,15 +145,15 @@ def test_runs_of_a_scene_are_listed_and_opened(bpy, lodgs, tmp_path, fake):
     assert run_folders.find_runs(root) == []
     for _ in range(2):
         jobs.follow(jobs.start(root))
-    other = tmp_path / "runs" / "other"
-    other.mkdir()
-    (other / "job.toml").write_text('scene = "/nowhere"\nout = "."\nmethod = "flod"\n')
+    foreign = tmp_path / "runs" / "other"
+    foreign.mkdir()
+    (foreign / "job.toml").write_text('scene = "/nowhere"\nout = "."\nmethod = "flod"\n')
     (tmp_path / "runs" / "broken").mkdir()
     (tmp_path / "runs" / "broken" / "job.toml").write_text("]")
     first, second = run_folders.find_runs(root)
     assert first.state == second.state == "done" and second.folder.path == run_folders.run_folder(root).path
     layout = StatusLayout()
-    lodgs("panels.verbs").LODGS_MT_runs.draw(SimpleNamespace(layout=layout), bpy.context)
+    lodgs("panels.menus").LODGS_MT_runs.draw(SimpleNamespace(layout=layout), bpy.context)
     (name, text, icon, properties), (_, _, icon_of_second, _) = layout.operators
     assert name == "lodgs.open_run" and "FLoD" in text and "done" in text
     assert (icon, icon_of_second) == ("RADIOBUT_OFF", "RADIOBUT_ON")

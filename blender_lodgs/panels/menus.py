@@ -8,7 +8,7 @@ from ...training.methods import method_info
 from ..data import roots
 from ..runs import run_folders
 
-VERBS = (
+OPERATORS = (
     ("lodgs.train", "lodgs.resume_training", "lodgs.cancel_training", "lodgs.open_run", "lodgs.add_region",
      "lodgs.plan_cells", "lodgs.submit_to_flamenco", "lodgs.show_log", "lodgs.show_costs"),
     ("lodgs.look_through", "lodgs.compare_view", "lodgs.compare_worst", "lodgs.measure_views",
@@ -27,7 +27,7 @@ class LODGS_MT_verbs(bpy.types.Menu):
     def draw(self, context):
         layout = self.layout
         layout.menu("LODGS_MT_runs")
-        for group in VERBS:
+        for group in OPERATORS:
             layout.separator()
             for name in group:
                 layout.operator(name)
