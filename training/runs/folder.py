@@ -107,7 +107,7 @@ class RunFolder:
 
     @property
     def started(self) -> bool:
-        """Whether training has started in this folder."""
+        """True if training has started in this folder."""
         return self.events_file.exists() or any(self.checkpoints.glob("step_*.pt"))
 
     # -- reading ---------------------------------------------------------------------------------------
@@ -147,7 +147,7 @@ class RunFolder:
 
     @property
     def running(self) -> bool:
-        """Whether a trainer is running in this folder."""
+        """True if a trainer is running in this folder."""
         try:
             try:
                 file = open_regular(self._lock, writing=True)

@@ -112,11 +112,11 @@ def _final_event(error: BaseException) -> tuple[int, dict]:
         return CANCELLED, {"kind": "cancelled", "message": str(error)}
     if isinstance(error, KeyboardInterrupt):
         return CANCELLED, {"kind": "cancelled", "message": "Stopped. The run can be resumed."}
-    what, remedy, code = describe_error(error)
+    problem, remedy, code = describe_error(error)
     if code == CRASHED:
         with suppress(OSError):
             traceback.print_exc(file=sys.stderr)
-    return code, {"kind": "error", "what": what, "remedy": remedy}
+    return code, {"kind": "error", "what": problem, "remedy": remedy}
 
 
 def _train(
@@ -308,8 +308,10 @@ class _TrainingRun:
                 resident = ResidentBundle(bundle, self.evaluation.backend)
                 baked_psnr = self.evaluation.measure_by_distance(resident, settings(bundle, {}))["psnr"]
                 meta |= {"neural_psnr": neural_psnr, "baked_psnr": baked_psnr}
-                message = f"Held-out views: {neural_psnr:.2f} dB with networks, {baked_psnr:.2f} dB baked for Blender."
-                self._warn(message)
+                self._warn(
+                    f"Held-out views: {neural_psnr:.2f} dB with networks, "
+                    f"{baked_psnr:.2f} dB baked for Blender."
+                )
         write_bundle(self.folder.bundle, bundle)
         return bundle
 

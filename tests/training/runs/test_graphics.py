@@ -114,7 +114,7 @@ def test_a_device_that_draws_otherwise_is_a_warning_and_the_processor_trains(gra
     assert code == 0
     assert [event["backend"] for event in events if "backend" in event] == ["cpu"]
     (warning,) = [event["message"] for event in events if event["event"] == "warning"]
-    assert warning.startswith(f"{graphics.adapter.name} is not used: its pictures are 3% off. The processor")
+    assert warning.startswith(f"{graphics.adapter.name} is not used: its pictures are 3% off. The CPU")
 
 
 @pytest.mark.slow

@@ -1,2 +1,1 @@
-"""A scene that is too large for one run: cells of it are trained one by one, here or on other computers, and
-put together. A block is the ordinary run of a cell."""
+"""Scenes too large for one run: plan cells, train each as an ordinary run, and merge the results."""

@@ -1,5 +1,6 @@
-"""Blocks put together, level by level, one of them in memory at a time: what a seam's training begins with,
-and the bundle of all.
+"""Merge trained blocks, one batch of splats in memory at a time.
+
+The result is the bundle of all blocks, or the base from which a seam's training starts.
 """
 
 from __future__ import annotations
@@ -23,65 +24,67 @@ from .plan import Block, Division
 
 
 def merge(division: Division, path: Path) -> list[tuple[int, int]]:
-    """Writes the bundle of all parts.
+    """Write the merged bundle of all parts.
 
-    Each level has the splats of the block in whose cell they stand, with the colours and opacities that the
-    block's seam gave those at full detail. What no block has are the coarse levels.
+    Each level takes from each block the splats inside its cell. At full detail, their colours and opacities
+    come from the block's seam. Levels that no block has come from the coarse part.
 
     Args:
-        division: every part of it finished.
-        path: of the bundle; files of its size are made beside it meanwhile.
+        division: plan whose parts are all finished.
+        path: bundle to write. Temporary files of the same size are created next to it.
 
     Returns:
-        For each block how many splats were kept, and of how many.
+        For each block the number of splats inside its cell, and of all its splats.
 
     Raises:
-        LodgsError: a part is not finished, they do not belong together, or the disk is full.
+        LodgsError: a part is not finished, parts do not belong together, or the disk is full.
     """
     opened = [open_bundle(block.folder.bundle) for block in division.blocks]
     first = opened[0][0]
-    for block, found in zip(division.blocks, opened, strict=True):
-        _check_alike(block, found, first)
+    for block, bundle in zip(division.blocks, opened, strict=True):
+        _check_compatible(block, bundle, first)
     facts = {level.number: level.facts for head, _ in opened for level in head.levels}
     seams = {seam.number: seam for seam in division.seams}
-    kept = []
+    counts = []
     with ExitStack() as stack:
         levels = {number: stack.enter_context(ScratchFile(path.parent)) for number in sorted(facts)}
         for block, (head, rows) in zip(division.blocks, opened, strict=True):
             assert block.region is not None
-            fitted = _Fitted(seams[block.number]) if block.number in seams else None
+            fitted = _FittedBorder(seams[block.number]) if block.number in seams else None
             detail = {level.number for level in head.drawn_levels(max(rows))}
-            before = sum(map(len, levels.values()))
+            previous = sum(map(len, levels.values()))
             for number in sorted(rows):
-                for splats in _cropped(rows[number], block.region):
+                for splats in _inside(rows[number], block.region):
                     if fitted is not None and number in detail:
                         splats = fitted.fit(splats)
                     levels[number].append(splats)
-            kept.append((sum(map(len, levels.values())) - before, sum(map(len, rows.values()))))
-        made = [Level(number, NO_SPLATS, facts[number], rows) for number, rows in levels.items() if len(rows)]
+            counts.append((sum(map(len, levels.values())) - previous, sum(map(len, rows.values()))))
+        merged = [
+            Level(number, NO_SPLATS, facts[number], rows) for number, rows in levels.items() if len(rows)
+        ]
         if division.coarse is not None:
-            head, rows = found = open_bundle(division.coarse.folder.bundle)
-            _check_alike(division.coarse, found, first)
+            head, rows = bundle = open_bundle(division.coarse.folder.bundle)
+            _check_compatible(division.coarse, bundle, first)
             coarser = [level for level in head.levels if level.number not in facts]
-            made = [replace(level, on_disk=rows[level.number]) for level in coarser] + made
-        write_bundle(path, replace(first, levels=made))
-    return kept
+            merged = [replace(level, on_disk=rows[level.number]) for level in coarser] + merged
+        write_bundle(path, replace(first, levels=merged))
+    return counts
 
 
 def write_surroundings(division: Division, seam: Block) -> None:
-    """Writes what the training of a seam begins with, if it is not there yet.
+    """Write the base of a seam's training unless it exists.
 
-    That is, at full detail, what stands in the enlarged cell, each splat from the block in whose cell it
-    stands; and beyond it what the cell's own block has learned of what its views see there.
+    The base has the splats of full detail: inside the enlarged cell those of each block within its own cell,
+    outside of it those of the seam's own block.
 
     Raises:
-        LodgsError: a block that is needed is not finished, or the disk is full.
+        LodgsError: a required block is not finished, or the disk is full.
     """
     path = seam.folder.base
     if path.exists():
         return
     assert seam.region is not None
-    with ScratchFile(path.parent) as found:
+    with ScratchFile(path.parent) as base:
         meta = {}
         for block in division.blocks:
             assert block.region is not None
@@ -90,54 +93,57 @@ def write_surroundings(division: Division, seam: Block) -> None:
             head, rows = open_bundle(block.folder.bundle)
             meta |= head.meta
             for level in head.drawn_levels(max(rows)):
-                for splats in _pieces(rows[level.number]):
-                    around = seam.region.in_enlarged_cell(splats.means)
-                    chosen = around & block.region.contains(splats.means)
+                for splats in _batches(rows[level.number]):
+                    nearby = seam.region.in_enlarged_cell(splats.means)
+                    selected = nearby & block.region.contains(splats.means)
                     if block.number == seam.number:
-                        chosen |= ~around
-                    found.append(replace(splats.select(chosen), extras={}))
-        write_ply(path, found, comments_from_meta(meta))
+                        selected |= ~nearby
+                    base.append(replace(splats.select(selected), extras={}))
+        write_ply(path, base, comments_from_meta(meta))
 
 
-class _Fitted:
-    """What a seam has made of the splats at its cell's borders, in the order in which the block has them."""
+class _FittedBorder:
+    """Splats near a cell's borders as trained by its seam, in the order of the block."""
 
     def __init__(self, seam: Block) -> None:
         assert seam.region is not None
-        self._path, self._region, self._taken = seam.folder.path, seam.region, 0
+        self._path = seam.folder.path
+        self._region = seam.region
+        self._offset = 0
         _, rows = open_bundle(seam.folder.bundle)
-        parts = [splats.select(seam.region.near_border(splats.means)) for splats in _pieces(rows[max(rows)])]
+        parts = [splats.select(seam.region.near_border(splats.means)) for splats in _batches(rows[max(rows)])]
         self._splats = Splats.concatenated(parts)
 
     def fit(self, splats: Splats) -> Splats:
-        """The next splats of the cell, with fitted opacities and colours."""
-        where = np.flatnonzero(self._region.near_border(splats.means))
-        found = self._splats.select(slice(self._taken, self._taken + len(where)))
-        self._taken += len(where)
-        if not np.array_equal(found.means, splats.means[where]):
+        """Return the next splats of the cell with fitted opacities and colours."""
+        border = np.flatnonzero(self._region.near_border(splats.means))
+        fitted = self._splats.select(slice(self._offset, self._offset + len(border)))
+        self._offset += len(border)
+        if not np.array_equal(fitted.means, splats.means[border]):
             raise LodgsError(
-                f"{self._path} was not trained from the blocks that are there.",
-                f"Delete its bundle, events and {RunFolder('').base.name}, and go on.",
+                f"Cannot merge {self._path}: it was not trained from the current blocks.",
+                f"Delete its bundle, events and {RunFolder('').base.name}, and resume.",
             )
         opacity_logits, sh = splats.opacity_logits.copy(), splats.sh.copy()
-        opacity_logits[where], sh[where] = found.opacity_logits, found.sh
+        opacity_logits[border] = fitted.opacity_logits
+        sh[border] = fitted.sh
         return replace(splats, opacity_logits=opacity_logits, sh=sh)
 
 
-def _cropped(rows: FileRows, region: Region) -> Iterator[Splats]:
-    for splats in _pieces(rows):
+def _inside(rows: FileRows, region: Region) -> Iterator[Splats]:
+    for splats in _batches(rows):
         yield splats.select(region.contains(splats.means))
 
 
-def _pieces(rows: FileRows) -> Iterator[Splats]:
-    for begin in range(0, len(rows), BATCH_ROWS):
-        yield drop_undrawable(rows.select(slice(begin, begin + BATCH_ROWS)), rows.path)
+def _batches(rows: FileRows) -> Iterator[Splats]:
+    for start in range(0, len(rows), BATCH_ROWS):
+        yield drop_undrawable(rows.select(slice(start, start + BATCH_ROWS)), rows.path)
 
 
-def _check_alike(block: Block, found: tuple[Bundle, Mapping[int, FileRows]], first: Bundle) -> None:
-    head, rows = found
+def _check_compatible(block: Block, bundle: tuple[Bundle, Mapping[int, FileRows]], first: Bundle) -> None:
+    head, rows = bundle
     if not rows or (head.method, head.rule, head.facts) != (first.method, first.rule, first.facts):
         raise LodgsError(
-            f"{block.folder.path} is of another kind than the other blocks.",
-            "Train all blocks with the jobs of one plan.",
+            f"Cannot merge {block.folder.path}: its method, rule or facts differ from those of other blocks.",
+            "Train all blocks with the jobs of the same plan.",
         )

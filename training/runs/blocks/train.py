@@ -1,4 +1,4 @@
-"""Trains the parts of a divided run and puts them together, wherever they are trained."""
+"""Train the parts of a divided run on any workers, and merge them."""
 
 from __future__ import annotations
 
@@ -14,160 +14,166 @@ from .merge import merge, write_surroundings
 from .plan import BLOCK, Block, Division
 from .workers import Pending, Submit
 
-LOOKS = 0.5
-"""Seconds between two looks at how blocks get on."""
-SILENT = 20.0
-"""Seconds between two words at most."""
-GRACE = 10.0
-"""Seconds in which who was given a part begins it, and so hears that it is to stop."""
-TRIES = 3
-"""How often a block may be lost without having got any further before that ends the run."""
+POLL_SECONDS = 0.5
+"""Seconds between checks of the blocks' progress."""
+MAX_PROGRESS_SECONDS = 20.0
+"""Maximum seconds between ``progress`` events."""
+START_SECONDS = 10.0
+"""Seconds in which a worker starts a submitted part and can then be asked to stop."""
+MAX_ATTEMPTS = 3
+"""Number of lost trainers of a block without progress before the run fails."""
 
-Tell = Callable[..., object]
+Report = Callable[..., object]
 """Called with an event's kind and values."""
 
 
 class BlocksStopped(Exception):
-    """Some blocks were asked to stop, and the others are finished; the message says which."""
+    """Some blocks were cancelled, as listed in the message; all others are finished."""
 
 
 def prepare_part(division: Division, part: Block) -> None:
-    """Writes what a part begins with, of those that are finished before it.
+    """Write the base of a part from the finished parts of earlier stages.
 
     Raises:
-        LodgsError: one is not finished, or the disk is full.
+        LodgsError: a required part is not finished, or the disk is full.
     """
     if part.region is not None and part.region.seam:
         write_surroundings(division, part)
 
 
-def train_blocks(division: Division, path: Path, submit: Submit, tell: Tell) -> None:
-    """Trains all parts that are not finished, stage by stage, and writes what they are together.
+def train_blocks(division: Division, path: Path, submit: Submit, report: Report) -> None:
+    """Train all unfinished parts, stage by stage, and write the merged bundle.
 
-    How they get on is read from their folders; an interrupt stops all of them politely first. One that was
-    stopped by itself goes on when its folder is asked to (``RunFolder.request_resume``): beside the others;
-    or, asked before this begins, without them.
+    Progress is read from the run folders of the parts. An interrupt first stops all parts cleanly. A part
+    that was cancelled resumes on request (``RunFolder.request_resume``). If the request precedes this call,
+    only the requested parts of its kind are trained.
 
     Args:
-        path: of the bundle of all.
-        submit: has a part trained.
+        division: the parts.
+        path: merged bundle to write.
+        submit: starts the training of a part.
+        report: called with events.
 
     Raises:
-        BlocksStopped: some were cancelled by themselves.
-        LodgsError: one could not be trained; the others have been.
+        BlocksStopped: single parts were cancelled.
+        LodgsError: a part could not be trained.
     """
     if path.exists():
         return
-    stages = [[_Watched(part, division) for part in stage] for stage in division.stages]
-    everything = [each for stage in stages for each in stage]
-    asked = [each.block for each in everything if each.block.folder.take_resume()]
-    for each in everything:
-        if each.code is None and each.block not in asked and each.block.kind in {one.kind for one in asked}:
-            each.code = CANCELLED
+    stages = [[_BlockWatch(part, division) for part in stage] for stage in division.stages]
+    watches = [watch for stage in stages for watch in stage]
+    requested = [watch.block for watch in watches if watch.block.folder.take_resume()]
+    kinds = {block.kind for block in requested}
+    for watch in watches:
+        if watch.code is None and watch.block not in requested and watch.block.kind in kinds:
+            watch.code = CANCELLED
     for stage in stages:
-        _train_stage(stage, everything, submit, tell)
-    tell("status", message=f"Putting {len(division.blocks)} blocks together")
-    kept = merge(division, path)
+        _train_stage(stage, watches, submit, report)
+    report("status", message=f"Merging {len(division.blocks)} blocks")
+    counts = merge(division, path)
     for seam in division.seams:
         seam.folder.base.unlink(missing_ok=True)
-    for block, (own, all_) in zip(division.blocks, kept, strict=True):
-        tell("status", message=f"Block {block.number}: {own:,} of {all_:,} splats stand in its cell")
+    for block, (inside, total) in zip(division.blocks, counts, strict=True):
+        report("status", message=f"Block {block.number}: {inside:,} of {total:,} splats are in its cell")
 
 
 def _train_stage(
-    stage: Sequence[_Watched], everything: Sequence[_Watched], submit: Submit, tell: Tell
+    stage: Sequence[_BlockWatch], watches: Sequence[_BlockWatch], submit: Submit, report: Report
 ) -> None:
     try:
-        for each in stage:
-            each.begin(submit)
-        started = told = each_told = time.monotonic()
+        for watch in stage:
+            watch.start(submit)
+        started = last_report = last_block_report = time.monotonic()
         states: list[str] = []
-        while not all([each.look(submit) for each in stage]):
+        while not all([watch.poll(submit) for watch in stage]):
             now = time.monotonic()
-            if now - told >= min(max((now - started) / 1000, LOOKS), SILENT):
-                values, told = _progress(everything), now
-                changed = states != (states := [each.state for each in everything])
-                if changed or now - each_told >= (now - started) / 30:  # many parts are long lines
-                    each_told = now
+            if now - last_report >= min(max((now - started) / 1000, POLL_SECONDS), MAX_PROGRESS_SECONDS):
+                values = _progress(watches)
+                last_report = now
+                changed = states != (states := [watch.state for watch in watches])
+                if changed or now - last_block_report >= (now - started) / 30:  # many parts are long lines
+                    last_block_report = now
                 else:
                     del values["blocks"]
-                tell("progress", **values)
-            time.sleep(LOOKS)
+                report("progress", **values)
+            time.sleep(POLL_SECONDS)
     except BaseException:
         _stop_stage(stage)
         raise
     if stage:
-        tell("progress", **_progress(everything))
-    for each in stage:
-        if each.code not in (DONE, CANCELLED):
-            raise each.trouble()
-    if stopped := [each.block.name for each in stage if each.code == CANCELLED]:
-        raise BlocksStopped(f"Stopped: {', '.join(stopped)}; the run can be resumed.")
+        report("progress", **_progress(watches))
+    for watch in stage:
+        if watch.code not in (DONE, CANCELLED):
+            raise watch.error()
+    if stopped := [watch.block.name for watch in stage if watch.code == CANCELLED]:
+        raise BlocksStopped(f"Stopped: {', '.join(stopped)}. The run can be resumed.")
 
 
-def _stop_stage(stage: Sequence[_Watched]) -> None:
-    """Has all parts stopped: who trains one saves first, and who was given one does not begin."""
-    asked = [each for each in stage if not each.over]
-    for each in asked:
-        each.block.folder.request_cancel()
-    given_up = time.monotonic() + GRACE
-    while not all(each.over for each in asked):
-        time.sleep(LOOKS)
-        if time.monotonic() > given_up:
-            for each in asked:
-                each.give_up()
-    for each in asked:
-        each.block.folder.take_cancel()  # which nobody has heard
+def _stop_stage(stage: Sequence[_BlockWatch]) -> None:
+    """Cancel all parts: running trainers save first, submitted ones do not start."""
+    unfinished = [watch for watch in stage if not watch.finished]
+    for watch in unfinished:
+        watch.block.folder.request_cancel()
+    deadline = time.monotonic() + START_SECONDS
+    while not all(watch.finished for watch in unfinished):
+        time.sleep(POLL_SECONDS)
+        if time.monotonic() > deadline:
+            for watch in unfinished:
+                watch.abandon()
+    for watch in unfinished:
+        watch.block.folder.take_cancel()  # no trainer has consumed it
 
 
-class _Watched:
-    """A part on its way.
+class _BlockWatch:
+    """Submits a part and follows its progress.
 
     Attributes:
-        code: its trainer's exit code, once it has ended for good.
+        code: exit code of the last trainer; None while training continues or is retried.
     """
 
     def __init__(self, block: Block, division: Division) -> None:
-        self.block, self._division = block, division
-        block.folder.take_cancel()  # which was meant for an earlier trainer
+        self.block = block
+        self._division = division
+        block.folder.take_cancel()  # meant for an earlier trainer
         self._pending: Pending | None = None
         self.code: int | None = None
         if block.folder.bundle.exists() and block.folder.state() == "done":
             self.code = DONE
-        self._lost, self._reached = 0, -1
+        self._attempts = 0
+        self._last_step = -1
         self.progress = block.folder.last_event("progress") or {}
-        self._since, self._heard = block.folder.events()[1], False
+        self._offset = block.folder.events()[1]
+        self._started = False
         self.steps = block.job.resolved_parameters().total_steps
-        self._why = ""
+        self._worker_error = ""
 
-    def begin(self, submit: Submit) -> None:
-        """Has it trained, unless it is finished."""
+    def start(self, submit: Submit) -> None:
+        """Submit the part unless it is finished."""
         if self.code is None:
             prepare_part(self._division, self.block)
-            self._heard = False
+            self._started = False
             self._pending = submit(self.block.folder.path)
 
-    def give_up(self) -> None:
-        """Waits no longer for those who were given it and have not begun: there may be nobody."""
+    def abandon(self) -> None:
+        """Cancel the submission if no worker has started it."""
         if self._pending is not None:
             self._pending.cancel()
 
     @property
-    def over(self) -> bool:
-        """Whether nobody is at work on it any more, not even a trainer whose worker was lost."""
+    def finished(self) -> bool:
+        """True if no trainer is running, not even one whose worker was lost."""
         return self._pending is None or (self._pending.done() and not self.block.folder.running)
 
-    def look(self, submit: Submit) -> bool:
-        """Reads how far it is, and begins it again where whoever trained it was lost, or where it was stopped
-        and is asked to; whether it is over."""
+    def poll(self, submit: Submit) -> bool:
+        """Read progress; restart after a lost worker or on a resume request; return whether it has ended."""
         if self.code == CANCELLED and self.block.folder.take_resume():
             self.code = None
-            self.begin(submit)
+            self.start(submit)
         if self.code is not None:
             return True
-        events, self._since = self.block.folder.events(self._since)
+        events, self._offset = self.block.folder.events(self._offset)
         for event in events:
-            self._heard = True
+            self._started = True
             if event["event"] == "progress":
                 self.progress = event
         assert self._pending is not None
@@ -175,45 +181,46 @@ class _Watched:
             return False
         try:
             code = self._pending.result()
-        except CancelledError:  # the scheduler was lost, and with it who has the part, which may be well
-            self.begin(submit)
+        except CancelledError:  # the scheduler and its workers were lost; the trainer may still run
+            self.start(submit)
             return False
-        except Exception as error:  # the worker, not the block
-            code, self._why = -1, str(error)
+        except Exception as error:  # the worker failed, not the trainer
+            code = -1
+            self._worker_error = str(error)
         if code in (DONE, BAD_INPUT, CANCELLED):
             self.code = code
             return True
-        self._lost = self._lost + 1 if self.step <= self._reached else 1
-        self._reached = max(self.step, self._reached)
-        if self._lost < TRIES:
-            self.begin(submit)
+        self._attempts = self._attempts + 1 if self.step <= self._last_step else 1
+        self._last_step = max(self.step, self._last_step)
+        if self._attempts < MAX_ATTEMPTS:
+            self.start(submit)
             return False
         self.code = code
         return True
 
     @property
     def step(self) -> int:
-        """How many steps it has made."""
+        """Number of completed steps."""
         return self.steps if self.code == DONE else self.progress.get("step", 0)
 
     @property
     def state(self) -> str:
         """``waiting``, ``running``, ``done``, ``cancelled`` or ``failed``."""
         if self.code is None:
-            return "running" if self._heard else "waiting"
+            return "running" if self._started else "waiting"
         return {DONE: "done", CANCELLED: "cancelled"}.get(self.code, "failed")
 
-    def trouble(self) -> LodgsError:
-        """Why it could not be trained."""
+    def error(self) -> LodgsError:
+        """Return the reason for the failure."""
         if self.code == BAD_INPUT:
             end = self.block.folder.end_event()
             if end is not None and end["event"] == "error":
                 return LodgsError(f"{self._name}: {end['what']}", end.get("remedy", ""))
             return LodgsError(f"{self._name}: {run_outcome(self.block.folder, self.code)[1]}")
-        why = f" ({self._why})" if self._why else ""
+        reason = f" ({self._worker_error})" if self._worker_error else ""
         return LodgsError(
-            f"{self._name} was lost {TRIES} times at step {self.step}{why}.",
-            f"What its trainer wrote is in {self.block.folder.log}.",
+            f"The trainer of {self.block.name} was lost {MAX_ATTEMPTS} times at step {self.step}{reason}.",
+            f"Read its log, {self.block.folder.log}.",
         )
 
     @property
@@ -221,26 +228,28 @@ class _Watched:
         return self.block.name[0].upper() + self.block.name[1:]
 
 
-def _progress(watched: Sequence[_Watched]) -> dict:
-    """How all are together, as a ``progress`` event, with each beside it."""
-    there = [each.progress for each in watched if each.progress]
-    step, of = sum(each.step for each in watched), sum(each.steps for each in watched)
-    speed = sum(each.progress.get("steps_per_s", 0.0) for each in watched if each.code is None)
-    blocks = [each for each in watched if each.block.kind == BLOCK]
-    over = sum(each.code == DONE for each in blocks)
+def _progress(watches: Sequence[_BlockWatch]) -> dict:
+    """Return the values of a ``progress`` event for all parts together, with the state of each."""
+    reports = [watch.progress for watch in watches if watch.progress]
+    step = sum(watch.step for watch in watches)
+    steps = sum(watch.steps for watch in watches)
+    speed = sum(watch.progress.get("steps_per_s", 0.0) for watch in watches if watch.code is None)
+    blocks = [watch for watch in watches if watch.block.kind == BLOCK]
+    done = sum(watch.code == DONE for watch in blocks)
 
     def mean(name: str) -> float:
-        return round(sum(each.get(name, 0.0) for each in there) / max(len(there), 1), 5)
+        return round(sum(report.get(name, 0.0) for report in reports) / max(len(reports), 1), 5)
 
     return {
-        "stage": f"{over} of {len(blocks)} blocks", "level": 1, "levels": 1, "step": step, "of": of,
-        "loss": mean("loss"), "psnr": mean("psnr"), "splats": sum(each.get("splats", 0) for each in there),
-        "steps_per_s": round(speed, 2), "eta_s": round((of - step) / speed, 1) if speed else 0.0,
+        "stage": f"{done} of {len(blocks)} blocks", "level": 1, "levels": 1, "step": step, "of": steps,
+        "loss": mean("loss"), "psnr": mean("psnr"),
+        "splats": sum(report.get("splats", 0) for report in reports),
+        "steps_per_s": round(speed, 2), "eta_s": round((steps - step) / speed, 1) if speed else 0.0,
         "blocks": [
             {
-                "block": each.block.number, "kind": each.block.kind, "state": each.state,
-                "step": each.step, "of": each.steps,
+                "block": watch.block.number, "kind": watch.block.kind, "state": watch.state,
+                "step": watch.step, "of": watch.steps,
             }
-            for each in watched
+            for watch in watches
         ],
     }  # fmt: skip

@@ -1,4 +1,4 @@
-"""Where blocks are trained: one after the other here, or side by side by the workers of a Dask cluster."""
+"""Workers that train blocks: this process, one block at a time, or a Dask cluster in parallel."""
 
 from __future__ import annotations
 
@@ -18,39 +18,42 @@ from ..failures import CANCELLED
 from ..folder import RunFolder
 
 HERE = "here"
-ANSWERS = 20
-"""Seconds in which a scheduler answers."""
-_LETS_US_STOP = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
-"""What Dask's workers here begin with: Ctrl-C in a terminal goes to all programs, and we handle it."""
+TIMEOUT_SECONDS = 20
+"""Seconds to wait for a scheduler or nvidia-smi."""
+_IGNORE_INTERRUPT = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
+"""Preload code of local Dask workers: a terminal sends Ctrl-C to all processes, and this one handles it."""
 _PACKAGE = (__package__ or "").partition(".")[0]
 
 
 class Pending(Protocol):
-    """A block that somebody trains, as ``concurrent.futures`` and Dask have it."""
+    """Submitted training of a block, as a future of ``concurrent.futures`` or Dask."""
 
     def done(self) -> bool:
-        """Whether it has ended."""
+        """Return whether it has ended."""
         ...
 
     def result(self) -> int:
-        """The trainer's exit code; raises what went wrong with whoever ran it."""
+        """Return the trainer's exit code, or raise the error of the worker."""
         ...
 
     def cancel(self) -> object:
-        """Gives it up where nobody has begun it."""
+        """Withdraw it if no worker has started it."""
         ...
 
 
 Submit = Callable[[Path], Pending]
-"""Has a run's folder trained."""
+"""Submits a run folder for training."""
 
 
-class _Given:
-    """What a Dask client was given, which is over, too, where the client has lost its scheduler: a future
-    that came in that moment would wait for ever."""
+class _DaskTask:
+    """A Dask future that also ends when the client loses its scheduler.
+
+    A future submitted at that moment would never end.
+    """
 
     def __init__(self, future: Any, client: Any) -> None:
-        self._future, self._client = future, client
+        self._future = future
+        self._client = client
 
     def done(self) -> bool:
         return self._future.done() or self._client.status == "closed"
@@ -65,25 +68,24 @@ class _Given:
 
 
 def train_block(folder: str, threads: int = 0, cards: Sequence[str] = ()) -> int:
-    """Trains a run to its end, or goes on with it, in a process of its own; a worker calls it.
+    """Start or resume a run in a separate process, and wait for its end. Called by a worker.
 
-    Where the trainer of a worker that was lost is still at work it is waited for first. A run that has been
-    asked to stop does not begin.
+    If the trainer of a lost worker still runs, wait for it first. A run with a cancel request does not start.
 
     Args:
-        folder: of the run, which has its job.
-        threads: of the kernels; 0 for as many as the computer has.
-        cards: graphics cards as CUDA names them, of which a Dask worker takes the one of its number; none for
-            what the process sees.
+        folder: run folder with its job.
+        threads: number of kernel threads; 0 for all cores.
+        cards: CUDA identifiers of graphics cards; a Dask worker uses the one with its number. Empty for all
+            visible cards.
 
     Returns:
-        The trainer's exit code, negative where it was killed.
+        The trainer's exit code, negative if it was killed.
     """
     run = RunFolder(folder)
-    left = run.running
+    was_running = run.running
     while run.running:
         time.sleep(1)
-    if run.take_cancel() or (left and run.state() == "cancelled"):
+    if run.take_cancel() or (was_running and run.state() == "cancelled"):
         return CANCELLED
     package = Path(__file__).resolve().parents[2]
     environment = dict(os.environ)
@@ -103,16 +105,16 @@ def train_block(folder: str, threads: int = 0, cards: Sequence[str] = ()) -> int
 
 @contextmanager
 def workers(on: str = HERE, resources: dict[str, float] | None = None) -> Iterator[Submit]:
-    """Those who train blocks.
+    """Start workers and yield a function that submits blocks to them.
 
     Args:
-        on: HERE, one block after the other; "local:N", N at a time on this computer, which share its cores
-            and graphics cards; or the address of a Dask scheduler, "tcp://HOST:8786", whose workers see run
+        on: HERE, one block at a time; "local:N", N blocks at a time on this computer, sharing its cores and
+            graphics cards; or the address of a Dask scheduler, "tcp://HOST:8786", whose workers access run
             and scene under the same paths.
-        resources: what each block takes of a Dask worker's, such as {"GPU": 1}.
+        resources: Dask resources that each block requires, such as {"GPU": 1}.
 
     Raises:
-        LodgsError: there is no such cluster, or Dask is not installed.
+        LodgsError: the cluster is unknown or unreachable, or Dask is not installed.
     """
     if on == HERE:
         with ThreadPoolExecutor(1) as pool:
@@ -121,34 +123,36 @@ def workers(on: str = HERE, resources: dict[str, float] | None = None) -> Iterat
     kind, _, count = on.partition(":")
     if not (kind == "local" and count.isdecimal() and int(count)) and "://" not in on:
         raise LodgsError(
-            f"There is nothing to train on at '{on}'.",
-            "Say here, local:2 (two at a time on this computer) or tcp://HOST:8786 (a Dask scheduler).",
+            f"Unknown workers '{on}'.",
+            "Use here, local:2 (two blocks at a time) or tcp://HOST:8786 (a Dask scheduler).",
         )
     distributed = _distributed()
-    threads, cards = 0, []
-    made: Any = on
+    threads = 0
+    cards = []
+    cluster: Any = on
     if kind == "local":
-        n, cards = int(count), graphics_cards()
+        n = int(count)
+        cards = graphics_cards()
         threads = max(_cores() // n, 1)
-        made = distributed.LocalCluster(
+        cluster = distributed.LocalCluster(
             n_workers=n, threads_per_worker=1, processes=True, dashboard_address=":0", resources=resources,
-            silence_logs=logging.ERROR, preload=[_LETS_US_STOP],
+            silence_logs=logging.ERROR, preload=[_IGNORE_INTERRUPT],
         )  # fmt: skip
     try:
-        client = distributed.Client(made, timeout=ANSWERS)
+        client = distributed.Client(cluster, timeout=TIMEOUT_SECONDS)
     except (OSError, ValueError) as error:
         raise LodgsError(
-            f"No Dask scheduler answers at {on}.", "Start it, or correct the address."
+            f"Cannot connect to the Dask scheduler at {on}.", "Start it, or correct the address."
         ) from error
 
     def submit(folder: Path) -> Pending:
         try:
-            given = client.submit(train_block, str(folder), threads, cards, pure=False, resources=resources)
-            return _Given(given, client)
+            future = client.submit(train_block, str(folder), threads, cards, pure=False, resources=resources)
+            return _DaskTask(future, client)
         except distributed.client.ClosedClientError as error:
             raise LodgsError(
-                f"The Dask scheduler at {on} is gone.",
-                "Start it and its workers again, and give the same command: all goes on from where it is.",
+                f"Lost the connection to the Dask scheduler at {on}.",
+                "Restart it and its workers, and repeat the command to resume.",
             ) from error
 
     try:
@@ -156,25 +160,25 @@ def workers(on: str = HERE, resources: dict[str, float] | None = None) -> Iterat
     finally:
         client.close()
         if kind == "local":
-            made.close()
+            cluster.close()
 
 
 def graphics_cards() -> list[str]:
-    """NVIDIA's graphics cards of this computer as CUDA names them: those of CUDA_VISIBLE_DEVICES, or all."""
-    said = os.environ.get("CUDA_VISIBLE_DEVICES")
-    if said is None:
+    """Return CUDA identifiers of this computer's NVIDIA cards: those in CUDA_VISIBLE_DEVICES, or all."""
+    identifiers = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if identifiers is None:
         try:
-            said = subprocess.run(
+            identifiers = subprocess.run(
                 ["nvidia-smi", "--query-gpu=uuid", "--format=csv,noheader"], capture_output=True, text=True,
-                timeout=ANSWERS, check=True,
+                timeout=TIMEOUT_SECONDS, check=True,
             ).stdout  # fmt: skip
         except (OSError, subprocess.SubprocessError):
-            said = ""
-    return said.replace(",", " ").split()
+            identifiers = ""
+    return identifiers.replace(",", " ").split()
 
 
 def _cores() -> int:
-    """Those that this process may use."""
+    """Return the number of cores available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -184,6 +188,6 @@ def _distributed() -> Any:
     except ModuleNotFoundError:
         raise LodgsError(
             f"Dask is not installed in {sys.executable}.",
-            'Install it there with: pip install "lodgs[cluster]", or train on: here.',
+            'Install it with: pip install "lodgs[cluster]", or train on: here.',
         ) from None
     return distributed

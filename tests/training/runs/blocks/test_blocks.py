@@ -366,7 +366,7 @@ LEVEL = random_splats(np.random.default_rng(3), 5)
 
 @pytest.fixture
 def blocks(tiny_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(blocks_module, "LOOKS", 0.005)
+    monkeypatch.setattr(blocks_module, "POLL_SECONDS", 0.005)
     return planned(job_for(tiny_scene, tmp_path / "run"))
 
 
@@ -405,7 +405,7 @@ def test_one_that_could_not_even_write_what_is_wrong_says_so(blocks):
 
 def test_whom_nobody_has_begun_is_given_up_at_an_interrupt(blocks, monkeypatch):
     """A cluster without workers, on which nothing will ever be begun; it may be later, by itself."""
-    monkeypatch.setattr(blocks_module, "GRACE", 0.05)
+    monkeypatch.setattr(blocks_module, "START_SECONDS", 0.05)
     asked = []
 
     def submit(folder: Path) -> Future:

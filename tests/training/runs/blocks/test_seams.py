@@ -12,7 +12,7 @@ from training.optimize.parameters import override
 from training.optimize.training_data import TrainingData
 from training.runs.blocks import merge as merge_module
 from training.runs.blocks.merge import merge, write_surroundings
-from training.runs.blocks.plan import STILL, Block, Division
+from training.runs.blocks.plan import SEAM_PARAMETERS, Block, Division
 from training.runs.folder import RunFolder
 from training.scenes.colmap import read_scene
 from training.scenes.regions import Region
@@ -148,7 +148,7 @@ def test_steps_of_a_seam_change_colours_and_opacities_of_what_is_not_held(tiny_s
     data = TrainingData(read_scene(tiny_scene), test_every=4)
     rng = np.random.default_rng(0)
     base = random_splats(rng, 200)
-    values = {**STILL, "lr_exposure": 0.0, "steps": 8, "max_splats": 200, "sh_degree": 1}
+    values = {**SEAM_PARAMETERS, "lr_exposure": 0.0, "steps": 8, "max_splats": 200, "sh_degree": 1}
     method = create("3dgs", data, override(create_parameters(), values), 0, "cpu", base)
     held = torch.from_numpy(rng.random(200) < 0.5)
     method.model.hold(held)

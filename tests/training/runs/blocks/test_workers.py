@@ -48,7 +48,7 @@ def test_without_dask_it_says_what_to_install(monkeypatch):
 @pytest.mark.slow
 def test_a_scheduler_that_does_not_answer_is_told(monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr(workers_module, "ANSWERS", 1)
+    monkeypatch.setattr(workers_module, "TIMEOUT_SECONDS", 1)
     with pytest.raises(LodgsError, match="No Dask scheduler answers"), workers("tcp://127.0.0.1:1"):
         pass
 
@@ -157,7 +157,7 @@ def test_a_scheduler_that_was_started_by_hand_trains_a_block_and_its_loss_is_tol
     block, tmp_path, monkeypatch
 ):
     pytest.importorskip("distributed")
-    monkeypatch.setattr(workers_module, "ANSWERS", 5)
+    monkeypatch.setattr(workers_module, "TIMEOUT_SECONDS", 5)
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     address, root = f"tcp://127.0.0.1:{port}", Path(workers_module.__file__).parents[3]
