@@ -360,15 +360,10 @@ def _detach(obj: bpy.types.Object) -> None:
         remove_modifier(obj, modifier)
 
 
-_BEFORE_RULES = ("LODGS Distance Band", "LODGS Octree Level")
-"""Modifiers of files that version 0.1.0 saved: their groups do not name a rule."""
-
-
 def _modifier(obj: bpy.types.Object) -> bpy.types.NodesModifier | None:
     """The modifier that chooses by distance, whichever rule and version it is of."""
     for modifier in obj.modifiers:
-        if isinstance(modifier, bpy.types.NodesModifier) and (
-            modifier.name in _BEFORE_RULES or (modifier.node_group and groups.RULE in modifier.node_group)
-        ):
+        group = modifier.node_group if isinstance(modifier, bpy.types.NodesModifier) else None
+        if group and groups.RULE in group:
             return modifier
     return None

@@ -54,7 +54,7 @@ def parameters_of(method: str, preset: str, changes: dict) -> Parameters:
         LodgsError: there is no such method or preset, or a change is not possible.
     """
     info = method_info(method)
-    if idle := sorted(set(changes) & set(info.retired)):
+    if idle := sorted(set(changes) & set(info.unused)):
         raise LodgsError(f"{info.label} has no use for '{idle[0]}'.", "Leave it out.")
     return override(info.preset(preset), changes)
 

@@ -45,8 +45,7 @@ class MethodInfo:
             whose splats, put together, are then its base; "" where cells cannot be put together.
         divided: of the parameters of a scene in cells, those of a run of all of it that makes the coarser
             levels once, and those of the cells' runs, which go on from them; None: cells make all levels.
-        retired: names of parameters without a use here, inherited or not, which earlier versions wrote into
-            job files.
+        unused: names of inherited parameters that this method ignores.
         package: the folder as a module, set where the method is found.
     """
 
@@ -64,13 +63,13 @@ class MethodInfo:
     in_cells: str = ""
     divided: Callable[[Any], tuple[Parameters, Parameters] | None] = undivided
     captured: Mapping[str, Any] = field(default_factory=dict)
-    retired: tuple[str, ...] = ()
+    unused: tuple[str, ...] = ()
     package: str = ""
 
     @property
     def fields(self) -> list[Field]:
         """The parameters that can be set."""
-        return [each for each in fields(self.parameters) if each.name not in self.retired]
+        return [each for each in fields(self.parameters) if each.name not in self.unused]
 
     def preset(self, name: str) -> Parameters:
         """The parameters of a preset.

@@ -11,7 +11,7 @@ from ..documents import quote, read_json, read_toml
 from ..errors import LodgsError
 from ..files import atomic_write
 from ..lod.crop import Crop, is_text_of_crop
-from ..methods import METHODS, method_info, parameters_of
+from ..methods import method_info, parameters_of
 from ..optimize.parameters import Parameters
 from .folder import RunFolder
 
@@ -114,10 +114,6 @@ class Job:
             )
         read = read_json if kind == ".json" else read_toml
         values = read(path, f"The job file {path}")
-        method, parameters = values.get("method", cls.method), values.get("parameters")
-        if isinstance(method, str) and method in METHODS and isinstance(parameters, dict):
-            retired = METHODS[method].retired
-            values["parameters"] = {k: value for k, value in parameters.items() if k not in retired}
         run = RunFolder(path.parent)
         if path == run.job and run.started:
             values["out"] = "."

@@ -174,15 +174,15 @@ def write_bundle(path: str | Path, bundle: Bundle, order: str = "finest_first") 
     if order == "stream" or bundle.cumulative:
         levels.reverse()
     if bundle.cumulative:
-        elements = [Element.of_splats("vertex", [level.rows for _, level in levels], splat_columns)]
+        elements = [Element.from_splats("vertex", [level.rows for _, level in levels], splat_columns)]
     else:
         names = ["vertex", *(f"lod_{lod}_vertex" for lod, _ in levels[1:])]
         elements = [
-            Element.of_splats(name, [level.rows], splat_columns)
+            Element.from_splats(name, [level.rows], splat_columns)
             for name, (_, level) in zip(names, levels, strict=True)
         ]
     extras = {
-        lod: Element.of_splats(f"lod_extra_{lod}", [level.rows], extra_columns)
+        lod: Element.from_splats(f"lod_extra_{lod}", [level.rows], extra_columns)
         for lod, level in levels
         if extra_columns(level.rows.select(slice(0, 0)))
     }
@@ -216,7 +216,7 @@ def read_bundle(path: str | Path, warn: Warn = ignore, rows_of: RowSelector | No
 
     Splats that cannot be drawn are left out (`dialects.drawable`).
 
-    Elements and comments that are not ours are passed over. Version 1, which names no rule, is read as well.
+    Elements and comments that are not ours are passed over.
 
     Args:
         warn: as for `read_ply`.
@@ -427,7 +427,7 @@ def write_folder(folder: str | Path, bundle: Bundle) -> None:
             path = folder / f"lod{lod}.ply"
             temporary = stack.enter_context(atomic_write(path))
             drawn = bundle.drawn_levels(level.number)
-            element = Element.of_splats(
+            element = Element.from_splats(
                 "vertex",
                 [x.rows for x in drawn],
                 lambda some: splat_columns(some) | {name: some.extras[name] for name in sorted(shared)},
@@ -447,7 +447,7 @@ def write_folder(folder: str | Path, bundle: Bundle) -> None:
             )
         if bundle.tables:
             temporary = stack.enter_context(atomic_write(folder / TABLES_FILE))
-            no_splats = Element.of("vertex", splat_columns(NO_SPLATS))
+            no_splats = Element.from_columns("vertex", splat_columns(NO_SPLATS))
             write_elements(temporary, [no_splats, *_table_elements(bundle)])
         manifest_file.write_text(
             json.dumps(manifest, indent=1, default=json_default, allow_nan=False) + "\n", "ascii"
@@ -539,7 +539,7 @@ def _level_line(lod: int, level: Level) -> dict:
 
 
 def _table_elements(bundle: Bundle) -> list[Element]:
-    return [Element.of(f"lod_{name}", columns) for name, columns in bundle.tables.items()]
+    return [Element.from_columns(f"lod_{name}", columns) for name, columns in bundle.tables.items()]
 
 
 def _table_lines(bundle: Bundle) -> list[dict]:
@@ -577,6 +577,8 @@ def _bundle(head: dict, lines: list[dict], meta: dict, path: str | Path) -> Bund
     version = _whole(head["v"], "v")
     if version > FORMAT_VERSION:
         raise LodgsError(f"{path} is a bundle of the newer version {version}.", "Update LODGS to read it.")
+    if version < FORMAT_VERSION:
+        raise ValueError(f"version {version} is not supported")
     _of_kind(meta, dict, "meta")
     for name, shape in META_SHAPES.items():
         if name in meta:
@@ -594,8 +596,6 @@ def _bundle(head: dict, lines: list[dict], meta: dict, path: str | Path) -> Bund
         _whole(line["count"], "count")
         if not 1 <= _whole(line["level"], "level") < 2**15:
             raise ValueError(f"{line['level']} is no level's number")
-    if version == 1:
-        head, lines = _from_v1(head, lines, meta)
     controls = _of_kind(head["controls"], dict, "controls")
     # earlier exports from Blender have boxes to tick as true and false
     controls = {name: int(value) if isinstance(value, bool) else value for name, value in controls.items()}
@@ -626,38 +626,6 @@ def _whole(value: int, name: str) -> int:
     if type(value) is not int or value < 0:
         raise ValueError(f"{name} = {quote(value)} is no whole number")
     return value
-
-
-def rule_of_v1(
-    meta: dict, s_min: Sequence[float | None], cumulative: bool
-) -> tuple[str, dict, dict, list[dict]]:
-    """What version 1 of bundles and .blend files leave to be concluded.
-
-    Args:
-        meta: of the bundle.
-        s_min: of each level, as version 1 has it.
-
-    Returns:
-        The rule, its facts of the scene, its controls, and its facts of each level.
-
-    Raises:
-        KeyError, TypeError, ValueError: meta is incomplete.
-    """
-    if cumulative and "d_max" in meta:
-        facts = {"d_max": float(meta["d_max"]), "d_max_focal": float(meta["focal_px"])}
-        return "octree", facts, {}, [{} for _ in s_min]
-    if len(s_min) > 1 and all(value is not None for value in s_min):
-        controls = {"gamma": float(meta["gamma"])} if "gamma" in meta else {}
-        return "bands", {}, controls, [{"s_min": value} for value in s_min]
-    return "", {}, {}, [{} for _ in s_min]
-
-
-def _from_v1(head: dict, lines: list[dict], meta: dict) -> tuple[dict, list[dict]]:
-    """Head and lines of version 1 as those of version 2."""
-    cumulative = head.get("cumulative", "d_max" in meta)  # a folder's head does not say it
-    rule, facts, controls, levels = rule_of_v1(meta, [line["s_min"] for line in lines], cumulative)
-    now = {"rule": rule, "facts": facts, "controls": controls, "cumulative": cumulative}
-    return head | now, [line | {"facts": each} for line, each in zip(lines, levels, strict=True)]
 
 
 def _numbers(values: dict) -> dict[str, float]:

@@ -15,7 +15,6 @@ from training.splats.bundle import Bundle, Level, read_bundle, read_folder, writ
 from training.splats.gaussians import Splats
 
 ROOT = Path(__file__).parents[3]
-OLD = ROOT / "tests" / "data" / "version_0_1_0"
 EYES = ((0, 0, 0), (1.5, -2, 3), (9, 0, 1), (40.25, 3, -8), (-3000, 0, 0))
 FOCAL = (60.0, 500.0, 1333.3)
 CHOICES = {
@@ -51,7 +50,10 @@ class Page:
             self.tables = {line["table"]: elements[line["element"]] for line in others if "table" in line}
         lines.sort(key=lambda line: line["level"])
         self.numbers = [line["level"] for line in lines]
-        self.conclude(lines)
+        assert self.head["v"] == 2
+        self.rule, self.facts, self.controls = (self.head[key] for key in ("rule", "facts", "controls"))
+        self.cumulative = self.head["cumulative"]
+        self.level_facts = {line["level"]: line.get("facts", {}) for line in lines}
         self.means, self.opacities, self.columns, before = {}, {}, {}, 0
         for n in self.numbers:
             part, extra = rows[n][before:], extras[n]
@@ -61,23 +63,6 @@ class Page:
             self.columns[n] = {name: extra[name][before:] for name in names}
             if path.is_dir() and self.cumulative:  # each file has the coarser levels too
                 before = len(rows[n])
-
-    def conclude(self, lines: list[dict]) -> None:
-        """The rule; of version 1 by its section."""
-        if self.head["v"] == 2:
-            self.rule, self.facts, self.controls = (self.head[key] for key in ("rule", "facts", "controls"))
-            self.cumulative = self.head["cumulative"]
-            self.level_facts = {line["level"]: line.get("facts", {}) for line in lines}
-            return
-        self.cumulative = self.head.get("cumulative", "d_max" in self.meta)
-        self.rule, self.facts, self.controls, self.level_facts = "", {}, {}, {}
-        if self.cumulative and "d_max" in self.meta:
-            self.rule = "octree"
-            self.facts = {"d_max": self.meta["d_max"], "d_max_focal": self.meta["focal_px"]}
-        elif len(lines) > 1 and all(line["s_min"] is not None for line in lines):
-            self.rule = "bands"
-            self.level_facts = {line["level"]: {"s_min": line["s_min"]} for line in lines}
-            self.controls = {"gamma": self.meta["gamma"]} if "gamma" in self.meta else {}
 
     def weights(self, eye, f: float, given: dict) -> dict[int, np.ndarray]:
         """w of every splat, level by level."""
@@ -238,8 +223,7 @@ def made(tmp_path):
     return make
 
 
-WRITTEN_BY_0_1_0 = ("flod.ply", "octree.ply", "flod_folder", "octree_folder")
-WRITTEN_NOW = (
+BUNDLES = (
     "bands",
     "bands stream",
     "bands folder",
@@ -256,9 +240,9 @@ WRITTEN_NOW = (
 )
 
 
-@pytest.mark.parametrize("name", [*WRITTEN_BY_0_1_0, *WRITTEN_NOW])
+@pytest.mark.parametrize("name", BUNDLES)
 def test_a_stranger_chooses_what_we_choose(name, made):
-    path = OLD / name if name in WRITTEN_BY_0_1_0 else made(name)
+    path = made(name)
     page, bundle = Page(path), (read_folder if path.is_dir() else read_bundle)(path)
     assert page.rule == bundle.rule and page.numbers == [level.number for level in bundle.levels]
     drawn = 0

@@ -1,8 +1,5 @@
 """What holds of every rule: its declarations, its place in files, and what it refuses."""
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -15,7 +12,6 @@ from training.splats.gaussians import Splats
 
 RULES = sorted(rules())
 WITH_FACTS = [name for name in RULES if rules()[name].scene_facts or rules()[name].level_facts]
-OLD = Path(__file__).parents[2] / "data" / "version_0_1_0"
 
 
 def splats(count: int, seed: int, columns: tuple[str, ...]) -> Splats:
@@ -189,31 +185,6 @@ def test_facts_know_the_neighbours():
     assert found == {
         "level": 3, "finer": 7, "coarser": 1, "levels": 7, "s_min": 2.0, "coarser_s_min": 4.0,
     }  # fmt: skip
-
-
-@pytest.mark.parametrize("form", ["ply", "folder"])
-@pytest.mark.parametrize("method, rule", [("flod", "bands"), ("octree", "octree")])
-def test_files_of_version_0_1_0_choose_as_before(method, rule, form):
-    bundle = read_bundle(OLD / f"{method}.ply") if form == "ply" else read_folder(OLD / f"{method}_folder")
-    assert bundle.rule == rule
-    now_called = {"start": "first", "end": "last"}
-    for case in json.loads((OLD / "expected.json").read_text())[method]:
-        given = {now_called.get(name, name): float(value) for name, value in case["detail"].items()}
-        shown = select_levels(bundle, np.array(case["eye"]), case["focal"], settings(bundle, given))
-        found = [
-            (one.number, len(one.splats), len(one.splats) if one.weights is None else one.weights.sum())
-            for one in shown
-        ]
-        wanted = {
-            row["level"]: (row["count"], row["count"] if row["weight"] is None else row["weight"])
-            for row in case["shown"]
-        }
-        for number, count, weight in found:
-            assert (count, weight) == pytest.approx(wanted.get(number, (0, 0)), abs=1e-3)
-
-
-def test_a_plain_file_of_version_0_1_0_has_no_rule():
-    assert read_bundle(OLD / "plain.ply").rule == ""
 
 
 @pytest.mark.parametrize("name", RULES)

@@ -162,38 +162,7 @@ def test_what_is_no_job_file_is_not_read_as_one(tmp_path):
         Job.from_file(write(tmp_path / "scene.zip", 'scene = "x"'))
 
 
-OLD_3DGS = """
-scene = "/s"
-out = "/o"
-method = "3dgs"
-preset = "draft"
-[parameters]
-levels = 1
-max_splats = 4321
-rho = 4.0
-footprint = 16.0
-s_min_1 = 0.0
-steps = [4300]
-densify_until = [0.5]
-densify_interval = [50]
-budget_ratio = 0.65
-overlap_interval = 50
-rejoin_points = true
-lr_means_steps = 0
-"""
-
-
-def test_a_3dgs_run_of_0_1_0_is_the_same_job_and_no_new_one_may_name_what_had_no_effect(tmp_path):
-    """Version 0.1.0 trained 3DGS as FLoD with one level, and wrote all of FLoD's parameters."""
-    parameters = Job.from_file(write(tmp_path / "job.toml", OLD_3DGS)).resolved_parameters()
-    assert (parameters.total_steps, parameters.max_splats) == (4300, 4321)
-    with pytest.raises(LodgsError, match="no use for 'rho'"):
-        Job.from_dict({"scene": "/s", "out": "/o", "method": "3dgs", "parameters": {"rho": 4.0}})
-
-
-def test_what_a_method_inherits_without_a_use_is_refused_but_in_files_of_earlier_versions(tmp_path):
+def test_unused_parameters_are_refused():
     values = {"scene": "/s", "out": "/o", "method": "octree_neural", "parameters": {"dropout": 0.1}}
-    with pytest.raises(LodgsError, match="neural has no use for 'dropout'"):
+    with pytest.raises(LodgsError, match="'dropout'"):
         Job.from_dict(values)
-    text = 'scene = "/s"\nout = "/o"\nmethod = "octree_neural"\n[parameters]\ndropout = 0.1\n'
-    assert "dropout" not in Job.from_file(write(tmp_path / "job.toml", text)).resolved().parameters

@@ -471,7 +471,7 @@ def test_folder_without_manifest(tmp_path, make_splats):
 def test_folder_without_levels(tmp_path):
     with pytest.raises(LodgsError, match="no series of levels"):
         read_folder(tmp_path)
-    for text in ('{"v": 1, "levels": [{}]}', '{"v": 1, "method": "", "meta": {}, "levels": []}', "[]", "{"):
+    for text in ('{"v": 2, "levels": [{}]}', '{"v": 2, "method": "", "meta": {}, "levels": []}', "[]", "{"):
         (tmp_path / "manifest.json").write_text(text)
         with pytest.raises(LodgsError, match=r"manifest\.json (describes its levels|is not valid)"):
             read_folder(tmp_path)

@@ -106,7 +106,7 @@ METHOD = MethodInfo(
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     rule="octree",
     offered=("levels", "max_splats"),
-    retired=(
+    unused=(
         "candidates",
         "sh_interval",
         "dropout",

@@ -46,7 +46,6 @@ METHOD = MethodInfo(
     parameters=ThreedgsParameters,
     presets={"draft": _DRAFT, "standard": _STANDARD, "paper": _PAPER},
     offered=("max_splats",),
-    retired=("levels", "rho", "footprint", "s_min_1", "budget_ratio", "overlap_interval", "rejoin_points"),
     from_base=True,
     in_cells="3dgs",
 )
