@@ -135,7 +135,7 @@ def submit(root: bpy.types.Object, folder: str = "") -> str:
 
     Args:
         root: scene root with photos.
-        folder: run folder, which all workers must see. Empty for a new folder in the location of the settings.
+        folder: run folder, which all workers must see. Empty for a new folder.
 
     Returns:
         URL of the job's status page.

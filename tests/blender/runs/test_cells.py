@@ -1,4 +1,4 @@
-"""Scenes that are trained in cells, from Blender: what is planned, how each gets on, stopped and resumed."""
+"""Training of a scene in cells from Blender: plan, progress, cancel and resume."""
 
 import json
 import time
@@ -45,10 +45,10 @@ def _states(watch):
     return [block["state"] for block in watch.blocks]
 
 
-# -- planned -----------------------------------------------------------------------------------------------
+# -- plan --------------------------------------------------------------------------------------------------
 
 
-def test_a_plan_says_what_the_trainer_will_do(bpy, lodgs, job_settings, root):
+def test_plan_matches_the_trainers(bpy, lodgs, job_settings, root):
     settings = root.lodgs.training
     settings.rows, settings.method, settings.test_every = 2, "3dgs", 4
     assert bpy.ops.lodgs.plan_cells() == {"FINISHED"}
@@ -72,7 +72,7 @@ def test_a_plan_says_what_the_trainer_will_do(bpy, lodgs, job_settings, root):
         assert frames.shape == (len(eyes), 4, 3)
 
 
-def test_outlines_meet_on_the_ground_and_hold_their_cameras(bpy, lodgs, root):
+def test_outlines_lie_on_the_ground_and_contain_their_cameras(bpy, lodgs, root):
     settings = root.lodgs.training
     settings.rows = 2
     bpy.ops.lodgs.plan_cells()
@@ -86,42 +86,42 @@ def test_outlines_meet_on_the_ground_and_hold_their_cameras(bpy, lodgs, root):
     def sides(outline):
         return np.linalg.norm(outline[[1, 3]] - outline[0], axis=1)
 
-    def around(outline, places):
-        along = (outline[[1, 3]] - outline[0]) / sides(outline)[:, None] ** 2
-        return ((s := (places - outline[0]) @ along.T) > -1e-4).all(axis=1) & (s < 1 + 1e-4).all(axis=1)
+    def contains(outline, points):
+        axes = (outline[[1, 3]] - outline[0]) / sides(outline)[:, None] ** 2
+        return ((s := (points - outline[0]) @ axes.T) > -1e-4).all(axis=1) & (s < 1 + 1e-4).all(axis=1)
 
     centers = np.array([camera.center for camera in scene.cameras])
-    stand = [around(outline, centers) for outline in corners]
-    assert (np.sum(stand, axis=0) == 1).all(), "each camera stands in one cell"
+    inside = [contains(outline, centers) for outline in corners]
+    assert (np.sum(inside, axis=0) == 1).all(), "each camera is in one cell"
     for inner, outer, cell in zip(corners, enlarged, settings.planned_cells, strict=True):
-        assert around(outer, inner).all() and (sides(outer) > 1.05 * sides(inner)).all()
-        assert set(np.flatnonzero(around(outer, centers))) <= set(json.loads(cell.places))
+        assert contains(outer, inner).all() and (sides(outer) > 1.05 * sides(inner)).all()
+        assert set(np.flatnonzero(contains(outer, centers))) <= set(json.loads(cell.places))
 
 
-def test_a_plan_is_for_the_settings_that_it_was_made_with(bpy, lodgs, job_settings, root, tmp_path):
+def test_plan_is_outdated_by_changed_settings(bpy, lodgs, job_settings, root, tmp_path):
     cells, settings = lodgs("data.cells"), root.lodgs.training
     bpy.ops.lodgs.plan_cells()
 
-    def fits():
+    def is_current():
         return cells.is_planned(settings, job_settings.make_job(root, tmp_path, {}))
 
-    assert fits()
+    assert is_current()
     settings.seed = 9
-    assert fits(), "on which no plan depends"
+    assert is_current(), "the plan does not depend on the seed"
     for name, value in (("rows", 2), ("preset", "standard"), ("test_every", 3), ("method", "3dgs")):
         setattr(settings, name, value)
-        assert not fits()
+        assert not is_current()
         bpy.ops.lodgs.plan_cells()
-        assert fits()
+        assert is_current()
     blend = str(tmp_path / "scene.blend")
     bpy.ops.wm.save_as_mainfile(filepath=blend)
     bpy.ops.wm.open_mainfile(filepath=blend)
     (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
     settings = root.lodgs.training
-    assert fits() and len(settings.planned_cells) == 4
+    assert is_current() and len(settings.planned_cells) == 4
 
 
-def test_what_cannot_be_divided_is_refused_in_a_sentence(bpy, root, tmp_path, fake):
+def test_impossible_plans_are_rejected(bpy, root, tmp_path, fake):
     fake()
     settings = root.lodgs.training
     settings.columns = 30
@@ -142,17 +142,17 @@ def test_what_cannot_be_divided_is_refused_in_a_sentence(bpy, root, tmp_path, fa
     assert not (tmp_path / "run").exists()
 
 
-# -- trained -----------------------------------------------------------------------------------------------
+# -- training ----------------------------------------------------------------------------------------------
 
 
-def test_cells_are_trained_and_followed(bpy, lodgs, jobs, fake, root, tmp_path):
+def test_cells_are_trained(bpy, lodgs, jobs, fake, root, tmp_path):
     fake()
     settings = root.lodgs.training
     watch = jobs.start(root, str(tmp_path / "run"))
     assert lodgs("training.runs.job").Job.from_file(tmp_path / "run" / "job.toml").cells == "2x1"
     _wait(watch, lambda: [block["step"] for block in watch.blocks] == [STEPS // 2] * 2)
     assert _states(watch) == ["running"] * 2 and watch.fraction == 0.5
-    assert len(settings.planned_cells) == 2, "for the list, though nothing was planned"
+    assert len(settings.planned_cells) == 2, "the list needs them without a plan"
     (tmp_path / "run" / "go on").touch()
     jobs.follow(watch)
     assert (watch.state, watch.problem, _states(watch)) == ("done", "", ["done"] * 2)
@@ -160,18 +160,18 @@ def test_cells_are_trained_and_followed(bpy, lodgs, jobs, fake, root, tmp_path):
     assert "--on here" in watch.folder.log_tail()
 
 
-def test_one_cell_is_stopped_and_goes_on_beside_the_others(bpy, jobs, fake, root, tmp_path):
+def test_one_cell_is_cancelled_and_resumed(bpy, jobs, fake, root, tmp_path):
     fake()
     watch = jobs.start(root, str(tmp_path / "run"))
     _wait(watch, lambda: watch.blocks)
-    with pytest.raises(RuntimeError, match="Cell 2 of 'lantern_garden' has nothing to go on with"):
+    with pytest.raises(RuntimeError, match="Cannot resume cell 2 of 'lantern_garden'"):
         bpy.ops.lodgs.resume_block(block=2)
     assert bpy.ops.lodgs.cancel_block(block=2) == {"FINISHED"}
     assert watch.stopping == {("block", 2)}
     _wait(watch, lambda: _states(watch) == ["running", "cancelled"])
     assert not watch.stopping
     for number in (2, 3):
-        with pytest.raises(RuntimeError, match=f"Cell {number} of 'lantern_garden' is not being trained"):
+        with pytest.raises(RuntimeError, match=f"cell {number} of 'lantern_garden': it is not being trained"):
             bpy.ops.lodgs.cancel_block(block=number)
     assert bpy.ops.lodgs.resume_block(block=2) == {"FINISHED"}
     _wait(watch, lambda: _states(watch) == ["running"] * 2)
@@ -180,51 +180,52 @@ def test_one_cell_is_stopped_and_goes_on_beside_the_others(bpy, jobs, fake, root
     assert watch.state == "done"
 
 
-def test_all_are_stopped_and_one_goes_on_alone_or_all_do(bpy, lodgs, jobs, fake, root, tmp_path):
+def test_cancelled_run_resumes_one_or_all_cells(bpy, lodgs, jobs, fake, root, tmp_path):
     fake()
     watch = jobs.start(root, str(tmp_path / "run"))
     _wait(watch, lambda: watch.blocks)
     assert bpy.ops.lodgs.cancel_training() == {"FINISHED"}
     jobs.follow(watch)
     assert (watch.state, watch.problem) == ("cancelled", "")
-    with pytest.raises(RuntimeError, match="is not being trained"):
+    with pytest.raises(RuntimeError, match="it is not being trained"):
         bpy.ops.lodgs.cancel_block(block=1)
     (tmp_path / "run" / "go on").touch()
-    with pytest.raises(RuntimeError, match="Cell 3"):
+    with pytest.raises(RuntimeError, match="cell 3"):
         bpy.ops.lodgs.resume_block(block=3)
     bpy.ops.lodgs.resume_block(block=1)
     watch = lodgs("runs.watch").watch_of(root)
     assert (watch.state, _states(watch)) == ("cancelled", ["done", "cancelled"])
-    with pytest.raises(RuntimeError, match="nothing to go on with"):
+    with pytest.raises(RuntimeError, match="it is not stopped"):
         bpy.ops.lodgs.resume_block(block=1)
     assert bpy.ops.lodgs.resume_training() == {"FINISHED"}
     watch = lodgs("runs.watch").watch_of(root)
     assert (watch.state, _states(watch)) == ("done", ["done"] * 2)
 
 
-def test_a_file_opened_again_finds_its_cells(bpy, lodgs, jobs, fake, root, tmp_path):
+def test_reopened_file_attaches_to_its_cells(bpy, lodgs, jobs, fake, root, tmp_path):
     blend = str(tmp_path / "scene.blend")
     bpy.ops.wm.save_as_mainfile(filepath=blend)
     fake()
     watch = jobs.start(root)
-    bpy.ops.wm.save_mainfile()  # before the list is there
+    bpy.ops.wm.save_mainfile()  # before the run has reported its cells
     _wait(watch, lambda: watch.blocks)
     bpy.ops.wm.read_homefile(use_empty=True)
     bpy.ops.wm.open_mainfile(filepath=blend)
     root = bpy.data.objects["lantern_garden"]
-    found = lodgs("runs.watch").watch_of(root)
-    assert found is not watch and found.running and found.process is None and len(found.blocks) == 2
-    _wait(found, lambda: len(root.lodgs.training.planned_cells) == 2)
+    attached = lodgs("runs.watch").watch_of(root)
+    assert attached is not watch and attached.running
+    assert attached.process is None and len(attached.blocks) == 2
+    _wait(attached, lambda: len(root.lodgs.training.planned_cells) == 2)
     jobs.cancel_block(root, 1)
-    _wait(found, lambda: _states(found)[0] == "cancelled")
+    _wait(attached, lambda: _states(attached)[0] == "cancelled")
     jobs.cancel(root)
-    _wait(found, lambda: not found.running)
+    _wait(attached, lambda: not attached.running)
 
 
 def test_cells_at_once_need_dask(bpy, lodgs, jobs, fake, root, tmp_path):
     fake("no_dask")
     root.lodgs.training.at_once = 3
-    with pytest.raises(RuntimeError, match=r"3 cells at once needs Dask.*set Cells at Once to 1"):
+    with pytest.raises(RuntimeError, match=r"3 cells at once: .*Dask.*set Cells at Once to 1"):
         bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
     assert not (tmp_path / "run").exists()
     root.lodgs.training.columns = 1  # no cells
@@ -237,21 +238,22 @@ def test_cells_at_once_need_dask(bpy, lodgs, jobs, fake, root, tmp_path):
     assert "--on local:3" in lodgs("training.runs.folder").RunFolder(tmp_path / "run").log_tail()
 
 
-def test_a_second_cancel_ends_every_cells_trainer(lodgs, jobs, fake, root, tmp_path, monkeypatch):
-    """The run's own may not listen; what its cells' trainers are doing ends as well."""
+def test_second_cancel_kills_the_trainers_of_all_cells(lodgs, jobs, fake, root, tmp_path, monkeypatch):
+    """The trainer of the run may not respond. Those of the cells are killed too."""
     fake()
-    folder, ended = lodgs("training.runs.folder").RunFolder, []
+    folder = lodgs("training.runs.folder").RunFolder
+    killed = []
     watch = jobs.start(root, str(tmp_path / "run"))
     _wait(watch, lambda: watch.blocks)
-    monkeypatch.setattr(folder, "end", lambda run: ended.append(run.path.name))
+    monkeypatch.setattr(folder, "kill", lambda run: killed.append(run.path.name))
     watch.cancel_requested = True
     jobs.cancel(root)
-    assert ended == ["1", "2"]
+    assert killed == ["1", "2"]
     _wait(watch, lambda: not watch.running)
     assert watch.state == "interrupted"
 
 
-def test_the_panel_shows_a_jobs_cells(lodgs, job_settings, root, tmp_path):
+def test_apply_job_sets_the_cells(lodgs, job_settings, root, tmp_path):
     job = lodgs("training.runs.job").Job("/scene", "/run", "3dgs", cells="3x2")
     job_settings.apply_job(root.lodgs.training, job)
     assert job_settings.make_job(root, tmp_path, {}).cells == "3x2"

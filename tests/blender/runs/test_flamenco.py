@@ -1,4 +1,4 @@
-"""Jobs for a Flamenco manager, whose part a small HTTP server on this computer plays."""
+"""Job submission to a Flamenco manager, which a local HTTP server replaces."""
 
 import json
 import platform
@@ -20,16 +20,17 @@ TYPE = {"name": "lodgs-blocks", "etag": "5e", "settings": [*SETTINGS, {"key": "l
 
 
 class Manager:
-    """What the server answers, (code, JSON or bytes) by the end of the path, and what it was asked."""
+    """Responses of the server as (code, JSON or bytes), and the requests it received."""
 
     def __init__(self) -> None:
-        self.type, self.job = (200, TYPE), (200, {"id": "6f-1", "name": "tiny"})
-        self.asked: list[tuple[str, str, dict | None]] = []
+        self.type = (200, TYPE)
+        self.job = (200, {"id": "6f-1", "name": "tiny"})
+        self.requests: list[tuple[str, str, dict | None]] = []
 
     def answer(self, method: str, path: str, body: bytes) -> tuple[int, bytes]:
-        self.asked.append((method, path, json.loads(body) if body else None))
-        code, said = self.job if path == "/api/v3/jobs" else self.type
-        return code, said if isinstance(said, bytes) else json.dumps(said).encode()
+        self.requests.append((method, path, json.loads(body) if body else None))
+        code, content = self.job if path == "/api/v3/jobs" else self.type
+        return code, content if isinstance(content, bytes) else json.dumps(content).encode()
 
 
 @contextmanager
@@ -37,11 +38,11 @@ def served(manager: Manager):
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self):
             body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
-            code, said = manager.answer(self.command, self.path, body)
+            code, content = manager.answer(self.command, self.path, body)
             self.send_response(code)
-            self.send_header("Content-Length", str(len(said)))
+            self.send_header("Content-Length", str(len(content)))
             self.end_headers()
-            self.wfile.write(said)
+            self.wfile.write(content)
 
         do_POST = do_GET
 
@@ -59,7 +60,7 @@ def served(manager: Manager):
 
 @pytest.fixture
 def flamenco(lodgs, bpy, monkeypatch):
-    """The module, in a Blender that may go online (which cannot be set)."""
+    """The module, with online access (which Python cannot enable in Blender)."""
     module = lodgs("runs.flamenco")
     app = SimpleNamespace(online_access=True)
     monkeypatch.setattr(module, "bpy", SimpleNamespace(app=app, path=bpy.path, data=bpy.data))
@@ -83,35 +84,35 @@ def root(bpy, tmp_path):
 
 @pytest.fixture
 def manager(flamenco, lodgs):
-    """A manager whose address the preferences have."""
-    made = Manager()
-    with served(made) as address:
+    """A manager whose address is set in the preferences."""
+    manager = Manager()
+    with served(manager) as address:
         lodgs("extension").preferences().flamenco = address
-        yield made
+        yield manager
 
 
-def submit(bpy, **given):
-    return bpy.ops.lodgs.submit_to_flamenco(**given)
+def submit(bpy, **options):
+    return bpy.ops.lodgs.submit_to_flamenco(**options)
 
 
-def test_the_job_is_what_the_panel_says(bpy, lodgs, manager, root, tmp_path):
+def test_job_has_the_settings_of_the_panel(bpy, lodgs, manager, root, tmp_path):
     settings = root.lodgs.training
     settings.method, settings.preset, settings.image_scale = "octree", "standard", 0.65
     settings.columns, settings.rows, settings.seed = 2, 3, 7
     settings.images = str(tmp_path / "my photographs")
     settings.parameters.max_splats = 4321
     assert submit(bpy) == {"FINISHED"}
-    (first, second) = manager.asked
+    (first, second) = manager.requests
     assert first == ("GET", "/api/v3/jobs/type/lodgs-blocks", None)
     method, path, job = second
     assert (method, path) == ("POST", "/api/v3/jobs")
-    said = job["settings"]
-    options = said.pop("options")
+    submitted = job["settings"]
+    options = submitted.pop("options")
     assert job == {
         "name": "tiny", "type": "lodgs-blocks", "type_etag": "5e", "priority": 50,
-        "submitter_platform": platform.system().lower(), "settings": said,
+        "submitter_platform": platform.system().lower(), "settings": submitted,
     }  # fmt: skip
-    assert said == {
+    assert submitted == {
         "scene": str(tmp_path / "scene"), "output": str(tmp_path / "runs" / "tiny"), "columns": 2, "rows": 3,
         "method": "octree", "preset": "standard", "image_scale": 0.65,
         "polish": lodgs("training.runs.job").Job.polish,
@@ -120,117 +121,119 @@ def test_the_job_is_what_the_panel_says(bpy, lodgs, manager, root, tmp_path):
     split = shlex.split(options)
     assert split[split.index("--images") + 1] == str(tmp_path / "my photographs")
     assert split[split.index("--seed") + 1] == "7" and "max_splats=4321" in split
-    assert "--backend" not in split, "each of the farm's computers has its own"
-    assert not (tmp_path / "runs").exists(), "the farm makes it"
+    assert "--backend" not in split, "each worker has its own backend"
+    assert not (tmp_path / "runs").exists(), "the farm creates it"
 
 
-def test_what_the_farm_compiles_of_it_is_the_job_that_training_here_has(lodgs, manager, bpy, root, tmp_path):
-    """The command that the job type makes of the settings, read as the farm's trainer reads it."""
+def test_farm_and_local_training_have_the_same_job(lodgs, manager, bpy, root, tmp_path):
+    """Parse the command of the job type as the trainer on the farm does."""
     import argparse
 
     settings = root.lodgs.training
     settings.columns, settings.rows, settings.test_every = 2, 2, 5
     settings.parameters.levels = 3
     submit(bpy)
-    said = manager.asked[1][2]["settings"]
+    submitted = manager.requests[1][2]["settings"]
     options = lodgs("training.cli.job_options")
     parser = argparse.ArgumentParser()
     options.add_options(parser)
     command = [
-        "--scene", said["scene"], "--out", said["output"], "--cells", f"{said['columns']}x{said['rows']}",
-        "--method", said["method"], "--preset", said["preset"], "--image-scale", str(said["image_scale"]),
-        "--polish", str(said["polish"]), *shlex.split(said["options"]),
+        "--scene", submitted["scene"], "--out", submitted["output"],
+        "--cells", f"{submitted['columns']}x{submitted['rows']}",
+        "--method", submitted["method"], "--preset", submitted["preset"],
+        "--image-scale", str(submitted["image_scale"]), "--polish", str(submitted["polish"]),
+        *shlex.split(submitted["options"]),
     ]  # fmt: skip
-    there = options.job_from_options(parser.parse_args(command))
-    here = lodgs("runs.job_settings").make_job(root, tmp_path / "runs" / "tiny", {})
-    assert there.resolved() == here.resolved()
+    farm_job = options.job_from_options(parser.parse_args(command))
+    local_job = lodgs("runs.job_settings").make_job(root, tmp_path / "runs" / "tiny", {})
+    assert farm_job.resolved() == local_job.resolved()
 
 
-def test_the_type_is_that_of_the_script_that_lies_here(flamenco, manager, bpy, root):
-    """Flamenco names a type like its file, with hyphens; settings it does not know would be lost."""
+def test_job_type_matches_the_script(flamenco, manager, bpy, root):
+    """Flamenco derives the name of a type from its file, and ignores unknown settings."""
     assert flamenco.SCRIPT.stem.replace("_", "-") == flamenco.JOB_TYPE
     submit(bpy)
     script = flamenco.SCRIPT.read_text()
-    for key in manager.asked[1][2]["settings"]:
+    for key in manager.requests[1][2]["settings"]:
         assert f'key: "{key}"' in script
 
 
-def test_a_scene_without_cells_is_one_block(bpy, manager, root):
+def test_scene_without_cells_is_one_cell(bpy, manager, root):
     assert submit(bpy) == {"FINISHED"}
-    said = manager.asked[1][2]["settings"]
-    assert (said["columns"], said["rows"]) == (1, 1)
+    submitted = manager.requests[1][2]["settings"]
+    assert (submitted["columns"], submitted["rows"]) == (1, 1)
 
 
-def test_a_script_gets_the_address_of_the_job(flamenco, lodgs, manager, root, tmp_path):
+def test_submit_returns_the_url_of_the_job(flamenco, lodgs, manager, root, tmp_path):
     address = lodgs("extension").preferences().flamenco
     assert flamenco.submit(root, str(tmp_path / "other")) == f"{address}/app/jobs/6f-1"
-    assert manager.asked[1][2]["settings"]["output"] == str(tmp_path / "other")
+    assert manager.requests[1][2]["settings"]["output"] == str(tmp_path / "other")
 
 
-REFUSALS = {
+REJECTIONS = {
     "unknown type": (
         {"type": (404, {"code": 404, "message": "no such job type known"})},
-        "does not know the job type lodgs-blocks. Put .*lodgs_blocks.js into the folder scripts",
+        "has no job type lodgs-blocks. Copy .*lodgs_blocks.js to the scripts folder",
     ),
     "an older type": (
         {"type": (200, {**TYPE, "settings": SETTINGS[:-1]})},
-        "of another version: it has no options",
+        "job type lodgs-blocks has no setting options",
     ),
-    "refused": (
+    "rejected": (
         {"job": (400, {"code": 400, "message": "uncaught exception: not so."})},
-        "refused the job: uncaught exception: not so. Its log",
+        "reports: uncaught exception: not so. See the log",
     ),
     "outdated": (
         {"job": (412, {"code": 412, "message": "rejecting job because its settings are outdated"})},
-        "refused the job: rejecting job because",
+        "reports: rejecting job because",
     ),
-    "not JSON": ({"type": (200, b"<html>It works!</html>")}, "is no Flamenco manager"),
-    "not UTF-8": ({"job": (200, b"\xff\xfe")}, "is no Flamenco manager"),
-    "an answer of another kind": ({"type": (200, {"settings": "none"})}, "is no Flamenco manager"),
-    "a job without a name": ({"job": (200, {})}, "is no Flamenco manager"),
-    "not JSON, and an error": ({"type": (404, b"<html>Not found</html>")}, "is no Flamenco manager"),
-    "too long": ({"type": (200, b'{"a": "' + b"a" * (1 << 21) + b'"}')}, "is no Flamenco manager"),
-    "a list": ({"job": (200, [1, 2])}, "is no Flamenco manager"),
+    "not JSON": ({"type": (200, b"<html>It works!</html>")}, "is not a Flamenco manager"),
+    "not UTF-8": ({"job": (200, b"\xff\xfe")}, "is not a Flamenco manager"),
+    "invalid settings": ({"type": (200, {"settings": "none"})}, "is not a Flamenco manager"),
+    "a job without an ID": ({"job": (200, {})}, "is not a Flamenco manager"),
+    "an error that is not JSON": ({"type": (404, b"<html>Not found</html>")}, "is not a Flamenco manager"),
+    "too long": ({"type": (200, b'{"a": "' + b"a" * (1 << 21) + b'"}')}, "is not a Flamenco manager"),
+    "a list": ({"job": (200, [1, 2])}, "is not a Flamenco manager"),
 }
 
 
-@pytest.mark.parametrize("case", REFUSALS)
-def test_what_the_manager_answers_otherwise_is_a_sentence(bpy, manager, root, case):
-    answers, words = REFUSALS[case]
-    vars(manager).update(answers)
-    with pytest.raises(RuntimeError, match=words) as refused:
+@pytest.mark.parametrize("case", REJECTIONS)
+def test_rejections_are_reported(bpy, manager, root, case):
+    responses, message = REJECTIONS[case]
+    vars(manager).update(responses)
+    with pytest.raises(RuntimeError, match=message) as rejected:
         submit(bpy)
-    assert "Traceback" not in str(refused.value)
+    assert "Traceback" not in str(rejected.value)
 
 
-def test_nobody_answers(bpy, lodgs, flamenco, root):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
+def test_unreachable_manager_is_reported(bpy, lodgs, flamenco, root):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
     lodgs("extension").preferences().flamenco = f"127.0.0.1:{port}"
     with pytest.raises(
-        RuntimeError, match=r"No Flamenco manager answers at http://127\.0\.0\.1:\d+: .*refused"
+        RuntimeError, match=r"Cannot reach a Flamenco manager at http://127\.0\.0\.1:\d+: .*refused"
     ):
         submit(bpy)
 
 
-def test_one_that_never_answers_is_given_up(bpy, lodgs, flamenco, root, monkeypatch):
+def test_silent_manager_times_out(bpy, lodgs, flamenco, root, monkeypatch):
     monkeypatch.setattr(flamenco, "TIMEOUT", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         lodgs("extension").preferences().flamenco = "http://{}:{}".format(*silent.getsockname())
-        with pytest.raises(RuntimeError, match=r"No Flamenco manager answers at .*timed out"):
+        with pytest.raises(RuntimeError, match=r"Cannot reach a Flamenco manager at .*timed out"):
             submit(bpy)
 
 
-def test_the_panel_goes_on_while_it_is_waited_for(flamenco, lodgs, root):
-    """As in a window: each piece of the operator's work is over at once."""
+def test_operator_does_not_block_while_waiting(flamenco, lodgs, root):
+    """Each step of the modal operator returns immediately."""
     operator = lodgs("operators.flamenco").LODGS_OT_submit_to_flamenco
     with socket.create_server(("127.0.0.1", 0)) as silent:
         lodgs("extension").preferences().flamenco = "http://{}:{}".format(*silent.getsockname())
         work = operator.work(SimpleNamespace(folder=""), flamenco_context(root))
-        begun = time.monotonic()
+        start = time.monotonic()
         for _ in range(5):
             next(work)
-        assert time.monotonic() - begun < 1.0
+        assert time.monotonic() - start < 1.0
         work.close()
 
 
@@ -244,42 +247,40 @@ def flamenco_context(root):
 @pytest.mark.parametrize(
     "address", ["ftp://farm", "http://", "http://farm:port", "http://my farm", "http://[::"]
 )
-def test_what_is_no_address_is_said(bpy, lodgs, flamenco, root, address):
+def test_invalid_addresses_are_rejected(bpy, lodgs, flamenco, root, address):
     lodgs("extension").preferences().flamenco = address
-    with pytest.raises(RuntimeError, match="is no address of a Flamenco manager"):
+    with pytest.raises(RuntimeError, match="Invalid address of the Flamenco manager"):
         submit(bpy)
 
 
 @pytest.mark.parametrize("address", ["farm:8080", "http://farm:8080", "http://farm:8080/", " farm:8080/ "])
-def test_addresses_are_taken_as_people_write_them(flamenco, address):
-    assert flamenco.manager_of(address) == "http://farm:8080"
+def test_addresses_are_normalized(flamenco, address):
+    assert flamenco.manager_url(address) == "http://farm:8080"
 
 
-def test_what_cannot_be_submitted_is_said_before_anybody_is_asked(
-    bpy, lodgs, manager, root, tmp_path, monkeypatch
-):
-    def refused(words):
-        with pytest.raises(RuntimeError, match=words):
+def test_invalid_jobs_are_rejected_before_any_request(bpy, lodgs, manager, root, tmp_path, monkeypatch):
+    def assert_rejected(message):
+        with pytest.raises(RuntimeError, match=message):
             submit(bpy)
 
     settings = root.lodgs.training
-    taken = tmp_path / "taken"
-    taken.mkdir()
-    (taken / "job.toml").touch()
-    with pytest.raises(RuntimeError, match="already holds a run"):
-        submit(bpy, folder=str(taken))
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "job.toml").touch()
+    with pytest.raises(RuntimeError, match="contains a run"):
+        submit(bpy, folder=str(run))
     settings.method = "octree_neural"
-    refused("cannot train cells one by one")
+    assert_rejected("cannot train cells one by one")
     settings.method = "flod"
     settings.output = ""
-    refused("not saved")
+    assert_rejected("not saved")
     settings.output = str(tmp_path)
     root.lodgs.scene_folder = ""
-    refused("Import a COLMAP folder")
+    assert_rejected("Import a COLMAP folder")
     root.lodgs.scene_folder = str(tmp_path)
     monkeypatch.setattr(lodgs("runs.flamenco"), "bpy", bpy)
     assert not bpy.app.online_access
-    refused("Allow Online Access")
+    assert_rejected("Allow Online Access")
     lodgs("extension").preferences().flamenco = ""
-    refused("not said where the Flamenco manager is")
-    assert manager.asked == []
+    assert_rejected("no Flamenco manager is set")
+    assert manager.requests == []

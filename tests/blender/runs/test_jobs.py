@@ -1,4 +1,4 @@
-"""Trainings from Blender, with a fake trainer that fails on request and with the real one."""
+"""Training from Blender with a fake trainer that fails on request, and with the real trainer."""
 
 import os
 import time
@@ -31,7 +31,7 @@ def watch_of(lodgs):
 
 @pytest.fixture
 def root(bpy, tmp_path):
-    """A scene root as an import makes it, without its cameras."""
+    """A scene root as after an import, without cameras."""
     collection = bpy.data.collections.new("tiny")
     bpy.context.scene.collection.children.link(collection)
     root = bpy.data.objects.new("tiny", None)
@@ -41,12 +41,12 @@ def root(bpy, tmp_path):
 
 
 def _levels(root) -> dict[int, int]:
-    """Points of each level's object."""
+    """Return the number of points by level."""
     return {item.number: len(item.object.data.points) for item in root.lodgs.levels if item.exists}
 
 
 def _wait(watch, until, seconds=20.0):
-    """Steps a run, as the timer does in a window, until something holds."""
+    """Step a run, as the timer does with a window, until a condition holds."""
     end = time.monotonic() + seconds
     while not until():
         assert watch.running, (watch.message, watch.problem)
@@ -55,7 +55,7 @@ def _wait(watch, until, seconds=20.0):
         time.sleep(0.02)
 
 
-def test_training_brings_levels_and_facts(bpy, jobs, watch_of, fake, root, tmp_path):
+def test_training_adds_levels_and_facts(bpy, jobs, watch_of, fake, root, tmp_path):
     fake()
     run = tmp_path / "run"
     assert bpy.ops.lodgs.train(folder=str(run)) == {"FINISHED"}
@@ -73,16 +73,14 @@ def test_training_brings_levels_and_facts(bpy, jobs, watch_of, fake, root, tmp_p
     assert watch.progress["of"] == 10_000
 
 
-def test_controls_begin_with_what_a_run_records_until_somebody_sets_them(
-    bpy, lodgs, jobs, fake, root, tmp_path
-):
+def test_controls_follow_the_run_until_the_user_sets_them(bpy, lodgs, jobs, fake, root, tmp_path):
     fake()
     assert root.lodgs.bands.gamma == 1.0
     bpy.ops.lodgs.train(folder=str(tmp_path / "first"))
     assert root.lodgs.bands.gamma == 2.0
     scenes, Bundle = lodgs("data.scenes"), lodgs("training.splats.bundle").Bundle
     scenes.set_bundle_facts(root, Bundle("flod", [], "bands", {}, {"gamma": 0.4}))
-    assert root.lodgs.bands.gamma == pytest.approx(0.4), "nobody has set it"
+    assert root.lodgs.bands.gamma == pytest.approx(0.4), "not set by the user"
     assert scenes.read_levels(root).controls == {"gamma": 0.4}
     root.lodgs.bands.gamma = 0.7
     bpy.ops.lodgs.train(folder=str(tmp_path / "second"))
@@ -90,7 +88,7 @@ def test_controls_begin_with_what_a_run_records_until_somebody_sets_them(
     assert scenes.read_levels(root).controls == {"gamma": 0.7}
 
 
-def test_settings_become_the_job(bpy, lodgs, jobs, fake, root, tmp_path):
+def test_job_has_the_settings(bpy, lodgs, jobs, fake, root, tmp_path):
     settings = root.lodgs.training
     settings.method, settings.preset, settings.seed = "flod", "standard", 7
     settings.parameters.levels, settings.parameters.max_splats, settings.image_scale = 3, 1234, 0.25
@@ -101,10 +99,10 @@ def test_settings_become_the_job(bpy, lodgs, jobs, fake, root, tmp_path):
     assert job.scene == str(tmp_path / "scene")
     assert job.parameters["levels"] == 3 and job.parameters["max_splats"] == 1234
     assert job.parameters["steps"] == [4000, 6000, 15000]
-    assert job.parameters["footprint"] == 16.0  # not set: the preset's
+    assert job.parameters["footprint"] == 16.0  # not set: value of the preset
 
 
-def test_numbers_are_what_was_typed(job_settings, root):
+def test_numbers_are_as_typed(job_settings, root):
     settings = root.lodgs.training
     settings.image_scale, settings.parameters.footprint = 0.3, 8.3
     assert job_settings.changed_parameters(settings) == {"footprint": 8.3}
@@ -112,26 +110,30 @@ def test_numbers_are_what_was_typed(job_settings, root):
 
 
 @pytest.mark.parametrize("budget", [3 * LEAVES, 2 * LEAVES - 2, 2000])
-def test_a_tree_larger_than_the_budget_stays_in_its_file(bpy, lodgs, jobs, fake, root, tmp_path, budget):
-    """No level of it comes before; what comes is what an import brings. A smaller one comes whole."""
+def test_tree_larger_than_the_budget_is_streamed(bpy, lodgs, jobs, fake, root, tmp_path, budget):
+    """A tree larger than the budget appears at the end, like an imported one."""
     fake("tree")
-    root.lodgs.stream.budget, counts = budget, []
+    root.lodgs.stream.budget = budget
+    counts = []
     watch = jobs.start(root, str(tmp_path / "run"))
     jobs.follow(watch, lambda watch: counts.append(sum(_levels(root).values())))
     assert (watch.state, watch.problem) == ("done", "")
     streams, fits = lodgs("data.streams"), budget > 2 * LEAVES
     assert max(counts) <= (2 * LEAVES - 1 if fits else budget // 4)
-    found = lodgs("data.scenes").read_levels(root)
-    whole = lodgs("data.importing").import_splats(bpy.context, tmp_path / "run" / "bundle.ply", budget=budget)
-    expected = lodgs("data.scenes").read_levels(whole)
-    for one, other in zip(found.levels, expected.levels, strict=True):
-        np.testing.assert_array_equal(np.sort(one.splats.means, axis=0), np.sort(other.splats.means, axis=0))
-    assert (streams.source_of(root) is None) == (streams.source_of(whole) is None) == fits
+    trained = lodgs("data.scenes").read_levels(root)
+    imported = lodgs("data.importing").import_splats(
+        bpy.context, tmp_path / "run" / "bundle.ply", budget=budget
+    )
+    expected = lodgs("data.scenes").read_levels(imported)
+    for level, reference in zip(trained.levels, expected.levels, strict=True):
+        means, expected_means = (np.sort(item.splats.means, axis=0) for item in (level, reference))
+        np.testing.assert_array_equal(means, expected_means)
+    assert (streams.source_of(root) is None) == (streams.source_of(imported) is None) == fits
     if not fits:
         source = streams.source_of(root)
         assert source.path == tmp_path / "run" / "bundle.ply" and source.total == 2 * LEAVES - 1
         assert root.lodgs.eye == "VIEW" and root.lodgs.stream.budget == budget
-        fake("")  # another run's levels are not that file's
+        fake("")  # levels of another run replace the streamed file
         assert bpy.ops.object.select_all(action="DESELECT") and not root.select_set(True)
         bpy.context.view_layer.objects.active = root
         jobs.follow(jobs.start(root, str(tmp_path / "other")))
@@ -140,19 +142,19 @@ def test_a_tree_larger_than_the_budget_stays_in_its_file(bpy, lodgs, jobs, fake,
 
 @pytest.fixture
 def from_base(lodgs, monkeypatch):
-    """FLoD as a method that can begin with splats."""
+    """Let FLoD start from splats."""
     methods = lodgs("training.methods").METHODS
     monkeypatch.setitem(methods, "flod", replace(methods["flod"], from_base=True))
 
 
-def test_training_starts_from_points_this_run_or_a_file(
+def test_training_starts_from_points_a_run_or_a_file(
     bpy, lodgs, job_settings, fake, root, tmp_path, from_base, monkeypatch
 ):
     settings, base = root.lodgs.training, lambda: job_settings.make_job(root, Path("/run"), {}).base
     error = lodgs("training.errors").LodgsError
     assert base() == ""
     settings.start_from = "RUN"
-    with pytest.raises(error, match="'tiny' has no finished run to start from"):
+    with pytest.raises(error, match="'tiny' has no finished run"):
         base()
     fake("killed")
     settings.start_from = "POINTS"
@@ -169,22 +171,22 @@ def test_training_starts_from_points_this_run_or_a_file(
     with pytest.raises(RuntimeError):
         bpy.ops.lodgs.train(folder=str(tmp_path / "second"))
     fake()
-    assert bpy.ops.lodgs.resume_training() == {"FINISHED"}, "its base is not asked for again"
+    assert bpy.ops.lodgs.resume_training() == {"FINISHED"}, "the base is in the run already"
     job = lodgs("training.runs.job").Job.from_file(tmp_path / "second" / "job.toml")
     assert job.base == str(tmp_path / "first")
     settings.start_from = "FILE"
-    with pytest.raises(error, match="No splats are chosen"):
+    with pytest.raises(error, match="no file is chosen"):
         base()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"), check_existing=False)
     settings = bpy.data.objects["tiny"].lodgs.training
     settings.base = "//splats.ply"
     root = bpy.data.objects["tiny"]
     assert job_settings.make_job(root, Path("/run"), {}).base == str(tmp_path / "splats.ply")
-    settings.method = "octree"  # which cannot
+    settings.method = "octree"  # starts from points only
     assert job_settings.make_job(root, Path("/run"), {}).base == ""
 
 
-def test_the_panel_shows_a_job(lodgs, job_settings, root, from_base):
+def test_apply_job_sets_the_settings(lodgs, job_settings, root, from_base):
     settings = root.lodgs.training
     settings.parameters.max_splats = 5
     parameters = {"levels": 2, "footprint": 9.5, "steps": [10, 20]}
@@ -194,16 +196,15 @@ def test_the_panel_shows_a_job(lodgs, job_settings, root, from_base):
     job_settings.apply_job(settings, job)
     assert job_settings.changed_parameters(settings) == {"levels": 2, "footprint": 9.5}
     root.lodgs.scene_folder = "/scene"
-    again = job_settings.make_job(root, Path("/run"), {"steps": [10, 20]})
-    assert again == job
-    job_settings.apply_job(settings, job.resolved())  # as a run keeps it
+    assert job_settings.make_job(root, Path("/run"), {"steps": [10, 20]}) == job
+    job_settings.apply_job(settings, job.resolved())  # as stored in a run
     assert job_settings.changed_parameters(settings) == {"levels": 2, "footprint": 9.5}
 
 
-def test_the_panel_shows_a_jobs_distances(lodgs, job_settings, root):
+def test_apply_job_sets_the_distances(lodgs, job_settings, root):
     settings, job = root.lodgs.training, lodgs("training.runs.job").Job
-    given = {"levels": 4, "distances": [9.0, 0.0, 2.5, 0.0]}
-    job_settings.apply_job(settings, job("/scene", "/run", "lodge", "draft", parameters=given))
+    parameters = {"levels": 4, "distances": [9.0, 0.0, 2.5, 0.0]}
+    job_settings.apply_job(settings, job("/scene", "/run", "lodge", "draft", parameters=parameters))
     assert not settings.find_distances
     assert job_settings.changed_parameters(settings) == {"levels": 4, "distances": (9.0, 0.0, 2.5, 0.0)}
     job_settings.apply_job(settings, job("/scene", "/run", "lodge", "draft"))
@@ -213,7 +214,7 @@ def test_the_panel_shows_a_jobs_distances(lodgs, job_settings, root):
 
 
 @pytest.mark.parametrize("backend", ["auto", "cpu", "cuda", "gpu"])
-def test_what_trains_is_a_preference(bpy, lodgs, jobs, fake, root, tmp_path, backend):
+def test_backend_is_a_preference(bpy, lodgs, jobs, fake, root, tmp_path, backend):
     preferences = lodgs("extension").preferences()
     assert preferences.backend == "auto"
     fake()
@@ -226,7 +227,7 @@ def test_what_trains_is_a_preference(bpy, lodgs, jobs, fake, root, tmp_path, bac
 
 
 @pytest.mark.parametrize(
-    ("mode", "state", "says"),
+    ("mode", "state", "message"),
     [
         ("killed", "interrupted", "signal 9"),
         ("crash", "interrupted", "the card caught fire"),
@@ -235,17 +236,19 @@ def test_what_trains_is_a_preference(bpy, lodgs, jobs, fake, root, tmp_path, bac
         ("refused", "failed", "The run folder belongs to another job. Choose another."),
     ],
 )
-def test_a_dead_trainer_is_reported_and_resumed(bpy, jobs, watch_of, fake, root, tmp_path, mode, state, says):
+def test_dead_trainer_is_reported_and_resumed(
+    bpy, jobs, watch_of, fake, root, tmp_path, mode, state, message
+):
     fake(mode)
     with pytest.raises(RuntimeError, match="Error:") as error:
         bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
-    assert says in str(error.value) and "Traceback" not in str(error.value)
+    assert message in str(error.value) and "Traceback" not in str(error.value)
     watch = watch_of(root)
-    assert watch.state == state and says in watch.problem
+    assert watch.state == state and message in watch.problem
     if mode == "odd":
         assert not watch.progress and not _levels(root)
     if mode in {"killed", "crash"}:
-        assert _levels(root) == {1: COUNTS[1]}  # what was trained is there
+        assert _levels(root) == {1: COUNTS[1]}  # the finished level is shown
     if mode == "crash":
         assert bpy.ops.lodgs.show_log() == {"FINISHED"}
         assert "RuntimeError" in bpy.data.texts["LODGS trainer log"].as_string()
@@ -254,7 +257,7 @@ def test_a_dead_trainer_is_reported_and_resumed(bpy, jobs, watch_of, fake, root,
     assert watch_of(root).problem == "" and _levels(root) == COUNTS
 
 
-def test_garbage_is_passed_over(bpy, jobs, fake, root, tmp_path):
+def test_garbage_is_ignored(bpy, jobs, fake, root, tmp_path):
     fake("garbage")
     assert bpy.ops.lodgs.train(folder=str(tmp_path / "run")) == {"FINISHED"}
     assert _levels(root) == COUNTS
@@ -267,7 +270,7 @@ def test_cancel_and_resume(bpy, jobs, fake, root, tmp_path):
     assert bpy.ops.lodgs.cancel_training() == {"FINISHED"}
     _wait(watch, lambda: not watch.running)
     assert (watch.state, watch.problem) == ("cancelled", "")
-    with pytest.raises(RuntimeError, match="No training of 'tiny' is at work"):
+    with pytest.raises(RuntimeError, match="no training of 'tiny' is running"):
         bpy.ops.lodgs.cancel_training()
     fake()
     assert bpy.ops.lodgs.resume_training() == {"FINISHED"}
@@ -275,20 +278,20 @@ def test_cancel_and_resume(bpy, jobs, fake, root, tmp_path):
         bpy.ops.lodgs.resume_training()
 
 
-def test_an_unresponsive_trainer_is_reported_and_can_be_ended(lodgs, jobs, fake, root, tmp_path, monkeypatch):
+def test_unresponsive_trainer_is_reported_and_can_be_killed(lodgs, jobs, fake, root, tmp_path, monkeypatch):
     fake("mute")
     monkeypatch.setattr(lodgs("runs.watch"), "UNRESPONSIVE_AFTER", 0.2)
     watch = jobs.start(root, str(tmp_path / "run"))
     _wait(watch, lambda: watch.unresponsive)
     jobs.cancel(root)
-    assert watch.step() and watch.running  # it does not listen
+    assert watch.step() and watch.running  # it does not respond
     jobs.cancel(root)
     _wait(watch, lambda: not watch.running)
     assert watch.state == "interrupted"
 
 
 def test_cancel_is_not_lost_before_the_trainer_is_ready(bpy, jobs, fake, root, tmp_path):
-    """What was asked of an earlier trainer is forgotten; what is asked of this one is heard."""
+    """A request to an earlier trainer is cleared. A request to the new one has effect."""
     fake("slow")
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "cancel").touch()
@@ -302,33 +305,33 @@ def test_cancel_is_not_lost_before_the_trainer_is_ready(bpy, jobs, fake, root, t
     assert watch.state == "cancelled"
 
 
-def test_only_the_runs_own_trainer_is_ended_by_force(lodgs, jobs, fake, root, tmp_path):
+def test_only_the_trainer_of_the_run_is_killed(lodgs, jobs, fake, root, tmp_path):
     fake("slow")
     first = jobs.start(root, str(tmp_path / "run"))
     _wait(first, lambda: first.progress)
-    found = jobs.attach(root, str(tmp_path / "run"))  # as another Blender finds it
-    assert found.process is None and found.running
+    attached = jobs.attach(root, str(tmp_path / "run"))  # as another Blender does
+    assert attached.process is None and attached.running
     lock = tmp_path / "run" / "lock"
-    said = lock.read_text()
-    lock.write_text(said.replace(f'"pid": {first.process.pid}', f'"pid": {os.getpid()}'))
-    found.cancel_requested = True
-    with pytest.raises(lodgs("training.errors").LodgsError, match="cannot be ended from here"):
+    content = lock.read_text()
+    lock.write_text(content.replace(f'"pid": {first.process.pid}', f'"pid": {os.getpid()}'))
+    attached.cancel_requested = True
+    with pytest.raises(lodgs("training.errors").LodgsError):
         jobs.cancel(root)
     assert first.process.poll() is None
-    lock.write_text(said)
+    lock.write_text(content)
     jobs.cancel(root)
     assert first.process.wait(20) == -9
-    _wait(found, lambda: not found.running)
+    _wait(attached, lambda: not attached.running)
 
 
-def test_a_moved_run_is_resumed_where_it_is(bpy, watch_of, fake, root, tmp_path):
+def test_moved_run_is_resumed(bpy, watch_of, fake, root, tmp_path):
     fake("killed")
     with pytest.raises(RuntimeError):
         bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
     (tmp_path / "run").rename(tmp_path / "moved")
-    job = tmp_path / "moved" / "job.toml"  # as it was written before a run was its own folder
+    job = tmp_path / "moved" / "job.toml"  # format of older versions
     job.write_text(job.read_text().replace('out = "."', f'out = "{tmp_path / "run"}"'))
-    with pytest.raises(RuntimeError, match="holds no run"):
+    with pytest.raises(RuntimeError, match="contains no run"):
         bpy.ops.lodgs.open_run(directory=str(tmp_path / "run"))
     bpy.ops.lodgs.open_run(directory=str(tmp_path / "moved"))
     fake()
@@ -337,7 +340,7 @@ def test_a_moved_run_is_resumed_where_it_is(bpy, watch_of, fake, root, tmp_path)
     assert not (tmp_path / "run").exists()
 
 
-def test_following_a_run_never_raises_whatever_its_files_say(bpy, jobs, fake, root, tmp_path):
+def test_following_a_run_with_corrupt_events_never_raises(bpy, jobs, fake, root, tmp_path):
     fake("killed")
     with pytest.raises(RuntimeError):
         bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
@@ -363,48 +366,47 @@ def test_following_a_run_never_raises_whatever_its_files_say(bpy, jobs, fake, ro
     assert any("does not understand" in warning for warning in watch.warnings)
 
 
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names here")
-def test_opening_a_file_waits_for_no_pipe_and_asks_no_other_computer(
-    bpy, lodgs, watch_of, root, tmp_path, monkeypatch
-):
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes on this system")
+def test_opening_a_file_reads_no_pipe_and_no_network_share(bpy, lodgs, watch_of, root, tmp_path, monkeypatch):
     (tmp_path / "run").mkdir()
     for name in ("events.jsonl", "lock", "trainer.log"):
         os.mkfifo(tmp_path / "run" / name)
     (tmp_path / "run" / "job.toml").write_text("")
     root.lodgs.training.run = str(tmp_path / "run")
-    far = root.copy()
-    root.users_collection[0].objects.link(far)
-    far.lodgs.training.run = r"\\server\share\run"
-    asked, folder = [], lodgs("training.runs.folder").RunFolder
+    remote = root.copy()
+    root.users_collection[0].objects.link(remote)
+    remote.lodgs.training.run = r"\\server\share\run"
+    folder = lodgs("training.runs.folder").RunFolder
+    queried = []
     state = folder.state
-    monkeypatch.setattr(folder, "state", lambda run: asked.append(run.path.name) or state(run))
+    monkeypatch.setattr(folder, "state", lambda run: queried.append(run.path.name) or state(run))
     blend = str(tmp_path / "scene.blend")
     bpy.ops.wm.save_as_mainfile(filepath=blend)
     bpy.ops.wm.open_mainfile(filepath=blend)
-    assert asked == ["run"] and watch_of(bpy.data.objects["tiny"]) is None
+    assert queried == ["run"] and watch_of(bpy.data.objects["tiny"]) is None
 
 
-def test_one_trainer_a_folder_but_several_at_once(bpy, lodgs, jobs, fake, root, tmp_path):
+def test_one_trainer_per_folder_and_several_at_once(bpy, lodgs, jobs, fake, root, tmp_path):
     error = lodgs("training.errors").LodgsError
-    other = root.copy()
-    root.users_collection[0].objects.link(other)
+    copy = root.copy()
+    root.users_collection[0].objects.link(copy)
     fake("slow")
     first = jobs.start(root, str(tmp_path / "run"))
     _wait(first, lambda: first.progress)
-    with pytest.raises(error, match="Another training is already at work"):
-        jobs.start(other, str(tmp_path / "run"))
-    second = jobs.start(other, str(tmp_path / "run 2"))
+    with pytest.raises(error, match="another training is running"):
+        jobs.start(copy, str(tmp_path / "run"))
+    second = jobs.start(copy, str(tmp_path / "run 2"))
     _wait(second, lambda: second.progress)
-    for obj in (root, other):
+    for obj in (root, copy):
         jobs.cancel(obj)
     _wait(first, lambda: not first.running)
     _wait(second, lambda: not second.running)
-    with pytest.raises(error, match="already holds a run"):
-        jobs.start(other, str(tmp_path / "run"))
+    with pytest.raises(error, match="contains a run"):
+        jobs.start(copy, str(tmp_path / "run"))
 
 
-def test_a_run_outlives_the_file_and_is_found_again(bpy, jobs, watch_of, fake, root, tmp_path):
-    """Saved while it trains, closed, opened while it trains, closed, opened when it is finished."""
+def test_reopened_file_attaches_to_its_run(bpy, jobs, watch_of, fake, root, tmp_path):
+    """Save and close the file while the run trains, reopen it while it trains, and after it has finished."""
     blend = str(tmp_path / "scene.blend")
     bpy.ops.wm.save_as_mainfile(filepath=blend)
     fake("slow")
@@ -415,25 +417,25 @@ def test_a_run_outlives_the_file_and_is_found_again(bpy, jobs, watch_of, fake, r
     bpy.ops.wm.save_mainfile()
 
     bpy.ops.wm.read_homefile(use_empty=True)
-    assert not watch.step()  # its scene root is not here any more
+    assert not watch.step()  # its scene root no longer exists
     bpy.ops.wm.open_mainfile(filepath=blend)
-    found = watch_of(bpy.data.objects["tiny"])
-    assert found.running and found.process is None and found.progress["step"] >= 1
+    attached = watch_of(bpy.data.objects["tiny"])
+    assert attached.running and attached.process is None and attached.progress["step"] >= 1
     jobs.cancel(bpy.data.objects["tiny"])
-    _wait(found, lambda: not found.running)
-    assert found.state == "cancelled"
+    _wait(attached, lambda: not attached.running)
+    assert attached.state == "cancelled"
     bpy.ops.wm.save_mainfile()
 
     fake()
     resumed = jobs.resume(bpy.data.objects["tiny"])
-    bpy.ops.wm.read_homefile(use_empty=True)  # closed before any level came
+    bpy.ops.wm.read_homefile(use_empty=True)  # closed before the first level
     resumed.process.wait(20)
     bpy.ops.wm.open_mainfile(filepath=blend)
     root = bpy.data.objects["tiny"]
     assert watch_of(root).state == "done" and _levels(root) == COUNTS
     assert tuple(root.lodgs.camera_center) == (1, 2, 3)
 
-    # What was loaded is not loaded twice: a level that the artist deleted stays away.
+    # levels are not loaded twice: a level that the user deleted stays deleted
     bpy.data.objects.remove(root.lodgs.levels[0].object)
     bpy.ops.wm.save_mainfile()
     bpy.ops.wm.open_mainfile(filepath=blend)
@@ -443,8 +445,8 @@ def test_a_run_outlives_the_file_and_is_found_again(bpy, jobs, watch_of, fake, r
     assert _levels(root) == COUNTS
 
 
-def test_undo_takes_neither_levels_nor_the_run(bpy, jobs, watch_of, fake, tmp_path, request):
-    """Undoing what followed a level keeps the level; undoing the import and redoing it finds the run."""
+def test_undo_keeps_levels_and_the_run(bpy, jobs, watch_of, fake, tmp_path, request):
+    """Undo after a level keeps the level. Undo and redo of the import attach to the run again."""
     bpy.ops.ed.undo_push(message="Start")
     root = request.getfixturevalue("root")
     bpy.ops.ed.undo_push(message="Import")
@@ -453,29 +455,29 @@ def test_undo_takes_neither_levels_nor_the_run(bpy, jobs, watch_of, fake, tmp_pa
     bpy.ops.ed.undo_push(message="Train")
     _wait(watch, lambda: watch.progress)
 
-    bpy.ops.ed.undo()  # what was known before Train
+    bpy.ops.ed.undo()  # before Train
     root = bpy.data.objects["tiny"]
     assert root.lodgs.training.run == str(tmp_path / "run") and watch_of(root) is watch
     bpy.ops.ed.undo()  # before the import
     assert "tiny" not in bpy.data.objects and not watch.step()
     bpy.ops.ed.redo()
     root = bpy.data.objects["tiny"]
-    assert watch_of(root) is None  # it had no run then
+    assert watch_of(root) is None  # without a run at that step
     bpy.ops.ed.redo()
     root = bpy.data.objects["tiny"]
-    found = watch_of(root)
-    assert found is not watch and found.running
+    attached = watch_of(root)
+    assert attached is not watch and attached.running
     jobs.cancel(root)
-    _wait(found, lambda: not found.running)
+    _wait(attached, lambda: not attached.running)
 
     fake()
     resumed = jobs.resume(root)
     _wait(resumed, lambda: not resumed.running)
-    bpy.context.scene.collection.objects.link(bpy.data.objects.new("the artist's", None))
+    bpy.context.scene.collection.objects.link(bpy.data.objects.new("user object", None))
     bpy.ops.ed.undo_push(message="Add")
     bpy.ops.ed.undo()
     root = bpy.data.objects["tiny"]
-    assert "the artist's" not in bpy.data.objects and _levels(root) == COUNTS
+    assert "user object" not in bpy.data.objects and _levels(root) == COUNTS
     bpy.ops.ed.undo()  # Training finished
     bpy.ops.ed.undo()  # Level 2
     assert _levels(bpy.data.objects["tiny"]) == {1: COUNTS[1]}
@@ -483,25 +485,25 @@ def test_undo_takes_neither_levels_nor_the_run(bpy, jobs, watch_of, fake, tmp_pa
     assert _levels(bpy.data.objects["tiny"]) == COUNTS
 
 
-def test_a_level_that_an_undo_took_away_is_back_at_the_end(bpy, jobs, fake, tmp_path, request):
-    """Undo past a level, do something else, and nothing could redo the level."""
+def test_level_removed_by_undo_returns_at_the_end(bpy, jobs, fake, tmp_path, request):
+    """Undo a level and do something else, so that redo cannot bring the level back."""
     root = request.getfixturevalue("root")
     bpy.ops.ed.undo_push(message="Import")
     fake("two halves")
     watch = jobs.start(root, str(tmp_path / "run"))
     _wait(watch, lambda: 2 in watch.levels)
     bpy.ops.ed.undo()
-    bpy.context.scene.collection.objects.link(bpy.data.objects.new("the artist's", None))
+    bpy.context.scene.collection.objects.link(bpy.data.objects.new("user object", None))
     bpy.ops.ed.undo_push(message="Add")
     assert _levels(bpy.data.objects["tiny"]) == {1: COUNTS[1]}
     (tmp_path / "run" / "go on").touch()
     _wait(watch, lambda: not watch.running)
     root = bpy.data.objects["tiny"]
     assert watch.state == "done" and not watch.problem and _levels(root) == COUNTS
-    assert [item.number for item in root.lodgs.levels] == [1, 2] and "the artist's" in bpy.data.objects
+    assert [item.number for item in root.lodgs.levels] == [1, 2] and "user object" in bpy.data.objects
 
 
-def test_a_removed_scenes_training_goes_on(bpy, jobs, fake, root, tmp_path, capfd):
+def test_training_continues_after_removing_the_scene(bpy, jobs, fake, root, tmp_path, capfd):
     fake("slow")
     watch = jobs.start(root, str(tmp_path / "run"))
     _wait(watch, lambda: watch.progress)
@@ -512,17 +514,17 @@ def test_a_removed_scenes_training_goes_on(bpy, jobs, fake, root, tmp_path, capf
     assert watch.process.wait(20) == 3
 
 
-def test_a_lost_run_folder_is_no_error_on_opening(bpy, jobs, watch_of, root, tmp_path):
-    root.lodgs.training.run = str(tmp_path / "gone")
+def test_missing_run_folder_is_no_error_on_opening(bpy, jobs, watch_of, root, tmp_path):
+    root.lodgs.training.run = str(tmp_path / "missing")
     blend = str(tmp_path / "scene.blend")
     bpy.ops.wm.save_as_mainfile(filepath=blend)
     bpy.ops.wm.open_mainfile(filepath=blend)
     assert watch_of(bpy.data.objects["tiny"]) is None
-    with pytest.raises(RuntimeError, match="holds no run"):
-        bpy.ops.lodgs.open_run(directory=str(tmp_path / "gone"))
+    with pytest.raises(RuntimeError, match="contains no run"):
+        bpy.ops.lodgs.open_run(directory=str(tmp_path / "missing"))
 
 
-def test_deleting_the_root_ends_the_watching_only(bpy, jobs, lodgs, fake, root, tmp_path):
+def test_deleting_the_root_ends_only_the_watch(bpy, jobs, lodgs, fake, root, tmp_path):
     fake("slow")
     watch = jobs.start(root, str(tmp_path / "run"))
     _wait(watch, lambda: watch.progress)
@@ -533,7 +535,7 @@ def test_deleting_the_root_ends_the_watching_only(bpy, jobs, lodgs, fake, root, 
     assert watch.process.wait(20) == 3
 
 
-def test_a_shorter_run_removes_the_levels_of_a_longer_one(bpy, lodgs, jobs, fake, root, tmp_path):
+def test_run_with_fewer_levels_removes_the_other_levels(bpy, lodgs, jobs, fake, root, tmp_path):
     Level = lodgs("training.splats.bundle").Level
     for number in (1, 2, 3):
         lodgs("data.scenes").set_level(root, Level(number, splats(3)))
@@ -542,8 +544,8 @@ def test_a_shorter_run_removes_the_levels_of_a_longer_one(bpy, lodgs, jobs, fake
     assert _levels(root) == COUNTS
 
 
-def test_levels_of_two_runs_never_stand_together(bpy, lodgs, jobs, fake, root, tmp_path):
-    """A second training that dies after its first level leaves that level alone."""
+def test_levels_of_two_runs_are_never_mixed(bpy, lodgs, jobs, fake, root, tmp_path):
+    """If a second training dies after its first level, only this level remains."""
     fake()
     bpy.ops.lodgs.train(folder=str(tmp_path / "first"))
     coarsest = root.lodgs.levels[0].object
@@ -551,7 +553,7 @@ def test_levels_of_two_runs_never_stand_together(bpy, lodgs, jobs, fake, root, t
     with pytest.raises(RuntimeError):
         bpy.ops.lodgs.train(folder=str(tmp_path / "second"))
     assert _levels(root) == {1: COUNTS[1]}
-    assert root.lodgs.levels[0].object == coarsest, "the object stays, with what artists hung on it"
+    assert root.lodgs.levels[0].object == coarsest, "the object stays with its modifiers and children"
     assert (root.lodgs.bands.last, root.lodgs.single_level) == (1, 1)
     assert [level.number for level in lodgs("data.scenes").read_levels(root).levels] == [1]
 
@@ -559,31 +561,29 @@ def test_levels_of_two_runs_never_stand_together(bpy, lodgs, jobs, fake, root, t
 def test_run_folders_do_not_collide(lodgs, jobs, fake, root, tmp_path):
     fake()
 
-    def started():
+    def train():
         watch = jobs.start(root)
-        with pytest.raises(
-            lodgs("training.errors").LodgsError, match="is being trained already"
-        ):  # which another one would hide
+        with pytest.raises(lodgs("training.errors").LodgsError, match="is already being trained"):
             jobs.start(root)
         watch.process.wait(20)
         while watch.step():
             pass
         return watch.folder.path
 
-    assert started() == tmp_path / "home" / "lodgs_runs" / "tiny"  # not saved: at home
-    assert started() == tmp_path / "home" / "lodgs_runs" / "tiny-2"
+    assert train() == tmp_path / "home" / "lodgs_runs" / "tiny"  # the file is not saved: at home
+    assert train() == tmp_path / "home" / "lodgs_runs" / "tiny-2"
     root.lodgs.training.output = str(tmp_path / "mine")
-    assert started() == tmp_path / "mine" / "tiny"
+    assert train() == tmp_path / "mine" / "tiny"
 
 
-def test_mistakes_are_sentences(bpy, jobs, fake, root, tmp_path, monkeypatch):
+def test_mistakes_are_reported(bpy, jobs, fake, root, tmp_path, monkeypatch):
     fake()
     with pytest.raises(RuntimeError, match="has no run to resume"):
         bpy.ops.lodgs.resume_training()
-    with pytest.raises(RuntimeError, match="written no log"):
+    with pytest.raises(RuntimeError, match="has not written one"):
         bpy.ops.lodgs.show_log()
     (tmp_path / "file").write_text("")
-    with pytest.raises(RuntimeError, match="cannot be read"):
+    with pytest.raises(RuntimeError, match="Cannot read the run folder"):
         bpy.ops.lodgs.train(folder=str(tmp_path / "file" / "run"))
     root.lodgs.training.test_every = 1
     with pytest.raises(RuntimeError, match="test_every"):
@@ -596,7 +596,7 @@ def test_mistakes_are_sentences(bpy, jobs, fake, root, tmp_path, monkeypatch):
     with pytest.raises(RuntimeError, match="not installed"):
         bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
     root.lodgs.scene_folder = ""
-    with pytest.raises(RuntimeError, match="not imported from photographs"):
+    with pytest.raises(RuntimeError, match="it has no photos"):
         bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
     assert not (tmp_path / "run").exists()
     bpy.data.objects.remove(root)
@@ -604,10 +604,10 @@ def test_mistakes_are_sentences(bpy, jobs, fake, root, tmp_path, monkeypatch):
 
 
 def test_the_real_trainer(bpy, jobs, tmp_path, monkeypatch):
-    """Photographs to levels and back to a bundle, in a few steps on tiny images."""
+    """Train levels from small images in a few steps, cancel and resume."""
     if not TRAINER:
         pytest.skip("no trainer; set LODGS_TRAINER_PYTHON")
-    monkeypatch.setenv("NUMBA_CACHE_DIR", "")  # the checkout's own, so that kernels compile once
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")  # cache of the checkout, so that kernels compile once
     bpy.ops.lodgs.import_colmap(directory=str(REPOSITORY / "examples" / "lantern_garden"), photographs=False)
     (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
     root.lodgs.training.image_scale = 0.1
@@ -625,7 +625,7 @@ def test_the_real_trainer(bpy, jobs, tmp_path, monkeypatch):
     assert "signal 9" in watch.problem
 
 
-def test_resuming_takes_what_trains_now(bpy, lodgs, jobs, fake, root, tmp_path):
+def test_resume_uses_the_current_backend(bpy, lodgs, jobs, fake, root, tmp_path):
     fake("killed")
     with pytest.raises(RuntimeError):
         bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
@@ -636,8 +636,8 @@ def test_resuming_takes_what_trains_now(bpy, lodgs, jobs, fake, root, tmp_path):
     assert Job.from_file(tmp_path / "run" / "job.toml").backend == "cpu"
 
 
-def test_octree_levels_add_up_and_follow_the_distance(bpy, lodgs, jobs, tmp_path, monkeypatch):
-    """The real trainer again: all levels arrive together, twice, and choose by distance at once."""
+def test_octree_levels_are_cumulative_and_follow_the_distance(bpy, lodgs, jobs, tmp_path, monkeypatch):
+    """With the real trainer, all levels arrive together, twice, and are selected by distance at once."""
     if not TRAINER:
         pytest.skip("no trainer; set LODGS_TRAINER_PYTHON")
     monkeypatch.setenv("NUMBA_CACHE_DIR", "")
@@ -663,10 +663,10 @@ def test_octree_levels_add_up_and_follow_the_distance(bpy, lodgs, jobs, tmp_path
     )
     assert 0 < shown <= everything
     bundles = lodgs("training.splats.bundle")
-    bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "again.ply"))
-    ours, theirs = (bundles.read_bundle(p) for p in (tmp_path / "again.ply", watch.folder.bundle))
-    assert ours.cumulative and ours.meta == theirs.meta
-    for a, b in zip(ours.levels, theirs.levels, strict=True):
+    bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "export.ply"))
+    exported, trained = (bundles.read_bundle(p) for p in (tmp_path / "export.ply", watch.folder.bundle))
+    assert exported.cumulative and exported.meta == trained.meta
+    for a, b in zip(exported.levels, trained.levels, strict=True):
         assert (a.splats.means == b.splats.means).all()
         assert (a.splats.extras["lod_bias"] == b.splats.extras["lod_bias"]).all()
         assert (a.splats.extras["lod_level"] == a.number).all()

@@ -1,4 +1,4 @@
-"""Splats that came without photographs get levels: the views of them, the job, and what comes back."""
+"""Training of levels for splats without photos: rendered views, job and result."""
 
 import os
 
@@ -15,10 +15,10 @@ TRAINER = os.environ.get("LODGS_TRAINER_PYTHON", "")
 
 
 def ball(count: int = 400) -> Splats:
-    """Opaque splats on a sphere of radius 2 about (5, -1, 3)."""
+    """Opaque splats on a sphere with radius 2 and centre (5, -1, 3)."""
     rng = np.random.default_rng(1)
-    out = rng.normal(size=(count, 3))
-    means = 2 * out / np.linalg.norm(out, axis=1, keepdims=True) + [5, -1, 3]
+    directions = rng.normal(size=(count, 3))
+    means = 2 * directions / np.linalg.norm(directions, axis=1, keepdims=True) + [5, -1, 3]
     return Splats(
         means.astype(np.float32), np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
         np.full((count, 3), np.log(0.15), np.float32), np.full(count, 4.0, np.float32),
@@ -28,7 +28,7 @@ def ball(count: int = 400) -> Splats:
 
 @pytest.fixture
 def root(bpy, tmp_path):
-    """The ball as its import leaves it, then turned, moved and enlarged."""
+    """The imported ball with a transform."""
     write_bundle(tmp_path / "ball.ply", Bundle("", [Level(1, ball())]))
     bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "ball.ply"))
     (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
@@ -47,49 +47,49 @@ def new_camera(bpy, location, lens=35.0):
 
 
 def train(bpy, tmp_path):
-    """The job of a training with the fake trainer, and its views."""
+    """Train with the fake trainer. Return the job and its views."""
     assert bpy.ops.lodgs.train(folder=str(tmp_path / "run")) == {"FINISHED"}
     files = sorted((tmp_path / "run" / "cameras").glob("*.json"))
     return Job.from_file(tmp_path / "run" / "job.toml"), [read_camera(file) for file in files]
 
 
-def assert_sees_as_blender(bpy, root, camera, view, near):
-    """Where splats are in a picture is where Blender itself says that its camera sees them."""
+def assert_matches_blender(bpy, root, camera, view, near):
+    """Assert that splats project to the pixels and depths that Blender computes for its camera."""
     from bpy_extras.object_utils import world_to_camera_view
     from mathutils import Vector
 
     points = ball(20).means.astype(float)
     pixels, depths = view.project(points)
     for point, pixel, depth in zip(points, pixels, depths, strict=True):
-        place = root.lodgs.axes.matrix_world @ Vector(point)
-        x, y, away = world_to_camera_view(bpy.context.scene, camera, place)
+        position = root.lodgs.axes.matrix_world @ Vector(point)
+        x, y, distance = world_to_camera_view(bpy.context.scene, camera, position)
         assert pixel == pytest.approx((x * view.width, (1 - y) * view.height), abs=0.02)
-        assert depth * 2 == pytest.approx(away, rel=1e-4)  # the root is twice as large
+        assert depth * 2 == pytest.approx(distance, rel=1e-4)  # the root is twice as large
     assert near == pytest.approx(camera.data.clip_start / 2)
 
 
-def test_imported_splats_are_handed_over_as_they_are_now(bpy, lodgs, fake, root, tmp_path):
+def test_current_splats_are_exported_to_the_run(bpy, lodgs, fake, root, tmp_path):
     fake()
     objects = lodgs("data.objects")
     (item,) = root.lodgs.levels
     thinned = objects.new_splats("fewer", ball().select(slice(0, 150)))
-    item.object.data = thinned.data  # an artist has deleted some
-    before = item.object
+    item.object.data = thinned.data  # some splats were deleted
+    finest = item.object
     root.lodgs.training.view_width = 300
     job, views = train(bpy, tmp_path)
     assert (job.method, job.scene, job.capture, job.views, job.view_width) == ("lodge", "", "dome", 64, 300)
-    assert job.test_every == 8 and not views, "the trainer places them"
+    assert job.test_every == 8 and not views, "the trainer places the views"
     assert job.base == str(tmp_path / "run" / "base.ply")
-    (handed,) = read_bundle(job.base).levels
+    (exported,) = read_bundle(job.base).levels
     for name, column in vars(ball().select(slice(0, 150))).items():
         if name != "extras":
-            np.testing.assert_array_equal(getattr(handed.splats, name), column)
+            np.testing.assert_array_equal(getattr(exported.splats, name), column)
     levels = {item.number: item.object for item in root.lodgs.levels}
     assert {number: len(obj.data.points) for number, obj in levels.items()} == COUNTS
-    assert levels[1] == before, "its object stays, with all that hangs on it"
+    assert levels[1] == finest, "the object stays with its modifiers and children"
 
 
-def test_every_camera_of_the_scene(bpy, fake, root, tmp_path):
+def test_views_of_all_cameras(bpy, fake, root, tmp_path):
     fake()
     root.lodgs.training.views_from = "CAMERAS"
     with pytest.raises(RuntimeError, match="has 0 camera"):
@@ -103,10 +103,10 @@ def test_every_camera_of_the_scene(bpy, fake, root, tmp_path):
     assert job.capture == str(tmp_path / "run" / "cameras") and job.test_every == 0
     for camera, (view, near) in zip(cameras, views, strict=True):
         assert (view.width, view.height) == (400, 150)
-        assert_sees_as_blender(bpy, root, camera, view, near)
+        assert_matches_blender(bpy, root, camera, view, near)
 
 
-def test_a_camera_that_moves(bpy, fake, root, tmp_path):
+def test_views_of_an_animated_camera(bpy, fake, root, tmp_path):
     fake()
     camera = bpy.context.scene.camera = new_camera(bpy, (0, -9, 4))
     scene, training = bpy.context.scene, root.lodgs.training
@@ -121,10 +121,10 @@ def test_a_camera_that_moves(bpy, fake, root, tmp_path):
     assert scene.frame_current == 7
     for frame, (view, near) in zip((1, 11, 21, 31, 41), views, strict=True):
         scene.frame_set(frame)
-        assert_sees_as_blender(bpy, root, camera, view, near)
+        assert_matches_blender(bpy, root, camera, view, near)
 
 
-def test_a_walk_along_a_curve(bpy, fake, root, tmp_path):
+def test_views_along_a_curve(bpy, fake, root, tmp_path):
     fake()
     training = root.lodgs.training
     training.views_from, training.views = "CURVE", 30
@@ -136,13 +136,15 @@ def test_a_walk_along_a_curve(bpy, fake, root, tmp_path):
     bpy.context.view_layer.objects.active = root
     curves = len(bpy.data.curves), len(bpy.data.objects)
     _, views = train(bpy, tmp_path)
-    assert (len(bpy.data.curves), len(bpy.data.objects)) == (curves[0], curves[1] + 1), "but for a level"
+    assert (len(bpy.data.curves), len(bpy.data.objects)) == (curves[0], curves[1] + 1), (
+        "only one level was added"
+    )
     matrix = np.array(root.lodgs.axes.matrix_world)
-    eyes = np.array([view.center for view, _ in views]) @ matrix[:3, :3].T + matrix[:3, 3]
-    np.testing.assert_allclose(np.linalg.norm(eyes[:, :2] - [1, 2], axis=1), 6, atol=0.1)
-    np.testing.assert_allclose(eyes[:, 2], 1.7, atol=1e-5)
-    apart = np.linalg.norm(eyes - np.roll(eyes, 1, axis=0), axis=1)
-    np.testing.assert_allclose(apart, apart.mean(), rtol=0.02)  # all the way round
+    centers = np.array([view.center for view, _ in views]) @ matrix[:3, :3].T + matrix[:3, 3]
+    np.testing.assert_allclose(np.linalg.norm(centers[:, :2] - [1, 2], axis=1), 6, atol=0.1)
+    np.testing.assert_allclose(centers[:, 2], 1.7, atol=1e-5)
+    gaps = np.linalg.norm(centers - np.roll(centers, 1, axis=0), axis=1)
+    np.testing.assert_allclose(gaps, gaps.mean(), rtol=0.02)  # evenly spaced on the circle
     for view, _ in views:
         down = matrix[:3, :3] @ view.world_to_camera[1, :3]
         np.testing.assert_allclose(down / np.linalg.norm(down), [0, 0, -1], atol=1e-5)
@@ -150,17 +152,15 @@ def test_a_walk_along_a_curve(bpy, fake, root, tmp_path):
     assert training.curve is None
 
 
-def test_a_method_that_needs_photographs_says_so(bpy, fake, root, tmp_path):
+def test_method_that_needs_photos_is_rejected(bpy, fake, root, tmp_path):
     fake()
     root.lodgs.training.method = "flod"
-    with pytest.raises(RuntimeError, match="FLoD needs photographs"):
+    with pytest.raises(RuntimeError, match="with FLoD: it has no photos"):
         bpy.ops.lodgs.train(folder=str(tmp_path / "run"))
     assert not (tmp_path / "run").exists()
 
 
-def test_splats_of_a_scene_with_photographs_can_be_begun_with_as_they_are_now(
-    bpy, lodgs, fake, root, tmp_path
-):
+def test_training_with_photos_starts_from_the_current_splats(bpy, lodgs, fake, root, tmp_path):
     fake()
     root.lodgs.scene_folder, root.lodgs.training.start_from = str(tmp_path / "scene"), "SCENE"
     job, _ = train(bpy, tmp_path)
@@ -168,19 +168,19 @@ def test_splats_of_a_scene_with_photographs_can_be_begun_with_as_they_are_now(
     np.testing.assert_array_equal(read_bundle(job.base).levels[-1].splats.means, ball().means)
 
 
-def test_the_real_trainer_gives_levels_to_splats_alone(bpy, lodgs, root, tmp_path, monkeypatch):
+def test_the_real_trainer_adds_levels_to_splats_without_photos(bpy, lodgs, root, tmp_path, monkeypatch):
     if not TRAINER:
         pytest.skip("no trainer; set LODGS_TRAINER_PYTHON")
-    monkeypatch.setenv("NUMBA_CACHE_DIR", "")  # the checkout's own, so that kernels compile once
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")  # cache of the checkout, so that kernels compile once
     jobs, training = lodgs("runs.jobs"), root.lodgs.training
     training.views, training.view_width, training.image_scale = 8, 96, 1.0
     (item,) = root.lodgs.levels
     imported = item.object
     watch = jobs.start(root, str(tmp_path / "run"), {"levels": 3, "tune_steps": 3})
-    seen = []
-    jobs.follow(watch, lambda watch: seen.append(watch.message))
+    messages = []
+    jobs.follow(watch, lambda watch: messages.append(watch.message))
     assert (watch.state, watch.problem) == ("done", "")
-    assert any("Drawing view" in message for message in seen)
+    assert any("Drawing view" in message for message in messages)
     levels = {item.number: item.object for item in root.lodgs.levels}
     assert list(levels) == [1, 2, 3] and levels[3] == imported and imported.name.endswith("level 3")
     finest = lodgs("data.scenes").read_level(root, 3)
