@@ -154,6 +154,18 @@ def test_there_is_no_circle_of_files():
         raise AssertionError("a circle:\n" + "\n".join(f"{a} imports {b}" for a, b in inside))
 
 
+@pytest.mark.parametrize(("package", "limit"), [("training/methods", 20), ("training/lod", 25)])
+def test_parts_of_a_package_hardly_import_each_other(package, limit):
+    """A part is a file or a folder; files of one folder may import each other."""
+
+    def part(file: str) -> str:
+        return file.removeprefix(f"{package}/").split("/")[0]
+
+    inside = {arrow for arrow in arrows() if all(file.startswith(f"{package}/") for file in arrow)}
+    between = {(part(a), part(b)) for a, b in inside if part(a) != part(b)}
+    assert 0 < len(between) <= limit, sorted(between)
+
+
 @pytest.mark.parametrize(
     ("arrow", "answer"),
     [
