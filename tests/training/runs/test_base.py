@@ -1,4 +1,4 @@
-"""What a training can begin with besides points."""
+"""Base splats of a training."""
 
 import numpy as np
 import pytest
@@ -24,32 +24,35 @@ def splats(count: int) -> Splats:
 
 
 @pytest.mark.parametrize("cumulative", [False, True])
-def test_an_exported_folder_is_as_good_as_its_bundle(tmp_path, cumulative):
+def test_base_from_exported_folder_equals_base_from_bundle(tmp_path, cumulative):
     bundle = Bundle("", [Level(1, splats(10)), Level(2, splats(30))], cumulative=cumulative)
     write_bundle(tmp_path / "b.ply", bundle)
     write_folder(tmp_path / "folder", bundle)
-    (wanted, _), (found, _) = read_base(tmp_path / "b.ply"), read_base(tmp_path / "folder")
-    assert len(found) == (40 if cumulative else 30)
+    expected, _ = read_base(tmp_path / "b.ply")
+    splats_read, _ = read_base(tmp_path / "folder")
+    assert len(splats_read) == (40 if cumulative else 30)
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
+        np.testing.assert_array_equal(getattr(splats_read, name), getattr(expected, name))
 
 
-def test_a_base_says_whether_it_is_antialiased(tmp_path):
+def test_base_reports_antialiasing(tmp_path):
     for meta in ({}, {"antialias": True}):
         write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, splats(3))], meta=meta))
         write_ply(tmp_path / "p.ply", splats(3), comments_from_meta(meta))
         assert [read_base(tmp_path / name)[1] for name in ("b.ply", "p.ply")] == [bool(meta)] * 2
 
 
-def test_a_folder_of_something_else_is_no_base(tmp_path):
-    with pytest.raises(LodgsError, match="holds no finished run"):
+def test_unrelated_folder_is_rejected_as_base(tmp_path):
+    with pytest.raises(LodgsError, match="is not a finished run"):
         read_base(tmp_path)
 
 
 @pytest.mark.parametrize("kind", ["plain", "finest_first", "stream", "cumulative", "smoothed"])
-def test_splats_that_stay_in_their_file_are_those_that_are_read(tmp_path, monkeypatch, kind):
+def test_base_opened_on_disk_equals_base_read_into_memory(tmp_path, monkeypatch, kind):
     monkeypatch.setattr(bundles, "BATCH_ROWS", 7)
-    path, told, finest = tmp_path / "b.ply", [], splats(50)
+    path = tmp_path / "b.ply"
+    warnings = []
+    finest = splats(50)
     finest.means[20] = np.nan
     finest.extras["size"] = np.arange(50, dtype=np.float32)
     if kind in ("plain", "smoothed"):
@@ -60,11 +63,11 @@ def test_splats_that_stay_in_their_file_are_those_that_are_read(tmp_path, monkey
         write_bundle(path, bundle, "stream" if kind == "stream" else "finest_first")
     expected = read_bundle(path)
     expected = complete(expected, expected.levels[-1])
-    rows, _ = base.open_base(path, told.append)
+    rows, _ = base.open_base(path, warnings.append)
     assert len(rows) == len(expected) == (59 if kind == "cumulative" else 49)
-    assert len(told) == 1 and told[0].startswith("1 splats of")
-    for some in (slice(None), slice(17, 23), slice(40, 90)):
-        one, other = rows.select(some), expected.select(some)
+    assert len(warnings) == 1 and warnings[0].startswith("1 splats of")
+    for selection in (slice(None), slice(17, 23), slice(40, 90)):
+        part, expected_part = rows.select(selection), expected.select(selection)
         for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
-            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+            np.testing.assert_array_equal(getattr(part, name), getattr(expected_part, name))
     assert kind == "cumulative" or "size" in rows.select(slice(3)).extras

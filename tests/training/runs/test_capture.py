@@ -1,4 +1,4 @@
-"""Splats alone become a scene: its pictures are theirs, its points lie on them, and LODGE trains from it."""
+"""Capture of splats as a COLMAP scene: its images and points match the splats, and LODGE trains from it."""
 
 import json
 import time
@@ -25,10 +25,10 @@ from training.splats.ply import write_ply
 
 @pytest.fixture(scope="module")
 def ball() -> Splats:
-    """Opaque splats on a sphere of radius 2 about (5, -1, 3), and one astray far away."""
+    """Opaque splats on a sphere of radius 2 around (5, -1, 3), and one outlier far away."""
     rng = np.random.default_rng(1)
-    out = rng.normal(size=(600, 3))
-    means = 2 * out / np.linalg.norm(out, axis=1, keepdims=True) + [5, -1, 3]
+    directions = rng.normal(size=(600, 3))
+    means = 2 * directions / np.linalg.norm(directions, axis=1, keepdims=True) + [5, -1, 3]
     means[0] = [900, 0, 0]
     return Splats(
         means.astype(np.float32), np.tile(np.float32([1, 0, 0, 0]), (600, 1)),
@@ -37,30 +37,31 @@ def ball() -> Splats:
     )  # fmt: skip
 
 
-def test_a_dome_shows_all_that_is_not_astray_from_all_sides(ball):
+def test_dome_views_surround_all_splats_except_outliers(ball):
     views, near = dome_views(ball, 24, 96, 64)
-    eyes = np.array([view.center for view in views]) - [5, -1, 3]
-    assert np.linalg.norm(eyes.mean(axis=0)) < 0.25 * np.linalg.norm(eyes, axis=1).mean()
+    centers = np.array([view.center for view in views]) - [5, -1, 3]
+    assert np.linalg.norm(centers.mean(axis=0)) < 0.25 * np.linalg.norm(centers, axis=1).mean()
     for view in views:
         assert view.sees(ball.means[1:], near=near).all()
-    assert 0 < near < np.linalg.norm(eyes, axis=1).min() - 2
+    assert 0 < near < np.linalg.norm(centers, axis=1).min() - 2
 
 
-def test_the_scene_has_the_splats_own_pictures_and_points_on_them(ball, tmp_path):
+def test_captured_images_and_points_match_the_splats(ball, tmp_path):
     views, near = dome_views(ball, 12, 96, 64)
     count = write_scene(tmp_path / "scene", ball, views, near, points=2000)
     scene = read_scene(tmp_path / "scene")
     assert len(scene.points) == count > 100 and len(scene.cameras) == 12
-    away = np.linalg.norm(scene.points - [5, -1, 3], axis=1)
-    assert np.quantile(np.abs(away - 2), 0.95) < 0.25
+    radii = np.linalg.norm(scene.points - [5, -1, 3], axis=1)
+    assert np.quantile(np.abs(radii - 2), 0.95) < 0.25
     for view, camera in zip(views, scene.cameras, strict=True):
         np.testing.assert_allclose(camera.world_to_camera, view.world_to_camera, atol=1e-9)
-        drawn = rasterize(Gaussians.of(ball), view, near=near, backend="reference").image.numpy().clip(0, 1)
-        photograph = load_image(camera.image, 96, 64)
-        assert np.abs(photograph - drawn).mean() < 0.02  # it is a JPEG
+        rendering = rasterize(Gaussians.of(ball), view, near=near, backend="reference")
+        photo = load_image(camera.image, 96, 64)
+        error = np.abs(photo - rendering.image.numpy().clip(0, 1)).mean()
+        assert error < 0.02  # the photo is a JPEG
 
 
-def test_pictures_of_antialiased_splats_are_so(ball, tmp_path):
+def test_captured_images_of_antialiased_splats_are_antialiased(ball, tmp_path):
     views, near = dome_views(ball, 6, 96, 64)
     small = replace(ball, log_scales=ball.log_scales - np.float32(1))
     for view in views:
@@ -69,84 +70,86 @@ def test_pictures_of_antialiased_splats_are_so(ball, tmp_path):
     command = ["capture", str(tmp_path / "small.ply"), "--cameras", str(tmp_path / "cameras")]
     assert main([*command, "--out", str(tmp_path / "scene")]) == 0
     for view, camera in zip(views, read_scene(tmp_path / "scene").cameras, strict=True):
-        photograph = load_image(camera.image, 96, 64)
+        photo = load_image(camera.image, 96, 64)
         errors = [
             np.abs(
                 rasterize(Gaussians.of(small), view, near=near, antialias=flag, backend="reference")
                 .image.numpy()
                 .clip(0, 1)
-                - photograph
+                - photo
             ).mean()
             for flag in (True, False)
         ]
         assert errors[0] < 0.02 and errors[0] < errors[1] / 2
 
 
-def test_nothing_is_overwritten_and_nothing_half_is_left(ball, tmp_path):
+def test_capture_overwrites_nothing_and_leaves_no_partial_scene(ball, tmp_path):
     views, near = dome_views(ball, 4, 48, 32)
-    (tmp_path / "there").mkdir()
-    with pytest.raises(LodgsError, match="exists already"):
-        write_scene(tmp_path / "there", ball, views, near)
+    (tmp_path / "existing").mkdir()
+    with pytest.raises(LodgsError, match="already exists"):
+        write_scene(tmp_path / "existing", ball, views, near)
     unseen = Splats(**{**vars(ball), "means": ball.means + np.float32(1e4)})
     with pytest.raises(LodgsError, match="No two views"):
         write_scene(tmp_path / "new", unseen, views, near)
-    assert [path.name for path in tmp_path.iterdir()] == ["there"] and not any((tmp_path / "there").iterdir())
+    assert [path.name for path in tmp_path.iterdir()] == ["existing"] and not any(
+        (tmp_path / "existing").iterdir()
+    )
     faint = Splats(**{**vars(ball), "opacity_logits": np.full(600, -3, np.float32)})
     with pytest.raises(LodgsError, match="no opaque splat"):
         dome_views(faint, 4)
 
 
-def test_views_along_a_way_are_level_and_look_all_around(ball):
-    way = np.array([[0, 0, 0], [3, 0, 0], [3, 0, 0], [3, 0.6, 9]], float)  # -y is up: it leads down a little
-    views, near = walk_views(ball, way, np.array([0.0, -2, 0]), 24, 96, 64)
-    eyes = np.array([view.center for view in views])
-    on_first = eyes[:, 2] < 1e-9
-    np.testing.assert_allclose(eyes[on_first, 1:], 0, atol=1e-9)
-    np.testing.assert_allclose(eyes[~on_first, 0], 3, atol=1e-9)
-    steps = np.linalg.norm(np.diff(eyes, axis=0), axis=1)
+def test_views_along_a_path_are_level_and_look_in_all_directions(ball):
+    path = np.array([[0, 0, 0], [3, 0, 0], [3, 0, 0], [3, 0.6, 9]], float)  # -y is up: it descends slightly
+    views, near = walk_views(ball, path, np.array([0.0, -2, 0]), 24, 96, 64)
+    centers = np.array([view.center for view in views])
+    on_first = centers[:, 2] < 1e-9
+    np.testing.assert_allclose(centers[on_first, 1:], 0, atol=1e-9)
+    np.testing.assert_allclose(centers[~on_first, 0], 3, atol=1e-9)
+    steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
     assert np.median(steps) == pytest.approx((3 + np.hypot(0.6, 9)) / 24)
     _, down, ahead = np.array([view.world_to_camera[:3, :3] for view in views]).transpose(1, 0, 2)
     np.testing.assert_allclose(ahead[:, 1], 0, atol=1e-9)
     np.testing.assert_allclose(down, np.tile([0, 1, 0], (24, 1)), atol=1e-9)
     np.testing.assert_allclose(ahead[0], [1, 0, 0], atol=1e-9)
     np.testing.assert_allclose(ahead[-6], [0, 0, 1], atol=1e-9)
-    about = np.sort(np.degrees(np.arctan2(ahead[-6:, 0], ahead[-6:, 2])) % 360)
-    np.testing.assert_allclose(np.diff(about), 60, atol=1e-9)
-    turned = np.cross(ahead[-6], ahead[-5])  # the first side is the left one, seen with -y up
+    headings = np.sort(np.degrees(np.arctan2(ahead[-6:, 0], ahead[-6:, 2])) % 360)
+    np.testing.assert_allclose(np.diff(headings), 60, atol=1e-9)
+    turned = np.cross(ahead[-6], ahead[-5])  # views turn to the left first, with -y up
     assert turned[1] < 0 < near < 1
-    for odd in (way[:1], np.array([[0, 0, 0], [0, 5, 0]], float)):
+    for invalid in (path[:1], np.array([[0, 0, 0], [0, 5, 0]], float)):
         with pytest.raises(LodgsError, match="no length, or leads straight up"):
-            walk_views(ball, odd, np.array([0.0, -1, 0]), 6)
+            walk_views(ball, invalid, np.array([0.0, -1, 0]), 6)
 
 
-def test_views_above_show_all_of_an_area_from_all_sides():
+def test_aerial_views_show_an_area_from_all_directions():
     ground = np.array([(x, y, z) for x in (-30, 30) for y in (5, 35) for z in (1, 4)], float)
     views, near = aerial_views(ground, 200, 96, 64)
-    eyes = np.array([view.center for view in views])
-    raised = eyes[0, 2] - 4
-    np.testing.assert_allclose(eyes[:, 2], 4 + raised)
-    assert raised == pytest.approx(2 * 3) and 0 < near < 0.1 * raised, "a grid of 20 x 10: every 3 m a view"
+    centers = np.array([view.center for view in views])
+    raised = centers[0, 2] - 4
+    np.testing.assert_allclose(centers[:, 2], 4 + raised)
+    assert raised == pytest.approx(2 * 3) and 0 < near < 0.1 * raised, "a grid of 20 x 10 views, 3 m apart"
     looks = np.array([view.world_to_camera[2, :3] for view in views])
-    targets = eyes + looks * (raised / -looks[:, 2:])  # where their middles meet the top
-    for axis, (low, high, many) in enumerate([(-30, 30, 20), (5, 35, 10)]):
-        middles = low + (np.arange(many) + 0.5) / many * (high - low)
+    targets = centers + looks * (raised / -looks[:, 2:])  # intersections of the optical axes with the top
+    for axis, (low, high, count) in enumerate([(-30, 30, 20), (5, 35, 10)]):
+        middles = low + (np.arange(count) + 0.5) / count * (high - low)
         np.testing.assert_allclose(np.unique(targets[:, axis].round(6)), middles)
     kinds, counts = np.unique(looks.round(6), axis=0, return_counts=True)
     assert len(kinds) == 5 and (counts == 40).all()
     np.testing.assert_allclose(np.abs(looks[:, 2]), np.where(np.abs(looks[:, 2]) > 0.9, 1, np.sqrt(0.5)))
-    places = np.random.default_rng(0).uniform((-30, 5, 1), (30, 35, 4), (300, 3))
-    assert np.sum([view.sees(places) for view in views], axis=0).min() >= 4
+    positions = np.random.default_rng(0).uniform((-30, 5, 1), (30, 35, 4), (300, 3))
+    assert np.sum([view.sees(positions) for view in views], axis=0).min() >= 4
     assert aerial_views(ground, 200, raised=11.0)[0][7].center[2] == pytest.approx(15)
     line, _ = aerial_views(np.array([[0, 0, 0], [0, 9, 0]], float), 9)
     np.testing.assert_allclose(np.ptp([view.center[2] for view in line]), 0, atol=1e-9)
-    for odd, says in ((ground[:0], "no opaque"), (ground[:1], "no extent")):
-        with pytest.raises(LodgsError, match=says):
-            aerial_views(odd, 9)
+    for invalid, message in ((ground[:0], "no opaque"), (ground[:1], "no extent")):
+        with pytest.raises(LodgsError, match=message):
+            aerial_views(invalid, 9)
 
 
 @pytest.fixture
 def cameras(ball, tmp_path):
-    """A folder of camera files, of two lenses."""
+    """Folder of camera files with two different lenses."""
     views, near = dome_views(ball, 8, 96, 64)
     for number, view in enumerate(views):
         write_camera(
@@ -155,7 +158,7 @@ def cameras(ball, tmp_path):
     return tmp_path / "cameras"
 
 
-def test_views_may_have_lenses_of_their_own(ball, cameras, tmp_path):
+def test_captured_views_may_have_different_lenses(ball, cameras, tmp_path):
     views, near = read_camera_folder(cameras)
     assert near > 0 and len({view.focal for view in views}) == 2
     assert write_scene(tmp_path / "scene", ball, views, near, points=2000) > 10
@@ -169,15 +172,15 @@ QUICK = ["--set", "tune_steps=4", "--set", "levels=2", "--image-scale", "1"]
 
 
 @pytest.mark.slow
-def test_from_a_ply_alone_to_levels_in_a_shell(ball, cameras, tmp_path, capsys):
-    """In two commands, and in one: the same views give the same levels."""
+def test_train_levels_from_a_ply_without_photos(ball, cameras, tmp_path, capsys):
+    """With separate capture and train commands, and with one: the same views give the same levels."""
     write_ply(tmp_path / "ball.ply", ball)
     source, scene = str(tmp_path / "ball.ply"), str(tmp_path / "scene")
     assert main(["capture", source, "--out", scene, "--cameras", str(cameras)]) == 0
     assert "8 views" in capsys.readouterr().out
     training = ["train", *QUICK, "--method", "lodge", "--base", source]
-    for name, where in (("two", ["--scene", scene]), ("one", ["--capture", str(cameras)])):
-        assert main([*training, *where, "--out", str(tmp_path / name)]) == 0
+    for name, source_options in (("two", ["--scene", scene]), ("one", ["--capture", str(cameras)])):
+        assert main([*training, *source_options, "--out", str(tmp_path / name)]) == 0
         assert json.loads(capsys.readouterr().out.splitlines()[-1])["event"] == "done"
     two, one = (read_bundle(RunFolder(tmp_path / name).bundle) for name in ("two", "one"))
     assert [level.number for level in one.levels] == [1, 2] and one.rule == "chunks"
@@ -188,12 +191,12 @@ def test_from_a_ply_alone_to_levels_in_a_shell(ball, cameras, tmp_path, capsys):
     np.testing.assert_array_equal(finest.sh[:, :1], base.sh)
     np.testing.assert_array_equal(one.levels[0].splats.means, two.levels[0].splats.means)
     assert len(cost_curves(one.meta)) == 1 and (tmp_path / "one" / "costs.png").stat().st_size > 1000
-    drawn = [e for e in RunFolder(tmp_path / "one").events()[0] if e.get("of") == 8]
-    assert [e["step"] for e in drawn] == list(range(1, 9)) and drawn[2]["message"] == "Drawing view 3 of 8"
+    views = [e for e in RunFolder(tmp_path / "one").events()[0] if e.get("of") == 8]
+    assert [e["step"] for e in views] == list(range(1, 9)) and views[2]["message"] == "Rendering view 3 of 8"
 
 
 @pytest.mark.slow
-def test_a_capture_that_is_cancelled_leaves_nothing_and_goes_on_where_the_run_lies_now(
+def test_cancelled_capture_leaves_no_files_and_resumes_after_the_run_was_moved(
     ball, tmp_path, capsys, monkeypatch
 ):
     run = RunFolder(tmp_path / "run")
@@ -211,30 +214,30 @@ def test_a_capture_that_is_cancelled_leaves_nothing_and_goes_on_where_the_run_li
         "--seed",
         "1",
     ]
-    draw = capture.rasterize
+    original = capture.rasterize
 
     def cancelled(*arguments, **options):
         run.request_cancel()
         time.sleep(10)
-        raise AssertionError("nobody has heard it")
+        raise AssertionError("not interrupted")
 
     monkeypatch.setattr(capture, "rasterize", cancelled)
     assert main(["train", *QUICK, "--method", "lodge", *words, "--out", str(run.path)]) == 3
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["event"] == "cancelled"
     assert not run.captured.exists() and not list(run.path.glob(".captured*"))
-    monkeypatch.setattr(capture, "rasterize", draw)
-    moved = RunFolder(run.path.rename(tmp_path / "elsewhere"))
+    monkeypatch.setattr(capture, "rasterize", original)
+    moved = RunFolder(run.path.rename(tmp_path / "moved"))
     assert main(["train", str(moved.job)]) == 0
     assert len(list((moved.captured / "images").iterdir())) == 6 and read_bundle(moved.bundle).levels
     assert main(["evaluate", str(moved.path)]) == 0
 
 
 @pytest.mark.parametrize(
-    ("words", "what"),
-    [(["--cameras", "."], "no two camera files"), (["--views", "1"], "views = 1 is not possible")],
+    ("words", "message"),
+    [(["--cameras", "."], "no two camera files"), (["--views", "1"], "views = 1")],
 )
-def test_a_capture_says_what_it_lacks(ball, tmp_path, capsys, monkeypatch, words, what):
+def test_capture_reports_missing_views(ball, tmp_path, capsys, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
     write_ply(tmp_path / "ball.ply", ball)
     assert main(["capture", "ball.ply", "--out", "scene", *words]) == 2
-    assert what in capsys.readouterr().err and not (tmp_path / "scene").exists()
+    assert message in capsys.readouterr().err and not (tmp_path / "scene").exists()

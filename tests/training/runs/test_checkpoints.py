@@ -1,4 +1,4 @@
-"""Checkpoints: whole or not at all, whatever happened to the file."""
+"""Checkpoints: verified reading, damage, full disks and low memory."""
 
 import errno
 import os
@@ -22,41 +22,42 @@ def run(tmp_path) -> RunFolder:
     return run
 
 
-def test_what_was_written_is_read(run):
-    taken = []
-    assert read_newest(run, "cpu", taken.append, pytest.fail) == (2, [])
-    assert taken[0]["step"] == 2 and taken[0]["means"].shape == (200, 3)
+def test_checkpoint_round_trip(run):
+    states = []
+    assert read_newest(run, "cpu", states.append, pytest.fail) == (2, [])
+    assert states[0]["step"] == 2 and states[0]["means"].shape == (200, 3)
 
 
 @pytest.mark.parametrize("damage", ["flip", "zero", "cut", "swap"])
-def test_damage_is_noticed_or_changes_nothing(run, damage):
+def test_damage_is_detected_or_harmless(run, damage):
     path = run.checkpoints / "step_0000002.pt"
     good, truth = path.read_bytes(), read_checkpoint(path, "cpu")
-    chance = random.Random(damage)
-    refused = 0
+    rng = random.Random(damage)
+    detected = 0
     for _ in range(60):
-        data, place = bytearray(good), chance.randrange(len(good) - 64)
+        data = bytearray(good)
+        offset = rng.randrange(len(good) - 64)
         if damage == "flip":
-            data[place] ^= 1 << chance.randrange(8)
+            data[offset] ^= 1 << rng.randrange(8)
         elif damage == "zero":
-            data[place : place + 64] = bytes(64)
+            data[offset : offset + 64] = bytes(64)
         elif damage == "cut":
-            del data[place:]
+            del data[offset:]
         else:
-            data[place : place + 32], data[:32] = data[:32], data[place : place + 32]
+            data[offset : offset + 32], data[:32] = data[:32], data[offset : offset + 32]
         path.write_bytes(data)
         try:
             state = read_checkpoint(path, "cpu")
         except Exception:
-            refused += 1
+            detected += 1
             continue
         assert state["step"] == truth["step"] and state["method"]["step"] == 2
         assert torch.equal(state["method"]["means"], truth["method"]["means"])
-    assert refused > 20
+    assert detected > 20
 
 
-def test_a_full_disk_is_said_to_be_full(run, monkeypatch):
-    """torch itself says ``[enforce fail at inline_container.cc``."""
+def test_full_disk_is_reported_as_such(run, monkeypatch):
+    """torch reports only ``[enforce fail at inline_container.cc``."""
     from training.runs import checkpoints
 
     class Full:
@@ -72,7 +73,7 @@ def test_a_full_disk_is_said_to_be_full(run, monkeypatch):
         def flush(self):
             self._file.flush()
 
-    monkeypatch.setattr(checkpoints, "_Remembering", Full)
+    monkeypatch.setattr(checkpoints, "_ErrorRecorder", Full)
     with pytest.raises(Exception, match="No space left on device") as error:
         write_checkpoint(run, 3, [], {"means": torch.zeros(5000, 3)})
     assert "Free some space" in describe_error(error.value)[1]
@@ -80,9 +81,9 @@ def test_a_full_disk_is_said_to_be_full(run, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("error", "says"),
+    ("error", "message"),
     [
-        (OSError(errno.ENOSPC, "No space left on device"), "The disk is full"),
+        (OSError(errno.ENOSPC, "No space left on device"), "the disk is full"),
         (OSError(errno.EROFS, "Read-only file system", "/run/x"), "Read-only file system (/run/x)"),
         (OSError(errno.ENOMEM, "Cannot allocate memory"), "not enough memory"),
         (RuntimeError("[enforce fail at alloc_cpu.cpp:121] . DefaultCPUAllocator: can't allocate memory: you "
@@ -90,25 +91,26 @@ def test_a_full_disk_is_said_to_be_full(run, monkeypatch):
         (MemoryError(), "not enough memory"),
     ],
 )  # fmt: skip
-def test_what_a_computer_lacks_is_a_sentence(error, says):
-    what, remedy, code = describe_error(error)
-    assert says in what and remedy and code == 2
+def test_lack_of_resources_is_reported_with_a_remedy(error, message):
+    problem, remedy, code = describe_error(error)
+    assert message in problem and remedy and code == 2
 
 
-def test_a_spoilt_checkpoint_does_not_push_out_one_that_can_be_read(run):
-    spoilt, warned = run.checkpoints / "step_0000002.pt", []
-    spoilt.write_bytes(b"nothing")
-    assert read_newest(run, "cpu", lambda state: None, warned.append) == (1, [])
-    assert len(warned) == 1 and not spoilt.exists()
+def test_corrupt_checkpoint_does_not_displace_a_readable_one(run):
+    corrupt = run.checkpoints / "step_0000002.pt"
+    warnings = []
+    corrupt.write_bytes(b"nothing")
+    assert read_newest(run, "cpu", lambda state: None, warnings.append) == (1, [])
+    assert len(warnings) == 1 and not corrupt.exists()
     write_checkpoint(run, 2, [], {})
     assert read_newest(run, "cpu", lambda state: None, pytest.fail) == (2, [])
     assert (run.checkpoints / "step_0000001.pt").exists()
 
 
-def test_too_little_memory_is_no_spoilt_checkpoint(run):
-    def take(state):
+def test_low_memory_does_not_delete_checkpoints(run):
+    def load(state):
         raise MemoryError
 
     with pytest.raises(MemoryError):
-        read_newest(run, "cpu", take, pytest.fail)
+        read_newest(run, "cpu", load, pytest.fail)
     assert len(list(run.checkpoints.glob("step_*.pt"))) == 2

@@ -1,4 +1,4 @@
-"""The door where events are read: whatever stands in the file, what leaves it is what its names say."""
+"""Reading events: any file content yields only well-formed events."""
 
 import json
 import math
@@ -32,7 +32,7 @@ def read(tmp_path, *lines) -> list[dict]:
     "event",
     [LEVEL, PROGRESS, PROGRESS | {"blocks": [BLOCK]}, {"event": "done", "veil": {"mean": 0.0, "max": 0.1}}],
 )
-def test_what_the_trainer_says_is_read_as_it_is(tmp_path, event):
+def test_valid_events_round_trip(tmp_path, event):
     assert read(tmp_path, event) == [event]
 
 
@@ -48,7 +48,7 @@ def test_what_the_trainer_says_is_read_as_it_is(tmp_path, event):
         *({"splats": splats} for splats in (-1, 2**31, 10**400, 1.5, "5", [5])),
     ],
 )
-def test_a_level_that_is_none_becomes_one_warning(tmp_path, change):
+def test_malformed_levels_become_one_warning(tmp_path, change):
     (warning,) = read(tmp_path, LEVEL | change, LEVEL | change)
     assert warning["event"] == "warning" and "'level'" in warning["message"]
 
@@ -63,7 +63,7 @@ def test_a_level_that_is_none_becomes_one_warning(tmp_path, change):
         {"cumulative": "yes"}, {"scene_facts": {"d_max": None}}, {"controls": {"gamma": True}},
     ],
 )  # fmt: skip
-def test_a_value_of_another_kind_is_left_out(tmp_path, change):
+def test_malformed_optional_values_are_dropped(tmp_path, change):
     (event,) = read(tmp_path, LEVEL | change)
     assert event == {name: value for name, value in LEVEL.items() if name not in change}
 
@@ -72,63 +72,63 @@ def test_a_value_of_another_kind_is_left_out(tmp_path, change):
     "blocks", [3, [3], [{}], [BLOCK | {"state": "asleep"}], [BLOCK | {"kind": []}], [BLOCK | {"step": -1}],
                [BLOCK | {"block": "../1"}], [BLOCK, {name: 1 for name in BLOCK}]],
 )  # fmt: skip
-def test_blocks_that_are_none_are_left_out(tmp_path, blocks):
+def test_malformed_blocks_are_dropped(tmp_path, blocks):
     assert read(tmp_path, PROGRESS | {"blocks": blocks}) == [PROGRESS]
 
 
 @pytest.mark.parametrize("name", sorted(PROGRESS.keys() - {"event"}))
 @pytest.mark.parametrize("value", ["Infinity", "NaN", "1e400", "null", '"1"', "[1]", "-1e31", "true"])
-def test_progress_has_numbers(tmp_path, name, value):
+def test_progress_requires_valid_numbers(tmp_path, name, value):
     line = json.dumps(PROGRESS | {name: "@"}).replace('"@"', value)
     assert [event["event"] for event in read(tmp_path, line)] in ([], ["warning"])
 
 
-def test_lines_that_are_no_events_are_passed_over(tmp_path):
+def test_other_lines_are_skipped(tmp_path):
     deep = '{"event": "done", "x": ' + "[" * 100_000 + "]" * 100_000 + "}"
     long = '{"event": "warning", "message": "' + "x" * MAX_LINE + '"}'
-    odd = [
+    lines = [
         "not json",
         "[1]",
         "{}",
         '{"event": []}',
-        '{"event": "unheard"}',
+        '{"event": "unknown"}',
         '{"event": {}}',
         "\0",
         "1" * 5000,
     ]
     nested = {"event": "done", "x": [[[[[[[[[[1]]]]]]]]]]}
-    events = read(tmp_path, *odd, deep, long, nested, PROGRESS)
+    events = read(tmp_path, *lines, deep, long, nested, PROGRESS)
     assert events == [{"event": "done"}, PROGRESS]
 
 
-def test_a_file_that_is_too_long_is_a_sentence(tmp_path):
+def test_oversized_file_is_rejected(tmp_path):
     path = tmp_path / "events.jsonl"
     with path.open("wb") as file:
         file.truncate(MAX_BYTES + MAX_LINE)
-    with pytest.raises(LodgsError, match="too long to be a run's events"):
+    with pytest.raises(LodgsError, match="too large"):
         read_events(path)
 
 
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names here")
-def test_a_pipe_is_not_waited_for(tmp_path):
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
+def test_named_pipe_is_rejected_without_waiting(tmp_path):
     os.mkfifo(tmp_path / "events.jsonl")
     with pytest.raises(OSError, match="not a file"):
         read_events(tmp_path / "events.jsonl")
 
 
 @pytest.mark.parametrize("since", [-5, 10**9])
-def test_a_place_that_the_file_does_not_have_is_its_beginning(tmp_path, since):
+def test_offset_outside_the_file_restarts_at_its_beginning(tmp_path, since):
     read(tmp_path, PROGRESS)
     assert read_events(tmp_path / "events.jsonl", since)[0] == [PROGRESS]
 
 
-def test_every_line_is_json_that_other_programs_read(tmp_path):
+def test_lines_are_standard_json(tmp_path):
     line = event_line("level", psnr=math.inf, deep={"x": [math.nan, 1.5]}, name=os.fsdecode(b"caf\xe9.jpg"))
-    said = json.loads(line, parse_constant=lambda name: pytest.fail(name))
-    assert (said["psnr"], said["deep"], said["name"]) == (None, {"x": [None, 1.5]}, "caf?.jpg")
+    record = json.loads(line, parse_constant=lambda name: pytest.fail(name))
+    assert (record["psnr"], record["deep"], record["name"]) == (None, {"x": [None, 1.5]}, "caf?.jpg")
 
 
-def test_after_a_torn_line_a_new_one_begins(tmp_path):
+def test_writer_starts_a_new_line_after_an_incomplete_one(tmp_path):
     path = tmp_path / "events.jsonl"
     path.write_text('{"event": "pro')
     events = EventWriter(path, tmp_path / "reserve", None)

@@ -1,4 +1,4 @@
-"""A run's folder: whose it is, what is written where, and which process is at work in it."""
+"""Run folders: links, locks, cancel requests and the process of the trainer."""
 
 import errno
 import json
@@ -16,7 +16,7 @@ from training.runs import processes
 from training.runs.folder import RunFolder
 
 ROOT = Path(__file__).resolve().parents[3]
-HOLDS = (
+LOCK_RUN = (
     "import sys, time; from training.runs.folder import RunFolder\n"
     "with RunFolder(sys.argv[1]).locked(): print('held', flush=True); time.sleep(600)"
 )
@@ -31,9 +31,9 @@ def run(tmp_path) -> RunFolder:
 
 @pytest.fixture
 def holder(run):
-    """Another process that holds the run."""
+    """Another process that locks the run."""
     with subprocess.Popen(
-        [sys.executable, "-c", HOLDS, str(run.path)], cwd=ROOT, stdout=subprocess.PIPE
+        [sys.executable, "-c", LOCK_RUN, str(run.path)], cwd=ROOT, stdout=subprocess.PIPE
     ) as process:
         assert process.stdout is not None and process.stdout.readline() == b"held\n"
         yield process
@@ -47,39 +47,39 @@ def holder(run):
         "checkpoints", "undistorted", "reserve", "metrics.json", "levels/level_1.ply",
     ],
 )  # fmt: skip
-def test_links_in_a_run_are_refused(run, tmp_path, name):
-    """A stranger's run does not choose where is written."""
-    place = run.path / name
-    if place.is_dir():
-        place.rmdir()
-    place.symlink_to(tmp_path / "elsewhere")
+def test_links_in_a_run_are_rejected(run, tmp_path, name):
+    """A run from an untrusted source cannot redirect writes."""
+    path = run.path / name
+    if path.is_dir():
+        path.rmdir()
+    path.symlink_to(tmp_path / "outside")
     with pytest.raises(LodgsError, match="is a link or a special file"):
         run.create()
-    assert not (tmp_path / "elsewhere").exists()
+    assert not (tmp_path / "outside").exists()
 
 
-def test_files_of_a_run_lie_in_it(run, tmp_path):
-    (run.path / "levels" / "level_1.ply").write_text("here")
-    (tmp_path / "secret").write_text("there")
+def test_find_file_rejects_paths_outside_the_run(run, tmp_path):
+    (run.path / "levels" / "level_1.ply").write_text("inside")
+    (tmp_path / "secret").write_text("outside")
     (run.path / "levels" / "level_2.ply").symlink_to(tmp_path / "secret")
-    assert run.find_file("levels/level_1.ply").read_text() == "here"
+    assert run.find_file("levels/level_1.ply").read_text() == "inside"
     for path in ("levels/level_2.ply", "levels", "levels/level_3.ply", "../secret"):
-        with pytest.raises(LodgsError, match="holds no file"):
+        with pytest.raises(LodgsError, match="has no file"):
             run.find_file(path)
 
 
-def test_what_killed_trainers_left_goes_and_nothing_else(run):
-    left = [run.checkpoints / ".step_0000001.pt.0123abcd.tmp", run.path / ".bundle.ply.89abcdef.tmp"]
-    kept = [run.path / ".notes.tmp", run.path / "mine.tmp", run.checkpoints / "step_0000001.pt"]
-    for path in left + kept:
+def test_locking_deletes_only_temporary_files_of_killed_trainers(run):
+    leftovers = [run.checkpoints / ".step_0000001.pt.0123abcd.tmp", run.path / ".bundle.ply.89abcdef.tmp"]
+    user_files = [run.path / ".notes.tmp", run.path / "mine.tmp", run.checkpoints / "step_0000001.pt"]
+    for path in leftovers + user_files:
         path.write_text("")
     (run.undistorted / "undistorting-x" / "images").mkdir(parents=True)
     with run.locked():
-        assert not any(path.exists() for path in left) and all(path.exists() for path in kept)
+        assert not any(path.exists() for path in leftovers) and all(path.exists() for path in user_files)
         assert not any(run.undistorted.iterdir())
 
 
-def test_a_cancel_that_was_meant_for_another_trainer_is_forgotten(run):
+def test_stale_cancel_request_is_ignored(run):
     run.request_cancel()
     with run.locked():
         assert run.take_cancel() and not run.take_cancel()
@@ -90,16 +90,16 @@ def test_a_cancel_that_was_meant_for_another_trainer_is_forgotten(run):
         assert not run.take_cancel()
 
 
-@pytest.mark.skipif(os.name == "nt", reason="Windows does not delete what is open")
-def test_who_has_lost_the_lock_notices(run):
+@pytest.mark.skipif(os.name == "nt", reason="Windows does not delete open files")
+def test_lost_lock_is_detected(run):
     with run.locked():
         run.require_lock()
         os.unlink(run.path / "lock")
-        with RunFolder(run.path).locked(), pytest.raises(LodgsError, match="or its lock was"):
+        with RunFolder(run.path).locked(), pytest.raises(LodgsError, match="moved or deleted"):
             run.require_lock()
 
 
-def test_a_trainer_is_ended_by_force(run, holder):
+def test_kill_ends_the_trainer(run, holder):
     assert run.running
     run.kill()
     holder.wait(20)
@@ -113,33 +113,34 @@ def test_a_trainer_is_ended_by_force(run, holder):
         {"identity": "elsewhere 1 boot 5"}, {"identity": None}, {"pid": os.getppid()},
     ],
 )  # fmt: skip
-def test_no_other_process_is_ended_whatever_the_file_says(run, holder, change, monkeypatch):
+def test_kill_never_ends_another_process(run, holder, change, monkeypatch):
     lock = run.path / "lock"
     lock.write_text(json.dumps(json.loads(lock.read_text()) | change))
-    monkeypatch.setattr(os, "kill", lambda *_: pytest.fail("it was"))
-    with pytest.raises(LodgsError, match="cannot be ended from here"):
+    monkeypatch.setattr(os, "kill", lambda *_: pytest.fail("killed"))
+    with pytest.raises(LodgsError, match="Cannot kill"):
         run.kill()
     assert holder.poll() is None
 
 
-def test_no_process_is_ended_where_none_is_at_work(run, monkeypatch):
+def test_kill_without_a_running_trainer_is_rejected(run, monkeypatch):
     holder = {"pid": os.getppid(), "identity": processes.identity(os.getppid())}
     (run.path / "lock").write_text(json.dumps(holder))
-    monkeypatch.setattr(os, "kill", lambda *_: pytest.fail("it was"))
-    with pytest.raises(LodgsError, match="cannot be ended from here"):
+    monkeypatch.setattr(os, "kill", lambda *_: pytest.fail("killed"))
+    with pytest.raises(LodgsError, match="Cannot kill"):
         run.kill()
 
 
-def test_processes_are_told_apart(monkeypatch):
-    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
-        mine, theirs = processes.identity(os.getpid()), processes.identity(other.pid)
-        assert mine and theirs and mine != theirs and mine == processes.identity(os.getpid())
-        other.kill()
-        other.wait()
-        assert processes.identity(other.pid) == "" == processes.identity(-1)
+def test_process_identities_are_unique(monkeypatch):
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        parent = processes.identity(os.getpid())
+        identity = processes.identity(process.pid)
+        assert parent and identity and parent != identity and parent == processes.identity(os.getpid())
+        process.kill()
+        process.wait()
+        assert processes.identity(process.pid) == "" == processes.identity(-1)
 
 
-def test_a_link_among_exports_is_followed(tmp_path):
+def test_atomic_write_follows_links(tmp_path):
     (tmp_path / "real.txt").write_text("old")
     (tmp_path / "link.txt").symlink_to("real.txt")
     with atomic_write(tmp_path / "link.txt") as temporary:
@@ -148,15 +149,16 @@ def test_a_link_among_exports_is_followed(tmp_path):
     assert sorted(os.listdir(tmp_path)) == ["link.txt", "real.txt"]
 
 
-def test_where_locks_are_writes_a_run_that_has_ended_is_not_running(tmp_path, monkeypatch):
-    """As NFS has it: a lock takes a file that is open for writing."""
+def test_ended_run_is_not_running_where_locks_need_write_access(tmp_path, monkeypatch):
+    """NFS locks only files that are open for writing."""
     fcntl = pytest.importorskip("fcntl")
-    run, real = RunFolder(tmp_path), fcntl.flock
+    run = RunFolder(tmp_path)
+    original = fcntl.flock
 
-    def flock(file, how):
+    def flock(file, operation):
         if fcntl.fcntl(file, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
             raise OSError(errno.EBADF, "Bad file descriptor")
-        real(file, how)
+        original(file, operation)
 
     run.create()
     monkeypatch.setattr(fcntl, "flock", flock)
