@@ -27,9 +27,9 @@ import torch
 
 from examples import town
 from training.evaluate.metrics import psnr
-from training.lod.partial_read import BLOCKS, read_part, table_of_blocks
+from training.lod.partial_read import BLOCKS, block_table, read_part
 from training.lod.rules.chunks import RULE, TABLE, member_columns
-from training.lod.selection import settings
+from training.lod.selection import resolve_controls
 from training.methods.lodge.chunks import members
 from training.methods.lodge.composite import IndexedLevel
 from training.rasterize import Gaussians, Rendering
@@ -40,7 +40,8 @@ from training.runs.job import Job
 from training.scenes.cameras import Camera, pick_evenly
 from training.scenes.colmap import read_scene
 from training.scenes.images import write_png
-from training.splats.bundle import Bundle, read_bundle, write_bundle
+from training.splats.bundle import read_bundle, write_bundle
+from training.splats.levels import Bundle
 from training.splats.ply import extra_columns, read_ply, splat_columns, write_ply
 
 REPEATS = 7
@@ -142,7 +143,7 @@ def without_visibility(file: Path) -> Path:
         level.number: replace(level.splats, extras=member_columns(np.stack(sets[level.number])))
         for level in bundle.levels
     }
-    tables = {**bundle.tables, BLOCKS: table_of_blocks(RULE, splats)}
+    tables = {**bundle.tables, BLOCKS: block_table(RULE, splats)}
     found = [replace(level, splats=splats[level.number]) for level in bundle.levels]
     write_bundle(path, replace(bundle, levels=found, tables=tables))
     return path
@@ -153,7 +154,7 @@ def rows_of(file: Path, others: dict[str, Path]) -> list[Row]:
 
     def row(name: str, shown: Path, **values: float) -> Row:
         resident = ResidentBundle(shown)
-        given = settings(resident.bundle, values)
+        given = resolve_controls(resident.bundle, values)
         return Row(
             name, resident, lambda camera: resident.draw(camera, given, near=town.NEAR), bytes_of(shown)
         )
@@ -228,11 +229,13 @@ def jumps(rows: Sequence[Row], bundle: Bundle, plan: town.Plan, picture: Path) -
     """
     eyes = np.stack([camera.center for camera in town.walk(plan, 1000)])
     views = town.walk(plan, round(np.linalg.norm(np.diff(eyes, axis=0), axis=1).sum() / PACE), 0.5)
-    values = settings(bundle, {"fade": 0})
+    values = resolve_controls(bundle, {"fade": 0})
     nearest = [RULE.near_chunks(view.center, values, bundle.tables)[:1] for view in views]
     borders = [number for number, (a, b) in enumerate(pairwise(nearest)) if a != b]
     places = {"border": borders, "elsewhere": [(a + b) // 2 for a, b in pairwise(borders)]}
-    places = {name: [max(place - 2, 0) for place in pick_evenly(some, PLACES)] for name, some in places.items()}
+    places = {
+        name: [max(place - 2, 0) for place in pick_evenly(some, PLACES)] for name, some in places.items()
+    }
     shown = [rows[0], *rows[3:5]]
 
     def drawn(row: Row, place: int) -> list[np.ndarray]:

@@ -18,14 +18,15 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(HERE))
 
-from training.editing.bake_filter import without_filter  # noqa: E402
+from training.editing.bake_filter import bake_filter  # noqa: E402
 from training.errors import LodgsError  # noqa: E402
 from training.evaluate.views import Evaluation, full_detail_selector  # noqa: E402
-from training.lod.selection import levels_alone  # noqa: E402
+from training.lod.selection import standalone_levels  # noqa: E402
 from training.runs.data import training_data  # noqa: E402
 from training.runs.folder import RunFolder  # noqa: E402
 from training.runs.job import Job  # noqa: E402
-from training.splats.bundle import Bundle, Level, read_bundle  # noqa: E402
+from training.splats.bundle import read_bundle
+from training.splats.levels import Bundle, Level
 
 SIZES = (1, 2, 4)
 """How many times the size of training."""
@@ -36,7 +37,7 @@ def as_drawn(bundle: Bundle) -> dict[str, Bundle]:
     from a file that is made for them, and from the bundle itself."""
     if not bundle.antialias:
         return {"": bundle}
-    made = without_filter(bundle)
+    made = bake_filter(bundle)
     levels = [Level(level.number, level.rows.select(slice(None)), level.facts) for level in made.levels]
     untold = {name: value for name, value in bundle.meta.items() if name != "antialias"}
     return {
@@ -69,7 +70,7 @@ def psnr_by_size(run: Path) -> Iterator[tuple[int, str, dict[int, float]]]:
                             evaluation.cameras, full_detail_selector(bundle, level)
                         ).mean()
                     )
-                    for level in levels_alone(bundle)
+                    for level in standalone_levels(bundle)
                 },
             )
 

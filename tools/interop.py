@@ -20,9 +20,11 @@ from plyfile import PlyData
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from training.splats.bundle import Bundle, Level, read_bundle, write_bundle, write_folder  # noqa: E402
+from training.splats.bundle import read_bundle, write_bundle
 from training.splats.formats import STREAMED, lods_of  # noqa: E402
 from training.splats.gaussians import Splats  # noqa: E402
+from training.splats.level_folder import write_folder
+from training.splats.levels import Bundle, Level
 from training.splats.ply import write_ply  # noqa: E402
 
 PACKAGE = "@playcanvas/splat-transform"

@@ -14,11 +14,11 @@ import numpy as np
 
 from ...training.editing import cleaning
 from ...training.errors import LodgsError
-from ...training.lod.crop import kept
+from ...training.lod.crop import crop_mask
 from ...training.lod.rules.cut import RULE as CUT
 from ...training.lod.tree.paging import COLUMNS
 from ...training.scenes.cameras import Camera
-from ...training.splats.bundle import Bundle
+from ...training.splats.levels import Bundle
 from ..attributes import BASE, HIDDEN, SCALE, SELECTION, read_attribute, view_attribute, write_attribute
 from . import changes, crops, photographs, selection
 from .cameras import view_from
@@ -47,12 +47,12 @@ _counts: dict[int, tuple[tuple, int]] = {}
 def large(root: bpy.types.Object, most: float) -> Test:
     """Finds splats whose largest standard deviation is above a length of the world."""
     most /= unit_of(root)
-    return lambda cloud: cleaning.large(view_of(cloud, SCALE), most)
+    return lambda cloud: cleaning.find_large(view_of(cloud, SCALE), most)
 
 
 def faint(least: float) -> Test:
     """Finds splats of less opacity."""
-    return lambda cloud: cleaning.faint(view_of(cloud, BASE)[:, 3], least)
+    return lambda cloud: cleaning.find_faint(view_of(cloud, BASE)[:, 3], least)
 
 
 def far(context: bpy.types.Context, root: bpy.types.Object, most: float) -> Test:
@@ -63,7 +63,7 @@ def far(context: bpy.types.Context, root: bpy.types.Object, most: float) -> Test
     """
     eyes = np.array([camera.center for camera in cameras(context, root)])
     most /= unit_of(root)
-    return lambda cloud: cleaning.far(view_of(cloud, "position"), eyes, most)
+    return lambda cloud: cleaning.find_far(view_of(cloud, "position"), eyes, most)
 
 
 def unseen(context: bpy.types.Context, root: bpy.types.Object, least: int) -> Test:
@@ -73,7 +73,7 @@ def unseen(context: bpy.types.Context, root: bpy.types.Object, least: int) -> Te
         LodgsError: as :func:`cameras`.
     """
     views = cameras(context, root)
-    return lambda cloud: cleaning.unseen(view_of(cloud, "position"), views, least)
+    return lambda cloud: cleaning.find_unseen(view_of(cloud, "position"), views, least)
 
 
 def selected(cloud: bpy.types.PointCloud) -> np.ndarray:
@@ -92,18 +92,19 @@ def find(root: bpy.types.Object, test: Test) -> dict[int, np.ndarray]:
 def find_floaters(
     context: bpy.types.Context, root: bpy.types.Object, gap: float, share: float
 ) -> dict[int, np.ndarray]:
-    """The floaters among what hiding and crops leave: see ``cleaning.floaters``.
+    """The floaters among what hiding and crops leave: see ``cleaning.find_floaters``.
 
     Args:
-        gap: a length of the world; 0: ``cleaning.typical_gap``.
+        gap: a length of the world; 0: ``cleaning.default_gap``.
     """
     cropped = crops.as_objects_stand(root, context.evaluated_depsgraph_get())
     means = {item.number: view_of(item.object.data, "position") for item in levels(root)}
     left = {
-        item.number: ~hidden(item.object.data) & kept(cropped, means[item.number]) for item in levels(root)
+        item.number: ~hidden(item.object.data) & crop_mask(cropped, means[item.number])
+        for item in levels(root)
     }
     stays = {number: mask.copy() for number, mask in left.items()}
-    cleaning.leave_floaters(stays, means, gap / unit_of(root), share, _family(root))
+    cleaning.exclude_floaters(stays, means, gap / unit_of(root), share, _family(root))
     return _with_nodes(root, {number: left[number] & ~mask for number, mask in stays.items()})
 
 
@@ -184,17 +185,17 @@ def show_all(root: bpy.types.Object) -> int:
 
 
 def left(root: bpy.types.Object, bundle: Bundle, depsgraph: bpy.types.Depsgraph) -> Bundle:
-    """The levels of a scene without what is hidden and what crops leave out; see ``cleaning.without``.
+    """The levels of a scene without what is hidden and what crops leave out; see ``cleaning.keep_splats``.
 
     Raises:
         LodgsError: nothing is left.
     """
     cropped, clouds = crops.as_objects_stand(root, depsgraph), {item.number: item for item in levels(root)}
     masks = {
-        level.number: kept(cropped, level.splats.means) & ~hidden(clouds[level.number].object.data)
+        level.number: crop_mask(cropped, level.splats.means) & ~hidden(clouds[level.number].object.data)
         for level in bundle.levels
     }
-    return bundle if all(mask.all() for mask in masks.values()) else cleaning.without(bundle, masks)
+    return bundle if all(mask.all() for mask in masks.values()) else cleaning.keep_splats(bundle, masks)
 
 
 def count_left(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> dict[int, tuple[int, int]]:
@@ -204,7 +205,7 @@ def count_left(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> dict[i
         cloud = item.object.data
         there = changes.version(cloud), len(cloud.points), cropped
         if _counts.get(cloud.session_uid, (None, 0))[0] != there:
-            mask = kept(cropped, view_of(cloud, "position")) & ~hidden(cloud)
+            mask = crop_mask(cropped, view_of(cloud, "position")) & ~hidden(cloud)
             _counts[cloud.session_uid] = there, int(np.count_nonzero(mask))
         found[item.number] = _counts[cloud.session_uid][1], len(cloud.points)
     return found
@@ -254,7 +255,7 @@ def suggestions(context: bpy.types.Context, root: bpy.types.Object) -> dict[str,
     some = slice(None, None, max(len(means) // 100_000, 1))
     found = {
         "size": float(np.quantile(scales[some].max(axis=1), 0.99)) * unit,
-        "gap": cleaning.typical_gap(means) * unit,
+        "gap": cleaning.default_gap(means) * unit,
     }
     try:
         eyes = np.array([camera.center for camera in cameras(context, root)], np.float32)
@@ -299,7 +300,7 @@ def _with_nodes(root: bpy.types.Object, found: dict[int, np.ndarray]) -> dict[in
     return {item.number: ~stays[item.number] & ~hidden(item.object.data) for item in levels(root)}
 
 
-def _family(root: bpy.types.Object) -> cleaning.Family | None:
+def _family(root: bpy.types.Object) -> cleaning.TreeRelations | None:
     """Who stands for whom, where the levels are a tree."""
     if root.lodgs.rule != CUT.name:
         return None
@@ -310,7 +311,7 @@ def _family(root: bpy.types.Object) -> cleaning.Family | None:
         nothing = np.zeros(len(cloud.points), np.float32)
         found = {name: read_attribute(cloud, name) for name in COLUMNS}
         columns[item.number] = {name: nothing if x is None else x for name, x in found.items()}
-    return cleaning.Family(columns, means)
+    return cleaning.TreeRelations(columns, means)
 
 
 def view_of(cloud: bpy.types.PointCloud, name: str) -> np.ndarray:

@@ -1,25 +1,27 @@
 """Import of COLMAP scenes and splat files as new splat scenes."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from __future__ import annotations
-
 import bpy
 from mathutils import Matrix
 
-from ...training.lod.selection import unknown_rule
-from ...training.lod.tree.paging import TreeFile, is_tree, read_within
+from ...training.lod.selection import unknown_rule_error
+from ...training.lod.tree.paging import TreeFile, is_tree, read_budgeted
 from ...training.methods import METHODS
 from ...training.scenes.cameras import Camera, camera_extent
 from ...training.scenes.colmap import read_scene
 from ...training.scenes.formats import ensure_colmap_scene
 from ...training.scenes.undistort import cached_undistorted_scene
 from ...training.scenes.view_tables import read_view_tables
-from ...training.splats.bundle import Bundle, read_bundle, read_folder, read_header
+from ...training.splats.bundle import read_bundle, read_header
 from ...training.splats.formats import STREAMED_FILE, is_plain_ply, open_as_ply
+from ...training.splats.level_folder import read_folder
+from ...training.splats.levels import Bundle
 from . import objects, scenes, streams
 from .photographs import match_render, new_camera, views
 from .placement import axes_of, new_axes
@@ -190,7 +192,7 @@ def read_splats_file(path: Path | str, budget: int = 0) -> SplatsFile:
         path = path.resolve().parent
     if budget and not path.is_dir() and is_plain_ply(path) and is_tree(read_header(path)):
         total = TreeFile(path).total
-        bundle, _ = read_within(path, budget if total <= budget else streams.held_of(budget))
+        bundle, _ = read_budgeted(path, budget if total <= budget else streams.held_of(budget))
         here = sum(len(level.splats) for level in bundle.levels)
         if here < total:
             warnings.append(
@@ -230,7 +232,7 @@ def place_splats(
         bpy.data.batch_remove([obj.data for obj in made])  # which takes the objects along
         raise
     if bundle.rule and not root.lodgs.by_distance:
-        warn(" ".join(unknown_rule(bundle.rule)))
+        warn(" ".join(unknown_rule_error(bundle.rule)))
     return root
 
 

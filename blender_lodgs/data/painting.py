@@ -17,7 +17,7 @@ import numpy as np
 
 from ...training.editing import paint
 from ...training.errors import LodgsError
-from ...training.splats.bundle import Level
+from ...training.splats.levels import Level
 from ..attributes import view_attribute, write_attribute
 from . import changes, selection, streams
 from .cleaning import levels, view_of
@@ -69,7 +69,7 @@ def over(
     for number, there in before.items():
         rows = np.flatnonzero(share[number])
         found[number] = there.copy()
-        found[number][rows] = paint.over(there[rows], share[number][rows], color)
+        found[number][rows] = paint.blend_paint(there[rows], share[number][rows], color)
     return found
 
 
@@ -95,7 +95,7 @@ def write(root: bpy.types.Object, painted: Mapping[int, np.ndarray]) -> int:
     with changes.painting():
         for item in levels(root):
             cloud = item.object.data
-            for name, column in paint.columns_of(painted[item.number]).items():
+            for name, column in paint.paint_columns(painted[item.number]).items():
                 write_attribute(cloud, name, "FLOAT", column)
             for name in paint.COLUMNS if not count else ():
                 cloud.attributes.remove(cloud.attributes[name])
@@ -126,8 +126,8 @@ def carried(root: bpy.types.Object, level: Level) -> Level:
     source = next((cloud for cloud in sources if cloud and paint_of(cloud) is not None), None)
     if source is None or paint.COLUMNS[-1] in level.splats.extras:
         return level
-    given = paint.carried(paint_of(source), view_of(source, "position"), level.splats.means)
-    extras = level.splats.extras | paint.columns_of(given)
+    given = paint.transfer_paint(paint_of(source), view_of(source, "position"), level.splats.means)
+    extras = level.splats.extras | paint.paint_columns(given)
     return replace(level, splats=replace(level.splats, extras=extras))
 
 

@@ -15,11 +15,11 @@ import numpy as np
 from ...training.editing import look, placement
 from ...training.errors import LodgsError
 from ...training.lod.rule import Tables, find_rule
-from ...training.lod.selection import complete, known_rule, not_alone
+from ...training.lod.selection import check_rule, complete_splats, standalone_error
 from ...training.scenes.view_tables import VIEWS, make_view_tables
 from ...training.scenes.view_tables import transform_views as placed_views
-from ...training.splats.bundle import Bundle, Level
 from ...training.splats.gaussians import Splats
+from ...training.splats.levels import Bundle, Level
 from .. import extension
 from ..nodes import ellipsoids
 from . import cleaning, crops, looks, objects, painting, selection, streams, tables
@@ -39,7 +39,7 @@ def set_bundle_facts(root: bpy.types.Object, bundle: Bundle) -> None:
         LodgsError: a value that it records is not possible, or it contradicts its rule. Nothing is taken over
             in that case.
     """
-    settings, rule = root.lodgs, known_rule(bundle)
+    settings, rule = root.lodgs, check_rule(bundle)
     for control in rule.controls if rule else ():
         control.checked(bundle.controls.get(control.name, control.default))
     if rule is not None and (rule.always or not rule.complete) and settings.rule != bundle.rule:
@@ -154,9 +154,9 @@ def read_levels(root: bpy.types.Object, placed: bool = False, looked: bool = Fal
     )  # fmt: skip
     bundle = cleaning.left(root, bundle, bpy.context.evaluated_depsgraph_get())
     if looked:
-        bundle = look.looked_levels(bundle, _looks(root))
+        bundle = look.apply_looks_to_levels(bundle, _looks(root))
     if placed:
-        bundle = placement.placed(bundle, placement_of(root))
+        bundle = placement.transform_bundle(bundle, placement_of(root))
         bundle.meta["up_rotation"] = np.eye(3)
     return bundle
 
@@ -221,7 +221,7 @@ def read_level(root: bpy.types.Object, number: int, placed: bool = False, looked
     for level in bundle.levels:
         if level.number == number:
             _require_alone(root, number)
-            return complete(bundle, level)
+            return complete_splats(bundle, level)
     raise LodgsError(f"{root.name} has no level {number}.", "Choose one from the list of levels.")
 
 
@@ -244,7 +244,7 @@ def shown_splats(
         objects.read_splats(item.object, depsgraph) for item in root.lodgs.levels if _visible(context, item)
     ]
     if looked:
-        parts = [look.looked(part, _looks(root)) for part in parts]
+        parts = [look.apply_looks(part, _looks(root)) for part in parts]
     if not any(len(part) for part in parts):
         raise LodgsError(f"No splats of {root.name} are shown.", "Look at the detail settings.")
     if len({part.sh_degree for part in parts}) > 1:
@@ -308,7 +308,7 @@ def _looks(root: bpy.types.Object) -> look.Looks:
 def _require_alone(root: bpy.types.Object, number: int) -> None:
     finest = max((item.number for item in root.lodgs.levels if item.exists), default=number)
     if number < finest and not root.lodgs.complete:
-        raise LodgsError(*not_alone(number, finest))
+        raise LodgsError(*standalone_error(number, finest))
 
 
 def _visible(context: bpy.types.Context, item) -> bool:

@@ -9,7 +9,7 @@ import bpy
 
 from ...training.methods import METHODS, PRESETS, MethodInfo, method_info
 from ...training.runs.job import MAX_CELLS, Job
-from ...training.splats.bundle import MAX_LEVELS
+from ...training.splats.levels import MAX_LEVELS
 from . import crops, photographs, viewpoints
 
 _WHOLE_MOST, _MOST = 2**31 - 1, 3.4e38

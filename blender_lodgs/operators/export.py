@@ -8,11 +8,11 @@ from pathlib import Path
 import bpy
 from bpy_extras.io_utils import ExportHelper
 
-from ...training.editing.bake_filter import without_filter
+from ...training.editing.bake_filter import bake_filter
 from ...training.errors import LodgsError
 from ...training.lod.tree.paging import is_tree
 from ...training.lod.tree.shape import complete_levels
-from ...training.splats.bundle import Bundle, Level, write_bundle, write_folder
+from ...training.splats.bundle import write_bundle
 from ...training.splats.formats import (
     FORMATS,
     PLY,
@@ -22,6 +22,8 @@ from ...training.splats.formats import (
     write_splats,
     write_streamed_levels,
 )
+from ...training.splats.level_folder import write_folder
+from ...training.splats.levels import Bundle, Level
 from ..data import roots, scenes, selection
 from ..data.objects import megabytes, sh_degree
 from .base import ReadLevelsOperator, report_errors
@@ -226,7 +228,7 @@ class LODGS_OT_export_plain(_ForeignExport, _FileExport, _ConvertingExport, bpy.
         meta = selection.read_json(root.lodgs.meta)
         bundle = Bundle("", [Level(1, splats)], meta=meta, tables=scenes.view_tables(root, self.placed))
         if not (self.antialiased or find_format(path).antialiased):
-            bundle = without_filter(bundle)
+            bundle = bake_filter(bundle)
         yield from self.follow(write_splats(path, bundle.levels[0].rows, bundle.meta))
         self.written = f"{len(splats):,} splats written to {path}"
 
@@ -295,7 +297,7 @@ class LODGS_OT_export_streamed(_ForeignExport, _FolderExport, _ConvertingExport,
 
     def work(self, context):
         bundle = self._bundle(context)
-        bundle = bundle if self.antialiased else without_filter(bundle)
+        bundle = bundle if self.antialiased else bake_filter(bundle)
         yield from self.follow(write_streamed_levels(self._folder(), bundle))
         self.written = f"{_levels(bundle)} written: {self._folder() / STREAMED_FILE}"
 

@@ -17,7 +17,8 @@ from ...training.errors import LodgsError
 from ...training.lod.rules.cut import RULE as CUT
 from ...training.runs.folder import RunFolder
 from ...training.runs.outcome import run_outcome
-from ...training.splats.bundle import Bundle, Level, read_header, read_tables
+from ...training.splats.bundle import read_header, read_tables
+from ...training.splats.levels import Bundle, Level
 from ...training.splats.ply import read_ply
 from .. import extension
 from ..data import cells, importing, scenes

@@ -34,8 +34,9 @@ from training.methods import METHODS
 from training.runs.events import PROTOCOL, EventWriter
 from training.runs.folder import RunFolder
 from training.runs.job import Job
-from training.splats.bundle import Bundle, Level, write_bundle
+from training.splats.bundle import write_bundle
 from training.splats.gaussians import Splats
+from training.splats.levels import Bundle, Level
 from training.splats.ply import write_ply
 
 COUNTS = {1: 5, 2: 20}

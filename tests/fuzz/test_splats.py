@@ -13,15 +13,10 @@ from hypothesis import strategies as st
 from tests.fuzz.doors import attempt
 from tests.fuzz.mutations import spoiled, spoiled_value
 from training.cli.info import describe
-from training.splats.bundle import (
-    Bundle,
-    Level,
-    read_bundle,
-    read_folder,
-    write_bundle,
-    write_folder,
-)
+from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
+from training.splats.level_folder import read_folder, write_folder
+from training.splats.levels import Bundle, Level
 from training.splats.ply import read_ply, write_ply
 
 META = {"camera_center": [0.1, -0.2, 3.4], "view": [[1, 0, 0], [0, 0, 1]], "gamma": 1.5, "antialias": True}

@@ -10,8 +10,9 @@ import pytest
 from training.__main__ import main
 from training.runs.measure import format_report
 from training.scenes.cameras import Camera, write_camera
-from training.splats.bundle import Bundle, Level, write_bundle
+from training.splats.bundle import write_bundle
 from training.splats.gaussians import Splats
+from training.splats.levels import Bundle, Level
 from training.splats.ply import write_ply
 
 SHARE = 0.02

@@ -7,7 +7,11 @@ import json
 from pathlib import Path
 
 from ..lod.rule import find_rule
-from ..splats.bundle import Bundle, DrawableRows, bounding_box, json_default, open_bundle, read_folder
+from ..splats.bundle import open_bundle
+from ..splats.bundle_header import json_default
+from ..splats.file_rows import DrawableRows
+from ..splats.level_folder import read_folder
+from ..splats.levels import Bundle, bounding_box
 from ..splats.ply import Element, all_columns
 
 
@@ -50,7 +54,7 @@ def describe(path: str | Path) -> str:
         f"{'level':>5}  {'splats':>10}  {'MB':>8}  {''.join(f'{name:>10}  ' for name in names)}extras",
     ]
     for level in bundle.levels:
-        size = Element.of_splats("", [level.rows], all_columns).size / 1e6
+        size = Element.from_splats("", [level.rows], all_columns).size / 1e6
         facts = "".join(
             f"{level.facts[name]:>10.6g}  " if name in level.facts else f"{'-':>10}  " for name in names
         )

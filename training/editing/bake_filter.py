@@ -15,20 +15,20 @@ import numpy as np
 
 from ..scenes.cameras import Camera, pick_evenly
 from ..scenes.view_tables import read_view_tables
-from ..splats.bundle import NO_SPLATS, Bundle, Level
 from ..splats.gaussians import SplatRows, Splats
+from ..splats.levels import NO_SPLATS, Bundle, Level
 
 MIP_VARIANCE = 0.1
 """Added to a splat's variance on the image, in square pixels, about a pixel's own extent (Yu et al. 2024,
 Eq. 10)."""
-MOST_VIEWS = 24
+MAX_VIEWS = 24
 """In so many views opacities are looked up."""
-MARGIN = 0.5
+VIEW_MARGIN = 0.5
 """Views are as much wider on every side, as a share of their size: where photographs are continued."""
 _AT_ONCE = 1 << 16
 
 
-def without_filter(bundle: Bundle) -> Bundle:
+def bake_filter(bundle: Bundle) -> Bundle:
     """Splats for programs that do not know the filter, which are not antialiased any more.
 
     The bundle itself where it is not antialiased, or does not know from where it was photographed.
@@ -41,9 +41,9 @@ def without_filter(bundle: Bundle) -> Bundle:
         return bundle
     focal = float(np.median([view.focal for view in views]))
     share = float(bundle.meta.get("focal_px", focal)) / focal  # views are of the photographs' own size
-    views = [view.scaled(share).widened(MARGIN) for view in pick_evenly(views, MOST_VIEWS)]
+    views = [view.scaled(share).widened(VIEW_MARGIN) for view in pick_evenly(views, MAX_VIEWS)]
     levels = [
-        Level(level.number, NO_SPLATS, level.facts, Unfiltered(level.rows, views, near))
+        Level(level.number, NO_SPLATS, level.facts, RowsWithBakedFilter(level.rows, views, near))
         for level in bundle.levels
     ]
     meta = {name: value for name, value in bundle.meta.items() if name != "antialias"}
@@ -51,7 +51,7 @@ def without_filter(bundle: Bundle) -> Bundle:
 
 
 @dataclass(frozen=True)
-class Unfiltered:
+class RowsWithBakedFilter:
     """Splats with the opacity that the filter gives them in some views, as they are read.
 
     Attributes:

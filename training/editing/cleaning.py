@@ -13,21 +13,21 @@ from math import inf
 import numpy as np
 
 from ..errors import LodgsError
-from ..lod.crop import Crop, kept
-from ..lod.partial_read import BLOCKS, table_of_blocks
+from ..lod.crop import Crop, crop_mask
+from ..lod.partial_read import BLOCKS, block_table
 from ..lod.rule import find_rule
 from ..lod.rules.cut import PARENT, PARENT_SIZE
-from ..lod.selection import unknown_rule
-from ..lod.tree.paging import COLUMNS, Standing, is_tree, table_of_pages
+from ..lod.selection import unknown_rule_error
+from ..lod.tree.paging import COLUMNS, ResidentTree, is_tree, page_table
 from ..scenes.cameras import Camera
 from ..scenes.view_tables import VIEW_TABLES
-from ..splats.bundle import Bundle
 from ..splats.gaussians import SplatRows, Splats
+from ..splats.levels import Bundle
 from ..splats.ply import BATCH_ROWS
 
-SHARE = 0.001
+MAX_FLOATER_SHARE = 0.001
 """Of all splats: clusters that have no larger share are floaters."""
-CELLS = 48
+GAPS_ACROSS = 48
 """Into so many gaps the middle 80 % of the splats are divided along a diagonal where no gap is given."""
 _FARTHEST_CELL = (1 << 20) - 2
 
@@ -35,17 +35,17 @@ Masks = Mapping[int, np.ndarray]
 """(N,) bool of each level's splats, by the level's number."""
 
 
-def large(scales: np.ndarray, most: float) -> np.ndarray:
+def find_large(scales: np.ndarray, most: float) -> np.ndarray:
     """(N,) bool, whose largest standard deviation, of (N, 3), is above a length."""
     return scales.max(axis=1, initial=0) > most
 
 
-def faint(opacities: np.ndarray, least: float) -> np.ndarray:
+def find_faint(opacities: np.ndarray, least: float) -> np.ndarray:
     """(N,) bool, whose opacity (N,) is below the least one."""
     return opacities < least
 
 
-def far(means: np.ndarray, eyes: np.ndarray, most: float) -> np.ndarray:
+def find_far(means: np.ndarray, eyes: np.ndarray, most: float) -> np.ndarray:
     """(N,) bool, which means (N, 3) are farther than that from the nearest of some eyes (C, 3)."""
     found = np.ones(len(means), bool)
     for eye in eyes:
@@ -54,7 +54,7 @@ def far(means: np.ndarray, eyes: np.ndarray, most: float) -> np.ndarray:
     return found
 
 
-def unseen(means: np.ndarray, cameras: Sequence[Camera], least: int, reach: float = inf) -> np.ndarray:
+def find_unseen(means: np.ndarray, cameras: Sequence[Camera], least: int, reach: float = inf) -> np.ndarray:
     """(N,) bool, which means (N, 3) stand in the images of fewer cameras than that.
 
     Whether something hides them does not count.
@@ -72,27 +72,27 @@ def unseen(means: np.ndarray, cameras: Sequence[Camera], least: int, reach: floa
     return count < least
 
 
-def floaters(means: np.ndarray, gap: float = 0.0, share: float = SHARE) -> np.ndarray:
+def find_floaters(means: np.ndarray, gap: float = 0.0, share: float = MAX_FLOATER_SHARE) -> np.ndarray:
     """(N,) bool, which splats at means (N, 3) are in clusters of at most a share of all splats.
 
     Space is divided into cells; splats are of one cluster where cells with splats touch, also across edges
     and corners, so that nothing nearer than a cell is apart, and nothing farther than two is together.
 
     Args:
-        gap: the length of a cell; 0: :func:`typical_gap`.
+        gap: the length of a cell; 0: :func:`default_gap`.
     """
     if not len(means):
         return np.zeros(0, bool)
-    cell_of, cells = cells_of(means, gap or typical_gap(means))
+    cell_of, cells = assign_cells(means, gap or default_gap(means))
     cluster = _clusters(cells)
     counts = np.bincount(cluster[cell_of], minlength=len(cells))
     return (counts <= share * len(means))[cluster][cell_of]
 
 
-def typical_gap(means: np.ndarray) -> float:
+def default_gap(means: np.ndarray) -> float:
     """A distance (of means (N, 3)) beyond which splats look apart: a share of where most of them are."""
     low, high = np.quantile(means[:: max(len(means) // 100_000, 1)], (0.1, 0.9), axis=0)
-    return float(np.linalg.norm(high - low)) / CELLS or 1.0
+    return float(np.linalg.norm(high - low)) / GAPS_ACROSS or 1.0
 
 
 @dataclass(frozen=True)
@@ -100,13 +100,13 @@ class Cleaning:
     """What goes; lengths are in the splats' units.
 
     Attributes:
-        crops: see ``crop.kept``.
-        max_size: see :func:`large`.
-        min_opacity: see :func:`faint`.
-        max_distance: see :func:`far`, from the cameras' eyes.
-        min_views: see :func:`unseen`, of the cameras.
+        crops: see ``crop.crop_mask``.
+        max_size: see :func:`find_large`.
+        min_opacity: see :func:`find_faint`.
+        max_distance: see :func:`find_far`, from the cameras' eyes.
+        min_views: see :func:`find_unseen`, of the cameras.
         cameras: in the splats' space.
-        drop_floaters, gap, share: see :func:`floaters`, among what the other tests leave.
+        drop_floaters, gap, share: see :func:`find_floaters`, among what the other tests leave.
     """
 
     crops: tuple[Crop, ...] = ()
@@ -117,37 +117,37 @@ class Cleaning:
     cameras: tuple[Camera, ...] = ()
     drop_floaters: bool = False
     gap: float = 0.0
-    share: float = SHARE
+    share: float = MAX_FLOATER_SHARE
 
     def keeps(self, splats: Splats) -> np.ndarray:
         """(N,) bool, which splats stay as far as each can be told by itself."""
-        found = kept(self.crops, splats.means)
+        found = crop_mask(self.crops, splats.means)
         with np.errstate(over="ignore"):
             if self.max_size < inf:
-                found &= ~large(np.exp(splats.log_scales), self.max_size)
+                found &= ~find_large(np.exp(splats.log_scales), self.max_size)
             if self.min_opacity > 0:
-                found &= ~faint(1 / (1 + np.exp(-splats.opacity_logits)), self.min_opacity)
+                found &= ~find_faint(1 / (1 + np.exp(-splats.opacity_logits)), self.min_opacity)
         if self.max_distance < inf:
             eyes = np.array([camera.center for camera in self.cameras])
-            found &= ~far(splats.means, eyes, self.max_distance)
+            found &= ~find_far(splats.means, eyes, self.max_distance)
         if self.min_views > 0:
-            found &= ~unseen(splats.means, self.cameras, self.min_views)
+            found &= ~find_unseen(splats.means, self.cameras, self.min_views)
         return found
 
 
-def cleaned(bundle: Bundle, cleaning: Cleaning) -> Bundle:
+def clean_bundle(bundle: Bundle, cleaning: Cleaning) -> Bundle:
     """The levels without what goes. All splats are read once; they are read again where they are written.
 
     Memory holds some dozens of bytes of each splat.
 
     Raises:
-        LodgsError: as :func:`without`.
+        LodgsError: as :func:`keep_splats`.
     """
     tree, masks, places, columns = is_tree(bundle), {}, {}, {}
     for level in bundle.levels:
         parts = [
             (cleaning.keeps(splats), splats.means, {name: splats.extras.get(name) for name in COLUMNS})
-            for splats in in_parts(level.rows)
+            for splats in read_batches(level.rows)
         ]
         masks[level.number] = np.concatenate([mask for mask, _, _ in parts])
         if cleaning.drop_floaters or tree:
@@ -157,14 +157,14 @@ def cleaned(bundle: Bundle, cleaning: Cleaning) -> Bundle:
                 name: np.concatenate([_or_zeros(part[name], len(means)) for _, means, part in parts])
                 for name in COLUMNS
             }
-    family = Family(columns, places) if tree else None
+    family = TreeRelations(columns, places) if tree else None
     if cleaning.drop_floaters:
-        leave_floaters(masks, places, cleaning.gap, cleaning.share, family)
-    return without(bundle, masks, family)
+        exclude_floaters(masks, places, cleaning.gap, cleaning.share, family)
+    return keep_splats(bundle, masks, family)
 
 
-def leave_floaters(
-    masks: dict[int, np.ndarray], means: Masks, gap: float, share: float, family: Family | None = None
+def exclude_floaters(
+    masks: dict[int, np.ndarray], means: Masks, gap: float, share: float, family: TreeRelations | None = None
 ) -> None:
     """Takes floaters out of what stays of each level, (N,) bool; of a tree those among the leaves.
 
@@ -173,14 +173,14 @@ def leave_floaters(
     """
     asked = family.leaves if family else {number: np.ones(len(mask), bool) for number, mask in masks.items()}
     rows = {number: np.flatnonzero(mask & asked[number]) for number, mask in masks.items()}
-    found = floaters(np.concatenate([means[number][some] for number, some in rows.items()]), gap, share)
+    found = find_floaters(np.concatenate([means[number][some] for number, some in rows.items()]), gap, share)
     begin = 0
     for number, some in rows.items():
         masks[number][some[found[begin : begin + len(some)]]] = False
         begin += len(some)
 
 
-def without(bundle: Bundle, masks: Masks, family: Family | None = None) -> Bundle:
+def keep_splats(bundle: Bundle, masks: Masks, family: TreeRelations | None = None) -> Bundle:
     """The levels with those splats that stay, (N,) bool each; tables follow.
 
     Of a tree only leaves are asked. A node of which one child is left gives way to it, which so is the other
@@ -194,10 +194,10 @@ def without(bundle: Bundle, masks: Masks, family: Family | None = None) -> Bundl
     """
     rule = find_rule(bundle.rule)
     if bundle.rule and rule is None and bundle.tables.keys() - set(VIEW_TABLES):
-        raise LodgsError(*unknown_rule(bundle.rule))
+        raise LodgsError(*unknown_rule_error(bundle.rule))
     changed: dict[int, dict[str, np.ndarray]] = {}
     if is_tree(bundle):
-        masks, changed = (family or Family.of(bundle)).pruned(masks)
+        masks, changed = (family or TreeRelations.of(bundle)).pruned(masks)
     levels = []
     for level in bundle.levels:
         rows, columns = np.flatnonzero(masks[level.number]), changed.get(level.number, {})
@@ -206,23 +206,23 @@ def without(bundle: Bundle, masks: Masks, family: Family | None = None) -> Bundl
             splats.extras |= columns
             levels.append(replace(level, splats=splats))
         else:
-            levels.append(replace(level, on_disk=SomeRows(level.rows, rows, columns)))
+            levels.append(replace(level, on_disk=RowSubset(level.rows, rows, columns)))
     if not any(len(level.rows) for level in levels):
         raise LodgsError("Nothing is left of the splats.", "Look at the crops, and at the limits.")
     tables = dict(bundle.tables)
     if BLOCKS in tables and is_tree(bundle):
-        tables[BLOCKS] = table_of_pages({number: columns for number, columns in changed.items()})
+        tables[BLOCKS] = page_table({number: columns for number, columns in changed.items()})
     elif BLOCKS in tables and rule is not None:
         parts = [
-            table_of_blocks(rule, {level.number: splats})
+            block_table(rule, {level.number: splats})
             for level in levels
-            for splats in in_parts(level.rows)
+            for splats in read_batches(level.rows)
         ]
         tables[BLOCKS] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return replace(bundle, levels=levels, tables=tables)
 
 
-class Family:
+class TreeRelations:
     """Who stands for whom among the splats of a tree: its levels' rows one after the other.
 
     Args:
@@ -237,17 +237,17 @@ class Family:
         self._columns = {
             name: np.concatenate([columns[number][name] for number in self._numbers]) for name in COLUMNS
         }
-        standing = Standing(self._columns | dict(zip("xyz", places.T, strict=True)))
+        standing = ResidentTree(self._columns | dict(zip("xyz", places.T, strict=True)))
         standing.update(np.arange(len(places)))
         self._parents = standing.parents
         self._children = self._count(np.ones(len(places), bool))
 
     @classmethod
-    def of(cls, bundle: Bundle) -> Family:
+    def of(cls, bundle: Bundle) -> TreeRelations:
         """That of a bundle's levels."""
         columns, means = {}, {}
         for level in bundle.levels:
-            parts = list(in_parts(level.rows))
+            parts = list(read_batches(level.rows))
             means[level.number] = np.concatenate([part.means for part in parts])
             columns[level.number] = {
                 name: np.concatenate([_or_zeros(part.extras.get(name), len(part)) for part in parts])
@@ -265,7 +265,7 @@ class Family:
         return self._by_level(self._standing(masks))
 
     def pruned(self, masks: Masks) -> tuple[dict[int, np.ndarray], dict[int, dict[str, np.ndarray]]]:
-        """What stays where some leaves do, and the rule's columns (M,) of what stays: see :func:`without`."""
+        """What stays where some leaves do, and the rule's columns (M,) of what stays: see :func:`keep_splats`."""
         stays = self._standing(masks)
         one = stays & (self._count(stays) == 1)
         # whose place each takes: the highest of those right above it that give way, or its own
@@ -302,7 +302,7 @@ class Family:
 
 
 @dataclass(frozen=True)
-class SomeRows:
+class RowSubset:
     """Some of the splats that are read a few at a time, with other columns of theirs.
 
     Attributes:
@@ -324,7 +324,7 @@ class SomeRows:
         return splats
 
 
-def in_parts(rows: SplatRows) -> Iterator[Splats]:
+def read_batches(rows: SplatRows) -> Iterator[Splats]:
     """All splats, BATCH_ROWS of them at a time; at least one part, which may be empty."""
     for begin in range(0, max(len(rows), 1), BATCH_ROWS):
         yield rows.select(slice(begin, begin + BATCH_ROWS))
@@ -334,7 +334,7 @@ def _or_zeros(column: np.ndarray | None, count: int) -> np.ndarray:
     return np.zeros(count, np.float32) if column is None else column
 
 
-def cells_of(means: np.ndarray, gap: float) -> tuple[np.ndarray, np.ndarray]:
+def assign_cells(means: np.ndarray, gap: float) -> tuple[np.ndarray, np.ndarray]:
     """Which cubes of an edge ``gap`` splats at means (N, 3) are in.
 
     Returns:

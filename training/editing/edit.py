@@ -9,19 +9,22 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LodgsError
-from ..lod.selection import known_rule
+from ..lod.selection import check_rule
 from ..lod.tree.paging import is_tree
 from ..lod.tree.shape import complete_levels
-from ..splats.bundle import Bundle, DrawableRows, Level, open_bundle, read_folder, write_bundle, write_folder
+from ..splats.bundle import open_bundle, write_bundle
 from ..splats.dialects import Warn, comments_from_meta, ignore, meta_from_comments
+from ..splats.file_rows import DrawableRows
 from ..splats.formats import PLY, SPLAT, format_of, program, write_splats, write_streamed
 from ..splats.gaussians import SplatRows, Splats
+from ..splats.level_folder import read_folder, write_folder
+from ..splats.levels import Bundle, Level
 from ..splats.ply import write_ply
 from ..splats.similarity import Similarity
-from .bake_filter import without_filter
-from .cleaning import Cleaning, cleaned
-from .look import Looks, looked_levels
-from .placement import placed, standing
+from .bake_filter import bake_filter
+from .cleaning import Cleaning, clean_bundle
+from .look import Looks, apply_looks_to_levels
+from .placement import transform_bundle, upright_placement
 
 
 def edit(
@@ -75,11 +78,11 @@ def edit(
         bundle, rows = open_bundle(source)
         for level in bundle.levels:
             level.on_disk = DrawableRows(rows[level.number], warn)
-    known_rule(bundle)
-    found = looked_levels(cleaned(bundle, cleaning), looks)
+    check_rule(bundle)
+    found = apply_looks_to_levels(clean_bundle(bundle, cleaning), looks)
     if placement is not None or upright or ground:
-        stands = standing(bundle, upright, ground, points)
-        found = placed(found, stands if placement is None else placement.compose(stands))
+        stands = upright_placement(bundle, upright, ground, points)
+        found = transform_bundle(found, stands if placement is None else placement.compose(stands))
         if upright or ground:
             found.meta["up_rotation"] = np.eye(3)
     if out is None:
@@ -95,32 +98,32 @@ def edit(
         for before, after in zip(bundle.levels, found.levels, strict=True)
     ]
     for path in plain:
-        form = found if antialiased or format_of(path).antialiased else without_filter(found)
-        finish(write_splats(path, Joined.upto(form, form.levels[-1].number), form.meta))
+        form = found if antialiased or format_of(path).antialiased else bake_filter(found)
+        run_to_end(write_splats(path, ConcatenatedRows.upto(form, form.levels[-1].number), form.meta))
     if folder is not None or streamed is not None:
         levels = complete_levels(_in_memory(found)) if is_tree(found) else found
         if folder is not None:
             write_folder(folder, levels)
         if streamed is not None:
-            finish(write_streamed(streamed, levels if antialiased else without_filter(levels)))
+            run_to_end(write_streamed(streamed, levels if antialiased else bake_filter(levels)))
     paths = [path for path in (out, *plain, folder, streamed) if path is not None]
     return "\n".join([*lines, *(f"{path}: written" for path in paths)])
 
 
-def finish(work: Iterator[str]) -> None:
+def run_to_end(work: Iterator[str]) -> None:
     """Waits for what goes on beside."""
     for _ in work:
         pass
 
 
 @dataclass(frozen=True)
-class Joined:
+class ConcatenatedRows:
     """Splats of several sets, one after the other, as they are read: where levels add up, a whole scene."""
 
     sets: Sequence[SplatRows]
 
     @classmethod
-    def upto(cls, bundle: Bundle, number: int) -> Joined:
+    def upto(cls, bundle: Bundle, number: int) -> ConcatenatedRows:
         """All that is drawn at a level."""
         return cls([level.rows for level in bundle.drawn_levels(number)])
 

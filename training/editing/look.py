@@ -16,9 +16,9 @@ import numpy as np
 
 from ..errors import LodgsError
 from ..lod.crop import Crop
-from ..splats.bundle import Bundle
 from ..splats.gaussians import SH_C0, SplatRows, Splats
-from .paint import painted
+from ..splats.levels import Bundle
+from .paint import apply_paint
 
 GAMMA = 2.2
 """Of the power that stands for the sRGB curve."""
@@ -116,7 +116,7 @@ def _black_body(temperature: float) -> np.ndarray:
     return _RGB_OF_XYZ @ (x / y, 1.0, (1 - x - y) / y)
 
 
-def changed(
+def change_colors(
     looks: Looks, means: np.ndarray, sh: np.ndarray, opacity_logits: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """What looks make of harmonics (N, K, 3) and opacity logits (N,) of splats at means (N, 3).
@@ -139,15 +139,15 @@ def changed(
     return sh, opacity_logits
 
 
-def looked(splats: Splats, looks: Looks) -> Splats:
+def apply_looks(splats: Splats, looks: Looks) -> Splats:
     """Splats as paint and looks have them; places of regions are in the splats' own space."""
-    splats = painted(splats)
-    sh, opacity_logits = changed(looks, splats.means, splats.sh, splats.opacity_logits)
+    splats = apply_paint(splats)
+    sh, opacity_logits = change_colors(looks, splats.means, splats.sh, splats.opacity_logits)
     return replace(splats, sh=sh, opacity_logits=opacity_logits)
 
 
 @dataclass(frozen=True)
-class LookedRows:
+class RowsWithLook:
     """Splats that are read a few at a time, as paint and looks have them."""
 
     of: SplatRows
@@ -158,16 +158,16 @@ class LookedRows:
 
     def select(self, some: slice | np.ndarray, /) -> Splats:
         """The splats of a range of rows, or of some rows (M,) ascending."""
-        return looked(self.of.select(some), self.looks)
+        return apply_looks(self.of.select(some), self.looks)
 
 
-def looked_levels(bundle: Bundle, looks: Looks) -> Bundle:
+def apply_looks_to_levels(bundle: Bundle, looks: Looks) -> Bundle:
     """A bundle whose levels are as paint and looks have them; those that are in files stay there until they
     are written."""
     levels = [
-        replace(level, splats=looked(level.splats, looks))
+        replace(level, splats=apply_looks(level.splats, looks))
         if level.on_disk is None
-        else replace(level, on_disk=LookedRows(level.on_disk, looks))
+        else replace(level, on_disk=RowsWithLook(level.on_disk, looks))
         for level in bundle.levels
     ]
     return replace(bundle, levels=levels)

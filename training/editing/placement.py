@@ -10,17 +10,17 @@ import numpy as np
 from ..errors import LodgsError
 from ..lod.partial_read import BLOCKS
 from ..lod.rule import Rule, find_rule
-from ..lod.selection import columns_of, unknown_rule
-from ..lod.tree.paging import BOUNDS, table_of_pages
+from ..lod.selection import rule_columns, unknown_rule_error
+from ..lod.tree.paging import BOUNDS, page_table
 from ..scenes import view_tables
 from ..scenes.ground import find_ground, ground_placement, points_near_cameras
-from ..splats.bundle import META_LENGTHS, NO_SPLATS, Bundle, Level
 from ..splats.gaussians import SplatRows, Splats
+from ..splats.levels import META_LENGTHS, NO_SPLATS, Bundle, Level
 from ..splats.ply import BATCH_ROWS, Columns
 from ..splats.similarity import Similarity, TransformedRows
 
 
-def placed(bundle: Bundle, placement: Similarity) -> Bundle:
+def transform_bundle(bundle: Bundle, placement: Similarity) -> Bundle:
     """A bundle whose splats, and all that it says of places and lengths, stand elsewhere.
 
     Levels that are in files stay there until they are written. Of a rule whose columns are ``related`` these
@@ -31,7 +31,9 @@ def placed(bundle: Bundle, placement: Similarity) -> Bundle:
     """
     rule = find_rule(bundle.rule)
     if rule is None and bundle.rule:
-        raise LodgsError(unknown_rule(bundle.rule)[0], "Update LODGS, or export one level as a plain PLY.")
+        raise LodgsError(
+            unknown_rule_error(bundle.rule)[0], "Update LODGS, or export one level as a plain PLY."
+        )
     lengths, places = (rule.lengths, rule.places) if rule else ((), ())
 
     def of(splats: Splats) -> Splats:
@@ -57,12 +59,12 @@ def placed(bundle: Bundle, placement: Similarity) -> Bundle:
     if view_tables.VIEWS in tables:
         tables[view_tables.VIEWS] = view_tables.transform_views(tables[view_tables.VIEWS], placement)
     if BOUNDS[0] in tables.get(BLOCKS, {}):
-        tables[BLOCKS] = table_of_pages({x.number: c for x, c in zip(bundle.levels, remade, strict=True)})
+        tables[BLOCKS] = page_table({x.number: c for x, c in zip(bundle.levels, remade, strict=True)})
     meta = _meta(bundle.meta, placement)
     return replace(bundle, levels=levels, facts=facts(bundle.facts), tables=tables, meta=meta)
 
 
-def standing(
+def upright_placement(
     bundle: Bundle, upright: bool = False, ground: bool = False, points: np.ndarray | None = None
 ) -> Similarity:
     """What stands a bundle's scene upright, z up, and where it is asked for its ground on z = 0.
@@ -130,7 +132,7 @@ def _agreed(bundle: Bundle, rule: Rule, placement: Similarity) -> list[Columns]:
     for level in bundle.levels:
         for begin in range(0, max(len(level.rows), 1), BATCH_ROWS):
             splats = level.rows.select(slice(begin, begin + BATCH_ROWS))
-            parts.append(columns_of(rule, splats) | dict(zip("xyz", splats.means.T.copy(), strict=True)))
+            parts.append(rule_columns(rule, splats) | dict(zip("xyz", splats.means.T.copy(), strict=True)))
         ends.append(len(level.rows))
     before = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     after = placement.transform_columns(before, rule.lengths, (*rule.places, ("x", "y", "z")))

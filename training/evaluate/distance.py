@@ -9,10 +9,10 @@ from itertools import pairwise
 import numpy as np
 
 from ..lod.rule import Values
-from ..lod.selection import rule_of
+from ..lod.selection import require_rule
 from ..rasterize.resident import ResidentBundle
 from ..scenes.cameras import Camera
-from ..splats.bundle import Bundle
+from ..splats.levels import Bundle
 from .metrics import psnr
 from .views import Evaluation, full_detail_selector
 
@@ -70,7 +70,10 @@ def measure_popping(evaluation: Evaluation, bundle: Bundle, values: Values, came
         The largest jump, by what it is of: ``by distance``; where the rule's levels fade, ``faded`` and
         ``hard``, with levels switched on and off.
     """
-    shown, resident = full_detail_selector(bundle, bundle.levels[-1]), ResidentBundle(bundle, evaluation.backend)
+    shown, resident = (
+        full_detail_selector(bundle, bundle.levels[-1]),
+        ResidentBundle(bundle, evaluation.backend),
+    )
     everything, fixed = shown(camera)
     everything = evaluation.load(everything)
     views = [
@@ -92,6 +95,6 @@ def measure_popping(evaluation: Evaluation, bundle: Bundle, values: Values, came
         return evaluation.draw(splats, view, fixed).numpy()
 
     still = differences(map(full, views))
-    if any(control.name == "fade" for control in rule_of(bundle).controls):
+    if any(control.name == "fade" for control in require_rule(bundle).controls):
         return {"faded": largest({**values, "fade": 1}), "hard": largest({**values, "fade": 0})}
     return {"by distance": largest(values)}

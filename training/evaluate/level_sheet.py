@@ -10,13 +10,13 @@ import torch
 
 from ..files import atomic_write
 from ..lod.colors import level_color
-from ..lod.on_disk import in_sight
+from ..lod.on_disk import read_visible
 from ..lod.rule import Values, find_rule
-from ..lod.selection import complete, levels_alone, select
+from ..lod.selection import complete_splats, select, standalone_levels
 from ..scenes.cameras import Camera
 from ..scenes.images import write_png
-from ..splats.bundle import Bundle
 from ..splats.gaussians import SH_C0, Splats
+from ..splats.levels import Bundle
 from .metrics import psnr
 from .views import Evaluation
 
@@ -33,7 +33,7 @@ def write_level_sheet(
     """
     target = evaluation.target(camera)
     if bundle.on_disk:
-        bundle = in_sight(bundle, camera)
+        bundle = read_visible(bundle, camera)
 
     def tile(name: str, splats: Splats, weights: np.ndarray | None = None) -> tuple[str, torch.Tensor]:
         image = evaluation.draw(splats, camera, weights)
@@ -42,7 +42,10 @@ def write_level_sheet(
     rule = find_rule(bundle.rule)
     tiles = []
     if rule is None or not rule.always:
-        tiles = [tile(f"level {level.number}", complete(bundle, level)) for level in levels_alone(bundle)]
+        tiles = [
+            tile(f"level {level.number}", complete_splats(bundle, level))
+            for level in standalone_levels(bundle)
+        ]
     if rule and rule.sweep:
         name, steps = rule.sweep
         for step in steps:

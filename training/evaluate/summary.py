@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from ..scenes.cameras import pick_evenly
-from ..splats.bundle import Bundle
+from ..splats.levels import Bundle
 from .metrics import fit_exposure, psnr
 from .offset_views import count_oversized, measure_veil
 from .views import MAX_TRAINING_VIEWS, Evaluation, full_detail_selector

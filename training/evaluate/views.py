@@ -9,15 +9,15 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from ..lod.on_disk import Sight
+from ..lod.on_disk import CulledReader
 from ..lod.rule import Values, find_rule
-from ..lod.selection import Choice, complete, settings
+from ..lod.selection import BundleSelector, complete_splats, resolve_controls
 from ..optimize.training_data import TrainingData
 from ..rasterize import Gaussians, Rendering, Target, rasterize, tensor_device
 from ..rasterize.resident import ResidentBundle, SplatSet, WeightedSet, draw
 from ..scenes.cameras import Camera, pick_evenly
-from ..splats.bundle import Bundle, Level
 from ..splats.gaussians import Splats
+from ..splats.levels import Bundle, Level
 from .metrics import psnr, ssim
 
 MAX_TRAINING_VIEWS = 24
@@ -43,15 +43,15 @@ def full_detail_selector(bundle: Bundle, level: Level) -> SplatSelector:
         return _in_sight(bundle, level)
     rule = find_rule(bundle.rule)
     if rule is None or not rule.always:
-        everything = complete(bundle, level)
+        everything = complete_splats(bundle, level)
         return lambda camera: (everything, None)
     alone = replace(bundle, levels=bundle.drawn_levels(level.number))
-    choice, values = Choice(alone), settings(alone, {})
+    choice, values = BundleSelector(alone), resolve_controls(alone, {})
     return lambda camera: (choice.splats, choice.weights(camera.center, camera.focal, values))
 
 
 def _in_sight(bundle: Bundle, level: Level) -> SplatSelector:
-    sights = [Sight(each.rows) for each in bundle.drawn_levels(level.number)]
+    sights = [CulledReader(each.rows) for each in bundle.drawn_levels(level.number)]
     parts: list[Splats | None] = [None] * len(sights)
 
     def shown_to(camera: Camera) -> tuple[Splats, None]:
@@ -174,7 +174,7 @@ class Evaluation:
 
         def count(camera: Camera) -> int:
             shown = resident.select_by_rule(camera, values).values()
-            return sum(len(one.splats.select_visible(one.choice)[0]) for one in shown)
+            return sum(len(one.splats.select_visible(one.query)[0]) for one in shown)
 
         return self.measure(lambda camera: resident.draw(camera, values, **self._options), count)
 
@@ -183,7 +183,7 @@ class Evaluation:
         rule, alone = find_rule(bundle.rule), replace(bundle, levels=bundle.drawn_levels(level.number))
         resident = ResidentBundle(alone, self.backend)
         if rule is not None and rule.always:
-            return self.measure_by_distance(resident, settings(alone, {}))
+            return self.measure_by_distance(resident, resolve_controls(alone, {}))
         total = sum(len(each.rows) for each in alone.levels)
         return self.measure(
             lambda camera: resident.draw_level(level.number, camera, **self._options), lambda camera: total

@@ -9,15 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from ..scenes.cameras import Camera
-from ..splats.bundle import Bundle, open_bundle, read_header
+from ..splats.bundle import open_bundle, read_header
 from ..splats.dialects import Warn, drop_undrawable, dropped_message, ignore
 from ..splats.gaussians import SplatRows, Splats
+from ..splats.levels import Bundle
 from .blocks import SIZE, Blocks
-from .query import Choice
+from .query import LodQuery
 from .rule import Rule, find_rule
-from .selection import columns_of
+from .selection import rule_columns
 
-IN_MEMORY = 4_000_000
+MAX_IN_MEMORY = 4_000_000
 """Splats of a file that are all kept in memory, where nothing else is said: 1 GB of degree 3."""
 _ANYWHERE = np.float32(1e15)
 """Farther than any splat is drawn."""
@@ -29,7 +30,7 @@ _SPARE = 2
 """What has been read is kept as long as it is no more than so many times what a camera may see."""
 
 
-def in_parts(rule: str) -> bool:
+def supports_culled_reads(rule: str) -> bool:
     """Whether levels of a rule can be drawn by those splats alone that a camera may see."""
     found = find_rule(rule)
     return found is not None and found.apart and not found.tables
@@ -46,17 +47,17 @@ def open_if_large(path: str | Path, most: int = 0) -> Bundle | None:
     Raises:
         LodgsError: as ``read_bundle``.
     """
-    if not in_parts(read_header(path).rule):
+    if not supports_culled_reads(read_header(path).rule):
         return None
     bundle, rows = open_bundle(path)
-    if sum(map(len, rows.values())) <= (most or IN_MEMORY):
+    if sum(map(len, rows.values())) <= (most or MAX_IN_MEMORY):
         return None
     for level in bundle.levels:
         level.on_disk = rows[level.number]
     return bundle
 
 
-class Sight:
+class CulledReader:
     """A level's splats in blocks of rows, of which it is known where they are; all are read once for it.
 
     Args:
@@ -81,7 +82,7 @@ class Sight:
             if missing:  # no numbers to go by
                 blocks.low[:], blocks.high[:] = -_ANYWHERE, _ANYWHERE
             parts.append((blocks.low, blocks.high, blocks.reach))
-            columns = {} if rule is None else columns_of(rule, splats)
+            columns = {} if rule is None else rule_columns(rule, splats)
             of_columns.append({name: blocks.highest(column) for name, column in columns.items()})
         if undrawable:
             warn(dropped_message(undrawable, self._path))
@@ -99,7 +100,7 @@ class Sight:
     def __len__(self) -> int:
         return len(self._rows)
 
-    def missing(self, camera: Camera, choice: Choice | None = None) -> np.ndarray | None:
+    def missing(self, camera: Camera, choice: LodQuery | None = None) -> np.ndarray | None:
         """The blocks (B,) bool of all splats that a camera has in its image and, by a choice, a weight; None
         where what was read last will do."""
         wanted = self._blocks.in_view(camera, 0.0)
@@ -122,11 +123,11 @@ class Sight:
         return drop_undrawable(splats, self._path)
 
 
-def in_sight(bundle: Bundle, camera: Camera) -> Bundle:
+def read_visible(bundle: Bundle, camera: Camera) -> Bundle:
     """A bundle in memory as far as a camera may see it."""
     levels = []
     for level in bundle.levels:
-        sight = Sight(level.rows)
+        sight = CulledReader(level.rows)
         blocks = sight.missing(camera)
         assert blocks is not None, "nothing has been read yet"
         levels.append(replace(level, splats=sight.read(blocks), on_disk=None))

@@ -8,33 +8,34 @@ from pathlib import Path
 
 import numpy as np
 
-from ..splats.bundle import Bundle, read_bundle, read_header, read_tables
+from ..splats.bundle import read_bundle, read_header, read_tables
 from ..splats.dialects import Warn, ignore
 from ..splats.gaussians import Splats
+from ..splats.levels import Bundle
 from ..splats.ply import extra_columns
 from ..splats.ply import splat_columns as columns_in_file
 from .blocks import SIZE
 from .rule import Region, Rule
-from .selection import columns_of, rule_of
+from .selection import require_rule, rule_columns
 
 BLOCKS = "blocks"
 """The table of blocks, SIZE rows of a level each, in the order of their rows: ``level``, and the rule's
 columns of bits, those of all rows of the block together."""
 
 
-def table_of_blocks(rule: Rule, levels: dict[int, Splats]) -> dict[str, np.ndarray]:
+def block_table(rule: Rule, levels: dict[int, Splats]) -> dict[str, np.ndarray]:
     """The table for levels by number, of a rule whose columns are whole numbers of bits, float32."""
     table: dict[str, list[np.ndarray]] = {"level": []}
     for number, splats in levels.items():
         begins = np.arange(0, len(splats), SIZE)
         table["level"].append(np.full(len(begins), number, np.int32))
-        for name, column in columns_of(rule, splats).items():
+        for name, column in rule_columns(rule, splats).items():
             bits = np.bitwise_or.reduceat(column.astype(np.int32), begins) if len(begins) else np.zeros(0)
             table.setdefault(name, []).append(bits.astype(np.float32))
     return {name: np.concatenate(parts) for name, parts in table.items()}
 
 
-def read_head_and_tables(path: str | Path) -> Bundle:
+def read_header_and_tables(path: str | Path) -> Bundle:
     """What a bundle says of its levels, which are without splats, with its tables.
 
     Raises:
@@ -69,7 +70,7 @@ def read_part(
         table = bundle.tables.get(BLOCKS)
         if table is None or region is None:
             return found
-        rule = rule_of(bundle)
+        rule = require_rule(bundle)
         nothing = np.zeros(len(table["level"]), np.float32)
         needed = rule.loaded({name: table.get(name, nothing) for name in rule.columns}, region)
         for number in numbers:
@@ -78,10 +79,10 @@ def read_part(
         return found
 
     bundle = read_bundle(path, warn, rows_of)
-    rule = None if region is None or BLOCKS not in bundle.tables else rule_of(bundle)
+    rule = None if region is None or BLOCKS not in bundle.tables else require_rule(bundle)
     for level in bundle.levels:
         columns = columns_in_file(level.splats) | extra_columns(level.splats)
         size += sum(column.dtype.itemsize for column in columns.values()) * len(level.splats)
         if rule is not None and region is not None:
-            level.splats = level.splats.select(rule.loaded(columns_of(rule, level.splats), region))
+            level.splats = level.splats.select(rule.loaded(rule_columns(rule, level.splats), region))
     return bundle, size

@@ -8,13 +8,13 @@ from functools import cached_property
 import numpy as np
 
 from ..errors import LodgsError
-from ..splats.bundle import Bundle, Level
 from ..splats.gaussians import Splats
-from .rule import OPACITY, Rule, Values, facts_of, find_rule
+from ..splats.levels import Bundle, Level
+from .rule import OPACITY, Rule, Values, collect_facts, find_rule
 
 
 @dataclass
-class Shown:
+class SelectedLevel:
     """What is shown of one level.
 
     Attributes:
@@ -28,7 +28,7 @@ class Shown:
     weights: np.ndarray | None = None
 
 
-def known_rule(bundle: Bundle) -> Rule | None:
+def check_rule(bundle: Bundle) -> Rule | None:
     """The rule that a bundle's levels are chosen by; None where they have none, or it is not known here.
 
     Raises:
@@ -54,20 +54,20 @@ def known_rule(bundle: Bundle) -> Rule | None:
     return rule
 
 
-def rule_of(bundle: Bundle) -> Rule:
+def require_rule(bundle: Bundle) -> Rule:
     """The rule that a bundle's levels are chosen by.
 
     Raises:
         LodgsError: they are not made for distances, this version does not know the rule, or they contradict
             it.
     """
-    rule = known_rule(bundle)
+    rule = check_rule(bundle)
     if rule is None:
-        raise LodgsError(*unknown_rule(bundle.rule))
+        raise LodgsError(*unknown_rule_error(bundle.rule))
     return rule
 
 
-def unknown_rule(name: str) -> tuple[str, str]:
+def unknown_rule_error(name: str) -> tuple[str, str]:
     """What to say, and what to do about it, where there is no such rule."""
     if not name:
         return "These levels are not made for distances.", "Leave out the options that choose by distance."
@@ -77,14 +77,14 @@ def unknown_rule(name: str) -> tuple[str, str]:
     )
 
 
-def settings(bundle: Bundle, given: Values) -> Values:
+def resolve_controls(bundle: Bundle, given: Values) -> Values:
     """A value for every control of a bundle's rule: those given, else the bundle's own, else the rule's.
 
     Raises:
-        LodgsError: as :func:`rule_of`, the rule has no such control, a value is not possible, or no level is
+        LodgsError: as :func:`require_rule`, the rule has no such control, a value is not possible, or no level is
             left in use.
     """
-    return rule_of(bundle).settings(given, [level.number for level in bundle.levels], bundle.controls)
+    return require_rule(bundle).settings(given, [level.number for level in bundle.levels], bundle.controls)
 
 
 def select(
@@ -92,15 +92,15 @@ def select(
 ) -> tuple[Splats, np.ndarray | None]:
     """A copy of the splats of a bundle that an eye is shown by its rule, and their weights (None: all 1).
 
-    For one eye after another see :class:`Choice`.
+    For one eye after another see :class:`BundleSelector`.
 
     Args:
         eye: (3,) world position that distances are measured from.
         focal_px: focal length in pixels of the image that is looked at (``Camera.focal``).
-        values: of the rule's controls, see :func:`settings`.
+        values: of the rule's controls, see :func:`resolve_controls`.
 
     Raises:
-        LodgsError: as :func:`rule_of`, or the rule's facts are incomplete.
+        LodgsError: as :func:`require_rule`, or the rule's facts are incomplete.
     """
     shown = select_levels(bundle, eye, focal_px, values)
     splats = Splats.concatenated([one.splats for one in shown])
@@ -110,32 +110,35 @@ def select(
     return splats, np.concatenate(ones)
 
 
-def select_levels(bundle: Bundle, eye: np.ndarray, focal_px: float, values: Values) -> list[Shown]:
+def select_levels(bundle: Bundle, eye: np.ndarray, focal_px: float, values: Values) -> list[SelectedLevel]:
     """The same level by level, coarse to fine; levels of which nothing is shown have no splats."""
     shown = []
-    of_levels = Choice(bundle).of_levels(eye, focal_px, values)
+    of_levels = BundleSelector(bundle).of_levels(eye, focal_px, values)
     for level, weights in zip(bundle.levels, of_levels, strict=True):
         some = weights > 0
         splats, weights = level.splats.select(some), weights[some]
-        shown.append(Shown(level.number, splats, None if (weights == 1).all() else weights))
+        shown.append(SelectedLevel(level.number, splats, None if (weights == 1).all() else weights))
     return shown
 
 
-class Choice:
+class BundleSelector:
     """A bundle's levels, to choose from for one eye after another: weights alone, and no copy of a splat.
 
     What a rule needs to know is gathered once. Whoever draws keeps ``splats`` where they are drawn, on a GPU
     for example; splats of weight 0 cost a rasterizer next to nothing.
 
     Raises:
-        LodgsError: as :func:`rule_of`, or the rule's facts are incomplete.
+        LodgsError: as :func:`require_rule`, or the rule's facts are incomplete.
     """
 
     def __init__(self, bundle: Bundle) -> None:
-        self._rule, self._levels, self._tables = rule_of(bundle), bundle.levels, bundle.tables
+        self._rule, self._levels, self._tables = require_rule(bundle), bundle.levels, bundle.tables
         numbered = [(level.number, level.facts) for level in bundle.levels]
         self._known = [
-            (columns_of(self._rule, level.splats), facts_of(self._rule, bundle.facts, numbered, level.number))
+            (
+                rule_columns(self._rule, level.splats),
+                collect_facts(self._rule, bundle.facts, numbered, level.number),
+            )
             for level in bundle.levels
         ]
 
@@ -157,7 +160,7 @@ class Choice:
         return np.concatenate(self.of_levels(eye, focal_px, values))
 
 
-def columns_of(rule: Rule, splats: Splats) -> dict[str, np.ndarray]:
+def rule_columns(rule: Rule, splats: Splats) -> dict[str, np.ndarray]:
     """What a rule needs to know of splats, (N,) float32 by name; zeros where they lack it."""
     nothing = np.broadcast_to(np.float32(0), len(splats))
     columns = {name: splats.extras.get(name, nothing) for name in rule.columns}
@@ -167,14 +170,14 @@ def columns_of(rule: Rule, splats: Splats) -> dict[str, np.ndarray]:
     return columns
 
 
-def levels_alone(bundle: Bundle) -> list[Level]:
+def standalone_levels(bundle: Bundle) -> list[Level]:
     """The levels that can be shown one at a time, coarse to fine: see ``Rule.alone``."""
     rule, numbers = find_rule(bundle.rule), [level.number for level in bundle.levels]
     alone = numbers if rule is None else rule.alone(numbers)
     return [level for level in bundle.levels if level.number in alone]
 
 
-def not_alone(number: int, finest: int) -> tuple[str, str]:
+def standalone_error(number: int, finest: int) -> tuple[str, str]:
     """What to say, and what to do about it, where a level is wanted that is no scene by itself."""
     return (
         f"Level {number} is no scene by itself: its splats stand for groups of finer ones, where those are "
@@ -183,6 +186,6 @@ def not_alone(number: int, finest: int) -> tuple[str, str]:
     )
 
 
-def complete(bundle: Bundle, level: Level) -> Splats:
+def complete_splats(bundle: Bundle, level: Level) -> Splats:
     """All that is drawn at a level, as one set of splats."""
-    return Splats.concatenated([each.splats for each in bundle.upto(level.number)])
+    return Splats.concatenated([each.splats for each in bundle.drawn_levels(level.number)])

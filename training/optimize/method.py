@@ -12,8 +12,8 @@ import torch
 
 from ..rasterize import Gaussians, Rendering, Target, photometric_loss, rasterize, tensor_device
 from ..scenes.cameras import Camera
-from ..splats.bundle import Level
 from ..splats.gaussians import Splats
+from ..splats.levels import Level
 from ..splats.ply import Columns
 from .density_control import require_rows
 from .exposure import Exposure

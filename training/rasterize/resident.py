@@ -1,9 +1,9 @@
-"""Splats where they are drawn, kept from picture to picture: whatever draws levels by distance draws with it.
+"""Splats resident in device memory, from which level-of-detail renderers draw image after image.
 
-A set of splats (``SplatSet``) is put in spatial order once, and looked at in blocks of rows: what is out of
-sight, or out of its level's reach, is left out before its splats are looked at one by one, and nothing that
-is left out is copied. ``ResidentBundle`` is a bundle's levels as such sets; of a file that has an index of its
-blocks it reads what the eye's region needs.
+A :class:`SplatSet` is sorted spatially once and culled in blocks of rows: invisible blocks and blocks beyond
+their level's distance range are skipped before single splats are tested, and culled splats are never copied.
+A :class:`ResidentBundle` holds a bundle's levels as such sets. From a file with a block index it reads only
+the splats that the camera's region needs.
 """
 
 from __future__ import annotations
@@ -18,39 +18,39 @@ import numpy as np
 import torch
 from torch.nn.functional import pad
 
-from ..editing.look import Looks, changed
+from ..editing.look import Looks, change_colors
 from ..errors import LodgsError
 from ..lod.blocks import SIZE, spatial_order
-from ..lod.on_disk import Sight, open_if_large
-from ..lod.partial_read import BLOCKS, read_head_and_tables, read_part
-from ..lod.query import Choice, Chooser
-from ..lod.rule import OPACITY, Region, Values, every_column, facts_of
-from ..lod.selection import known_rule, levels_alone, not_alone, rule_of
+from ..lod.on_disk import CulledReader, open_if_large
+from ..lod.partial_read import BLOCKS, read_header_and_tables, read_part
+from ..lod.query import LodQuery, SplatSelector
+from ..lod.rule import OPACITY, Region, Values, all_rule_columns, collect_facts
+from ..lod.selection import check_rule, require_rule, standalone_error, standalone_levels
 from ..scenes.cameras import Camera
-from ..splats.bundle import Bundle
 from ..splats.dialects import Warn, ignore
 from ..splats.gaussians import Splats
+from ..splats.levels import Bundle
 from ..splats.ply import Element, all_columns
 from . import rasterize, tensor_device
 from .gaussians import Gaussians
 from .rendering import Rendering
 from .transform import transform_gaussians
 
-MANY = 16 * SIZE
-"""Fewer splats are not worth being put in order; of equally deep ones the first in order is in front."""
+SORT_THRESHOLD = 16 * SIZE
+"""Smaller sets are not sorted spatially. Among splats of equal depth, the first in order is in front."""
 
 
 class SplatSet:
-    """Splats where a backend draws them.
+    """Splats on a backend's device.
 
     Args:
-        splats: in the set's own coordinates; of their extras those are kept that rules ask for.
-        weights: (N,) on the opacities; None: ones.
-        backend: rasterizer.
-        ordered: their rows are in spatial order already; then nothing is copied.
+        splats: splats in the set's coordinates. Of their extra columns, only those that rules use are kept.
+        weights: (N,) factors of the opacities; None means 1.
+        backend: rasterizer backend.
+        ordered: the rows are already in spatial order, so they need no copy.
 
     Attributes:
-        gaussians: the same, where there are MANY in spatial order, on the backend's device.
+        gaussians: the splats on the backend's device, in spatial order if they reach SORT_THRESHOLD.
     """
 
     def __init__(
@@ -61,135 +61,149 @@ class SplatSet:
         ordered: bool = False,
     ) -> None:
         device = tensor_device(backend)
-        if not ordered and len(splats) >= MANY:
+        if not ordered and len(splats) >= SORT_THRESHOLD:
             order = spatial_order(splats.means)
-            splats, weights = splats.select(order), None if weights is None else weights[order]
+            splats = splats.select(order)
+            weights = None if weights is None else weights[order]
         self.gaussians = Gaussians.of(splats, device)
         self._weights = None if weights is None else np.asarray(weights, np.float32)
-        # opacities as they were trained, by which rules choose whatever looks make of them
-        self._columns = {name: splats.extras[name] for name in every_column() if name in splats.extras}
+        # rules select by the trained opacities, which looks may change
+        self._columns = {name: splats.extras[name] for name in all_rule_columns() if name in splats.extras}
         with np.errstate(over="ignore"):
             self._columns[OPACITY] = 1 / (1 + np.exp(-splats.opacity_logits))
-        self._chooser: Chooser | None = None
-        self._in_world: tuple[bytes, Gaussians] | None = None
-        self._joined: tuple[list[SplatSet], Gaussians] | None = None
-        self._looked: tuple[Looks, SplatSet] | None = None
+        self._chooser: SplatSelector | None = None
+        self._transformed: tuple[bytes, Gaussians] | None = None
+        self._concatenated: tuple[list[SplatSet], Gaussians] | None = None
+        self._with_looks: tuple[Looks, SplatSet] | None = None
 
     def __len__(self) -> int:
         return len(self.gaussians)
 
     def select_visible(
-        self, choice: Choice | None, camera: Camera | None = None, near: float = 0.0
+        self, query: LodQuery | None, camera: Camera | None = None, near: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The splats that have a weight, (M,) int32 ascending, and their weights (M,) float32.
+        """Select the splats with positive weight.
 
         Args:
-            choice: by what they are weighted, on top of their own weights; None: by these alone.
-            camera: in the set's own coordinates; splats that are out of its sight may be left out.
-            near: depth at which its drawing begins, in the set's units.
+            query: rule and arguments that weight the splats in addition to their own weights; None applies no
+                rule.
+            camera: camera in the set's coordinates; splats outside its image may be skipped.
+            near: near depth of the camera, in the set's units.
+
+        Returns:
+            Row indices (M,) int32, ascending, and weights (M,) float32.
         """
         if self._chooser is None:
             self._chooser = self._make_chooser()
-        rows, weights = self._chooser.chosen(choice, camera, near)
+        rows, weights = self._chooser.chosen(query, camera, near)
         if self._weights is None:
             return rows, weights
         weights = weights * self._weights[rows]
-        some = weights > 0
-        return (rows, weights) if some.all() else (rows[some], weights[some])
+        positive = weights > 0
+        return (rows, weights) if positive.all() else (rows[positive], weights[positive])
 
     def transformed(self, matrix: np.ndarray) -> Gaussians:
-        """The splats where a transform (4, 4) puts them, any affine one; kept while it is the same.
+        """Apply an affine transform (4, 4) to the splats; the last result is cached.
 
-        Their harmonics stay the set's.
+        Their harmonics are not rotated.
         """
         key = matrix.tobytes()
-        if self._in_world is None or self._in_world[0] != key:
-            self._in_world = key, transform_gaussians(self.gaussians, matrix)
-        return self._in_world[1]
+        if self._transformed is None or self._transformed[0] != key:
+            self._transformed = key, transform_gaussians(self.gaussians, matrix)
+        return self._transformed[1]
 
     def with_looks(self, looks: Looks) -> SplatSet:
-        """The set as looks have it, with everything else shared; kept while they are the same."""
+        """Return the set with looks applied, sharing all other data; the last result is cached."""
         if not looks:
-            self._looked = None
+            self._with_looks = None
             return self
-        if self._looked is None or self._looked[0] != looks:
-            own, other = self.gaussians, copy(self)
-            sh, logits = changed(looks, *(x.cpu().numpy() for x in (own.means, own.sh, own.opacity_logits)))
+        if self._with_looks is None or self._with_looks[0] != looks:
+            own = self.gaussians
+            copied = copy(self)
+            sh, logits = change_colors(
+                looks, *(x.cpu().numpy() for x in (own.means, own.sh, own.opacity_logits))
+            )
             sh, logits = (torch.from_numpy(x).to(own.means.device) for x in (sh, logits))
-            other.gaussians = replace(own, sh=sh, opacity_logits=logits)
-            other._in_world = other._joined = other._looked = None
-            self._looked = looks, other
-        return self._looked[1]
+            copied.gaussians = replace(own, sh=sh, opacity_logits=logits)
+            copied._transformed = copied._concatenated = copied._with_looks = None
+            self._with_looks = looks, copied
+        return self._with_looks[1]
 
-    def concatenated(self, others: Sequence[SplatSet]) -> Gaussians:
-        """These splats and those of other sets as one, kept as long as these are the others.
+    def concatenated(self, following: Sequence[SplatSet]) -> Gaussians:
+        """Concatenate the splats of this set and the following sets; the last result is cached.
 
-        All of them are parts of it then, so that nothing is there twice.
+        All sets then become views of the result, so no splat is stored twice.
         """
-        others = list(others)
-        if not others:
+        following = list(following)
+        if not following:
             return self.gaussians
-        if self._joined is None or self._joined[0] != others:
-            sets = [self, *others]
-            most = max(one.gaussians.sh.shape[1] for one in sets)
-            whole = Gaussians.concatenated([
-                replace(one.gaussians, sh=pad(one.gaussians.sh, (0, 0, 0, most - one.gaussians.sh.shape[1])))
-                for one in sets
-            ])  # fmt: skip
-            if self in others:  # drawn twice at one place
-                return whole
+        if self._concatenated is None or self._concatenated[0] != following:
+            sets = [self, *following]
+            terms = max(splat_set.gaussians.sh.shape[1] for splat_set in sets)
+            combined = Gaussians.concatenated(
+                [_pad_harmonics(splat_set.gaussians, terms) for splat_set in sets]
+            )
+            if self in following:  # a set that is drawn twice cannot be a view of both copies
+                return combined
             begin = 0
-            for one in sets:
-                end = begin + len(one)
-                one.gaussians, begin = whole.select(slice(begin, end)), end
-                one._chooser = one._in_world = None  # which hold what these tensors took the place of
-            self._joined = others, whole
-        return self._joined[1]
+            for splat_set in sets:
+                end = begin + len(splat_set)
+                splat_set.gaussians = combined.select(slice(begin, end))
+                splat_set._chooser = splat_set._transformed = None  # they reference the replaced tensors
+                begin = end
+            self._concatenated = following, combined
+        return self._concatenated[1]
 
-    def _make_chooser(self) -> Chooser:
+    def _make_chooser(self) -> SplatSelector:
         own = self.gaussians
-        return Chooser(own.means.cpu().numpy(), self._columns, own.log_scales.cpu().numpy())
+        return SplatSelector(own.means.cpu().numpy(), self._columns, own.log_scales.cpu().numpy())
+
+
+def _pad_harmonics(gaussians: Gaussians, terms: int) -> Gaussians:
+    sh = gaussians.sh
+    return replace(gaussians, sh=pad(sh, (0, 0, 0, terms - sh.shape[1])))
 
 
 class WeightedSet(NamedTuple):
-    """A set of splats, and by what they are weighted; None: by nothing but their own weights."""
+    """A set of splats and the query that weights them; None applies no rule."""
 
     splats: SplatSet
-    choice: Choice | None
+    query: LodQuery | None
 
 
 def combine_visible(
     sets: Sequence[WeightedSet], camera: Camera, near: float
 ) -> tuple[Gaussians, torch.Tensor, torch.Tensor | None]:
-    """Of sets that stand together all splats, N, which of them to look at, and weights: for ``rasterize``.
+    """Concatenate sets in the same coordinates and select their visible splats, for ``rasterize``.
 
     Args:
-        camera, near: in the sets' coordinates.
+        camera, near: camera and near depth in the sets' coordinates.
 
     Returns:
-        The splats; rows (M,) int32; weights (N,), which count in these rows only, or None: all are 1.
+        All N splats; rows (M,) int32 to consider; weights (N,), valid in these rows only, or None if all are
+        1.
     """
-    gaussians = sets[0].splats.concatenated([one.splats for one in sets[1:]])
+    gaussians = sets[0].splats.concatenated([weighted.splats for weighted in sets[1:]])
     device = gaussians.means.device
-    chosen = [splats.chosen(choice, camera, near) for splats, choice in sets]
-    begins = np.cumsum([0, *(len(one.splats) for one in sets)], dtype=np.int32)
-    rows = np.concatenate([some + begin for begin, (some, _) in zip(begins, chosen, strict=False)])
-    found = np.concatenate([weights for _, weights in chosen])
-    rows_there = torch.from_numpy(rows).to(device)
-    if (found == 1).all():
-        return gaussians, rows_there, None
+    selections = [splats.select_visible(query, camera, near) for splats, query in sets]
+    begins = np.cumsum([0, *(len(weighted.splats) for weighted in sets)], dtype=np.int32)
+    rows = np.concatenate([index + begin for begin, (index, _) in zip(begins, selections, strict=False)])
+    row_weights = np.concatenate([weights for _, weights in selections])
+    device_rows = torch.from_numpy(rows).to(device)
+    if (row_weights == 1).all():
+        return gaussians, device_rows, None
     weights = np.zeros(len(gaussians), np.float32)
-    weights[rows] = found
-    return gaussians, rows_there, torch.from_numpy(weights).to(device)
+    weights[rows] = row_weights
+    return gaussians, device_rows, torch.from_numpy(weights).to(device)
 
 
 def draw(
     sets: Sequence[WeightedSet], camera: Camera, *, near: float = 0.01, backend: str = "auto", **options: Any
 ) -> Rendering:
-    """What a camera sees of sets that stand together. Nothing is kept for gradients.
+    """Render sets in the same coordinates, without gradients.
 
     Args:
-        options: as for :func:`training.rasterize.rasterize`.
+        options: see :func:`training.rasterize.rasterize`.
     """
     with torch.no_grad():
         gaussians, rows, weights = combine_visible(sets, camera, near)
@@ -197,24 +211,25 @@ def draw(
 
 
 class ResidentBundle:
-    """A bundle's levels, for one picture after another.
+    """A bundle's levels, ready to render images.
+
+    Levels in memory become resident as a whole. Of levels on disk, only the splats that a camera may see are
+    read (``lod.on_disk``). A file is read on demand: if it has a block table (``lod.partial_read``) and its
+    rule defines regions, only the splats of the camera's region are resident.
 
     Args:
-        source: a bundle, all of whose splats are kept ready, but for levels that are elsewhere: of these each
-            camera has read what it may see (``lod.on_disk``). Or the file of one. Of that is read what is asked
-            for: where it has a table of blocks (``lod.partial_read``), and the rule tells for a region which
-            splats may be shown in it, these alone, which stay while the eye is there.
-        backend: rasterizer.
-        warn: as for ``read_bundle``.
-        most: see ``open_if_large``, for a file without such regions.
+        source: a bundle, or a bundle's file.
+        backend: rasterizer backend.
+        warn: see ``read_bundle``.
+        most: see ``open_if_large``; for files without regions.
 
     Attributes:
-        bundle: what is known of it; without splats where it is a file.
-        loaded: how many splats are held ready.
-        bytes_read: of the file, so far.
+        bundle: the bundle; without splats if the source is a file.
+        loaded: number of resident splats.
+        bytes_read: bytes read from the file so far.
 
     Raises:
-        LodgsError: as ``read_bundle``, or the bundle contradicts its rule.
+        LodgsError: see ``read_bundle``, or the bundle contradicts its rule.
     """
 
     def __init__(
@@ -225,15 +240,17 @@ class ResidentBundle:
         most: int = 0,
     ) -> None:
         self._path = None if isinstance(source, Bundle) else Path(source)
-        self.bundle = source if isinstance(source, Bundle) else read_head_and_tables(source)
-        self._backend, self._warn = backend, warn
-        self.loaded, self.bytes_read = 0, 0
+        self.bundle = source if isinstance(source, Bundle) else read_header_and_tables(source)
+        self._backend = backend
+        self._warn = warn
+        self.loaded = 0
+        self.bytes_read = 0
         self._sets: dict[int, SplatSet] = {}
-        self._holds: tuple[Region | None, frozenset[int]] | None = None
-        self._rule = known_rule(self.bundle)
+        self._resident: tuple[Region | None, frozenset[int]] | None = None
+        self._rule = check_rule(self.bundle)
         if self._path is not None:
             self.bundle = open_if_large(self._path, most) or self.bundle
-        self._sights: dict[int, Sight] = {}
+        self._sights: dict[int, CulledReader] = {}
         self._row_bytes = 0
         self._facts: dict[int, tuple[tuple[str, float], ...]] = {}
         self._tables = tuple(
@@ -243,97 +260,98 @@ class ResidentBundle:
         )
 
     def select_by_rule(self, camera: Camera, values: Values) -> dict[int, WeightedSet]:
-        """The levels by number, weighted as the rule says for a camera's eye.
+        """Return the levels by number, weighted by the bundle's rule for a camera.
 
         Args:
-            values: of the rule's controls, see ``lod.selection.settings``.
+            values: values of the rule's controls, see ``lod.selection.resolve_controls``.
 
         Raises:
-            LodgsError: the levels are not made for distances, the rule is not known here, or facts are
-                missing; or as ``read_bundle``.
+            LodgsError: the bundle has no rule, an unknown rule, or lacks facts; or see ``read_bundle``.
         """
-        rule = rule_of(self.bundle)
+        rule = require_rule(self.bundle)
         x, y, z = camera.center.tolist()
-        choices = {
-            number: Choice(rule.name, (x, y, z), camera.focal, facts, tuple(values.items()), self._tables)
+        queries = {
+            number: LodQuery(rule.name, (x, y, z), camera.focal, facts, tuple(values.items()), self._tables)
             for number, facts in self._all_facts().items()
         }
         if self.bundle.on_disk:
             return {
-                n: WeightedSet(self._in_sight(n, camera, choice), choice) for n, choice in choices.items()
+                number: WeightedSet(self._read_visible(number, camera, query), query)
+                for number, query in queries.items()
             }
-        self._hold(next(iter(choices.values())).region(), frozenset(choices))
-        return {number: WeightedSet(self._sets[number], choice) for number, choice in choices.items()}
+        self._load(next(iter(queries.values())).region(), frozenset(queries))
+        return {number: WeightedSet(self._sets[number], query) for number, query in queries.items()}
 
     def select_level(self, number: int, camera: Camera) -> dict[int, WeightedSet]:
-        """All that a camera sees of a level: the level, and where levels add up the coarser ones before it.
+        """Return one level, with all coarser ones if levels are cumulative.
 
         Raises:
-            LodgsError: there is no such level, or it is no scene by itself; or as ``read_bundle``.
+            LodgsError: the level does not exist or is not a complete scene; or see ``read_bundle``.
         """
-        known = [level.number for level in self.bundle.levels]
-        if number not in known:
+        available = [level.number for level in self.bundle.levels]
+        if number not in available:
             raise LodgsError(
-                f"There is no level {number}.", f"Choose from {known[0]} (coarsest) to {known[-1]}."
+                f"Cannot draw level {number}: the bundle has no such level.",
+                f"Choose a level from {available[0]} (coarsest) to {available[-1]}.",
             )
-        if number not in [level.number for level in levels_alone(self.bundle)]:
-            raise LodgsError(*not_alone(number, known[-1]))
+        if number not in [level.number for level in standalone_levels(self.bundle)]:
+            raise LodgsError(*standalone_error(number, available[-1]))
         numbers = [level.number for level in self.bundle.drawn_levels(number)]
         if self.bundle.on_disk:
-            return {number: WeightedSet(self._in_sight(number, camera, None), None) for number in numbers}
-        self._hold(None, frozenset(numbers))
+            return {number: WeightedSet(self._read_visible(number, camera, None), None) for number in numbers}
+        self._load(None, frozenset(numbers))
         return {number: WeightedSet(self._sets[number], None) for number in numbers}
 
     def draw(self, camera: Camera, values: Values, *, near: float = 0.01, **options: Any) -> Rendering:
-        """What a camera is shown by the rule; arguments as of :meth:`select_by_rule` and :func:`draw`."""
+        """Render the levels as the rule selects them; see :meth:`select_by_rule` and :func:`draw`."""
         return self._draw(self.select_by_rule(camera, values), camera, near, options)
 
     def draw_level(self, number: int, camera: Camera, *, near: float = 0.01, **options: Any) -> Rendering:
-        """What a camera sees at a level; arguments as of :meth:`select_level` and :func:`draw`."""
+        """Render one level; see :meth:`select_level` and :func:`draw`."""
         return self._draw(self.select_level(number, camera), camera, near, options)
 
-    def _draw(self, shown: dict[int, WeightedSet], camera: Camera, near: float, options: dict) -> Rendering:
+    def _draw(self, sets: dict[int, WeightedSet], camera: Camera, near: float, options: dict) -> Rendering:
         options = {"antialias": self.bundle.antialias, "backend": self._backend} | options
-        return draw(list(shown.values()), camera, near=near, **options)
+        return draw(list(sets.values()), camera, near=near, **options)
 
     def _all_facts(self) -> dict[int, tuple[tuple[str, float], ...]]:
-        """What the rule knows of each level, by number."""
+        """Return the rule's facts of every level, by number."""
         if not self._facts:
-            rule, numbered = (
-                rule_of(self.bundle),
-                [(level.number, level.facts) for level in self.bundle.levels],
-            )
+            rule = require_rule(self.bundle)
+            numbered = [(level.number, level.facts) for level in self.bundle.levels]
             for number, _ in numbered:
-                found = facts_of(rule, self.bundle.facts, numbered, number)
-                self._facts[number] = tuple(found.items())
+                facts = collect_facts(rule, self.bundle.facts, numbered, number)
+                self._facts[number] = tuple(facts.items())
         return self._facts
 
-    def _in_sight(self, number: int, camera: Camera, choice: Choice | None) -> SplatSet:
-        """The splats of a level that a camera may see, where they are drawn."""
+    def _read_visible(self, number: int, camera: Camera, query: LodQuery | None) -> SplatSet:
+        """Read the splats of a level that a camera may see."""
         if number not in self._sights:
             (level,) = (level for level in self.bundle.levels if level.number == number)
-            self._sights[number] = Sight(level.rows, self._rule, self._path or "", self._warn)
+            self._sights[number] = CulledReader(level.rows, self._rule, self._path or "", self._warn)
         sight = self._sights[number]
-        missing = sight.missing(camera, choice)
+        missing = sight.missing(camera, query)
         if missing is not None:
-            self._sets.pop(number, None)  # so that both are never in memory
+            self._sets.pop(number, None)  # free it before reading the replacement
             splats = sight.read(missing)
             self._sets[number] = SplatSet(splats, None, self._backend, ordered=True)
-            self._row_bytes = Element.of("", all_columns(splats)).dtype.itemsize
+            self._row_bytes = Element.from_columns("", all_columns(splats)).dtype.itemsize
         self.loaded = sum(map(len, self._sets.values()))
-        self.bytes_read = self._row_bytes * sum(each.count for each in self._sights.values())
+        self.bytes_read = self._row_bytes * sum(sight.count for sight in self._sights.values())
         return self._sets[number]
 
-    def _hold(self, region: Region | None, numbers: frozenset[int]) -> None:
-        """Has these levels ready, or at least what a region shows of them."""
+    def _load(self, region: Region | None, numbers: frozenset[int]) -> None:
+        """Make levels resident; if their file supports it, only the splats of a region."""
         if self._path is None or BLOCKS not in self.bundle.tables:
             region = None
-        if self._holds is not None and self._holds[0] == region and numbers <= self._holds[1]:
+        if self._resident is not None and self._resident[0] == region and numbers <= self._resident[1]:
             return
         if self._path is None:
-            bundle, numbers = self.bundle, frozenset(level.number for level in self.bundle.levels)
+            bundle = self.bundle
+            numbers = frozenset(level.number for level in bundle.levels)
         else:
-            self._holds, self._sets = None, {}  # so that both are never in memory
+            self._resident = None
+            self._sets = {}  # free them before reading the replacements
             bundle, size = read_part(self._path, numbers, region, self._warn)
             self.bytes_read += size
         ordered = BLOCKS in bundle.tables
@@ -343,4 +361,4 @@ class ResidentBundle:
             if level.number in numbers
         }
         self.loaded = sum(map(len, self._sets.values()))
-        self._holds = region, numbers
+        self._resident = region, numbers

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ..errors import LodgsError
 from ..lod.rule import Values, find_rule
-from ..lod.selection import settings
+from ..lod.selection import resolve_controls
 from ..rasterize import cpu_fallback_reason
 from ..rasterize.resident import ResidentBundle
 from ..runs.data import training_data
@@ -16,8 +16,10 @@ from ..runs.job import Job
 from ..scenes.cameras import Camera
 from ..scenes.colmap import read_scene
 from ..scenes.view_tables import read_view_tables
-from ..splats.bundle import Bundle, read_folder, read_header, read_tables
+from ..splats.bundle import read_header, read_tables
 from ..splats.dialects import Warn, ignore
+from ..splats.level_folder import read_folder
+from ..splats.levels import Bundle
 from .image import read_depth, write_image
 from .scene import Instance, draw
 
@@ -134,7 +136,7 @@ def render(
     resident = ResidentBundle(source.levels, backend, warn)
     bundle, rule = resident.bundle, find_rule(source.rule)
     if given is not None or (rule is not None and rule.always and not level):
-        shown = resident.select_by_rule(camera, settings(bundle, given or {}))
+        shown = resident.select_by_rule(camera, resolve_controls(bundle, given or {}))
     else:
         shown = resident.select_level(level or bundle.levels[-1].number, camera)
     instances = [

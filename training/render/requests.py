@@ -13,8 +13,8 @@ from ..documents import parse_json
 from ..editing.look import RANGES, Look
 from ..errors import LodgsError
 from ..lod.crop import SHAPES, Crop
-from ..lod.query import Choice
-from ..lod.rule import EVERYTHING, Rule, fact_names, find_rule
+from ..lod.query import LodQuery
+from ..lod.rule import NO_RULE, Rule, fact_names, find_rule
 from ..lod.rules.cut import RULE as CUT
 from ..scenes.cameras import MAX_COORDINATE, Camera, camera_from_dict, check_render_size
 
@@ -60,7 +60,7 @@ class SetRequest:
     level: int
     antialias: bool = False
     columns: tuple[str, ...] = ()
-    choice: Choice | None = None
+    choice: LodQuery | None = None
     tree: Path | None = None
     looks: tuple[tuple[Crop | None, Look], ...] = ()
 
@@ -174,9 +174,9 @@ def _columns(values: dict) -> tuple[str, ...]:
     return names
 
 
-def _choice(values: dict) -> Choice:
+def _choice(values: dict) -> LodQuery:
     name = _of_kind(values, "rule", str)
-    rule = find_rule(name) if name else EVERYTHING
+    rule = find_rule(name) if name else NO_RULE
     if rule is None:
         raise _refused("rule", name)
     x, y, z = _numbers(values, "eye", 3, MAX_COORDINATE)
@@ -186,7 +186,7 @@ def _choice(values: dict) -> Choice:
         if not np.float32(control.low) <= np.float32(controls[control.name]) <= np.float32(control.high):
             raise _refused(control.name, controls[control.name])
     facts = _by_name(values, "facts", fact_names(rule) if name else [])
-    return Choice(
+    return LodQuery(
         rule.name, (x, y, z), focal_px, tuple(facts.items()), tuple(controls.items()), _tables(values, rule),
         _crops(values),
     )  # fmt: skip
@@ -230,7 +230,7 @@ def _looks(values: dict) -> tuple[tuple[Crop | None, Look], ...]:
 
 
 def _tables(values: dict, rule: Rule) -> tuple:
-    """Tables as ``Choice`` has them; those that the rule knows, if any."""
+    """Tables as ``LodQuery`` has them; those that the rule knows, if any."""
     found = []
     for name, table in _of_kind({"tables": {}} | values, "tables", dict).items():
         if name not in rule.tables or not isinstance(table, dict) or len(table) > MAX_COLUMNS:

@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 
 from ..editing.look import Looks
 from ..errors import LodgsError, is_out_of_memory
-from ..lod.query import Choice
+from ..lod.query import LodQuery
 from ..rasterize import Gaussians, rasterize_strips
 from ..rasterize.resident import SplatSet, WeightedSet, combine_visible
 from ..scenes.cameras import Camera, check_render_size
@@ -42,7 +42,7 @@ class Instance:
     matrix: np.ndarray = field(default_factory=lambda: np.eye(4))
     level: int = 0
     antialias: bool = False
-    choice: Choice | None = None
+    choice: LodQuery | None = None
     looks: Looks = ()
 
 
@@ -148,7 +148,9 @@ def _in_one_frame(
     there, weights = [], []
     for one in instances:
         inside, unit = camera.in_object_space(one.matrix) if is_similarity(one.matrix) else (None, 1.0)
-        rows, weight = (torch.from_numpy(each) for each in one.splats.select_visible(one.choice, inside, near / unit))
+        rows, weight = (
+            torch.from_numpy(each) for each in one.splats.select_visible(one.choice, inside, near / unit)
+        )
         there.append(_in_world(one, camera, rows.long()))
         weights.append(weight.to(there[-1].means))
     return Gaussians.concatenated(there), None, torch.cat(weights), list(map(len, there)), camera, near, 1.0

@@ -10,10 +10,13 @@ from scipy.special import expit, logit
 
 from ..errors import LodgsError
 from ..lod.rule import find_rule
-from ..lod.selection import complete, select, settings
-from ..splats.bundle import Bundle, DrawableRows, open_bundle, read_bundle, read_folder, read_header
+from ..lod.selection import complete_splats, resolve_controls, select
+from ..splats.bundle import open_bundle, read_bundle, read_header
 from ..splats.dialects import Warn, ignore
+from ..splats.file_rows import DrawableRows
 from ..splats.gaussians import SplatRows, Splats
+from ..splats.level_folder import read_folder
+from ..splats.levels import Bundle
 from .folder import RunFolder
 
 
@@ -68,7 +71,7 @@ def _finest(bundle: Bundle) -> Splats:
     rule = find_rule(bundle.rule)
     if rule is not None and rule.always and "camera_center" in bundle.meta:
         return _with_weights_baked(bundle, np.asarray(bundle.meta["camera_center"]))
-    return complete(bundle, bundle.levels[-1])
+    return complete_splats(bundle, bundle.levels[-1])
 
 
 def _with_weights_baked(bundle: Bundle, center: np.ndarray) -> Splats:
@@ -76,7 +79,7 @@ def _with_weights_baked(bundle: Bundle, center: np.ndarray) -> Splats:
 
     A rule that always weights was trained with these weights.
     """
-    splats, weights = select(bundle, center, 1.0, settings(bundle, {}))
+    splats, weights = select(bundle, center, 1.0, resolve_controls(bundle, {}))
     if weights is None:
         return splats
     opacities = np.clip(weights * expit(splats.opacity_logits), 1e-6, 1 - 1e-6)

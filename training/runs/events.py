@@ -21,7 +21,7 @@ import numpy as np
 
 from ..errors import LodgsError
 from ..files import open_regular
-from ..splats.bundle import MAX_LEVELS, META_SHAPES
+from ..splats.levels import MAX_LEVELS, META_SHAPES
 
 PROTOCOL = 1
 """Version of the events; increased when a reader of older events would misread them."""

@@ -17,12 +17,13 @@ from ..evaluate.views import Evaluation, full_detail_selector
 from ..files import atomic_write
 from ..lod.on_disk import open_if_large
 from ..lod.rule import Rule, Values, find_rule
-from ..lod.selection import levels_alone, select, settings, unknown_rule
+from ..lod.selection import resolve_controls, select, standalone_levels, unknown_rule_error
 from ..methods import create
 from ..rasterize.resident import ResidentBundle
 from ..scenes.offset_views import read_offset_views
-from ..splats.bundle import Bundle, read_bundle
+from ..splats.bundle import read_bundle
 from ..splats.dialects import Warn, ignore
+from ..splats.levels import Bundle
 from .arrays import array_error, read_arrays
 from .data import training_data
 from .folder import RunFolder
@@ -76,9 +77,9 @@ def evaluate_run(
     evaluation = Evaluation(data, job.backend, bundle.antialias)
     rule = find_rule(bundle.rule)
     if rule is None and (controls or bundle.rule):
-        raise LodgsError(*unknown_rule(bundle.rule))
+        raise LodgsError(*unknown_rule_error(bundle.rule))
     report = _measure_levels(job, evaluation, bundle)
-    values = settings(bundle, controls or {}) if rule else {}
+    values = resolve_controls(bundle, controls or {}) if rule else {}
     if rule:
         report |= _measure_rule(job, evaluation, bundle, rule, values)
     if folder.model.exists():
@@ -119,7 +120,7 @@ def _report_warning(warn: Warn, kind: str, values: dict[str, Any]) -> None:
 def _measure_levels(job: Job, evaluation: Evaluation, bundle: Bundle) -> dict:
     """Return the report's head, the summary of the finest level, ``levels`` and ``aside``."""
     offset_cameras = [camera.scaled(job.image_scale) for camera in read_offset_views(Path(job.scene))]
-    levels = levels_alone(bundle)
+    levels = standalone_levels(bundle)
     *coarser, finest = levels
     summary = summarize(evaluation, bundle)
     veils = [measure_veil(evaluation, full_detail_selector(bundle, level)) for level in coarser]
@@ -160,7 +161,7 @@ def _measure_rule(job: Job, evaluation: Evaluation, bundle: Bundle, rule: Rule, 
             {name: step, **evaluation.measure_by_distance(resident, {**values, name: step})} for step in steps
         ]
     if not rule.always:
-        finest = levels_alone(bundle)[-1]
+        finest = standalone_levels(bundle)[-1]
         report["frame_s"] = evaluation.frame_times({
             "by_distance": lambda camera: resident.draw(camera, values, near=data.near),
             "full": lambda camera: resident.draw_level(finest.number, camera, near=data.near),

@@ -25,9 +25,9 @@ from ..evaluate.metrics import psnr
 from ..evaluate.summary import summarize
 from ..evaluate.views import Evaluation
 from ..files import atomic_write
-from ..lod.on_disk import IN_MEMORY, in_parts, open_if_large
+from ..lod.on_disk import MAX_IN_MEMORY, open_if_large, supports_culled_reads
 from ..lod.rule import find_rule
-from ..lod.selection import levels_alone, settings
+from ..lod.selection import resolve_controls, standalone_levels
 from ..methods import METHODS, create
 from ..optimize.memory import keep_freed_memory
 from ..optimize.method import Method
@@ -38,9 +38,11 @@ from ..rasterize.resident import ResidentBundle
 from ..scenes.orientation import up_rotation
 from ..scenes.regions import Region
 from ..scenes.view_tables import make_view_tables
-from ..splats.bundle import NO_SPLATS, Bundle, Level, open_ply, read_bundle, write_bundle
+from ..splats.bundle import read_bundle, write_bundle
 from ..splats.dialects import comments_from_meta
+from ..splats.file_rows import open_ply
 from ..splats.gaussians import SplatRows, Splats
+from ..splats.levels import NO_SPLATS, Bundle, Level
 from ..splats.ply import BATCH_ROWS, Columns, read_ply, write_ply
 from .base import open_base
 from .blocks.plan import write_plan
@@ -171,7 +173,7 @@ def _write_merged_levels(
     """Write the levels of merged blocks, with their quality, and finish the run."""
     bundle = open_if_large(folder.bundle) or read_bundle(folder.bundle)
     evaluation = Evaluation(data, backend, bundle.antialias)
-    complete = [level.number for level in levels_alone(bundle)]
+    complete = [level.number for level in standalone_levels(bundle)]
     for position, level in enumerate(bundle.levels, 1):
         path = folder.levels_folder / f"level_{level.number}.ply"
         write_ply(path, level.rows, comments_from_meta(bundle.meta))
@@ -306,7 +308,9 @@ class _TrainingRun:
             if self.data.test:
                 neural_psnr = self.evaluation.measure_images(self.method.picture)["psnr"]
                 resident = ResidentBundle(bundle, self.evaluation.backend)
-                baked_psnr = self.evaluation.measure_by_distance(resident, settings(bundle, {}))["psnr"]
+                baked_psnr = self.evaluation.measure_by_distance(resident, resolve_controls(bundle, {}))[
+                    "psnr"
+                ]
                 meta |= {"neural_psnr": neural_psnr, "baked_psnr": baked_psnr}
                 self._warn(
                     f"Held-out views: {neural_psnr:.2f} dB with networks, "
@@ -324,7 +328,7 @@ class _TrainingRun:
     def _read_level(self, record: dict) -> Level:
         """Read a stored level; large ones stay on disk."""
         path = self.folder.find_file(record["path"])
-        if record["splats"] > IN_MEMORY and in_parts(METHODS[self.job.method].rule):
+        if record["splats"] > MAX_IN_MEMORY and supports_culled_reads(METHODS[self.job.method].rule):
             return Level(record["level"], NO_SPLATS, record["facts"], open_ply(path))
         return Level(record["level"], read_ply(path), record["facts"])
 
@@ -358,7 +362,7 @@ class _TrainingRun:
         """Write a file and an event for each finished level; replace a level that was written before."""
         records = {record["level"]: record for record in self.levels}
         bundle = replace(self._empty_bundle(), levels=levels)
-        complete = [level.number for level in levels_alone(bundle)]
+        complete = [level.number for level in standalone_levels(bundle)]
         for position, level in enumerate(levels, 1):
             path = self.folder.levels_folder / f"level_{level.number}.ply"
             write_ply(path, level.rows, comments_from_meta(bundle.meta))

@@ -24,9 +24,10 @@ import numpy as np
 from ..documents import open_file, read_json
 from ..errors import LodgsError
 from ..files import atomic_write
-from .bundle import MAX_READ_LEVELS, Bundle, write_folder
 from .dialects import comments_from_meta
 from .gaussians import SH_C0, SplatRows, Splats
+from .level_folder import write_folder
+from .levels import MAX_READ_LEVELS, Bundle
 from .ply import BATCH_ROWS, write_ply
 
 PROGRAM = "splat-transform"

@@ -1,4 +1,4 @@
-"""A set of 3D Gaussian splats as plain arrays."""
+"""3D Gaussian splats as plain arrays."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from typing import Protocol
 import numpy as np
 
 SH_C0 = 0.28209479177387814
-"""The harmonic of degree 0, sqrt(1 / 4π): a base colour is 0.5 + SH_C0 · sh[:, 0]."""
+"""Spherical harmonic of degree 0, sqrt(1 / 4π): a base colour is 0.5 + SH_C0 · sh[:, 0]."""
 
 
 class SplatRows(Protocol):
-    """Splats that are handed over some rows at a time, from wherever they are: ``Splats`` from memory."""
+    """Splats that are loaded in batches of rows from memory (``Splats``), a file or another source."""
 
     def __len__(self) -> int: ...
 
     def select(self, index: slice | np.ndarray, /) -> Splats:
-        """The splats of a range of rows, or of some rows (M,) ascending."""
+        """Return the splats of a range of rows, or of ascending rows (M,)."""
         ...
 
 
@@ -31,8 +31,8 @@ class Splats:
         log_scales: (N, 3) float32, natural logarithm of the standard deviation along each axis.
         opacity_logits: (N,) float32; opacity = sigmoid(logit).
         sh: (N, (degree + 1)**2, 3) float32; colour = 0.5 + sum of coefficient * basis, degree 0 to 4.
-        extras: further per-splat columns by name, each (N,) of a type that PLY knows (8- to 32-bit integers,
-            float32, float64); they survive every read, edit and write.
+        extras: additional per-splat columns by name, each (N,) of a PLY type (8- to 32-bit integers, float32,
+            float64); they survive every read, edit and write.
     """
 
     means: np.ndarray
@@ -50,14 +50,14 @@ class Splats:
         """Degree of the spherical harmonics, 0 to 4."""
         return int(np.sqrt(self.sh.shape[1])) - 1
 
-    def select(self, index) -> Splats:
-        """The splats at ``index``: a slice, a boolean mask (N,) or an integer array."""
+    def select(self, index: slice | np.ndarray | list[int]) -> Splats:
+        """Return the splats at ``index``: a slice, a boolean mask (N,) or an integer array."""
         columns = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "extras"}
         return Splats(**columns, extras={name: column[index] for name, column in self.extras.items()})
 
     @classmethod
     def concatenated(cls, sets: list[Splats]) -> Splats:
-        """All splats of several sets of one SH degree, in order; only extras that all have are kept."""
+        """Join sets of one SH degree in order. Only extras that all sets have are kept."""
         columns = {
             f.name: np.concatenate([getattr(s, f.name) for s in sets])
             for f in fields(cls)

@@ -1,6 +1,6 @@
-"""Splats as PLY files: the layout of the original 3DGS, and every dialect of it on reading.
+"""Splats as PLY files: writes the original 3DGS layout, and reads all supported dialects.
 
-Columns of ``vertex``, in this order, all float: x y z, nx ny nz (zero), f_dc_0..2, f_rest_0.. (all red
+The columns of ``vertex``, in this order, all float: x y z, nx ny nz (zero), f_dc_0..2, f_rest_0.. (all red
 coefficients first, then green, then blue), opacity, scale_0..2, rot_0..3 (Kerbl et al. 2023, reference code).
 """
 
@@ -26,10 +26,12 @@ from ..files import atomic_write
 from .dialects import Warn, drawable_3dgs, ignore, reject_unsupported
 from .gaussians import SplatRows, Splats
 
-MAX_HEADER_BYTES, MAX_COLUMNS = 1 << 20, 1000
-"""Most bytes of a header, and most columns of all elements; ours have 70 columns a level."""
+MAX_HEADER_BYTES = 1 << 20
+"""Maximum length of a header."""
+MAX_COLUMNS = 1000
+"""Maximum number of columns of all elements together; ours have 70 per level."""
 NORMALS = ("nx", "ny", "nz")
-# PLY names its types as C does; viewers know no others.
+# PLY's type names, from C. Viewers support no others.
 _TYPES = {
     "i1": "char",
     "u1": "uchar",
@@ -40,16 +42,16 @@ _TYPES = {
     "f4": "float",
     "f8": "double",
 }
-# Rows are moved between a file's records and our columns in blocks that stay in the processor's cache.
+# Rows are converted in blocks that fit in the processor's cache.
 _BLOCK = 4096
 BATCH_ROWS = 1 << 15
-"""Rows that are in memory at a time, of splats that are not."""
+"""Rows per batch when splats are larger than memory."""
 
 Columns = dict[str, np.ndarray]
 
 
 class ElementPart(NamedTuple):
-    """Some rows of an element: how many, and what gives the columns of a range of them."""
+    """Rows of an element: their number, and a function that returns the columns of a range."""
 
     count: int
     columns: Callable[[slice], Columns]
@@ -57,83 +59,86 @@ class ElementPart(NamedTuple):
 
 @dataclass
 class Element:
-    """One element of a PLY: rows of named columns, given in parts that follow one another."""
+    """One element of a PLY: rows of named columns, in consecutive parts."""
 
     name: str
     parts: Sequence[ElementPart]
 
     @classmethod
-    def of(cls, name: str, columns: Columns) -> Element:
-        """The element of columns (N,) in memory."""
+    def from_columns(cls, name: str, columns: Columns) -> Element:
+        """Create an element of columns (N,) in memory."""
         count = len(next(iter(columns.values())))
         return cls(
-            name, [ElementPart(count, lambda some: {key: rows[some] for key, rows in columns.items()})]
+            name, [ElementPart(count, lambda index: {key: rows[index] for key, rows in columns.items()})]
         )
 
     @classmethod
-    def of_splats(cls, name: str, sets: Sequence[SplatRows], columns: Callable[[Splats], Columns]) -> Element:
-        """The element of columns of splats, of one set after the other."""
+    def from_splats(
+        cls, name: str, sets: Sequence[SplatRows], columns: Callable[[Splats], Columns]
+    ) -> Element:
+        """Create an element of columns of splats, one set after the other."""
         return cls(
             name,
-            [ElementPart(len(rows), lambda some, rows=rows: columns(rows.select(some))) for rows in sets],
+            [ElementPart(len(rows), lambda index, rows=rows: columns(rows.select(index))) for rows in sets],
         )
 
     @cached_property
     def dtype(self) -> np.dtype:
-        """One row as the file holds it: packed and little-endian."""
-        return _row_of(self.parts[0].columns(slice(0, 0)))
+        """Type of one row in the file: packed and little-endian."""
+        return _row_dtype(self.parts[0].columns(slice(0, 0)))
 
     @property
     def count(self) -> int:
-        """Rows of the element, of all its parts."""
+        """Number of rows of all parts."""
         return sum(part.count for part in self.parts)
 
     @property
     def size(self) -> int:
-        """Bytes in the file."""
+        """Size in the file in bytes."""
         return self.count * self.dtype.itemsize
 
 
 def read_ply(path: str | Path, warn: Warn = ignore) -> Splats:
     """Read the element ``vertex`` of any 3DGS PLY.
 
-    Ascii, little- or big-endian, SH degree 0 to 4, columns in any order and of any scalar type. Missing
-    normals are fine; normals that are all zero, as 3DGS writes them, are dropped. Columns of dialects are
-    worked into the others (`dialects.as_3dgs`); every other column survives in ``extras`` with its name and
-    type. A bundle reads as its ``vertex``, the finest level by default.
+    ASCII, little- and big-endian files of SH degree 0 to 4 are supported, with columns in any order and of
+    any scalar type. Normals may be missing; all-zero normals, which 3DGS writes, are dropped. Columns of
+    dialects are converted (`dialects.drawable_3dgs`). Every other column survives in ``extras`` with its
+    name and type. For a bundle, the result is its ``vertex``, by default the finest level.
 
     Args:
-        warn: receives a sentence for each thing that was left out or is shown otherwise than by its maker.
+        warn: receives one sentence for each omission or changed look, see `dialects.Warn`.
 
     Raises:
-        LodgsError: not a PLY, cut short, without the columns of splats, or of a dialect that cannot be read.
+        LodgsError: the file is not a PLY, is truncated, lacks the columns of splats, or has an unsupported
+            dialect.
     """
     elements, _ = read_elements(path)
     return drawable_3dgs(splats_from_rows(elements["vertex"], path), path, warn)
 
 
 def write_ply(path: str | Path, splats: SplatRows, comments: Sequence[str] = ()) -> None:
-    """Write splats as one binary little-endian ``vertex``, extras behind the 3DGS columns.
+    """Write splats as one binary little-endian ``vertex``, with extras after the 3DGS columns.
 
     Args:
-        splats: in memory, or where they are read a few at a time.
-        comments: for the header, such as `dialects.comments_of` a bundle's meta.
+        splats: splats in memory, or a source that is read in batches.
+        comments: header comments, such as those of `dialects.comments_from_meta`.
 
     Raises:
-        LodgsError: the file cannot be written, or an extra has a name or a type that PLY does not know.
+        LodgsError: the file cannot be written, or PLY does not support the name or type of an extra.
     """
-    write_elements(path, [Element.of_splats("vertex", [splats], all_columns)], comments)
+    write_elements(path, [Element.from_splats("vertex", [splats], all_columns)], comments)
 
 
 def splat_columns(splats: Splats) -> Columns:
-    """The 3DGS columns in their order, as views (N,) into the arrays of ``splats``."""
+    """Return the 3DGS columns in file order, as views (N,) of the arrays of ``splats``."""
     zero = np.broadcast_to(np.float32(0), len(splats))
-    rest = splats.sh.shape[1] - 1
+    rest_count = splats.sh.shape[1] - 1
     return {
         **{name: splats.means[:, i] for i, name in enumerate("xyz")},
         **{name: splats.extras.get(name, zero) for name in NORMALS},
         **{f"f_dc_{i}": splats.sh[:, 0, i] for i in range(3)},
-        **{f"f_rest_{i}": splats.sh[:, 1 + i % rest, i // rest] for i in range(3 * rest)},
+        **{f"f_rest_{i}": splats.sh[:, 1 + i % rest_count, i // rest_count] for i in range(3 * rest_count)},
         "opacity": splats.opacity_logits,
         **{f"scale_{i}": splats.log_scales[:, i] for i in range(3)},
         **{f"rot_{i}": splats.quats[:, i] for i in range(4)},
@@ -141,18 +146,18 @@ def splat_columns(splats: Splats) -> Columns:
 
 
 def all_columns(splats: Splats) -> Columns:
-    """The 3DGS columns, and the extras."""
+    """Return the 3DGS columns and the extras."""
     return splat_columns(splats) | extra_columns(splats)
 
 
 def extra_columns(splats: Splats) -> Columns:
-    """The extras that are columns of their own (normals have their place in the 3DGS layout)."""
+    """Return the extras except normals, which are part of the 3DGS layout."""
     return {name: column for name, column in splats.extras.items() if name not in NORMALS}
 
 
 def to_records(columns: Columns) -> np.ndarray:
-    """Columns (N,) as rows of a file, (N,) structured: packed and little-endian."""
-    records = np.empty(len(next(iter(columns.values()))), _row_of(columns))
+    """Convert columns (N,) to structured rows (N,) of a file: packed and little-endian."""
+    records = np.empty(len(next(iter(columns.values()))), _row_dtype(columns))
     for block in _blocks(len(records)):
         for name, column in columns.items():
             records[name][block] = column[block]
@@ -160,74 +165,81 @@ def to_records(columns: Columns) -> np.ndarray:
 
 
 def splats_from_rows(rows: np.ndarray, path: str | Path) -> Splats:
-    """Splats from the structured rows of an element that has the 3DGS columns; ``path`` is for the message.
+    """Convert the structured rows of an element with the 3DGS columns to splats.
+
+    Args:
+        path: path of the file, for messages.
 
     Raises:
         LodgsError: columns are missing, or the number of f_rest columns fits no SH degree.
     """
     names = rows.dtype.names or ()
-    rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in names)
-    degree = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}.get(rest)
+    rest_count = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in names)
+    degree = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}.get(rest_count)
     if degree is None:
         raise LodgsError(
-            f"{path} has {rest} f_rest columns, which fits no degree of spherical harmonics.",
-            "0, 9, 24, 45 or 72 belong to degree 0 to 4; export the splats again.",
+            f"Cannot read {path}: its {rest_count} f_rest columns fit no degree of spherical harmonics.",
+            "Export the splats again; degree 0 to 4 have 0, 9, 24, 45 or 72 such columns.",
         )
     splats = _empty_splats(len(rows), degree)
     columns = {name: column for name, column in splat_columns(splats).items() if name not in NORMALS}
     missing = [name for name in columns if name not in names]
     if missing:
         raise LodgsError(
-            f"{path} is not a PLY of Gaussian splats: it has no {', '.join(missing)}.",
-            "Choose a PLY that a 3DGS trainer wrote; other point clouds and meshes have no splats.",
+            f"Cannot read {path}: it is not a PLY of Gaussian splats: it has no {', '.join(missing)}.",
+            "Choose a PLY from a 3DGS trainer; other point clouds and meshes contain no splats.",
         )
     extras = {
         name: np.empty(len(rows), rows.dtype[name].newbyteorder("=")) for name in names if name not in columns
     }
-    moves = [(column, np.asarray(rows[name])) for name, column in (columns | extras).items()]
-    with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite or no number is left out later
+    pairs = [(column, np.asarray(rows[name])) for name, column in (columns | extras).items()]
+    with np.errstate(over="ignore", invalid="ignore"):  # infinities and NaN are dropped later
         for block in _blocks(len(rows)):
-            for column, source in moves:
+            for column, source in pairs:
                 column[block] = source[block]
-        meant = any(extras[name].any() for name in NORMALS if name in extras)
-    if not meant:
+        has_normals = any(extras[name].any() for name in NORMALS if name in extras)
+    if not has_normals:
         extras = {name: column for name, column in extras.items() if name not in NORMALS}
     splats.extras = extras
     return splats
 
 
 def read_elements(path: str | Path) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Elements of a PLY as structured rows (memory-mapped when binary), and its comments in order.
+    """Read the elements of a PLY as structured rows (memory-mapped if binary), and its comments in order.
 
-    Elements without columns are passed over. So is everything from the first list on, such as a mesh's
-    faces: where a list ends stands in its rows alone, and no splats are made of any.
+    Elements without columns are skipped. So is everything from the first list on, such as a mesh's faces:
+    only reading all of its rows would show where a list ends, and lists describe no splats.
 
     Raises:
-        LodgsError: not a PLY, no ``vertex`` of splats, a dialect that cannot be read, or cut short.
+        LodgsError: the file is not a PLY, has no ``vertex`` of splats or an unsupported dialect, or is
+            truncated.
     """
     path = Path(path)
     with open_file(path) as file:
         header, counts = _read_header(file, path)
-        begin, size = file.tell(), os.fstat(file.fileno()).st_size
-        found: list[tuple[str, np.dtype, int]] = []
+        begin = file.tell()
+        size = os.fstat(file.fileno()).st_size
+        layout: list[tuple[str, np.dtype, int]] = []
         for element, count in zip(header.elements, counts, strict=True):
             if count and _has_lists(element):
                 break
             if element.properties:
                 kinds = [(column.name, column.dtype(header.byte_order)) for column in element.properties]
-                found.append((element.name, np.dtype(kinds), count))
-        if "vertex" not in (name for name, _, _ in found):
-            raise LodgsError(f"{path} has lists before its vertices.", "Choose a .ply of Gaussian splats.")
-        if header.text:
-            return _read_text(file, found, size - begin, path), _comments(header)
-        promised = begin + sum(count * row.itemsize for _, row, count in found)
-        if size < promised:
+                layout.append((element.name, np.dtype(kinds), count))
+        if "vertex" not in (name for name, _, _ in layout):
             raise LodgsError(
-                f"{path} is cut short: {promised - size} of its {promised} bytes are missing.",
+                f"Cannot read {path}: it has lists before its vertices.", "Choose a .ply of Gaussian splats."
+            )
+        if header.text:
+            return _read_text(file, layout, size - begin, path), _comments(header)
+        expected = begin + sum(count * row.itemsize for _, row, count in layout)
+        if size < expected:
+            raise LodgsError(
+                f"Cannot read {path}: it is truncated, {expected - size} of {expected} bytes are missing.",
                 "Export or copy it again.",
             )
         elements: dict[str, np.ndarray] = {}
-        for name, row, count in found:
+        for name, row, count in layout:
             mapped = np.memmap(file, row, "c", begin, (count,)) if count else np.empty(0, row)
             elements[name] = mapped
             begin += count * row.itemsize
@@ -235,7 +247,7 @@ def read_elements(path: str | Path) -> tuple[dict[str, np.ndarray], list[str]]:
 
 
 def release_pages(rows: np.ndarray) -> None:
-    """Gives back the pages of a mapped file that have been read, which count as the process's own memory."""
+    """Release the pages of a mapped file that have been read, which count as memory of the process."""
     base = rows
     while isinstance(base, np.ndarray):
         base = base.base
@@ -244,126 +256,146 @@ def release_pages(rows: np.ndarray) -> None:
 
 
 def read_comments(path: str | Path) -> list[str]:
-    """The comments of a PLY of splats, in the time that its header takes.
+    """Read the comments of a PLY of splats, from its header alone.
 
     Raises:
-        LodgsError: not a PLY, no ``vertex`` of splats, or a dialect that cannot be read.
+        LodgsError: the file is not a PLY, or has no ``vertex`` of splats or an unsupported dialect.
     """
     with open_file(path) as file:
         return _comments(_read_header(file, Path(path))[0])
 
 
 def write_elements(path: str | Path, elements: Iterable[Element], comments: Sequence[str] = ()) -> None:
-    """Write elements as a binary little-endian PLY, whole or not at all.
+    """Write elements as a binary little-endian PLY, atomically.
 
-    The first element stands on line 3 of the header and the comments follow its properties: so every
-    viewer that was checked reads it.
+    The first element is on line 3 of the header, and the comments follow its properties: all tested viewers
+    read this order.
 
     Raises:
-        LodgsError: a column's name or type does not exist in PLY, or the file cannot be written.
+        LodgsError: PLY does not support a column's name or type, or the file cannot be written.
     """
     elements = list(elements)
-    first, *others = [_header_of(element) for element in elements]
+    first, *further = [_header_lines(element) for element in elements]
     lines = [
         "ply",
         "format binary_little_endian 1.0",
         *first,
         *(f"comment {comment}" for comment in comments),
     ]
-    lines += [line for header in others for line in header] + ["end_header", ""]
+    lines += [line for header in further for line in header] + ["end_header", ""]
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         file.write("\n".join(lines).encode("ascii"))
         for element in elements:
             for part in element.parts:
-                for some in _blocks(part.count, BATCH_ROWS):
-                    file.write(to_records(part.columns(some)).data)
+                for batch in _blocks(part.count, BATCH_ROWS):
+                    file.write(to_records(part.columns(batch)).data)
 
 
-def _row_of(columns: Columns) -> np.dtype:
+def _row_dtype(columns: Columns) -> np.dtype:
     return np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
 
 
-def _header_of(element: Element) -> list[str]:
+def _header_lines(element: Element) -> list[str]:
     lines = [f"element {element.name} {element.count}"]
     for name, column in element.parts[0].columns(slice(0, 0)).items():
         kind = _TYPES.get(column.dtype.str[1:])
         if kind is None or not re.fullmatch(r"[!-~]+", name):
             raise LodgsError(
-                f"The column {name!r} of type {column.dtype} cannot be written as PLY.",
-                f"Give it an ASCII name without spaces and one of the types {', '.join(_TYPES.values())}.",
+                f"Cannot write column {name!r} of type {column.dtype} to a PLY.",
+                f"Use an ASCII name without spaces and one of the types {', '.join(_TYPES.values())}.",
             )
         lines.append(f"property {kind} {name}")
     return lines
 
 
 def _read_header(file: IO[bytes], path: Path) -> tuple[PlyData, list[int]]:
-    """The header of a PLY of splats, with no rows, and the rows that each element should have.
+    """Read the header of a PLY of splats, and stop at the first row.
 
-    The file is left where the rows begin.
+    Returns:
+        The header with empty elements, and the number of rows of each element.
 
     Raises:
         LodgsError: as `read_comments`.
     """
-    start = file.read(MAX_HEADER_BYTES)
-    begin = re.match(rb"ply[ \t]*(\r\n|\n|\r)", start)
-    if begin is None:
-        raise LodgsError(f"{path} is not a PLY file.", "Choose a .ply of Gaussian splats.")
-    end = re.search(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)", start)
-    if end is None:
-        if len(start) == MAX_HEADER_BYTES:
-            raise LodgsError(
-                f"{path} has a header of more than {MAX_HEADER_BYTES:,} bytes.",
-                "Export it again, with less in it.",
-            )
-        raise LodgsError(f"{path} is cut short: its header does not end.", "Export or copy it again.")
-    file.seek(end.end())
-    lines = start[: end.end()].decode("ascii", "replace").split(begin[1].decode())
+    lines = _read_header_lines(file, path)
     counts: list[int] = []
     try:
-        for place, line in enumerate(lines):
+        for number, line in enumerate(lines):
             match line.split():
                 case ["element", name, *count]:
                     if len(count) != 1 or not re.fullmatch("[0-9]{1,15}", count[0]):
-                        raise ValueError(f"{line[:200]!r} says no number of rows")
+                        raise ValueError(f"{line[:200]!r} contains no number of rows")
                     counts.append(int(count[0]))
-                    lines[place] = f"element {name} 0"  # plyfile reads a header only together with rows
+                    lines[number] = f"element {name} 0"  # plyfile reads a header only together with rows
         if sum(line.lstrip().startswith("property") for line in lines) > MAX_COLUMNS:
             raise ValueError(f"it has more than {MAX_COLUMNS:,} columns")
         header = PlyData.read(io.BytesIO("\n".join(lines).encode("ascii", "replace")))
     except (PlyParseError, ValueError) as error:
         raise LodgsError(
-            f"{path} has a damaged header: {str(error)[:300]}.", "Export or copy it again."
+            f"Cannot read {path}: its header is corrupt: {str(error)[:300]}.", "Export or copy it again."
         ) from error
     if "vertex" not in header:
-        raise LodgsError(f"{path} has no element vertex.", "Choose a .ply of Gaussian splats.")
+        raise LodgsError(
+            f"Cannot read {path}: it has no element vertex.", "Choose a .ply of Gaussian splats."
+        )
     vertex = header["vertex"]
     if _has_lists(vertex):
-        raise LodgsError(f"{path} has lists in its vertices.", "Choose a .ply of Gaussian splats.")
+        raise LodgsError(
+            f"Cannot read {path}: it has lists in its vertices.", "Choose a .ply of Gaussian splats."
+        )
     reject_unsupported([column.name for column in vertex.properties], _comments(header), path)
     splats_from_rows(vertex.data, path)
     return header, counts
 
 
+def _read_header_lines(file: IO[bytes], path: Path) -> list[str]:
+    """Read the lines of a header and leave the file at the first row."""
+    start = file.read(MAX_HEADER_BYTES)
+    begin = re.match(rb"ply[ \t]*(\r\n|\n|\r)", start)
+    if begin is None:
+        raise LodgsError(f"Cannot read {path}: it is not a PLY file.", "Choose a .ply of Gaussian splats.")
+    end = re.search(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)", start)
+    if end is None:
+        if len(start) == MAX_HEADER_BYTES:
+            raise LodgsError(
+                f"Cannot read {path}: its header exceeds {MAX_HEADER_BYTES:,} bytes.",
+                "Export it again with fewer columns and comments.",
+            )
+        raise LodgsError(
+            f"Cannot read {path}: it is truncated, its header has no end.", "Export or copy it again."
+        )
+    file.seek(end.end())
+    return start[: end.end()].decode("ascii", "replace").split(begin[1].decode())
+
+
 def _read_text(
-    file: IO[bytes], found: list[tuple[str, np.dtype, int]], size: int, path: Path
+    file: IO[bytes], layout: list[tuple[str, np.dtype, int]], size: int, path: Path
 ) -> dict[str, np.ndarray]:
-    """The rows of elements (name, row, count) of a PLY in ASCII, which take so many bytes at most."""
+    """Read the rows of an ASCII PLY.
+
+    Args:
+        layout: name, row type and number of rows of each element.
+        size: remaining bytes of the file.
+    """
     try:
-        if (
-            sum(count * 2 * len(row.names or ()) for _, row, count in found) > size + 1
-        ):  # a digit and a space each
+        least = sum(count * 2 * len(row.names or ()) for _, row, count in layout)  # a digit and a space each
+        if least > size + 1:
             raise ValueError("it is too short for its rows")
         elements: dict[str, np.ndarray] = {}
         lines = io.TextIOWrapper(file, "ascii", "replace")
-        for name, row, count in found:
+        for name, row, count in layout:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of a file that ends here: its rows are counted
+                warnings.simplefilter(
+                    "ignore"
+                )  # numpy warns at the end of a file; the rows are counted below
                 rows = np.loadtxt(lines, row, comments=None, ndmin=1, max_rows=count) if count else []
             if len(rows) != count:
                 raise ValueError(f"{count - len(rows):,} of {count:,} rows of {name} are missing")
             elements[name] = np.asarray(rows, row)
     except (ValueError, OverflowError) as error:
-        raise LodgsError(f"{path} is damaged: {str(error)[:300]}.", "Export or copy it again.") from error
+        raise LodgsError(
+            f"Cannot read {path}: it is corrupt: {str(error)[:300]}.", "Export or copy it again."
+        ) from error
     return elements
 
 

@@ -1,4 +1,4 @@
-"""Splats in a file of no name, which takes them out of memory for a while."""
+"""Temporary storage of splats in an unnamed file."""
 
 from __future__ import annotations
 
@@ -15,27 +15,28 @@ from .gaussians import Splats
 from .ply import all_columns, splats_from_rows, to_records
 
 _PAGE = 64
-"""Rows that are read together where some of them are wanted."""
+"""Rows per page. Wanted rows on neighbouring pages are read together."""
 _RUN = 1 << 15
-"""Most rows that are read together."""
+"""Maximum number of rows of one read."""
 
 
 class ScratchFile:
-    """Splats of the same columns, in a file that goes when it is closed, or the process ends.
+    """Splats with identical columns in a file that disappears when it is closed or the process ends.
 
-    The file is read and written by explicit calls: a mapped page would count as the process's own memory.
+    Reads and writes are explicit calls, because mapped pages would count as memory of the process.
 
     Args:
-        folder: where the file is.
+        folder: location of the file.
 
     Raises:
-        LodgsError: the folder takes no file.
+        LodgsError: the folder is not writable.
     """
 
     def __init__(self, folder: Path) -> None:
-        self._folder, self._count = folder, 0
+        self._folder = folder
+        self._count = 0
         self._row = np.dtype([])
-        with self._telling():
+        with self._errors_as_sentences():
             self._file = tempfile.TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115
 
     def __enter__(self) -> ScratchFile:
@@ -48,11 +49,11 @@ class ScratchFile:
         return self._count
 
     def close(self) -> None:
-        """Forgets the splats."""
+        """Discard the splats."""
         self._file.close()
 
     def write(self, begin: int, splats: Splats) -> None:
-        """Puts splats at the rows from one on, which may be beyond the last one.
+        """Write splats to consecutive rows from ``begin``, which may lie beyond the last row.
 
         Raises:
             LodgsError: the disk is full, or the file cannot be written.
@@ -61,14 +62,14 @@ class ScratchFile:
         self._row = self._row if self._row.names else records.dtype
         assert records.dtype == self._row, "splats of other columns"
         self._count = max(self._count, begin + len(splats))
-        with self._telling():
+        with self._errors_as_sentences():
             self._file.seek(begin * self._row.itemsize)
-            left = records.view(np.uint8).data
-            while left:
-                left = left[self._file.write(left) :]
+            remaining = records.view(np.uint8).data
+            while remaining:
+                remaining = remaining[self._file.write(remaining) :]
 
     def append(self, splats: Splats) -> None:
-        """Adds splats at the end.
+        """Write splats after the last row.
 
         Raises:
             LodgsError: as :meth:`write`.
@@ -76,7 +77,7 @@ class ScratchFile:
         self.write(len(self), splats)
 
     def select(self, rows: slice | np.ndarray) -> Splats:
-        """The splats of a range of rows, or of rows (M,) in any order.
+        """Read the splats of a range of rows, or of rows (M,) in any order.
 
         Raises:
             LodgsError: the file cannot be read.
@@ -85,35 +86,36 @@ class ScratchFile:
             begin, end, _ = rows.indices(self._count)
             return splats_from_rows(self._read(begin, max(begin, end)), "")
         order = np.argsort(rows, kind="stable")
-        whole = np.dtype((np.void, self._row.itemsize))  # which numpy copies faster than field by field
-        rows, found = rows[order], np.empty(len(rows), whole)
+        opaque_row = np.dtype((np.void, self._row.itemsize))  # numpy copies it faster than separate fields
+        rows = rows[order]
+        records = np.empty(len(rows), opaque_row)
         pages = rows // _PAGE
         breaks = np.flatnonzero((np.diff(pages) > 1) | (np.diff(rows // _RUN) > 0)) + 1
         for begin, end in pairwise([0, *breaks.tolist(), len(rows)]):
             if begin < end:
-                part = self._read(int(rows[begin]), int(rows[end - 1]) + 1).view(whole)
-                found[order[begin:end]] = part[rows[begin:end] - rows[begin]]
-        return splats_from_rows(found.view(self._row), "")
+                run = self._read(int(rows[begin]), int(rows[end - 1]) + 1).view(opaque_row)
+                records[order[begin:end]] = run[rows[begin:end] - rows[begin]]
+        return splats_from_rows(records.view(self._row), "")
 
     def _read(self, begin: int, end: int) -> np.ndarray:
         records = np.empty(end - begin, self._row)
-        with self._telling():
+        with self._errors_as_sentences():
             self._file.seek(begin * self._row.itemsize)
-            left = records.view(np.uint8).data
-            while left:
-                got = self._file.readinto(left)
-                if not got:
-                    raise OSError("it is cut short")
-                left = left[got:]
+            remaining = records.view(np.uint8).data
+            while remaining:
+                count = self._file.readinto(remaining)
+                if not count:
+                    raise OSError("it is truncated")
+                remaining = remaining[count:]
         return records
 
     @contextmanager
-    def _telling(self) -> Iterator[None]:
-        """What goes wrong with the file is a LodgsError."""
+    def _errors_as_sentences(self) -> Iterator[None]:
+        """Turn OSError into LodgsError."""
         try:
             yield
         except OSError as error:
             raise LodgsError(
-                f"A file in {self._folder} could not be read or written: {error.strerror or error}.",
+                f"Cannot read or write a temporary file in {self._folder}: {error.strerror or error}.",
                 "Free some space there or choose another folder.",
             ) from error

@@ -1,7 +1,7 @@
-"""Real spherical harmonics of degree 0 to 4, with the signs and the order of 3DGS. No torch, no Numba.
+"""Real spherical harmonics of degree 0 to 4, with the signs and order of 3DGS. No torch, no Numba.
 
-The same functions serve torch (``out`` is a list that receives tensors) and Numba (``out`` is an array that
-receives numbers), so that every backend has one basis.
+The same functions serve torch (``out`` is a list of tensors) and Numba (``out`` is an array of numbers), so
+all backends share one basis.
 """
 
 from .gaussians import SH_C0
@@ -18,16 +18,20 @@ C4 = (
 
 
 def coefficient_count(degree: int) -> int:
-    """How many coefficients a colour channel has up to ``degree``."""
+    """Return the number of coefficients of a colour channel up to ``degree``."""
     return (degree + 1) * (degree + 1)
 
 
 def degree_from_count(count: int) -> int:
-    """The degree that ``count`` coefficients a channel make; ValueError where they make none of 0 to 4."""
+    """Return the degree of ``count`` coefficients per channel.
+
+    Raises:
+        ValueError: no degree from 0 to 4 has so many coefficients.
+    """
     for degree in range(MAX_DEGREE + 1):
         if coefficient_count(degree) == count:
             return degree
-    raise ValueError(f"{count} SH coefficients a channel are no whole degree from 0 to {MAX_DEGREE}")
+    raise ValueError(f"no SH degree from 0 to {MAX_DEGREE} has {count} coefficients per channel")
 
 
 def basis(x, y, z, degree, out):
@@ -65,7 +69,7 @@ def basis(x, y, z, degree, out):
 
 
 def basis_gradient(x, y, z, degree, by_x, by_y, by_z):
-    """Write the derivatives of :func:`basis` by x, y and z, taken as independent, to three outputs."""
+    """Write the derivatives of :func:`basis` with respect to independent x, y and z to three outputs."""
     by_x[0] = by_y[0] = by_z[0] = 0.0 * x
     if degree >= 1:
         by_x[1], by_y[1], by_z[1] = 0.0, -C1, 0.0

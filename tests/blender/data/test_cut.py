@@ -38,7 +38,7 @@ def shown_rows(bpy, lodgs, root):
 
 
 def wanted_rows(lodgs, tree, eye, focal, pixels):
-    choice = lodgs("training.lod.selection").Choice(tree)
+    choice = lodgs("training.lod.selection").BundleSelector(tree)
     return [np.flatnonzero(w) for w in choice.of_levels(np.float32(eye), focal, {"pixels": pixels})]
 
 
@@ -93,7 +93,7 @@ def test_a_coarser_level_is_not_shown_alone_nor_exported(bpy, lodgs, root, tmp_p
 
 def test_a_folder_gets_levels_that_are_scenes_by_themselves(bpy, lodgs, tree, root, tmp_path):
     assert bpy.ops.lodgs.export_folder(directory=str(tmp_path / "levels")) == {"FINISHED"}
-    again = lodgs("training.splats.bundle").read_folder(tmp_path / "levels")
+    again = lodgs("training.splats.level_folder").read_folder(tmp_path / "levels")
     counts = [len(level.splats) for level in again.levels]
     assert again.rule == "bands" and counts[-1] == LEAVES and 500 <= counts[0] <= LEAVES / 4
     levels = lodgs("data.importing").import_splats(bpy.context, tmp_path / "levels").lodgs.levels

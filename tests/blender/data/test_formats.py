@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from tests.blender.fake_trainer import splats
-from training.splats.bundle import Bundle, Level, write_bundle
+from training.splats.bundle import write_bundle
 from training.splats.formats import PROGRAM
+from training.splats.levels import Bundle, Level
 
 HERE = Path(__file__).parents[3] / "build" / "interop" / "node_modules" / ".bin"
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from training.scenes.colmap import read_scene
-from training.splats.bundle import Bundle, Level, write_bundle
+from training.splats.bundle import write_bundle
 from training.splats.gaussians import Splats
+from training.splats.levels import Bundle, Level
 
 GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
 KINDS = ("objects", "collections", "pointclouds", "cameras", "images", "meshes", "scenes")

@@ -16,8 +16,9 @@ from tests.training.lod.tree.trees import random_leaves, tree_of, write_in_pages
 from training.editing.look import Look
 from training.editing.paint import COLUMNS
 from training.scenes.color import linear_from_srgb
-from training.splats.bundle import Level, read_bundle
+from training.splats.bundle import read_bundle
 from training.splats.gaussians import SH_C0
+from training.splats.levels import Level
 from training.splats.ply import read_ply
 
 RED, BLUE = (0.9, 0.2, 0.1), (0.1, 0.3, 0.8)

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from training.splats.bundle import Level
 from training.splats.gaussians import Splats
+from training.splats.levels import Level
 
 SIZE = 200, 100
 

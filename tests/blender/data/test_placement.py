@@ -6,10 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from training.editing.placement import placed
+from training.editing.placement import transform_bundle
 from training.lod.rules.chunks import member_columns
-from training.splats.bundle import Bundle, Level, read_bundle, read_folder, write_bundle
+from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
+from training.splats.level_folder import read_folder
+from training.splats.levels import Bundle, Level
 from training.splats.similarity import Similarity
 
 GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
@@ -240,7 +242,7 @@ def test_a_bundle_as_placed_stands_there_when_it_is_imported(bpy, lodgs, root, t
     stand_somewhere(bpy, root)
     there = world(root)
     bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "out.ply"), placed=True)
-    found, wanted = read_bundle(tmp_path / "out.ply"), placed(lodge(), Similarity.from_matrix(
+    found, wanted = read_bundle(tmp_path / "out.ply"), transform_bundle(lodge(), Similarity.from_matrix(
         lodgs("data.placement").placement_of(root).matrix))  # fmt: skip
     assert found.meta["up_rotation"] == np.eye(3).tolist()
     np.testing.assert_allclose(found.meta["camera_center"], wanted.meta["camera_center"])
@@ -263,7 +265,7 @@ def test_a_bundle_as_placed_stands_there_when_it_is_imported(bpy, lodgs, root, t
 def test_plain_plys_and_folders_as_placed(bpy, lodgs, root, tmp_path):
     stand_somewhere(bpy, root)
     placement = lodgs("data.placement").placement_of(root)
-    wanted = placed(lodge(), Similarity.from_matrix(placement.matrix)).levels[1].splats
+    wanted = transform_bundle(lodge(), Similarity.from_matrix(placement.matrix)).levels[1].splats
     bpy.ops.lodgs.export_plain(filepath=str(tmp_path / "p.ply"), source="LEVEL", level=2, placed=True)
     bpy.ops.lodgs.export_folder(directory=str(tmp_path / "f"), placed=True)
     root.lodgs.mode, root.lodgs.single_level = "SINGLE", 2

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.blender.fake_trainer import splats
-from training.splats.bundle import Bundle, Level
+from training.splats.levels import Bundle, Level
 
 KINDS = ("objects", "collections", "pointclouds", "cameras", "images", "meshes", "scenes")
 

@@ -8,7 +8,9 @@ import pytest
 
 from tests.blender.fake_trainer import splats
 from training.lod.rules.chunks import member_columns
-from training.splats.bundle import Bundle, Level, read_bundle, read_folder, write_bundle, write_folder
+from training.splats.bundle import read_bundle, write_bundle
+from training.splats.level_folder import read_folder, write_folder
+from training.splats.levels import Bundle, Level
 
 CHUNKS = {
     "x": np.float32([0.1, 7, -3]), "y": np.float32([1, 2, 3]), "z": np.float32([0, 0, 1 / 3]),

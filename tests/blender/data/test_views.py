@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from tests.blender.fake_trainer import splats
-from training.editing.bake_filter import without_filter
+from training.editing.bake_filter import bake_filter
 from training.scenes.cameras import Camera, look_at
 from training.scenes.colmap import read_scene
 from training.scenes.view_tables import make_view_tables, read_view_tables
-from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
+from training.splats.bundle import read_bundle, write_bundle
+from training.splats.levels import Bundle, Level
 from training.splats.similarity import Similarity
 
 GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
@@ -115,7 +116,7 @@ def test_files_for_other_programs_are_as_opaque_as_the_views_show_them(bpy, root
 
     assert bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "own.ply")) == {"FINISHED"}
     bundle = read_bundle(tmp_path / "own.ply")
-    own, expected = bundle.levels[0].splats, without_filter(bundle).levels[0].rows.select(slice(None))
+    own, expected = bundle.levels[0].splats, bake_filter(bundle).levels[0].rows.select(slice(None))
     filtered, kept = exported(antialiased=True)
     assert bundle.antialias and filtered
     np.testing.assert_array_equal(kept, own.opacity_logits)

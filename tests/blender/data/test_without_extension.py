@@ -7,7 +7,8 @@ import sys
 import pytest
 
 from tests.blender.fake_trainer import splats
-from training.splats.bundle import Bundle, Level, write_bundle
+from training.splats.bundle import write_bundle
+from training.splats.levels import Bundle, Level
 
 COUNTS = {1: 5, 2: 20, 3: 9}
 LOOK = """

@@ -17,7 +17,7 @@ def weights(bpy, lodgs):
 
     ``weights.root`` is their scene, which stands askew and has a level for the rest as well.
     """
-    from training.splats.bundle import Bundle, Level
+    from training.splats.levels import Bundle, Level
 
     scenes = lodgs("data.scenes")
     fine = splats(SETS)

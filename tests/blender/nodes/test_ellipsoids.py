@@ -26,7 +26,7 @@ def scene(bpy, lodgs):
     root = bpy.data.objects.new("one", None)
     root.lodgs.is_root = True
     collection.objects.link(root)
-    from training.splats.bundle import Level
+    from training.splats.levels import Level
 
     lodgs("data.scenes").set_level(root, Level(1, splats(), 0.0))
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
@@ -71,7 +71,7 @@ def test_a_splat_around_the_camera_is_seen_if_its_middle_is_before_it(
     bpy, lodgs, scene, tmp_path, ahead, seen
 ):
     """Round, 2 wide: a ray that passes its middle in the distance d sees exp(-d²/8) of its opacity."""
-    from training.splats.bundle import Level
+    from training.splats.levels import Level
 
     one = splats(means=[[0, -5 + ahead, 0]], quats=[[1, 0, 0, 0]], log_scales=np.log([[2.0, 2.0, 2.0]]))
     lodgs("data.scenes").set_level(bpy.data.objects["one"], Level(1, one, 0.0))
@@ -94,7 +94,7 @@ def test_rays_go_on_through_many_ellipsoids(bpy, lodgs, scene, tmp_path):
         means=row, quats=np.tile([1.0, 0, 0, 0], (30, 1)), log_scales=np.log(np.full((30, 3), 3.0)),
         opacity_logits=np.full(30, np.log(0.1 / 0.9)), sh=np.zeros((30, 1, 3)),
     )  # fmt: skip
-    from training.splats.bundle import Level
+    from training.splats.levels import Level
 
     lodgs("data.scenes").set_level(bpy.data.objects["one"], Level(1, many, 0.0))
     scene.camera.location.y = -30
@@ -117,7 +117,7 @@ def test_they_are_there_only_where_they_are_wanted(bpy, lodgs, scene):
         bpy.context.view_layer.update()
         assert modifier.show_render == expected
     # a level that comes later has them too
-    from training.splats.bundle import Level
+    from training.splats.levels import Level
 
     lodgs("data.scenes").set_level(bpy.data.objects["one"], Level(2, splats(), 0.0))
     assert "LODGS Ellipsoids" in bpy.data.objects["one level 2"].modifiers

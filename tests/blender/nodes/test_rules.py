@@ -125,8 +125,8 @@ def test_the_node_group_weights_every_splat_as_the_rule_does(bpy, lodgs, level, 
 @pytest.fixture
 def splat_scene(bpy, lodgs):
     """``splat_scene(name)``: the root of a scene whose few levels are chosen by that rule."""
-    from training.splats.bundle import Bundle, Level
     from training.splats.gaussians import Splats
+    from training.splats.levels import Bundle, Level
 
     def make(name):
         rule, rng, scenes = rules()[name], np.random.default_rng(1), lodgs("data.scenes")
@@ -235,7 +235,7 @@ def test_a_group_that_an_artist_has_changed_is_followed_by_all(bpy, lodgs, half,
         if placed.choice is None:
             return len(splats)
         columns = splats.extras | {"opacity": 1 / (1 + np.exp(-splats.opacity_logits))}
-        return len(lodgs("training.lod.query").Chooser(splats.means, columns).chosen(placed.choice)[0])
+        return len(lodgs("training.lod.query").SplatSelector(splats.means, columns).chosen(placed.choice)[0])
 
     def everything():
         return sum(len(item.object.data.points) for item in root.lodgs.levels if item.object.visible_get())

@@ -8,8 +8,8 @@ import pytest
 from tests.training.lod.tree.trees import random_leaves, tree_of
 from training.lod.rule import rules
 from training.lod.rules.chunks import member_columns
-from training.splats.bundle import Bundle, Level
 from training.splats.gaussians import Splats
+from training.splats.levels import Bundle, Level
 
 
 @pytest.fixture

@@ -3,7 +3,8 @@
 import pytest
 
 from tests.blender.fake_trainer import splats
-from training.splats.bundle import Bundle, Level, write_bundle
+from training.splats.bundle import write_bundle
+from training.splats.levels import Bundle, Level
 
 
 @pytest.fixture
@@ -106,7 +107,7 @@ def test_frames_of_viewport_quality_are_no_movie(bpy, lodgs, scene):
         compat.media_type = "VIDEO"
     scene.render.image_settings.file_format = "FFMPEG"
     with pytest.raises(lodgs("training.errors").LodgsError, match="image format"):
-        next(lodgs("render.quick").render_animation(bpy.context, range(1, 2)))
+        next(lodgs("render.viewport_quality").render_animation(bpy.context, range(1, 2)))
 
 
 def test_captures_leave_splats_out_whichever_level_is_shown(bpy, lodgs, scene):

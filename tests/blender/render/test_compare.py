@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from training.scenes.colmap import read_scene
-from training.splats.bundle import Bundle, Level, write_bundle
+from training.splats.bundle import write_bundle
 from training.splats.gaussians import Splats
+from training.splats.levels import Bundle, Level
 
 GARDEN = Path(__file__).resolve().parents[3] / "examples" / "lantern_garden"
 
@@ -76,7 +77,7 @@ def measured(bpy, lodgs, tmp_path):
     view as the trainer's evaluation finds it: only their files are shared."""
     pytest.importorskip("torch", reason="the evaluation runs beside Blender here")
     from training.evaluate.views import Evaluation
-    from training.lod.selection import Choice, settings
+    from training.lod.selection import BundleSelector, resolve_controls
     from training.optimize.training_data import TrainingData
     from training.scenes.colmap import read_scene
 
@@ -93,7 +94,7 @@ def measured(bpy, lodgs, tmp_path):
         evaluation = Evaluation(TrainingData(read_scene(folder), scale, 8), backend="cpu")
         camera = evaluation.cameras[index]
         bundle.controls["gamma"] = 2.4 * scale
-        choice, values = Choice(bundle), settings(bundle, {})
+        choice, values = BundleSelector(bundle), resolve_controls(bundle, {})
         weights = choice.weights(camera.center, camera.focal, values)
         counts = np.unique(np.repeat([1, 2, 3], 300)[weights > 0], return_counts=True)
         assert min(counts[1]) > 20 and len(counts[0]) == 3  # every level has its part

@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from training.splats.bundle import Bundle, Level, write_bundle
+from training.splats.bundle import write_bundle
 from training.splats.gaussians import Splats
+from training.splats.levels import Bundle, Level
 
 ROOT = Path(__file__).resolve().parents[3]
 TRAINER = os.environ.get("LODGS_TRAINER_PYTHON", "")
@@ -96,9 +97,11 @@ def passes(bpy, lodgs, **settings):
     """The planes that the engine draws of the scene as it is."""
     engine, scene = lodgs("render.engine"), bpy.context.scene
     scene.view_layers[0].use_pass_z = scene.lodgs_render.use_pass_levels = True
-    width, height = engine.size(scene.render)
+    width, height = engine.render_size(scene.render)
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    drawn = engine.frame(depsgraph, width, height, engine.border(scene.render, width, height), **settings)
+    drawn = engine.render_frame(
+        depsgraph, width, height, engine.render_border(scene.render, width, height), **settings
+    )
     return drawn and drawn.planes
 
 
@@ -698,7 +701,7 @@ def test_a_moving_cube_holds_out_frame_by_frame(bpy, lodgs, fog_and_wall, tmp_pa
 )  # fmt: skip
 def test_frames_have_their_numbers(bpy, lodgs, pattern, frame, name):
     scene = bpy.context.scene
-    path = lodgs("render.engine").at_frame(pattern, scene, frame)
+    path = lodgs("render.engine").frame_path(pattern, scene, frame)
     assert path.name == name and str(path.parent) == pattern.rpartition("/")[0]
 
 

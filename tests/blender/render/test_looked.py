@@ -20,7 +20,7 @@ def seen(bpy, lodgs):
 
     def drawn(draw=None):
         bpy.context.view_layer.update()
-        draw = draw or lodgs("render.engine").frame
+        draw = draw or lodgs("render.engine").render_frame
         planes = draw(bpy.context.evaluated_depsgraph_get(), 96, 64, (0, 0, 96, 64), lambda *_: True).planes
         return srgb_from_linear(np.stack([planes[f"Combined.{channel}"] for channel in "RGB"], axis=2))
 
@@ -87,7 +87,7 @@ def test_the_frame_is_the_colour_mapped_frame(bpy, lodgs, seen, tmp_path):
 
 @pytest.mark.usefixtures("camera", "frame")
 def test_viewports_draw_what_is_exported(bpy, lodgs, seen, tmp_path):
-    quick, importing = lodgs("render.quick")._frame, lodgs("data.importing")
+    quick, importing = lodgs("render.viewport_quality")._render_frame, lodgs("data.importing")
     root = importing.import_splats(bpy.context, file_of(tmp_path), upright=False)
     root.location, root.rotation_euler = (1, 2, 0), (0.1, 0.2, 0.7)
     before = seen(quick)
@@ -152,7 +152,11 @@ def test_frames_show_paint_as_what_is_exported_with_it(bpy, lodgs, seen, tmp_pat
 @pytest.mark.parametrize("modifier", [False, True])
 def test_viewports_show_paint_at_once_and_read_no_splat_anew(bpy, lodgs, seen, tmp_path, modifier):
     """But of those that a modifier of somebody's own changes."""
-    quick, importing, views = lodgs("render.quick")._frame, lodgs("data.importing"), lodgs("viewport.views")
+    quick, importing, views = (
+        lodgs("render.viewport_quality")._render_frame,
+        lodgs("data.importing"),
+        lodgs("viewport.views"),
+    )
     root = importing.import_splats(bpy.context, file_of(tmp_path), upright=False)
     root.lodgs.mode, root.lodgs.single_level = "SINGLE", 3
     if modifier:
@@ -207,7 +211,7 @@ def test_a_tree_that_is_read_from_its_file_has_its_look(bpy, lodgs, seen, tmp_pa
 def test_ellipsoids_have_the_look_s_colour_and_opacity(bpy, lodgs, tmp_path):
     """One splat, seen by Cycles: as what is exported of it."""
     from tests.blender.nodes.test_ellipsoids import rendered, splats
-    from training.splats.bundle import Bundle, Level
+    from training.splats.levels import Bundle, Level
 
     scene, camera = bpy.context.scene, bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))  # noqa: F811
     scene.collection.objects.link(camera)

@@ -8,8 +8,9 @@ import pytest
 from tests.blender.fake_trainer import COUNTS
 from training.runs.job import Job
 from training.scenes.cameras import read_camera
-from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
+from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
+from training.splats.levels import Bundle, Level
 
 TRAINER = os.environ.get("LODGS_TRAINER_PYTHON", "")
 

@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from training.editing.bake_filter import without_filter
+from training.editing.bake_filter import bake_filter
 from training.editing.cleaning import Cleaning
 from training.editing.edit import edit
 from training.rasterize import Gaussians, rasterize
 from training.scenes.cameras import Camera, look_at
 from training.scenes.view_tables import make_view_tables
-from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
+from training.splats.bundle import read_bundle, write_bundle
 from training.splats.formats import open_as_ply
 from training.splats.gaussians import Splats
+from training.splats.levels import Bundle, Level
 from training.splats.ply import read_ply
 
 SIZE, FOCAL = (48, 36), 40.0
@@ -64,7 +65,7 @@ def error(shown: Bundle, truth: Bundle) -> float:
 
 def test_it_looks_about_as_the_filter_shows_it(bundle):
     untold = replace(bundle, meta={})
-    found = without_filter(bundle)
+    found = bake_filter(bundle)
     assert not found.antialias and found.tables == bundle.tables
     assert error(found, bundle) < 0.4 * error(untold, bundle)
     assert bundle.antialias, "untouched"
@@ -74,7 +75,7 @@ def test_opacities_are_what_the_filter_leaves_in_a_view(bundle):
     """Of one view: the alpha in the middle of a splat that is drawn alone."""
     eye = EYES["a"]
     alone = replace(bundle, tables=make_view_tables([view("a", eye, 3)], 0.05))
-    found = without_filter(alone).levels[0].rows.select(np.array([1, 4, 900]))
+    found = bake_filter(alone).levels[0].rows.select(np.array([1, 4, 900]))
     own = bundle.levels[0].splats.select(np.array([1, 4, 900]))
     for row in range(3):
         one = own.select(slice(row, row + 1))
@@ -99,7 +100,7 @@ def test_files_for_others_have_it_and_bundles_do_not(bundle, tmp_path):
         )
         plain = read_bundle(paths[0])
         assert plain.antialias is antialiased, "so that it is not done twice"
-        expected = (bundle if antialiased else without_filter(bundle)).levels[0].rows.select(slice(None))
+        expected = (bundle if antialiased else bake_filter(bundle)).levels[0].rows.select(slice(None))
         np.testing.assert_array_equal(plain.levels[0].splats.opacity_logits, expected.opacity_logits)
         with open_as_ply(paths[1]) as path:
             opacity = torch.sigmoid(torch.from_numpy(read_ply(path).opacity_logits)).numpy()
@@ -108,4 +109,4 @@ def test_files_for_others_have_it_and_bundles_do_not(bundle, tmp_path):
 
 def test_where_views_are_unknown_or_no_filter_is_nothing_changes(bundle):
     for one in (replace(bundle, tables={}), replace(bundle, meta={})):
-        assert without_filter(one) is one
+        assert bake_filter(one) is one

@@ -7,17 +7,27 @@ import pytest
 
 from tests.training.lod.tree.trees import random_leaves, surfaces, tree_of, write_in_pages
 from training.__main__ import main
-from training.editing.cleaning import Cleaning, Family, cleaned, far, floaters, unseen, without
+from training.editing.cleaning import (
+    Cleaning,
+    TreeRelations,
+    clean_bundle,
+    find_far,
+    find_floaters,
+    find_unseen,
+    keep_splats,
+)
 from training.errors import LodgsError
-from training.lod.crop import Crop, kept
-from training.lod.partial_read import BLOCKS, read_part, table_of_blocks
-from training.lod.query import Choice, Chooser
-from training.lod.rule import OPACITY, facts_of, rules
-from training.lod.selection import select_levels, settings
-from training.lod.tree.paging import COLUMNS, Standing, TreeFile, read_within
+from training.lod.crop import Crop, crop_mask
+from training.lod.partial_read import BLOCKS, block_table, read_part
+from training.lod.query import LodQuery, SplatSelector
+from training.lod.rule import OPACITY, collect_facts, rules
+from training.lod.selection import resolve_controls, select_levels
+from training.lod.tree.paging import COLUMNS, ResidentTree, TreeFile, read_budgeted
 from training.scenes.cameras import Camera, look_at
-from training.splats.bundle import Bundle, Level, read_bundle, read_folder, write_bundle, write_folder
+from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
+from training.splats.level_folder import read_folder, write_folder
+from training.splats.levels import Bundle, Level
 
 NOT_TREES = sorted(rules().keys() - {"cut"})
 
@@ -50,7 +60,7 @@ def bundle_of(name, rng):
         column = {axis: rng.normal(0, 4, 3).astype(np.float32) for axis in "xyz"}
         tables[table] = column | {"radius": np.float32([5, 6, 7])}
     if name == "chunks":
-        tables[BLOCKS] = table_of_blocks(rule, {level.number: level.splats for level in levels})
+        tables[BLOCKS] = block_table(rule, {level.number: level.splats for level in levels})
     facts = dict.fromkeys(rule.scene_facts, 5.0)
     if "tau" in facts:
         facts["tau"] = 0.004
@@ -80,12 +90,14 @@ def test_a_flat_crop_holds_nothing_and_what_is_cut_out_goes_from_what_is_kept():
     flat = Crop.at("BOX", np.diag([1.0, 1, 0, 1]))
     assert not flat.holds(means).any()
     one, other = Crop.sphere((0, 0, 0), 1), Crop.box((1, -1, -1), (3, 1, 1))
-    np.testing.assert_array_equal(kept([one, other], means), [True, True, False, True])
+    np.testing.assert_array_equal(crop_mask([one, other], means), [True, True, False, True])
     np.testing.assert_array_equal(
-        kept([one, other, Crop.sphere((2, 0, 0), 0.2, True)], means), [True, False, False, True]
+        crop_mask([one, other, Crop.sphere((2, 0, 0), 0.2, True)], means), [True, False, False, True]
     )
-    np.testing.assert_array_equal(kept([Crop.sphere((0, 0, 0), 1, True)], means), [False, True, True, True])
-    assert kept([], means).all()
+    np.testing.assert_array_equal(
+        crop_mask([Crop.sphere((0, 0, 0), 1, True)], means), [False, True, True, True]
+    )
+    assert crop_mask([], means).all()
 
 
 def naive_floaters(means, gap, most):
@@ -124,9 +136,9 @@ def test_floaters_are_those_that_were_planted():
     )
     means = np.concatenate([ground, planted]).astype(np.float32)
     order = rng.permutation(len(means))
-    found = floaters(means[order])
+    found = find_floaters(means[order])
     np.testing.assert_array_equal(found, order >= len(ground))
-    np.testing.assert_array_equal(found, floaters(means[order]))
+    np.testing.assert_array_equal(found, find_floaters(means[order]))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -134,7 +146,7 @@ def test_floaters_are_small_clusters_of_touching_cells(seed):
     rng = np.random.default_rng(seed)
     means = (rng.normal(0, 1, (600, 3)) * rng.uniform(0.2, 3, (600, 1))).astype(np.float32)
     means[0] = 1e9  # beyond all cells that are told apart
-    np.testing.assert_array_equal(floaters(means, 0.5, 0.02), naive_floaters(means, 0.5, 12))
+    np.testing.assert_array_equal(find_floaters(means, 0.5, 0.02), naive_floaters(means, 0.5, 12))
 
 
 def test_far_and_unseen_ask_every_camera():
@@ -145,10 +157,10 @@ def test_far_and_unseen_ask_every_camera():
         Camera("", 80, 60, 70, 75, 41, 29, look_at(eye, eye + rng.normal(size=3), (0, 0, 1))) for eye in eyes
     ]
     away = np.array([[np.linalg.norm(mean - eye) for eye in eyes] for mean in means]).min(axis=1)
-    np.testing.assert_array_equal(far(means, eyes, 4.0), away > 4)
+    np.testing.assert_array_equal(find_far(means, eyes, 4.0), away > 4)
     seen = sum(camera.sees(means.astype(np.float64)).astype(int) for camera in cameras)
     for least in (1, 2, 3):
-        np.testing.assert_array_equal(unseen(means, cameras, least), seen < least)
+        np.testing.assert_array_equal(find_unseen(means, cameras, least), seen < least)
 
 
 @pytest.mark.parametrize("name", NOT_TREES)
@@ -156,8 +168,8 @@ def test_what_is_left_is_chosen_as_before(name):
     rng = np.random.default_rng(3)
     bundle = bundle_of(name, rng)
     crop = Crop.sphere((1, 0, -1), 4.0)
-    found = cleaned(bundle, Cleaning((crop,), max_size=0.4, min_opacity=0.05))
-    values = settings(bundle, {})
+    found = clean_bundle(bundle, Cleaning((crop,), max_size=0.4, min_opacity=0.05))
+    values = resolve_controls(bundle, {})
     for _ in range(5):
         eye = rng.normal(0, 4, 3)
         before, after = (select_levels(one, eye, 3.0, values) for one in (bundle, found))
@@ -181,20 +193,20 @@ def test_a_choice_with_crops_is_the_rule_of_what_they_leave(name):
         splats = level.splats
         columns = {**splats.extras, OPACITY: 1 / (1 + np.exp(-splats.opacity_logits))}
         columns["hidden"] = (splats.extras["row"] % 3 == 0).astype(np.float32)
-        stays = kept(crops, splats.means) & (splats.extras["row"] % 3 > 0)
-        choice = Choice(
+        stays = crop_mask(crops, splats.means) & (splats.extras["row"] % 3 > 0)
+        choice = LodQuery(
             name, (1.0, 2.0, 3.0), 3.0,
-            tuple(facts_of(rule, bundle.facts, numbered, level.number).items()),
-            tuple(settings(bundle, {}).items()), crops=crops,
+            tuple(collect_facts(rule, bundle.facts, numbered, level.number).items()),
+            tuple(resolve_controls(bundle, {}).items()), crops=crops,
         )  # fmt: skip
         rest = {key: column[stays] for key, column in columns.items()}
         wanted = rule.weights(
             splats.means[stays], np.float32([1, 2, 3]), 3.0, rest, dict(choice.facts), dict(choice.values)
         )
-        rows, weights = Chooser(splats.means, columns, splats.log_scales).chosen(choice)
+        rows, weights = SplatSelector(splats.means, columns, splats.log_scales).chosen(choice)
         np.testing.assert_array_equal(rows, np.flatnonzero(stays)[wanted > 0])
         np.testing.assert_array_equal(weights, wanted[wanted > 0])
-    alone, _ = Chooser(splats.means, columns).chosen(Choice.by_crops(crops))
+    alone, _ = SplatSelector(splats.means, columns).chosen(LodQuery.by_crops(crops))
     np.testing.assert_array_equal(alone, np.flatnonzero(stays))
 
 
@@ -202,7 +214,7 @@ def drawn_for_each_leaf(tree, eye, focal):
     """How many of a leaf and the nodes above it an eye is shown, by parents known by size and place."""
     splats = Splats.concatenated([level.splats for level in tree.levels])
     columns = splats.extras | dict(zip("xyz", splats.means.T, strict=True))
-    standing = Standing(columns)
+    standing = ResidentTree(columns)
     inner, reached = standing.update(np.arange(len(splats)))
     assert reached.all()  # every other node has two children
     weights = rules()["cut"].weights(
@@ -220,7 +232,7 @@ def test_a_tree_that_was_cropped_is_one_still():
     rng = np.random.default_rng(5)
     tree = tree_of(surfaces(3000))
     crop = Crop.box((-4, -6, -2), (6, 3, 4))
-    found = cleaned(tree, Cleaning((crop,)))
+    found = clean_bundle(tree, Cleaning((crop,)))
     leaves = tree.levels[1].splats.means
     stays = ((leaves >= (-4, -6, -2)) & (leaves <= (6, 3, 4))).all(axis=1)
     np.testing.assert_array_equal(found.levels[1].splats.means, leaves[stays])
@@ -233,7 +245,7 @@ def test_a_tree_that_was_cropped_is_one_still():
 def test_nodes_of_a_tree_go_when_all_their_leaves_do():
     tree = tree_of(random_leaves(200, np.random.default_rng(6)))
     masks = {1: np.ones(199, bool), 2: np.arange(200) < 130}
-    stays, family = Family.of(tree).standing(masks), Family.of(tree)
+    stays, family = TreeRelations.of(tree).standing(masks), TreeRelations.of(tree)
     splats = Splats.concatenated([level.splats for level in tree.levels])
     place = {(size, *mean): i for i, (size, mean) in enumerate(
         zip(splats.extras["node_size"].tolist(), splats.means.tolist(), strict=True))}  # fmt: skip
@@ -256,7 +268,7 @@ def test_a_cropped_tree_in_a_file_is_read_in_pages(tmp_path):
     arguments = ["--crop-sphere", "2", "-1", "0", "5", "--min-opacity", "0.5"]
     assert main(["edit", str(tmp_path / "tree.ply"), "--out", str(out), *arguments]) == 0
     whole = read_bundle(tmp_path / "tree.ply")
-    in_memory = cleaned(whole, Cleaning((Crop.sphere((2, -1, 0), 5),), min_opacity=0.5))
+    in_memory = clean_bundle(whole, Cleaning((Crop.sphere((2, -1, 0), 5),), min_opacity=0.5))
     there = read_bundle(out)
     for one, other in zip(in_memory.levels, there.levels, strict=True):
         np.testing.assert_array_equal(one.splats.means, other.splats.means)
@@ -265,12 +277,12 @@ def test_a_cropped_tree_in_a_file_is_read_in_pages(tmp_path):
     np.testing.assert_equal(there.tables[BLOCKS], in_memory.tables[BLOCKS])
 
     file = TreeFile(out)
-    choice = Choice("cut", (1.0, 2.0, 3.0), 400.0, (), (("pixels", 2.0),))
+    choice = LodQuery("cut", (1.0, 2.0, 3.0), 400.0, (), (("pixels", 2.0),))
     wanted = select_levels(there, np.float32(choice.eye), 400.0, {"pixels": 2.0})
     for one in wanted:
         cut = file.cut(choice)[one.number]
         assert sorted(map(tuple, cut.means)) == sorted(map(tuple, one.splats.means))
-    top, total = read_within(out, 1024)
+    top, total = read_budgeted(out, 1024)
     assert total == sum(len(level.splats) for level in there.levels)
     _, count = drawn_for_each_leaf(top, (0, 0, 0), 1e5)
     assert (count == 1).all()
@@ -283,7 +295,7 @@ def test_blocks_of_chunks_follow(tmp_path):
     assert main(["edit", str(tmp_path / "all.ply"), "--out", str(tmp_path / "some.ply"), *crop]) == 0
     found = read_bundle(tmp_path / "some.ply")
     levels = {level.number: level.splats for level in found.levels}
-    np.testing.assert_equal(found.tables[BLOCKS], table_of_blocks(rules()["chunks"], levels))
+    np.testing.assert_equal(found.tables[BLOCKS], block_table(rules()["chunks"], levels))
     part, _ = read_part(tmp_path / "some.ply", [3], (1,))
     member = found.levels[2].splats.extras["chunks_0"].astype(int) & 2 != 0
     np.testing.assert_array_equal(part.levels[2].splats.means, found.levels[2].splats.means[member])
@@ -329,4 +341,4 @@ def test_what_cannot_be_is_said(tmp_path, monkeypatch, capsys, arguments, said):
 def test_tables_of_an_unknown_rule_are_left_alone():
     bundle = Bundle("new", [Level(1, some_splats(np.random.default_rng(0), 9))], "newer", tables={"x": {}})
     with pytest.raises(LodgsError, match="newer"):
-        without(bundle, {1: np.arange(9) < 5})
+        keep_splats(bundle, {1: np.arange(9) < 5})

@@ -7,24 +7,18 @@ from scipy.spatial.transform import Rotation
 from tests.training.lod.test_rule import RULES, any_values, bundle_of
 from tests.training.lod.tree.trees import random_tree, surfaces
 from training.__main__ import main
-from training.editing.placement import placed
+from training.editing.placement import transform_bundle
 from training.errors import LodgsError
 from training.lod.partial_read import BLOCKS
 from training.lod.rule import rules
 from training.lod.rules.chunks import member_columns
-from training.lod.selection import Choice, settings
-from training.lod.tree.paging import TreeFile, streaming_order, table_of_pages
+from training.lod.selection import BundleSelector, resolve_controls
+from training.lod.tree.paging import TreeFile, page_table, streaming_order
 from training.lod.tree.shape import Tree
-from training.splats.bundle import (
-    Bundle,
-    Level,
-    open_bundle,
-    read_bundle,
-    read_folder,
-    write_bundle,
-    write_folder,
-)
+from training.splats.bundle import open_bundle, read_bundle, write_bundle
 from training.splats.gaussians import Splats
+from training.splats.level_folder import read_folder, write_folder
+from training.splats.levels import Bundle, Level
 from training.splats.ply import write_ply
 from training.splats.similarity import Similarity
 
@@ -38,7 +32,7 @@ def tree_bundle(seed: int, leaves: int = 400) -> tuple[Bundle, Tree]:
     tree, splats = random_tree(rng, leaves), surfaces(2 * leaves - 1)
     splats.extras["node"] = np.arange(len(splats), dtype=np.int32)
     levels = tree.levels(splats)
-    table = table_of_pages({level.number: level.splats.extras for level in levels})
+    table = page_table({level.number: level.splats.extras for level in levels})
     return Bundle("tree", levels, "cut", tables={BLOCKS: table}), tree
 
 
@@ -68,11 +62,11 @@ def general(scale: float, away: float) -> Similarity:
 def test_every_rule_chooses_as_before_bit_for_bit(name):
     """Where nothing is rounded. A length or a place that a rule does not declare would show."""
     bundle, placement, rng = choosable(name), Similarity.from_matrix(QUARTER), np.random.default_rng(1)
-    there, shown = placed(bundle, placement), 0
-    before, after = Choice(bundle), Choice(there)
+    there, shown = transform_bundle(bundle, placement), 0
+    before, after = BundleSelector(bundle), BundleSelector(there)
     for _ in range(40):
         eye, focal = np.float32(rng.normal(0, 4, 3)), rng.uniform(1, 90)
-        values = settings(bundle, any_values(rules()[name], rng))
+        values = resolve_controls(bundle, any_values(rules()[name], rng))
         weights = before.weights(eye, focal, values)
         shown += np.count_nonzero(weights)
         np.testing.assert_array_equal(after.weights(placement.transform_points(eye), focal, values), weights)
@@ -84,11 +78,11 @@ def test_every_rule_chooses_as_before_bit_for_bit(name):
 def test_every_rule_chooses_as_before_anywhere(name, scale):
     """But for what meets a border in the last bits of single precision."""
     bundle, placement, rng = choosable(name), general(scale, 3 * scale), np.random.default_rng(1)
-    there = placed(bundle, placement)
-    before, after = Choice(bundle), Choice(there)
+    there = transform_bundle(bundle, placement)
+    before, after = BundleSelector(bundle), BundleSelector(there)
     for _ in range(20):
         eye, focal = np.float32(rng.normal(0, 4, 3)), rng.uniform(1, 90)
-        values = settings(bundle, any_values(rules()[name], rng))
+        values = resolve_controls(bundle, any_values(rules()[name], rng))
         weights = before.weights(eye, focal, values)
         same = np.isclose(after.weights(placement.transform_points(eye), focal, values), weights, atol=2e-4)
         assert np.count_nonzero(~same) <= 1 + len(same) // 200
@@ -98,14 +92,14 @@ def test_every_rule_chooses_as_before_anywhere(name, scale):
 def test_cuts_of_a_placed_tree_are_proper(scale, away):
     """Of each leaf and the nodes above it exactly one is shown, however much is rounded."""
     bundle, tree = tree_bundle(1)
-    there, rng = placed(bundle, general(scale, away)), np.random.default_rng(2)
-    choice = Choice(there)
+    there, rng = transform_bundle(bundle, general(scale, away)), np.random.default_rng(2)
+    choice = BundleSelector(there)
     nodes, means = choice.splats.extras["node"], choice.splats.means
     for _ in range(200):
         eye = means[rng.integers(len(means))] + scale * rng.normal(0, rng.choice([0.1, 3, 30]), 3)
         focal = 10 ** rng.uniform(0, 4)
         shown = np.zeros(len(tree))
-        shown[nodes] = choice.weights(eye, focal, settings(there, {}))
+        shown[nodes] = choice.weights(eye, focal, resolve_controls(there, {}))
         above = shown.copy()
         for layer in tree.layers:
             above[tree.children[layer - tree.leaves]] += above[layer][:, None]
@@ -120,10 +114,10 @@ def test_nodes_of_a_placed_tree_know_their_parents():
     splats = Splats.concatenated([leaves, leaves.select(slice(63))])
     bundle = Bundle("tree", tree.levels(splats), "cut")
     for scale in (0.61, 1.3, 2.9):
-        nodes = placed(bundle, general(scale, 1.0)).levels[0].splats
+        nodes = transform_bundle(bundle, general(scale, 1.0)).levels[0].splats
         sizes = nodes.extras["node_size"]
         assert len(np.unique(sizes)) == len(sizes) == 63
-        for level in placed(bundle, general(scale, 1.0)).levels:
+        for level in transform_bundle(bundle, general(scale, 1.0)).levels:
             above = level.splats.extras["parent_size"]
             assert np.isin(above[above < 3e38], sizes).all()
 
@@ -134,7 +128,7 @@ def test_what_a_bundle_says_goes_along():
         "camera_center": [1, 0, 0], "view": [[0, 0, 0], [0, 1, 0]], "up_rotation": np.eye(3),
         "median_depth": 4, "focal_px": 100.0, "costs": [{"level": 1, "distances": [1.5, 2]}], "seed": 3,
     }  # fmt: skip
-    there = placed(bundle, Similarity.from_matrix(QUARTER))
+    there = transform_bundle(bundle, Similarity.from_matrix(QUARTER))
     assert there.meta == {
         "camera_center": [0, 2, 0], "view": [[0, 0, 0], [-2, 0, 0]], "median_depth": 8.0,
         "up_rotation": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], "focal_px": 100.0,
@@ -153,8 +147,8 @@ def test_what_stays_in_a_file_is_placed_as_what_is_in_memory(name, tmp_path):
     for level in head.levels:
         level.on_disk = rows[level.number]
     placement = general(1.7, 2.0)
-    write_bundle(tmp_path / "out.ply", placed(head, placement))
-    wanted, found = placed(bundle, placement), read_bundle(tmp_path / "out.ply")
+    write_bundle(tmp_path / "out.ply", transform_bundle(head, placement))
+    wanted, found = transform_bundle(bundle, placement), read_bundle(tmp_path / "out.ply")
     assert (found.rule, found.facts) == (wanted.rule, wanted.facts)
     for one, other in zip(found.levels, wanted.levels, strict=True):
         assert one.facts == other.facts and one.splats.extras.keys() == other.splats.extras.keys()
@@ -166,7 +160,7 @@ def test_what_stays_in_a_file_is_placed_as_what_is_in_memory(name, tmp_path):
 
 def test_a_placed_tree_is_read_by_pages(tmp_path):
     bundle, _ = tree_bundle(1, 3000)
-    write_bundle(tmp_path / "t.ply", placed(bundle, general(2.3, 9.0)))
+    write_bundle(tmp_path / "t.ply", transform_bundle(bundle, general(2.3, 9.0)))
     file = TreeFile(tmp_path / "t.ply")
     table = file.bundle.tables[BLOCKS]
     del file.bundle.tables[BLOCKS]
@@ -179,9 +173,9 @@ def test_a_placed_tree_is_read_by_pages(tmp_path):
 def test_an_unknown_rule_is_refused():
     bundle = Bundle("new", [Level(1, surfaces(5))], "of tomorrow")
     with pytest.raises(LodgsError, match="of tomorrow"):
-        placed(bundle, Similarity.from_matrix(QUARTER))
+        transform_bundle(bundle, Similarity.from_matrix(QUARTER))
     bundle.rule = ""
-    assert len(placed(bundle, Similarity.from_matrix(QUARTER)).levels[0].splats) == 5
+    assert len(transform_bundle(bundle, Similarity.from_matrix(QUARTER)).levels[0].splats) == 5
 
 
 def test_the_command_writes_the_same_form(tmp_path, capsys):
@@ -200,7 +194,7 @@ def test_the_command_writes_the_same_form(tmp_path, capsys):
         assert main(["edit", str(tmp_path / name), "--out", str(out), *options]) == 0
         assert f"{out}:" in capsys.readouterr().out
         read = read_folder if out.is_dir() else read_bundle
-        found, wanted = read(out), placed(read(tmp_path / name), placement)
+        found, wanted = read(out), transform_bundle(read(tmp_path / name), placement)
         assert (found.rule, found.facts, found.meta.keys()) == (wanted.rule, wanted.facts, wanted.meta.keys())
         for one, other in zip(found.levels, wanted.levels, strict=True):
             np.testing.assert_array_equal(one.splats.means, other.splats.means)

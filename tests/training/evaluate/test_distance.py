@@ -8,10 +8,10 @@ import pytest
 from training.evaluate.distance import measure_farther_views, measure_popping, pull_back
 from training.evaluate.metrics import MAX_PSNR
 from training.evaluate.views import Evaluation
-from training.lod.selection import complete, select, settings
+from training.lod.selection import complete_splats, resolve_controls, select
 from training.scenes.cameras import Camera
-from training.splats.bundle import Bundle, Level
 from training.splats.gaussians import Splats
+from training.splats.levels import Bundle, Level
 
 
 def splats(count: int, seed: int, size: float, bias: float = 0.0) -> Splats:
@@ -59,7 +59,7 @@ def test_what_lies_at_the_depth_is_so_many_times_as_far(camera):
 
 def test_the_rule_on_a_whole_bundle(bundle):
     eye, focal = np.array([0.5, 0, -7.0]), 80.0
-    chosen, weights = select(bundle, eye, focal, settings(bundle, {"offset": 0.25}))
+    chosen, weights = select(bundle, eye, focal, resolve_controls(bundle, {"offset": 0.25}))
     assert weights is not None
     expected = []
     for level in bundle.levels:  # splat by splat: L* = log2(d_max / d) + offset, rounded in half a level
@@ -74,14 +74,14 @@ def test_the_rule_on_a_whole_bundle(bundle):
 
 
 def test_a_level_comes_with_all_coarser_ones_only_where_they_add_up(bundle):
-    assert len(complete(bundle, bundle.levels[1])) == 260
+    assert len(complete_splats(bundle, bundle.levels[1])) == 260
     apart = Bundle("flod", bundle.levels)
-    assert len(complete(apart, apart.levels[1])) == 200
+    assert len(complete_splats(apart, apart.levels[1])) == 200
 
 
 @pytest.mark.slow
 def test_fewer_splats_are_drawn_from_farther_away(bundle, evaluation):
-    rows = measure_farther_views(evaluation, bundle, settings(bundle, {}))
+    rows = measure_farther_views(evaluation, bundle, resolve_controls(bundle, {}))
     assert [row["factor"] for row in rows] == [1, 2, 4, 8]
     drawn = [row["drawn"] for row in rows]
     assert drawn[0] == rows[0]["drawn_full"] and rows[0]["psnr"] == MAX_PSNR
@@ -90,11 +90,14 @@ def test_fewer_splats_are_drawn_from_farther_away(bundle, evaluation):
 
 
 def test_fading_takes_the_jumps_away(bundle, evaluation, camera):
-    found = measure_popping(evaluation, bundle, settings(bundle, {}), camera)
+    found = measure_popping(evaluation, bundle, resolve_controls(bundle, {}), camera)
     assert found["faded"] < found["hard"]
 
 
 def test_where_nothing_is_seen_nothing_jumps(bundle, evaluation, camera):
     for level in bundle.levels:
         level.splats.opacity_logits[:] = -20
-    assert measure_popping(evaluation, bundle, settings(bundle, {}), camera) == {"faded": 0, "hard": 0}
+    assert measure_popping(evaluation, bundle, resolve_controls(bundle, {}), camera) == {
+        "faded": 0,
+        "hard": 0,
+    }

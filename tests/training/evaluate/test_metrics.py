@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from training.evaluate.metrics import MAX_PSNR, fit_exposure, psnr, ssim, to_8_bit
-from training.lod.selection import select, settings
-from training.splats.bundle import Bundle, Level
+from training.lod.selection import resolve_controls, select
 from training.splats.gaussians import Splats
+from training.splats.levels import Bundle, Level
 
 
 def test_psnr_of_a_known_difference():
@@ -79,7 +79,7 @@ def test_the_selective_view_is_the_papers_inequality(start, end):
             far = math.inf if number == start else s_min[number - 2] / gamma * focal
             if near <= distance < far:
                 expected.append(mean)
-    values = settings(bundle, {"gamma": gamma, "first": start, "last": end})
+    values = resolve_controls(bundle, {"gamma": gamma, "first": start, "last": end})
     chosen, weights = select(bundle, eye, focal, values)
     assert weights is None
     np.testing.assert_array_equal(chosen.means, np.array(expected, np.float32).reshape(-1, 3))

@@ -10,9 +10,11 @@ from plyfile import PlyData
 from training.lod.rule import rules
 from training.lod.rules.chunks import member_columns
 from training.lod.rules.cut import RULE
-from training.lod.selection import select_levels, settings
-from training.splats.bundle import Bundle, Level, read_bundle, read_folder, write_bundle, write_folder
+from training.lod.selection import resolve_controls, select_levels
+from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
+from training.splats.level_folder import read_folder, write_folder
+from training.splats.levels import Bundle, Level
 
 ROOT = Path(__file__).parents[3]
 EYES = ((0, 0, 0), (1.5, -2, 3), (9, 0, 1), (40.25, 3, -8), (-3000, 0, 0))
@@ -250,7 +252,7 @@ def test_a_stranger_chooses_what_we_choose(name, made):
         for f in FOCAL:
             for given in CHOICES[page.rule]:
                 theirs = page.weights(eye, f, given)
-                for ours in select_levels(bundle, np.array(eye), f, settings(bundle, given)):
+                for ours in select_levels(bundle, np.array(eye), f, resolve_controls(bundle, given)):
                     weights, count = theirs[ours.number], len(ours.splats)
                     assert (weights > 0).sum() == count
                     total = count if ours.weights is None else ours.weights.sum(dtype=np.float64)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from training.errors import LodgsError
-from training.lod.rule import NO_TABLES, facts_of, rules
+from training.lod.rule import NO_TABLES, collect_facts, rules
 from training.lod.rules.chunks import member_columns, members
-from training.lod.selection import known_rule
-from training.splats.bundle import NO_SPLATS, Bundle, Level
+from training.lod.selection import check_rule
+from training.splats.levels import NO_SPLATS, Bundle, Level
 
 CHUNKS = rules()["chunks"]
 LEVELS = [(1, {"d_l": 20.0}), (2, {"d_l": 5.0}), (3, {"d_l": 0.0})]
@@ -20,7 +20,7 @@ def weights(number, levels=LEVELS, scale=1.0, focal_px=500.0):
     means = np.stack([AWAY + 1, 0 * AWAY, 0 * AWAY], axis=1)
     values = {"distance_scale": scale, "chunks": 1, "fade": 1}
     return CHUNKS.weights(
-        means, np.array([1.0, 0, 0]), focal_px, {}, facts_of(CHUNKS, {}, levels, number), values
+        means, np.array([1.0, 0, 0]), focal_px, {}, collect_facts(CHUNKS, {}, levels, number), values
     ).tolist()
 
 
@@ -65,7 +65,7 @@ def chunk_weights(eye, tables=TABLES, **values):
     there by distance."""
     means = np.float32([[0, 100, 0]] * 4)
     values = CHUNKS.defaults([1, 2, 3]) | values
-    facts = facts_of(CHUNKS, {}, LEVELS, 2)
+    facts = collect_facts(CHUNKS, {}, LEVELS, 2)
     columns = dict.fromkeys(CHUNKS.columns, np.zeros(4, np.float32)) | member_columns(SETS)
     return CHUNKS.weights(means, np.array(eye, float), 500.0, columns, facts, values, tables).tolist()
 
@@ -196,9 +196,9 @@ def test_a_table_of_no_chunks_is_refused(change, says):
     table = dict(TABLES["chunks"])
     levels = [Level(number, NO_SPLATS, facts) for number, facts in LEVELS]
     bundle = Bundle("lodge", levels, "chunks", tables={"chunks": table})
-    assert known_rule(bundle) is CHUNKS
+    assert check_rule(bundle) is CHUNKS
     change(table)
     with pytest.raises(LodgsError, match=says):
-        known_rule(bundle)
+        check_rule(bundle)
     bundle.tables = {"chunks": {}}
-    assert known_rule(bundle) is CHUNKS
+    assert check_rule(bundle) is CHUNKS

@@ -11,8 +11,9 @@ from training.lod.rule import rules
 from training.lod.rules.decay import attenuation, last_seen_at
 from training.runs.base import read_base
 from training.scenes.cameras import Camera
-from training.splats.bundle import Bundle, Level, write_bundle
+from training.splats.bundle import write_bundle
 from training.splats.gaussians import Splats
+from training.splats.levels import Bundle, Level
 
 DECAY = rules()["decay"]
 FACTS = {"reference": 8.0, "tau": 0.004, "level": 1, "levels": 1}
@@ -132,8 +133,8 @@ def test_as_a_base_and_as_full_detail_splats_have_the_weights_that_a_camera_sees
 
 
 def test_of_several_levels_the_finest_alone_is_drawn():
-    from training.lod.selection import select_levels, settings
-    from training.splats.bundle import Bundle, Level
+    from training.lod.selection import resolve_controls, select_levels
+    from training.splats.levels import Bundle, Level
 
     means, columns = scene(50)
     splats = Splats(
@@ -143,7 +144,7 @@ def test_of_several_levels_the_finest_alone_is_drawn():
     alone = Bundle("clod", [Level(3, splats)], "decay", {"reference": 8.0, "tau": 0.004})
     several = Bundle("clod", [Level(1, splats), Level(3, splats)], "decay", alone.facts)
     (wanted,), (coarse, fine) = (
-        select_levels(one, np.zeros(3), 500.0, settings(one, {})) for one in (alone, several)
+        select_levels(one, np.zeros(3), 500.0, resolve_controls(one, {})) for one in (alone, several)
     )
     assert len(coarse.splats) == 0 and len(fine.splats) == len(wanted.splats) > 0
     np.testing.assert_array_equal(fine.weights, wanted.weights)

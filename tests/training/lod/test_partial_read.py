@@ -7,11 +7,12 @@ import pytest
 
 from training.errors import LodgsError
 from training.lod.blocks import SIZE, spatial_order
-from training.lod.partial_read import BLOCKS, read_part, table_of_blocks
+from training.lod.partial_read import BLOCKS, block_table, read_part
 from training.lod.rule import rules
 from training.lod.rules.chunks import member_columns, members
-from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
+from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
+from training.splats.levels import Bundle, Level
 
 COUNTS = {1: 300, 2: 5 * SIZE, 3: 20 * SIZE + 33}
 BYTES = 4 * (3 + 3 + 3 + 1 + 3 + 4 + 2)
@@ -35,7 +36,7 @@ def bundle():
         levels.append(Level(number, splats, {"d_l": 4.0 - number if number < 3 else 0.0}))
     x = np.arange(30, dtype=np.float32) + 0.5
     chunks = {"x": x, "y": 0 * x, "z": 0 * x, "radius": 0 * x + 1}
-    blocks = table_of_blocks(rules()["chunks"], {level.number: level.splats for level in levels})
+    blocks = block_table(rules()["chunks"], {level.number: level.splats for level in levels})
     return Bundle("lodge", levels, "chunks", tables={"chunks": chunks, BLOCKS: blocks})
 
 
@@ -82,5 +83,5 @@ def test_blocks_that_contradict_the_levels_lose_rows_at_most(tmp_path, bundle):
     assert all(len(level.splats) <= COUNTS[level.number] for level in part.levels)
     del table["level"]
     write_bundle(tmp_path / "none.ply", replace(bundle, tables={**bundle.tables, BLOCKS: table}))
-    with pytest.raises(LodgsError, match="cannot be followed"):
+    with pytest.raises(LodgsError, match="is inconsistent"):
         read_part(tmp_path / "none.ply", COUNTS, (3,))

@@ -5,10 +5,12 @@ import pytest
 
 from tests.training.lod.tree.trees import random_leaves, tree_of
 from training.errors import LodgsError
-from training.lod.rule import Control, Rule, distances, every_control, facts_of, find_rule, rules
-from training.lod.selection import Choice, select, select_levels, settings
-from training.splats.bundle import Bundle, Level, read_bundle, read_folder, write_bundle, write_folder
+from training.lod.rule import Control, Rule, all_controls, collect_facts, distances, find_rule, rules
+from training.lod.selection import BundleSelector, resolve_controls, select, select_levels
+from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
+from training.splats.level_folder import read_folder, write_folder
+from training.splats.levels import Bundle, Level
 
 RULES = sorted(rules())
 WITH_FACTS = [name for name in RULES if rules()[name].scene_facts or rules()[name].level_facts]
@@ -44,7 +46,7 @@ def test_a_rule_declares_itself(name):
     for control in rule.controls:
         assert control.low <= control.default <= control.high
         assert control.label and control.about and not control.about.endswith(".")
-        assert every_control()[control.name].whole == control.whole
+        assert all_controls()[control.name].whole == control.whole
 
 
 @pytest.mark.parametrize("name", RULES)
@@ -54,14 +56,14 @@ def test_files_give_back_the_rule_its_facts_and_the_same_choice(name, tmp_path):
     bundle.controls = {control.name: control.low + 0.125}
     write_bundle(tmp_path / "b.ply", bundle)
     write_folder(tmp_path / "folder", bundle)
-    values = settings(bundle, {})
+    values = resolve_controls(bundle, {})
     assert values[control.name] == control.low + 0.125
     for again in (read_bundle(tmp_path / "b.ply"), read_folder(tmp_path / "folder")):
         assert (again.rule, again.facts, again.controls) == (name, bundle.facts, bundle.controls)
         assert [level.facts for level in again.levels] == [level.facts for level in bundle.levels]
         for eye in ((0, 0, 0), (9, 0, 0), (500, 0, 0)):
             one = select_levels(bundle, np.array(eye), 3.0, values)
-            other = select_levels(again, np.array(eye), 3.0, settings(again, {}))
+            other = select_levels(again, np.array(eye), 3.0, resolve_controls(again, {}))
             for a, b in zip(one, other, strict=True):
                 np.testing.assert_array_equal(a.splats.means, b.splats.means)
                 np.testing.assert_array_equal(a.weights, b.weights)
@@ -83,15 +85,15 @@ def any_values(rule: Rule, rng: np.random.Generator) -> dict[str, float]:
 def test_an_eye_is_shown_what_the_rule_gives_weight_bit_for_bit(name, seed):
     """One choice for many eyes, a copy for one eye, and the rule asked level by level are the same."""
     bundle, rule, rng = bundle_of(name), rules()[name], np.random.default_rng(seed)
-    choice, levels = Choice(bundle), [(level.number, level.facts) for level in bundle.levels]
+    choice, levels = BundleSelector(bundle), [(level.number, level.facts) for level in bundle.levels]
     for _ in range(10):
         eye, focal = rng.normal(0, 6, 3), rng.uniform(0.5, 9)
-        values = settings(bundle, any_values(rule, rng))
+        values = resolve_controls(bundle, any_values(rule, rng))
         expected = []
         for level in bundle.levels:
             columns = {n: level.splats.extras[n] for n in rule.columns if n != "opacity"}
             columns["opacity"] = 1 / (1 + np.exp(-level.splats.opacity_logits))
-            facts = facts_of(rule, bundle.facts, levels, level.number)
+            facts = collect_facts(rule, bundle.facts, levels, level.number)
             expected.append(rule.weights(level.splats.means, np.float32(eye), focal, columns, facts, values))
         weights = np.concatenate(expected)
         np.testing.assert_array_equal(choice.weights(eye, focal, values), weights)
@@ -112,11 +114,11 @@ def test_nothing_outside_the_band_has_a_weight(name):
     levels = [(level.number, level.facts) for level in bundle.levels]
     for _ in range(60):
         eye, focal = rng.normal(0, 6, 3).astype(np.float32), rng.uniform(0.5, 9)
-        values = settings(bundle, any_values(rule, rng))
+        values = resolve_controls(bundle, any_values(rule, rng))
         for level in bundle.levels:
             columns = {n: level.splats.extras[n] for n in rule.columns if n != "opacity"}
             columns["opacity"] = 1 / (1 + np.exp(-level.splats.opacity_logits))
-            facts = facts_of(rule, bundle.facts, levels, level.number)
+            facts = collect_facts(rule, bundle.facts, levels, level.number)
             weighted = rule.weights(level.splats.means, eye, focal, columns, facts, values) > 0
             away = distances(level.splats.means, eye)
             of_all = {n: column.max(keepdims=True) for n, column in columns.items()}
@@ -139,9 +141,9 @@ def test_distances_are_those_of_float64():
 @pytest.mark.parametrize("name", RULES)
 def test_an_option_of_another_rule_is_a_sentence(name):
     bundle, own = bundle_of(name), {control.name for control in rules()[name].controls}
-    for foreign in every_control().keys() - own | {"nonsense"}:
+    for foreign in all_controls().keys() - own | {"nonsense"}:
         with pytest.raises(LodgsError, match=f"The rule '{name}' has no option '{foreign}'. It has: "):
-            settings(bundle, {foreign: 1})
+            resolve_controls(bundle, {foreign: 1})
 
 
 @pytest.mark.parametrize("name", WITH_FACTS)
@@ -169,7 +171,7 @@ def test_impossible_facts_are_a_sentence(name, value):
 @pytest.mark.parametrize("rule, said", [("telepathy", "rule 'telepathy', which"), ("", "not made for dist")])
 def test_no_rule_and_an_unknown_one_are_sentences(rule, said):
     with pytest.raises(LodgsError, match=said):
-        settings(Bundle("any", [Level(1, splats(3, 0, ()))], rule), {})
+        resolve_controls(Bundle("any", [Level(1, splats(3, 0, ()))], rule), {})
 
 
 @pytest.mark.parametrize("value", [0.5, 3, -1, float("nan"), float("inf"), 10**400, "2", None])
@@ -181,7 +183,7 @@ def test_what_is_no_number_of_a_control_is_a_sentence(value):
 
 def test_facts_know_the_neighbours():
     levels = [(1, {"s_min": 4.0}), (3, {"s_min": 2.0}), (7, {"s_min": 0.0})]
-    found = facts_of(rules()["bands"], {}, levels, 3)
+    found = collect_facts(rules()["bands"], {}, levels, 3)
     assert found == {
         "level": 3, "finer": 7, "coarser": 1, "levels": 7, "s_min": 2.0, "coarser_s_min": 4.0,
     }  # fmt: skip
@@ -192,6 +194,6 @@ def test_levels_that_contradict_their_rule_are_refused(name):
     bundle = bundle_of(name)
     bundle.cumulative = not bundle.cumulative
     with pytest.raises(LodgsError, match=f"but by their rule '{name}' they"):
-        settings(bundle, {})
+        resolve_controls(bundle, {})
     with pytest.raises(LodgsError, match="export it again"):
-        Choice(bundle)
+        BundleSelector(bundle)

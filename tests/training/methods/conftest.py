@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from training.optimize.method import Method
-from training.splats.bundle import Level
+from training.splats.levels import Level
 from training.splats.ply import extra_columns, splat_columns
 
 

@@ -22,8 +22,9 @@ from training.runs.job import Job
 from training.runs.measure import evaluate_run
 from training.scenes.colmap import read_scene
 from training.scenes.images import load_image
-from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
+from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
+from training.splats.levels import Bundle, Level
 from training.splats.ply import write_ply
 
 ABOUT = """

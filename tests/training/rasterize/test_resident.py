@@ -10,17 +10,18 @@ from training.editing.look import Look
 from training.errors import LodgsError
 from training.lod import on_disk
 from training.lod.blocks import SIZE, spatial_order
-from training.lod.partial_read import BLOCKS, table_of_blocks
-from training.lod.query import Choice, Chooser
+from training.lod.partial_read import BLOCKS, block_table
+from training.lod.query import LodQuery, SplatSelector
 from training.lod.rule import HIDDEN, rules
 from training.lod.rules.chunks import member_columns
-from training.lod.selection import complete, select, settings
+from training.lod.selection import complete_splats, resolve_controls, select
 from training.methods.tree.build import build
 from training.rasterize import Gaussians, rasterize
-from training.rasterize.resident import MANY, ResidentBundle, SplatSet
+from training.rasterize.resident import SORT_THRESHOLD, ResidentBundle, SplatSet
 from training.scenes.cameras import Camera, look_at
-from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
+from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
+from training.splats.levels import Bundle, Level
 
 NEAR = 0.1
 EYES = [(0, 0, 0), (1.0, 0.4, 0), (1.9, 0, 0.2), (4.2, 1, 0), (0, 2.2, 0), (30, 0, 0)]
@@ -86,7 +87,7 @@ def views():
 )  # fmt: skip
 def test_pictures_are_those_of_what_is_selected(rule, given):
     shown, most = bundle(rule), 0
-    values, resident = settings(shown, given), ResidentBundle(shown, "cpu")
+    values, resident = resolve_controls(shown, given), ResidentBundle(shown, "cpu")
     for camera in views():
         ours = resident.draw(camera, values, near=NEAR)
         splats, weights = select(shown, camera.center, camera.focal, values)
@@ -105,7 +106,7 @@ def test_a_level_is_drawn_with_all_that_belongs_to_it(rule):
     resident = ResidentBundle(shown, "cpu")
     for number in (1, 3):
         one = next(level for level in shown.levels if level.number == number)
-        whole = rasterize(Gaussians.of(complete(shown, one)), camera, near=NEAR, backend="cpu").image
+        whole = rasterize(Gaussians.of(complete_splats(shown, one)), camera, near=NEAR, backend="cpu").image
         torch.testing.assert_close(resident.draw_level(number, camera, near=NEAR).image, whole)
 
 
@@ -120,7 +121,7 @@ def test_of_a_large_file_a_camera_has_read_what_it_may_see(tmp_path, monkeypatch
     shown.levels[-1].splats.means[700] = np.nan  # which is left out
     write_bundle(tmp_path / "bundle.ply", shown)
     shown = read_bundle(tmp_path / "bundle.ply")
-    told, values, total = [], settings(shown, {}), sum(len(each.splats) for each in shown.levels)
+    told, values, total = [], resolve_controls(shown, {}), sum(len(each.splats) for each in shown.levels)
     whole, part = (
         ResidentBundle(shown, "cpu"),
         ResidentBundle(tmp_path / "bundle.ply", "cpu", told.append, most=1000),
@@ -146,7 +147,7 @@ def indexed(path) -> Bundle:
         splats = each.splats.select(spatial_order(each.splats.means))
         near = np.linalg.norm(splats.means - CENTRES[:, None], axis=2) < 7
         levels.append(replace(each, splats=replace(splats, extras=member_columns(near))))
-    table = table_of_blocks(rules()["chunks"], {x.number: x.splats for x in levels})
+    table = block_table(rules()["chunks"], {x.number: x.splats for x in levels})
     shown = replace(shown, levels=levels, tables={**shown.tables, BLOCKS: table})
     write_bundle(path, shown)
     return shown
@@ -160,7 +161,7 @@ def members(shown: Bundle, *chunks: int) -> int:
 def test_of_a_file_only_what_a_region_can_show_is_loaded_and_pictures_are_the_same_bits(tmp_path):
     shown = indexed(tmp_path / "bundle.ply")
     whole, part = ResidentBundle(shown, "cpu"), ResidentBundle(tmp_path / "bundle.ply", "cpu")
-    values, total = settings(shown, {}), sum(len(level.splats) for level in shown.levels)
+    values, total = resolve_controls(shown, {}), sum(len(level.splats) for level in shown.levels)
     assert part.loaded == part.bytes_read == 0
     loaded, read = [], []
     for eye in ((0.0, 0, 0), (0.1, 0, 0), (0.6, 0, 0), (30.0, 0, 0), (0.0, 0, 0)):
@@ -187,14 +188,14 @@ def test_of_a_file_a_level_is_read_alone(tmp_path):
             picture, ResidentBundle(shown, "cpu").draw_level(level.number, camera, near=NEAR).image
         )
         assert part.loaded == len(level.splats)
-    with pytest.raises(LodgsError, match="There is no level 7"):
+    with pytest.raises(LodgsError, match="Cannot draw level 7"):
         part.draw_level(7, camera)
 
 
 def test_what_is_drawn_now_and_then_at_a_level_is_what_was(tmp_path):
     """Sets are joined anew where others are drawn together."""
     shown = bundle("octree")
-    resident, values, camera = ResidentBundle(shown, "cpu"), settings(shown, {}), next(views())
+    resident, values, camera = ResidentBundle(shown, "cpu"), resolve_controls(shown, {}), next(views())
     first = resident.draw(camera, values, near=NEAR).image
     resident.draw_level(2, camera, near=NEAR)
     assert torch.equal(resident.draw(camera, values, near=NEAR).image, first)
@@ -204,12 +205,12 @@ def test_what_is_drawn_now_and_then_at_a_level_is_what_was(tmp_path):
 def test_nothing_with_a_weight_is_passed_over(rule):
     """Whatever is chosen for a camera, is all that has a weight among what it sees."""
     shown = bundle(rule)
-    resident, values, passed = ResidentBundle(shown, "cpu"), settings(shown, {}), 0
+    resident, values, passed = ResidentBundle(shown, "cpu"), resolve_controls(shown, {}), 0
     for camera in views():
         for level in shown.levels:
             splats, choice = resident.select_by_rule(camera, values)[level.number]
             ordered = level.splats
-            if len(ordered) >= MANY:
+            if len(ordered) >= SORT_THRESHOLD:
                 ordered = ordered.select(spatial_order(ordered.means))
             opacity, own = 1 / (1 + np.exp(-ordered.opacity_logits)), splats.gaussians
             weights = choice.weights(ordered.means, ordered.extras | {"opacity": opacity})
@@ -238,20 +239,20 @@ def test_within_a_band_nothing_is_asked_and_the_same_is_chosen(monkeypatch):
         return real(self, means, *rest)
 
     monkeypatch.setattr(type(rule), "weights", counting)
-    chooser = Chooser(one.means, {}, one.log_scales)
+    chooser = SplatSelector(one.means, {}, one.log_scales)
     away = np.linalg.norm(one.means, axis=1)
     counts = []
     for s_min, coarser in ((0.0, 1e6), (0.0, 0.23), (0.02, 0.1), (0.3, 0.4)):
         facts = {"level": 2, "levels": 3, "finer": 3, "coarser": 1, "s_min": s_min, "coarser_s_min": coarser}
         values = {"gamma": 1.0, "first": 1, "last": 3}
-        choice = Choice("bands", (0.0, 0.0, 0.0), 60.0, tuple(facts.items()), tuple(values.items()))
+        choice = LodQuery("bands", (0.0, 0.0, 0.0), 60.0, tuple(facts.items()), tuple(values.items()))
         expected = np.flatnonzero((away >= np.float32(60 * s_min)) & (away < np.float32(60 * coarser)))
         asked.clear()
         rows, weights = chooser.chosen(choice)
         np.testing.assert_array_equal(rows, expected)
         assert rows.dtype == np.int32 and (weights == 1).all() and weights.dtype == np.float32
         counts.append((sum(asked), len(expected)))
-        hidden = Chooser(one.means, {HIDDEN: (one.means[:, 0] > 0).astype(np.float32)}, one.log_scales)
+        hidden = SplatSelector(one.means, {HIDDEN: (one.means[:, 0] > 0).astype(np.float32)}, one.log_scales)
         rows, _ = hidden.chosen(replace(choice, crops=()))
         np.testing.assert_array_equal(rows, expected[one.means[expected, 0] <= 0])
     assert counts[0] == (0, len(one)) and 0 < counts[1][0] < 0.8 * counts[1][1] and counts[3] == (0, 0)
@@ -259,7 +260,7 @@ def test_within_a_band_nothing_is_asked_and_the_same_is_chosen(monkeypatch):
 
 def test_a_crop_may_come_while_the_eye_stays_in_its_region():
     shown, camera = bundle("chunks"), next(views())
-    everything = ResidentBundle(shown, "cpu").select_by_rule(camera, settings(shown, {}))
+    everything = ResidentBundle(shown, "cpu").select_by_rule(camera, resolve_controls(shown, {}))
     for splats, choice in everything.values():
         before = splats.select_visible(choice)[0]
         np.testing.assert_array_equal(splats.select_visible(replace(choice, crops=()))[0], before)
@@ -270,7 +271,7 @@ def test_looks_change_what_is_seen_and_not_what_is_chosen(looked_first):
     shown = bundle("decay")
     own = shown.levels[0].splats
     camera, looks = next(views()), ((None, Look(opacity=0.2)),)
-    _, choice = ResidentBundle(shown, "cpu").select_by_rule(camera, settings(shown, {}))[1]
+    _, choice = ResidentBundle(shown, "cpu").select_by_rule(camera, resolve_controls(shown, {}))[1]
     trained = {"opacity": 1 / (1 + np.exp(-own.opacity_logits)), **own.extras}
     truth = np.flatnonzero(choice.weights(own.means, trained) > 0)
     splats = SplatSet(own, backend="cpu", ordered=True)

@@ -9,7 +9,7 @@ import torch
 
 from training.editing.look import Look, looks_as_dicts
 from training.lod.crop import Crop
-from training.lod.query import Choice
+from training.lod.query import LodQuery
 from training.lod.rule import NO_FINER, fact_names, rules
 from training.lod.rules.chunks import TABLE, member_columns
 from training.render.requests import parse_request
@@ -29,14 +29,14 @@ def table(columns: dict) -> tuple:
 TABLES = {"chunks": table(dict(zip("xyz", CENTRES.T, strict=True)) | {"radius": [3, 3, 6]})}
 
 
-def choice_of(name: str, eye, **values) -> Choice:
+def choice_of(name: str, eye, **values) -> LodQuery:
     """A choice that shows about half of splats around the origin."""
     rule = rules()[name]
     facts = dict.fromkeys(fact_names(rule), 1.0) | {"level": 2, "finer": NO_FINER, "coarser": 1, "levels": 2}
     facts |= {"s_min": 0.3, "coarser_s_min": 0.8, "d_max": 2.5, "tau": 0.01, "d_l": 0.0, "coarser_d_l": 1.0}
     facts = {each: float(facts[each]) for each in fact_names(rule)}
     settings = rule.defaults([1, 2]) | values
-    return Choice(
+    return LodQuery(
         name, tuple(map(float, eye)), 1.0, tuple(facts.items()), tuple(settings.items()), TABLES.get(name, ())
     )
 
@@ -51,7 +51,7 @@ def splats(make_splats) -> Splats:
     return replace(make_splats(COUNT), extras=extras | member_columns(rng.random((3, COUNT)) < 0.4))
 
 
-def by_rule(choice: Choice, splats: Splats) -> np.ndarray:
+def by_rule(choice: LodQuery, splats: Splats) -> np.ndarray:
     """The rule's own weights."""
     columns = {
         name: splats.extras.get(name, np.zeros(COUNT, np.float32)) for name in rules()[choice.rule].columns
@@ -60,7 +60,7 @@ def by_rule(choice: Choice, splats: Splats) -> np.ndarray:
     return choice.weights(splats.means, columns)
 
 
-def weights_of(held: SplatSet, choice: Choice) -> np.ndarray:
+def weights_of(held: SplatSet, choice: LodQuery) -> np.ndarray:
     """The weights (N,) of all."""
     weights = np.zeros(COUNT, np.float32)
     some, found = held.select_visible(choice)
@@ -146,7 +146,7 @@ def test_a_choice_travels_as_json(camera):
         assert found.as_dict() == choice.as_dict()
         assert found.region() == choice.region()
     crops = (Crop.sphere((1, 2, 3), 4), Crop.box((0, 0, 0), (1, 2, 3), True))
-    for choice in (choice_of("bands", (0.1, -2, 3)), Choice.by_crops(())):
+    for choice in (choice_of("bands", (0.1, -2, 3)), LodQuery.by_crops(())):
         choice = replace(choice, crops=crops)
         one = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "choice": choice.as_dict()}
         asked = json.loads(

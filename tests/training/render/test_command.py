@@ -12,14 +12,15 @@ from tests.training.conftest import write_tiny_scene
 from tests.training.lod.tree.trees import tree_of
 from training.__main__ import main
 from training.lod.blocks import spatial_order
-from training.lod.partial_read import BLOCKS, table_of_blocks
+from training.lod.partial_read import BLOCKS, block_table
 from training.lod.rule import rules
 from training.lod.rules.chunks import member_columns
 from training.lod.selection import select
 from training.rasterize import Gaussians, render
 from training.runs.job import Job
 from training.scenes.cameras import camera_to_dict, read_camera, write_camera
-from training.splats.bundle import Bundle, Level, write_bundle
+from training.splats.bundle import write_bundle
+from training.splats.levels import Bundle, Level
 from training.splats.ply import write_ply
 
 
@@ -93,7 +94,7 @@ def test_only_what_the_view_needs_is_read(make_splats, camera, tmp_path, capsys)
         levels.append(Level(number, replace(splats, extras=extras), {"d_l": 2.0 * (number < 2)}))
     apart = np.float32([-1, 3])
     chunks = {"x": apart, "y": 0 * apart, "z": 0 * apart, "radius": np.float32([9, 9])}
-    blocks = table_of_blocks(rule, {level.number: level.splats for level in levels})
+    blocks = block_table(rule, {level.number: level.splats for level in levels})
     bundle = Bundle("lodge", levels, "chunks", tables={"chunks": chunks, BLOCKS: blocks})
     write_bundle(tmp_path / "blocks.ply", bundle)
     write_bundle(tmp_path / "plain.ply", replace(bundle, tables={"chunks": chunks}))
@@ -172,7 +173,10 @@ def test_a_holdout(bundle, camera, tmp_path):
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (["--level", "7"], "There is no level 7. Choose from 1 (coarsest) to 2."),
+        (
+            ["--level", "7"],
+            "Cannot draw level 7: the bundle has no such level. Choose a level from 1 (coarsest) to 2.",
+        ),
         (["--first", "2", "--last", "1"], "Levels 2 to 1 cannot be shown."),
         (["--gamma", "0"], "gamma = 0.0 is not possible. Give a number from 0.01 to 1000."),
         (["--offset", "1"], "The rule 'bands' has no option 'offset'. It has: gamma, first, last."),
@@ -234,7 +238,12 @@ def test_little_memory_is_a_sentence(bundle, camera, tmp_path, capsys, monkeypat
         str(tmp_path / "a.png"),
     ]
     torchs = RuntimeError("[enforce fail at alloc_cpu.cpp:117] DefaultCPUAllocator: can't allocate memory: 9")
-    for place in ("image.RenderedImage.empty", "image.RenderedImage.eight_bit", "scene.rasterize_strips", "command.ResidentBundle"):
+    for place in (
+        "image.RenderedImage.empty",
+        "image.RenderedImage.eight_bit",
+        "scene.rasterize_strips",
+        "command.ResidentBundle",
+    ):
         for error in (MemoryError(), torchs):
 
             def fail(*_, error=error, **__):

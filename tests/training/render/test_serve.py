@@ -10,7 +10,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from training.lod.query import Choice
+from training.lod.query import LodQuery
 from training.lod.rule import rules
 from training.render import wire
 from training.render.scene import Instance, SplatSet, draw
@@ -92,7 +92,7 @@ def test_of_a_set_each_frame_draws_what_it_chooses(client, make_splats, camera):
     facts = {"level": 2.0, "finer": 3.0, "coarser": 1.0, "levels": 3.0, "d_max": 1.2, "d_max_focal": 1.5}
     values = {"offset": 0.25, "fade": 1}
     for frame, eye in enumerate(((0.0, 0.0, 0.5), (0.5, 0.25, -1.0))):
-        choice = Choice("octree", eye, 1.5, tuple(facts.items()), tuple(values.items())).as_dict()
+        choice = LodQuery("octree", eye, 1.5, tuple(facts.items()), tuple(values.items())).as_dict()
         one = {"file": "one", "count": 200, "matrix": np.eye(4).tolist(), "level": 2}
         client.say(**request(camera, [one | {"columns": ["lod_bias"], "choice": choice}], frame))
         answer = client.hear("frame", "error")
@@ -165,7 +165,7 @@ def test_odd_requests_end_nothing(client, make_splats, camera):
         one = {"file": name, "count": count, "matrix": shear.tolist(), "level": 0}
         client.say(**request(camera, [one], frame))
         if name == "bad":
-            assert client.hear("warning")["message"].startswith("5 splats of the scene have values")
+            assert client.hear("warning")["message"].startswith("5 splats of the scene")
         answer = client.hear("frame", "error")
         planes.append(wire.read_planes(client.folder / "frame", len(answer["passes"]), 48, 64))
     np.testing.assert_array_equal(*planes)

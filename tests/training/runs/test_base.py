@@ -4,13 +4,15 @@ import numpy as np
 import pytest
 
 from training.errors import LodgsError
-from training.lod.selection import complete
+from training.lod.selection import complete_splats
 from training.runs import base
 from training.runs.base import read_base
-from training.splats import bundle as bundles
-from training.splats.bundle import Bundle, Level, read_bundle, write_bundle, write_folder
+from training.splats import file_rows
+from training.splats.bundle import read_bundle, write_bundle
 from training.splats.dialects import comments_from_meta
 from training.splats.gaussians import Splats
+from training.splats.level_folder import write_folder
+from training.splats.levels import Bundle, Level
 from training.splats.ply import write_ply
 
 
@@ -49,7 +51,7 @@ def test_unrelated_folder_is_rejected_as_base(tmp_path):
 
 @pytest.mark.parametrize("kind", ["plain", "finest_first", "stream", "cumulative", "smoothed"])
 def test_base_opened_on_disk_equals_base_read_into_memory(tmp_path, monkeypatch, kind):
-    monkeypatch.setattr(bundles, "BATCH_ROWS", 7)
+    monkeypatch.setattr(file_rows, "BATCH_ROWS", 7)
     path = tmp_path / "b.ply"
     warnings = []
     finest = splats(50)
@@ -62,7 +64,7 @@ def test_base_opened_on_disk_equals_base_read_into_memory(tmp_path, monkeypatch,
         bundle = Bundle("", [Level(1, splats(10)), Level(2, finest)], cumulative=kind == "cumulative")
         write_bundle(path, bundle, "stream" if kind == "stream" else "finest_first")
     expected = read_bundle(path)
-    expected = complete(expected, expected.levels[-1])
+    expected = complete_splats(expected, expected.levels[-1])
     rows, _ = base.open_base(path, warnings.append)
     assert len(rows) == len(expected) == (59 if kind == "cumulative" else 49)
     assert len(warnings) == 1 and warnings[0].startswith("1 splats of")

@@ -5,14 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from training.editing.cleaning import Cleaning, cleaned
-from training.editing.placement import placed
+from training.editing.cleaning import Cleaning, clean_bundle
+from training.editing.placement import transform_bundle
 from training.errors import LodgsError
 from training.lod.crop import Crop
 from training.scenes.cameras import Camera, look_at
 from training.scenes.view_tables import NAMES, VIEWS, make_view_tables, read_view_tables
-from training.splats.bundle import Bundle, Level, read_bundle, read_folder, write_bundle, write_folder
+from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
+from training.splats.level_folder import read_folder, write_folder
+from training.splats.levels import Bundle, Level
 from training.splats.similarity import Similarity
 
 POSE = [f"w2c_{row}{column}" for row in range(3) for column in range(4)]
@@ -61,7 +63,7 @@ def test_views_come_back_to_the_bit_and_the_header_stays_small(tmp_path, count):
 def test_views_of_a_placed_scene_see_the_same():
     views, rng = cameras(), np.random.default_rng(2)
     placement = Similarity.from_angles((20, 40, 60), 2.5, (1, -2, 3))
-    there, near, _ = read_view_tables(placed(bundle_of(views), placement).tables)
+    there, near, _ = read_view_tables(transform_bundle(bundle_of(views), placement).tables)
     assert near == 0.625
     points = rng.normal(size=(20, 3))
     for before, after in zip(views, there, strict=True):
@@ -72,7 +74,7 @@ def test_views_of_a_placed_scene_see_the_same():
 
 def test_cleaning_leaves_views_alone_whatever_the_rule():
     bundle = replace(bundle_of(cameras()), rule="of a newer version")
-    left = cleaned(bundle, Cleaning((Crop.sphere((0, 0, 0), 1.0, False),)))
+    left = clean_bundle(bundle, Cleaning((Crop.sphere((0, 0, 0), 1.0, False),)))
     check(left, cameras())
 
 

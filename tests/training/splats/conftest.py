@@ -1,4 +1,4 @@
-"""Random splats for the tests of files."""
+"""Fixtures for tests of splat files."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from training.splats.gaussians import Splats
 
 @pytest.fixture
 def make_splats():
-    """make_splats(count, degree=3, **extras): random splats; every value is unlike every other."""
+    """Return ``make_splats(count, degree=3, **extras)``, which makes random splats of distinct values."""
     random = np.random.default_rng(7)
 
     def normal(*shape):
@@ -23,7 +23,7 @@ def make_splats():
 
 @pytest.fixture
 def same():
-    """same(a, b): two splats are equal bit for bit, extras and their types too."""
+    """Return ``same(a, b)``, which asserts that splats, extras and types are equal bit for bit."""
 
     def compare(a, b):
         for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):

@@ -1,4 +1,4 @@
-"""The bundle and the folder: judged by plyfile, and by readers as strict as the viewers they copy."""
+"""Bundles and folders of levels, read by plyfile and by copies of strict viewers."""
 
 import hashlib
 import json
@@ -10,16 +10,10 @@ from plyfile import PlyData
 
 from training.cli.info import describe
 from training.errors import LodgsError
-from training.splats.bundle import (
-    Bundle,
-    Level,
-    read_bundle,
-    read_folder,
-    read_header,
-    write_bundle,
-    write_folder,
-)
+from training.splats.bundle import read_bundle, read_header, write_bundle
 from training.splats.gaussians import Splats
+from training.splats.level_folder import read_folder, write_folder
+from training.splats.levels import Bundle, Level
 from training.splats.ply import read_ply, write_ply
 
 from . import viewers
@@ -37,17 +31,17 @@ META = {
 
 @pytest.fixture
 def bundle(make_splats):
-    """Three levels; the middle one has an extra of its own, all have a float and a byte column."""
+    """Three levels with a float and a byte column; the middle one has a third extra."""
     levels = []
     for number, (count, s_min) in enumerate(zip(COUNTS, S_MIN, strict=True), 1):
         extras = {"decay": np.arange(count, dtype="f4") + number, "label": np.arange(count).astype("u1")}
         if number == 2:
-            extras["only_here"] = np.arange(count, dtype="f8") / 3
+            extras["middle_only"] = np.arange(count, dtype="f8") / 3
         levels.append(Level(number, make_splats(count, 3, **extras), {"s_min": s_min}))
     return Bundle("flod", levels, "bands", {}, {"gamma": 1.5}, meta=META)
 
 
-def check_same(a: Bundle, b: Bundle, same):
+def assert_equal(a: Bundle, b: Bundle, same):
     for name in ("method", "rule", "facts", "controls", "cumulative", "meta"):
         assert getattr(a, name) == getattr(b, name), name
     assert [(x.number, x.facts) for x in a.levels] == [(x.number, x.facts) for x in b.levels]
@@ -55,10 +49,10 @@ def check_same(a: Bundle, b: Bundle, same):
 
 
 @pytest.mark.parametrize("cumulative", [False, True])
-def test_the_head_is_that_of_the_bundle(tmp_path, bundle, cumulative, monkeypatch):
+def test_header_describes_the_bundle(tmp_path, bundle, cumulative, monkeypatch):
     bundle.cumulative = cumulative
     write_bundle(tmp_path / "b.ply", bundle)
-    monkeypatch.setattr("training.splats.bundle.splats_from_rows", None)  # no splat is looked at
+    monkeypatch.setattr("training.splats.bundle.splats_from_rows", None)  # no splat is read
     head = read_header(tmp_path / "b.ply")
     assert (head.method, head.rule, head.controls, head.meta) == ("flod", "bands", {"gamma": 1.5}, META)
     assert [(level.number, level.facts) for level in head.levels] == [
@@ -69,24 +63,24 @@ def test_the_head_is_that_of_the_bundle(tmp_path, bundle, cumulative, monkeypatc
     plain = read_header(tmp_path / "plain.ply")
     assert (plain.method, plain.rule, [level.number for level in plain.levels]) == ("", "", [1])
     (tmp_path / "b.ply").write_bytes((tmp_path / "b.ply").read_bytes().replace(b'"level":2', b'"level":[]'))
-    with pytest.raises(LodgsError, match="cannot be followed"):
+    with pytest.raises(LodgsError, match="is inconsistent"):
         read_header(tmp_path / "b.ply")
 
 
 @pytest.mark.parametrize("order", ["finest_first", "stream"])
 @pytest.mark.parametrize("cumulative", [False, True])
-def test_reads_back_bit_for_bit(tmp_path, bundle, same, order, cumulative):
+def test_bundle_round_trips_bit_for_bit(tmp_path, bundle, same, order, cumulative):
     bundle.cumulative = cumulative
     write_bundle(tmp_path / "b.ply", bundle, order)
-    check_same(bundle, read_bundle(tmp_path / "b.ply"), same)
+    assert_equal(bundle, read_bundle(tmp_path / "b.ply"), same)
 
 
-def test_unusual_bits_survive(tmp_path, bundle):
-    """Negative zeros and denormals are values like others; NaN payloads and infinities are in columns."""
+def test_unusual_bits_round_trip(tmp_path, bundle):
+    """Negative zeros, denormals, NaN payloads and infinities keep their bits."""
     bits = np.array([0x80000000, 0x00000001, 0x7FC01234, 0xFF800000], np.uint32)
     finest = bundle.levels[2].splats
     finest.means.reshape(-1)[:2] = bits[:2].view("f4")
-    finest.opacity_logits[0] = finest.log_scales[1, 2] = -np.inf  # clear; flat
+    finest.opacity_logits[0] = finest.log_scales[1, 2] = -np.inf  # transparent, flat
     finest.extras["odd"] = np.resize(bits, len(finest)).view("f4")
     write_bundle(tmp_path / "b.ply", bundle)
     back = read_bundle(tmp_path / "b.ply").levels[2].splats
@@ -95,7 +89,7 @@ def test_unusual_bits_survive(tmp_path, bundle):
     assert back.extras["odd"].tobytes() == finest.extras["odd"].tobytes()
 
 
-def test_plyfile_finds_the_finest_level_first(tmp_path, bundle):
+def test_plyfile_reads_the_finest_level_first(tmp_path, bundle):
     write_bundle(tmp_path / "b.ply", bundle)
     data = PlyData.read(str(tmp_path / "b.ply"))
     assert [(element.name, element.count) for element in data.elements] == [
@@ -110,13 +104,13 @@ def test_plyfile_finds_the_finest_level_first(tmp_path, bundle):
     np.testing.assert_array_equal(data["vertex"]["y"], finest.means[:, 1])
     np.testing.assert_array_equal(data["vertex"]["f_rest_15"], finest.sh[:, 1, 1])
     np.testing.assert_array_equal(data["lod_2_vertex"]["scale_2"], bundle.levels[0].splats.log_scales[:, 2])
-    np.testing.assert_array_equal(data["lod_extra_1"]["only_here"], np.arange(20) / 3)
+    np.testing.assert_array_equal(data["lod_extra_1"]["middle_only"], np.arange(20) / 3)
     assert data["lod_extra_0"].data.dtype == np.dtype([("decay", "<f4"), ("label", "u1")])
     assert data.obj_info == [] and data.byte_order == "<"
 
 
-def test_offsets_lead_to_each_level(tmp_path, bundle):
-    """What a streaming reader does: comments, then a byte range."""
+def test_offsets_locate_each_level(tmp_path, bundle):
+    """Read as a streaming reader does: comments, then a byte range."""
     write_bundle(tmp_path / "b.ply", bundle, "stream")
     header, data = (tmp_path / "b.ply").read_bytes().split(b"end_header\n", 1)
     facts = [json.loads(text) for text in re.findall(rb"comment lodsplat (.*)\n", header)]
@@ -127,7 +121,7 @@ def test_offsets_lead_to_each_level(tmp_path, bundle):
         np.testing.assert_array_equal(rows[:, :3], level.splats.means)
 
 
-def test_cumulative_rows_run_from_coarse_to_fine_in_one_vertex(tmp_path, bundle):
+def test_cumulative_rows_are_coarse_to_fine_in_one_vertex(tmp_path, bundle):
     bundle.cumulative = True
     write_bundle(tmp_path / "b.ply", bundle)
     rows = PlyData.read(str(tmp_path / "b.ply"))["vertex"].data
@@ -136,7 +130,7 @@ def test_cumulative_rows_run_from_coarse_to_fine_in_one_vertex(tmp_path, bundle)
 
 
 @pytest.mark.parametrize("cumulative", [False, True])
-def test_strict_viewers_open_it(tmp_path, bundle, cumulative):
+def test_strict_viewers_open_bundles(tmp_path, bundle, cumulative):
     bundle.cumulative = cumulative
     write_bundle(tmp_path / "b.ply", bundle)
     data = (tmp_path / "b.ply").read_bytes()
@@ -153,8 +147,8 @@ def test_strict_viewers_open_it(tmp_path, bundle, cumulative):
     assert not any(b"f_rest_" in line for line in header.split(b"\n") if line.startswith(b"comment"))
 
 
-def test_readers_that_sum_all_properties_need_the_plain_file(tmp_path, bundle):
-    """The known limit of the bundle, and why plain PLY is there."""
+def test_readers_that_sum_all_properties_need_a_plain_file(tmp_path, bundle):
+    """This known limit of bundles is the reason to export plain PLYs."""
     write_bundle(tmp_path / "b.ply", bundle)
     with pytest.raises(ValueError, match="out of bounds"):
         viewers.sums_all_properties((tmp_path / "b.ply").read_bytes())
@@ -165,7 +159,7 @@ def test_readers_that_sum_all_properties_need_the_plain_file(tmp_path, bundle):
     np.testing.assert_array_equal(rows[:, -4:], finest.quats)
 
 
-def test_header_of_five_full_levels_stays_under_10_kb(tmp_path, make_splats):
+def test_header_of_five_full_levels_is_below_10_kb(tmp_path, make_splats):
     levels = [
         Level(i, make_splats(2, 3, decay=np.zeros(2, "f4")), {"s_min": 0.123456789012345678 / i})
         for i in range(1, 6)
@@ -175,14 +169,14 @@ def test_header_of_five_full_levels_stays_under_10_kb(tmp_path, make_splats):
     assert (tmp_path / "b.ply").read_bytes().index(b"end_header\n") < 10 * 1024
 
 
-def test_meta_that_no_header_can_hold_is_one_sentence(tmp_path, bundle):
+def test_meta_too_long_for_a_header_raises_one_sentence(tmp_path, bundle):
     bundle.meta = {"centres": list(range(5000))}
     with pytest.raises(LodgsError, match="bytes of header"):
         write_bundle(tmp_path / "b.ply", bundle)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_bundle_says_whether_it_is_antialiased_and_others_are_not(tmp_path, bundle):
+def test_antialias_flag_round_trips(tmp_path, bundle):
     for meta, flag in (
         (META, False),
         (META | {"antialias": False}, False),
@@ -194,7 +188,7 @@ def test_a_bundle_says_whether_it_is_antialiased_and_others_are_not(tmp_path, bu
         assert back.antialias is read_header(tmp_path / "b.ply").antialias is flag and back.meta == meta
 
 
-def test_numpy_numbers_in_meta_read_back_as_plain_ones(tmp_path, bundle):
+def test_numpy_numbers_in_meta_become_plain_numbers(tmp_path, bundle):
     bundle.meta = {"center": np.array([1.5, 2.5]), "focal_px": np.float32(0.1), "n": np.int64(3)}
     write_bundle(tmp_path / "b.ply", bundle)
     assert read_bundle(tmp_path / "b.ply").meta == {
@@ -204,7 +198,7 @@ def test_numpy_numbers_in_meta_read_back_as_plain_ones(tmp_path, bundle):
     }
 
 
-def test_any_plain_ply_reads_as_one_level(tmp_path, make_splats, same):
+def test_plain_ply_reads_as_one_level(tmp_path, make_splats, same):
     splats = make_splats(5, 4, temperature=np.arange(5, dtype="i2"))
     write_ply(tmp_path / "a.ply", splats)
     back = read_bundle(tmp_path / "a.ply")
@@ -212,28 +206,28 @@ def test_any_plain_ply_reads_as_one_level(tmp_path, make_splats, same):
     assert same(splats, back.levels[0].splats)
 
 
-def test_read_ply_reads_the_finest_level_of_a_bundle(tmp_path, bundle):
+def test_read_ply_reads_the_finest_level(tmp_path, bundle):
     write_bundle(tmp_path / "b.ply", bundle)
     np.testing.assert_array_equal(read_ply(tmp_path / "b.ply").means, bundle.levels[2].splats.means)
 
 
-def test_foreign_elements_and_comments_are_passed_over(tmp_path, bundle, same):
+def test_foreign_elements_and_comments_are_ignored(tmp_path, bundle, same):
     write_bundle(tmp_path / "b.ply", bundle)
     data = (tmp_path / "b.ply").read_bytes()
-    data = data.replace(b"comment lodsplat", b"comment made by lodsplat and others {\ncomment lodsplat", 1)
+    data = data.replace(b"comment lodsplat", b"comment made by lodsplat and more {\ncomment lodsplat", 1)
     data = data.replace(b"end_header\n", b"element camera 2\nproperty double fov\nend_header\n", 1) + bytes(
         16
     )
     (tmp_path / "c.ply").write_bytes(data)
-    check_same(bundle, read_bundle(tmp_path / "c.ply"), same)
+    assert_equal(bundle, read_bundle(tmp_path / "c.ply"), same)
 
 
 @pytest.mark.parametrize("missing", [1, 5000])
-def test_a_bundle_cut_short_says_what_is_missing(tmp_path, bundle, missing):
+def test_truncated_bundle_reports_missing_bytes(tmp_path, bundle, missing):
     write_bundle(tmp_path / "b.ply", bundle)
     data = (tmp_path / "b.ply").read_bytes()
     (tmp_path / "b.ply").write_bytes(data[:-missing])
-    with pytest.raises(LodgsError, match=f"cut short: {missing} of its {len(data)} bytes are missing"):
+    with pytest.raises(LodgsError, match=f"truncated, {missing} of {len(data)} bytes are missing"):
         read_bundle(tmp_path / "b.ply")
 
 
@@ -276,31 +270,34 @@ def test_a_bundle_cut_short_says_what_is_missing(tmp_path, bundle, missing):
         (b'"count":20,', b'"count":20.0,'),
     ],
 )
-def test_a_header_that_contradicts_itself_is_one_sentence(tmp_path, bundle, old, new):
+def test_inconsistent_header_raises_one_sentence(tmp_path, bundle, old, new):
     write_bundle(tmp_path / "b.ply", bundle)
     data = (tmp_path / "b.ply").read_bytes()
     assert data.count(old) == 1
     (tmp_path / "b.ply").write_bytes(data.replace(old, new))
     with pytest.raises(
-        LodgsError, match=r"b\.ply (describes its levels|is not valid|is a bundle of the newer version 99)"
+        LodgsError,
+        match=r"b\.ply(: .*is inconsistent| is not valid|: it is a bundle of the newer version 99)",
     ):
         read_bundle(tmp_path / "b.ply")
 
 
-def test_no_damage_to_the_header_is_a_traceback(tmp_path, make_splats):
-    """Bytes changed, lost and inserted anywhere in the header: read, or one sentence that names the file."""
+def test_corrupt_headers_never_raise_other_exceptions(tmp_path, make_splats):
+    """Change, remove and insert bytes anywhere in the header: it is read, or an error names the file."""
     finer = make_splats(9, 1, id=np.arange(9, dtype="u1"))
     levels = [Level(1, make_splats(3, 1), {"s_min": 0.5}), Level(2, finer)]
     path = tmp_path / "b.ply"
     write_bundle(path, Bundle("flod", levels, "bands", {}, {"gamma": 1}, meta={"gamma": 1}))
-    whole = path.read_bytes()
-    end = whole.index(b"end_header\n") + len(b"end_header\n")
+    intact = path.read_bytes()
+    end = intact.index(b"end_header\n") + len(b"end_header\n")
     random = np.random.default_rng(5)
     refused = 0
     for _ in range(400):
-        data = bytearray(whole)
-        at, lost = random.integers(end), random.choice([0, 1, 40])
-        data[at : at + lost] = random.choice([b"", b"\n", b"\r", b"0", b"-", b"{", b"\xff", b"element q 3\n"])
+        data = bytearray(intact)
+        at, removed = random.integers(end), random.choice([0, 1, 40])
+        data[at : at + removed] = random.choice(
+            [b"", b"\n", b"\r", b"0", b"-", b"{", b"\xff", b"element q 3\n"]
+        )
         path.write_bytes(data)
         try:
             describe(path)
@@ -317,7 +314,7 @@ def test_levels_of_different_degrees_are_refused(tmp_path, make_splats):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_folder_reads_back_and_its_manifest_tells_the_truth(tmp_path, bundle, same):
+def test_folder_round_trips_and_matches_its_manifest(tmp_path, bundle, same):
     write_folder(tmp_path / "f", bundle)
     assert sorted(x.name for x in (tmp_path / "f").iterdir()) == [
         "lod0.ply",
@@ -332,43 +329,43 @@ def test_folder_reads_back_and_its_manifest_tells_the_truth(tmp_path, bundle, sa
         assert (fact["file"], fact["level"], fact["count"]) == (file.name, level.number, len(level.splats))
         assert (fact["bytes"], fact["sha256"]) == (len(data), hashlib.sha256(data).hexdigest())
         assert fact["bounds"] == [level.splats.means.min(0).tolist(), level.splats.means.max(0).tolist()]
-    # All files have the same columns: the extra that only one level has is in the bundle alone.
-    del bundle.levels[1].splats.extras["only_here"]
-    check_same(bundle, read_folder(tmp_path / "f"), same)
+    # All files have the same columns, so the extra of one level is only in the bundle.
+    del bundle.levels[1].splats.extras["middle_only"]
+    assert_equal(bundle, read_folder(tmp_path / "f"), same)
 
 
-def test_a_folder_that_is_replaced_keeps_no_level_of_before_and_all_that_is_not_ours(tmp_path, bundle):
+def test_replaced_folder_loses_old_levels_and_keeps_foreign_files(tmp_path, bundle):
     write_folder(tmp_path, bundle)
-    others = ["lod9.txt", "lod.ply", "my_lod7.ply", "lod2_old.ply", "scene.ply"]
-    for name in others:
+    foreign = ["lod9.txt", "lod.ply", "my_lod7.ply", "lod2_old.ply", "scene.ply"]
+    for name in foreign:
         (tmp_path / name).write_text("mine")
     write_folder(tmp_path, Bundle("flod", bundle.levels[1:], meta=bundle.meta))
     assert sorted(x.name for x in tmp_path.iterdir()) == sorted(
-        [*others, "lod0.ply", "lod1.ply", "manifest.json"]
+        [*foreign, "lod0.ply", "lod1.ply", "manifest.json"]
     )
     assert [level.number for level in read_folder(tmp_path).levels] == [2, 3]
 
 
-def test_a_folder_that_cannot_be_written_whole_stays_as_it_was(tmp_path, bundle, monkeypatch):
+def test_failed_export_leaves_the_folder_unchanged(tmp_path, bundle, monkeypatch):
     write_folder(tmp_path, bundle)
-    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
-    bundle.levels[1].splats.extras["two words"] = np.zeros(20)  # of which no PLY can be made
+    original = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    bundle.levels[1].splats.extras["two words"] = np.zeros(20)  # not a PLY name
     for level in bundle.levels:
         level.splats.extras["two words"] = np.zeros(len(level.splats), "f4")
     with pytest.raises(LodgsError, match="two words"):
         write_folder(tmp_path, Bundle("flod", bundle.levels[1:]))
-    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == original
 
 
-def test_a_level_of_another_export_is_told(tmp_path, bundle, make_splats):
+def test_level_of_another_export_is_reported(tmp_path, bundle, make_splats):
     write_folder(tmp_path, bundle)
     write_ply(tmp_path / "lod1.ply", make_splats(19))
     with pytest.raises(LodgsError, match="level 2 should have 20 splats"):
         read_folder(tmp_path)
 
 
-def test_an_element_serves_one_level_or_table_and_levels_are_few(tmp_path, bundle, make_splats):
-    """A header's line costs a few bytes, and must not cost the memory of an element each."""
+def test_elements_are_not_reused_and_levels_are_limited(tmp_path, bundle, make_splats):
+    """Header lines of a few bytes must not multiply the memory of an element."""
     bundle.tables = {"a": {"x": np.zeros(7, "f4")}, "b": {"x": np.zeros(7, "f4")}}
     write_bundle(tmp_path / "b.ply", bundle)
     data = (tmp_path / "b.ply").read_bytes()
@@ -380,7 +377,7 @@ def test_an_element_serves_one_level_or_table_and_levels_are_few(tmp_path, bundl
     ):
         assert old in data
         (tmp_path / "c.ply").write_bytes(data.replace(old, new))
-        with pytest.raises(LodgsError, match=r"c\.ply describes its levels"):
+        with pytest.raises(LodgsError, match=r"c\.ply: .*is inconsistent"):
             read_bundle(tmp_path / "c.ply")
     levels = [Level(number, make_splats(0, 0)) for number in range(1, 66)]
     for number in range(65):
@@ -389,7 +386,7 @@ def test_an_element_serves_one_level_or_table_and_levels_are_few(tmp_path, bundl
         read_folder(tmp_path / "many")
 
 
-def test_bounds_of_means_that_are_no_numbers_are_those_of_the_others(tmp_path, bundle):
+def test_bounds_ignore_non_numeric_means(tmp_path, bundle):
     bundle.levels[0].splats.means[0, 1] = np.nan
     expected = bundle.levels[0].splats.means[1:]
     write_folder(tmp_path, bundle)
@@ -397,60 +394,60 @@ def test_bounds_of_means_that_are_no_numbers_are_those_of_the_others(tmp_path, b
     assert bounds == [expected.min(0).tolist(), expected.max(0).tolist()]
 
 
-def test_folder_of_a_cumulative_bundle_holds_complete_scenes_and_reads_back(tmp_path, bundle, same):
+def test_cumulative_folder_holds_complete_scenes_and_round_trips(tmp_path, bundle, same):
     bundle.cumulative = True
     for level in bundle.levels:
-        level.splats.extras.pop("only_here", None)
+        level.splats.extras.pop("middle_only", None)
     write_folder(tmp_path, bundle)
     assert [len(read_ply(tmp_path / f"lod{lod}.ply")) for lod in (2, 1, 0)] == [3, 23, 5023]
     expected = Splats.concatenated([level.splats for level in bundle.levels])
     np.testing.assert_array_equal(read_ply(tmp_path / "lod0.ply").sh, expected.sh)
-    check_same(bundle, read_folder(tmp_path), same)
+    assert_equal(bundle, read_folder(tmp_path), same)
     write_ply(tmp_path / "lod1.ply", expected)
     with pytest.raises(LodgsError, match="level 2 should have 23 splats"):
         read_folder(tmp_path)
 
 
-def check_tables(expected, found):
-    assert list(found) == list(expected)
+def assert_tables_equal(expected, actual):
+    assert list(actual) == list(expected)
     for name, table in expected.items():
-        assert list(found[name]) == list(table)
+        assert list(actual[name]) == list(table)
         for column, values in table.items():
-            np.testing.assert_array_equal(found[name][column], values)
-            assert found[name][column].dtype == values.dtype
+            np.testing.assert_array_equal(actual[name][column], values)
+            assert actual[name][column].dtype == values.dtype
 
 
-def test_tables_come_back_from_a_bundle_and_from_a_folder(tmp_path, bundle, same):
+def test_tables_round_trip_in_bundle_and_folder(tmp_path, bundle, same):
     rng = np.random.default_rng(0)
     bundle.tables = {
         "chunks": {"x": rng.normal(size=7).astype("f4"), "splats": np.arange(7, dtype="u4")},
         "empty": {"x": np.zeros(0, "f4")},
     }
     write_bundle(tmp_path / "b.ply", bundle)
-    again = read_bundle(tmp_path / "b.ply")
-    check_same(bundle, again, same)
-    check_tables(bundle.tables, again.tables)
+    restored = read_bundle(tmp_path / "b.ply")
+    assert_equal(bundle, restored, same)
+    assert_tables_equal(bundle.tables, restored.tables)
     assert "table chunks: 7 rows of x, splats" in describe(tmp_path / "b.ply")
     for level in bundle.levels:
-        level.splats.extras.pop("only_here", None)
+        level.splats.extras.pop("middle_only", None)
     write_folder(tmp_path / "f", bundle)
-    again = read_folder(tmp_path / "f")
-    check_same(bundle, again, same)
-    check_tables(bundle.tables, again.tables)
+    restored = read_folder(tmp_path / "f")
+    assert_equal(bundle, restored, same)
+    assert_tables_equal(bundle.tables, restored.tables)
     assert "table chunks: 7 rows of x, splats" in describe(tmp_path / "f")
     bundle.tables = {}
     write_folder(tmp_path / "f", bundle)
     assert not (tmp_path / "f" / "tables.ply").exists() and read_folder(tmp_path / "f").tables == {}
 
 
-def test_a_folder_that_contradicts_its_tables_is_refused(tmp_path, bundle):
+def test_inconsistent_tables_of_a_folder_are_refused(tmp_path, bundle):
     bundle.tables = {"chunks": {"x": np.zeros(3, "f4")}}
     write_folder(tmp_path, bundle)
     manifest = json.loads((tmp_path / "manifest.json").read_text())
     for tables in (7, [{"table": "chunks"}], [{"table": "chunks", "element": "vertex"}],
-                   [{"table": "others", "element": "lod_others"}], ["chunks"]):  # fmt: skip
+                   [{"table": "more", "element": "lod_more"}], ["chunks"]):  # fmt: skip
         (tmp_path / "manifest.json").write_text(json.dumps(manifest | {"tables": tables}))
-        with pytest.raises(LodgsError, match="in a way that cannot be followed"):
+        with pytest.raises(LodgsError, match="is inconsistent"):
             read_folder(tmp_path)
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
     (tmp_path / "tables.ply").unlink()
@@ -458,7 +455,7 @@ def test_a_folder_that_contradicts_its_tables_is_refused(tmp_path, bundle):
         read_folder(tmp_path)
 
 
-def test_folder_without_manifest(tmp_path, make_splats):
+def test_folder_without_manifest_is_read(tmp_path, make_splats):
     for lod, count in ((0, 50), (2, 5), (10, 1)):
         write_ply(tmp_path / f"tree_lod{lod}.ply", make_splats(count))
     bundle = read_folder(tmp_path)
@@ -468,16 +465,16 @@ def test_folder_without_manifest(tmp_path, make_splats):
         read_folder(tmp_path)
 
 
-def test_folder_without_levels(tmp_path):
+def test_folder_without_levels_is_refused(tmp_path):
     with pytest.raises(LodgsError, match="no series of levels"):
         read_folder(tmp_path)
     for text in ('{"v": 2, "levels": [{}]}', '{"v": 2, "method": "", "meta": {}, "levels": []}', "[]", "{"):
         (tmp_path / "manifest.json").write_text(text)
-        with pytest.raises(LodgsError, match=r"manifest\.json (describes its levels|is not valid)"):
+        with pytest.raises(LodgsError, match=r"manifest\.json(: .*is inconsistent| is not valid)"):
             read_folder(tmp_path)
 
 
-def test_describe(tmp_path, bundle):
+def test_info_describes_bundle_folder_and_ply(tmp_path, bundle):
     bundle.levels[2].splats.means[:] = [[-1, 2, 3]]
     bundle.levels[1].splats.means[:] = [[-1, 2, 3]]
     bundle.levels[0].splats.means[:] = [[5, 2, 0]]

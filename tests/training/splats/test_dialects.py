@@ -1,4 +1,4 @@
-"""Dialects of splat PLYs: files as their makers write them, by plyfile, against numbers worked by hand."""
+"""Dialects of splat PLYs, written with plyfile and compared with numbers computed by hand."""
 
 import math
 
@@ -12,16 +12,10 @@ from training.errors import LodgsError
 from training.rasterize.filter3d import apply_filter3d
 from training.render.scene import Instance, SplatSet, draw
 from training.scenes.cameras import Camera
-from training.splats.bundle import (
-    Bundle,
-    Level,
-    read_bundle,
-    read_folder,
-    read_header,
-    write_bundle,
-    write_folder,
-)
+from training.splats.bundle import read_bundle, read_header, write_bundle
 from training.splats.dialects import comments_from_meta
+from training.splats.level_folder import read_folder, write_folder
+from training.splats.levels import Bundle, Level
 from training.splats.ply import read_ply, write_ply
 
 XYZ = ["x", "y", "z"]
@@ -47,7 +41,7 @@ OCTREE = [*XYZ, "level", "extra_level", "info", *SCAFFOLD[6:]]
 
 @pytest.fixture
 def write(tmp_path):
-    """write(columns, values, ...): a float PLY by plyfile; columns without values are random numbers."""
+    """Return ``write(columns, values, ...)``, which writes a float PLY; columns without values are random."""
 
     def make(columns, values=None, *, count=2, comments=(), obj_info=(), name="a.ply", elements=()):
         random = np.random.default_rng(3)
@@ -65,8 +59,8 @@ def write(tmp_path):
     return make
 
 
-def test_the_3d_filter_is_applied(write):
-    """s = 0.3, 0.4, 1.2 under 0.4: s'² = 0.25, 0.32, 1.6; the mass 0.9 · 0.144 stays. And a filter of 0."""
+def test_3d_filter_is_applied(write):
+    """Scales 0.3, 0.4, 1.2 filtered by 0.4: s'² = 0.25, 0.32, 1.6, at constant mass 0.9 · 0.144."""
     values = {f"scale_{i}": [math.log(s), -1] for i, s in enumerate((0.3, 0.4, 1.2))}
     values |= {"opacity": [math.log(9), 20], "filter_3D": [0.4, 0]} | dict.fromkeys(NORMALS, 0)
     splats = read_ply(write([*PLAIN, "filter_3D"], values))
@@ -78,8 +72,8 @@ def test_the_3d_filter_is_applied(write):
     assert splats.extras == {} and splats.log_scales.dtype == splats.opacity_logits.dtype == np.float32
 
 
-def test_a_filter_of_any_size_leaves_numbers(write):
-    """Narrow and wide, opaque and clear: s'² and the mass in 80 digits' worth of range."""
+def test_3d_filter_is_accurate_for_extreme_values(write):
+    """Narrow to wide, opaque to clear splats cover 80 orders of magnitude."""
     s, o, f = (x.ravel() for x in np.meshgrid([-40.0, -3, 5], [-90.0, 0, 15, 200], [0, 1e-12, 0.1, 1e4]))
     values = {"scale_0": s, "scale_1": s, "scale_2": s, "opacity": o, "filter_3D": f}
     splats = read_ply(write([*PLAIN, "filter_3D"], values, count=len(s)))
@@ -91,7 +85,7 @@ def test_a_filter_of_any_size_leaves_numbers(write):
     assert (splats.opacity_logits <= o.astype(np.float32)).all()
 
 
-def test_a_filtered_scene_looks_as_the_trainers_filter_makes_it(write):
+def test_3d_filter_matches_the_trainer(write):
     random = np.random.default_rng(1)
     count = 200
     values = {axis: random.uniform(-1, 1, count) for axis in "xy"} | {"z": random.uniform(2, 4, count)}
@@ -105,18 +99,18 @@ def test_a_filtered_scene_looks_as_the_trainers_filter_makes_it(write):
     )
     camera = Camera("a", 48, 40, 40.0, 40.0, 24.0, 20.0, np.eye(4))
 
-    def picture(splats):
-        drawn = draw([Instance(SplatSet(splats, backend="reference"))], camera, backend="reference")
-        assert drawn is not None
-        return drawn.image
+    def render(splats):
+        image = draw([Instance(SplatSet(splats, backend="reference"))], camera, backend="reference")
+        assert image is not None
+        return image.image
 
-    unfiltered = picture(raw)
+    unfiltered = render(raw)
     raw.log_scales, raw.opacity_logits = log_scales.numpy(), logits.numpy()
-    np.testing.assert_allclose(picture(read), picture(raw), atol=1e-5)
-    assert np.abs(picture(read) - unfiltered).max() > 0.05
+    np.testing.assert_allclose(render(read), render(raw), atol=1e-5)
+    assert np.abs(render(read) - unfiltered).max() > 0.05
 
 
-def test_anchors_become_splats(write):
+def test_explicit_anchors_become_splats(write):
     """Octree-AnyGS, explicit: 1, 2, 3 + (0.5, -1, 2) · (2, 0.5, 1) = 2, 1.5, 5."""
     values = {"x": 1, "y": 2, "z": 3, "f_offset_0": 0.5, "f_offset_1": -1, "f_offset_2": 2}
     values |= {f"scale_{i}": math.log(s) for i, s in enumerate((2, 0.5, 1, 0.1, 0.2, 0.3))}
@@ -135,7 +129,7 @@ def test_anchors_become_splats(write):
 
 
 @pytest.mark.parametrize("columns", [[*PLAIN, "filter_3D"], ANYGS])
-def test_nothing_is_applied_twice(write, tmp_path, same, columns):
+def test_conversion_is_not_applied_twice(write, tmp_path, same, columns):
     splats = read_ply(write(columns))
     write_ply(tmp_path / "b.ply", splats)
     assert same(splats, read_ply(tmp_path / "b.ply"))
@@ -146,37 +140,37 @@ PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 
 
 @pytest.mark.parametrize(
-    ("columns", "what", "remedy"),
+    ("columns", "reason", "remedy"),
     [
-        (PACKED, "is a compressed PLY, as SuperSplat", "splat-transform a.ply"),
-        (SCAFFOLD, "anchors of Scaffold-GS or Octree-GS: networks that are not in the file", "Train"),
-        (OCTREE, "anchors of Scaffold-GS or Octree-GS: networks that are not in the file", "Train"),
+        (PACKED, "compressed PLY of SuperSplat", "splat-transform a.ply"),
+        (SCAFFOLD, "anchors of Scaffold-GS or Octree-GS", "Train"),
+        (OCTREE, "anchors of Scaffold-GS or Octree-GS", "Train"),
         ([*ANYGS, "f_offset_3", "f_offset_4", "f_offset_5"], "several splats each", "Export"),
         ([*PLAIN, *OFFSETS], "several splats each", "Export"),
-        (FLOD, "FLoD's own program: its scales lack s_min", "convert4viewer.py"),
-        (SPACETIME, "splats that move in time", "one moment"),
-        ([*PLAIN, "t", "scale_t"], "splats that move in time", "one moment"),
-        ([*PLAIN, "t", "scale_t_0", "rot_r_0"], "splats that move in time", "one moment"),
+        (FLOD, "original FLoD program, whose scales lack s_min", "convert4viewer.py"),
+        (SPACETIME, "its splats move in time", "one moment"),
+        ([*PLAIN, "t", "scale_t"], "its splats move in time", "one moment"),
+        ([*PLAIN, "t", "scale_t_0", "rot_r_0"], "its splats move in time", "one moment"),
         ([name for name in PLAIN if name != "scale_2"], "2D Gaussian Splatting", "3DGS trainer"),
-        ([*XYZ, "red", "green", "blue"], "point cloud or a mesh with colours", "3DGS trainer"),
+        ([*XYZ, "red", "green", "blue"], "coloured point cloud or mesh", "3DGS trainer"),
         ([*PLAIN[:-1]], "it has no rot_3", "3DGS trainer"),
     ],
 )
-def test_what_cannot_be_drawn_is_named(write, columns, what, remedy):
+def test_unsupported_dialect_is_named(write, columns, reason, remedy):
     path = write(columns)
     for read in (read_ply, read_bundle, read_header):
-        with pytest.raises(LodgsError, match=what) as caught:
+        with pytest.raises(LodgsError, match=reason) as caught:
             read(path)
         assert str(path) in caught.value.what and remedy in caught.value.remedy
 
 
-def test_a_compressed_ply_with_its_chunks_is_named(write):
+def test_compressed_ply_with_chunks_is_named(write):
     chunk = PlyElement.describe(np.zeros(1, [("min_x", "f4"), ("max_x", "f4")]), "chunk")
     with pytest.raises(LodgsError, match="compressed"):
         read_ply(write(PACKED, elements=[chunk]))
 
 
-def test_the_coarsest_level_of_flod_is_known_by_its_folder(write):
+def test_coarsest_flod_level_is_detected_by_its_folder(write):
     with pytest.raises(LodgsError, match="s_min"):
         read_ply(write(PLAIN, name="point_cloud/lod_1_iteration_10000/point_cloud.ply"))
     read_ply(write(PLAIN, name="point_cloud/iteration_30000/point_cloud.ply"))
@@ -195,7 +189,7 @@ def test_the_coarsest_level_of_flod_is_known_by_its_folder(write):
         ([], False),
     ],
 )
-def test_a_2d_filter_is_known(write, comments, mip):
+def test_2d_filter_is_detected(write, comments, mip):
     path, warnings = write(PLAIN, comments=comments), []
     bundle = read_bundle(path, warnings.append)
     assert bundle.meta == ({"antialias": True} if mip else {}) == read_header(path).meta
@@ -203,13 +197,13 @@ def test_a_2d_filter_is_known(write, comments, mip):
     assert warnings == []
 
 
-def test_flat_splats_by_a_comment_are_refused(write):
+def test_2dgs_comment_is_refused(write):
     with pytest.raises(LodgsError, match="2D Gaussian Splatting"):
         read_ply(write(PLAIN, comments=["SplatRenderMode: 2dgs"]))
 
 
-def test_the_2d_filter_survives_every_way_of_writing(tmp_path, make_splats):
-    """Other programs know it by the comment, ours too."""
+def test_2d_filter_survives_every_export(tmp_path, make_splats):
+    """The comment tells it to other programs and to LODGS."""
     comment = "SplatRenderMode: mip"
     levels = [Level(1, make_splats(2, 0)), Level(2, make_splats(5, 0))]
     bundle = Bundle("lodge", levels, meta={"antialias": True})
@@ -227,7 +221,7 @@ def test_the_2d_filter_survives_every_way_of_writing(tmp_path, make_splats):
     assert comments_from_meta({}) == []
 
 
-def test_splats_that_are_no_numbers_are_left_out(write):
+def test_non_numeric_splats_are_dropped(write):
     count = 9
     values = {name: np.zeros(count) for name in PLAIN} | {"rot_0": np.ones(count), "x": np.arange(count)}
     values["x"] = np.where(np.arange(count) == 0, np.inf, values["x"])
@@ -244,8 +238,8 @@ def test_splats_that_are_no_numbers_are_left_out(write):
 
 
 @pytest.mark.parametrize("cumulative", [False, True])
-def test_of_our_own_levels_too_and_the_others_stay_in_their_level(tmp_path, make_splats, same, cumulative):
-    """Where levels add up, a file's rows are counted before any is left out."""
+def test_undrawable_splats_of_levels_are_dropped(tmp_path, make_splats, same, cumulative):
+    """Cumulative levels count the rows of a file before any is dropped."""
     coarse, fine = make_splats(5, 1), make_splats(7, 1, mark=np.arange(7, dtype="u1"))
     coarse.opacity_logits[2] = coarse.sh[3, 0, 0] = fine.quats[0, 1] = np.nan
     coarse.extras["mark"] = np.arange(5, dtype="u1")
@@ -260,14 +254,14 @@ def test_of_our_own_levels_too_and_the_others_stay_in_their_level(tmp_path, make
         assert sorted(text.split(" splats of ")[0] for text in warnings) == ["1", "2"]
 
 
-def test_splats_too_large_for_single_precision_are_left_out(write):
-    """Squares of places, sizes and rotations must be finite, sums of colours too; faint and far ones stay."""
+def test_splats_too_large_for_single_precision_are_dropped(write):
+    """Squares of positions, sizes and rotations, and sums of colours, stay finite."""
     count = 10
     values = {name: np.zeros(count) for name in PLAIN} | {"rot_0": np.ones(count)}
     values["x"] = 10.0 ** np.arange(count)
     values["y"][0] = values["rot_3"][1] = values["f_dc_0"][2] = 1e30
     values["scale_0"][3] = 44.5  # its square is infinite
-    values["rot_0"][4] = 1e-30  # its square is zero: a rotation that nobody can norm is none
+    values["rot_0"][4] = 1e-30  # its square is zero: the rotation becomes the identity
     values["opacity"][5] = -1e30
     values["f_dc_1"][6] = -1e5
     splats = read_ply(write(PLAIN, values, count=count))

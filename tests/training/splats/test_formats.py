@@ -10,7 +10,7 @@ import pytest
 
 from training.__main__ import main
 from training.errors import LodgsError
-from training.splats.bundle import Bundle, Level, read_bundle, read_folder, write_bundle
+from training.splats.bundle import read_bundle, write_bundle
 from training.splats.formats import (
     FORMATS,
     PROGRAM,
@@ -24,6 +24,8 @@ from training.splats.formats import (
     write_streamed,
 )
 from training.splats.gaussians import SH_C0, Splats
+from training.splats.level_folder import read_folder
+from training.splats.levels import Bundle, Level
 from training.splats.ply import read_ply
 
 HERE = Path(__file__).parents[3] / "build" / "interop" / "node_modules" / ".bin"

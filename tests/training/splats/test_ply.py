@@ -1,4 +1,4 @@
-"""Plain PLY: judged by hand-made bytes and by plyfile."""
+"""Plain PLY files, compared with hand-made bytes and plyfile."""
 
 import struct
 
@@ -9,7 +9,7 @@ from plyfile import PlyData, PlyElement
 from training.errors import LodgsError
 from training.splats.ply import read_elements, read_ply, splats_from_rows, write_ply
 
-# Degree 1, two splats; value = splat / 2 + place of the column.
+# Degree 1, two splats; value = splat / 2 + number of the column.
 GOLDEN_COLUMNS = [
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
     *(
@@ -40,7 +40,7 @@ GOLDEN = header() + struct.pack("<52f", *golden_values(0), *golden_values(1))
 
 
 def check_golden(splats):
-    """The columns by hand: places 0-2 means, 6-8 DC, 9-17 rest by channel, 18 opacity, 19-21, 22-25."""
+    """Columns 0-2 are means, 6-8 DC, 9-17 rest by channel, 18 opacity, 19-21 scales, 22-25 rotation."""
     for i in range(2):
         o = 0.5 * i
         assert splats.means[i].tolist() == [o, o + 1, o + 2]
@@ -55,21 +55,21 @@ def check_golden(splats):
         assert splats.quats[i].tolist() == [o + 22, o + 23, o + 24, o + 25]
 
 
-def test_reads_the_original_layout(tmp_path):
+def test_original_layout_is_read(tmp_path):
     (tmp_path / "a.ply").write_bytes(GOLDEN)
     splats = read_ply(tmp_path / "a.ply")
     check_golden(splats)
     assert splats.sh_degree == 1 and splats.extras == {}
 
 
-def test_writes_the_original_layout_to_the_byte(tmp_path):
+def test_written_bytes_match_original_layout(tmp_path):
     (tmp_path / "a.ply").write_bytes(GOLDEN)
     write_ply(tmp_path / "b.ply", read_ply(tmp_path / "a.ply"))
     assert (tmp_path / "b.ply").read_bytes() == GOLDEN
 
 
 @pytest.mark.parametrize("degree", range(5))
-def test_every_degree_comes_back_and_plyfile_agrees(tmp_path, make_splats, same, degree):
+def test_every_degree_round_trips_and_matches_plyfile(tmp_path, make_splats, same, degree):
     count = 5000  # more than one block of rows
     splats = make_splats(count, degree)
     write_ply(tmp_path / "a.ply", splats)
@@ -78,40 +78,40 @@ def test_every_degree_comes_back_and_plyfile_agrees(tmp_path, make_splats, same,
     data = PlyData.read(str(tmp_path / "a.ply"))
     assert [element.name for element in data.elements] == ["vertex"]
     rows = data["vertex"].data
-    rest = (degree + 1) ** 2 - 1
+    rest_count = (degree + 1) ** 2 - 1
     assert list(rows.dtype.names) == [
         *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
-        *(f"f_rest_{i}" for i in range(3 * rest)),
+        *(f"f_rest_{i}" for i in range(3 * rest_count)),
         *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
     ]
     np.testing.assert_array_equal(rows["z"], splats.means[:, 2])
     np.testing.assert_array_equal(rows["rot_0"], splats.quats[:, 0])
-    for i in range(3 * rest):  # as the reference code: features_rest.transpose(1, 2).flatten(start_dim=1)
+    for i in range(3 * rest_count):  # the reference code: features_rest.transpose(1, 2).flatten(start_dim=1)
         flat = splats.sh[:, 1:].transpose(0, 2, 1).reshape(count, -1)
         np.testing.assert_array_equal(rows[f"f_rest_{i}"], flat[:, i])
 
 
-def test_other_byte_order(tmp_path):
+def test_big_endian_file_is_read(tmp_path):
     body = struct.pack(">52f", *golden_values(0), *golden_values(1))
     (tmp_path / "a.ply").write_bytes(header("binary_big_endian") + body)
     check_golden(read_ply(tmp_path / "a.ply"))
 
 
-def test_ascii(tmp_path):
+def test_ascii_file_is_read(tmp_path):
     body = "\n".join(" ".join(map(str, golden_values(i))) for i in range(2)) + "\n"
     (tmp_path / "a.ply").write_bytes(header("ascii") + body.encode())
     check_golden(read_ply(tmp_path / "a.ply"))
 
 
-def test_windows_line_ends(tmp_path):
+def test_windows_line_ends_are_read(tmp_path):
     body = GOLDEN[len(header()) :]
     (tmp_path / "a.ply").write_bytes(header().replace(b"\n", b"\r\n") + body)
     check_golden(read_ply(tmp_path / "a.ply"))
 
 
-def test_other_order_without_normals_and_with_faces(tmp_path):
+def test_reordered_columns_without_normals_before_faces_are_read(tmp_path):
     columns = [name for name in reversed(GOLDEN_COLUMNS) if name not in ("nx", "ny", "nz")]
-    rows = np.zeros(2, [(name, "f8") for name in columns])  # doubles, too
+    rows = np.zeros(2, [(name, "f8") for name in columns])  # doubles are converted
     for name in columns:
         rows[name] = [golden_values(i)[GOLDEN_COLUMNS.index(name)] for i in range(2)]
     faces = np.empty(1, [("vertex_indices", "O")])
@@ -121,7 +121,7 @@ def test_other_order_without_normals_and_with_faces(tmp_path):
     check_golden(read_ply(tmp_path / "a.ply"))
 
 
-def test_unknown_columns_of_every_type_survive(tmp_path, make_splats, same):
+def test_unknown_columns_of_every_type_round_trip(tmp_path, make_splats, same):
     kinds = ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"]
     edge = {
         kind: np.array([np.finfo(kind).tiny if kind[0] == "f" else np.iinfo(kind).max, 3, 0], kind)
@@ -136,7 +136,7 @@ def test_unknown_columns_of_every_type_survive(tmp_path, make_splats, same):
         np.testing.assert_array_equal(rows[f"column_{kind}"], column)
 
 
-def test_normals_that_mean_something_survive_in_their_place(tmp_path, make_splats, same):
+def test_nonzero_normals_keep_their_position(tmp_path, make_splats, same):
     splats = make_splats(4, 0, nx=np.arange(4, dtype="f4"), ny=np.zeros(4, "f4"), nz=np.ones(4, "f4"))
     write_ply(tmp_path / "a.ply", splats)
     rows = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
@@ -144,13 +144,13 @@ def test_normals_that_mean_something_survive_in_their_place(tmp_path, make_splat
     assert same(splats, read_ply(tmp_path / "a.ply"))
 
 
-def test_no_splats_at_all(tmp_path, make_splats):
+def test_empty_file_round_trips(tmp_path, make_splats):
     write_ply(tmp_path / "a.ply", make_splats(0, 2))
     splats = read_ply(tmp_path / "a.ply")
     assert len(splats) == 0 and splats.sh_degree == 2
 
 
-def test_a_selection_is_written_as_it_is(tmp_path, make_splats):
+def test_selected_splats_are_written_in_order(tmp_path, make_splats):
     splats = make_splats(100, 1, mark=np.arange(100, dtype="u1"))
     write_ply(tmp_path / "a.ply", splats.select(splats.means[:, 0] > 0))
     back = read_ply(tmp_path / "a.ply")
@@ -160,34 +160,34 @@ def test_a_selection_is_written_as_it_is(tmp_path, make_splats):
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
-        (GOLDEN[:-5], "a.ply is cut short: 5 of its [0-9]+ bytes are missing"),
-        (GOLDEN[:100], "cut short: its header does not end"),
-        (b"", "is not a PLY file"),
-        (b"PK\x03\x04 something else", "is not a PLY file"),
+        (GOLDEN[:-5], r"a\.ply: it is truncated, 5 of [0-9]+ bytes are missing"),
+        (GOLDEN[:100], "truncated, its header has no end"),
+        (b"", "it is not a PLY file"),
+        (b"PK\x03\x04 something else", "it is not a PLY file"),
         (
             header(columns=["x", "y", "z", "red"]) + bytes(32),
             r"it has no f_dc_0, f_dc_1, f_dc_2, opacity, scale_0",
         ),
-        (header(columns=[*GOLDEN_COLUMNS, "f_rest_9"]) + bytes(216), "has 10 f_rest columns"),
-        (header(columns=[*GOLDEN_COLUMNS, "x"]) + bytes(216), "damaged header"),
-        (header().replace(b"float z", b"quad z"), "damaged header"),
+        (header(columns=[*GOLDEN_COLUMNS, "f_rest_9"]) + bytes(216), "its 10 f_rest columns"),
+        (header(columns=[*GOLDEN_COLUMNS, "x"]) + bytes(216), "header is corrupt"),
+        (header().replace(b"float z", b"quad z"), "header is corrupt"),
         (header().replace(b"element vertex", b"element point") + bytes(208), "no element vertex"),
         (header().replace(b"property float x", b"property list uchar int x"), "lists in its vertices"),
-        (header("ascii") + b"1 2 3\n", "is damaged: it is too short"),
-        (header("ascii") + b"1 2 3\n" * 26, "is damaged: .* requires 26 columns"),
-        (header("ascii") + b"1 " * 25 + b"one\n" + b"2 " * 26, "is damaged: could not convert"),
-        (header("ascii") + b"1 " * 26 + b"\n" * 60, "is damaged: 1 of 2 rows of vertex are missing"),
-        (header(count="-0") + bytes(208), "damaged header: 'element vertex -0'"),
-        (header(count="2 2") + bytes(208), "damaged header"),
-        (header(count="9" * 5000) + bytes(208), "damaged header"),
-        (header(count=2**60) + bytes(208), "damaged header"),
-        (header(count=10**14), "cut short: [0-9]+ of its [0-9]+ bytes are missing"),
-        (header("ascii", count=10**14) + bytes(208), "is damaged: it is too short"),
-        (header(columns=[f"c{i}" for i in range(1001)]), "damaged header: it has more than 1,000 columns"),
-        (header()[:-11] + b"comment " + b"x" * (1 << 20), "has a header of more than 1,048,576 bytes"),
+        (header("ascii") + b"1 2 3\n", "is corrupt: it is too short"),
+        (header("ascii") + b"1 2 3\n" * 26, "is corrupt: .* requires 26 columns"),
+        (header("ascii") + b"1 " * 25 + b"one\n" + b"2 " * 26, "is corrupt: could not convert"),
+        (header("ascii") + b"1 " * 26 + b"\n" * 60, "is corrupt: 1 of 2 rows of vertex are missing"),
+        (header(count="-0") + bytes(208), "header is corrupt: 'element vertex -0'"),
+        (header(count="2 2") + bytes(208), "header is corrupt"),
+        (header(count="9" * 5000) + bytes(208), "header is corrupt"),
+        (header(count=2**60) + bytes(208), "header is corrupt"),
+        (header(count=10**14), "truncated, [0-9]+ of [0-9]+ bytes are missing"),
+        (header("ascii", count=10**14) + bytes(208), "is corrupt: it is too short"),
+        (header(columns=[f"c{i}" for i in range(1001)]), "header is corrupt: it has more than 1,000 columns"),
+        (header()[:-11] + b"comment " + b"x" * (1 << 20), "its header exceeds 1,048,576 bytes"),
     ],
 )
-def test_a_bad_file_is_one_sentence(tmp_path, content, sentence):
+def test_invalid_file_raises_one_sentence(tmp_path, content, sentence):
     (tmp_path / "a.ply").write_bytes(content)
     with pytest.raises(LodgsError, match=sentence) as caught:
         read_ply(tmp_path / "a.ply")
@@ -198,13 +198,13 @@ FACES = b"element face %d\nproperty list uchar int vertex_indices\n"
 
 
 @pytest.mark.parametrize("kind", ["binary_little_endian", "ascii"])
-def test_lists_are_not_read_however_many_are_promised(tmp_path, kind):
-    """No splats are made of faces; to read 10^8 lists one by one would take minutes."""
+def test_lists_after_the_vertices_are_not_read(tmp_path, kind):
+    """Reading 10^8 faces one by one would take minutes."""
     text = "\n".join(" ".join(map(str, golden_values(i))) for i in range(2)).encode() + b"\n"
     body = text if kind == "ascii" else GOLDEN[len(header()) :]
     head = header(kind)
-    behind = head.replace(b"end_header", FACES % 10**8 + b"end_header") + body
-    (tmp_path / "a.ply").write_bytes(behind)
+    faces_last = head.replace(b"end_header", FACES % 10**8 + b"end_header") + body
+    (tmp_path / "a.ply").write_bytes(faces_last)
     check_golden(read_ply(tmp_path / "a.ply"))
     empty = head.replace(b"element vertex", FACES % 0 + b"element vertex") + body
     (tmp_path / "a.ply").write_bytes(empty)
@@ -216,12 +216,14 @@ def test_lists_are_not_read_however_many_are_promised(tmp_path, kind):
         read_ply(tmp_path / "a.ply")
 
 
-def test_ascii_of_several_elements_with_any_line_ends(tmp_path):
+def test_ascii_elements_with_any_line_ends_are_read(tmp_path):
     text = (
         " ".join(map(str, golden_values(0))) + "\n\n" + " ".join(map(str, golden_values(1))) + "\n7\n8\n9\n"
     )
-    other = b"element other 1\nproperty int a\nelement none 3\nelement third 2\nproperty uchar b\nend_header"
-    data = header("ascii").replace(b"end_header", other) + text.encode()
+    further = (
+        b"element other 1\nproperty int a\nelement none 3\nelement third 2\nproperty uchar b\nend_header"
+    )
+    data = header("ascii").replace(b"end_header", further) + text.encode()
     for ends in (b"\n", b"\r\n", b"\r"):
         (tmp_path / "a.ply").write_bytes(data.replace(b"\n", ends))
         elements, _ = read_elements(tmp_path / "a.ply")
@@ -230,20 +232,20 @@ def test_ascii_of_several_elements_with_any_line_ends(tmp_path):
         assert list(elements) == ["vertex", "other", "third"]
 
 
-def test_comments_in_other_letters_are_passed_over(tmp_path):
+def test_comments_outside_ascii_are_ignored(tmp_path):
     (tmp_path / "a.ply").write_bytes(
         GOLDEN.replace(b"end_header", "comment von Jürgen\nend_header".encode(), 1)
     )
     check_golden(read_ply(tmp_path / "a.ply"))
 
 
-def test_a_missing_file_is_one_sentence(tmp_path):
-    with pytest.raises(LodgsError, match=r"none\.ply could not be read: No such file"):
+def test_missing_file_raises_one_sentence(tmp_path):
+    with pytest.raises(LodgsError, match=r"Cannot read .*none\.ply: No such file"):
         read_ply(tmp_path / "none.ply")
 
 
 @pytest.mark.parametrize("name,column", [("two words", np.zeros(2, "f4")), ("flag", np.zeros(2, "i8"))])
-def test_a_column_that_ply_cannot_hold_is_one_sentence(tmp_path, make_splats, name, column):
-    with pytest.raises(LodgsError, match=f"{name}.* cannot be written as PLY"):
+def test_unsupported_column_raises_one_sentence(tmp_path, make_splats, name, column):
+    with pytest.raises(LodgsError, match=f"Cannot write column .{name}"):
         write_ply(tmp_path / "a.ply", make_splats(2, 0, **{name: column}))
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""The spherical-harmonics basis against what defines one, and its derivatives against autograd."""
+"""Spherical-harmonics basis: orthonormality, conventions, and derivatives compared with autograd."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ def directions(count: int) -> np.ndarray:
     return points / np.linalg.norm(points, axis=1, keepdims=True)
 
 
-def test_the_basis_is_orthonormal_on_the_sphere():
+def test_basis_is_orthonormal_on_the_sphere():
     cos_theta, weights = np.polynomial.legendre.leggauss(12)
     phi = np.arange(24) * 2 * np.pi / 24
     sin_theta = np.sqrt(1 - cos_theta**2)
@@ -24,7 +24,7 @@ def test_the_basis_is_orthonormal_on_the_sphere():
     np.testing.assert_allclose(gram, np.eye(25), atol=1e-12)
 
 
-def test_signs_and_order_are_those_of_3dgs():
+def test_signs_and_order_match_3dgs():
     """Degree 1 is (-y, z, -x), and m runs from -l to l: x² - y² comes last of degree 2."""
     values = [None] * 9
     basis(0.0, 0.0, 1.0, 2, values)
@@ -35,7 +35,7 @@ def test_signs_and_order_are_those_of_3dgs():
 
 
 @pytest.mark.parametrize("degree", range(5))
-def test_derivatives_are_autograds(degree):
+def test_derivatives_match_autograd(degree):
     count = coefficient_count(degree)
     points = torch.tensor(directions(20), requires_grad=True)
     values = [None] * count
@@ -45,11 +45,11 @@ def test_derivatives_are_autograds(degree):
     for k in range(count):
         (expected,) = torch.autograd.grad(values[k].sum(), points, retain_graph=True)
         for axis in range(3):
-            found = torch.as_tensor(by[axis][k], dtype=torch.float64).expand(20)
-            torch.testing.assert_close(found, expected[:, axis], atol=1e-12, rtol=1e-12)
+            actual = torch.as_tensor(by[axis][k], dtype=torch.float64).expand(20)
+            torch.testing.assert_close(actual, expected[:, axis], atol=1e-12, rtol=1e-12)
 
 
-def test_coefficients_that_make_no_degree_are_refused():
+def test_invalid_coefficient_count_is_refused():
     assert [degree_from_count(n) for n in (1, 4, 9, 16, 25)] == [0, 1, 2, 3, 4]
     with pytest.raises(ValueError, match="12"):
         degree_from_count(12)

@@ -1,4 +1,4 @@
-"""Splats that stand elsewhere: drawn from the other side, and against what covariances and colours are."""
+"""Similarity transforms of splats: rendered images, covariances, colours and positions."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ from training.splats.sh import basis, coefficient_count
 from training.splats.similarity import Similarity, TransformedRows
 
 
-def some_splats(count: int, degree: int, seed: int = 0) -> Splats:
+def random_splats(count: int, degree: int, seed: int = 0) -> Splats:
     rng = np.random.default_rng(seed)
     return Splats(
         means=rng.uniform(-1, 1, (count, 3)).astype(np.float32),
@@ -29,10 +29,10 @@ def some_splats(count: int, degree: int, seed: int = 0) -> Splats:
 
 def matrix_of(seed: int, scale: float = 1.0, away: float = 3.0) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    found = np.eye(4)
-    found[:3, :3] = scale * Rotation.random(random_state=seed).as_matrix()
-    found[:3, 3] = rng.uniform(-away, away, 3)
-    return found
+    matrix = np.eye(4)
+    matrix[:3, :3] = scale * Rotation.random(random_state=seed).as_matrix()
+    matrix[:3, 3] = rng.uniform(-away, away, 3)
+    return matrix
 
 
 def covariances(splats: Splats) -> np.ndarray:
@@ -41,29 +41,30 @@ def covariances(splats: Splats) -> np.ndarray:
     return half @ half.transpose(0, 2, 1)
 
 
-def drawn(splats: Splats, camera: Camera, near: float) -> np.ndarray:
+def render(splats: Splats, camera: Camera, near: float) -> np.ndarray:
     return rasterize(Gaussians.of(splats), camera, backend="reference", near=near).image.numpy()
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3, 4])
 @pytest.mark.parametrize("scale", [1.0, 0.37, 12.5])
-def test_the_turned_scene_is_what_the_turned_camera_sees(degree, scale):
-    """At least 50 dB, where harmonics that stay behind have less than 30."""
-    splats, placement = some_splats(300, degree), Similarity.from_matrix(matrix_of(degree, scale))
+def test_transformed_scene_matches_transformed_camera(degree, scale):
+    """At least 50 dB; unrotated harmonics stay below 30."""
+    splats, placement = random_splats(300, degree), Similarity.from_matrix(matrix_of(degree, scale))
     camera = Camera("", 96, 72, 90.0, 80.0, 50.0, 33.0, look_at((2.5, 0.4, 1.5)))
-    there, unit = camera.in_object_space(np.linalg.inv(placement.matrix))
+    moved_camera, unit = camera.in_object_space(np.linalg.inv(placement.matrix))
     assert unit == pytest.approx(1 / scale)
-    before = drawn(splats, camera, 0.01)
-    after = drawn(placement.transform_splats(splats), there, 0.01 * scale)
-    assert before.std() > 0.1
-    assert -10 * np.log10(np.square(after - before).mean()) > 50
-    left = drawn(replace(placement.transform_splats(splats), sh=splats.sh), there, 0.01 * scale)
-    assert -10 * np.log10(np.square(left - before).mean()) < 30
+    expected = render(splats, camera, 0.01)
+    image = render(placement.transform_splats(splats), moved_camera, 0.01 * scale)
+    assert expected.std() > 0.1
+    assert -10 * np.log10(np.square(image - expected).mean()) > 50
+    unrotated = replace(placement.transform_splats(splats), sh=splats.sh)
+    image = render(unrotated, moved_camera, 0.01 * scale)
+    assert -10 * np.log10(np.square(image - expected).mean()) < 30
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_colours_covariances_and_places_go_along(seed):
-    splats, matrix = some_splats(50, 4, seed), matrix_of(seed, 2.5)
+def test_colours_covariances_and_positions_are_transformed(seed):
+    splats, matrix = random_splats(50, 4, seed), matrix_of(seed, 2.5)
     placed, linear = Similarity.from_matrix(matrix).transform_splats(splats), matrix[:3, :3]
     np.testing.assert_allclose(placed.means, splats.means @ linear.T + matrix[:3, 3], atol=1e-6)
     np.testing.assert_allclose(
@@ -74,32 +75,34 @@ def test_colours_covariances_and_places_go_along(seed):
     )
     directions = np.random.default_rng(seed).normal(size=(3, 50))
     directions /= np.linalg.norm(directions, axis=0)
-    before, after = np.empty((2, 25, 50))
-    basis(*directions, 4, before)
-    basis(*(linear / 2.5 @ directions), 4, after)
+    original, rotated = np.empty((2, 25, 50))
+    basis(*directions, 4, original)
+    basis(*(linear / 2.5 @ directions), 4, rotated)
     np.testing.assert_allclose(
-        np.einsum("kn,nkc->nc", after, placed.sh), np.einsum("kn,nkc->nc", before, splats.sh), atol=1e-5
+        np.einsum("kn,nkc->nc", rotated, placed.sh), np.einsum("kn,nkc->nc", original, splats.sh), atol=1e-5
     )
 
 
-def test_the_identity_changes_nothing():
-    splats = some_splats(20, 3)
+def test_identity_changes_nothing():
+    splats = random_splats(20, 3)
     placed = Similarity.from_matrix(np.eye(4)).transform_splats(splats)
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
         np.testing.assert_array_equal(getattr(placed, name), getattr(splats, name))
 
 
-def test_back_again_is_where_it_was():
-    splats, matrix = some_splats(50, 3), matrix_of(4, 0.2)
-    again = Similarity.from_matrix(np.linalg.inv(matrix)).transform_splats(Similarity.from_matrix(matrix).transform_splats(splats))
+def test_inverse_restores_the_splats():
+    splats, matrix = random_splats(50, 3), matrix_of(4, 0.2)
+    restored = Similarity.from_matrix(np.linalg.inv(matrix)).transform_splats(
+        Similarity.from_matrix(matrix).transform_splats(splats)
+    )
     for name in ("means", "log_scales", "sh"):
-        np.testing.assert_allclose(getattr(again, name), getattr(splats, name), atol=2e-5)
-    sign = np.sign((again.quats * splats.quats).sum(axis=1, keepdims=True))  # q and -q are one rotation
-    np.testing.assert_allclose(sign * again.quats, splats.quats, atol=2e-5)
+        np.testing.assert_allclose(getattr(restored, name), getattr(splats, name), atol=2e-5)
+    sign = np.sign((restored.quats * splats.quats).sum(axis=1, keepdims=True))  # q and -q are one rotation
+    np.testing.assert_allclose(sign * restored.quats, splats.quats, atol=2e-5)
 
 
-def test_further_columns_go_along_as_what_they_are():
-    splats = some_splats(3, 0)
+def test_extra_lengths_and_positions_are_transformed():
+    splats = random_splats(3, 0)
     columns = {name: np.float32([1, 2, 3]) for name in ("size", "weight", "px", "py", "pz")}
     splats.extras = columns | {"nx": np.float32([1, 0, 0]), "ny": np.float32([0, 1, 0])}
     splats.extras |= {"nz": np.float32([0, 0, 1]), "far": np.float32([3e38, 0, 1])}
@@ -113,26 +116,28 @@ def test_further_columns_go_along_as_what_they_are():
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_a_rotation_as_a_quaternion(seed):
+def test_quaternion_of_a_rotation(seed):
     turn = Rotation.random(random_state=seed)
     if seed < 3:  # half turns, about each axis, have no w
         turn = Rotation.from_rotvec(np.pi * np.eye(3)[seed])
     matrix = np.eye(4)
     matrix[:3, :3] = turn.as_matrix()
-    quat, wanted = Similarity.from_matrix(matrix).quat, turn.as_quat()[[3, 0, 1, 2]]
-    assert abs(quat @ wanted) == pytest.approx(1, abs=1e-12)
+    quat, expected = Similarity.from_matrix(matrix).quat, turn.as_quat()[[3, 0, 1, 2]]
+    assert abs(quat @ expected) == pytest.approx(1, abs=1e-12)
 
 
-def test_angles_are_those_of_scipy_about_fixed_axes():
+def test_angles_match_scipy_about_fixed_axes():
     placement = Similarity.from_angles((20, -50, 130), 2.5, (1, 2, 3))
-    wanted = Rotation.from_euler("xyz", (20, -50, 130), degrees=True).as_matrix()
-    np.testing.assert_allclose(placement.matrix[:3, :3], 2.5 * wanted, atol=1e-12)
+    expected = Rotation.from_euler("xyz", (20, -50, 130), degrees=True).as_matrix()
+    np.testing.assert_allclose(placement.matrix[:3, :3], 2.5 * expected, atol=1e-12)
     assert placement.matrix[:3, 3].tolist() == [1, 2, 3]
-    with pytest.raises(LodgsError, match="scale of 0"):
+    with pytest.raises(LodgsError, match="Cannot scale splats by 0"):
         Similarity.from_angles(scale=0.0)
     first, points = Similarity.from_matrix(matrix_of(1, 3.0)), np.eye(3)
     np.testing.assert_allclose(
-        placement.compose(first).transform_points(points), placement.transform_points(first.transform_points(points)), atol=1e-12
+        placement.compose(first).transform_points(points),
+        placement.transform_points(first.transform_points(points)),
+        atol=1e-12,
     )
 
 
@@ -146,16 +151,18 @@ def test_angles_are_those_of_scipy_about_fixed_axes():
         np.diag([np.nan, 1, 1]),
     ],
 )
-def test_what_is_no_placement_is_refused(linear):
+def test_other_transforms_are_refused(linear):
     matrix = np.eye(4)
     matrix[:3, :3] = linear
-    with pytest.raises(LodgsError, match=r"stretches|no transform"):
+    with pytest.raises(LodgsError, match=r"stretches|not an affine transform"):
         Similarity.from_matrix(matrix)
 
 
-def test_rows_in_a_file_are_placed_as_they_are_read():
-    splats, placement = some_splats(30, 1), Similarity.from_matrix(matrix_of(1, 3.0))
+def test_rows_are_transformed_when_read():
+    splats, placement = random_splats(30, 1), Similarity.from_matrix(matrix_of(1, 3.0))
     rows = TransformedRows(splats, placement.transform_splats, {"mine": np.arange(30, dtype=np.float32)})
-    some, whole = rows.select(slice(10, 20)), placement.transform_splats(splats)
-    assert len(rows) == 30 and torch.equal(torch.from_numpy(some.means), torch.from_numpy(whole.means[10:20]))
-    np.testing.assert_array_equal(some.extras["mine"], np.arange(10, 20))
+    part, expected = rows.select(slice(10, 20)), placement.transform_splats(splats)
+    assert len(rows) == 30 and torch.equal(
+        torch.from_numpy(part.means), torch.from_numpy(expected.means[10:20])
+    )
+    np.testing.assert_array_equal(part.extras["mine"], np.arange(10, 20))

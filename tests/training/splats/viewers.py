@@ -1,6 +1,6 @@
-"""How three families of viewers read a PLY header, written from their rules and as strict as they are.
+"""PLY header readers that are as strict as three families of viewers.
 
-Each returns the finest rows as a float array (N, columns), or raises ValueError as the viewer would fail.
+Each returns the finest rows as a float array (N, columns), or raises ValueError if the viewer would fail.
 """
 
 import re
@@ -11,9 +11,10 @@ SIZES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "f
 
 
 def strict(data: bytes) -> dict[str, tuple[int, int, list[str]]]:
-    """splat-transform, SuperSplat: an unknown keyword throws, no lists, and the size must fit exactly.
+    """Read as splat-transform and SuperSplat do: no unknown keywords, no lists, and an exact size.
 
-    Returns element name -> (offset from the first data byte, count, column names).
+    Returns:
+        Element name -> (offset from the first data byte, count, column names).
     """
     end = data.index(b"\nend_header\n") + len(b"\nend_header\n")
     if end > 128 * 1024:
@@ -37,28 +38,28 @@ def strict(data: bytes) -> dict[str, tuple[int, int, list[str]]]:
                 stride[name] += SIZES[words[1]]
             case _:
                 raise ValueError(f"unrecognised header line {line!r}")
-    found, offset = {}, 0
+    layout, offset = {}, 0
     for name, (count, columns) in elements.items():
-        found[name] = (offset, count, columns)
+        layout[name] = (offset, count, columns)
         offset += count * stride[name]
     if end + offset != len(data):
         raise ValueError("size does not fit the header")
-    return found
+    return layout
 
 
 def fixed_record(data: bytes, degree: int) -> np.ndarray:
-    """SIBR: the vertex count is on line 3, the rest of the header is skipped, records are all float."""
+    """Read as SIBR does: vertex count on line 3, no further header checks, float records."""
     lines = data.split(b"\n", 3)
-    found = re.fullmatch(rb"element vertex (\d+)", lines[2])
-    if not found:
+    match = re.fullmatch(rb"element vertex (\d+)", lines[2])
+    if not match:
         raise ValueError("line 3 is not the vertex count")
     start = data.index(b"\nend_header\n") + len(b"\nend_header\n")
     width = 3 + 3 + 3 * (degree + 1) ** 2 + 1 + 3 + 4
-    return np.frombuffer(data, "<f4", int(found[1]) * width, start).reshape(-1, width)
+    return np.frombuffer(data, "<f4", int(match[1]) * width, start).reshape(-1, width)
 
 
 def sums_all_properties(data: bytes) -> np.ndarray:
-    """antimatter15, gsplat.js: a header within 10 KB; the stride counts every property line in it."""
+    """Read as antimatter15 and gsplat.js do: header within 10 KB, stride of all its property lines."""
     head = data[: 10 * 1024]
     start = head.index(b"\nend_header\n") + len(b"\nend_header\n")
     count = int(re.search(rb"element vertex (\d+)\n", head)[1])

@@ -11,13 +11,13 @@ from typing import Protocol
 
 import numpy as np
 
-from ...splats.bundle import NO_SPLATS, Level
 from ...splats.gaussians import Splats
+from ...splats.levels import NO_SPLATS, Level
 from ...splats.ply import Columns
 from ...splats.scratch import ScratchFile
 from ..rules.cut import NODE_SIZE, PARENT, PARENT_SIZE
-from .paging import streaming_order, table_of_pages
-from .shape import LEAVES, NODES, Apart, Tree
+from .paging import page_table, streaming_order
+from .shape import LEAVES, NODES, Tree, UniqueSizes
 
 Piece = tuple[Splats, Tree]
 """Splats, and the tree that they are the nodes of."""
@@ -42,7 +42,7 @@ class Forest(Protocol):
 
 
 @dataclass(frozen=True)
-class Grove:
+class MemoryForest:
     """A forest in memory; see :class:`Forest`."""
 
     subtrees: Sequence[Piece]
@@ -52,7 +52,7 @@ class Grove:
         return iter(self.subtrees)
 
 
-def longest_of(leaves: int) -> int:
+def max_subtree_leaves(leaves: int) -> int:
     """Most leaves of a subtree of a tree of N leaves: half the square root of the number of nodes, so that
     the upper tree and a subtree have about as many."""
     return max(math.isqrt(2 * leaves - 1) // 2, 1)
@@ -104,7 +104,7 @@ class ForestShape:
         return np.append(self.ends - 1, np.arange(self.ends[-1], len(self)))
 
 
-def shape_of(tree: Tree, longest: int) -> tuple[np.ndarray, ForestShape]:
+def forest_shape(tree: Tree, longest: int) -> tuple[np.ndarray, ForestShape]:
     """The largest subtrees of at most ``longest`` leaves, by their first leaves.
 
     Returns:
@@ -132,21 +132,21 @@ def shape_of(tree: Tree, longest: int) -> tuple[np.ndarray, ForestShape]:
     return order, ForestShape(tree.leaves_below[roots].astype(np.int64), upper)
 
 
-def divided(splats: Splats, tree: Tree, longest: int) -> Grove:
+def split_tree(splats: Splats, tree: Tree, longest: int) -> MemoryForest:
     """A tree as a forest: the largest subtrees of at most ``longest`` leaves, by their first leaves.
 
     Args:
         splats: its 2N - 1 nodes.
     """
-    order, shape = shape_of(tree, longest)
-    splats, trees = splats.select(order), subtrees_of(tree, order, shape)
+    order, shape = forest_shape(tree, longest)
+    splats, trees = splats.select(order), extract_subtrees(tree, order, shape)
     pieces = [splats.select(slice(*ends)) for ends in shape.ranges]
     upper = splats.select(slice(int(shape.ends[-1]), None)), shape.upper
-    return Grove(list(zip(pieces, trees, strict=True)), upper)
+    return MemoryForest(list(zip(pieces, trees, strict=True)), upper)
 
 
-def subtrees_of(tree: Tree, order: np.ndarray, shape: ForestShape) -> list[Tree]:
-    """The subtrees of a tree that :func:`shape_of` has found."""
+def extract_subtrees(tree: Tree, order: np.ndarray, shape: ForestShape) -> list[Tree]:
+    """The subtrees of a tree that :func:`forest_shape` has found."""
     place = np.empty(len(tree), np.int32)
     place[order] = np.arange(len(tree), dtype=np.int32)
     trees = []
@@ -155,7 +155,7 @@ def subtrees_of(tree: Tree, order: np.ndarray, shape: ForestShape) -> list[Tree]
     return trees
 
 
-def side_by_side(leaves: np.ndarray, children: np.ndarray) -> tuple[np.ndarray, Tree]:
+def combine_trees(leaves: np.ndarray, children: np.ndarray) -> tuple[np.ndarray, Tree]:
     """Trees one after the other as one ``Tree`` of several.
 
     Args:
@@ -174,17 +174,17 @@ def side_by_side(leaves: np.ndarray, children: np.ndarray) -> tuple[np.ndarray, 
     return order, Tree(number[children], len(leaves))
 
 
-def joined(forest: Forest) -> Piece:
+def merge_forest(forest: Forest) -> Piece:
     """A forest as one tree in memory: all leaves in the order of subtrees, the nodes above them, the upper
     tree's."""
     subtrees = list(forest)
     above, upper = forest.upper
     leaves = [splats.select(slice(0, tree.leaves)) for splats, tree in subtrees]
     inner = [splats.select(slice(tree.leaves, None)) for splats, tree in subtrees]
-    return Splats.concatenated([*leaves, *inner, above]), joined_trees([tree for _, tree in subtrees], upper)
+    return Splats.concatenated([*leaves, *inner, above]), merge_trees([tree for _, tree in subtrees], upper)
 
 
-def joined_trees(trees: Sequence[Tree], upper: Tree) -> Tree:
+def merge_trees(trees: Sequence[Tree], upper: Tree) -> Tree:
     """One tree of others: of the trees whose roots are the leaves of an upper one, in their order."""
     counts = np.array([tree.leaves for tree in trees])
     first_leaf, first_inner = np.cumsum(counts) - counts, np.cumsum(counts - 1) - (counts - 1)
@@ -201,7 +201,7 @@ def joined_trees(trees: Sequence[Tree], upper: Tree) -> Tree:
     return Tree(np.concatenate(children).astype(np.int32).reshape(-1, 2))
 
 
-def levels_of(forest: Forest, folder: Path) -> tuple[list[Level], Columns]:
+def build_levels(forest: Forest, folder: Path) -> tuple[list[Level], Columns]:
     """The levels of a bundle, in the order of their rows, and its table of blocks; the splats stay in files.
 
     What they are is what ``Tree.levels`` makes of the same tree, but that of nodes alike another one may be
@@ -214,7 +214,7 @@ def levels_of(forest: Forest, folder: Path) -> tuple[list[Level], Columns]:
         LodgsError: the folder takes no files.
     """
     files = {number: _LevelFile(folder) for number in (NODES, LEAVES)}
-    roots, places, apart = [], [], Apart()
+    roots, places, apart = [], [], UniqueSizes()
     for splats, tree in forest:
         columns = tree.columns(splats.means, apart.sizes(tree, splats.means, splats.log_scales))
         splats = replace(splats, extras=columns)
@@ -254,7 +254,7 @@ class _LevelFile:
         keys, self.keys = np.concatenate(self.keys), []
         columns: Columns = dict(zip(_KEYS, keys.T, strict=True))
         order = streaming_order(columns).astype(np.int32)
-        table = table_of_pages({number: {name: column[order] for name, column in columns.items()}})
+        table = page_table({number: {name: column[order] for name, column in columns.items()}})
         return Level(number, NO_SPLATS, on_disk=_Ordered(self.splats, order)), table
 
 

@@ -22,12 +22,14 @@ import numpy as np
 
 from ...errors import LodgsError
 from ...scenes.cameras import Camera
-from ...splats.bundle import Bundle, FileRows, Level, open_bundle
+from ...splats.bundle import open_bundle
 from ...splats.dialects import drop_undrawable
+from ...splats.file_rows import FileRows
 from ...splats.gaussians import Splats
-from ..blocks import ROUNDING, SIZE, Blocks, places_on_curve
+from ...splats.levels import Bundle, Level
+from ..blocks import ROUNDING, SIZE, Blocks, morton_codes
 from ..partial_read import BLOCKS
-from ..query import Choice
+from ..query import LodQuery
 from ..rule import distances_by_axes
 from ..rules.cut import (
     ABOVE_ROOT,
@@ -44,11 +46,11 @@ from ..rules.cut import (
 BOUNDS = tuple(f"{end}_{axis}" for end in ("low", "high") for axis in "xyz")
 """Columns of the table of blocks beside ``level`` and ``parent_size``: bounds of the parents' places."""
 COLUMNS = (NODE_SIZE, PARENT_SIZE, *PARENT)
-AT_ONCE = 256
+PAGES_PER_UPDATE = 256
 """Pages that come in between two looks at where the eye is."""
-SIGHT = np.radians(50.0)
+VIEW_ANGLE = np.radians(50.0)
 """An angle that images reach from where their eye looks."""
-BEHIND = 2.0
+BEHIND_FACTOR = 2.0
 """What an eye does not look at comes in as if seen with so many times less detail, while there is room."""
 _PAGE = "page"
 """Column that tells of rows in which page they are, while they are read."""
@@ -68,12 +70,12 @@ def streaming_order(columns: Columns) -> np.ndarray:
     Args:
         columns: of the rule, (N,) each.
     """
-    places = places_on_curve(np.stack([columns[name] for name in PARENT], axis=1))
+    places = morton_codes(np.stack([columns[name] for name in PARENT], axis=1))
     octaves = -np.floor(np.log2(np.maximum(columns[PARENT_SIZE], 1e-30)))
     return np.lexsort((places, octaves.astype(np.int16)))
 
 
-def table_of_pages(columns: Mapping[int, Columns]) -> dict[str, np.ndarray]:
+def page_table(columns: Mapping[int, Columns]) -> dict[str, np.ndarray]:
     """The table ``blocks`` of a tree: of every SIZE rows of a level, in the order of rows, the ``level``, the
     greatest ``parent_size``, and the BOUNDS of the parents' places.
 
@@ -179,7 +181,7 @@ class TreeFile:
             self._index = self._make_index(on_progress)
         return self._index
 
-    def cut(self, choice: Choice, camera: Camera | None = None, near: float = 0.0) -> dict[int, Splats]:
+    def cut(self, choice: LodQuery, camera: Camera | None = None, near: float = 0.0) -> dict[int, Splats]:
         """By the level's number, the splats that a choice of the rule ``cut`` shows; those that cannot be
         drawn are missing.
 
@@ -194,8 +196,8 @@ class TreeFile:
         found: dict[int, list[Splats]] = {
             number: [self.read_rows(number, pages[:0])] for number in self._rows
         }
-        for begin in range(0, len(pages), AT_ONCE):
-            for number, rows in self._rows_of(pages[begin : begin + AT_ONCE]).items():
+        for begin in range(0, len(pages), PAGES_PER_UPDATE):
+            for number, rows in self._rows_of(pages[begin : begin + PAGES_PER_UPDATE]).items():
                 columns = self._rows[number].columns(rows, (*COLUMNS, *"xyz"))
                 means = np.stack([columns.pop(axis) for axis in "xyz"], axis=1)
                 zeros = dict.fromkeys(COLUMNS, np.zeros(len(rows), np.float32))
@@ -278,7 +280,9 @@ class PageIndex:
         to = middle - np.asarray(eye, np.float64)
         away = np.sqrt(np.square(to).sum(axis=1))
         aside = np.arccos(np.clip(to @ direction / np.maximum(away, 1e-30), -1, 1))
-        return (away <= reach) | (aside <= SIGHT + np.arcsin(np.clip(reach / np.maximum(away, 1e-30), 0, 1)))
+        return (away <= reach) | (
+            aside <= VIEW_ANGLE + np.arcsin(np.clip(reach / np.maximum(away, 1e-30), 0, 1))
+        )
 
     def order(self, eye: np.ndarray, k: float, direction: np.ndarray | None = None) -> np.ndarray:
         """The pages (M,) that an eye needs at a detail, those first without which others are of no use.
@@ -294,11 +298,11 @@ class PageIndex:
         some = np.flatnonzero(detail < k * (1 + ROUNDING))
         wanted = np.maximum(detail[some], K_LEAST)
         if direction is not None:
-            wanted[~self.ahead(eye, direction)[some]] *= BEHIND
+            wanted[~self.ahead(eye, direction)[some]] *= BEHIND_FACTOR
         return some[np.lexsort((-self.parent_size[some], wanted))]
 
 
-class Standing:
+class ResidentTree:
     """Which splats of a tree, at N places in memory, a cut can tell apart where others may be missing.
 
     Children know their parent by its size and place, bit for bit. (Of several nodes of one size at one place
@@ -364,7 +368,7 @@ class Standing:
         return identities(*(self._columns[name][places] for name in (size, *axes)))
 
 
-def read_within(
+def read_budgeted(
     path: str | Path, budget: int, eye: np.ndarray | None = None, k: float = inf
 ) -> tuple[Bundle, int]:
     """The top of a tree as a smaller one, complete by itself; and how many splats the whole has.
@@ -390,7 +394,7 @@ def read_within(
     if not len(splats):
         raise LodgsError(*_too_few(budget, path))
     columns = splats.extras | dict(zip("xyz", splats.means.T, strict=True))
-    inner, reached = Standing(columns).update(np.arange(len(splats)))
+    inner, reached = ResidentTree(columns).update(np.arange(len(splats)))
     coarse, fine = splats.select(inner & reached), splats.select(~inner & reached)
     fine.extras[NODE_SIZE] = np.zeros(len(fine), np.float32)
     parts = zip((bundle.levels[0], bundle.levels[-1]), (coarse, fine), strict=True)
@@ -404,7 +408,7 @@ def _too_few(budget: int, path: str | Path) -> tuple[str, str]:
 
 
 @dataclass(frozen=True)
-class Update:
+class PageUpdate:
     """What comes in at once.
 
     Attributes:
@@ -449,7 +453,7 @@ class Pager:
         self.rows, self.sh_degree = slots * SIZE, first.sh_degree
         self.arrived, self.short, self.problem = 0, False, ""
         self._columns = {name: np.zeros(self.rows, np.float32) for name in (*COLUMNS, *"xyz")}
-        self._standing = Standing(self._columns)
+        self._standing = ResidentTree(self._columns)
         self._slot_of, self._page_in = np.full(len(self.file), -1), np.full(slots, -1)
         self._used, self._tick = np.zeros(len(self.file), np.int64), 0
         self._index: PageIndex | None = None
@@ -457,7 +461,7 @@ class Pager:
         self._done = self._asked
         self._settled = self._asked
         self._changed, self._stopping = threading.Condition(), False
-        self._ready: Update | None = None
+        self._ready: PageUpdate | None = None
         self._thread: threading.Thread | None = None
 
     @property
@@ -471,7 +475,9 @@ class Pager:
         with self._changed:
             return self._ready is None and (bool(self.problem) or self._settled is self._asked)
 
-    def step(self, eye: np.ndarray | None, k: float, direction: np.ndarray | None = None) -> Update | None:
+    def step(
+        self, eye: np.ndarray | None, k: float, direction: np.ndarray | None = None
+    ) -> PageUpdate | None:
         """The next pages for an eye: what the thread does again and again; None where there are no more.
 
         Args:
@@ -489,7 +495,7 @@ class Pager:
             self.short, order = len(order) > slots, order[:slots]
         self._tick += 1
         self._used[order] = self._tick
-        missing = order[self._slot_of[order] < 0][:AT_ONCE]
+        missing = order[self._slot_of[order] < 0][:PAGES_PER_UPDATE]
         if not len(missing):
             return None
         free = np.flatnonzero(self._page_in < 0)
@@ -512,7 +518,7 @@ class Pager:
         inner, reached = self._standing.update((begins[:, None] + np.arange(SIZE)).reshape(-1))
         # nodes that stand for all below them are leaves; what is not drawn is fine enough for nobody
         sizes = np.where(inner, self._columns[NODE_SIZE], np.float32(0))
-        return Update(pages, (sizes, np.where(reached, self._columns[PARENT_SIZE], np.float32(0))))
+        return PageUpdate(pages, (sizes, np.where(reached, self._columns[PARENT_SIZE], np.float32(0))))
 
     def start(self) -> None:
         """Begins to read in a thread: the first pages of the file, and then what is asked for."""
@@ -525,7 +531,7 @@ class Pager:
             self._asked = np.array(eye, np.float64), float(k), direction
             self._changed.notify_all()
 
-    def take(self) -> Update | None:
+    def take(self) -> PageUpdate | None:
         """What has come in, to be taken over before the next is asked for; None where there is nothing."""
         with self._changed:
             update, self._ready = self._ready, None

@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 
 from ...scenes.view_tables import VIEW_TABLES
-from ...splats.bundle import MAX_LEVELS, Bundle, Level
 from ...splats.gaussians import Splats
+from ...splats.levels import MAX_LEVELS, Bundle, Level
 from ..rules.bands import RULE as BANDS
 from ..rules.cut import (
     ABOVE_ROOT,
@@ -29,7 +29,7 @@ NODES, LEAVES = 1, 2
 """Numbers of the levels: the nodes above, and the leaves, which are the full scene."""
 THINNING = 4
 """How many times fewer splats a complete level has than the next finer one: half the detail of a surface."""
-FEWEST = 500
+MIN_SPLATS = 500
 """Levels of fewer splats are not worth a file."""
 
 
@@ -84,7 +84,7 @@ class Tree:
         of_leaves: np.ndarray | float = 0.0,
         larger: Callable[[np.ndarray, np.ndarray], np.ndarray] = lambda sizes, means: sizes,
     ) -> np.ndarray:
-        """(2N - 1,) float32, saturated: of leaves 0, of others at least :func:`size_of` and ``least_size``.
+        """(2N - 1,) float32, saturated: of leaves 0, of others at least :func:`splat_size` and ``least_size``.
 
         Args:
             means, log_scales: (2N - 1, 3) float32 of all nodes; of leaves log-scales are not looked at.
@@ -97,7 +97,7 @@ class Tree:
             below = self.children[layer - self.leaves]
             apart = means[below].astype(np.float64) - means[layer, None].astype(np.float64)
             least = least_size(sizes[below], np.sqrt(np.square(apart).sum(axis=2))).max(axis=1)
-            sizes[layer] = larger(rounded_up(np.maximum(least, size_of(log_scales[layer]))), means[layer])
+            sizes[layer] = larger(rounded_up(np.maximum(least, splat_size(log_scales[layer]))), means[layer])
         return sizes
 
     def columns(self, means: np.ndarray, sizes: np.ndarray) -> dict[str, np.ndarray]:
@@ -110,7 +110,7 @@ class Tree:
     def levels(self, splats: Splats) -> list[Level]:
         """All nodes, (2N - 1), as a bundle has them: those above, and the leaves, both from coarse to fine in
         the order in which ranges are of one place (``paging.streaming_order``)."""
-        sizes = Apart().sizes(self, splats.means, splats.log_scales)
+        sizes = UniqueSizes().sizes(self, splats.means, splats.log_scales)
         splats.extras |= self.columns(splats.means, sizes)
         levels = []
         for number, begin, end in ((NODES, self.leaves, len(self)), (LEAVES, 0, self.leaves)):
@@ -119,10 +119,10 @@ class Tree:
         return levels
 
 
-class Apart:
+class UniqueSizes:
     """Sizes of nodes, no two of which are the same at the same place.
 
-    By size and place children know their parent where a part of a tree is read (``paging.Standing``), and
+    By size and place children know their parent where a part of a tree is read (``paging.ResidentTree``), and
     equal splats make equal nodes. In memory are 8 bytes of each node.
     """
 
@@ -170,18 +170,18 @@ class Apart:
             self._taken.append(np.sort(keys))
 
 
-def size_of(log_scales: np.ndarray) -> np.ndarray:
+def splat_size(log_scales: np.ndarray) -> np.ndarray:
     """sqrt(s1 s2 + s1 s3 + s2 s3), (N,) float64, of log-scales (N, 3) (A LoD of Gaussians, Eq. 6)."""
-    return np.sqrt(area_of(log_scales))
+    return np.sqrt(splat_area(log_scales))
 
 
-def area_of(log_scales: np.ndarray) -> np.ndarray:
+def splat_area(log_scales: np.ndarray) -> np.ndarray:
     """s1 s2 + s1 s3 + s2 s3, (N,) float64: 1 / 2π of a Gaussian ellipsoid's mean shadow, times 3 if round."""
     a, b, c = np.exp(np.minimum(log_scales, 60).T.astype(np.float64))
     return a * b + a * c + b * c
 
 
-def treeless_columns(count: int) -> Mapping[str, np.ndarray]:
+def leaf_only_columns(count: int) -> Mapping[str, np.ndarray]:
     """Columns (N,) of leaves with nothing above them: every eye is shown all of them."""
     nothing = np.zeros(count, np.float32)
     above = np.full(count, ABOVE_ROOT, np.float32)
@@ -204,7 +204,7 @@ def complete_levels(bundle: Bundle) -> Bundle:
     counts = np.searchsorted(np.sort(own), sizes, "right") - np.searchsorted(np.sort(above), sizes, "right")
     cuts = [0.0]
     most = counts[0] // THINNING
-    while most >= FEWEST and len(cuts) < MAX_LEVELS:
+    while most >= MIN_SPLATS and len(cuts) < MAX_LEVELS:
         place = int(np.argmax(counts <= most))  # counts fall
         cuts.append(float(sizes[place]))
         most = counts[place] // THINNING

@@ -20,8 +20,8 @@ from ...optimize.schedules import due
 from ...optimize.training_data import TrainingView
 from ...rasterize import contributions
 from ...scenes.cameras import Camera
-from ...splats.bundle import Level
 from ...splats.gaussians import Splats
+from ...splats.levels import Level
 from ..threedgs import train as threedgs_train
 from . import ClodParameters
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from ...errors import LodgsError
 from ...optimize.method_info import MethodInfo
 from ...optimize.parameters import PAPER, STANDARD, DensityParameters, parameter
-from ...splats.bundle import MAX_LEVELS
+from ...splats.levels import MAX_LEVELS
 
 PAPER_FOOTPRINT = 40.0
 """Pixels that the paper's lambda, 0.2 COLMAP units, covers at the median depth of its scenes, about."""

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from ...lod.blocks import spatial_order
-from ...lod.rule import Values, facts_of
+from ...lod.rule import Values, collect_facts
 from ...lod.rules.bands import RULE
 from ...optimize.model import Model, splat_rates
 from ...optimize.pruning import least_importance, room_taken_over
@@ -26,7 +26,7 @@ from ...optimize.training_data import TrainingData
 from ...rasterize import Gaussians, contributions
 from ...rasterize.adam import LearningRate
 from ...scenes.cameras import Camera, pick_evenly
-from ...splats.bundle import Level
+from ...splats.levels import Level
 from . import FlodParameters
 
 LEVEL = "level"
@@ -181,7 +181,7 @@ def _weights(
     means: np.ndarray, number: int, s_min: Sequence[float], camera: Camera, values: Values
 ) -> np.ndarray:
     """The rule's weights (N,) of a level's splats."""
-    eye, facts = np.asarray(camera.center, np.float32), facts_of(RULE, {}, _facts(s_min), number)
+    eye, facts = np.asarray(camera.center, np.float32), collect_facts(RULE, {}, _facts(s_min), number)
     return RULE.weights(means, eye, camera.focal, {}, facts, values)
 
 

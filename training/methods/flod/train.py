@@ -12,7 +12,7 @@ import torch
 from scipy.spatial import KDTree
 
 from ...errors import LodgsError
-from ...lod.rule import Values, every_control
+from ...lod.rule import Values, all_controls
 from ...lod.rules.bands import s_min_of
 from ...optimize import method
 from ...optimize.density_control import constrained_log, densify, prune, reset_opacities
@@ -22,8 +22,8 @@ from ...optimize.model import Model, splat_rates
 from ...optimize.schedules import due, log_linear, shrink_at
 from ...optimize.training_data import TrainingView
 from ...rasterize import Gaussians
-from ...splats.bundle import Level
 from ...splats.gaussians import Splats
+from ...splats.levels import Level
 from . import PAPER_REACH, TOGETHER, FlodParameters, finish
 
 
@@ -92,7 +92,7 @@ class Method(method.Method[FlodParameters, Drawing]):
         if self.levels == 1:
             return {}
         pixels = self.s_min[-2] * self.data.focal / self.data.median_depth
-        value = max(min(pixels / PAPER_REACH, 1.0), every_control()["gamma"].low)
+        value = max(min(pixels / PAPER_REACH, 1.0), all_controls()["gamma"].low)
         return {"gamma": float(f"{value:.6g}")}  # as many digits as Blender keeps
 
     def meta(self) -> dict:

@@ -6,7 +6,7 @@ from itertools import pairwise
 from ...errors import LodgsError
 from ...optimize.method_info import MethodInfo
 from ...optimize.parameters import PAPER, STANDARD, parameter
-from ...splats.bundle import MAX_LEVELS
+from ...splats.levels import MAX_LEVELS
 from ..threedgs import ThreedgsParameters
 
 ROUNDS = (0.2, 0.6, 1.0)

@@ -12,7 +12,7 @@ import torch
 
 from ...errors import LodgsError
 from ...lod.blocks import Blocks, block_quantiles, spatial_order
-from ...lod.partial_read import BLOCKS, table_of_blocks
+from ...lod.partial_read import BLOCKS, block_table
 from ...lod.rules.chunks import RULE, TABLE, member_columns
 from ...optimize.density_control import require_rows
 from ...optimize.method import Drawing, Made
@@ -21,8 +21,8 @@ from ...optimize.pruning import least_importance, room_taken_over
 from ...optimize.training_data import TrainingView
 from ...rasterize import Gaussians, photometric_loss
 from ...scenes.cameras import pick_evenly
-from ...splats.bundle import Level
 from ...splats.gaussians import Splats
+from ...splats.levels import Level
 from ...splats.ply import Columns
 from ..threedgs.refining import Refining
 from . import ROUNDS, LodgeParameters, chunks
@@ -119,7 +119,7 @@ class Method(Refining):
         splats = {number: self._level(number).splats for number in sorted(self.sets)}
         return {
             TABLE: {"x": x, "y": y, "z": z, "radius": self.radii},
-            BLOCKS: table_of_blocks(RULE, splats),
+            BLOCKS: block_table(RULE, splats),
         }
 
     def meta(self) -> dict:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from ...errors import LodgsError
 from ...optimize.method_info import MethodInfo
 from ...optimize.parameters import AS_PUBLISHED, STANDARD, Parameters, parameter
-from ...splats.bundle import MAX_LEVELS
+from ...splats.levels import MAX_LEVELS
 
 
 @dataclass(frozen=True)

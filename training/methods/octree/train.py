@@ -23,8 +23,8 @@ from ...optimize.training_data import TrainingView
 from ...rasterize import contributions
 from ...rasterize.rendering import ALPHA_MIN
 from ...scenes.cameras import Camera
-from ...splats.bundle import Level
 from ...splats.gaussians import Splats
+from ...splats.levels import Level
 from . import OctreeParameters, growing
 
 MARGIN = "margin"

@@ -14,7 +14,7 @@ import numpy as np
 
 from ...errors import LodgsError
 from ...scenes.cameras import Camera, pick_evenly
-from ...splats.bundle import MAX_LEVELS
+from ...splats.levels import MAX_LEVELS
 
 POINTS, VIEWS = 50_000, 500
 """About so many points and views tell how far views see."""

@@ -27,8 +27,8 @@ from ...rasterize.adam import LearningRate
 from ...rasterize.rendering import ALPHA_MIN
 from ...scenes.cameras import Camera
 from ...splats import sh as harmonics
-from ...splats.bundle import Level
 from ...splats.gaussians import SH_C0, Splats
+from ...splats.levels import Level
 from ..octree import growing
 from . import NeuralOctreeParameters
 

@@ -15,8 +15,8 @@ from ...optimize.model import Model, splat_rates
 from ...optimize.schedules import due, log_linear, shrink_at
 from ...optimize.training_data import TrainingView
 from ...rasterize import contributions
-from ...splats.bundle import Level
 from ...splats.gaussians import Splats
+from ...splats.levels import Level
 from . import ThreedgsParameters
 
 WEIGHED_AT = (8 / 30, 16 / 30, 24 / 30)

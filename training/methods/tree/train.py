@@ -17,8 +17,8 @@ import numpy as np
 import torch
 
 from ...lod.partial_read import BLOCKS
-from ...lod.tree.forest import levels_of
-from ...lod.tree.shape import LEAVES, treeless_columns
+from ...lod.tree.forest import build_levels
+from ...lod.tree.shape import LEAVES, leaf_only_columns
 from ...optimize.initialize import from_splats
 from ...optimize.method import Drawing, Made
 from ...optimize.out_of_core.view_order import Walk
@@ -26,8 +26,8 @@ from ...optimize.schedules import due
 from ...optimize.training_data import TrainingView
 from ...rasterize import Gaussians, Rendering, records
 from ...rasterize.adam import LearningRate
-from ...splats.bundle import Level
 from ...splats.gaussians import SplatRows
+from ...splats.levels import Level
 from ...splats.ply import Columns
 from ..threedgs import train as threedgs_train
 from ..threedgs.refining import Refining
@@ -141,11 +141,11 @@ class Method(Refining):
         """The leaves as soon as they are there, for whoever waits; all nodes at the end."""
         if step + 1 == self.steps:
             assert self.store is not None
-            levels, self._table = levels_of(self.store, self.data.scratch)
+            levels, self._table = build_levels(self.store, self.data.scratch)
             return levels
         if step + 1 == self.finest_steps:
             splats = self.model.splats()
-            splats.extras |= treeless_columns(len(splats))
+            splats.extras |= leaf_only_columns(len(splats))
             return [Level(LEAVES, splats)]
         return []
 
@@ -153,7 +153,7 @@ class Method(Refining):
         """Which blocks of rows an eye needs, by which a part of the file can be read."""
         if self.store is None:
             return {}
-        return {BLOCKS: self._table or levels_of(self.store, self.data.scratch)[1]}
+        return {BLOCKS: self._table or build_levels(self.store, self.data.scratch)[1]}
 
     def controls(self) -> dict[str, float]:
         """Pictures begin with the granularity that was trained."""

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from training.lod.rule import rules
-from training.lod.selection import Choice, select_levels, settings
+from training.lod.selection import BundleSelector, resolve_controls, select_levels
 from training.lod.tree import paging
-from training.lod.tree.forest import divided, joined, levels_of, longest_of
-from training.lod.tree.paging import Pager, table_of_pages
+from training.lod.tree.forest import build_levels, max_subtree_leaves, merge_forest, split_tree
+from training.lod.tree.paging import Pager, page_table
 from training.lod.tree.shape import Tree
 from training.methods.tree.build import build
-from training.splats.bundle import Bundle, read_bundle, write_bundle
+from training.splats.bundle import read_bundle, write_bundle
+from training.splats.levels import Bundle
 
 from .test_shape import nodes
 from .trees import random_leaves, random_tree
@@ -40,7 +41,7 @@ def families(splats, tree):
 @pytest.mark.parametrize("longest", [1, 2, 9, 1000])
 def test_pieces_are_the_tree(leaves, longest):
     splats, tree = tagged(leaves, leaves)
-    forest = divided(splats, tree, longest)
+    forest = split_tree(splats, tree, longest)
     above, upper = forest.upper
     assert upper.leaves == len(forest.subtrees) and len(above) == upper.leaves - 1
     of_tree = families(splats, tree)
@@ -57,24 +58,24 @@ def test_pieces_are_the_tree(leaves, longest):
     parents = {child: parent for parent, pair in of_tree.items() for child in pair}
     for root in roots:  # none could be larger
         assert root == len(tree) - 1 or tree.leaves_below[parents[root]] > longest
-    whole, again = joined(forest)
+    whole, again = merge_forest(forest)
     assert families(whole, again) == of_tree and again.parents[-1] == -1
     assert sorted(whole.sh[: again.leaves, 0, 0]) == list(range(leaves))
-    assert divided(whole, again, longest).upper[1].children.tolist() == upper.children.tolist()
+    assert split_tree(whole, again, longest).upper[1].children.tolist() == upper.children.tolist()
 
 
 def test_upper_tree_and_lists_are_about_as_long():
-    assert [longest_of(leaves) for leaves in (1, 2, 5000, 5_000_000)] == [1, 1, 49, 1581]
+    assert [max_subtree_leaves(leaves) for leaves in (1, 2, 5000, 5_000_000)] == [1, 1, 49, 1581]
 
 
 @pytest.mark.parametrize(("leaves", "longest"), [(2, 1), (2, 2), (900, 1), (3000, 40), (900, 1000)])
 def test_a_file_of_pieces_is_to_the_byte_the_tree_s(tmp_path, leaves, longest):
     splats, tree = tagged(1, leaves)
-    forest = divided(splats, tree, longest)
-    levels, table = levels_of(forest, tmp_path)
+    forest = split_tree(splats, tree, longest)
+    levels, table = build_levels(forest, tmp_path)
     write_bundle(tmp_path / "pieces.ply", Bundle("tree", levels, "cut", tables={"blocks": table}))
-    expected = Tree.levels(*reversed(joined(forest)))
-    known = table_of_pages({level.number: level.splats.extras for level in expected})
+    expected = Tree.levels(*reversed(merge_forest(forest)))
+    known = page_table({level.number: level.splats.extras for level in expected})
     write_bundle(tmp_path / "whole.ply", Bundle("tree", expected, "cut", tables={"blocks": known}))
     assert (tmp_path / "pieces.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["pieces.ply", "whole.ply"]
@@ -83,12 +84,12 @@ def test_a_file_of_pieces_is_to_the_byte_the_tree_s(tmp_path, leaves, longest):
 def test_cuts_of_a_file_of_pieces_are_proper(tmp_path):
     """One node, traced back by its tag, on each path from a leaf to the root: sizes fit where pieces meet."""
     splats, tree = tagged(2, 400)
-    levels, _ = levels_of(divided(splats, tree, 7), tmp_path)
+    levels, _ = build_levels(split_tree(splats, tree, 7), tmp_path)
     write_bundle(tmp_path / "a.ply", Bundle("tree", levels, "cut"))
     bundle, drawn = read_bundle(tmp_path / "a.ply"), []
     for eye in (np.zeros(3), np.array([40.0, 3, 1]), np.array([3e3, 0, 0]), splats.means[7]):
         for pixels in (0.5, 4, 15, 60):
-            shown = select_levels(bundle, eye, 500.0, settings(bundle, {"pixels": pixels}))
+            shown = select_levels(bundle, eye, 500.0, resolve_controls(bundle, {"pixels": pixels}))
             seen = np.zeros(len(tree), bool)
             seen[np.concatenate([one.splats.sh[:, 0, 0] for one in shown]).astype(int)] = True
             for node in range(400):
@@ -113,7 +114,7 @@ def with_twins():
 
 def read_back(folder, forest):
     """A forest's levels, of the file a.ply."""
-    levels, table = levels_of(forest, folder)
+    levels, table = build_levels(forest, folder)
     write_bundle(folder / "a.ply", Bundle("tree", levels, "cut", tables={"blocks": table}))
     return read_bundle(folder / "a.ply").levels
 
@@ -122,9 +123,9 @@ def read_back(folder, forest):
 @pytest.mark.parametrize("longest", [40, 10**6])
 def test_equal_splats_stream_as_others_do(tmp_path, longest, budget, monkeypatch):
     """One of each leaf and the nodes above it is drawn while pages come in, in the end the whole's cut."""
-    monkeypatch.setattr(paging, "AT_ONCE", 2)
+    monkeypatch.setattr(paging, "PAGES_PER_UPDATE", 2)
     splats, tree = with_twins()
-    whole = Choice(Bundle("tree", read_back(tmp_path, divided(splats, tree, longest)), "cut"))
+    whole = BundleSelector(Bundle("tree", read_back(tmp_path, split_tree(splats, tree, longest)), "cut"))
     pager = Pager(tmp_path / "a.ply", budget)
     tags, means = np.zeros(pager.rows, int), np.zeros((pager.rows, 3), np.float32)
     columns = {name: np.zeros(pager.rows, np.float32) for name in CUT.columns}
@@ -154,7 +155,7 @@ def test_equal_splats_stream_as_others_do(tmp_path, longest, budget, monkeypatch
 
 def test_equal_splats_stay_as_they_are_and_sizes_fit(tmp_path):
     splats, tree = with_twins()
-    inner, leaves = (level.splats for level in read_back(tmp_path, divided(splats, tree, 40)))
+    inner, leaves = (level.splats for level in read_back(tmp_path, split_tree(splats, tree, 40)))
     of_leaves = np.argsort(leaves.sh[:, 0, 0])
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
         np.testing.assert_array_equal(getattr(leaves, name)[of_leaves], getattr(splats, name)[: tree.leaves])

@@ -14,11 +14,12 @@ from training.lod.blocks import SIZE
 from training.lod.partial_read import BLOCKS
 from training.lod.rule import rules
 from training.lod.rules.cut import ABOVE_ROOT
-from training.lod.selection import Choice, select
+from training.lod.selection import BundleSelector, select
 from training.lod.tree import paging
-from training.lod.tree.paging import Pager, Standing, TreeFile, read_within, streaming_order, table_of_pages
+from training.lod.tree.paging import Pager, ResidentTree, TreeFile, page_table, read_budgeted, streaming_order
 from training.scenes.cameras import Camera, look_at
-from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
+from training.splats.bundle import read_bundle, write_bundle
+from training.splats.levels import Bundle, Level
 
 CUT = rules()["cut"]
 FOCAL = 1000.0
@@ -29,7 +30,7 @@ class Truth:
     """A whole tree: its nodes by their places, which none shares, and which is above which."""
 
     def __init__(self, bundle):
-        self.bundle, self.choice = bundle, Choice(bundle)
+        self.bundle, self.choice = bundle, BundleSelector(bundle)
         splats = self.choice.splats
         self.node_at = {mean.tobytes(): node for node, mean in enumerate(splats.means)}
         assert len(self.node_at) == len(splats)
@@ -70,7 +71,7 @@ def path(request, truth, tmp_path):
         ordered = [level.splats.select(streaming_order(level.splats.extras)) for level in bundle.levels]
         bundle = replace(bundle, levels=[Level(1, ordered[0]), Level(2, ordered[1])])
     if request.param == "with a table":
-        tables = {BLOCKS: table_of_pages({level.number: level.splats.extras for level in bundle.levels})}
+        tables = {BLOCKS: page_table({level.number: level.splats.extras for level in bundle.levels})}
     file = tmp_path / f"{request.param}.ply"
     write_bundle(file, replace(bundle, tables=tables))
     return file
@@ -120,7 +121,7 @@ def test_with_room_for_all_it_is_the_whole_files_cut(truth, path):
 @pytest.mark.parametrize("budget", [SIZE, 5000, 20_000])
 def test_within_a_budget_cuts_are_complete_whatever_is_there(truth, path, budget, monkeypatch):
     """Also while pages come in, and from an eye that they are not for."""
-    monkeypatch.setattr(paging, "AT_ONCE", 3)
+    monkeypatch.setattr(paging, "PAGES_PER_UPDATE", 3)
     pager, equal = Pager(path, budget), 0
     memory = Memory(pager)
     assert pager.rows <= budget
@@ -190,11 +191,11 @@ def test_a_thread_that_fails_says_why(path, monkeypatch):
 
 @pytest.mark.parametrize("budget", [SIZE, 5000, 10**6])
 def test_the_top_of_a_tree_is_a_smaller_tree(truth, path, budget, tmp_path):
-    bundle, total = read_within(path, budget)
+    bundle, total = read_budgeted(path, budget)
     assert total == 2 * LEAVES - 1
     assert 0 < sum(len(level.splats) for level in bundle.levels) <= budget
     write_bundle(tmp_path / "small.ply", bundle)
-    choice = Choice(read_bundle(tmp_path / "small.ply"))
+    choice = BundleSelector(read_bundle(tmp_path / "small.ply"))
     for eye in EYES:
         for pixels in (1.0, 30.0):
             some = choice.weights(np.float32(eye), FOCAL, {"pixels": pixels}) > 0
@@ -210,7 +211,7 @@ def test_the_top_of_a_tree_is_a_smaller_tree(truth, path, budget, tmp_path):
 def test_what_one_eye_needs_is_read_for_it(truth, path):
     for eye in EYES[-2:]:
         k = FOCAL / 20
-        part, _ = read_within(path, 10**6, np.array(eye), k)
+        part, _ = read_budgeted(path, 10**6, np.array(eye), k)
         assert sum(len(level.splats) for level in part.levels) < 1.8 * LEAVES
         splats, _ = select(part, np.array(eye), FOCAL, {"pixels": 20.0})
         np.testing.assert_array_equal(np.sort(truth.nodes(splats.means)), truth.cut(eye, 20.0))
@@ -228,7 +229,7 @@ def test_nodes_stand_for_what_is_missing():
     columns["parent_size"][0] = ABOVE_ROOT
 
     def found(*rows):
-        here = Standing({name: column[list(rows)] for name, column in columns.items()})
+        here = ResidentTree({name: column[list(rows)] for name, column in columns.items()})
         return [np.array(rows)[each].tolist() for each in here.update(np.arange(len(rows)))]
 
     assert found(0, 1, 2, 3, 4, 5, 6) == [[0, 1, 3], [0, 1, 2, 3, 4, 5, 6]]
@@ -248,7 +249,7 @@ def test_what_stands_follows_whatever_comes_and_goes(truth):
     top = np.argsort(-splats.extras["parent_size"], kind="stable")[:600]  # of several ways few go far down
     whole = splats.extras | dict(zip("xyz", splats.means.T, strict=True))
     columns = {name: np.zeros(len(top), np.float32) for name in (*CUT.columns, *"xyz")}
-    holds, here, most = np.full(len(top), -1), Standing(columns), 0
+    holds, here, most = np.full(len(top), -1), ResidentTree(columns), 0
     for _ in range(60):
         places = rng.permutation(len(top))[: rng.integers(1, 200)]
         free = np.setdiff1d(top, np.delete(holds, places))
@@ -276,7 +277,7 @@ def test_what_stands_follows_whatever_comes_and_goes(truth):
 
 def test_a_table_of_pages_is_what_reading_finds(truth, tmp_path):
     bundle = truth.bundle
-    table = table_of_pages({level.number: level.splats.extras for level in bundle.levels})
+    table = page_table({level.number: level.splats.extras for level in bundle.levels})
     write_bundle(tmp_path / "a.ply", bundle)
     write_bundle(tmp_path / "b.ply", replace(bundle, tables={BLOCKS: table}))
     one, other = (TreeFile(tmp_path / name).index() for name in ("a.ply", "b.ply"))
@@ -304,13 +305,13 @@ def test_what_is_no_tree_or_has_no_room_is_a_sentence(truth, tmp_path):
     leaves = truth.bundle.levels[1].splats
     write_bundle(tmp_path / "a.ply", Bundle("flod", [Level(1, leaves, {"s_min": 0.0})], "bands"))
     write_bundle(tmp_path / "b.ply", truth.bundle)
-    for read in (TreeFile, lambda path: read_within(path, 10**5), lambda path: Pager(path, 10**5)):
+    for read in (TreeFile, lambda path: read_budgeted(path, 10**5), lambda path: Pager(path, 10**5)):
         with pytest.raises(LodgsError, match="is no tree of splats"):
             read(tmp_path / "a.ply")
-    for read, budget in ((read_within, 0), (Pager, 300)):
+    for read, budget in ((read_budgeted, 0), (Pager, 300)):
         with pytest.raises(LodgsError, match=f"{budget} splats are too few"):
             read(tmp_path / "b.ply", budget)
-    bundle, _ = read_within(tmp_path / "b.ply", 1)
+    bundle, _ = read_budgeted(tmp_path / "b.ply", 1)
     assert [len(level.splats) for level in bundle.levels] == [0, 1]
 
 
@@ -319,7 +320,7 @@ def test_the_cut_of_a_file_is_read_from_it(truth, path, pixels):
     """All of it; for a camera at least what it sees, and hardly more."""
     file, shares = TreeFile(path), []
     for eye in EYES:
-        choice = by_values.Choice("cut", eye, FOCAL, (), (("pixels", pixels),))
+        choice = by_values.LodQuery("cut", eye, FOCAL, (), (("pixels", pixels),))
         found = file.cut(choice)
         wanted = truth.cut(eye, pixels)
         drawn = truth.nodes(np.concatenate([splats.means for splats in found.values()]))

@@ -5,10 +5,12 @@ import pytest
 
 from training.lod.rule import rules
 from training.lod.rules.cut import ABOVE_ROOT, K_LEAST
-from training.lod.selection import select_levels, settings
-from training.lod.tree.shape import area_of, complete_levels, size_of, treeless_columns
-from training.splats.bundle import Bundle, Level, read_bundle, read_folder, write_bundle, write_folder
+from training.lod.selection import resolve_controls, select_levels
+from training.lod.tree.shape import complete_levels, leaf_only_columns, splat_area, splat_size
+from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
+from training.splats.level_folder import read_folder, write_folder
+from training.splats.levels import Bundle, Level
 
 from .trees import random_tree
 
@@ -24,8 +26,8 @@ def nodes(rng, count):
 
 
 def test_the_size_of_a_disc_is_its_radius():
-    assert size_of(np.log([[2.0, 2.0, 1e-9]])) == pytest.approx(2)
-    assert area_of(np.log([[1.0, 2.0, 3.0]])) == pytest.approx(2 + 3 + 6)
+    assert splat_size(np.log([[2.0, 2.0, 1e-9]])) == pytest.approx(2)
+    assert splat_area(np.log([[1.0, 2.0, 3.0]])) == pytest.approx(2 + 3 + 6)
 
 
 @pytest.mark.parametrize("leaves", [2, 3, 50, 400])
@@ -80,7 +82,7 @@ def test_levels_in_a_file_are_a_proper_cut_from_everywhere(tmp_path):
     drawn = []
     for eye in (np.zeros(3), np.array([40.0, 3, 1]), np.array([3e3, 0, 0]), splats.means[7]):
         for pixels in (0.5, 8, 60):
-            shown = select_levels(bundle, eye, 500.0, settings(bundle, {"pixels": pixels}))
+            shown = select_levels(bundle, eye, 500.0, resolve_controls(bundle, {"pixels": pixels}))
             found = np.concatenate([one.splats.sh[:, 0, 0] for one in shown]).astype(int)
             assert all(one.weights is None for one in shown)
             seen = np.zeros(len(tree), bool)
@@ -120,15 +122,17 @@ def test_levels_for_whoever_knows_no_trees_are_whole_scenes(tmp_path):
     write_folder(tmp_path, found)
     again = read_folder(tmp_path)
     assert (again.rule, again.controls) == ("bands", {"gamma": 2.0, "first": 1}) and again.meta == {"seed": 3}
-    near, far = (select_levels(again, np.full(3, away), 100.0, settings(again, {})) for away in (0.0, 1e6))
+    near, far = (
+        select_levels(again, np.full(3, away), 100.0, resolve_controls(again, {})) for away in (0.0, 1e6)
+    )
     assert [len(one.splats) for one in far] == [counts[0], 0, 0] and len(near[2].splats) > 0
 
 
 def test_leaves_without_a_tree_are_all_shown():
-    means, columns = np.zeros((5, 3), np.float32), treeless_columns(5)
+    means, columns = np.zeros((5, 3), np.float32), leaf_only_columns(5)
     assert rules()["cut"].weights(means, np.ones(3), 100.0, columns, {}, {"pixels": 16.0}).all()
     rng = np.random.default_rng(0)
     splats = nodes(rng, 5)
     splats.extras |= columns
     bundle = Bundle("tree", [Level(2, splats)], "cut")
-    assert len(select_levels(bundle, np.zeros(3), 10.0, settings(bundle, {}))[0].splats) == 5
+    assert len(select_levels(bundle, np.zeros(3), 10.0, resolve_controls(bundle, {}))[0].splats) == 5

@@ -7,10 +7,11 @@ import numpy as np
 from training.lod.blocks import spatial_order
 from training.lod.partial_read import BLOCKS
 from training.lod.rules.cut import ABOVE_ROOT, least_size
-from training.lod.tree.paging import streaming_order, table_of_pages
+from training.lod.tree.paging import page_table, streaming_order
 from training.lod.tree.shape import Tree
-from training.splats.bundle import Bundle, Level, write_bundle
+from training.splats.bundle import write_bundle
 from training.splats.gaussians import Splats
+from training.splats.levels import Bundle, Level
 
 
 def random_tree(rng: np.random.Generator, leaves: int) -> Tree:
@@ -97,5 +98,5 @@ def tree_of(leaves: Splats) -> Bundle:
 def write_in_pages(path, tree):
     """A tree as a file whose ranges are of one place, with the table that says of which."""
     levels = [Level(x.number, x.splats.select(streaming_order(x.splats.extras))) for x in tree.levels]
-    table = table_of_pages({level.number: level.splats.extras for level in levels})
+    table = page_table({level.number: level.splats.extras for level in levels})
     write_bundle(path, Bundle("tree", levels, "cut", tables={BLOCKS: table}))

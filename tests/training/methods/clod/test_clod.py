@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from training.errors import LodgsError
-from training.lod.rule import facts_of, rules
-from training.lod.selection import select, settings
+from training.lod.rule import collect_facts, rules
+from training.lod.selection import resolve_controls, select
 from training.methods import create, method_info
 from training.methods.clod.train import ClodDrawing
 from training.optimize.parameters import override
 from training.rasterize import contributions
-from training.splats.bundle import Bundle
+from training.splats.levels import Bundle
 
 
 def make(data, base=None, preset="draft", **values):
@@ -55,7 +55,7 @@ def test_training_draws_by_the_rule(data):
         falloff, _, shown = clod.attenuated(camera, s_v)
         opacity = clod.model["opacity_logits"].sigmoid()
         columns = {"sigma_d": clod.sigma.detach().numpy(), "opacity": opacity.detach().numpy()}
-        facts = facts_of(rule, clod.facts(), [(1, {})], 1)
+        facts = collect_facts(rule, clod.facts(), [(1, {})], 1)
         means = clod.model["means"].detach().numpy()
         values = {"s_v": s_v, "at_most": 0}
         wanted = rule.weights(means, camera.center, camera.focal, columns, facts, values)
@@ -145,13 +145,13 @@ def test_any_prefix_is_a_coarser_scene_and_counts_fall_with_the_scale(data):
     bundle, camera = bundle_of(clod, [level]), data.train[0]
     counts = []
     for s_v in (1.0, 2.0, 4.0):
-        chosen, weights = select(bundle, camera.center, camera.focal, settings(bundle, {"s_v": s_v}))
+        chosen, weights = select(bundle, camera.center, camera.focal, resolve_controls(bundle, {"s_v": s_v}))
         counts.append(len(chosen))
         assert weights is not None
     assert counts[0] > counts[1] > counts[2] > 0
     mean = np.zeros(len(level.splats))
     for view in data.train:
-        rule, facts = rules()["decay"], facts_of(rules()["decay"], clod.facts(), [(1, {})], 1)
+        rule, facts = rules()["decay"], collect_facts(rules()["decay"], clod.facts(), [(1, {})], 1)
         opacity = 1 / (1 + np.exp(-level.splats.opacity_logits))
         columns = {"sigma_d": level.splats.extras["sigma_d"], "opacity": opacity}
         values = {"s_v": 1.0, "at_most": 0}

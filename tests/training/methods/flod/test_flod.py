@@ -8,8 +8,8 @@ import torch
 
 from training.errors import LodgsError
 from training.lod.blocks import SIZE, spatial_order
-from training.lod.rule import every_control
-from training.lod.selection import select, settings
+from training.lod.rule import all_controls
+from training.lod.selection import resolve_controls, select
 from training.methods.flod import METHOD, finish
 from training.methods.flod.train import Method, apart
 from training.optimize.initialize import from_splats
@@ -18,7 +18,7 @@ from training.optimize.parameters import override
 from training.optimize.training_data import TrainingData
 from training.rasterize import Gaussians, contributions, rasterize
 from training.scenes.colmap import read_scene
-from training.splats.bundle import Bundle, Level
+from training.splats.levels import Bundle, Level
 
 
 def make(data, **values) -> Method:
@@ -64,7 +64,7 @@ def test_a_draft_is_chosen_at_two_fifths_of_a_pixel_and_the_paper_at_one(data):
 @pytest.mark.parametrize("s_min_1, expected", [(1e-9, 0.01), (1e9, 1)])
 def test_gamma_stays_possible_and_within_a_pixel(data, s_min_1, expected):
     assert make(data, s_min_1=s_min_1).controls() == {"gamma": expected}
-    assert every_control()["gamma"].checked(expected) == expected
+    assert all_controls()["gamma"].checked(expected) == expected
     assert make(data, levels=1, steps=[4]).controls() == {}
 
 
@@ -287,7 +287,7 @@ def test_views_by_distance_draw_at_most_a_share_of_the_finest_level(data, drawn)
     levels = finish.levels_of(flod.model, flod.s_min)
     bundle, by_distance, finest = Bundle("flod", levels, "bands"), 0, 0
     for camera in data.train:
-        values = settings(bundle, flod.controls())
+        values = resolve_controls(bundle, flod.controls())
         shown, _ = select(bundle, camera.center, camera.focal, values)
         by_distance += camera.sees(shown.means, data.near).sum()
         finest += camera.sees(handed[-1].splats.means, data.near).sum()

@@ -9,7 +9,7 @@ import torch
 
 from training.errors import LodgsError
 from training.lod.blocks import spatial_order
-from training.lod.selection import select, settings
+from training.lod.selection import resolve_controls, select
 from training.methods import create, method_info
 from training.methods.lodge import LodgeParameters
 from training.methods.lodge.composite import IndexedLevel, Stack, rows_seen, together
@@ -18,8 +18,9 @@ from training.methods.threedgs.train import WEIGHED_AT
 from training.optimize.parameters import override
 from training.rasterize import Gaussians, contributions, rasterize
 from training.scenes.cameras import Camera
-from training.splats.bundle import MAX_LEVELS, Bundle, Level, read_bundle, write_bundle
+from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
+from training.splats.levels import MAX_LEVELS, Bundle, Level
 
 
 def make(data, base=None, preset="draft", **values):
@@ -124,7 +125,7 @@ def test_training_draws_what_the_bundle_shows(data, base):
     drawn = {level.number: IndexedLevel.of(Gaussians.of(level.splats)) for level in reversed(levels)}
     for scale in (1.0, 1.4):
         splats, weights = select(
-            bundle, camera.center, camera.focal, settings(bundle, {"distance_scale": scale})
+            bundle, camera.center, camera.focal, resolve_controls(bundle, {"distance_scale": scale})
         )
         assert weights is None
         rows = rows_seen(drawn, lodge.d_l, camera, 0.01, scale)
@@ -212,7 +213,7 @@ def test_views_by_distance_draw_at_most_a_share_of_the_finest_level(data, base, 
     bundle = Bundle("lodge", sorted(trained(lodge), key=lambda level: level.number), "chunks")
     by_distance = finest = 0
     for camera in data.train:
-        shown, _ = select(bundle, camera.center, camera.focal, settings(bundle, {}))
+        shown, _ = select(bundle, camera.center, camera.focal, resolve_controls(bundle, {}))
         by_distance += camera.sees(shown.means, data.near).sum()
         finest += camera.sees(base.means, data.near).sum()
     assert 0.8 * drawn < by_distance / finest <= drawn * 1.001

@@ -5,10 +5,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from training.lod.selection import select_levels, settings
-from training.lod.tree.forest import joined, levels_of
+from training.lod.selection import resolve_controls, select_levels
+from training.lod.tree.forest import build_levels, merge_forest
 from training.methods.tree.build import GrowingForest, _cells
-from training.splats.bundle import Bundle, open_ply, read_bundle, write_bundle
+from training.splats.bundle import read_bundle, write_bundle
+from training.splats.file_rows import open_ply
+from training.splats.levels import Bundle
 from training.splats.ply import write_ply
 
 from .test_build import below, covariances, scene
@@ -36,14 +38,14 @@ def test_cells_are_boxes_of_space_with_few_enough():
 def test_every_node_stands_for_its_leaves(cell):
     leaves = scene(600)
     forest = GrowingForest(leaves, longest=8, cell=cell)
-    nodes, tree = joined(forest)
+    nodes, tree = merge_forest(forest)
     assert len(nodes) == len(tree) == 1199 and tree.leaves == 600
     assert sorted(below(tree, len(tree) - 1)) == list(range(600))
     order = np.lexsort(nodes.means[:600].T)
     expected = leaves.select(np.lexsort(leaves.means.T))
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):  # leaves are untouched
         np.testing.assert_array_equal(getattr(nodes, name)[:600][order], getattr(expected, name))
-    one, _ = joined(GrowingForest(leaves))
+    one, _ = merge_forest(GrowingForest(leaves))
     np.testing.assert_allclose(nodes.means[-1], one.means[-1], atol=1e-4)  # the root's, of all leaves
     np.testing.assert_allclose(covariances(nodes)[-1], covariances(one)[-1], rtol=1e-3)
     np.testing.assert_allclose(nodes.sh[-1], one.sh[-1], atol=1e-4)
@@ -70,7 +72,7 @@ def test_cells_leave_no_seam():
     leaves = scene(30_000)
 
     def found(cell):
-        nodes, tree = joined(GrowingForest(leaves, cell=cell))
+        nodes, tree = merge_forest(GrowingForest(leaves, cell=cell))
         rows = np.concatenate([nodes.means, nodes.log_scales], axis=1)[tree.leaves :]
         return {
             row.tobytes(): int(count)
@@ -84,7 +86,7 @@ def test_cells_leave_no_seam():
 
 def test_levels_of_what_grows_are_all_nodes(tmp_path):
     leaves = scene(3000)
-    levels, table = levels_of(GrowingForest(leaves, cell=500), tmp_path)
+    levels, table = build_levels(GrowingForest(leaves, cell=500), tmp_path)
     assert [len(level.rows) for level in levels] == [2999, 3000] and table["level"].tolist() == [1] * 6 + [
         2
     ] * 6
@@ -96,10 +98,10 @@ def test_levels_of_what_grows_are_all_nodes(tmp_path):
 def test_cuts_of_what_grew_in_cells_are_proper(tmp_path, cell, longest):
     """One node on each path from a leaf to the root, for any eye: sizes fit where cells and pieces meet."""
     leaves = scene(500)
-    levels, _ = levels_of(GrowingForest(leaves, longest=longest, cell=cell), tmp_path)
+    levels, _ = build_levels(GrowingForest(leaves, longest=longest, cell=cell), tmp_path)
     write_bundle(tmp_path / "a.ply", Bundle("tree", levels, "cut"))
     bundle, drawn = read_bundle(tmp_path / "a.ply"), []
-    nodes, tree = joined(GrowingForest(leaves, longest=longest, cell=cell))
+    nodes, tree = merge_forest(GrowingForest(leaves, longest=longest, cell=cell))
 
     def keys(splats):
         return [row.tobytes() for row in np.concatenate([splats.means, splats.quats, splats.log_scales], 1)]
@@ -109,7 +111,7 @@ def test_cuts_of_what_grew_in_cells_are_proper(tmp_path, cell, longest):
     for eye in (np.zeros(3), np.array([30.0, 3, 1]), np.array([900.0, 0, 0]), nodes.means[7]):
         for pixels in (0.5, 4, 15):
             seen = np.zeros(len(tree), bool)
-            for one in select_levels(bundle, eye, 500.0, settings(bundle, {"pixels": pixels})):
+            for one in select_levels(bundle, eye, 500.0, resolve_controls(bundle, {"pixels": pixels})):
                 seen[[number[key] for key in keys(one.splats)]] = True
             above = np.zeros(len(tree), int)  # how many of a node and those above it are drawn
             above[-1] = seen[-1]

@@ -9,16 +9,16 @@ import torch
 
 from tests.training.lod.tree.trees import surfaces
 from training.lod.rules.cut import least_size
-from training.lod.selection import Choice, settings
-from training.lod.tree.forest import joined
-from training.lod.tree.shape import size_of
+from training.lod.selection import BundleSelector, resolve_controls
+from training.lod.tree.forest import merge_forest
+from training.lod.tree.shape import splat_size
 from training.methods import create, method_info
 from training.methods.tree.store import layout_of
 from training.optimize.out_of_core.cut_cache import BESIDE
 from training.optimize.parameters import override
 from training.rasterize import Gaussians, rasterize
-from training.splats.bundle import Bundle
 from training.splats.gaussians import Splats
+from training.splats.levels import Bundle
 
 
 def make(data, base=None, preset="draft", **values):
@@ -75,9 +75,13 @@ def test_leaves_come_first_and_all_nodes_last(data):
     assert tree.steps == tree.parameters.total_steps == 12 + 1 + 8 and tree.levels == 2
     first, above, leaves = trained(tree)
     assert [level.number for level in (first, above, leaves)] == [2, 1, 2]
-    assert len(first.splats) == len(leaves.splats) == len(above.splats) + 1 == joined(tree.store)[1].leaves
+    assert (
+        len(first.splats) == len(leaves.splats) == len(above.splats) + 1 == merge_forest(tree.store)[1].leaves
+    )
     camera = data.train[0]  # until there is a tree everything is shown
-    weights = Choice(Bundle("tree", [first], "cut")).weights(camera.center, camera.focal, {"pixels": 16.0})
+    weights = BundleSelector(Bundle("tree", [first], "cut")).weights(
+        camera.center, camera.focal, {"pixels": 16.0}
+    )
     assert weights.all()
 
 
@@ -143,10 +147,10 @@ def test_leaves_come_to_rest(data, base):
 def test_sizes_are_saturated_after_training(data, base):
     tree = make(data, base, lr_scales=0.5, lr_means_final=0.05)  # which moves nodes far
     levels = trained(tree)
-    splats, nodes = joined(tree.store)
+    splats, nodes = merge_forest(tree.store)
     sizes = nodes.sizes(splats.means, splats.log_scales)
     for node in range(nodes.leaves, len(nodes)):
-        assert sizes[node] >= size_of(splats.log_scales[node : node + 1])[0]
+        assert sizes[node] >= splat_size(splats.log_scales[node : node + 1])[0]
         for child in nodes.children[node - nodes.leaves]:
             away = np.linalg.norm(splats.means[child].astype(float) - splats.means[node].astype(float))
             assert float(sizes[node]) >= least_size(np.array(float(sizes[child])), np.array(away))
@@ -174,13 +178,15 @@ def test_a_step_moves_the_cut_of_its_view_alone(data, base):
 def test_training_draws_what_the_bundle_shows(data, base):
     tree = make(data, base, tune_steps=0)
     bundle = Bundle("tree", trained(tree), "cut")
-    choice = Choice(bundle)
+    choice = BundleSelector(bundle)
     for pixels in (0.5, 3.0, 11.0):
         for camera in data.train[:3]:
             rows = shown(tree, camera, pixels)
             gaussians = tree.store.gaussians_at(tree.store.take(camera, pixels, data.near))
             one = tree.rasterize_model(camera, 0, gaussians=gaussians).image
-            weights = choice.weights(camera.center, camera.focal, settings(bundle, {"pixels": pixels}))
+            weights = choice.weights(
+                camera.center, camera.focal, resolve_controls(bundle, {"pixels": pixels})
+            )
             gaussians = Gaussians.of(choice.splats)
             own, reference = (
                 rasterize(
@@ -210,7 +216,7 @@ def test_a_bundle_tells_which_blocks_an_eye_needs(data, base):
 def test_pictures_begin_with_the_granularity_that_was_trained(data, base):
     tree = make(data, base, tune_steps=0, pixels=3.0)
     bundle = Bundle("tree", trained(tree), "cut", controls=tree.controls())
-    assert settings(bundle, {})["pixels"] == 3
+    assert resolve_controls(bundle, {})["pixels"] == 3
 
 
 def test_noise_is_coarser_most_at_its_end(data, base):

@@ -1,4 +1,4 @@
-"""Blocks: what a plan asks of them, how they are put together, and whatever befalls them on the way."""
+"""Blocks: planning, merging, failures of workers, and whole runs."""
 
 import itertools
 import json
@@ -33,19 +33,20 @@ from training.runs.job import POLISH_STEPS, Job
 from training.scenes.cameras import Camera
 from training.scenes.colmap import Scene
 from training.scenes.regions import Region
-from training.splats.bundle import Bundle, Level, read_bundle, write_bundle
+from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
+from training.splats.levels import Bundle, Level
 
 ROOT = Path(__file__).resolve().parents[4]
 FEW = {"max_splats": 200, "random_background": False}
 TINY = {"steps": 45, "densify_interval": 10, "grad_threshold": 1e-5, **FEW}
 
 
-def job_for(scene, out, method="3dgs", **further) -> Job:
-    parameters = further.pop("parameters", TINY)
+def job_for(scene, out, method="3dgs", **keys) -> Job:
+    parameters = keys.pop("parameters", TINY)
     return Job.from_dict({
         "scene": str(scene), "out": str(out), "method": method, "image_scale": 1.0, "test_every": 4,
-        "cells": "2x1", "parameters": parameters, **further,
+        "cells": "2x1", "parameters": parameters, **keys,
     })  # fmt: skip
 
 
@@ -55,69 +56,71 @@ def planned(job: Job) -> list[Block]:
     return write_plan(job.resolved(), folder).blocks
 
 
-# -- a plan ------------------------------------------------------------------------------------------------
+# -- planning ---------------------------------------------------------------------------------------------
 
 
-def test_each_view_is_seen_as_often_as_in_the_whole(tiny_scene, tmp_path):
+def test_steps_and_splats_of_blocks_are_proportional_to_views_and_points(tiny_scene, tmp_path):
     job = job_for(tiny_scene, tmp_path / "run", parameters={**TINY, "steps": 600, "max_splats": 1000})
-    whole = training_data(replace(job, cells=""), RunFolder(tmp_path))
+    undivided = training_data(replace(job, cells=""), RunFolder(tmp_path))
     for block in planned(job):
         data, p = training_data(block.job, block.folder), block.job.resolved_parameters()
-        assert p.steps / len(data.train) == pytest.approx(600 / len(whole.train), abs=0.5)
-        assert p.max_splats == pytest.approx(1000 * len(data.scene.points) / len(whole.scene.points), abs=0.5)
+        assert p.steps / len(data.train) == pytest.approx(600 / len(undivided.train), abs=0.5)
+        assert p.max_splats == pytest.approx(
+            1000 * len(data.scene.points) / len(undivided.scene.points), abs=0.5
+        )
         assert block.job.method == "3dgs" and block.job.cells == ""
 
 
 @pytest.mark.parametrize("method", ["flod", "octree", "clod", "3dgs", "lodge", "tree"])
-def test_all_have_the_units_of_the_whole_and_hold_out_its_views(tiny_scene, tmp_path, method):
+def test_blocks_have_the_units_and_held_out_views_of_the_full_scene(tiny_scene, tmp_path, method):
     job = job_for(tiny_scene, tmp_path / "run", method, parameters={})
-    whole = training_data(replace(job, cells=""), RunFolder(tmp_path))
+    undivided = training_data(replace(job, cells=""), RunFolder(tmp_path))
     blocks = planned(job)
-    seen = set()
+    trained = set()
     for block in blocks:
         data = training_data(block.job, block.folder)
         for name in ("extent", "median_depth", "near", "focal", "threshold_scale"):
-            assert getattr(data, name) == getattr(whole, name)
-        np.testing.assert_array_equal(data.mean_camera, whole.mean_camera)
-        held_out = {camera.name for camera in whole.test}
+            assert getattr(data, name) == getattr(undivided, name)
+        np.testing.assert_array_equal(data.mean_camera, undivided.mean_camera)
+        held_out = {camera.name for camera in undivided.test}
         assert {camera.name for camera in data.test} == held_out & set(block.region.views)
         assert not {camera.name for camera in data.train} & held_out
-        seen |= {camera.name for camera in data.train}
-        assert 0 < len(data.scene.points) <= len(whole.scene.points)
-    assert seen == {camera.name for camera in whole.train}
+        trained |= {camera.name for camera in data.train}
+        assert 0 < len(data.scene.points) <= len(undivided.scene.points)
+    assert trained == {camera.name for camera in undivided.train}
     assert {block.job.method for block in blocks} == {METHODS[method].in_cells}
 
 
-def test_a_photograph_that_is_spoilt_shifts_no_held_out_views(tiny_scene, tmp_path):
-    """Left out where they are decoded, it would be counted there and not where the whole is measured."""
+def test_corrupt_photo_does_not_change_the_held_out_views(tiny_scene, tmp_path):
+    """Blocks decode photos, the plan does not; both must count the same views."""
     scene = tmp_path / "scene"
     shutil.copytree(tiny_scene, scene)
-    photograph = scene / "images" / "01.jpg"
-    data = photograph.read_bytes()
-    table = data.index(b"\xff\xc4") + 5  # a Huffman table: its size and its end can be read, no pixels
-    photograph.write_bytes(data[:table] + b"\xff" * 16 + data[table + 16 :])
+    photo = scene / "images" / "01.jpg"
+    data = photo.read_bytes()
+    table = data.index(b"\xff\xc4") + 5  # Huffman table: size and end stay readable, pixels do not
+    photo.write_bytes(data[:table] + b"\xff" * 16 + data[table + 16 :])
     job = job_for(scene, tmp_path / "run")
-    blocks, whole = planned(job), training_data(job, RunFolder(tmp_path))
-    held_out = {camera.name for camera in whole.test}
+    blocks = planned(job)
+    held_out = {camera.name for camera in training_data(job, RunFolder(tmp_path)).test}
     assert held_out == {"00.jpg", "04.jpg", "08.jpg"}
     trained = {camera.name for block in blocks for camera in training_data(block.job, block.folder).train}
     assert not trained & {*held_out, "01.jpg"} and len(trained) == 5
 
 
-def test_a_plan_that_cannot_be_leaves_the_folder_free(tiny_scene, tmp_path, capsys):
+def test_invalid_plan_writes_nothing(tiny_scene, tmp_path, capsys):
     out = tmp_path / "run"
     command = f"blocks plan {tiny_scene} --method 3dgs --out {out}".split()
     assert main(command) == 2
-    assert "how many cells" in capsys.readouterr().err
+    assert "cells" in capsys.readouterr().err
     assert main([*command, "--cells", "5x1"]) == 2
     assert "too few" in capsys.readouterr().err
     assert main([*command, "--cells", "2x1"]) == 0
     assert "blocks run" in capsys.readouterr().out
-    assert main([*command, "--cells", "1x2"]) == 2, "it is another plan's now"
+    assert main([*command, "--cells", "1x2"]) == 2, "the folder belongs to another plan"
     assert "belongs to another job" in capsys.readouterr().err
 
 
-def test_blocks_of_a_plan_are_relative_to_it(tiny_scene, tmp_path):
+def test_plan_can_be_moved(tiny_scene, tmp_path):
     planned(job_for(tiny_scene, tmp_path / "run", "flod", test_every=0, parameters={}))
     (tmp_path / "run").rename(tmp_path / "moved")
     division = read_plan(RunFolder(tmp_path / "moved"))
@@ -125,23 +128,23 @@ def test_blocks_of_a_plan_are_relative_to_it(tiny_scene, tmp_path):
     for block in division.blocks + division.seams:
         assert Path(block.job.region) == block.folder.path / "region.json"
         assert Path(block.job.out) == block.folder.path
-        lies = division.coarse.folder.path if block.kind == "block" else block.folder.base
-        assert Path(block.job.base) == lies
+        base = division.coarse.folder.path if block.kind == "block" else block.folder.base
+        assert Path(block.job.base) == base
 
 
-def test_a_plan_tells_ahead_what_its_blocks_then_take(tiny_scene, tmp_path):
+def test_plan_predicts_the_cost_of_blocks(tiny_scene, tmp_path):
     job = job_for(tiny_scene, tmp_path / "run", "flod", parameters={}).resolved()
-    told = plan(job)
-    assert not (tmp_path / "run").exists(), "nothing is written"
-    for each, block in zip(told, planned(job), strict=True):
+    cells = plan(job)
+    assert not (tmp_path / "run").exists(), "planning writes nothing"
+    for cell, block in zip(cells, planned(job), strict=True):
         data, p = training_data(block.job, block.folder), block.job.resolved_parameters()
-        assert (each.number, each.region.views) == (block.number, block.region.views)
-        assert (each.views, each.points) == (len(data.train), len(data.scene.points))
-        assert (each.steps, each.splats) == (p.total_steps, p.max_splats)
-        assert each.memory > 1000 * each.splats
+        assert (cell.number, cell.region.views) == (block.number, block.region.views)
+        assert (cell.views, cell.points) == (len(data.train), len(data.scene.points))
+        assert (cell.steps, cell.splats) == (p.total_steps, p.max_splats)
+        assert cell.memory > 1000 * cell.splats
 
 
-def test_coarse_levels_and_blocks_make_the_steps_and_levels_of_all(tiny_scene, tmp_path):
+def test_coarse_part_and_blocks_share_the_levels(tiny_scene, tmp_path):
     job = job_for(tiny_scene, tmp_path / "run", "flod", parameters={})
     planned(job)
     division = read_plan(RunFolder(job.out))
@@ -158,41 +161,41 @@ def test_coarse_levels_and_blocks_make_the_steps_and_levels_of_all(tiny_scene, t
             coarse.sh_degree,
         )
         assert block.job.base == str(division.coarse.folder.path)
-    few = job_for(tiny_scene, tmp_path / "few", "flod", parameters={"levels": 2})
-    planned(few)
-    division = read_plan(RunFolder(few.out))
+    shallow = job_for(tiny_scene, tmp_path / "few", "flod", parameters={"levels": 2})
+    planned(shallow)
+    division = read_plan(RunFolder(shallow.out))
     assert division.coarse is None and division.blocks[0].job.base == ""
 
 
-def test_seams_are_planned_where_views_stand_at_borders_and_rules_allow_it(tiny_scene, tmp_path):
-    def seams(name, **further):
-        job = job_for(tiny_scene, tmp_path / name, test_every=0, parameters={}, **further)
+def test_seams_need_polish_steps_and_a_rule_without_weights(tiny_scene, tmp_path):
+    def seams(name, **keys):
+        job = job_for(tiny_scene, tmp_path / name, test_every=0, parameters={}, **keys)
         planned(job)
         return read_plan(RunFolder(job.out)).seams
 
-    found = seams("one")
-    assert found and all(seam.job.parameters["steps"] == POLISH_STEPS for seam in found)
-    assert all(seam.region.seam and seam.job.base == str(seam.folder.base) for seam in found)
+    planned_seams = seams("one")
+    assert planned_seams and all(seam.job.parameters["steps"] == POLISH_STEPS for seam in planned_seams)
+    assert all(seam.region.seam and seam.job.base == str(seam.folder.base) for seam in planned_seams)
     assert not seams("none", polish=0) and not seams("clod", method="clod")
 
 
-def test_as_few_cells_as_keep_to_what_a_block_may_have(tmp_path):
-    """Views and points in a square of 60 by 40; views look down, so that each sees what is around it."""
+def test_choose_cells_returns_the_smallest_grid_within_limits(tmp_path):
+    """Points in a rectangle of 60 by 40, with cameras above that look down."""
     job = Job.from_dict(
         {"scene": str(tmp_path), "out": str(tmp_path / "run"), "parameters": {"max_splats": 900}}
     )
     scene = street_map(tmp_path)
     sizes = {}
     for cells in ("1x1", "2x1", "2x2"):
-        sizes[cells] = max(each.splats for each in plan(job.with_cells(cells), scene))
+        sizes[cells] = max(cell.splats for cell in plan(job.with_cells(cells), scene))
     assert sizes["1x1"] == 900 and sizes["2x2"] < sizes["2x1"] < 900
-    for cells, most in sizes.items():
-        assert choose_cells(job, splats=most, scene=scene) == cells
-    more = choose_cells(job, splats=sizes["2x2"] // 2, scene=scene)
-    assert max(each.splats for each in plan(job.with_cells(more), scene)) <= sizes["2x2"] // 2
-    assert Job("s", "o", cells=more).grid > (2, 2)
+    for cells, limit in sizes.items():
+        assert choose_cells(job, splats=limit, scene=scene) == cells
+    finer = choose_cells(job, splats=sizes["2x2"] // 2, scene=scene)
+    assert max(cell.splats for cell in plan(job.with_cells(finer), scene)) <= sizes["2x2"] // 2
+    assert Job("s", "o", cells=finer).grid > (2, 2)
     assert choose_cells(job, memory=10**12, scene=scene) == "1x1"
-    with pytest.raises(LodgsError, match=r"still has|too few|too little"):
+    with pytest.raises(LodgsError, match=r"too large|too few|too small"):
         choose_cells(job, splats=3, scene=scene)
 
 
@@ -202,40 +205,41 @@ def street_map(folder: Path) -> Scene:
     for x in range(0, 60, 4):
         for y in range(0, 40, 4):
             pose = np.eye(4)
-            turned = down * [[-1], [-1], [1]] if x % 8 else down  # there and back, as drones fly
-            pose[:3, :3], pose[:3, 3] = turned, -turned @ (x, y, 3)
+            rotation = down * [[-1], [-1], [1]] if x % 8 else down  # alternating flight directions
+            pose[:3, :3] = rotation
+            pose[:3, 3] = -rotation @ (x, y, 3)
             cameras.append(Camera(f"{x:02}-{y:02}", 64, 48, 40.0, 40.0, 32.0, 24.0, pose))
     points = np.random.default_rng(0).uniform((0, 0, 0), (60, 40, 1), (3000, 3)).astype(np.float32)
     return Scene(folder, folder, folder, cameras, points, np.zeros((3000, 3), np.uint8))
 
 
-def test_parts_have_names(tiny_scene, tmp_path):
+def test_parts_are_found_by_name(tiny_scene, tmp_path):
     job = job_for(tiny_scene, tmp_path / "run", test_every=0)
     planned(job)
     division = read_plan(RunFolder(job.out))
     assert division.part("block-2") == division.blocks[1] and division.part("coarse") is None
     assert division.part("seam-1") == division.seams[0]
     for name in ("", "block", "block-3", "block-0", "seam-", "coarse-1", "merge", "2"):
-        with pytest.raises(LodgsError, match="There is no part"):
+        with pytest.raises(LodgsError, match="Unknown part"):
             division.part(name)
-    assert main(["blocks", "run", job.out, "--only", "coarse"]) == 0, "a part that is not needed is done"
-    assert main(["blocks", "run", job.out, "--only", "seam-1"]) == 2, "its blocks are not finished"
+    assert main(["blocks", "run", job.out, "--only", "coarse"]) == 0, "an unneeded part counts as finished"
+    assert main(["blocks", "run", job.out, "--only", "seam-1"]) == 2, "its blocks are unfinished"
 
 
-def test_levels_to_go_on_from_have_to_be_said(tiny_scene, tmp_path):
+def test_continuing_levels_requires_a_base(tiny_scene, tmp_path):
     keys = {"scene": str(tiny_scene), "out": str(tmp_path / "run"), "method": "flod"}
-    with pytest.raises(LodgsError, match="which levels to go on from"):
+    with pytest.raises(LodgsError, match="has no base"):
         Job.from_dict({**keys, "parameters": {"first_level": 2}})
-    with pytest.raises(LodgsError, match="cannot begin with the splats"):
+    with pytest.raises(LodgsError, match="cannot start from a base"):
         Job.from_dict({**keys, "base": "base.ply"})
     assert Job.from_dict({**keys, "base": "base.ply", "parameters": {"first_level": 2}}).base
 
 
-def test_what_cannot_be_is_refused_in_a_sentence(tiny_scene, tmp_path):
+def test_invalid_cells_are_rejected(tiny_scene, tmp_path):
     for cells in ("0x2", "2", "axb", "1000x1000", "-1x2", "2x2x2"):
         with pytest.raises(LodgsError, match="cells"):
             job_for(tiny_scene, tmp_path / "run", cells=cells)
-    with pytest.raises(LodgsError, match="cells one by one"):
+    with pytest.raises(LodgsError, match="cannot train a scene in cells"):
         job_for(tiny_scene, tmp_path / "run", "octree_neural", parameters={})
     with pytest.raises(LodgsError, match="both 'cells' and 'region'"):
         job_for(tiny_scene, tmp_path / "run", region="region.json")
@@ -244,15 +248,15 @@ def test_what_cannot_be_is_refused_in_a_sentence(tiny_scene, tmp_path):
     assert not (tmp_path / "run" / "blocks").exists()
 
 
-# -- put together ------------------------------------------------------------------------------------------
+# -- merging ---------------------------------------------------------------------------------------
 
 
-def finished(folder: Path, number: int, cell, splats: list[Splats], **further) -> Block:
-    """A block with a bundle of these levels."""
+def finished(folder: Path, number: int, cell, splats: list[Splats], **header) -> Block:
+    """Return a finished block whose bundle has these levels."""
     run = RunFolder(folder / str(number))
     run.create()
-    levels = [Level(i, each, {"s_min": 1.0 / i}) for i, each in enumerate(splats, 1)]
-    write_bundle(run.bundle, Bundle(**({"method": "flod", "rule": "bands"} | further), levels=levels))
+    levels = [Level(i, level, {"s_min": 1.0 / i}) for i, level in enumerate(splats, 1)]
+    write_bundle(run.bundle, Bundle(**({"method": "flod", "rule": "bands"} | header), levels=levels))
     inside = np.array([cell, [-np.inf, np.inf]])
     return Block(number, run, Region(np.eye(3), inside, inside, ("a",)))
 
@@ -265,7 +269,7 @@ def random_splats(rng, count) -> Splats:
     )  # fmt: skip
 
 
-def test_every_splat_of_its_own_cell_is_there_once_and_no_other(tmp_path, monkeypatch):
+def test_merged_bundle_has_each_blocks_splats_inside_its_cell(tmp_path, monkeypatch):
     from training.runs.blocks import merge as merge_module
 
     monkeypatch.setattr(merge_module, "BATCH_ROWS", 7)
@@ -273,38 +277,39 @@ def test_every_splat_of_its_own_cell_is_there_once_and_no_other(tmp_path, monkey
     sets = [[random_splats(rng, n) for n in (20, 50)] for _ in range(3)]
     cells = [(-np.inf, -0.3), (-0.3, 0.4), (0.4, np.inf)]
     blocks = [
-        finished(tmp_path, i, cell, its) for i, (cell, its) in enumerate(zip(cells, sets, strict=True), 1)
+        finished(tmp_path, i, cell, levels)
+        for i, (cell, levels) in enumerate(zip(cells, sets, strict=True), 1)
     ]
-    kept = merge(Division(None, blocks, []), tmp_path / "whole.ply")
-    made = read_bundle(tmp_path / "whole.ply")
-    assert [level.facts for level in made.levels] == [{"s_min": 1.0}, {"s_min": 0.5}]
-    assert sum(own for own, _ in kept) == sum(len(level.splats) for level in made.levels)
-    assert [all_ for _, all_ in kept] == [70, 70, 70]
-    for number, level in enumerate(made.levels):
-        wanted = Splats.concatenated([
-            its[number].select((its[number].means[:, 0] >= low) & (its[number].means[:, 0] < high))
-            for (low, high), its in zip(cells, sets, strict=True)
+    counts = merge(Division(None, blocks, []), tmp_path / "merged.ply")
+    merged = read_bundle(tmp_path / "merged.ply")
+    assert [level.facts for level in merged.levels] == [{"s_min": 1.0}, {"s_min": 0.5}]
+    assert sum(inside for inside, _ in counts) == sum(len(level.splats) for level in merged.levels)
+    assert [total for _, total in counts] == [70, 70, 70]
+    for number, level in enumerate(merged.levels):
+        expected = Splats.concatenated([
+            levels[number].select((levels[number].means[:, 0] >= low) & (levels[number].means[:, 0] < high))
+            for (low, high), levels in zip(cells, sets, strict=True)
         ])  # fmt: skip
         for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
-            np.testing.assert_array_equal(getattr(level.splats, name), getattr(wanted, name))
-        np.testing.assert_array_equal(level.splats.extras["lod_level"], wanted.extras["lod_level"])
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["1", "2", "3", "whole.ply"]
+            np.testing.assert_array_equal(getattr(level.splats, name), getattr(expected, name))
+        np.testing.assert_array_equal(level.splats.extras["lod_level"], expected.extras["lod_level"])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["1", "2", "3", "merged.ply"]
 
 
-def test_blocks_that_do_not_belong_together_are_refused(tmp_path):
+def test_incompatible_blocks_are_rejected(tmp_path):
     rng = np.random.default_rng(0)
-    one = finished(tmp_path, 1, (-np.inf, 0), [random_splats(rng, 9)])
-    other = finished(tmp_path, 2, (0, np.inf), [random_splats(rng, 9)], method="3dgs", rule="")
-    with pytest.raises(LodgsError, match="another kind"):
-        merge(Division(None, [one, other], []), tmp_path / "whole.ply")
-    assert not (tmp_path / "whole.ply").exists()
+    first = finished(tmp_path, 1, (-np.inf, 0), [random_splats(rng, 9)])
+    second = finished(tmp_path, 2, (0, np.inf), [random_splats(rng, 9)], method="3dgs", rule="")
+    with pytest.raises(LodgsError, match="differ"):
+        merge(Division(None, [first, second], []), tmp_path / "merged.ply")
+    assert not (tmp_path / "merged.ply").exists()
 
 
-# -- whatever befalls them -----------------------------------------------------------------------------------
+# -- failures and cancelling ---------------------------------------------------------------------------------
 
 
 class Workers:
-    """Train blocks as they are told: by block, what each attempt does, given the block's folder."""
+    """Simulated workers. For each block, a list of functions that stand for the attempts to train it."""
 
     def __init__(self, **plans) -> None:
         self.plans = {name.removeprefix("block_"): list(plan) for name, plan in plans.items()}
@@ -313,12 +318,12 @@ class Workers:
     def __call__(self, folder: Path) -> Future:
         future: Future = Future()
         future.set_running_or_notify_cancel()
-        what = self.plans[folder.name][min(self.attempts[folder.name], len(self.plans[folder.name]) - 1)]
+        attempt = self.plans[folder.name][min(self.attempts[folder.name], len(self.plans[folder.name]) - 1)]
         self.attempts[folder.name] += 1
 
         def work() -> None:
             try:
-                future.set_result(what(RunFolder(folder)))
+                future.set_result(attempt(RunFolder(folder)))
             except Exception as error:
                 future.set_exception(error)
 
@@ -340,18 +345,18 @@ def progressing(step: int, code: int):
 
 
 def done(folder: RunFolder) -> int:
-    made = finished(folder.path.parent / "made", int(folder.path.name), (-np.inf, np.inf), [LEVEL])
-    made.folder.bundle.rename(folder.bundle)
+    block = finished(folder.path.parent / "finished", int(folder.path.name), (-np.inf, np.inf), [LEVEL])
+    block.folder.bundle.rename(folder.bundle)
     with folder.events_file.open("a") as file:
         file.write(event_line("done", bundle="bundle.ply") + "\n")
     return 0
 
 
 def lost(_: RunFolder) -> int:
-    raise RuntimeError("the worker is gone")
+    raise RuntimeError("worker lost")
 
 
-def refused(folder: RunFolder) -> int:
+def failed(folder: RunFolder) -> int:
     with folder.events_file.open("a") as file:
         file.write(event_line("error", what="The disk is full.", remedy="Free some space.") + "\n")
     return 2
@@ -370,116 +375,117 @@ def blocks(tiny_scene, tmp_path, monkeypatch):
     return planned(job_for(tiny_scene, tmp_path / "run"))
 
 
-def trained(blocks, workers, tell=lambda *_, **__: None):
-    path = blocks[0].folder.path.parent / "whole.ply"
-    train_blocks(Division(None, blocks, []), path, workers, tell)
+def train_all(blocks, workers, report=lambda *_, **__: None):
+    path = blocks[0].folder.path.parent / "merged.ply"
+    train_blocks(Division(None, blocks, []), path, workers, report)
     return path
 
 
-def test_a_block_that_gets_on_is_begun_again_as_often_as_it_is_lost(blocks):
+def test_lost_block_that_makes_progress_is_restarted_every_time(blocks):
     workers = Workers(block_1=[*(progressing(i, -9) for i in range(8)), lost, done], block_2=[done])
-    assert trained(blocks, workers).exists()
+    assert train_all(blocks, workers).exists()
     assert workers.attempts == {"1": 10, "2": 1}
 
 
-def test_one_that_does_not_get_on_ends_the_run_after_the_others_are_done(blocks):
+def test_block_without_progress_fails_the_run_after_the_others_have_finished(blocks):
     workers = Workers(block_1=[lost], block_2=[progressing(3, -9), done])
-    with pytest.raises(LodgsError, match=r"Block 1 was lost 3 times at step 0 \(the worker is gone\)"):
-        trained(blocks, workers)
+    with pytest.raises(LodgsError, match=r"trainer of block 1 was lost 3 times at step 0 \(worker lost\)"):
+        train_all(blocks, workers)
     assert blocks[1].folder.bundle.exists() and workers.attempts == {"1": 3, "2": 2}
-    again = Workers(block_1=[done], block_2=[lost])
-    assert trained(blocks, again).exists()
-    assert again.attempts == {"1": 1, "2": 0}, "what is finished is not begun again"
+    second_run = Workers(block_1=[done], block_2=[lost])
+    assert train_all(blocks, second_run).exists()
+    assert second_run.attempts == {"1": 1, "2": 0}, "finished blocks are not trained again"
 
 
-def test_what_is_wrong_with_a_block_is_said_in_its_words(blocks):
-    with pytest.raises(LodgsError, match="Block 2: The disk is full") as found:
-        trained(blocks, Workers(block_1=[done], block_2=[refused]))
-    assert found.value.remedy == "Free some space."
+def test_error_of_a_block_is_reported(blocks):
+    with pytest.raises(LodgsError, match="Block 2: The disk is full") as error:
+        train_all(blocks, Workers(block_1=[done], block_2=[failed]))
+    assert error.value.remedy == "Free some space."
 
 
-def test_one_that_could_not_even_write_what_is_wrong_says_so(blocks):
-    with pytest.raises(LodgsError, match=r"Block 2: The trainer could write nothing more .* disk is full"):
-        trained(blocks, Workers(block_1=[done], block_2=[lambda _: 2]))
+def test_block_that_cannot_write_its_error_is_reported(blocks):
+    with pytest.raises(LodgsError, match=r"Block 2: The trainer could not write to .* disk is full"):
+        train_all(blocks, Workers(block_1=[done], block_2=[lambda _: 2]))
 
 
-def test_whom_nobody_has_begun_is_given_up_at_an_interrupt(blocks, monkeypatch):
-    """A cluster without workers, on which nothing will ever be begun; it may be later, by itself."""
+def test_interrupt_withdraws_blocks_that_no_worker_has_started(blocks, monkeypatch):
+    """A cluster without workers never starts them, or only later."""
     monkeypatch.setattr(blocks_module, "START_SECONDS", 0.05)
-    asked = []
+    futures = []
 
     def submit(folder: Path) -> Future:
-        asked.append(Future())
-        return asked[-1]
+        futures.append(Future())
+        return futures[-1]
 
     def interrupt(kind, **_):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        trained(blocks, submit, interrupt)
-    assert [future.cancelled() for future in asked] == [True, True]
+        train_all(blocks, submit, interrupt)
+    assert [future.cancelled() for future in futures] == [True, True]
     assert not any(block.folder.take_cancel() for block in blocks)
 
 
-def test_a_lost_scheduler_is_no_loss_of_a_block(blocks):
-    """Its blocks are given out again as often as it comes back; that it does not is said by who gives out."""
+def test_lost_scheduler_does_not_count_as_a_lost_block(blocks):
+    """Blocks are submitted again; if the scheduler stays away, ``submit`` raises an error."""
 
     def scheduler_lost(_: RunFolder) -> int:
         raise CancelledError
 
     workers = Workers(block_1=[scheduler_lost] * 5 + [done], block_2=[done])
-    assert trained(blocks, workers).exists() and workers.attempts == {"1": 6, "2": 1}
+    assert train_all(blocks, workers).exists() and workers.attempts == {"1": 6, "2": 1}
 
 
-def test_a_block_can_be_stopped_alone_and_gone_on_with(blocks):
+def test_single_block_can_be_cancelled_and_resumed(blocks):
     with pytest.raises(BlocksStopped, match="block 2"):
-        trained(blocks, Workers(block_1=[done], block_2=[cancelled]))
-    assert trained(blocks, Workers(block_1=[lost], block_2=[done])).exists()
+        train_all(blocks, Workers(block_1=[done], block_2=[cancelled]))
+    assert train_all(blocks, Workers(block_1=[lost], block_2=[done])).exists()
 
 
-def test_a_block_that_was_stopped_goes_on_beside_the_others_when_it_is_asked_to(blocks):
-    """While the other is at work, and no sooner; what was asked is forgotten then."""
-    told, folder = [], blocks[1].folder
+def test_cancelled_block_resumes_on_request_while_others_train(blocks):
+    """The request is consumed."""
+    reports = []
+    folder = blocks[1].folder
 
-    def until_the_other_is_done(_: RunFolder) -> int:
+    def wait_for_second_block(_: RunFolder) -> int:
         while not folder.bundle.exists():
             time.sleep(0.002)
         return done(blocks[0].folder)
 
-    def tell(kind, **values):
-        states = [each["state"] for each in values.get("blocks", ())]
-        told.append(states)
+    def report(kind, **values):
+        states = [block["state"] for block in values.get("blocks", ())]
+        reports.append(states)
         if states == ["running", "cancelled"] and not workers.attempts["2"] > 1:
             folder.request_resume()
 
-    def stopped(folder: RunFolder) -> int:
+    def cancel(folder: RunFolder) -> int:
         progressing(5, 3)(folder)
-        progressing(5, 3)(blocks[0].folder)  # of which something is heard so
+        progressing(5, 3)(blocks[0].folder)  # makes the first block "running"
         return 3
 
-    workers = Workers(block_1=[until_the_other_is_done], block_2=[stopped, done])
-    assert trained(blocks, workers, tell).exists()
+    workers = Workers(block_1=[wait_for_second_block], block_2=[cancel, done])
+    assert train_all(blocks, workers, report).exists()
     assert workers.attempts == {"1": 1, "2": 2} and not folder.take_resume()
-    assert ["running", "cancelled"] in told and told[-1] != ["running", "cancelled"]
+    assert ["running", "cancelled"] in reports and reports[-1] != ["running", "cancelled"]
 
 
-def test_one_that_is_asked_to_go_on_before_all_begin_does_so_alone(blocks):
+def test_resume_request_before_the_start_trains_only_that_block(blocks):
     workers = Workers(block_1=[done], block_2=[done])
     blocks[1].folder.request_resume()
     with pytest.raises(BlocksStopped, match="block 1"):
-        trained(blocks, workers)
+        train_all(blocks, workers)
     assert workers.attempts == {"1": 0, "2": 1}
-    assert trained(blocks, workers).exists(), "then it is forgotten"
+    assert train_all(blocks, workers).exists(), "the request is consumed"
     assert workers.attempts == {"1": 1, "2": 1}
 
 
-def test_a_block_is_at_work_once_its_trainer_has_said_so(blocks):
-    """Not because an earlier one has: blocks wait for their turn again when a run goes on."""
+def test_block_is_running_once_its_trainer_has_written_an_event(blocks):
+    """Events of earlier trainers do not count: blocks wait again when a run resumes."""
     states = []
 
-    def tell(kind, **values):
+    def report(kind, **values):
         if kind == "progress":
-            states.append([(each["state"], each["step"]) for each in values["blocks"]])
+            states.append([(block["state"], block["step"]) for block in values["blocks"]])
 
     def waits(folder: RunFolder) -> int:
         while len(states) < 5:
@@ -487,11 +493,11 @@ def test_a_block_is_at_work_once_its_trainer_has_said_so(blocks):
         return done(folder)
 
     progressing(7, 3)(blocks[0].folder)
-    trained(blocks, Workers(block_1=[waits], block_2=[done]), tell)
+    train_all(blocks, Workers(block_1=[waits], block_2=[done]), report)
     assert states[0][0] == ("waiting", 7)
 
 
-def test_an_interrupt_stops_all_politely(blocks):
+def test_interrupt_cancels_running_blocks(blocks):
     def until_cancelled(folder: RunFolder) -> int:
         while not folder.take_cancel():
             time.sleep(0.002)
@@ -501,14 +507,14 @@ def test_an_interrupt_stops_all_politely(blocks):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        trained(blocks, Workers(block_1=[until_cancelled], block_2=[until_cancelled]), interrupt)
+        train_all(blocks, Workers(block_1=[until_cancelled], block_2=[until_cancelled]), interrupt)
 
 
-def test_how_all_get_on_is_one_event(blocks):
-    told = []
+def test_progress_event_contains_all_blocks(blocks):
+    reports = []
     workers = Workers(block_1=[progressing(20, -9), done], block_2=[progressing(10, -9), done])
-    trained(blocks, workers, lambda kind, **values: told.append((kind, values)))
-    *_, last = (values for kind, values in told if kind == "progress")
+    train_all(blocks, workers, lambda kind, **values: reports.append((kind, values)))
+    *_, last = (values for kind, values in reports if kind == "progress")
     steps = [block.job.resolved_parameters().total_steps for block in blocks]
     assert last["step"] == last["of"] == sum(steps)
     assert last["blocks"] == [
@@ -518,10 +524,10 @@ def test_how_all_get_on_is_one_event(blocks):
     from training.runs.events import _well_formed
 
     event = json.loads(event_line("progress", **last))
-    assert _well_formed(event) == event, "whoever reads runs understands it"
+    assert _well_formed(event) == event, "readers accept the event"
 
 
-# -- from the outside ----------------------------------------------------------------------------------------
+# -- whole runs --------------------------------------------------------------------------------------
 
 
 def run_all(keys: dict) -> tuple[int, RunFolder]:
@@ -529,8 +535,15 @@ def run_all(keys: dict) -> tuple[int, RunFolder]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["3dgs", "flod", "octree"])
-def test_cells_give_a_bundle_like_the_whole(tiny_scene, tmp_path, method):
+@pytest.mark.parametrize(
+    "method",
+    [
+        pytest.param("3dgs", marks=pytest.mark.nightly),
+        "flod",
+        pytest.param("octree", marks=pytest.mark.nightly),
+    ],
+)
+def test_bundle_of_cells_is_like_that_of_an_undivided_run(tiny_scene, tmp_path, blocks_in_process, method):
     parameters = {
         "3dgs": TINY,
         "flod": {**TINY, "levels": 3, "steps": [15, 15, 15], "footprint": 6.0},
@@ -539,89 +552,86 @@ def test_cells_give_a_bundle_like_the_whole(tiny_scene, tmp_path, method):
     keys = asdict(job_for(tiny_scene, tmp_path / "cells", method, parameters=parameters))
     code, folder = run_all(keys)
     assert code == 0, folder.events()[0][-1]
-    code, whole = run_all({**keys, "cells": "", "out": str(tmp_path / "whole")})
+    code, undivided = run_all({**keys, "cells": "", "out": str(tmp_path / "undivided")})
     assert code == 0
-    one, other = read_bundle(folder.bundle), read_bundle(whole.bundle)
-    assert (one.method, one.rule, one.facts, one.controls) == (
-        other.method,
-        other.rule,
-        other.facts,
-        other.controls,
-    )
-    assert [level.number for level in one.levels] == [level.number for level in other.levels]
-    assert [level.facts for level in one.levels] == [level.facts for level in other.levels]
-    same = {key: value for key, value in one.meta.items() if key in other.meta}
-    assert same == other.meta
-    assert [event["splats"] for event in folder.levels()] == [len(level.splats) for level in one.levels]
+    bundle, expected = read_bundle(folder.bundle), read_bundle(undivided.bundle)
+    for name in ("method", "rule", "facts", "controls"):
+        assert getattr(bundle, name) == getattr(expected, name)
+    assert [level.number for level in bundle.levels] == [level.number for level in expected.levels]
+    assert [level.facts for level in bundle.levels] == [level.facts for level in expected.levels]
+    assert {key: value for key, value in bundle.meta.items() if key in expected.meta} == expected.meta
+    assert [event["splats"] for event in folder.levels()] == [len(level.splats) for level in bundle.levels]
     assert folder.state() == "done" and "train_psnr" in folder.last_event("done")
 
 
 @pytest.mark.slow
-def test_a_tree_is_built_over_what_blocks_give_together(tiny_scene, tmp_path):
+def test_tree_is_built_from_merged_blocks(tiny_scene, tmp_path, blocks_in_process):
     parameters = {**TINY, "tune_steps": 5}
     keys = asdict(job_for(tiny_scene, tmp_path / "cells", "tree", parameters=parameters))
     code, folder = run_all(keys)
     assert code == 0, folder.events()[0][-1]
-    leaves, made = read_bundle(folder.merged), read_bundle(folder.bundle)
-    assert made.rule == "cut" and len(made.levels[-1].splats) == len(leaves.levels[-1].splats)
+    leaves, tree = read_bundle(folder.merged), read_bundle(folder.bundle)
+    assert tree.rule == "cut" and len(tree.levels[-1].splats) == len(leaves.levels[-1].splats)
 
 
 @pytest.mark.slow
-def test_trainers_killed_and_a_run_interrupted_end_in_the_same_bundle(tiny_scene, tmp_path):
-    keys = asdict(job_for(tiny_scene, tmp_path / "calm", parameters={**TINY, "steps": 1000}))
-    code, calm = run_all(keys)
+@pytest.mark.nightly
+def test_killed_trainers_and_an_interrupted_run_give_the_same_bundle(tiny_scene, tmp_path):
+    keys = asdict(job_for(tiny_scene, tmp_path / "undisturbed", parameters={**TINY, "steps": 1000}))
+    code, undisturbed = run_all(keys)
     assert code == 0
     path = tmp_path / "job.json"
-    path.write_text(json.dumps({**keys, "out": str(tmp_path / "wild")}))
+    path.write_text(json.dumps({**keys, "out": str(tmp_path / "attacked")}))
     environment = {**os.environ, "LODGS_CHECKPOINT_SECONDS": "0.2"}
-    wild, kills = RunFolder(tmp_path / "wild"), 0
+    attacked = RunFolder(tmp_path / "attacked")
+    kills = 0
     for attempt in range(20):
         process = subprocess.Popen(
             [sys.executable, "-m", "training", "train", str(path)], cwd=ROOT, env=environment,
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
-        until = time.monotonic() + 120
-        while process.poll() is None and time.monotonic() < until:
-            time.sleep(0.02)  # less than a block takes, on any machine
-            for block in read_plan(wild).blocks if wild.blocks.exists() else ():
+        deadline = time.monotonic() + 120
+        while process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.02)  # shorter than the training of a block
+            for block in read_plan(attacked).blocks if attacked.blocks.exists() else ():
                 if kills < 4 and block.folder.running and block.folder.last_event("progress"):
-                    with suppress(LodgsError):  # it has just ended by itself
+                    with suppress(LodgsError):  # it has just ended
                         block.folder.kill()
                         kills += 1
             if attempt == 0 and kills >= 2:
                 process.send_signal(signal.SIGKILL)
         if process.wait() == 0:
             break
-    assert wild.bundle.read_bytes() == calm.bundle.read_bytes() and kills >= 2
+    assert attacked.bundle.read_bytes() == undisturbed.bundle.read_bytes() and kills >= 2
 
 
-def test_many_blocks_fill_no_file_with_how_they_get_on(monkeypatch):
-    """A hundred of them for two weeks, looked at every five minutes."""
+def test_progress_of_many_blocks_does_not_fill_the_event_file(monkeypatch):
+    """A hundred blocks for two weeks, polled every five minutes."""
     clock = itertools.count(0, 300)
     monkeypatch.setattr(blocks_module.time, "monotonic", lambda: next(clock))
     monkeypatch.setattr(blocks_module.time, "sleep", lambda seconds: None)
 
-    class Block:
-        code, progress, step, steps, looks = 0, {}, 0, 9, 0
+    class Watch:
+        code, progress, step, steps, polls = 0, {}, 0, 9, 0
 
         def __init__(self, number):
             self.block = SimpleNamespace(kind="block", number=number, name=f"block {number}")
-            self.ends = 40 * number
+            self.last = 40 * number
 
-        begin = staticmethod(lambda submit: None)
+        start = staticmethod(lambda submit: None)
 
         @property
         def state(self):
-            return "done" if self.looks >= self.ends else "running"
+            return "done" if self.polls >= self.last else "running"
 
-        def look(self, submit):
-            self.looks += 1
-            return self.looks >= self.ends
+        def poll(self, submit):
+            self.polls += 1
+            return self.polls >= self.last
 
-    said = []
-    stage = [Block(number) for number in range(1, 101)]
-    blocks_module._train_stage(stage, stage, None, lambda kind, **values: said.append(values))
-    assert sum(len(event_line("progress", **values)) for values in said) < MAX_BYTES / 4
-    told = [values["blocks"] for values in said if "blocks" in values]
-    counts = [sum(each["state"] == "done" for each in blocks) for blocks in told]
-    assert set(counts) >= set(range(1, 100)) and said[-1]["blocks"] == told[-1] and counts[-1] == 100
+    reports = []
+    stage = [Watch(number) for number in range(1, 101)]
+    blocks_module._train_stage(stage, stage, None, lambda kind, **values: reports.append(values))
+    assert sum(len(event_line("progress", **values)) for values in reports) < MAX_BYTES / 4
+    detailed = [values["blocks"] for values in reports if "blocks" in values]
+    counts = [sum(block["state"] == "done" for block in blocks) for blocks in detailed]
+    assert set(counts) >= set(range(1, 100)) and reports[-1]["blocks"] == detailed[-1] and counts[-1] == 100

@@ -1,0 +1,103 @@
+"""Splats in files that are read in batches of rows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .dialects import Warn, drop_undrawable, dropped_message, ignore, to_3dgs
+from .gaussians import Splats
+from .ply import BATCH_ROWS, read_elements, release_pages, splats_from_rows
+
+_ROW = "row"
+"""Extra column with each splat's row in the file."""
+
+
+@dataclass(frozen=True)
+class FileRows:
+    """A level's splats in a file.
+
+    Attributes:
+        vertices: the 3DGS columns of each splat, structured.
+        extras: the extra columns, structured, or None.
+        path: path of the file.
+    """
+
+    vertices: np.ndarray
+    extras: np.ndarray | None
+    path: str | Path
+
+    def __len__(self) -> int:
+        return len(self.vertices)
+
+    def columns(self, index: slice | np.ndarray, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """Read the existing ones of the named columns, (M,) each, and nothing else."""
+        columns = {}
+        for rows in (self.vertices, self.extras):
+            available = () if rows is None else rows.dtype.names or ()
+            columns |= {name: np.array(rows[name][index]) for name in names if name in available}  # type: ignore[index]
+            if rows is not None:
+                release_pages(rows)
+        return columns
+
+    def select(self, index: slice | np.ndarray) -> Splats:
+        """Read splats, drawable or not, and keep nothing of the file in memory.
+
+        Raises:
+            LodgsError: as ``splats_from_rows``.
+        """
+        splats = splats_from_rows(self.vertices[index], self.path)
+        if self.extras is not None:
+            extras = self.extras[index]
+            splats.extras |= {column: np.array(extras[column]) for column in extras.dtype.names or ()}
+        release_pages(self.vertices)
+        if self.extras is not None:
+            release_pages(self.extras)
+        return splats
+
+
+class DrawableRows:
+    """The drawable splats of a file, converted to the meaning of the 3DGS columns.
+
+    The constructor reads all splats once to find them.
+
+    Args:
+        warn: as for `read_ply`.
+    """
+
+    def __init__(self, rows: FileRows, warn: Warn = ignore) -> None:
+        self._rows = rows
+        self._drawable = None
+        parts = []
+        for begin in range(0, len(rows), BATCH_ROWS):
+            splats = self._convert(slice(begin, begin + BATCH_ROWS), ignore if begin else warn)
+            splats.extras = {_ROW: begin + np.arange(len(splats))}
+            parts.append(drop_undrawable(splats, rows.path).extras[_ROW])
+        missing = len(rows) - sum(map(len, parts))
+        if missing:
+            self._drawable = np.concatenate(parts)
+            warn(dropped_message(missing, rows.path))
+
+    def __len__(self) -> int:
+        return len(self._rows) if self._drawable is None else len(self._drawable)
+
+    def select(self, index: slice | np.ndarray, /) -> Splats:
+        """Return the splats of a range of rows, or of ascending rows (M,)."""
+        rows = index if self._drawable is None else self._drawable[index]
+        return drop_undrawable(self._convert(rows), self._rows.path)
+
+    def _convert(self, index: slice | np.ndarray, warn: Warn = ignore) -> Splats:
+        splats = self._rows.select(index)
+        return splats if self._rows.extras is not None else to_3dgs(splats, self._rows.path, warn)
+
+
+def open_ply(path: str | Path) -> FileRows:
+    """Open a plain PLY to read its splats in batches, without conversion.
+
+    Raises:
+        LodgsError: as ``read_elements``.
+    """
+    return FileRows(read_elements(path)[0]["vertex"], None, path)
