@@ -16,8 +16,8 @@ from ..training.cli.info import describe
 from ..training.cli.job_options import add_options, job_from_options
 from ..training.cli.methods import describe_method, describe_methods
 from ..training.cli.options import parse_size
-from ..training.editing.bake_filter import without_filter
-from ..training.editing.edit import Joined, finish
+from ..training.editing.bake_filter import bake_filter
+from ..training.editing.edit import ConcatenatedRows, run_to_end
 from ..training.errors import LodgsError
 from ..training.evaluate.messages import summary_lines
 from ..training.runs.folder import RunFolder
@@ -28,7 +28,7 @@ from ..training.splats.formats import PLY, find_format, write_splats
 from . import extension
 from .data import importing, scenes, viewpoints
 from .render.capture import noise, render_views, write_model
-from .render.video import MOST_FRAMES, extract_frames
+from .render.video import MAX_FRAMES, extract_frames
 from .runs import environment, job_settings, jobs, photo_preparation
 from .runs.messages import format_duration, level_line
 from .runs.watch import Watch
@@ -153,7 +153,7 @@ def _add_frames(commands: _Commands) -> None:
     frames.add_argument("video", type=Path, help="video in any format that Blender reads")
     frames.add_argument("--out", type=Path, required=True, help="folder for the frames")
     frames.add_argument(
-        "--most", type=int, default=MOST_FRAMES, metavar="N", help=f"maximum number of frames ({MOST_FRAMES})"
+        "--most", type=int, default=MAX_FRAMES, metavar="N", help=f"maximum number of frames ({MAX_FRAMES})"
     )
 
 
@@ -241,8 +241,12 @@ def _export(args: argparse.Namespace) -> int:
     if find_format(args.bundle) is PLY:
         write_bundle(args.bundle, bundle)
     else:
-        exported = bundle if find_format(args.bundle).antialiased else without_filter(bundle)
-        finish(write_splats(args.bundle, Joined.upto(exported, exported.levels[-1].number), exported.meta))
+        exported = bundle if find_format(args.bundle).antialiased else bake_filter(bundle)
+        run_to_end(
+            write_splats(
+                args.bundle, ConcatenatedRows.upto(exported, exported.levels[-1].number), exported.meta
+            )
+        )
     return DONE
 
 

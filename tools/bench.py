@@ -23,8 +23,8 @@ import numpy as np
 import torch
 
 from training.lod.blocks import spatial_order
-from training.lod.query import Choice, Chooser
-from training.lod.rule import facts_of
+from training.lod.query import LodQuery, SplatSelector
+from training.lod.rule import collect_facts
 from training.lod.rules.bands import RULE as BANDS
 from training.rasterize import (
     Adam,
@@ -364,12 +364,12 @@ def choosing(splats: Gaussians, camera: Camera, seconds: float) -> tuple[float, 
     their middle: in blocks, of which only those at the border are looked at, and splat by splat."""
     order = spatial_order(splats.means.numpy())
     means, log_scales = splats.means.numpy()[order], splats.log_scales.numpy()[order]
-    chooser, values = Chooser(means, {}, log_scales), (("gamma", 1.0), ("first", 1), ("last", 2))
+    chooser, values = SplatSelector(means, {}, log_scales), (("gamma", 1.0), ("first", 1), ("last", 2))
     border = float(np.median(np.linalg.norm(means, axis=1))) / camera.focal
     levels = [(1, {"s_min": border}), (2, {"s_min": 0.0})]
     choices = [
-        Choice("bands", (0.0, 0.0, 0.0), camera.focal, tuple(facts.items()), values)
-        for facts in (facts_of(BANDS, {}, levels, number) for number, _ in levels)
+        LodQuery("bands", (0.0, 0.0, 0.0), camera.focal, tuple(facts.items()), values)
+        for facts in (collect_facts(BANDS, {}, levels, number) for number, _ in levels)
     ]
     return (
         least(lambda: [chooser.chosen(choice, camera, 0.01) for choice in choices], seconds),

@@ -113,7 +113,7 @@ def selection_seconds(bpy, path: Path) -> tuple[float, float]:
     rule = load("training.lod.rule").rules()["bands"]
     controls, levels = root.lodgs.bands, [(1, {"s_min": S_MIN}), (2, {"s_min": 0.0})]
     values = {control.name: getattr(controls, control.name) for control in rule.controls}
-    facts = [load("training.lod.rule").facts_of(rule, {}, levels, number) for number in (1, 2)]
+    facts = [load("training.lod.rule").collect_facts(rule, {}, levels, number) for number in (1, 2)]
     bands = [rule.band(root.lodgs.focal_px, each, values) for each in facts]
     arrays = (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh)
 
@@ -149,11 +149,11 @@ def f12_seconds(bpy, count: int) -> tuple[float, float]:
     engine = load("blender_lodgs.render.engine")
 
     def frame() -> None:
-        engine.frame(bpy.context.evaluated_depsgraph_get(), 32, 18, (0, 0, 32, 18))
+        engine.render_frame(bpy.context.evaluated_depsgraph_get(), 32, 18, (0, 0, 32, 18))
 
-    for chosen in (engine._chosen_by_rule, lambda *args: False):
+    for chosen in (engine._is_selected_by_rule, lambda *args: False):
         frames = []
-        with patch.object(engine, "_chosen_by_rule", chosen):
+        with patch.object(engine, "_is_selected_by_rule", chosen):
             for _ in range(6):
                 camera.location.x += 0.05
                 bpy.context.view_layer.update()
@@ -247,7 +247,7 @@ def clean_up(bpy, count: int) -> None:
     everywhere = least(lambda: cleaning.find_floaters(bpy.context, root, 0.0, 0.001))
     found = cleaning.find_floaters(bpy.context, root, 0.0, 0.001)
     strokes, depsgraph = load("blender_lodgs.viewport.strokes"), bpy.context.evaluated_depsgraph_get()
-    brushed = load("training.editing.brush").brushed
+    brushed = load("training.editing.brush").brush_coverage
     look, size = np.eye(4), (1280, 800)
     look[2, 3] = -15.0
     clip = np.array([[2, 0, 0, 0], [0, 3.2, 0, 0], [0, 0, -1, -0.1], [0, 0, -1, 0]], float)

@@ -13,7 +13,7 @@ _counts: dict[tuple[int, Region], int] = {}
 """Splats of a point cloud, by ``session_uid``, for a region: counting takes long where there are many."""
 
 
-def chosen(context: bpy.types.Context, root: bpy.types.Object) -> selection.Choice | None:
+def chosen(context: bpy.types.Context, root: bpy.types.Object) -> selection.LodQuery | None:
     """What a scene's levels are chosen by as of the last evaluation; None where none is shown by distance."""
     depsgraph = context.view_layer.depsgraph
     for item in root.lodgs.levels if depsgraph is not None else ():
@@ -23,7 +23,7 @@ def chosen(context: bpy.types.Context, root: bpy.types.Object) -> selection.Choi
     return None
 
 
-def count_loaded(root: bpy.types.Object, choice: selection.Choice) -> tuple[int, float]:
+def count_loaded(root: bpy.types.Object, choice: selection.LodQuery) -> tuple[int, float]:
     """How many splats an eye may be shown while it stays in its region, and their size in 10^6 bytes.
 
     All that there are where the rule, or the place, has no regions.
@@ -38,7 +38,7 @@ def count_loaded(root: bpy.types.Object, choice: selection.Choice) -> tuple[int,
     return splats, megabytes
 
 
-def _count(cloud: bpy.types.PointCloud, choice: selection.Choice, region: Region) -> int:
+def _count(cloud: bpy.types.PointCloud, choice: selection.LodQuery, region: Region) -> int:
     key = cloud.session_uid, region
     if key not in _counts:
         nothing = np.broadcast_to(np.float32(0), len(cloud.points))

@@ -10,7 +10,7 @@ import numpy as np
 from mathutils import Matrix, Vector
 
 from ...training.errors import LodgsError
-from ...training.lod.crop import kept
+from ...training.lod.crop import crop_mask
 from ...training.scenes.cameras import Camera
 from ...training.scenes.colmap import Scene
 from ...training.splats.dialects import Warn, ignore
@@ -272,7 +272,7 @@ def _most_places(root: bpy.types.Object) -> np.ndarray:
     if not levels:
         return _positions(root.lodgs.points)
     places, hidden = _positions(levels[-1]), read_attribute(levels[-1].data, HIDDEN)
-    left = kept(crops.as_objects_stand(root, bpy.context.evaluated_depsgraph_get()), places)
+    left = crop_mask(crops.as_objects_stand(root, bpy.context.evaluated_depsgraph_get()), places)
     if hidden is not None:
         left &= ~hidden.astype(bool)
     return places[left] if left.any() else places

@@ -16,8 +16,8 @@ import bpy
 import numpy as np
 
 from ...training.errors import LodgsError
-from ...training.lod.query import Choice
-from ...training.lod.rule import Rule, fact_names, facts_of, find_rule
+from ...training.lod.query import LodQuery
+from ...training.lod.rule import Rule, collect_facts, fact_names, find_rule
 from .. import compat
 from ..nodes import crops as crop_groups
 from ..nodes import look as look_groups
@@ -29,7 +29,7 @@ from .placement import axes_of
 from .tables import read_table
 
 
-def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Choice | None:
+def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> LodQuery | None:
     """What the modifiers of an evaluated level choose by, as of the depsgraph: its crops, then its rule.
 
     None where all is shown. A modifier whose group somebody has changed counts as none (:func:`only_chosen`).
@@ -38,7 +38,7 @@ def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Choic
     modifier = _modifier(evaluated)
     rule = None if modifier is None else groups.rule_of_group(modifier.node_group)
     if modifier is None or rule is None or not _is_on(modifier, depsgraph):
-        return None if cropped is None else Choice.by_crops(cropped)
+        return None if cropped is None else LodQuery.by_crops(cropped)
 
     def value(name: str):
         return compat.get_input(modifier, name)
@@ -53,7 +53,7 @@ def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Choic
         if obj is not None:
             place = obj.evaluated_get(depsgraph).matrix_world.translation
             eye = tuple(evaluated.matrix_world.inverted_safe() @ place)
-    return Choice(
+    return LodQuery(
         rule.name,
         eye,
         value(groups.STORED_FOCAL if held else groups.FOCAL),
@@ -65,7 +65,7 @@ def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Choic
 
 
 def _frozen(obj: bpy.types.Object | None) -> tuple[tuple[str, str, bytes], ...]:
-    """A table's columns as :class:`Choice` keeps them."""
+    """A table's columns as :class:`LodQuery` keeps them."""
     columns = read_table(obj.original) if obj is not None else {}
     return tuple((name, values.dtype.str, values.tobytes()) for name, values in columns.items())
 
@@ -152,7 +152,7 @@ def attach(root: bpy.types.Object) -> None:
                 _detach(item.object)
                 continue
             try:
-                facts = facts_of(rule, scene, levels, item.number)
+                facts = collect_facts(rule, scene, levels, item.number)
             except LodgsError:  # of a level that is still on its way
                 _detach(item.object)
                 continue

@@ -112,7 +112,7 @@ def without_coarser(instances: list[SplatInstance]) -> list[SplatInstance]:
     return [each for each in instances if each.source is None or each.level == each.source.level]
 
 
-def choice_of_picture(instance: SplatInstance, depsgraph: bpy.types.Depsgraph) -> selection.Choice | None:
+def choice_of_picture(instance: SplatInstance, depsgraph: bpy.types.Depsgraph) -> selection.LodQuery | None:
     """By what a picture of the scene's camera chooses an instance's splats; None where all are shown.
 
     That is what modifiers choose by. Where the eye is the viewport's, there is more to be read of a file than

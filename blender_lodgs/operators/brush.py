@@ -12,7 +12,7 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 from gpu_extras.presets import draw_circle_2d
 
-from ...training.editing.brush import brushed, lassoed
+from ...training.editing.brush import brush_coverage, lasso_coverage
 from ...training.errors import LodgsError
 from .. import extension
 from ..data import cleaning, painting, roots
@@ -150,8 +150,8 @@ class StrokeOperator(EditLevelsOperator):
     def _cover(self, picture: Picture, path: np.ndarray) -> np.ndarray:
         path = np.reshape(path, (-1, 2))
         if self.shape == "LASSO":
-            return lassoed(path, picture.size)
-        return brushed(path, self.radius, picture.size, self.hardness)
+            return lasso_coverage(path, picture.size)
+        return brush_coverage(path, self.radius, picture.size, self.hardness)
 
     def _find_hits(self, picture: Picture, cover: np.ndarray) -> dict[int, np.ndarray]:
         return picture.hits(cover, self.through, self.footprints)

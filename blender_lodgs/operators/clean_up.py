@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 from mathutils import Matrix
 
-from ...training.editing.cleaning import SHARE
+from ...training.editing.cleaning import MAX_FLOATER_SHARE
 from ...training.errors import LodgsError
 from ..data import cleaning, crops, roots, scenes
 from .base import EditLevelsOperator, SceneOperator, report_errors
@@ -145,7 +145,7 @@ class LODGS_OT_hide_splats(EditLevelsOperator, bpy.types.Operator):
     )  # fmt: skip
     share: bpy.props.FloatProperty(
         name="Largest Cluster", description="Keep clusters with more than this share of all splats",
-        default=100 * SHARE, min=0.0, max=100.0, precision=2, subtype="PERCENTAGE",
+        default=100 * MAX_FLOATER_SHARE, min=0.0, max=100.0, precision=2, subtype="PERCENTAGE",
     )  # fmt: skip
 
     def draw(self, context):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ...training.lod.rule import find_rule
-from ...training.lod.selection import unknown_rule
+from ...training.lod.selection import unknown_rule_error
 from ..data import loaded, objects, roots, scenes, selection, streams
 from ..viewport import views
 from .parts import LevelsPanel, say, split_column
@@ -82,7 +82,7 @@ class LODGS_PT_detail(LevelsPanel):
         row.enabled = rule is not None
         row.prop(settings, "mode", expand=True)
         if rule is None:
-            problem, remedy = unknown_rule(settings.rule)
+            problem, remedy = unknown_rule_error(settings.rule)
             say(layout, f"{problem} {remedy}" if settings.rule else problem, "INFO")
         elif rule.always and settings.mode == "SINGLE":
             text = "These splats are trained for By Distance. As one level they look too opaque."

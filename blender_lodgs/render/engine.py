@@ -1,7 +1,7 @@
-"""The render engine LODGS: F12 and animations of splats, drawn by the trainer's rasterizer.
+"""The render engine LODGS: stills and animations of splats, rendered by the trainer's rasterizer.
 
-Pixels equal those of ``python -m training render``. Meshes are not drawn: they are another engine's picture,
-which the compositor joins with this one by depth.
+Pixels equal those of ``python -m training render``. Meshes are not rendered: another engine renders them, and
+the compositor combines both images by depth.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import bpy
 import numpy as np
 
 from ...training.editing.paint import COLUMNS as PAINT
-from ...training.editing.paint import painted
+from ...training.editing.paint import apply_paint
 from ...training.errors import LodgsError
-from ...training.lod.rule import every_column
+from ...training.lod.rule import all_rule_columns
 from ...training.splats.gaussians import Splats
 from .. import attributes
 from ..data import changes, objects, roots, selection, shown
@@ -34,7 +34,7 @@ class LodgsEngine(bpy.types.RenderEngine):
     bl_label = "LODGS"
     bl_use_postprocess = True
     bl_use_preview = False
-    bl_use_eevee_viewport = True  # materials and lights of meshes; splats are drawn over it
+    bl_use_eevee_viewport = True  # for meshes; splats are drawn on top
     bl_use_spherical_stereo = False
 
     def update_render_passes(self, scene=None, renderlayer=None):
@@ -43,27 +43,27 @@ class LodgsEngine(bpy.types.RenderEngine):
             self.register_pass(scene, renderlayer, DEPTH, 1, "Z", "VALUE")
         if scene.lodgs_render.use_pass_levels:
             self.register_pass(scene, renderlayer, LEVEL, 1, "X", "VALUE")
-            for number in levels_in(scene):
+            for number in level_numbers(scene):
                 self.register_pass(scene, renderlayer, LEVEL_MASK.format(number), 1, "X", "VALUE")
 
     def render(self, depsgraph):
         size = self.resolution_x, self.resolution_y
-        window = border(depsgraph.scene.render, *size)
+        window = render_border(depsgraph.scene.render, *size)
         try:
-            drawn = _draw(depsgraph, *size, window, self._on_progress)
+            frame = _render_function(depsgraph, *size, window, self._on_progress)
         except LodgsError as error:
             self.error_set(str(error))
-            self.report({"ERROR"}, str(error))  # without it a black picture would be written
+            self.report({"ERROR"}, str(error))  # otherwise Blender would write a black image
             return
-        if drawn is None or self.test_break():
+        if frame is None or self.test_break():
             return
-        planes = drawn.planes
+        planes = frame.planes
         _, _, width, height = window
         result = self.begin_result(0, 0, width, height, layer=depsgraph.view_layer.name)
         for target in result.layers[0].passes:
             names = [f"{target.name}.{channel}" for channel in target.channel_id]
             if all(name in planes for name in names):
-                pixels = np.stack([planes[name][::-1] for name in names], axis=2)  # Blender's begin below
+                pixels = np.stack([planes[name][::-1] for name in names], axis=2)  # rows from the bottom
                 target.rect.foreach_set(np.ascontiguousarray(pixels).reshape(-1))
         self.end_result(result)
 
@@ -73,31 +73,35 @@ class LodgsEngine(bpy.types.RenderEngine):
         return not self.test_break()
 
 
-def frame(
+def render_frame(
     depsgraph: bpy.types.Depsgraph,
     width: int,
     height: int,
     window: tuple[int, int, int, int],
     on_progress: renderer.OnProgress = lambda fraction, text: True,
-) -> renderer.Frame | None:
-    """The splats that a depsgraph shows, as its scene's camera sees them in a picture of this size.
+) -> renderer.RenderedFrame | None:
+    """Render the splats of a depsgraph from its scene's camera.
 
     Args:
-        window: left, bottom, width and height of the part that is drawn.
+        depsgraph: evaluated depsgraph.
+        width: width of the full image in pixels.
+        height: height of the full image in pixels.
+        window: left, bottom, width and height of the rendered part in pixels.
         on_progress: see ``renderer.OnProgress``.
 
     Returns:
-        The picture with the passes that the view layer wants; None where it was ended.
+        The frame with the passes of the view layer, or None if it was cancelled.
 
     Raises:
-        LodgsError: there is no trainer, or the camera cannot be rendered through, or the depth that holds
-            out is missing, or the renderer failed.
+        LodgsError: the trainer is missing, the camera type is not supported, a holdout file is missing, or
+            the renderer failed.
     """
-    scene, layer = depsgraph.scene, depsgraph.view_layer
+    scene = depsgraph.scene
+    layer = depsgraph.view_layer
     camera, near = view_of(scene_camera(scene).evaluated_get(depsgraph), depsgraph, width, height)
-    left, bottom, across, up = window
+    left, bottom, window_width, window_height = window
     settings = scene.lodgs_render
-    return renderer.frame(
+    return renderer.draw_frame(
         placed_splats(depsgraph),
         camera,
         near,
@@ -105,87 +109,91 @@ def frame(
         background=None if scene.render.film_transparent else tuple(settings.background),
         depth=layer.use_pass_z,
         levels=settings.use_pass_levels,
-        window=(left, height - bottom - up, across, up),
+        window=(left, height - bottom - window_height, window_width, window_height),
         holdout=holdout_file(scene, scene.frame_current),
     )
 
 
-_draw = frame
-"""What renders of this engine are drawn by."""
+_render_function = render_frame
+"""Function that renders the frames of the engine."""
 
 
 @contextmanager
-def drawn_by(draw: Callable[..., renderer.Frame | None]) -> Iterator[None]:
-    """Has renders drawn by another function of the same arguments as :func:`frame`, in the block."""
-    global _draw
-    before, _draw = _draw, draw
+def use_renderer(function: Callable[..., renderer.RenderedFrame | None]) -> Iterator[None]:
+    """Render with another function within the block. Its arguments are those of :func:`render_frame`."""
+    global _render_function
+    previous = _render_function
+    _render_function = function
     try:
         yield
     finally:
-        _draw = before
+        _render_function = previous
 
 
 def holdout_file(scene: bpy.types.Scene, frame: int) -> Path | None:
-    """The file with the depth of the meshes in a frame; None where nothing is to be held out.
+    """Return the file with the mesh depth of a frame, or None if the scene has no mesh holdout.
 
     Raises:
-        LodgsError: it does not exist.
+        LodgsError: the file does not exist.
     """
     if not scene.lodgs_render.holdout:
         return None
-    path = at_frame(scene.lodgs_render.holdout, scene.original, frame)
+    path = frame_path(scene.lodgs_render.holdout, scene.original, frame)
     if not path.is_file():
         raise LodgsError(
-            f"The depth of the meshes in frame {frame} is missing: {path}.",
+            f"Cannot hold out meshes: the depth file of frame {frame} is missing: {path}.",
             "Press Render Mesh Depth (for all frames, the button beside it), or clear Hold Out.",
         )
     return path
 
 
-def at_frame(pattern: str, scene: bpy.types.Scene, frame: int) -> Path:
-    """A path with the frame's number in the place of the last # characters of its name, as Blender counts."""
+def frame_path(pattern: str, scene: bpy.types.Scene, frame: int) -> Path:
+    """Replace the last # characters of a file name by the frame number, as Blender does."""
     path = Path(bpy.path.abspath(pattern, library=scene.library))
 
-    def number(found: re.Match) -> str:
-        return "-" * (frame < 0) + str(abs(frame)).zfill(len(found[0]))
+    def number(match: re.Match) -> str:
+        return "-" * (frame < 0) + str(abs(frame)).zfill(len(match[0]))
 
     return path.with_name(re.sub(r"#+(?=[^#]*$)", number, path.name))
 
 
 def placed_splats(depsgraph: bpy.types.Depsgraph) -> list[renderer.PlacedSplats | renderer.PlacedTree]:
-    """What a depsgraph shows of splats, in the form that files have: so its pixels are those of the files.
+    """Return the visible splats of a depsgraph in the form of splat files, so that both render equally.
 
-    What only a rule chooses from is all of an object's splats, with the choice. Else it is what modifiers
-    leave.
+    For an object whose splats are selected only by a rule, all its splats are returned with the arguments of
+    the rule. Other objects give the splats that remain after their modifiers.
     """
-    found = []
+    placed = []
     for instance in shown.without_coarser(shown.splat_instances(depsgraph)):
         evaluated, matrix, level = instance.evaluated, instance.matrix_world, instance.level
-        place, empty = (matrix, level, instance.antialias), not len(evaluated.data.points)
+        placement = (matrix, level, instance.antialias)
+        is_empty = not len(evaluated.data.points)
         if instance.source is not None and (choice := shown.choice_of_picture(instance, depsgraph)):
             tree = instance.source.path, matrix, instance.antialias, choice, instance.looks
-            found.append(renderer.PlacedTree(*tree))
+            placed.append(renderer.PlacedTree(*tree))
             continue
-        if not _chosen_by_rule(instance, depsgraph):
-            if not empty:
-                read = partial(_splats_of, evaluated.data)
+        if not _is_selected_by_rule(instance, depsgraph):
+            if not is_empty:
+                read = partial(_read_splats, evaluated.data)
                 uid = instance.object.session_uid
-                found.append(renderer.PlacedSplats(uid, read, *place, looks=instance.looks))
+                placed.append(renderer.PlacedSplats(uid, read, *placement, looks=instance.looks))
             continue
-        own = instance.object.data
-        read = partial(_splats_of, own.evaluated_get(depsgraph), every_column())
-        version = *changes.version(own), *changes.paint(own)
+        cloud = instance.object.data
+        read = partial(_read_splats, cloud.evaluated_get(depsgraph), all_rule_columns())
+        version = *changes.version(cloud), *changes.paint(cloud)
         choice = selection.choice(evaluated, depsgraph)
-        found.append(
-            renderer.PlacedSplats(own.session_uid, read, *place, version, choice, empty, instance.looks)
+        placed.append(
+            renderer.PlacedSplats(
+                cloud.session_uid, read, *placement, version, choice, is_empty, instance.looks
+            )
         )
-    return found
+    return placed
 
 
-def _chosen_by_rule(instance: shown.SplatInstance, depsgraph: bpy.types.Depsgraph) -> bool:
-    """Whether an instance shows its object's own splats, chosen by nothing but a rule.
+def _is_selected_by_rule(instance: shown.SplatInstance, depsgraph: bpy.types.Depsgraph) -> bool:
+    """Return whether an instance shows the splats of its object, selected by nothing but a rule.
 
-    Of objects that no viewport shows, Blender does not tell when they change.
+    Objects that are hidden in the viewport do not count, because Blender does not report their changes.
     """
     return (
         selection.only_chosen(instance.evaluated, depsgraph)
@@ -194,41 +202,43 @@ def _chosen_by_rule(instance: shown.SplatInstance, depsgraph: bpy.types.Depsgrap
     )
 
 
-def _splats_of(cloud: bpy.types.PointCloud, columns: Iterable[str] = ()) -> tuple[Splats, np.ndarray | None]:
-    """The splats of a point cloud as painted, with what it has of some columns, and their weights."""
+def _read_splats(
+    cloud: bpy.types.PointCloud, columns: Iterable[str] = ()
+) -> tuple[Splats, np.ndarray | None]:
+    """Read the painted splats of a point cloud with optional columns, and their weights."""
     splats = objects.splats_of(cloud)
-    if splats is None:  # modifiers have taken their attributes away
-        nothing = np.zeros((0, 4), np.float32)
-        return Splats(nothing[:, :3], nothing, nothing[:, :3], nothing[:, 0], np.zeros((0, 1, 3))), None
+    if splats is None:  # a modifier has removed the attributes
+        empty = np.zeros((0, 4), np.float32)
+        return Splats(empty[:, :3], empty, empty[:, :3], empty[:, 0], np.zeros((0, 1, 3))), None
     for name in (*columns, *PAINT):
         values = attributes.read_attribute(cloud, name)
         if values is not None and values.ndim == 1:
             splats.extras[name] = values
-    return painted(splats), attributes.read_attribute(cloud, attributes.WEIGHT)
+    return apply_paint(splats), attributes.read_attribute(cloud, attributes.WEIGHT)
 
 
-def size(render: bpy.types.RenderSettings) -> tuple[int, int]:
-    """Width and height of the whole picture in pixels, in Blender's arithmetic."""
+def render_size(render: bpy.types.RenderSettings) -> tuple[int, int]:
+    """Return the width and height of the full image in pixels, rounded as in Blender."""
     percent = render.resolution_percentage
     return max(render.resolution_x * percent // 100, 1), max(render.resolution_y * percent // 100, 1)
 
 
-def border(render: bpy.types.RenderSettings, width: int, height: int) -> tuple[int, int, int, int]:
-    """Left, bottom, width and height of the part of the picture that is rendered, in Blender's arithmetic."""
+def render_border(render: bpy.types.RenderSettings, width: int, height: int) -> tuple[int, int, int, int]:
+    """Return left, bottom, width and height of the rendered region in pixels, rounded as in Blender."""
     if not render.use_border:
         return 0, 0, width, height
-    x = [int(np.float32(at) * np.float32(width)) for at in (render.border_min_x, render.border_max_x)]
-    y = [int(np.float32(at) * np.float32(height)) for at in (render.border_min_y, render.border_max_y)]
+    x = [int(np.float32(edge) * np.float32(width)) for edge in (render.border_min_x, render.border_max_x)]
+    y = [int(np.float32(edge) * np.float32(height)) for edge in (render.border_min_y, render.border_max_y)]
     return x[0], y[0], x[1] - x[0], y[1] - y[0]
 
 
-def levels_in(scene: bpy.types.Scene) -> list[int]:
-    """Numbers of the levels of all splat scenes in a scene."""
+def level_numbers(scene: bpy.types.Scene) -> list[int]:
+    """Return the sorted level numbers of all splat scenes in a Blender scene."""
     return sorted({item.number for root in roots.roots(scene) for item in root.lodgs.levels})
 
 
 def use(scene: bpy.types.Scene) -> None:
-    """Makes LODGS the scene's engine, and its colours those of the photographs."""
+    """Set the LODGS engine and a view transform that shows colours as in the photos."""
     scene.render.engine = ID
     scene.view_settings.view_transform = "Standard"
     scene.view_settings.look = "None"
@@ -236,17 +246,17 @@ def use(scene: bpy.types.Scene) -> None:
 
 CLASSES = (LodgsEngine,)
 
-_NOT_OURS = ("freestyle", "simplify", "gpencil")
-"""Parts of the names of Blender's panels that would promise too much."""
+_UNSUPPORTED = ("freestyle", "simplify", "gpencil")
+"""Parts of the names of Blender panels whose settings LODGS ignores."""
 
 
-def _shared_panels():
-    """Blender's own panels that make sense for any engine: output, colour management, cameras, ..."""
+def _shared_panels() -> list[type[bpy.types.Panel]]:
+    """Return Blender's panels that suit every engine: output, colour management, cameras and others."""
     return [
         panel
         for panel in bpy.types.Panel.__subclasses__()
         if "BLENDER_RENDER" in getattr(panel, "COMPAT_ENGINES", ())
-        and not any(part in panel.__name__ for part in _NOT_OURS)
+        and not any(part in panel.__name__ for part in _UNSUPPORTED)
     ]
 
 

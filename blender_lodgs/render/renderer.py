@@ -1,7 +1,7 @@
-"""The trainer's rasterizer as a program beside Blender (``training.render.serve``), alive between frames.
+"""Client of the renderer process (``training.render.serve``), which stays alive between frames.
 
-There is one, started with the first frame and given what has changed since the last. It ends with Blender,
-however that ends, with the file, or after some minutes without a frame.
+There is one renderer process. It starts with the first frame and receives only changed splats afterwards. It
+ends when Blender ends or crashes, when a file is opened, or after some minutes without a frame.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 
 from ...training.editing.look import Looks, looks_as_dicts
 from ...training.errors import LodgsError
-from ...training.lod.query import Choice
+from ...training.lod.query import LodQuery
 from ...training.render import wire
 from ...training.scenes.cameras import Camera, camera_to_dict
 from ...training.splats.gaussians import Splats
@@ -34,23 +34,23 @@ from ..data.changes import Version
 from ..runs import environment, processes
 
 IDLE = 300.0
-"""Seconds without a frame after which the renderer gives its memory back."""
+"""Seconds without a frame after which the renderer is closed to free its memory."""
 
 PATIENCE = 1.0
-"""Seconds that a cancelled frame is waited for."""
+"""Seconds to wait for a cancelled frame."""
 
 OnProgress = Callable[[float, str], bool]
-"""Called with the fraction that is done and a word on it; where it returns False the frame is cancelled."""
+"""Function called with the progress (0 to 1) and a status text. It returns False to cancel the frame."""
 
 
 @dataclass(frozen=True)
-class Frame:
-    """A picture.
+class RenderedFrame:
+    """A rendered image with its passes.
 
     Attributes:
-        planes: (H, W) float32 by name as ``training.render.image.RenderedImage.passes``, rows from the top; the
-            photograph's, where one was given, are "Photograph.R", ..., display-coded.
-        psnr: in dB against the photograph; NaN where none was given.
+        planes: (H, W) float32 by name as ``training.render.image.RenderedImage.passes``, rows from the
+            top. A photo, if given, is "Photograph.R" and so on, sRGB-encoded.
+        psnr: PSNR to the photo in dB. NaN without a photo.
     """
 
     planes: dict[str, np.ndarray]
@@ -59,19 +59,19 @@ class Frame:
 
 @dataclass(frozen=True)
 class PlacedSplats:
-    """Splats in the world, for one frame.
+    """Splats with a placement in the world, for one frame.
 
     Attributes:
-        key: says which splats are the same from frame to frame.
-        read: the splats in the files' form, in their own space, and their weights (N,), or None for ones;
-            called where they are not known already.
-        matrix: (4, 4) to the world.
-        level: 0 where they are no level.
+        key: identifier of the splats across frames.
+        read: function that returns the splats in their local space and their weights (N,), or None for ones.
+            It is called only if the renderer does not have these splats.
+        matrix: (4, 4), local space to world.
+        level: level number, or 0 if the splats are no level.
         antialias: see ``SplatScene.antialias``.
-        version: the splats with this key do not change as long as it stays; None: nobody knows.
-        choice: by what splats are weighted; None: all are drawn.
-        empty: whether nothing is seen of them. What has not been seen so far is not even read.
-        looks: what is made of their colours and opacities.
+        version: version of the splats with this key: unchanged if equal. None if unknown.
+        choice: arguments of the rule that selects splats, or None to draw all.
+        empty: whether no splat is visible. Empty sets are not read before they become visible.
+        looks: adjustments of colours and opacities.
     """
 
     key: int
@@ -80,29 +80,32 @@ class PlacedSplats:
     level: int
     antialias: bool = False
     version: Version | None = None
-    choice: Choice | None = None
+    choice: LodQuery | None = None
     empty: bool = False
     looks: Looks = ()
 
 
 @dataclass(frozen=True)
 class PlacedTree:
-    """A tree of splats in a file, for one frame, of which the renderer reads what the frame shows.
+    """A tree of splats in a file, for one frame. The renderer reads only the visible nodes.
 
     Attributes:
-        path: a bundle of the rule ``cut``.
-        matrix, antialias, choice, looks: see :class:`PlacedSplats`.
+        path: bundle with the rule ``cut``.
+        matrix: see :class:`PlacedSplats`.
+        antialias: see :class:`PlacedSplats`.
+        choice: see :class:`PlacedSplats`.
+        looks: see :class:`PlacedSplats`.
     """
 
     path: Path
     matrix: np.ndarray
     antialias: bool
-    choice: Choice
+    choice: LodQuery
     looks: Looks = ()
 
 
-class _Known(NamedTuple):
-    """A set that the program has, or can read: its file, what is in it, and what it was made of."""
+class _SentSet(NamedTuple):
+    """A set of splats that the renderer has or can read, with its file, content and version."""
 
     file: Path
     digest: tuple
@@ -111,15 +114,15 @@ class _Known(NamedTuple):
     version: Version | None
 
 
-class Stopped(Exception):
-    """The program has ended by itself."""
+class RendererStopped(Exception):
+    """The renderer process has ended unexpectedly."""
 
 
 class Renderer:
-    """One program, and what it knows.
+    """A renderer process and the splats that it has.
 
     Raises:
-        LodgsError: no Python is set up that can do it.
+        LodgsError: the trainer is missing or cannot be started.
     """
 
     def __init__(self) -> None:
@@ -128,10 +131,10 @@ class Renderer:
         self._folder = Path(tempfile.mkdtemp(prefix="lodgs-render-", dir=bpy.app.tempdir or None))
         wire.claim_folder(self._folder)
         self._log = self._folder / "renderer.log"
-        self._fresh = True  # the first frame on a computer compiles, for some seconds
-        self._known: dict[int, _Known] = {}
+        self._is_first_frame = True  # compiles kernels, which may take some seconds
+        self._sent: dict[int, _SentSet] = {}
         self._numbers = itertools.count(1)
-        self._answers: queue.SimpleQueue[dict | None] = queue.SimpleQueue()
+        self._responses: queue.SimpleQueue[dict | None] = queue.SimpleQueue()
         command = [str(python), "-m", "training", "serve", str(self._folder)]
         try:
             self.process = processes.spawn_piped(
@@ -140,12 +143,12 @@ class Renderer:
         except OSError as error:
             shutil.rmtree(self._folder, ignore_errors=True)
             raise LodgsError(
-                f"The renderer cannot be started with {python}: {error.strerror or error}.",
+                f"Cannot start the renderer with {python}: {error.strerror or error}.",
                 "Check the trainer's Python in the preferences of LODGS.",
             ) from error
-        threading.Thread(target=self._read_answers, daemon=True).start()
+        threading.Thread(target=self._read_responses, daemon=True).start()
 
-    def frame(
+    def draw_frame(
         self,
         sets: list[PlacedSplats | PlacedTree],
         camera: Camera,
@@ -159,52 +162,71 @@ class Renderer:
         photograph: Path | None = None,
         mask: Path | None = None,
         holdout: Path | None = None,
-    ) -> Frame | None:
-        """A picture, or None where it was cancelled.
+    ) -> RenderedFrame | None:
+        """Render a frame.
 
-        Args: as ``training.render.scene.draw``, and
-            photograph: to compare with.
-            mask: black where it does not count.
-            holdout: EXR with the depth of what hides splats.
+        Args:
+            sets: visible splats.
+            camera: camera in world space.
+            near: near clipping distance.
+            on_progress: function that receives the progress and may cancel the frame.
+            background: colour of the background, or None for transparent.
+            depth: whether to render the depth pass.
+            levels: whether to render the level passes.
+            window: left, top, width and height of the rendered region, or None for the full image.
+            photograph: photo to compare with.
+            mask: image that is black where the comparison ignores pixels.
+            holdout: EXR file with the depth of objects that occlude splats.
+
+        Returns:
+            The frame, or None if it was cancelled.
 
         Raises:
-            LodgsError: it cannot be drawn, says why.
-            Stopped: the program has ended.
+            LodgsError: the frame cannot be rendered.
+            RendererStopped: the process has ended.
         """
         frame = next(self._numbers)
         out = self._folder / f"frame-{frame}"
         try:
-            old, named = dict(self._known), self._write_sets(sets)
+            previous = dict(self._sent)
+            described = self._write_sets(sets)
             self._send(
-                frame=frame, out=out.name, sets=named, camera=camera_to_dict(camera, near),
+                frame=frame, out=out.name, sets=described, camera=camera_to_dict(camera, near),
                 background=background, depth=depth, levels=levels, window=window,
                 photograph=str(photograph) if photograph else None, mask=str(mask) if mask else None,
                 holdout=str(holdout) if holdout else None,
             )  # fmt: skip
-            answer = self._wait(frame, on_progress)
-            done = {each.file for each in old.values()} - {each.file for each in self._known.values()}
-            if answer["event"] == "frame":  # all has been read
-                done |= {each.file for each in self._known.values()}
-            for path in done:
-                path.unlink(missing_ok=True)
-            if answer["event"] == "error":
-                raise LodgsError(answer["what"], answer["remedy"])
-            if answer["event"] == "cancelled":
-                return None
-            names = answer["passes"]
-            planes = wire.read_planes(out, len(names), answer["height"], answer["width"])
-            out.unlink(missing_ok=True)
-            return Frame(dict(zip(names, planes, strict=True)), answer.get("psnr", float("nan")))
+            response = self._wait(frame, on_progress)
+            self._remove_files(previous, all_read=response["event"] == "frame")
+            return self._read_frame(out, response)
         except OSError as error:
             if self.process.poll() is not None or isinstance(error, BrokenPipeError):
-                raise Stopped from error
+                raise RendererStopped from error
             raise LodgsError(
-                f"The renderer's files in {self._folder} cannot be used: {error.strerror or error}.",
-                "Free some space there.",
+                f"Cannot use the renderer's files in {self._folder}: {error.strerror or error}.",
+                "Free some disk space.",
             ) from error
 
+    def _remove_files(self, previous: dict[int, _SentSet], all_read: bool) -> None:
+        """Remove the files of replaced sets, or of all sets once the renderer has read them."""
+        sent = {item.file for item in self._sent.values()}
+        unused = {item.file for item in previous.values()} - sent
+        for path in unused | sent if all_read else unused:
+            path.unlink(missing_ok=True)
+
+    def _read_frame(self, path: Path, response: dict) -> RenderedFrame | None:
+        """Read the frame of a response, or return None if it was cancelled."""
+        if response["event"] == "error":
+            raise LodgsError(response["what"], response["remedy"])
+        if response["event"] == "cancelled":
+            return None
+        names = response["passes"]
+        planes = wire.read_planes(path, len(names), response["height"], response["width"])
+        path.unlink(missing_ok=True)
+        return RenderedFrame(dict(zip(names, planes, strict=True)), response.get("psnr", float("nan")))
+
     def close(self) -> None:
-        """Ends the program and takes its files away."""
+        """End the process and remove its files."""
         with suppress(OSError):
             self.process.stdin.close()
         try:
@@ -215,12 +237,12 @@ class Renderer:
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def exit_reason(self) -> str:
-        """Why the program has ended, as far as one can know."""
+        """Return why the process has ended."""
         with suppress(subprocess.TimeoutExpired):
             self.process.wait(timeout=2)
         code = self.process.returncode
         if code is not None and code < 0:
-            return f"The renderer was killed (signal {-code}); often that means too little memory."
+            return f"The renderer was killed (signal {-code}), often because the memory is full."
         try:
             last = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:]
         except OSError:
@@ -228,118 +250,127 @@ class Renderer:
         return " ".join([f"The renderer stopped with exit code {code}.", *last])
 
     def _write_sets(self, sets: list[PlacedSplats | PlacedTree]) -> list[dict]:
-        """Writes the splats that are new or have changed, and names all."""
-        known, named = {}, []
-        for one in sets:
-            if isinstance(one, PlacedTree):
-                named.append(
+        """Write new and changed splats to files. Return the descriptions of all sets for the request."""
+        sent: dict[int, _SentSet] = {}
+        described = []
+        for item in sets:
+            if isinstance(item, PlacedTree):
+                described.append(
                     {
-                        "tree": str(one.path), "matrix": one.matrix.tolist(), "antialias": one.antialias,
-                        "choice": one.choice.as_dict(), "looks": looks_as_dicts(one.looks),
+                        "tree": str(item.path), "matrix": item.matrix.tolist(), "antialias": item.antialias,
+                        "choice": item.choice.as_dict(), "looks": looks_as_dicts(item.looks),
                     }
                 )  # fmt: skip
                 continue
-            if one.empty and one.key not in self._known:
+            if item.empty and item.key not in self._sent:
                 continue
-            if one.key not in known:
-                known[one.key] = self._written(one)
-            file, _, count, columns, _ = known[one.key]
-            named.append(
+            if item.key not in sent:
+                sent[item.key] = self._write_set(item)
+            file, _, count, columns, _ = sent[item.key]
+            described.append(
                 {
                     "file": file.name, "count": count, "columns": columns,
-                    "matrix": one.matrix.tolist(), "level": one.level, "antialias": one.antialias,
-                    "choice": None if one.choice is None else one.choice.as_dict(),
-                    "looks": looks_as_dicts(one.looks),
+                    "matrix": item.matrix.tolist(), "level": item.level, "antialias": item.antialias,
+                    "choice": None if item.choice is None else item.choice.as_dict(),
+                    "looks": looks_as_dicts(item.looks),
                 }
             )  # fmt: skip
-        self._known = known
-        return named
+        self._sent = sent
+        return described
 
-    def _written(self, one: PlacedSplats) -> _Known:
-        before = self._known.get(one.key)
-        if before is not None and one.version is not None and before.version == one.version:
-            return before
-        splats, weights = one.read()
+    def _write_set(self, item: PlacedSplats) -> _SentSet:
+        """Write a set to a file if it has changed since it was sent."""
+        previous = self._sent.get(item.key)
+        if previous is not None and item.version is not None and previous.version == item.version:
+            return previous
+        splats, weights = item.read()
         columns = wire.pack_set(splats, weights)
         digest, names = wire.digest(columns), list(splats.extras)
-        if before is not None and (before.digest, before.columns) == (digest, names):
-            return before._replace(version=one.version)
+        if previous is not None and (previous.digest, previous.columns) == (digest, names):
+            return previous._replace(version=item.version)
         path = self._folder / f"set-{next(self._numbers)}"
         wire.write_set(path, columns)
-        return _Known(path, digest, len(splats), names, one.version)
+        return _SentSet(path, digest, len(splats), names, item.version)
 
     def _wait(self, frame: int, on_progress: OnProgress) -> dict:
-        """The answer to a frame; that of a cancelled one may come late, and is then passed over."""
-        text, fraction, cancelled = "Preparing the renderer" if self._fresh else "Rendering", 0.0, 0.0
+        """Return the response to a frame. Responses to earlier frames, which were cancelled, are ignored."""
+        text = "Preparing the renderer" if self._is_first_frame else "Rendering"
+        fraction = 0.0
+        cancel_time = 0.0
         while True:
             try:
-                answer = self._answers.get(timeout=0.1)
+                response = self._responses.get(timeout=0.1)
             except queue.Empty:
-                answer = {}
-            if answer is None:
-                raise Stopped
-            kind, of = answer.get("event"), answer.get("frame")
-            if kind == "hello" and answer["protocol"] != wire.PROTOCOL:
-                raise LodgsError("The renderer is of another version.", "Restart Blender.")
-            if kind == "progress" and of == frame:
-                fraction, text, self._fresh = answer["share"], "Rendering", False
-            elif kind in {"frame", "cancelled", "error"} and of in {frame, None}:
-                return answer
-            if cancelled and time.monotonic() - cancelled > PATIENCE:
+                response = {}
+            if response is None:
+                raise RendererStopped
+            kind = response.get("event")
+            number = response.get("frame")
+            if kind == "hello" and response["protocol"] != wire.PROTOCOL:
+                raise LodgsError(
+                    "Cannot render: the renderer has another version than LODGS.", "Restart Blender."
+                )
+            if kind == "progress" and number == frame:
+                fraction = response["share"]
+                text = "Rendering"
+                self._is_first_frame = False
+            elif kind in {"frame", "cancelled", "error"} and number in {frame, None}:
+                return response
+            if cancel_time and time.monotonic() - cancel_time > PATIENCE:
                 return {"event": "cancelled"}
-            if not on_progress(fraction, text) and not cancelled:
-                cancelled = time.monotonic()
+            if not on_progress(fraction, text) and not cancel_time:
+                cancel_time = time.monotonic()
                 self._send(cancel=frame)
 
     def _send(self, **request) -> None:
         self.process.stdin.write(json.dumps(request) + "\n")
         self.process.stdin.flush()
 
-    def _read_answers(self) -> None:
-        """In a thread of its own: what the program answers, and that it has ended."""
+    def _read_responses(self) -> None:
+        """Queue the responses of the process, and None when it ends. Runs in a thread."""
         for line in self.process.stdout or ():
             with suppress(ValueError):
-                answer = json.loads(line)
-                if isinstance(answer, dict):
-                    self._answers.put(answer)
-        self._answers.put(None)
+                response = json.loads(line)
+                if isinstance(response, dict):
+                    self._responses.put(response)
+        self._responses.put(None)
 
 
 _renderer: Renderer | None = None
 _lock = threading.Lock()
-_used = 0.0
+_last_use = 0.0
 
 
-def frame(
+def draw_frame(
     sets: list[PlacedSplats | PlacedTree], camera: Camera, near: float, on_progress: OnProgress, **options
-) -> Frame | None:
-    """:meth:`Renderer.frame` by the one renderer; started when there is none, and once again when it dies.
+) -> RenderedFrame | None:
+    """Call :meth:`Renderer.draw_frame` of the shared renderer. Start it if needed, and once more if it dies.
 
     Raises:
-        LodgsError: no Python is set up that can render, it cannot be drawn, or the renderer died twice.
+        LodgsError: the trainer is missing, the frame cannot be rendered, or the renderer died twice.
     """
-    global _renderer, _used
+    global _renderer, _last_use
     with _lock:
         for attempt in (1, 2):
             if _renderer is None:
                 on_progress(0.0, "Starting the renderer")
                 _renderer = Renderer()
             try:
-                return _renderer.frame(sets, camera, near, on_progress, **options)
-            except Stopped:
+                return _renderer.draw_frame(sets, camera, near, on_progress, **options)
+            except RendererStopped:
                 reason = _renderer.exit_reason()
                 _renderer.close()
                 _renderer = None
                 if attempt == 2:
-                    raise LodgsError(reason, "Render a coarser level or a smaller picture.") from None
-                print(f"LODGS: {reason} It is started again.")
+                    raise LodgsError(reason, "Render a coarser level or a smaller image.") from None
+                print(f"LODGS: {reason} Restarting it.")
             finally:
-                _used = time.monotonic()
+                _last_use = time.monotonic()
     return None
 
 
 def close() -> None:
-    """Ends the renderer, if there is one; waits for the frame that is being drawn."""
+    """End the shared renderer after its current frame."""
     global _renderer
     with _lock:
         if _renderer is not None:
@@ -348,8 +379,8 @@ def close() -> None:
 
 
 def _close_when_idle() -> float:
-    """A timer: an idle renderer gives its memory back."""
-    if _renderer is not None and time.monotonic() - _used > IDLE and not _lock.locked():
+    """Close an idle renderer. Timer function."""
+    if _renderer is not None and time.monotonic() - _last_use > IDLE and not _lock.locked():
         close()
     return 60.0
 

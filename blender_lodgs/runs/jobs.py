@@ -13,7 +13,7 @@ from pathlib import Path
 import bpy
 
 from ...training.errors import LodgsError
-from ...training.lod.selection import complete
+from ...training.lod.selection import complete_splats
 from ...training.runs.folder import RunFolder
 from ...training.runs.job import CHANGEABLE, Job
 from ...training.scenes.cameras import write_camera
@@ -243,7 +243,7 @@ def _export_inputs(root: bpy.types.Object, run: RunFolder, job: Job) -> None:
     bundle = scenes.read_levels(root)
     views = []
     if job.capture:
-        views = viewpoints.placed(bpy.context, root, complete(bundle, bundle.levels[-1]))
+        views = viewpoints.placed(bpy.context, root, complete_splats(bundle, bundle.levels[-1]))
     run.create()
     write_bundle(run.base, bundle)
     for number, (camera, near) in enumerate(views):

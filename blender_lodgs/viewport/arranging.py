@@ -16,7 +16,8 @@ from typing import Protocol
 import numpy as np
 
 from ...training.editing.look import Looks
-from ...training.lod.query import Choice, Chooser
+from ...training.lod.query import LodQuery as Choice
+from ...training.lod.query import SplatSelector as Chooser
 from ...training.lod.rule import OPACITY
 
 SAMPLE, LEAST_SAMPLE = 16, 10_000

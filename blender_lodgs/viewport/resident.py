@@ -17,8 +17,8 @@ import bpy
 import gpu
 import numpy as np
 
-from ...training.editing.paint import mixed
-from ...training.lod.rule import every_column
+from ...training.editing.paint import mix_paint as mixed
+from ...training.lod.rule import all_rule_columns as every_column
 from .. import attributes
 from ..data import changes, cleaning, painting
 from . import splats

@@ -12,7 +12,7 @@ import time
 import numpy as np
 
 from ...training.errors import LodgsError
-from ...training.lod.query import Choice
+from ...training.lod.query import LodQuery as Choice
 from ...training.lod.rules.cut import NODE_SIZE, PARENT, PARENT_SIZE, detail_of
 from ...training.lod.tree.paging import SIZE, Pager
 from ...training.splats.gaussians import Splats

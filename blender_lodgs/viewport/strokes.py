@@ -5,9 +5,12 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
-from ...training.editing.brush import Front, Projection, hits, middle
-from ...training.lod.crop import kept
-from ...training.lod.query import Chooser
+from ...training.editing.brush import OcclusionDepth as Front
+from ...training.editing.brush import Projection
+from ...training.editing.brush import hit_strength as hits
+from ...training.editing.brush import middle_scale as middle
+from ...training.lod.crop import crop_mask as kept
+from ...training.lod.query import SplatSelector as Chooser
 from ...training.lod.rule import HIDDEN, OPACITY
 from .. import attributes
 from ..data import cleaning, crops, shown
@@ -57,10 +60,10 @@ class Picture:
     def hits(
         self, covered: np.ndarray, through: bool = False, footprints: bool = False
     ) -> dict[int, np.ndarray]:
-        """How strongly a stroke hits each level, (N,) by its number: see ``brush.hits``.
+        """How strongly a stroke hits each level, (N,) by its number: see ``brush.hit_strength``.
 
         Args:
-            covered: (H, W) the stroke, of the region's pixels (``brush.brushed``, ``brush.lassoed``).
+            covered: (H, W) the stroke, of the region's pixels (``brush.brush_coverage``, ``brush.lasso_coverage``).
             through: hit what is hidden by other splats as well.
             footprints: hit each splat as far as its footprint is covered, instead of by its mean.
         """

@@ -291,7 +291,7 @@ def _from_files(
 
 
 def _direction(
-    instance: shown.SplatInstance, choice: selection.Choice, view_matrix: Matrix
+    instance: shown.SplatInstance, choice: selection.LodQuery, view_matrix: Matrix
 ) -> Direction | None:
     """In which direction, in the splats' own space, an eye looks that is where the view is; None for one that
     is elsewhere."""
@@ -407,7 +407,7 @@ def _placements(
 
 def choice_of_view(
     instance: shown.SplatInstance, depsgraph: bpy.types.Depsgraph, moving: bool = True
-) -> selection.Choice | None:
+) -> selection.LodQuery | None:
     """By what an instance's splats are chosen, from where the eye is now.
 
     Args:

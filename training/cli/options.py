@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import LodgsError
-from ..lod.rule import every_control
+from ..lod.rule import all_controls
 
 if TYPE_CHECKING:
     from ..splats.similarity import Similarity
@@ -67,7 +67,7 @@ def parse_color(text: str) -> tuple[float, float, float] | None:
 def add_controls(parser: argparse.ArgumentParser) -> None:
     """Add an option for each control that any rule has."""
     group = parser.add_argument_group("level of detail by camera distance, depending on the method's rule")
-    for control in every_control().values():
+    for control in all_controls().values():
         default = "" if control.follows else f" (default: the file's, else {control.default:g})"
         group.add_argument(
             f"--{control.name.replace('_', '-')}", type=int if control.whole else float, metavar="N",
@@ -77,7 +77,7 @@ def add_controls(parser: argparse.ArgumentParser) -> None:
 
 def control_values(options: argparse.Namespace) -> dict[str, float]:
     """Return the control values that the user set, by name."""
-    values = {name: getattr(options, name) for name in every_control()}
+    values = {name: getattr(options, name) for name in all_controls()}
     return {name: value for name, value in values.items() if value is not None}
 
 

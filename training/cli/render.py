@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     from ..lod.rule import find_rule
-    from ..lod.selection import unknown_rule
+    from ..lod.selection import unknown_rule_error
     from ..render.command import RenderSource, render
     from ..scenes.cameras import check_render_size, read_camera
 
@@ -55,7 +55,7 @@ def run(options: argparse.Namespace) -> int:
         camera = camera.resized(*options.size)
     selected = controls if controls or options.by_distance else None
     if source.rule and find_rule(source.rule) is None and selected is None and not options.level:
-        warn(" ".join(unknown_rule(source.rule)))
+        warn(" ".join(unknown_rule_error(source.rule)))
     rendered = render(
         source, camera, near, options.out, level=options.level, given=selected,
         background=options.background, holdout=options.holdout, backend=options.backend, warn=warn,

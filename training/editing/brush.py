@@ -14,17 +14,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-SIDES = (4, 8, 16, 32, 64, 128, 256)
+CELL_SIDES = (4, 8, 16, 32, 64, 128, 256)
 """Pixels along the cells in which splats hide what is behind them: the smallest that hold three of their
 standard deviations."""
-DARK = float(np.log(2))
+OCCLUDING_THICKNESS = float(np.log(2))
 """Optical thickness behind which nothing counts as seen: half of the light."""
 _REACH = 6.0
 """Standard deviations beyond which nothing counts in the mean of a footprint."""
 _NOWHERE = np.float32(-1e9)
 
 
-def brushed(path: np.ndarray, radius: float, size: tuple[int, int], hardness: float = 1.0) -> np.ndarray:
+def brush_coverage(
+    path: np.ndarray, radius: float, size: tuple[int, int], hardness: float = 1.0
+) -> np.ndarray:
     """(H, W) float32, how strongly a brush covers pixels whose centres are within a radius of a path's points
     (P, 2), or of the way between them: from 1 down to 0 where it does not.
 
@@ -50,12 +52,12 @@ def brushed(path: np.ndarray, radius: float, size: tuple[int, int], hardness: fl
     return covered
 
 
-def lassoed(path: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def lasso_coverage(path: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """(H, W) bool, which pixels have their centres in the closed polygon of points (P, 2): an odd number of
     its edges is to their left.
 
     Args:
-        path, size: see :func:`brushed`.
+        path, size: see :func:`brush_coverage`.
     """
     width, height = size
     begin = np.asarray(path, np.float64).reshape(-1, 2)
@@ -74,14 +76,14 @@ def lassoed(path: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return np.cumsum(crossed, axis=1)[:, :width] % 2 == 1
 
 
-def middle(scales: np.ndarray) -> np.ndarray:
+def middle_scale(scales: np.ndarray) -> np.ndarray:
     """(N,) the middle ones of three standard deviations (N, 3): of a flat splat's face, the shorter."""
     a, b, c = scales.T
     return np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
 
 
 @dataclass(frozen=True)
-class Placed:
+class ProjectedSplats:
     """Where a picture has N splats.
 
     Attributes:
@@ -124,17 +126,17 @@ class Projection:
         rows = np.vstack([pixels, clip[2:], -to_camera[2] / scale])
         return cls(size, rows, 2 / (size[0] * to_clip[0, 0] * scale))
 
-    def place(self, means: np.ndarray) -> Placed:
+    def place(self, means: np.ndarray) -> ProjectedSplats:
         """Where means (N, 3) are."""
         to, more = self.rows[:, :3].astype(np.float32), self.rows[:, 3].astype(np.float32)
         x, y, z, w, depth = (to @ means.T) + more[:, None]
         there = (w > 0) & (np.abs(z) < w)
         with np.errstate(divide="ignore", invalid="ignore"):
             x, y = np.where(there, x / w, _NOWHERE), np.where(there, y / w, _NOWHERE)
-        return Placed(x, y, depth, w * np.float32(self.unit))
+        return ProjectedSplats(x, y, depth, w * np.float32(self.unit))
 
 
-class Front:
+class OcclusionDepth:
     """How deep one sees into the splats that a picture shows.
 
     In each cell of pixels splats take away light by their footprints, 2 pi sigma^2 times their opacity over
@@ -146,14 +148,16 @@ class Front:
             opacities with the weights that levels of detail give them.
     """
 
-    def __init__(self, parts: Sequence[tuple[Placed, np.ndarray, np.ndarray]]) -> None:
-        found: list[list[tuple[np.ndarray, ...]]] = [[] for _ in SIDES]
+    def __init__(self, parts: Sequence[tuple[ProjectedSplats, np.ndarray, np.ndarray]]) -> None:
+        found: list[list[tuple[np.ndarray, ...]]] = [[] for _ in CELL_SIDES]
         for splats, scales, opacities in parts:
-            shown = np.flatnonzero((splats.x > -SIDES[-1]) & (splats.y > -SIDES[-1]) & (opacities > 0))
+            shown = np.flatnonzero(
+                (splats.x > -CELL_SIDES[-1]) & (splats.y > -CELL_SIDES[-1]) & (opacities > 0)
+            )
             pixel = splats.pixel[shown]
-            sigma = middle(scales[shown]) / pixel
-            kind = np.searchsorted(np.array(SIDES[:-1], np.float32), 3 * sigma)
-            for number, side in enumerate(SIDES):
+            sigma = middle_scale(scales[shown]) / pixel
+            kind = np.searchsorted(np.array(CELL_SIDES[:-1], np.float32), 3 * sigma)
+            for number, side in enumerate(CELL_SIDES):
                 some = np.flatnonzero(kind == number)
                 rows = shown[some]
                 thick = np.float32(2 * np.pi / side**2) * sigma[some] ** 2 * opacities[rows]
@@ -166,7 +170,7 @@ class Front:
         deepest = np.full(len(x), np.inf, np.float32)
         if not len(x):
             return deepest
-        for side, (column, row, depth, thick, width) in zip(SIDES, self._kinds, strict=False):
+        for side, (column, row, depth, thick, width) in zip(CELL_SIDES, self._kinds, strict=False):
             across, down = (np.floor(each / side).astype(np.int32) for each in (x, y))
             left, low = across.min() - 1, down.min() - 1  # with the cells around
             columns, rows = across.max() - left + 2, down.max() - low + 2
@@ -179,17 +183,17 @@ class Front:
         return deepest
 
 
-def hits(
+def hit_strength(
     covered: np.ndarray,
-    splats: Placed,
+    splats: ProjectedSplats,
     reach: np.ndarray | None = None,
-    front: Front | None = None,
+    front: OcclusionDepth | None = None,
     sigma: np.ndarray | None = None,
 ) -> np.ndarray:
     """(N,) how strongly a stroke hits splats; what it does not is 0, or False.
 
     Args:
-        covered: (H, W) the stroke, see :func:`brushed` and :func:`lassoed`.
+        covered: (H, W) the stroke, see :func:`brush_coverage` and :func:`lasso_coverage`.
         sigma: (N,) standard deviations of splats in their units: each is hit as the stroke is in the mean of
             its round footprint, however small the one is beside the other. None: as it is at its mean.
         reach: (N,) how far splats reach, in their units, where only what is seen is to be hit.
@@ -276,7 +280,7 @@ def _darkened(
         begins = np.append(True, cell[1:] != cell[:-1])
         passed = np.cumsum(thick)
         passed -= (passed - thick)[np.flatnonzero(begins)][np.cumsum(begins) - 1]
-        dark = np.flatnonzero(passed >= DARK)[::-1]  # so that the nearest stays
+        dark = np.flatnonzero(passed >= OCCLUDING_THICKNESS)[::-1]  # so that the nearest stays
         found[:, cell[dark]] = depth[order[dark]], width[order[dark]]
     return found[0], found[1]
 

@@ -145,10 +145,10 @@ def block_quantiles(values: np.ndarray, quantile: float) -> np.ndarray:
 
 def spatial_order(means: np.ndarray) -> np.ndarray:
     """(N,) int64, an order of rows in which neighbours in space come near each other (a Z-order curve)."""
-    return np.argsort(places_on_curve(means), kind="stable")
+    return np.argsort(morton_codes(means), kind="stable")
 
 
-def places_on_curve(means: np.ndarray) -> np.ndarray:
+def morton_codes(means: np.ndarray) -> np.ndarray:
     """(N,) uint64, where means (N, 3) are on a Z-order curve through a grid, of 2^AXIS_BITS cells along its
     longest side; each bit halves a box of cells, three one along each axis."""
     if not len(means):

@@ -129,7 +129,7 @@ class Crop:
         return {"shape": self.shape, "to_own": [list(row) for row in self.to_own], "outside": self.outside}
 
 
-def kept(crops: Sequence[Crop], means: np.ndarray) -> np.ndarray:
+def crop_mask(crops: Sequence[Crop], means: np.ndarray) -> np.ndarray:
     """(N,) bool, which splats at means (N, 3) some crops leave.
 
     Those in any of the crops that keep what lies in them, or all where there is none such, but for those in
@@ -145,6 +145,6 @@ def kept(crops: Sequence[Crop], means: np.ndarray) -> np.ndarray:
     return found
 
 
-def is_text_of_crop(text: str) -> bool:
+def is_crop_text(text: str) -> bool:
     """Whether a text is meant to be one that :meth:`Crop.from_text` reads, and no path."""
     return text.split(" ", 1)[0].upper() in SHAPES

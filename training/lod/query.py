@@ -9,15 +9,15 @@ import numpy as np
 
 from ..scenes.cameras import Camera
 from .blocks import SIZE, Blocks
-from .crop import Crop, kept
-from .rule import EVERYTHING, HIDDEN, OPACITY, Region, Rule, Tables, every_column, rules
+from .crop import Crop, crop_mask
+from .rule import HIDDEN, NO_RULE, OPACITY, Region, Rule, Tables, all_rule_columns, rules
 
 Column = tuple[str, str, bytes]
 """A column of a table: its name, its type, its rows."""
 
 
 @dataclass(frozen=True)
-class Choice:
+class LodQuery:
     """By what a level's splats are chosen: a rule with all its arguments but the splats. Choices compare.
 
     Attributes:
@@ -39,14 +39,14 @@ class Choice:
     crops: tuple[Crop, ...] | None = None
 
     @classmethod
-    def by_crops(cls, crops: tuple[Crop, ...]) -> Choice:
+    def by_crops(cls, crops: tuple[Crop, ...]) -> LodQuery:
         """All that crops leave, without a rule."""
-        return cls(EVERYTHING.name, (0.0, 0.0, 0.0), 1.0, (), (), crops=crops)
+        return cls(NO_RULE.name, (0.0, 0.0, 0.0), 1.0, (), (), crops=crops)
 
     @property
     def how(self) -> Rule:
         """The rule itself."""
-        return rules()[self.rule] if self.rule else EVERYTHING
+        return rules()[self.rule] if self.rule else NO_RULE
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -63,7 +63,7 @@ class Choice:
 
         if self.crops is None:
             return weigh(means, columns)
-        there = kept(self.crops, means)
+        there = crop_mask(self.crops, means)
         if HIDDEN in columns:
             there &= columns[HIDDEN] == 0
         if there.all():
@@ -108,7 +108,7 @@ class Choice:
         eye, facts, values = np.array(self.eye, np.float32), dict(self.facts), dict(self.values)
         return self.how.wanted_level(means, eye, self.focal_px, facts, values)
 
-    def coarser(self, levels: Sequence[int]) -> Choice | None:
+    def coarser(self, levels: Sequence[int]) -> LodQuery | None:
         """The next coarser choice, where there is one."""
         values = self.how.coarser(dict(self.values), levels)
         return None if values is None else replace(self, values=tuple(values.items()))
@@ -132,7 +132,7 @@ class Choice:
         }  # fmt: skip
 
 
-class Chooser:
+class SplatSelector:
     """The splats of one set, from which one choice after the other is made.
 
     While the eye stays in a region (``Rule.region``), only what may be shown there is looked at. Of splats
@@ -149,13 +149,13 @@ class Chooser:
         self, means: np.ndarray, columns: Mapping[str, np.ndarray], log_scales: np.ndarray | None = None
     ) -> None:
         nothing = np.broadcast_to(np.float32(0), len(means))
-        known = dict.fromkeys([*every_column(), OPACITY], nothing) | dict(columns)
+        known = dict.fromkeys([*all_rule_columns(), OPACITY], nothing) | dict(columns)
         self._all, self._log_scales = _Part.of(None, means, known, log_scales), log_scales
         self._near: tuple[str, Region, _Part] | None = None
-        self._last: tuple[Choice | None, tuple[np.ndarray, np.ndarray]] | None = None
+        self._last: tuple[LodQuery | None, tuple[np.ndarray, np.ndarray]] | None = None
 
     def chosen(
-        self, choice: Choice | None, camera: Camera | None = None, near: float = 0.0
+        self, choice: LodQuery | None, camera: Camera | None = None, near: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
         """The splats that have a weight, (M,) int32 ascending, and their weights (M,) float32.
 
@@ -172,7 +172,7 @@ class Chooser:
             self._last = choice, self._choose(choice, None, 0.0)
         return self._last[1]
 
-    def _part(self, choice: Choice) -> tuple[_Part, bool]:
+    def _part(self, choice: LodQuery) -> tuple[_Part, bool]:
         """What is to be looked at, and whether that is of a region."""
         region, every = choice.region(), self._all
         if region is None:
@@ -187,7 +187,7 @@ class Chooser:
         return self._near[2], True
 
     def _choose(
-        self, choice: Choice | None, camera: Camera | None, near: float
+        self, choice: LodQuery | None, camera: Camera | None, near: float
     ) -> tuple[np.ndarray, np.ndarray]:
         part, in_region = (self._all, False) if choice is None else self._part(choice)
         blocks, means, rows = part.blocks, part.means, part.rows
@@ -220,9 +220,9 @@ class Chooser:
                 columns = {name: blocks.of_rows(asked, column) for name, column in columns.items()}
                 weights = weigh(blocks.of_rows(asked, means), columns)
                 if (seen & whole).any():  # which is of flat rules: their weights are 0 or 1
-                    kept = np.ones(len(rows), bool)
-                    kept[np.repeat(asked[seen], SIZE)[: len(rows)]] = weights > 0
-                    rows = rows[kept]
+                    crop_mask = np.ones(len(rows), bool)
+                    crop_mask[np.repeat(asked[seen], SIZE)[: len(rows)]] = weights > 0
+                    rows = rows[crop_mask]
                     return rows, np.ones(len(rows), np.float32)
         some = np.flatnonzero(weights > 0)
         found = some.astype(np.int32) if rows is None else rows[some]

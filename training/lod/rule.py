@@ -154,7 +154,7 @@ class Rule(ABC):
             eye: (3,) from where distances are measured, in the same space.
             focal_px: the eye's focal length in pixels (``Camera.focal``: the smaller of fx and fy).
             columns: (N,) of each of the rule's columns.
-            facts: of the scene and of the level, see :func:`facts_of`.
+            facts: of the scene and of the level, see :func:`collect_facts`.
             values: of every control.
             tables: of the bundle, those of the rule at least; coordinates are in the same space.
         """
@@ -286,7 +286,7 @@ def rules() -> dict[str, Rule]:
     return {module.RULE.name: module.RULE for module in modules}
 
 
-class Everything(Rule):
+class NoRule(Rule):
     """What stands for a rule where there is none: all splats are drawn."""
 
     name = ""
@@ -295,7 +295,7 @@ class Everything(Rule):
         return np.ones(len(means), np.float32)
 
 
-EVERYTHING = Everything()
+NO_RULE = NoRule()
 
 
 def find_rule(name: str) -> Rule | None:
@@ -303,23 +303,23 @@ def find_rule(name: str) -> Rule | None:
     return rules().get(name)
 
 
-def every_control() -> dict[str, Control]:
+def all_controls() -> dict[str, Control]:
     """The controls of all rules by name; two rules that share a name share its meaning."""
     return {control.name: control for rule in rules().values() for control in rule.controls}
 
 
-def every_column() -> set[str]:
+def all_rule_columns() -> set[str]:
     """The columns of all rules, but the opacity; and HIDDEN, which choices ask for beside them."""
     return {name for rule in rules().values() for name in rule.columns} - {OPACITY} | {HIDDEN}
 
 
 def fact_names(rule: Rule) -> list[str]:
-    """The names of all that :func:`facts_of` says of a level."""
+    """The names of all that :func:`collect_facts` says of a level."""
     coarser = [f"coarser_{name}" for name in rule.level_facts]
     return ["level", "finer", "coarser", "levels", *rule.scene_facts, *rule.level_facts, *coarser]
 
 
-def facts_of(
+def collect_facts(
     rule: Rule,
     scene: Mapping[str, Any],
     levels: Sequence[tuple[int, Mapping[str, Any]]],

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..lod.blocks import PIXELS, REACH, SLANT
 from ..lod.rules.cut import detail_of
-from ..lod.tree.forest import shape_of
+from ..lod.tree.forest import forest_shape
 from ..lod.tree.shape import Tree
 from ..scenes.cameras import Camera
 from .cpu.compile import STRICT, Buffers, f32, inlined, kernel, run_parallel, run_serial
@@ -132,7 +132,7 @@ class SequentialPointTree:
     def __init__(
         self, tree: Tree, means: np.ndarray, sizes: np.ndarray, log_scales: np.ndarray, longest: int = 0
     ) -> None:
-        order, forest = shape_of(tree, longest or max(math.isqrt(len(tree)) // 6, 1))
+        order, forest = forest_shape(tree, longest or max(math.isqrt(len(tree)) // 6, 1))
         names = self._names = order[forest.in_upper]
         inside = order[: forest.ends[-1]]
         bounds = node_bounds(means[inside], log_scales[inside], forest.begins)

@@ -10,7 +10,7 @@ from pathlib import Path
 from ..documents import quote, read_json, read_toml
 from ..errors import LodgsError
 from ..files import atomic_write
-from ..lod.crop import Crop, is_text_of_crop
+from ..lod.crop import Crop, is_crop_text
 from ..methods import method_info, parameters_of
 from ..optimize.parameters import Parameters
 from .folder import RunFolder
@@ -138,7 +138,7 @@ class Job:
             value = values.get(key)
             if not value or (key, value) == ("capture", DOME):
                 continue
-            if not (key == "region" and isinstance(value, str) and is_text_of_crop(value)):
+            if not (key == "region" and isinstance(value, str) and is_crop_text(value)):
                 values[key] = _path(key, value, folder)
         job = cls(**values)
         job._check()
@@ -182,7 +182,7 @@ class Job:
                 f"The method '{self.method}' cannot start from a base.",
                 "Remove 'base', or choose another method.",
             )
-        if is_text_of_crop(self.region):
+        if is_crop_text(self.region):
             Crop.from_text(self.region)
         if self.capture:
             self._check_capture()
@@ -229,12 +229,12 @@ class Job:
     @property
     def crop(self) -> Crop | None:
         """Region that is trained in detail; None for the full scene."""
-        return Crop.from_text(self.region) if is_text_of_crop(self.region) else None
+        return Crop.from_text(self.region) if is_crop_text(self.region) else None
 
     @property
     def cell(self) -> str:
         """Region file of the cell that this job trains; "" if it is not a cell's job."""
-        return "" if is_text_of_crop(self.region) else self.region
+        return "" if is_crop_text(self.region) else self.region
 
     @property
     def grid(self) -> tuple[int, int]:

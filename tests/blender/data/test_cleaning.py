@@ -7,7 +7,7 @@ import pytest
 
 from tests.training.editing.test_cleaning import bundle_of, drawn_for_each_leaf
 from tests.training.lod.tree.trees import random_leaves, tree_of
-from training.editing.cleaning import floaters
+from training.editing.cleaning import find_floaters
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.ply import read_ply
 
@@ -247,7 +247,7 @@ def test_each_test_hides_what_it_says(bpy, lodgs, scene_of):
     seen = (before > 0) & (x <= half) & (y <= half * render.resolution_y / render.resolution_x)
     np.testing.assert_array_equal(hidden_by(test="UNSEEN", views=1), ~seen)
     found = hidden_by(test="FLOATERS", gap=3.0 * unit, share=0.2)
-    np.testing.assert_array_equal(found, floaters(means, 3.0, 0.002))
+    np.testing.assert_array_equal(found, find_floaters(means, 3.0, 0.002))
     first = len(bundle.levels[0].splats)
     assert found[first : first + 3].all() and found.sum() < 60
 

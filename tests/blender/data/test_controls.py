@@ -80,7 +80,7 @@ def test_blender_begins_with_what_the_trainer_measures(bpy, lodgs, some, tmp_pat
     scenes, bundle = lodgs("data.scenes"), some(count, controls)
     if any(not bundle.levels[0].number <= controls.get(name, 2) <= count + 1 for name in ("first", "last")):
         pytest.skip("there are no such levels")
-    wanted = lodgs("training.lod.selection").settings(bundle, {})
+    wanted = lodgs("training.lod.selection").resolve_controls(bundle, {})
     lodgs("training.splats.bundle").write_bundle(tmp_path / "b.ply", bundle)
     assert in_use(lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")) == wanted
 
@@ -89,7 +89,7 @@ def test_blender_begins_with_what_the_trainer_measures(bpy, lodgs, some, tmp_pat
             scenes.set_level(root, level)
         scenes.set_bundle_facts(root, bundle)
     assert in_use(root) == wanted
-    plain = lodgs("training.lod.selection").settings(some(count, {}), {})
+    plain = lodgs("training.lod.selection").resolve_controls(some(count, {}), {})
     said = {name: value for name, value in controls.items() if value != plain[name]}
     assert scenes.read_levels(root).controls == said
 

@@ -116,7 +116,7 @@ def placed(lodgs, first, count, *, matrix=None, level=1, choice=None, scene=0, t
 def choice(lodgs, rule, focal_px, facts, values):
     """A choice by an eye at the origin."""
     pairs = tuple(facts.items()), tuple(values.items())
-    return lodgs("data.selection").Choice(rule, (0.0, 0.0, 0.0), focal_px, *pairs)
+    return lodgs("training.lod.query").LodQuery(rule, (0.0, 0.0, 0.0), focal_px, *pairs)
 
 
 def random_set(rng, count):
@@ -188,7 +188,7 @@ def test_what_is_kept_between_arrangements_is_what_is_found_anew(bpy, lodgs, mon
         for level, (start, part) in enumerate(zip(starts, sets, strict=False), 1):
             facts = rules.facts_of(rule, scene, levels, level)
             values = rule.defaults([1, 2, 3]) | values
-            by = lodgs("data.selection").Choice(
+            by = lodgs("training.lod.query").LodQuery(
                 name, eye, 1.0, tuple(facts.items()), tuple(values.items()), TABLE if name == "chunks" else ()
             )
             place = {"matrix": matrix, "level": level, "choice": by, "tell": tell}

@@ -29,7 +29,7 @@ def path(tree, tmp_path):
 @pytest.fixture
 def root(bpy, lodgs, path, monkeypatch):
     """A tree of which the top is here; pages come a few at a time."""
-    monkeypatch.setattr(lodgs("training.lod.tree.paging"), "AT_ONCE", 4)
+    monkeypatch.setattr(lodgs("training.lod.tree.paging"), "PAGES_PER_UPDATE", 4)
     root = lodgs("data.importing").import_splats(bpy.context, path, upright=False, budget=BUDGET)
     yield root
     lodgs("viewport.views").clear()

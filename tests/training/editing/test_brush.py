@@ -5,7 +5,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from training.editing.brush import Front, Placed, Projection, brushed, hits, lassoed
+from training.editing.brush import (
+    OcclusionDepth,
+    ProjectedSplats,
+    Projection,
+    brush_coverage,
+    hit_strength,
+    lasso_coverage,
+)
 from training.scenes.cameras import Camera, look_at
 
 SIZE = (96, 64)
@@ -42,7 +49,7 @@ def odd(x, y, corners):
 def test_a_brush_covers_the_pixels_that_are_near_its_path(path):
     ends = list(pairwise(path)) or [(path[0], path[0])]
     wanted = mask_of(lambda x, y: min(to_segment(x, y, *each) for each in ends) <= 7.3)
-    np.testing.assert_array_equal(brushed(path, 7.3, SIZE), wanted)
+    np.testing.assert_array_equal(brush_coverage(path, 7.3, SIZE), wanted)
     assert 0 < wanted.sum() < wanted.size
 
 
@@ -58,13 +65,13 @@ def test_a_soft_brush_falls_off_towards_its_edge_and_splats_are_hit_so_strongly(
         return 3 * rest**2 - 2 * rest**3
 
     wanted = np.array([strength(x, y) for x, y in centres()]).reshape(SIZE[1], SIZE[0])
-    covered = brushed(path, radius, SIZE, hardness)
+    covered = brush_coverage(path, radius, SIZE, hardness)
     np.testing.assert_allclose(covered, wanted, atol=1e-5)
     means = np.random.default_rng(3).uniform((-3, -2, -9), (3, 2, -1), (500, 3)).astype(np.float32)
     placed = Projection.of(np.eye(4), PERSPECTIVE, SIZE).place(means)
     x, y = np.floor(placed.x).astype(int), np.floor(placed.y).astype(int)
     inside = (x >= 0) & (x < SIZE[0]) & (y >= 0) & (y < SIZE[1])
-    found = hits(covered, placed)
+    found = hit_strength(covered, placed)
     np.testing.assert_array_equal(found[inside], covered[y[inside], x[inside]])
     assert not found[~inside].any() and 20 < np.count_nonzero(found) < 480
 
@@ -72,14 +79,14 @@ def test_a_soft_brush_falls_off_towards_its_edge_and_splats_are_hit_so_strongly(
 @pytest.mark.parametrize("radius", [2.5, 13.7])
 def test_a_splat_is_hit_as_far_as_its_footprint_is_covered(radius):
     """However small the stroke is: against the mean of the stroke's pixels, weighted by the splat."""
-    covered = brushed([(30.2, 20.7), (60.1, 40.3)], radius, SIZE, 0.4)
+    covered = brush_coverage([(30.2, 20.7), (60.1, 40.3)], radius, SIZE, 0.4)
     rng = np.random.default_rng(4)
     count = 400
     x, y = rng.uniform(0, SIZE[0], count), rng.uniform(0, SIZE[1], count)
     sigma = np.exp2(rng.uniform(-1, 4, count))
     pixel = rng.uniform(0.01, 0.1, count)
-    placed = Placed(*(each.astype(np.float32) for each in (x, y, np.ones(count), pixel)))
-    found = hits(covered, placed, sigma=(sigma * pixel).astype(np.float32))
+    placed = ProjectedSplats(*(each.astype(np.float32) for each in (x, y, np.ones(count), pixel)))
+    found = hit_strength(covered, placed, sigma=(sigma * pixel).astype(np.float32))
     across, down = np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5
     wanted = np.array([
         np.exp(-np.square(down - b) / 2 / s**2) @ covered @ np.exp(-np.square(across - a) / 2 / s**2)
@@ -92,11 +99,11 @@ def test_a_splat_is_hit_as_far_as_its_footprint_is_covered(radius):
 
 
 def test_a_dab_between_coarse_splats_paints_them_in_part():
-    covered = brushed([(48.0, 32.0)], 6.0, SIZE)
+    covered = brush_coverage([(48.0, 32.0)], 6.0, SIZE)
     x, y = (each.ravel().astype(np.float32) for each in np.meshgrid([28.0, 68.0], [12.0, 52.0]))
-    placed = Placed(x, y, np.ones(4, np.float32), np.ones(4, np.float32))
-    assert not hits(covered, placed).any(), "their means are beside it"
-    found = hits(covered, placed, sigma=np.full(4, 16.0, np.float32))
+    placed = ProjectedSplats(x, y, np.ones(4, np.float32), np.ones(4, np.float32))
+    assert not hit_strength(covered, placed).any(), "their means are beside it"
+    found = hit_strength(covered, placed, sigma=np.full(4, 16.0, np.float32))
     np.testing.assert_allclose(
         found, covered.sum() / (2 * np.pi * 16**2) * np.exp(-(20**2) / 16**2), rtol=0.3
     )
@@ -113,13 +120,13 @@ def test_a_dab_between_coarse_splats_paints_them_in_part():
 )
 def test_a_lasso_covers_the_pixels_that_it_encloses(path):
     wanted = mask_of(lambda x, y: odd(x, y, path))
-    np.testing.assert_array_equal(lassoed(path, SIZE), wanted)
+    np.testing.assert_array_equal(lasso_coverage(path, SIZE), wanted)
     assert 0 < wanted.sum() < wanted.size
 
 
 def test_a_lasso_of_no_area_covers_nothing():
     for path in ([], [(4, 4)], [(4, 4), (40, 50)]):
-        assert not lassoed(np.reshape(path, (-1, 2)), SIZE).any()
+        assert not lasso_coverage(np.reshape(path, (-1, 2)), SIZE).any()
 
 
 @pytest.mark.parametrize("clip", [PERSPECTIVE, FLAT])
@@ -129,7 +136,7 @@ def test_a_stroke_hits_the_means_that_are_projected_onto_it(clip):
     to_camera = np.eye(4)
     to_camera[:3, :3] = 1.7 * np.linalg.qr(rng.normal(size=(3, 3)))[0]
     to_camera[:3, 3] = (0.4, -0.2, -4)
-    covered = brushed([(20, 20), (70, 50)], 11, SIZE)
+    covered = brush_coverage([(20, 20), (70, 50)], 11, SIZE)
     wanted, clear = np.zeros(len(means), bool), np.ones(len(means), bool)
     for i, mean in enumerate(means):
         x, y, z, w = clip @ to_camera @ (*mean, 1)
@@ -138,7 +145,7 @@ def test_a_stroke_hits_the_means_that_are_projected_onto_it(clip):
             u, v = (x / w + 1) / 2 * SIZE[0], (y / w + 1) / 2 * SIZE[1]
             clear[i] &= min(abs(u - round(u)), abs(v - round(v))) > 1e-4
             wanted[i] = 0 <= u < SIZE[0] and 0 <= v < SIZE[1] and covered[int(v), int(u)]
-    found = hits(covered, Projection.of(to_camera, clip, SIZE).place(means))
+    found = hit_strength(covered, Projection.of(to_camera, clip, SIZE).place(means))
     np.testing.assert_array_equal(found[clear], wanted[clear])
     assert 20 < wanted.sum() < 2000 and clear.mean() > 0.95
 
@@ -177,15 +184,15 @@ def test_only_the_first_wall_is_seen_whatever_its_splats_are_and_fog_hides_none(
     ]
     size = (480, 320)
     projection = Projection.of(np.eye(4), clip, size)
-    covered = brushed([(200, 160), (280, 160)], 60, size) > 0
+    covered = brush_coverage([(200, 160), (280, 160)], 60, size) > 0
     placed = [projection.place(means) for means, _, _ in parts]
-    front = Front(
+    front = OcclusionDepth(
         [(where, scales, opacities) for where, (_, scales, opacities) in zip(placed, parts, strict=True)]
     )
     shares = []
     for where, (_, scales, _) in zip(placed, parts, strict=True):
-        under = hits(covered, where)
-        seen = hits(covered, where, 2 * scales.max(axis=1), front)
+        under = hit_strength(covered, where)
+        seen = hit_strength(covered, where, 2 * scales.max(axis=1), front)
         assert under.any() and not (seen & ~under).any()
         shares.append(seen.sum() / under.sum())
     assert shares[0] == 1 and shares[1] > 0.95 and shares[2] < 0.02, shares
@@ -206,9 +213,9 @@ def test_what_is_seen_is_what_light_reaches():
     scales[:] = scales[:, :1]
     opacities = rng.uniform(0.2, 0.9, len(means)).astype(np.float32)
     placed = Projection.of(np.eye(4), clip, size).place(means)
-    front = Front([(placed, scales, opacities)])
+    front = OcclusionDepth([(placed, scales, opacities)])
     everywhere = np.ones(size[::-1], bool)
-    seen = hits(everywhere, placed, 2 * scales[:, 0], front)
+    seen = hit_strength(everywhere, placed, 2 * scales[:, 0], front)
 
     depth = -means[:, 2].astype(np.float64)
     u, v = focal * means[:, 0] / depth, focal * means[:, 1] / depth
@@ -218,7 +225,7 @@ def test_what_is_seen_is_what_light_reaches():
         passed = 1 - opacities * np.exp(-away / 2)
         here[i] = np.prod(passed[depth < depth[i] - 2 * scales[i, 0]])
         before[i] = np.prod(passed[depth < depth[i] - 2 * scales[i, 0] - 1])
-    inside = hits(everywhere, placed)
+    inside = hit_strength(everywhere, placed)
     assert seen[inside & (here > 0.7)].mean() > 0.97
     assert seen[inside & (before < 0.05)].mean() < 0.05
     assert min((here[inside] > 0.7).sum(), (before[inside] < 0.05).sum()) > 400

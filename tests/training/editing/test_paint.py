@@ -8,8 +8,16 @@ import pytest
 from tests.training.editing.test_cleaning import bundle_of
 from training.editing.cleaning import Cleaning
 from training.editing.edit import edit
-from training.editing.look import Look, looked
-from training.editing.paint import COLUMNS, carried, columns_of, mixed, over, paint_of, painted
+from training.editing.look import Look, apply_looks
+from training.editing.paint import (
+    COLUMNS,
+    apply_paint,
+    blend_paint,
+    mix_paint,
+    paint_columns,
+    read_paint,
+    transfer_paint,
+)
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.ply import read_ply
 from training.splats.sh import basis
@@ -30,8 +38,10 @@ def test_strokes_mix_colours_from_everywhere_one_after_the_other(degree):
     rng = np.random.default_rng(degree)
     sh = rng.normal(0, 0.4, (200, (degree + 1) ** 2, 3)).astype(np.float32)
     first, second, gone = rng.uniform(0, 1, (3, 200)).astype(np.float32)
-    paint = over(over(over(np.zeros((200, 4), np.float32), first, RED), second, BLUE), gone, None)
-    found = mixed(sh, paint)
+    paint = blend_paint(
+        blend_paint(blend_paint(np.zeros((200, 4), np.float32), first, RED), second, BLUE), gone, None
+    )
+    found = mix_paint(sh, paint)
     for direction in rng.normal(size=(5, 3)):
         direction /= np.linalg.norm(direction)
         own = seen(sh, direction)
@@ -45,18 +55,18 @@ def test_strokes_mix_colours_from_everywhere_one_after_the_other(degree):
 def test_paint_is_columns_that_looks_act_upon_and_mixing_takes_away():
     splats = bundle_of("bands", np.random.default_rng(1)).levels[2].splats
     share = np.random.default_rng(2).uniform(0, 1, len(splats)).astype(np.float32)
-    paint = over(np.zeros((len(splats), 4), np.float32), share, RED)
-    there = replace(splats, extras=splats.extras | columns_of(paint))
-    found = paint_of(there.extras)
+    paint = blend_paint(np.zeros((len(splats), 4), np.float32), share, RED)
+    there = replace(splats, extras=splats.extras | paint_columns(paint))
+    found = read_paint(there.extras)
     assert found is not None
     np.testing.assert_array_equal(found, paint)
     look = Look(0.5, 5000, (1.0, 0.8, 0.9), 0.4)
-    found = looked(there, [(None, look)])
+    found = apply_looks(there, [(None, look)])
     assert found.extras.keys() == splats.extras.keys()
     direction = (0.6, 0.0, 0.8)
     wanted = (1 - share[:, None]) * seen(splats.sh, direction) + share[:, None] * np.array(RED)
     np.testing.assert_allclose(seen(found.sh, direction), wanted @ look.matrix.T, atol=2e-5)
-    assert painted(splats) is splats
+    assert apply_paint(splats) is splats
 
 
 def test_others_take_paint_over_from_where_they_are():
@@ -65,10 +75,10 @@ def test_others_take_paint_over_from_where_they_are():
     means = rng.uniform(-5, 5, (20_000, 3)).astype(np.float32)
     patch = np.linalg.norm(means - (-3, 0, 0), axis=1) < 2.5
     paint = np.zeros((len(means), 4), np.float32)
-    paint = over(paint, (means[:, 0] > 0).astype(np.float32), RED)
-    paint = over(paint, 0.5 * patch.astype(np.float32), BLUE)
+    paint = blend_paint(paint, (means[:, 0] > 0).astype(np.float32), RED)
+    paint = blend_paint(paint, 0.5 * patch.astype(np.float32), BLUE)
     to = np.concatenate([rng.uniform(-4, 4, (3000, 3)), rng.uniform(50, 60, (100, 3))]).astype(np.float32)
-    found, clear = carried(paint, means, to), 1.2  # as long as the largest cells are
+    found, clear = transfer_paint(paint, means, to), 1.2  # as long as the largest cells are
     away, far = np.linalg.norm(to - (-3, 0, 0), axis=1), to[:, 0] > 20
     in_half, in_patch = (to[:, 0] > clear) & ~far, away < 2.5 - clear
     nowhere = ((to[:, 0] < -clear) & (away > 2.5 + clear)) | far
@@ -79,14 +89,14 @@ def test_others_take_paint_over_from_where_they_are():
     assert not found[nowhere].any()
     # who is exactly where one was takes over just its paint, where nobody else is as near
     few = np.arange(0, len(means), 400)
-    np.testing.assert_allclose(carried(paint[few], means[few], means[few]), paint[few], atol=1e-6)
+    np.testing.assert_allclose(transfer_paint(paint[few], means[few], means[few]), paint[few], atol=1e-6)
 
 
 def test_lodgs_edit_writes_what_is_painted_mixed_in(tmp_path):
     bundle = bundle_of("bands", np.random.default_rng(3))
     for level in bundle.levels:
         share = (level.splats.means[:, 0] > 0).astype(np.float32)
-        level.splats.extras |= columns_of(over(np.zeros((len(share), 4), np.float32), share, RED))
+        level.splats.extras |= paint_columns(blend_paint(np.zeros((len(share), 4), np.float32), share, RED))
     write_bundle(tmp_path / "in.ply", bundle)
     back = read_bundle(tmp_path / "in.ply")
     assert all(set(COLUMNS) <= level.splats.extras.keys() for level in back.levels)

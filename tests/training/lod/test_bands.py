@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from training.errors import LodgsError
-from training.lod.rule import facts_of, rules
+from training.lod.rule import collect_facts, rules
 from training.lod.rules.bands import s_min_of
 
 BANDS = rules()["bands"]
@@ -16,7 +16,7 @@ def bands_of(s_min, focal_px, gamma, start, end):
     """Near and far of every level."""
     levels = [(number, {"s_min": value}) for number, value in enumerate(s_min, 1)]
     values = {"gamma": gamma, "first": start, "last": end}
-    return [BANDS.band(focal_px, facts_of(BANDS, {}, levels, number), values) for number, _ in levels]
+    return [BANDS.band(focal_px, collect_facts(BANDS, {}, levels, number), values) for number, _ in levels]
 
 
 def test_scale_constraints_are_the_published_ones():
@@ -47,7 +47,7 @@ def test_every_distance_belongs_to_exactly_one_level(start, end):
     levels = [(number, {"s_min": value}) for number, value in enumerate(s_min, 1)]
     values = {"gamma": 2.0, "first": start, "last": end}
     weights = [
-        BANDS.weights(means, np.zeros(3), 500, {}, facts_of(BANDS, {}, levels, number), values)
+        BANDS.weights(means, np.zeros(3), 500, {}, collect_facts(BANDS, {}, levels, number), values)
         for number, _ in levels
     ]
     assert (sum(weights) == 1).all()
@@ -56,7 +56,7 @@ def test_every_distance_belongs_to_exactly_one_level(start, end):
 def test_a_level_that_was_deleted_leaves_no_gap():
     levels = [(number, {"s_min": s_min}) for number, s_min in ((1, 0.2), (3, 0.0125), (5, 0.0))]
     values = {"gamma": 1.0, "first": 1, "last": 5}
-    found = [BANDS.band(100, facts_of(BANDS, {}, levels, number), values) for number, _ in levels]
+    found = [BANDS.band(100, collect_facts(BANDS, {}, levels, number), values) for number, _ in levels]
     near, middle, far = (0, 1.25, 20)
     expected = [(far, inf), (middle, far), (near, middle)]
     assert [pytest.approx(band) for band in expected] == found

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from training.lod.rule import facts_of
+from training.lod.rule import collect_facts
 from training.lod.rules.octree import BIAS, RULE, faded, wanted_at
 
 
@@ -37,7 +37,7 @@ def test_numpy_and_torch_agree():
 
 
 def test_without_the_focal_length_of_d_max_everything_is_wanted():
-    facts = facts_of(RULE, {"d_max": 32.0, "d_max_focal": 0.0}, [(1, {}), (2, {})], 2)
+    facts = collect_facts(RULE, {"d_max": 32.0, "d_max_focal": 0.0}, [(1, {}), (2, {})], 2)
     columns = {name: np.zeros(1, np.float32) for name in RULE.columns}
     eye, means = np.zeros(3, np.float32), np.full((1, 3), 50, np.float32)
     assert RULE.weights(means, eye, 100.0, columns, facts, RULE.defaults([1, 2])).tolist() == [1]
@@ -50,7 +50,9 @@ def test_the_band_ends_where_a_level_does(fade):
     bias = rng.uniform(-2, 2, 500).astype(np.float32)
     values = RULE.defaults([1, 2, 3, 4]) | {"fade": fade, "offset": 0.3}
     for level in (2, 3, 4):
-        facts = facts_of(RULE, {"d_max": 9.0, "d_max_focal": 50.0}, [(n, {}) for n in (1, 2, 3, 4)], level)
+        facts = collect_facts(
+            RULE, {"d_max": 9.0, "d_max_focal": 50.0}, [(n, {}) for n in (1, 2, 3, 4)], level
+        )
         near, far = RULE.band(70.0, facts, values, {BIAS: bias})
         assert near == 0 and far.shape == (500,)
         for share, there in ((0.999, True), (1.001, False)):
@@ -62,7 +64,7 @@ def test_the_band_ends_where_a_level_does(fade):
 
 def test_level_1_is_everywhere_and_nothing_is_left_out_unless_the_highest_bias_is_known():
     levels = [(1, {}), (2, {})]
-    facts = [facts_of(RULE, {"d_max": 9.0, "d_max_focal": 50.0}, levels, number) for number in (1, 2)]
+    facts = [collect_facts(RULE, {"d_max": 9.0, "d_max_focal": 50.0}, levels, number) for number in (1, 2)]
     values = RULE.defaults([1, 2])
     assert RULE.band(50.0, facts[0], values, {BIAS: np.zeros(3, np.float32)}) == (0.0, np.inf)
     assert RULE.band(50.0, facts[1], values) == (0.0, np.inf)

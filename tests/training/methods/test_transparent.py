@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from training.lod.selection import complete
+from training.lod.selection import complete_splats
 from training.optimize.training_data import TrainingData
 from training.rasterize import Gaussians, Target, rasterize
 from training.runs.job import Job
@@ -86,7 +86,7 @@ def test_what_is_trained_is_as_transparent(scene, tmp_path, method, capsys):
     }  # fmt: skip
     assert train(Job.from_dict(keys), sys.stdout) == 0
     bundle = read_bundle(tmp_path / "run" / "bundle.ply")
-    splats = complete(bundle, bundle.levels[-1])
+    splats = complete_splats(bundle, bundle.levels[-1])
     for camera in (ring()[0], ring()[8]):  # held out
         drawn = rasterize(Gaussians.of(splats), camera, near=0.03, backend="cpu")
         pixels = load_image(scene / "images" / camera.name, SIDE, SIDE, alpha=True)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ...lod.blocks import Blocks
-from ...lod.rule import facts_of
+from ...lod.rule import collect_facts
 from ...lod.rules.chunks import RULE
 from ...rasterize import Gaussians, contributions
 from ...rasterize.filter3d import apply_filter3d
@@ -85,7 +85,7 @@ def rows_at_distances(
     values = RULE.defaults(sorted(levels)) | {"distance_scale": distance_scale, "chunks": 0}
     eye, found = np.asarray(eye, np.float32), {}
     for number, level in levels.items():
-        of_level = facts_of(RULE, {}, facts, number)
+        of_level = collect_facts(RULE, {}, facts, number)
         some = level.blocks.between(eye, *RULE.band(1.0, of_level, values))[0]
         rows = level.blocks.rows(some if blocks is None else some & blocks[number])
         found[number] = rows[RULE.weights(level.means[rows], eye, 1.0, {}, of_level, values) > 0]

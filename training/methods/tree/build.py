@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit, spence
 
 from ...errors import LodgsError
-from ...lod.blocks import AXIS_BITS, places_on_curve
-from ...lod.tree.forest import Piece, divided, joined, joined_trees, longest_of
-from ...lod.tree.shape import Tree, area_of
+from ...lod.blocks import AXIS_BITS, morton_codes
+from ...lod.tree.forest import Piece, max_subtree_leaves, merge_forest, merge_trees, split_tree
+from ...lod.tree.shape import Tree, splat_area
 from ...rasterize.cpu.compile import STRICT, inlined, kernel, run_parallel
 from ...splats.gaussians import SH_C0, SplatRows, Splats
 from ...splats.scratch import ScratchFile
@@ -48,7 +48,7 @@ def build(leaves: Splats) -> tuple[Splats, Tree]:
     Raises:
         LodgsError: as :class:`GrowingForest`.
     """
-    return joined(GrowingForest(leaves))
+    return merge_forest(GrowingForest(leaves))
 
 
 class GrowingForest:
@@ -84,7 +84,7 @@ class GrowingForest:
             raise LodgsError("One splat makes no tree.", "Begin with more splats.")
         self._leaves, self._scratch, self._cell = leaves, scratch, cell
         self._coefficients = (sh_degree + 1) ** 2
-        self._longest = longest or longest_of(len(leaves))
+        self._longest = longest or max_subtree_leaves(len(leaves))
         self._upper: Piece | None = None
 
     @property
@@ -100,7 +100,7 @@ class GrowingForest:
             nodes, tree, root = _grown(leaves)
             moments.append(root)
             harmonics.append(nodes.sh[-1].copy())
-            grove = divided(nodes, tree, self._longest)
+            grove = split_tree(nodes, tree, self._longest)
             above, upper = grove.upper
             uppers.append((above.select(np.arange(len(above))), upper))  # a copy: a view would keep all nodes
             del nodes, leaves
@@ -109,7 +109,7 @@ class GrowingForest:
         above, top = _merged_up(np.stack(moments))
         nodes = _drawn(above, top, np.stack(harmonics), np.stack(moments)[:, 9])
         splats = Splats.concatenated([*(splats for splats, _ in uppers), nodes])
-        self._upper = splats, joined_trees([tree for _, tree in uppers], top)
+        self._upper = splats, merge_trees([tree for _, tree in uppers], top)
 
 
 def _by_cells(leaves: SplatRows, scratch: Path | None, most: int) -> Iterator[Splats]:
@@ -117,7 +117,7 @@ def _by_cells(leaves: SplatRows, scratch: Path | None, most: int) -> Iterator[Sp
     means = np.empty((len(leaves), 3), np.float32)
     for part in _parts(len(leaves)):
         means[part] = leaves.select(part).means
-    places = places_on_curve(means)
+    places = morton_codes(means)
     del means
     order = np.argsort(places, kind="stable")
     borders = _cells(places[order], most)
@@ -225,7 +225,7 @@ def _moments(splats: Splats) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         squares = matrices @ matrices.swapaxes(1, 2)
         covariances[some] = squares[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)]
     depths = optical_depth(np.clip(expit(splats.opacity_logits.astype(np.float64)), 1e-4, OPAQUE))
-    areas = np.maximum(area_of(splats.log_scales), 1e-60)
+    areas = np.maximum(splat_area(splats.log_scales), 1e-60)
     return splats.means.astype(np.float64), covariances, depths * areas
 
 
@@ -297,7 +297,7 @@ def _drawn(moments: np.ndarray, tree: Tree, sh: np.ndarray, depths: np.ndarray) 
         log_scales[some] = np.log(variances) / 2
         axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
         quats[some] = Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]]
-    hidden = moments[:, 9] / area_of(log_scales)  # optical depth, if it were drawn as large as its moments
+    hidden = moments[:, 9] / splat_area(log_scales)  # optical depth, if it were drawn as large as its moments
     known = np.linspace(1e-4, OPAQUE, 4096)
     opacities = np.interp(hidden, optical_depth(known), known)
     wider = np.clip(hidden / optical_depth(opacities), 1, SPREAD)

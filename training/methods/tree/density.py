@@ -14,7 +14,7 @@ import torch
 from scipy.special import logit
 
 from ...lod.crop import Crop
-from ...lod.tree.forest import joined_trees, longest_of, shape_of, subtrees_of
+from ...lod.tree.forest import extract_subtrees, forest_shape, max_subtree_leaves, merge_trees
 from ...lod.tree.shape import Tree
 from ...optimize.density_control import along_longest_axis
 from .store import RecordPiece, Store
@@ -101,7 +101,7 @@ class Growing:
         region: Crop | None = None,
     ) -> None:
         self._store, self._now = store, now
-        self._longest = longest_of(int(store.shape.counts.sum()))
+        self._longest = max_subtree_leaves(int(store.shape.counts.sum()))
         self._least_logit = float(logit(min_opacity))
         self._unseen_since = unseen_since
         self._upper: RecordPiece | None = None
@@ -136,14 +136,14 @@ class Growing:
             born = np.flatnonzero(split[source[: tree.leaves]])
             records = self._with_children(records[torch.from_numpy(source)], born)
             grown = tree.leaves > GROWN * self._longest
-            order, shape = shape_of(tree, self._longest if grown else tree.leaves)
+            order, shape = forest_shape(tree, self._longest if grown else tree.leaves)
             records = records[torch.from_numpy(order).long()]
-            for (first, last), part in zip(shape.ranges, subtrees_of(tree, order, shape), strict=True):
+            for (first, last), part in zip(shape.ranges, extract_subtrees(tree, order, shape), strict=True):
                 yield records[first:last], part
             uppers.append(shape.upper)
             above.append(records[shape.ends[-1] :].clone())  # the subtree's need not stay for it
         records, upper = self._store.upper_records()
-        self._upper = torch.cat([*above, records]), joined_trees(uppers, upper)
+        self._upper = torch.cat([*above, records]), merge_trees(uppers, upper)
 
     @property
     def upper(self) -> RecordPiece:

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from ...lod.rules.cut import K_LEAST, detail_of
-from ...lod.tree.forest import Forest, ForestShape, Piece, side_by_side
+from ...lod.tree.forest import Forest, ForestShape, Piece, combine_trees
 from ...lod.tree.shape import Tree
 from ...optimize.memory import free_memory
 from ...optimize.model import NAMES
@@ -154,7 +154,7 @@ class Store:
             children: (., 2) of the nodes above leaves in the order of their numbers, by number among all.
         """
         values = self.layout.split(records)
-        order, tree = side_by_side(counts, children.astype(np.int32))
+        order, tree = combine_trees(counts, children.astype(np.int32))
         sizes = np.empty(len(order), np.float32)
         sizes[order] = tree.sizes(values["means"].numpy()[order], values["log_scales"].numpy()[order])
         return sizes
@@ -248,7 +248,9 @@ class Store:
             links[:, :2], links[:, 2:] = entries[:, 1:3] + first[:, None], entries[:, 3:5]
             borders = np.append(0, np.cumsum(lengths[some]))
             these = np.arange(len(borders) - 1, dtype=np.int32)
-            found, counts[searched[some]] = search_lists(links, entries[:, 5:], borders, these, bands[some], eye, k)
+            found, counts[searched[some]] = search_lists(
+                links, entries[:, 5:], borders, these, bands[some], eye, k
+            )
             rows.append(found)
         return np.sort(np.concatenate(rows).astype(np.int64)), counts
 

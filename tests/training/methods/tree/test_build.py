@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit
 
 from training.errors import LodgsError
-from training.lod.tree.shape import area_of
+from training.lod.tree.shape import splat_area
 from training.methods.tree.build import OPAQUE, SPREAD, build, optical_depth
 from training.rasterize import Gaussians, rasterize
 from training.scenes.cameras import Camera
@@ -46,7 +46,7 @@ def test_every_node_has_the_moments_of_its_leaves(count):
     assert len(nodes) == len(tree) == 2 * count - 1 and tree.leaves == count
     assert sorted(below(tree, len(tree) - 1)) == list(range(count))
     means, spreads = nodes.means.astype(float), covariances(nodes)
-    weights = optical_depth(expit(nodes.opacity_logits.astype(float))) * area_of(nodes.log_scales)
+    weights = optical_depth(expit(nodes.opacity_logits.astype(float))) * splat_area(nodes.log_scales)
     for node in range(count, len(tree), 1 + count // 40):
         leaves = below(tree, node)
         shares = weights[leaves] / weights[leaves].sum()

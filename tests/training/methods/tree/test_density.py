@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tests.training.lod.tree.trees import random_tree
-from training.lod.tree.forest import joined, longest_of
+from training.lod.tree.forest import max_subtree_leaves, merge_forest
 from training.lod.tree.shape import Tree
 from training.methods.tree.build import GrowingForest
 from training.methods.tree.density import GROWN, Growing, edited
@@ -112,10 +112,10 @@ def grown(store, **values):
 
 
 def test_without_cause_nothing_changes(store):
-    before = joined(store)
+    before = merge_forest(store)
     growing, after = grown(store)
     assert growing.added == growing.removed == 0
-    splats, tree = joined(after)
+    splats, tree = merge_forest(after)
     assert np.array_equal(tree.children, before[1].children) and np.array_equal(splats.means, before[0].means)
 
 
@@ -124,7 +124,7 @@ def test_the_highest_scores_are_split_as_far_as_there_is_room(store):
     scores = rng.random(len(store)) * is_leaf(store)
     with_stats(store, score=scores, steps=3)
     growing, after = grown(store, threshold=0.5, most=450)
-    splats, new = joined(after)
+    splats, new = merge_forest(after)
     assert growing.added == 50 and new.leaves == 450 and len(splats) == len(new) == 899
     # those that are nodes now are the leaves of the highest scores, as they were
     least = np.sort(scores)[-50]
@@ -155,24 +155,24 @@ def test_faint_and_unseen_leaves_go(store):
     with_stats(store, seen=seen)
     removed = store.rows.read(gone)[:, :3].numpy()
     growing, after = grown(store, unseen_since=3)
-    splats, tree = joined(after)
+    splats, tree = merge_forest(after)
     assert growing.removed == 3 and tree.leaves == 397
     assert not (removed[:, None] == splats.means).all(2).any()
     faint = np.zeros(len(after))
     faint[np.flatnonzero(is_leaf(after))[:5]] = -9
     with_stats(after, opacity_logits=faint)
     growing, last = grown(after)
-    assert 0 < growing.removed <= 5 and joined(last)[1].leaves == 397 - growing.removed
+    assert 0 < growing.removed <= 5 and merge_forest(last)[1].leaves == 397 - growing.removed
 
 
 def test_a_subtree_that_grew_is_divided_and_the_tree_stays_one(store):
     for _ in range(4):
         with_stats(store, score=is_leaf(store))
-        before = joined(store)[1].leaves
+        before = merge_forest(store)[1].leaves
         _, store = grown(store, threshold=0.5)
-        splats, tree = joined(store)
+        splats, tree = merge_forest(store)
         assert tree.leaves == 2 * before == int(store.shape.counts.sum())
-        assert store.shape.counts.max() <= GROWN * longest_of(tree.leaves)
+        assert store.shape.counts.max() <= GROWN * max_subtree_leaves(tree.leaves)
         assert sorted(below(tree, len(tree) - 1)) == list(range(tree.leaves))
         sizes = tree.sizes(splats.means, splats.log_scales)
         assert (sizes[tree.parents[:-1]] >= sizes[:-1]).all()
@@ -180,4 +180,4 @@ def test_a_subtree_that_grew_is_divided_and_the_tree_stays_one(store):
 
 def test_of_leaves_that_are_all_too_faint_each_pair_keeps_one(store):
     growing, after = grown(store, min_opacity=1.0)
-    assert growing.removed == len(joined(store)[1].children) - len(joined(after)[1].children) > 0
+    assert growing.removed == len(merge_forest(store)[1].children) - len(merge_forest(after)[1].children) > 0

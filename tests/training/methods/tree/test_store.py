@@ -9,7 +9,7 @@ import torch
 from tests.training.lod.tree.trees import surfaces
 from tests.training.rasterize.test_sequential_point_tree import cameras
 from training.errors import LodgsError
-from training.lod.tree.forest import divided, joined, longest_of, shape_of
+from training.lod.tree.forest import forest_shape, max_subtree_leaves, merge_forest, split_tree
 from training.methods.tree import store as store_module
 from training.methods.tree.build import build
 from training.methods.tree.store import Store, layout_of
@@ -32,7 +32,7 @@ def stored(folder, town, budget=1 << 30, longest=0):
     nodes, tree = town
     folder.mkdir(parents=True, exist_ok=True)
     made = Store(folder, 1, budget)
-    made.fill(divided(nodes, tree, longest or longest_of(tree.leaves)))
+    made.fill(split_tree(nodes, tree, longest or max_subtree_leaves(tree.leaves)))
     return made
 
 
@@ -55,7 +55,9 @@ def test_a_cut_made_anew_is_that_of_hspt_in_memory(town, tmp_path, longest, monk
     made = stored(tmp_path, town, longest=longest)
     order = names_of(means_of(made), nodes.means)
     sizes = tree.sizes(nodes.means, nodes.log_scales)
-    hspt = SequentialPointTree(tree, nodes.means, sizes, nodes.log_scales, longest or longest_of(tree.leaves))
+    hspt = SequentialPointTree(
+        tree, nodes.means, sizes, nodes.log_scales, longest or max_subtree_leaves(tree.leaves)
+    )
     found = 0
     for camera in cameras(np.random.default_rng(longest)):
         for pixels in (0.2, 0.7, 1.8):
@@ -90,9 +92,9 @@ def test_sizes_follow_what_has_moved(town, tmp_path, monkeypatch):
     for seed in range(2):
         moved(made, seed)
         made.resize()
-        nodes, tree = joined(made)
-        longest = longest_of(tree.leaves)
-        order, _ = shape_of(tree, longest)
+        nodes, tree = merge_forest(made)
+        longest = max_subtree_leaves(tree.leaves)
+        order, _ = forest_shape(tree, longest)
         sizes = tree.sizes(nodes.means, nodes.log_scales)
         hspt = SequentialPointTree(tree, nodes.means, sizes, nodes.log_scales, longest)
         for camera in cameras(np.random.default_rng(5), 4):
@@ -104,7 +106,7 @@ def test_sizes_follow_what_has_moved(town, tmp_path, monkeypatch):
 def test_what_comes_out_is_what_came_in(town, tmp_path):
     """But for the order of a subtree's leaves, and of its nodes above leaves."""
     nodes, tree = town
-    forest = divided(nodes, tree, longest_of(tree.leaves))
+    forest = split_tree(nodes, tree, max_subtree_leaves(tree.leaves))
     made = stored(tmp_path, town)
     for (ours, shape), (theirs, other) in zip([*made, made.upper], [*forest, forest.upper], strict=True):
         if not len(ours):
