@@ -114,7 +114,7 @@ def selection_seconds(bpy, path: Path) -> tuple[float, float]:
     controls, levels = root.lodgs.bands, [(1, {"s_min": S_MIN}), (2, {"s_min": 0.0})]
     values = {control.name: getattr(controls, control.name) for control in rule.controls}
     facts = [load("training.lod.rule").collect_facts(rule, {}, levels, number) for number in (1, 2)]
-    bands = [rule.band(root.lodgs.focal_px, each, values) for each in facts]
+    bands = [rule.distance_band(root.lodgs.focal_px, each, values) for each in facts]
     arrays = (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh)
 
     def by_numpy() -> None:

@@ -72,7 +72,7 @@ def controls_page() -> str:
             f"{what}: {', '.join(f'`{name}`' for name in names)}" for what, names in needs.items() if names
         ]
         adds = "add up" if rule.cumulative else "replace one another" if rule.complete else "belong together"
-        always = " Its weights always count, for one level too." if rule.always else ""
+        always = " Its weights always count, for one level too." if rule.always_active else ""
         parts.append(f"Levels {adds}.{always} It needs {'; '.join(listed) or 'nothing else'}.")
     return "\n\n".join(parts) + "\n"
 

@@ -16,7 +16,7 @@ def changed_controls(root: bpy.types.Object) -> dict[str, float]:
     if rule is None:
         return {}
     own = rule.defaults([item.number for item in root.lodgs.levels if item.exists])
-    values = {control.name: control.checked(_value(root, control)) for control in rule.controls}
+    values = {control.name: control.validate(_value(root, control)) for control in rule.controls}
     return {name: value for name, value in values.items() if value != own[name]}
 
 
@@ -37,7 +37,7 @@ def update_controls(root: bpy.types.Object, recorded: dict[str, float] | None = 
         own = {control.name: control.default for control in rule.controls}
         begun = own | before | selection.read_facts(settings.begun)
         begins = (rule.defaults(numbers) if numbers else own) | recorded
-        begins = {control.name: control.checked(begins[control.name]) for control in rule.controls}
+        begins = {control.name: control.validate(begins[control.name]) for control in rule.controls}
         unset = [
             control
             for control in rule.controls

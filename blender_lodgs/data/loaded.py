@@ -44,7 +44,7 @@ def _count(cloud: bpy.types.PointCloud, choice: selection.LodQuery, region: Regi
         nothing = np.broadcast_to(np.float32(0), len(cloud.points))
         found = {name: read_attribute(cloud, name) for name in choice.columns}
         columns = {name: nothing if values is None else values for name, values in found.items()}
-        _counts[key] = int(np.count_nonzero(choice.loaded(columns)))
+        _counts[key] = int(np.count_nonzero(choice.visible_in_region(columns)))
     return _counts[key]
 
 

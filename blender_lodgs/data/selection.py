@@ -38,7 +38,7 @@ def choice(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> LodQu
     modifier = _modifier(evaluated)
     rule = None if modifier is None else groups.rule_of_group(modifier.node_group)
     if modifier is None or rule is None or not _is_on(modifier, depsgraph):
-        return None if cropped is None else LodQuery.by_crops(cropped)
+        return None if cropped is None else LodQuery.from_crops(cropped)
 
     def value(name: str):
         return compat.get_input(modifier, name)

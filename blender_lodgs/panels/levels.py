@@ -84,7 +84,7 @@ class LODGS_PT_detail(LevelsPanel):
         if rule is None:
             problem, remedy = unknown_rule_error(settings.rule)
             say(layout, f"{problem} {remedy}" if settings.rule else problem, "INFO")
-        elif rule.always and settings.mode == "SINGLE":
+        elif rule.always_active and settings.mode == "SINGLE":
             text = "These splats are trained for By Distance. As one level they look too opaque."
             say(layout, text, "INFO")
 
@@ -96,7 +96,7 @@ class LODGS_PT_detail(LevelsPanel):
             row.prop(settings, "single_level")
         else:
             choice = loaded.chosen(context, root)
-            idle = choice.idle() if choice else {}
+            idle = choice.inactive_controls() if choice else {}
             for control in rule.controls if rule else ():
                 row = column.row()
                 row.active = control.name not in idle

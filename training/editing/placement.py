@@ -23,7 +23,7 @@ from ..splats.similarity import Similarity, TransformedRows
 def transform_bundle(bundle: Bundle, placement: Similarity) -> Bundle:
     """A bundle whose splats, and all that it says of places and lengths, stand elsewhere.
 
-    Levels that are in files stay there until they are written. Of a rule whose columns are ``related`` these
+    Levels that are in files stay there until they are written. Of a rule whose columns are ``linked_columns`` these
     are in memory, some 150 bytes a splat.
 
     Raises:
@@ -42,7 +42,7 @@ def transform_bundle(bundle: Bundle, placement: Similarity) -> Bundle:
     def facts(known: dict[str, float]) -> dict[str, float]:
         return {n: value * placement.scale if n in lengths else value for n, value in known.items()}
 
-    remade = _agreed(bundle, rule, placement) if rule and rule.related else [{} for _ in bundle.levels]
+    remade = _agreed(bundle, rule, placement) if rule and rule.linked_columns else [{} for _ in bundle.levels]
     levels = []
     for level, columns in zip(bundle.levels, remade, strict=True):
         if level.on_disk is None:
@@ -136,6 +136,6 @@ def _agreed(bundle: Bundle, rule: Rule, placement: Similarity) -> list[Columns]:
         ends.append(len(level.rows))
     before = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     after = placement.transform_columns(before, rule.lengths, (*rule.places, ("x", "y", "z")))
-    after |= rule.agreed(before, after)
+    after |= rule.reconcile(before, after)
     parts = [np.split(after[name], np.cumsum(ends)[:-1]) for name in rule.columns]
     return [dict(zip(rule.columns, columns, strict=True)) for columns in zip(*parts, strict=True)]

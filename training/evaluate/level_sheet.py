@@ -41,7 +41,7 @@ def write_level_sheet(
 
     rule = find_rule(bundle.rule)
     tiles = []
-    if rule is None or not rule.always:
+    if rule is None or not rule.always_active:
         tiles = [
             tile(f"level {level.number}", complete_splats(bundle, level))
             for level in standalone_levels(bundle)

@@ -42,7 +42,7 @@ def full_detail_selector(bundle: Bundle, level: Level) -> SplatSelector:
     if bundle.on_disk:
         return _in_sight(bundle, level)
     rule = find_rule(bundle.rule)
-    if rule is None or not rule.always:
+    if rule is None or not rule.always_active:
         everything = complete_splats(bundle, level)
         return lambda camera: (everything, None)
     alone = replace(bundle, levels=bundle.drawn_levels(level.number))
@@ -182,7 +182,7 @@ class Evaluation:
         """The same of all that is drawn at a level; by the bundle's rule where its weights always count."""
         rule, alone = find_rule(bundle.rule), replace(bundle, levels=bundle.drawn_levels(level.number))
         resident = ResidentBundle(alone, self.backend)
-        if rule is not None and rule.always:
+        if rule is not None and rule.always_active:
             return self.measure_by_distance(resident, resolve_controls(alone, {}))
         total = sum(len(each.rows) for each in alone.levels)
         return self.measure(

@@ -106,7 +106,7 @@ class CulledReader:
         wanted = self._blocks.in_view(camera, 0.0)
         if choice is not None and self._rule is not None and self._rule.apart and choice.region() is None:
             eye = np.array(choice.eye, np.float32)
-            wanted &= self._blocks.between(eye, *choice.band(self._highest))[0]
+            wanted &= self._blocks.between(eye, *choice.distance_band(self._highest))[0]
         most = max(_SPARE * np.count_nonzero(wanted), _AT_ONCE // SIZE)
         if self._held is not None and not (wanted & ~self._held).any() and self._held.sum() <= most:
             return None

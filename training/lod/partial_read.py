@@ -72,7 +72,7 @@ def read_part(
             return found
         rule = require_rule(bundle)
         nothing = np.zeros(len(table["level"]), np.float32)
-        needed = rule.loaded({name: table.get(name, nothing) for name in rule.columns}, region)
+        needed = rule.visible_in_region({name: table.get(name, nothing) for name in rule.columns}, region)
         for number in numbers:
             blocks = np.flatnonzero(needed[table["level"] == number])
             found[number] = (blocks[:, None] * SIZE + np.arange(SIZE)).reshape(-1)
@@ -84,5 +84,5 @@ def read_part(
         columns = columns_in_file(level.splats) | extra_columns(level.splats)
         size += sum(column.dtype.itemsize for column in columns.values()) * len(level.splats)
         if rule is not None and region is not None:
-            level.splats = level.splats.select(rule.loaded(rule_columns(rule, level.splats), region))
+            level.splats = level.splats.select(rule.visible_in_region(rule_columns(rule, level.splats), region))
     return bundle, size

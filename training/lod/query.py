@@ -39,7 +39,7 @@ class LodQuery:
     crops: tuple[Crop, ...] | None = None
 
     @classmethod
-    def by_crops(cls, crops: tuple[Crop, ...]) -> LodQuery:
+    def from_crops(cls, crops: tuple[Crop, ...]) -> LodQuery:
         """All that crops leave, without a rule."""
         return cls(NO_RULE.name, (0.0, 0.0, 0.0), 1.0, (), (), crops=crops)
 
@@ -73,27 +73,27 @@ class LodQuery:
         weights[some] = weigh(means[some], own)
         return weights
 
-    def band(self, highest: Mapping[str, np.ndarray]) -> tuple[float, float | np.ndarray]:
-        """See ``Rule.band``."""
-        return self.how.band(self.focal_px, dict(self.facts), dict(self.values), highest)
+    def distance_band(self, highest: Mapping[str, np.ndarray]) -> tuple[float, float | np.ndarray]:
+        """See ``Rule.distance_band``."""
+        return self.how.distance_band(self.focal_px, dict(self.facts), dict(self.values), highest)
 
     def region(self) -> Region | None:
         """See ``Rule.region``."""
         return self.how.region(np.array(self.eye, np.float32), dict(self.values), self._tables())
 
-    def loaded(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-        """(N,) bool: see ``Rule.loaded``, of the region that there must be."""
+    def visible_in_region(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+        """(N,) bool: see ``Rule.visible_in_region``, of the region that there must be."""
         region = self.region()
         assert region is not None
-        return self.how.loaded(columns, region)
+        return self.how.visible_in_region(columns, region)
 
-    def where(self) -> str:
-        """See ``Rule.where``."""
-        return self.how.where(np.array(self.eye, np.float32), dict(self.values), self._tables())
+    def region_label(self) -> str:
+        """See ``Rule.region_label``."""
+        return self.how.region_label(np.array(self.eye, np.float32), dict(self.values), self._tables())
 
-    def idle(self) -> Mapping[str, str]:
-        """See ``Rule.idle``."""
-        return self.how.idle(np.array(self.eye, np.float32), dict(self.values), self._tables())
+    def inactive_controls(self) -> Mapping[str, str]:
+        """See ``Rule.inactive_controls``."""
+        return self.how.inactive_controls(np.array(self.eye, np.float32), dict(self.values), self._tables())
 
     def parts(self, means: np.ndarray) -> np.ndarray:
         """(N,) numbers of the parts of space where places are: see ``Rule.parts``."""
@@ -137,7 +137,7 @@ class SplatSelector:
 
     While the eye stays in a region (``Rule.region``), only what may be shown there is looked at. Of splats
     that stand together in rows (``blocks.spatial_order``) those blocks are passed over that are out of the
-    rule's reach (``Rule.band``), or out of sight.
+    rule's reach (``Rule.distance_band``), or out of sight.
 
     Args:
         means: (N, 3).
@@ -178,7 +178,7 @@ class SplatSelector:
         if region is None:
             return every, False
         if self._near is None or self._near[:2] != (choice.rule, region):
-            rows = np.flatnonzero(choice.loaded(every.columns)).astype(np.int32)
+            rows = np.flatnonzero(choice.visible_in_region(every.columns)).astype(np.int32)
             if len(rows) < len(every.means):
                 columns = {name: every.columns[name][rows] for name in (*choice.how.columns, HIDDEN)}
                 log_scales = None if self._log_scales is None else self._log_scales[rows]
@@ -202,9 +202,9 @@ class SplatSelector:
         else:
             seen, whole = np.ones(len(blocks.low), bool), np.full(len(blocks.low), choice is None)
             if choice is not None and rule is not None and rule.apart and not in_region:
-                eye, band = np.array(choice.eye, np.float32), choice.band(part.highest(rule))
+                eye, band = np.array(choice.eye, np.float32), choice.distance_band(part.highest(rule))
                 seen, inside = blocks.between(eye, *band)
-                if rule.flat and choice.crops is None:
+                if rule.binary and choice.crops is None:
                     whole = inside
             if camera is not None and seen.any():
                 seen = seen & blocks.in_view(camera, near)

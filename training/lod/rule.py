@@ -80,7 +80,7 @@ class Control:
         """Whether it is a box to tick."""
         return self.whole and (self.low, self.high) == (0, 1)
 
-    def checked(self, value: float) -> float:
+    def validate(self, value: float) -> float:
         """The value as this control takes it.
 
         Raises:
@@ -110,11 +110,11 @@ class Rule(ABC):
         tables: names of tables of the bundle; where one is missing, the rule does without it.
         lengths: which of its facts, its columns and the columns of its tables are lengths in scene units.
         places: names, as x, y and z, of those of its columns, or of its tables', that are places.
-        related: whether columns of one splat have to agree with those of others: see :meth:`agreed`.
-        always: whether its weights belong to the picture at full detail, too: without them a level is not
+        linked_columns: whether columns of one splat have to agree with those of others: see :meth:`reconcile`.
+        always_active: whether its weights belong to the picture at full detail, too: without them a level is not
             what was trained.
         apart: whether the weight of a splat does not depend on other splats, so that a few can be asked for.
-        flat: whether every splat within its level's :meth:`band` has the weight 1.
+        binary: whether every splat within its level's :meth:`distance_band` has the weight 1.
         complete: whether each level, with the coarser ones where levels add up, is a scene by itself;
             otherwise only the finest is, and coarser ones are there to choose from.
         sweep: a control, and values of it that a report measures one by one; None: it needs no such curve.
@@ -129,10 +129,10 @@ class Rule(ABC):
     tables: ClassVar[tuple[str, ...]] = ()
     lengths: ClassVar[tuple[str, ...]] = ()
     places: ClassVar[tuple[AxisNames, ...]] = ()
-    related: ClassVar[bool] = False
-    always: ClassVar[bool] = False
+    linked_columns: ClassVar[bool] = False
+    always_active: ClassVar[bool] = False
     apart: ClassVar[bool] = True
-    flat: ClassVar[bool] = False
+    binary: ClassVar[bool] = False
     complete: ClassVar[bool] = True
     sweep: ClassVar[tuple[str, tuple[float, ...]] | None] = None
 
@@ -159,7 +159,7 @@ class Rule(ABC):
             tables: of the bundle, those of the rule at least; coordinates are in the same space.
         """
 
-    def band(
+    def distance_band(
         self,
         focal_px: float,
         facts: Mapping[str, float],
@@ -181,8 +181,8 @@ class Rule(ABC):
         """Raises ValueError, with half a sentence, where tables are there but not what the rule reads."""
         return
 
-    def agreed(self, before: Columns, after: Columns) -> Columns:
-        """Where the rule is ``related``: those columns (N,) that rounding has put out of step, made anew.
+    def reconcile(self, before: Columns, after: Columns) -> Columns:
+        """Where the rule is ``linked_columns``: those columns (N,) that rounding has put out of step, made anew.
 
         Args:
             before: the rule's columns and x, y and z of the means, of the splats of all levels.
@@ -193,19 +193,19 @@ class Rule(ABC):
     def region(self, eye: np.ndarray, values: Values, tables: Tables) -> Region | None:
         """Where an eye is, for rules whose splats can be told beforehand for a whole region; else None.
 
-        As long as the eye stays in the region, no splat has a weight that :meth:`loaded` leaves out.
+        As long as the eye stays in the region, no splat has a weight that :meth:`visible_in_region` leaves out.
         """
         return None
 
-    def loaded(self, columns: Mapping[str, np.ndarray], region: Region) -> np.ndarray:
+    def visible_in_region(self, columns: Mapping[str, np.ndarray], region: Region) -> np.ndarray:
         """(N,) bool, which splats of a level an eye in a region may be shown."""
         raise NotImplementedError("this rule has no regions")
 
-    def where(self, eye: np.ndarray, values: Values, tables: Tables) -> str:
+    def region_label(self, eye: np.ndarray, values: Values, tables: Tables) -> str:
         """Where an eye is, in a few words for people; empty where the rule tells no regions apart."""
         return ""
 
-    def idle(self, eye: np.ndarray, values: Values, tables: Tables) -> Mapping[str, str]:
+    def inactive_controls(self, eye: np.ndarray, values: Values, tables: Tables) -> Mapping[str, str]:
         """The controls that change nothing for an eye, by name, each with the reason in a sentence."""
         return {}
 
@@ -214,7 +214,7 @@ class Rule(ABC):
         them apart; 0 where the rule has no such parts."""
         return np.zeros(len(means), np.float32)
 
-    def alone(self, levels: Sequence[int]) -> Sequence[int]:
+    def standalone_levels(self, levels: Sequence[int]) -> Sequence[int]:
         """The numbers of those levels that can be shown one at a time: all of them, or where levels are not
         ``complete`` the finest.
 
@@ -246,7 +246,7 @@ class Rule(ABC):
         """
         return None
 
-    def raised(self, values: Values, name: str) -> Values | None:
+    def raise_control(self, values: Values, name: str) -> Values | None:
         """The values with one control STEP times as large; None where that is beyond its range."""
         value = values[name] * STEP
         high = next(control.high for control in self.controls if control.name == name)
@@ -260,7 +260,7 @@ class Rule(ABC):
         """
         return {control.name: control.default for control in self.controls}
 
-    def settings(self, given: Values, levels: Sequence[int], recorded: Values | None = None) -> Values:
+    def resolve_controls(self, given: Values, levels: Sequence[int], recorded: Values | None = None) -> Values:
         """A value for every control: those given, then those that a bundle recorded, then :meth:`defaults`.
 
         Raises:
@@ -274,7 +274,7 @@ class Rule(ABC):
                     f"It has: {', '.join(controls) or 'none'}.",
                 )
         found = self.defaults(levels) | dict(recorded or {}) | dict(given)
-        return {name: control.checked(found[name]) for name, control in controls.items()}
+        return {name: control.validate(found[name]) for name, control in controls.items()}
 
 
 @cache

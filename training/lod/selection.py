@@ -84,7 +84,7 @@ def resolve_controls(bundle: Bundle, given: Values) -> Values:
         LodgsError: as :func:`require_rule`, the rule has no such control, a value is not possible, or no level is
             left in use.
     """
-    return require_rule(bundle).settings(given, [level.number for level in bundle.levels], bundle.controls)
+    return require_rule(bundle).resolve_controls(given, [level.number for level in bundle.levels], bundle.controls)
 
 
 def select(
@@ -113,7 +113,7 @@ def select(
 def select_levels(bundle: Bundle, eye: np.ndarray, focal_px: float, values: Values) -> list[SelectedLevel]:
     """The same level by level, coarse to fine; levels of which nothing is shown have no splats."""
     shown = []
-    of_levels = BundleSelector(bundle).of_levels(eye, focal_px, values)
+    of_levels = BundleSelector(bundle).level_weights(eye, focal_px, values)
     for level, weights in zip(bundle.levels, of_levels, strict=True):
         some = weights > 0
         splats, weights = level.splats.select(some), weights[some]
@@ -147,7 +147,7 @@ class BundleSelector:
         """The splats of all levels, coarse to fine."""
         return Splats.concatenated([level.splats for level in self._levels])
 
-    def of_levels(self, eye: np.ndarray, focal_px: float, values: Values) -> list[np.ndarray]:
+    def level_weights(self, eye: np.ndarray, focal_px: float, values: Values) -> list[np.ndarray]:
         """The weights of each level's splats; arguments as of :func:`select`."""
         eye = np.asarray(eye, np.float32)
         return [
@@ -157,7 +157,7 @@ class BundleSelector:
 
     def weights(self, eye: np.ndarray, focal_px: float, values: Values) -> np.ndarray:
         """The weights (N,) of ``splats``; those of weight 0 are not to be drawn."""
-        return np.concatenate(self.of_levels(eye, focal_px, values))
+        return np.concatenate(self.level_weights(eye, focal_px, values))
 
 
 def rule_columns(rule: Rule, splats: Splats) -> dict[str, np.ndarray]:
@@ -171,9 +171,9 @@ def rule_columns(rule: Rule, splats: Splats) -> dict[str, np.ndarray]:
 
 
 def standalone_levels(bundle: Bundle) -> list[Level]:
-    """The levels that can be shown one at a time, coarse to fine: see ``Rule.alone``."""
+    """The levels that can be shown one at a time, coarse to fine: see ``Rule.standalone_levels``."""
     rule, numbers = find_rule(bundle.rule), [level.number for level in bundle.levels]
-    alone = numbers if rule is None else rule.alone(numbers)
+    alone = numbers if rule is None else rule.standalone_levels(numbers)
     return [level for level in bundle.levels if level.number in alone]
 
 

@@ -135,7 +135,7 @@ def render(
         warn(problem)
     resident = ResidentBundle(source.levels, backend, warn)
     bundle, rule = resident.bundle, find_rule(source.rule)
-    if given is not None or (rule is not None and rule.always and not level):
+    if given is not None or (rule is not None and rule.always_active and not level):
         shown = resident.select_by_rule(camera, resolve_controls(bundle, given or {}))
     else:
         shown = resident.select_level(level or bundle.levels[-1].number, camera)

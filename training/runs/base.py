@@ -56,7 +56,7 @@ def open_base(path: str | Path, warn: Warn = ignore) -> tuple[SplatRows, bool]:
             )
     head = None if path.is_dir() else read_header(path)
     rule = None if head is None else find_rule(head.rule)
-    if head is None or head.cumulative or (rule is not None and rule.always):
+    if head is None or head.cumulative or (rule is not None and rule.always_active):
         bundle = (read_folder if path.is_dir() else read_bundle)(path, warn)
         splats: SplatRows = _finest(bundle)
     else:
@@ -69,7 +69,7 @@ def open_base(path: str | Path, warn: Warn = ignore) -> tuple[SplatRows, bool]:
 
 def _finest(bundle: Bundle) -> Splats:
     rule = find_rule(bundle.rule)
-    if rule is not None and rule.always and "camera_center" in bundle.meta:
+    if rule is not None and rule.always_active and "camera_center" in bundle.meta:
         return _with_weights_baked(bundle, np.asarray(bundle.meta["camera_center"]))
     return complete_splats(bundle, bundle.levels[-1])
 

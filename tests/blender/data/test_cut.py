@@ -39,7 +39,7 @@ def shown_rows(bpy, lodgs, root):
 
 def wanted_rows(lodgs, tree, eye, focal, pixels):
     choice = lodgs("training.lod.selection").BundleSelector(tree)
-    return [np.flatnonzero(w) for w in choice.of_levels(np.float32(eye), focal, {"pixels": pixels})]
+    return [np.flatnonzero(w) for w in choice.level_weights(np.float32(eye), focal, {"pixels": pixels})]
 
 
 def test_it_is_shown_by_distance_from_the_scenes_own_space(bpy, lodgs, tree, root):

@@ -47,7 +47,7 @@ def weights(bpy, lodgs):
         again = lodgs("data.selection").choice(evaluated, depsgraph)
         assert choice == again and hash(choice) == hash(again)
         region = choice.region()
-        assert region is None or (choice.loaded(fine.extras) >= (found > 0)).all()
+        assert region is None or (choice.visible_in_region(fine.extras) >= (found > 0)).all()
         return found.tolist()
 
     asked.root = root

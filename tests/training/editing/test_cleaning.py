@@ -206,7 +206,7 @@ def test_a_choice_with_crops_is_the_rule_of_what_they_leave(name):
         rows, weights = SplatSelector(splats.means, columns, splats.log_scales).chosen(choice)
         np.testing.assert_array_equal(rows, np.flatnonzero(stays)[wanted > 0])
         np.testing.assert_array_equal(weights, wanted[wanted > 0])
-    alone, _ = SplatSelector(splats.means, columns).chosen(LodQuery.by_crops(crops))
+    alone, _ = SplatSelector(splats.means, columns).chosen(LodQuery.from_crops(crops))
     np.testing.assert_array_equal(alone, np.flatnonzero(stays))
 
 

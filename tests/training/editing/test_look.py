@@ -7,7 +7,7 @@ import pytest
 
 from tests.training.conftest import look_at
 from tests.training.editing.test_cleaning import bundle_of
-from tests.training.splats.test_similarity import drawn, some_splats
+from tests.training.splats.test_similarity import random_splats, render
 from training.__main__ import main
 from training.editing.look import LUMA, NEUTRAL, Look, RowsWithLook, apply_looks
 from training.errors import LodgsError
@@ -33,7 +33,7 @@ def opacities(splats):
 
 
 def test_a_neutral_look_changes_nothing():
-    splats = some_splats(20, 3)
+    splats = random_splats(20, 3)
     np.testing.assert_allclose(NEUTRAL.matrix, np.eye(3), atol=1e-12)
     found = apply_looks(splats, [(None, NEUTRAL)])
     np.testing.assert_allclose(found.sh, splats.sh, atol=1e-6)
@@ -89,7 +89,7 @@ def test_saturation_keeps_lightness_and_tint_is_what_white_becomes():
 
 @pytest.mark.parametrize("degree", range(5))
 def test_every_degree_is_seen_as_the_matrix_has_it_from_anywhere(degree):
-    splats = some_splats(200, degree)
+    splats = random_splats(200, degree)
     found = apply_looks(splats, [(None, LOOK)])
     for direction in ((0, 0, 1), (0.6, -0.8, 0), (-0.48, 0.6, 0.64)):
         wanted = seen(splats, degree, direction) @ LOOK.matrix.T
@@ -100,7 +100,7 @@ def test_every_degree_is_seen_as_the_matrix_has_it_from_anywhere(degree):
 
 
 def test_opacities_of_any_logit():
-    splats = replace(some_splats(5, 0), opacity_logits=np.float32([-200, -5, 0, 5, 200]))
+    splats = replace(random_splats(5, 0), opacity_logits=np.float32([-200, -5, 0, 5, 200]))
     for factor in (0.0, 0.25, 1.0):
         found = apply_looks(splats, [(None, Look(opacity=factor))])
         assert np.isfinite(found.opacity_logits).all()
@@ -108,7 +108,7 @@ def test_opacities_of_any_logit():
 
 
 def test_regions_come_upon_the_look_everywhere():
-    splats, ball = some_splats(500, 1), Crop.sphere((0.2, 0, 0), 0.8)
+    splats, ball = random_splats(500, 1), Crop.sphere((0.2, 0, 0), 0.8)
     box, there = Crop.box((-2, -2, -2), (2, 2, 0), outside=True), Look(tint=(0.2, 1, 1))
     found = apply_looks(splats, [(None, LOOK), (ball, there), (box, Look(opacity=0.5))])
     held = np.linalg.norm(splats.means - np.float32([0.2, 0, 0]), axis=1) <= 0.8
@@ -122,12 +122,12 @@ def test_regions_come_upon_the_look_everywhere():
 
 def test_the_picture_is_the_colour_mapped_picture():
     """Blending is linear in colours, and the matrix leaves black black: what is over black is mapped, too."""
-    splats = some_splats(300, 2)
+    splats = random_splats(300, 2)
     splats.sh[:, 0] = np.abs(splats.sh[:, 0]) / 2
     splats.sh[:, 1:] *= 0.1
     camera = Camera("", 96, 72, 90.0, 80.0, 50.0, 33.0, look_at((2.5, 0.4, 1.5)))
     look = replace(LOOK, exposure=0.6, opacity=1.0)
-    before, after = drawn(splats, camera, 0.01), drawn(apply_looks(splats, [(None, look)]), camera, 0.01)
+    before, after = render(splats, camera, 0.01), render(apply_looks(splats, [(None, look)]), camera, 0.01)
     assert before.std() > 0.1 and np.abs(after - before).max() > 0.1
     np.testing.assert_allclose(after, before @ look.matrix.T, atol=2e-5)
 
@@ -184,7 +184,7 @@ def test_the_command_edits_regions_and_folders(tmp_path, capsys):
 
 
 def test_rows_that_are_read_by_and_by_are_the_same():
-    splats = some_splats(50, 1)
+    splats = random_splats(50, 1)
     looks = [(None, LOOK), (Crop.sphere((0, 0, 0), 0.7), Look(exposure=1))]
     rows = RowsWithLook(splats, looks)
     assert len(rows) == 50

@@ -16,7 +16,7 @@ def bands_of(s_min, focal_px, gamma, start, end):
     """Near and far of every level."""
     levels = [(number, {"s_min": value}) for number, value in enumerate(s_min, 1)]
     values = {"gamma": gamma, "first": start, "last": end}
-    return [BANDS.band(focal_px, collect_facts(BANDS, {}, levels, number), values) for number, _ in levels]
+    return [BANDS.distance_band(focal_px, collect_facts(BANDS, {}, levels, number), values) for number, _ in levels]
 
 
 def test_scale_constraints_are_the_published_ones():
@@ -56,7 +56,7 @@ def test_every_distance_belongs_to_exactly_one_level(start, end):
 def test_a_level_that_was_deleted_leaves_no_gap():
     levels = [(number, {"s_min": s_min}) for number, s_min in ((1, 0.2), (3, 0.0125), (5, 0.0))]
     values = {"gamma": 1.0, "first": 1, "last": 5}
-    found = [BANDS.band(100, collect_facts(BANDS, {}, levels, number), values) for number, _ in levels]
+    found = [BANDS.distance_band(100, collect_facts(BANDS, {}, levels, number), values) for number, _ in levels]
     near, middle, far = (0, 1.25, 20)
     expected = [(far, inf), (middle, far), (near, middle)]
     assert [pytest.approx(band) for band in expected] == found
@@ -70,13 +70,13 @@ def test_a_larger_gamma_brings_coarser_levels_nearer():
 @pytest.mark.parametrize("first, last, gamma", [(0, 3, 1), (4, 3, 1), (1, 6, 1), (1, 5, 0), (1.5, 5, 1)])
 def test_impossible_settings_are_refused(first, last, gamma):
     with pytest.raises(LodgsError):
-        BANDS.settings({"first": first, "last": last, "gamma": gamma}, [1, 2, 3, 4, 5])
+        BANDS.resolve_controls({"first": first, "last": last, "gamma": gamma}, [1, 2, 3, 4, 5])
 
 
 def test_figures_are_of_the_three_finest_levels_unless_asked_otherwise():
-    assert BANDS.settings({}, [1, 2, 3, 4, 5]) == {"gamma": 1.0, "first": 3, "last": 5}
-    assert BANDS.settings({"last": 4}, [1, 2, 3, 4, 5])["first"] == 3
-    assert BANDS.settings({"first": 1}, [1, 2], {"gamma": 2.5}) == {"gamma": 2.5, "first": 1, "last": 2}
+    assert BANDS.resolve_controls({}, [1, 2, 3, 4, 5]) == {"gamma": 1.0, "first": 3, "last": 5}
+    assert BANDS.resolve_controls({"last": 4}, [1, 2, 3, 4, 5])["first"] == 3
+    assert BANDS.resolve_controls({"first": 1}, [1, 2], {"gamma": 2.5}) == {"gamma": 2.5, "first": 1, "last": 2}
 
 
 def test_a_budget_does_without_the_finest_level_in_use():

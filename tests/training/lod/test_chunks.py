@@ -134,7 +134,7 @@ def test_what_a_region_loads_is_all_that_is_shown_in_it():
     assert CHUNKS.region(np.zeros(3), values | {"fade": 0}, TABLES) == (0,)
     assert CHUNKS.region(np.array([0, -11.0, 0]), values, TABLES) is None
     assert CHUNKS.region(np.zeros(3), values | {"chunks": 0}, TABLES) is None
-    assert CHUNKS.loaded(columns, (0, 1)).tolist() == [True, True, True, False]
+    assert CHUNKS.visible_in_region(columns, (0, 1)).tolist() == [True, True, True, False]
 
 
 def test_the_bits_of_96_chunks_are_exact_in_single_precision():
@@ -150,7 +150,7 @@ def test_the_bits_of_96_chunks_are_exact_in_single_precision():
 
 def test_where_an_eye_is_in_words():
     def said(eye, tables=TABLES, **values):
-        return CHUNKS.where(np.array(eye, float), CHUNKS.defaults([1]) | values, tables)
+        return CHUNKS.region_label(np.array(eye, float), CHUNKS.defaults([1]) | values, tables)
 
     assert said([2.5, 0, 0]) == "Chunks 0 and 1, 25 %"
     assert said([26.0, 0, 0]) == "Chunks 2 and 1, 15 %"  # the nearest first; t is 0.2, t' 2 / 15
@@ -166,7 +166,7 @@ def test_controls_that_change_nothing_say_why():
         for tables in (TABLES, NO_TABLES):
             for chunks in (0, 1):
                 values = CHUNKS.defaults([1]) | {"chunks": chunks}
-                idle = CHUNKS.idle(np.array(eye, float), values, tables)
+                idle = CHUNKS.inactive_controls(np.array(eye, float), values, tables)
                 before = chunk_weights(eye, tables, **values)
                 for name in idle:
                     for other in (0.02, 9.0) if name == "distance_scale" else (0, 1):

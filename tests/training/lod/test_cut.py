@@ -113,4 +113,4 @@ def test_a_viewers_budget_raises_the_granularity():
         assert values["pixels"] <= 100
         steps += 1
     assert steps == int(log(100) / log(1.25))
-    assert CUT.settings({"pixels": 2}, [1, 2]) == pytest.approx({"pixels": 2})
+    assert CUT.resolve_controls({"pixels": 2}, [1, 2]) == pytest.approx({"pixels": 2})

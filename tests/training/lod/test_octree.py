@@ -53,7 +53,7 @@ def test_the_band_ends_where_a_level_does(fade):
         facts = collect_facts(
             RULE, {"d_max": 9.0, "d_max_focal": 50.0}, [(n, {}) for n in (1, 2, 3, 4)], level
         )
-        near, far = RULE.band(70.0, facts, values, {BIAS: bias})
+        near, far = RULE.distance_band(70.0, facts, values, {BIAS: bias})
         assert near == 0 and far.shape == (500,)
         for share, there in ((0.999, True), (1.001, False)):
             means = np.zeros((500, 3), np.float32)
@@ -66,5 +66,5 @@ def test_level_1_is_everywhere_and_nothing_is_left_out_unless_the_highest_bias_i
     levels = [(1, {}), (2, {})]
     facts = [collect_facts(RULE, {"d_max": 9.0, "d_max_focal": 50.0}, levels, number) for number in (1, 2)]
     values = RULE.defaults([1, 2])
-    assert RULE.band(50.0, facts[0], values, {BIAS: np.zeros(3, np.float32)}) == (0.0, np.inf)
-    assert RULE.band(50.0, facts[1], values) == (0.0, np.inf)
+    assert RULE.distance_band(50.0, facts[0], values, {BIAS: np.zeros(3, np.float32)}) == (0.0, np.inf)
+    assert RULE.distance_band(50.0, facts[1], values) == (0.0, np.inf)

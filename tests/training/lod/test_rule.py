@@ -123,7 +123,7 @@ def test_nothing_outside_the_band_has_a_weight(name):
             away = distances(level.splats.means, eye)
             of_all = {n: column.max(keepdims=True) for n, column in columns.items()}
             for highest in (columns, of_all, {}):
-                near, far = rule.band(focal, facts, values, highest)
+                near, far = rule.distance_band(focal, facts, values, highest)
                 assert (near <= away[weighted] * 1.00001).all()
                 assert (away * 0.99999 < far)[weighted].all()
 
@@ -178,7 +178,7 @@ def test_no_rule_and_an_unknown_one_are_sentences(rule, said):
 def test_what_is_no_number_of_a_control_is_a_sentence(value):
     control = Control("turns", 1, 0, 2, "Turns", "How many", whole=True)
     with pytest.raises(LodgsError, match=r"turns = .* is not possible. Give a whole number from 0 to 2."):
-        control.checked(value)
+        control.validate(value)
 
 
 def test_facts_know_the_neighbours():

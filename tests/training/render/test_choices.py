@@ -82,7 +82,7 @@ def test_while_the_eye_stays_in_a_region_only_what_is_loaded_there_is_looked_at(
     held = SplatSet(splats, backend="cpu")
     looked_at, found = [], []
     rule = rules()["chunks"]
-    weights, loaded = type(rule).weights, type(rule).loaded
+    weights, loaded = type(rule).weights, type(rule).visible_in_region
 
     def counted(self, means, *rest):
         looked_at.append(len(means))
@@ -95,7 +95,7 @@ def test_while_the_eye_stays_in_a_region_only_what_is_loaded_there_is_looked_at(
     eyes = [(x, 0.1, 0) for x in (0.1, 0.4, 0.6, 0.9, 2.2)]
     wanted = [by_rule(choice_of("chunks", eye), splats) for eye in eyes]
     monkeypatch.setattr(type(rule), "weights", counted)
-    monkeypatch.setattr(type(rule), "loaded", once)
+    monkeypatch.setattr(type(rule), "visible_in_region", once)
     for eye, weight in zip(eyes, wanted, strict=True):
         np.testing.assert_array_equal(weights_of(held, choice_of("chunks", eye)), weight)
         held.select_visible(choice_of("chunks", eye))  # the same frame again
@@ -146,7 +146,7 @@ def test_a_choice_travels_as_json(camera):
         assert found.as_dict() == choice.as_dict()
         assert found.region() == choice.region()
     crops = (Crop.sphere((1, 2, 3), 4), Crop.box((0, 0, 0), (1, 2, 3), True))
-    for choice in (choice_of("bands", (0.1, -2, 3)), LodQuery.by_crops(())):
+    for choice in (choice_of("bands", (0.1, -2, 3)), LodQuery.from_crops(())):
         choice = replace(choice, crops=crops)
         one = {"file": "s", "count": 1, "matrix": np.eye(4).tolist(), "level": 1, "choice": choice.as_dict()}
         asked = json.loads(

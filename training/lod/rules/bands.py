@@ -35,7 +35,7 @@ class Bands(Rule):
     name = "bands"
     level_facts = ("s_min",)
     lengths = level_facts
-    flat = True
+    binary = True
     controls = (
         Control(
             "gamma", 1.0, 0.01, 1000.0, "Screen Size",
@@ -53,7 +53,7 @@ class Bands(Rule):
         ),
     )  # fmt: skip
 
-    def band(
+    def distance_band(
         self, focal_px: float, facts: Mapping[str, float], values: Values, highest=NO_COLUMNS
     ) -> tuple[float, float]:
         """Near and far end of a level's band, in scene units; (inf, inf) for a level that is not in use."""
@@ -66,7 +66,7 @@ class Bands(Rule):
         return near, far
 
     def weights(self, means, eye, focal_px, columns, facts, values, tables=NO_TABLES) -> np.ndarray:
-        near, far = self.band(focal_px, facts, values)
+        near, far = self.distance_band(focal_px, facts, values)
         if near == inf:
             return np.zeros(len(means), np.float32)
         away = distances(means, eye)
@@ -76,8 +76,8 @@ class Bands(Rule):
         """The three finest levels, as published figures have them (Sec. 5)."""
         return super().defaults(levels) | {"first": levels[-3:][0], "last": levels[-1]}
 
-    def settings(self, given: Values, levels: Sequence[int], recorded: Values | None = None) -> Values:
-        values = super().settings(given, levels, recorded)
+    def resolve_controls(self, given: Values, levels: Sequence[int], recorded: Values | None = None) -> Values:
+        values = super().resolve_controls(given, levels, recorded)
         first, last = (int(values[name]) for name in ("first", "last"))
         if not levels[0] <= first <= last <= levels[-1]:
             raise LodgsError(

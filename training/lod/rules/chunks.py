@@ -58,7 +58,7 @@ class Chunks(Rule):
         ),
     )  # fmt: skip
 
-    def band(
+    def distance_band(
         self, focal_px: float, facts: Mapping[str, float], values: Values, highest=NO_COLUMNS
     ) -> tuple[float, float]:
         """Near and far end of a level's distances from the eye, in scene units; any, where chunks count."""
@@ -95,13 +95,13 @@ class Chunks(Rule):
             return None
         return tuple(sorted(chunk for chunk, _ in near_chunks))
 
-    def loaded(self, columns, region: Region) -> np.ndarray:
+    def visible_in_region(self, columns, region: Region) -> np.ndarray:
         found = members(columns, region[0])
         for chunk in region[1:]:
             found |= members(columns, chunk)
         return found
 
-    def where(self, eye, values: Values, tables: Tables) -> str:
+    def region_label(self, eye, values: Values, tables: Tables) -> str:
         if not values["chunks"] or not _rows(tables):
             return ""
         near_chunks = self.near_chunks(eye, values, tables)
@@ -115,7 +115,7 @@ class Chunks(Rule):
             said += f", {100 * (1 - inside):.0f} % outside"
         return f"Chunk{'s'[: len(near_chunks) > 1]} {said}"
 
-    def idle(self, eye, values: Values, tables: Tables) -> Mapping[str, str]:
+    def inactive_controls(self, eye, values: Values, tables: Tables) -> Mapping[str, str]:
         if not _rows(tables):
             return dict.fromkeys(("chunks", "fade"), "These splats have no chunks.")
         if not values["chunks"]:
@@ -168,7 +168,7 @@ class Chunks(Rule):
     def coarser(self, values: Values, levels: Sequence[int]) -> Values | None:
         if values["chunks"]:
             return {**values, "chunks": 0}
-        return self.raised(values, "distance_scale")
+        return self.raise_control(values, "distance_scale")
 
 
 def _rows(tables: Tables) -> int:

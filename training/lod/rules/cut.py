@@ -95,7 +95,7 @@ class Cut(Rule):
     columns = (NODE_SIZE, PARENT_SIZE, *PARENT)
     lengths = (NODE_SIZE, PARENT_SIZE)
     places = (PARENT,)
-    related = True
+    linked_columns = True
     controls = (
         Control(
             "pixels", 1.0, 0.1, 100.0, "Granularity",
@@ -118,14 +118,14 @@ class Cut(Rule):
             shown[block] = chosen
         return shown
 
-    def band(self, focal_px, facts, values, highest=NO_COLUMNS) -> tuple[float, float | np.ndarray]:
+    def distance_band(self, focal_px, facts, values, highest=NO_COLUMNS) -> tuple[float, float | np.ndarray]:
         """As far as parents are too coarse: a node is at most K_LEAST of its parent's sizes away from it."""
         if PARENT_SIZE not in highest:
             return 0.0, np.inf
         k = detail_of(focal_px, values["pixels"])
         return 0.0, (k + K_LEAST) * (1 + 4 * ROUNDING) * highest[PARENT_SIZE].astype(np.float64)
 
-    def agreed(self, before: Columns, after: Columns) -> Columns:
+    def reconcile(self, before: Columns, after: Columns) -> Columns:
         """Sizes with which cuts are proper still, and no two nodes are the same at the same place.
 
         They are what scaling makes of them, or larger in the last places.
@@ -166,7 +166,7 @@ class Cut(Rule):
         return _octave(distances(means, eye) / np.float32(detail_of(focal_px, values["pixels"])))
 
     def coarser(self, values: Values, levels: Sequence[int]) -> Values | None:
-        return self.raised(values, "pixels")
+        return self.raise_control(values, "pixels")
 
 
 def identities(sizes: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:

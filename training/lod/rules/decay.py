@@ -71,7 +71,7 @@ class Decay(Rule):
             whole=True, step=1000,
         ),
     )  # fmt: skip
-    always = True
+    always_active = True
     apart = False
     sweep = ("s_v", (1.0, 1.5, 2.0, 3.0, 5.0))
 
@@ -101,7 +101,7 @@ class Decay(Rule):
         return np.where(columns[OPACITY] * weight > tau * s_v, weight, np.float32(0))
 
     def coarser(self, values: Values, levels: Sequence[int]) -> Values | None:
-        return self.raised(values, "s_v")
+        return self.raise_control(values, "s_v")
 
 
 RULE = Decay()

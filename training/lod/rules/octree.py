@@ -66,7 +66,7 @@ class Octree(Rule):
         ),
     )  # fmt: skip
 
-    def band(
+    def distance_band(
         self, focal_px: float, facts: Mapping[str, float], values: Values, highest=NO_COLUMNS
     ) -> tuple[float, float | np.ndarray]:
         """0, and where the splat with the highest bias is no longer wanted; level 1 is wanted everywhere."""

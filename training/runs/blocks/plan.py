@@ -326,7 +326,7 @@ def _part_job(job: Job, parameters: Parameters, method: str = "") -> Job:
 def _polishes(job: Job) -> bool:
     """Return whether borders of cells are fitted; the rule must not weight splats at full detail."""
     rule = find_rule(method_info(method_info(job.method).in_cells).rule)
-    return job.polish > 0 and (rule is None or not rule.always)
+    return job.polish > 0 and (rule is None or not rule.always_active)
 
 
 def _seam_job(job: Job) -> Job:

@@ -64,7 +64,7 @@ def test_a_draft_is_chosen_at_two_fifths_of_a_pixel_and_the_paper_at_one(data):
 @pytest.mark.parametrize("s_min_1, expected", [(1e-9, 0.01), (1e9, 1)])
 def test_gamma_stays_possible_and_within_a_pixel(data, s_min_1, expected):
     assert make(data, s_min_1=s_min_1).controls() == {"gamma": expected}
-    assert all_controls()["gamma"].checked(expected) == expected
+    assert all_controls()["gamma"].validate(expected) == expected
     assert make(data, levels=1, steps=[4]).controls() == {}
 
 
