@@ -123,7 +123,7 @@ def _draw_counts(layout: bpy.types.UILayout, context: bpy.types.Context, root: b
     """Draw the camera's chunk and the numbers of visible and loaded splats."""
     choice = loaded.chosen(context, root) if root.lodgs.mode == "SELECTIVE" else None
     column = layout.column(align=True)
-    position = choice.where() if choice else ""
+    position = choice.region_label() if choice else ""
     if position:
         column.label(text=position)
     if not streams.file_of(root):  # when streaming, viewports draw more splats than the levels hold
