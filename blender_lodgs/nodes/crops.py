@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import bpy
 
-from ...training.lod.crop import FACE
+from ...training.lod.crop import FACE_SQUARED
 from ..attributes import HIDDEN
 from .building import VERSION, Field, Nodes, ensure_group, is_edited
 
@@ -91,4 +91,4 @@ def inside_crop(nodes: Nodes, sockets, number: int, position: bpy.types.NodeSock
     x, y, z = (nodes.field(components.outputs[axis]) for axis in "XYZ")
     size, sphere = (nodes.field(sockets[name.format(number)]) for name in (SIZE, SPHERE))
     distance2 = (sphere > 0.5).where(x + y + z, x.maximum(y).maximum(z))
-    return nodes.field(inverse.outputs["Invertible"]) & (distance2 <= size * size * FACE)
+    return nodes.field(inverse.outputs["Invertible"]) & (distance2 <= size * size * FACE_SQUARED)

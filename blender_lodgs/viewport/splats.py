@@ -17,7 +17,7 @@ from mathutils import Matrix
 
 from ...training.editing.look import Looks
 from ...training.lod.colors import LEVEL_COLORS
-from ...training.lod.crop import FACE
+from ...training.lod.crop import FACE_SQUARED as FACE
 from .arranging import WIDTH, Arrangement
 
 MOST_COEFFICIENTS = 24

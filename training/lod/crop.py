@@ -11,7 +11,7 @@ from ..documents import quote
 from ..errors import LodgsError
 
 SHAPES = ("BOX", "SPHERE")
-FACE = (1 + 1e-5) ** 2
+FACE_SQUARED = (1 + 1e-5) ** 2
 """The square of how far a crop reaches in its own space: what lies on its face is in it, however numbers were
 rounded on the way there."""
 _NOWHERE = ((0.0, 0.0, 0.0, 2.0),) * 3
@@ -91,7 +91,7 @@ class Crop:
             else:
                 np.maximum(squares, axis, out=squares)
         assert squares is not None
-        return squares <= np.float32(FACE)
+        return squares <= np.float32(FACE_SQUARED)
 
     @classmethod
     def from_text(cls, text: str) -> Crop:

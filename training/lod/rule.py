@@ -260,7 +260,9 @@ class Rule(ABC):
         """
         return {control.name: control.default for control in self.controls}
 
-    def resolve_controls(self, given: Values, levels: Sequence[int], recorded: Values | None = None) -> Values:
+    def resolve_controls(
+        self, given: Values, levels: Sequence[int], recorded: Values | None = None
+    ) -> Values:
         """A value for every control: those given, then those that a bundle recorded, then :meth:`defaults`.
 
         Raises:
@@ -368,10 +370,10 @@ def distances(means: np.ndarray, eye: np.ndarray) -> np.ndarray:
 
     Axis by axis, which numpy does four times as fast as rows of three.
     """
-    return distances_by_axes([*means.T], eye)
+    return axis_distances([*means.T], eye)
 
 
-def distances_by_axes(axes: Sequence[np.ndarray], eye: np.ndarray) -> np.ndarray:
+def axis_distances(axes: Sequence[np.ndarray], eye: np.ndarray) -> np.ndarray:
     """The same of means whose x, y and z are (N,) each."""
     squares = np.zeros(len(axes[0]), axes[0].dtype)
     for axis, place in zip(axes, np.asarray(eye, squares.dtype), strict=True):

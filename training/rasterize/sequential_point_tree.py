@@ -244,7 +244,7 @@ def image_borders(camera: Camera, near: float) -> np.ndarray:
 
 @inlined(STRICT)
 def _fine(balls, i, eye, k):
-    """``lod.rules.cut.acceptable`` of a node, bit for bit."""
+    """``lod.rules.cut.is_fine_enough`` of a node, bit for bit."""
     x, y, z = balls[i, 0] - eye[0], balls[i, 1] - eye[1], balls[i, 2] - eye[2]
     return np.sqrt(x * x + y * y + z * z) >= k * balls[i, 3]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ....training.lod.rule import NO_FINER
-from ....training.lod.rules.chunks import BITS, LEAVING, MEMBERS, TABLE
+from ....training.lod.rules.chunks import BITS, FADE_SHARE, MEMBER_COLUMNS, TABLE
 from ..building import Field, Nodes
 from . import RuleInputs
 
@@ -49,7 +49,7 @@ def _by_chunks(inputs: RuleInputs, chunks: bpy.types.NodeSocket) -> Field:
 
     row = nodes.field(nodes.attribute(_ROW))
     distance = nodes.field(nodes.vector("DISTANCE", position, inputs.camera))
-    beyond = (distance / inputs.table_column("radius").maximum(1e-20) - 1.0) / LEAVING
+    beyond = (distance / inputs.table_column("radius").maximum(1e-20) - 1.0) / FADE_SHARE
     nearest = nodes.sort_points(chunks, distance.socket)
     centre = nodes.sample(nearest, position, 0, kind="FLOAT_VECTOR", clamp=True)
     to_camera = nodes.vector("SUBTRACT", inputs.camera, centre)
@@ -82,7 +82,7 @@ def _with_rows(nodes: Nodes, table: bpy.types.NodeSocket) -> bpy.types.NodeSocke
 def _member(inputs: RuleInputs, number: Field) -> Field:
     """Return 1 for splats that belong to a chunk: one bit of a membership column."""
     nodes = inputs.nodes
-    columns = [inputs.column(name).socket for name in MEMBERS]
+    columns = [inputs.column(name).socket for name in MEMBER_COLUMNS]
     column = nodes.field(nodes.index_switch((number / BITS).floor(), *columns))
     bit = nodes.field(nodes.math("POWER", 2.0, number.modulo(BITS).socket))
     return (column / bit).floor().modulo(2.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ....training.lod.rules.cut import K_LEAST, NODE_SIZE, PARENT, PARENT_SIZE
+from ....training.lod.rules.cut import MIN_DETAIL, NODE_SIZE, PARENT, PARENT_SIZE
 from ..building import Field
 from . import RuleInputs
 
@@ -15,7 +15,7 @@ FADES = False
 def weight(inputs: RuleInputs) -> Field:
     """Return 1 if a node is fine enough and its parent is not."""
     nodes = inputs.nodes
-    detail = (inputs.focal_px / inputs["pixels"]).maximum(K_LEAST)
+    detail = (inputs.focal_px / inputs["pixels"]).maximum(MIN_DETAIL)
 
     def is_coarse(position: bpy.types.NodeSocket, size: str) -> Field:
         """Return 1 if a node is too coarse. Node and parent use the same arithmetic, so rounding agrees."""

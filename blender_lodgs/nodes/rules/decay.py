@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ....training.lod.rules.decay import CLEAR, EPSILON, NEWTON_STEPS, SIGMA
+from ....training.lod.rules.decay import EPSILON, LIMIT_MARGIN, NEWTON_STEPS, SIGMA
 from ..building import Field
 from . import RuleInputs
 
@@ -44,4 +44,4 @@ def _for_budget(inputs: RuleInputs, opacity: Field, normalized: Field, variance:
         w = w / (w + 1.0) * ((product / w).log() + 1.0)
     limit = ratio * (w * -0.5).exp()
     ordered = nodes.sort_points(inputs.points, (limit * -1.0).socket)
-    return nodes.field(nodes.sample(ordered, limit.socket, inputs["at_most"].socket)) * (1 + CLEAR)
+    return nodes.field(nodes.sample(ordered, limit.socket, inputs["at_most"].socket)) * (1 + LIMIT_MARGIN)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from training.lod.rules.octree import faded, wanted_at
+from training.lod.rules.octree import fade_weights, target_level
 
 LEVELS, COUNT, D_MAX, FOCAL = 4, 5_000, 16.0, 700.0
 
@@ -47,7 +47,7 @@ def expected(root, eye, focal, offset=0.0):
         cloud.attributes["position"].data.foreach_get("vector", means)
         cloud.attributes["lod_bias"].data.foreach_get("value", bias)
         distances = np.linalg.norm(means.reshape(-1, 3) - np.float32(eye), axis=1) * (FOCAL / focal)
-        found.append(faded(wanted_at(distances, bias + offset, D_MAX, LEVELS), item.number))
+        found.append(fade_weights(target_level(distances, bias + offset, D_MAX, LEVELS), item.number))
     return found
 
 

@@ -289,7 +289,7 @@ def moved_by(bpy, offset):
 def fading(bpy, lodgs, camera, truth):
     """The root of two Octree levels that fade among the splats, and the trainer's picture of them with the
     weights that the rule gives."""
-    from training.lod.rules.octree import faded, wanted_at
+    from training.lod.rules.octree import fade_weights, target_level
 
     scenes, bundle = lodgs("data.scenes"), lodgs("training.splats.bundle")
     levels = [make_splats(lodgs, 1500, 1, seed) for seed in range(2)]
@@ -305,8 +305,8 @@ def fading(bpy, lodgs, camera, truth):
 
     def weights(means):
         distances = np.linalg.norm(means - eye, axis=1)
-        wanted = wanted_at(distances, 0.0, farthest, 2)
-        return faded(wanted, np.repeat([1, 2], 1500))
+        wanted = target_level(distances, 0.0, farthest, 2)
+        return fade_weights(wanted, np.repeat([1, 2], 1500))
 
     return root, truth([(splats, np.eye(4)) for splats in levels], keep=weights)
 

@@ -7,7 +7,7 @@ import pytest
 
 from training.errors import LodgsError
 from training.lod.rule import collect_facts, rules
-from training.lod.rules.bands import s_min_of
+from training.lod.rules.bands import min_scales
 
 BANDS = rules()["bands"]
 
@@ -16,16 +16,19 @@ def bands_of(s_min, focal_px, gamma, start, end):
     """Near and far of every level."""
     levels = [(number, {"s_min": value}) for number, value in enumerate(s_min, 1)]
     values = {"gamma": gamma, "first": start, "last": end}
-    return [BANDS.distance_band(focal_px, collect_facts(BANDS, {}, levels, number), values) for number, _ in levels]
+    return [
+        BANDS.distance_band(focal_px, collect_facts(BANDS, {}, levels, number), values)
+        for number, _ in levels
+    ]
 
 
 def test_scale_constraints_are_the_published_ones():
     # methods: lambda 0.2, rho 4, five levels -> .2 / .05 / .0125 / .003125 / 0
-    assert s_min_of(0.2, 4, 5) == pytest.approx([0.2, 0.05, 0.0125, 0.003125, 0])
+    assert min_scales(0.2, 4, 5) == pytest.approx([0.2, 0.05, 0.0125, 0.003125, 0])
 
 
 def test_one_level_has_no_constraint():
-    assert s_min_of(0.2, 4, 1) == [0.0]
+    assert min_scales(0.2, 4, 1) == [0.0]
 
 
 def test_bands_of_levels_three_to_five():
@@ -39,7 +42,7 @@ def test_bands_of_levels_three_to_five():
 
 @pytest.mark.parametrize("start, end", [(1, 5), (2, 4), (3, 3), (5, 5), (4, 2), (6, 9)])
 def test_every_distance_belongs_to_exactly_one_level(start, end):
-    s_min = s_min_of(0.3, 3, 5)
+    s_min = min_scales(0.3, 3, 5)
     bands = bands_of(s_min, 500, 2.0, start, end)
     borders = [border for band in bands for border in band if 0 < border < inf]
     means = np.zeros((1001 + len(borders), 3), np.float32)
@@ -56,14 +59,16 @@ def test_every_distance_belongs_to_exactly_one_level(start, end):
 def test_a_level_that_was_deleted_leaves_no_gap():
     levels = [(number, {"s_min": s_min}) for number, s_min in ((1, 0.2), (3, 0.0125), (5, 0.0))]
     values = {"gamma": 1.0, "first": 1, "last": 5}
-    found = [BANDS.distance_band(100, collect_facts(BANDS, {}, levels, number), values) for number, _ in levels]
+    found = [
+        BANDS.distance_band(100, collect_facts(BANDS, {}, levels, number), values) for number, _ in levels
+    ]
     near, middle, far = (0, 1.25, 20)
     expected = [(far, inf), (middle, far), (near, middle)]
     assert [pytest.approx(band) for band in expected] == found
 
 
 def test_a_larger_gamma_brings_coarser_levels_nearer():
-    near = [bands_of(s_min_of(0.2, 4, 5), 800, gamma, 3, 5)[2][0] for gamma in (0.5, 1, 2)]
+    near = [bands_of(min_scales(0.2, 4, 5), 800, gamma, 3, 5)[2][0] for gamma in (0.5, 1, 2)]
     assert near == pytest.approx([20, 10, 5])
 
 
@@ -76,7 +81,11 @@ def test_impossible_settings_are_refused(first, last, gamma):
 def test_figures_are_of_the_three_finest_levels_unless_asked_otherwise():
     assert BANDS.resolve_controls({}, [1, 2, 3, 4, 5]) == {"gamma": 1.0, "first": 3, "last": 5}
     assert BANDS.resolve_controls({"last": 4}, [1, 2, 3, 4, 5])["first"] == 3
-    assert BANDS.resolve_controls({"first": 1}, [1, 2], {"gamma": 2.5}) == {"gamma": 2.5, "first": 1, "last": 2}
+    assert BANDS.resolve_controls({"first": 1}, [1, 2], {"gamma": 2.5}) == {
+        "gamma": 2.5,
+        "first": 1,
+        "last": 2,
+    }
 
 
 def test_a_budget_does_without_the_finest_level_in_use():

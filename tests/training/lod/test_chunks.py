@@ -7,7 +7,7 @@ import pytest
 
 from training.errors import LodgsError
 from training.lod.rule import NO_TABLES, collect_facts, rules
-from training.lod.rules.chunks import member_columns, members
+from training.lod.rules.chunks import in_chunk, member_columns
 from training.lod.selection import check_rule
 from training.splats.levels import NO_SPLATS, Bundle, Level
 
@@ -143,7 +143,7 @@ def test_the_bits_of_96_chunks_are_exact_in_single_precision():
     assert list(columns) == ["chunks_0", "chunks_1", "chunks_2", "chunks_3"]
     assert all(column.dtype == np.float32 for column in columns.values())
     for chunk, one in enumerate(sets):
-        np.testing.assert_array_equal(members(columns, chunk), one)
+        np.testing.assert_array_equal(in_chunk(columns, chunk), one)
     assert list(member_columns(sets[:24])) == ["chunks_0"]
     assert list(member_columns(sets[:25])) == ["chunks_0", "chunks_1"]
 

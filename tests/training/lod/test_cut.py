@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from training.lod.rule import rules
-from training.lod.rules.cut import ABOVE_ROOT, K_LEAST, least_size
+from training.lod.rules.cut import ABOVE_ROOT, MIN_DETAIL, min_parent_size
 
 CUT = rules()["cut"]
 
@@ -43,7 +43,7 @@ def random_tree(rng, leaves, spread=1.0, place=0.0):
     for node in range(len(parents) - 1, 0, -1):
         above = parents[node]
         away = np.linalg.norm(means[node].astype(float) - means[above].astype(float))
-        needed = np.float32(least_size(float(sizes[node]), away))
+        needed = np.float32(min_parent_size(float(sizes[node]), away))
         sizes[above] = max(sizes[above], np.nextafter(needed, np.float32(np.inf)))
     return means, parents, sizes
 
@@ -76,11 +76,11 @@ def test_splats_without_columns_are_not_drawn():
 def test_detail_has_a_least_value():
     means, parents, sizes = random_tree(np.random.default_rng(1), 200)
     columns = columns_of(sizes, parents, means)
-    least = weights(means, columns, (3, 0, 0), K_LEAST, 1.0)
-    np.testing.assert_array_equal(weights(means, columns, (3, 0, 0), K_LEAST, 50.0), least)
+    least = weights(means, columns, (3, 0, 0), MIN_DETAIL, 1.0)
+    np.testing.assert_array_equal(weights(means, columns, (3, 0, 0), MIN_DETAIL, 50.0), least)
 
 
-@given(st.integers(0, 2**32), st.integers(1, 60), st.floats(K_LEAST, 5000), st.floats(0.01, 200))
+@given(st.integers(0, 2**32), st.integers(1, 60), st.floats(MIN_DETAIL, 5000), st.floats(0.01, 200))
 def test_of_each_leaf_and_what_is_above_it_exactly_one_is_drawn(seed, leaves, k, reach):
     rng = np.random.default_rng(seed)
     spread, place = rng.choice([1e-3, 1.0, 30.0]), rng.choice([0, 1000])  # where places are coarse

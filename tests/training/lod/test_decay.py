@@ -8,7 +8,7 @@ import pytest
 
 from training.evaluate.views import full_detail_selector
 from training.lod.rule import rules
-from training.lod.rules.decay import attenuation, last_seen_at
+from training.lod.rules.decay import attenuation, max_visible_scale
 from training.runs.base import read_base
 from training.scenes.cameras import Camera
 from training.splats.bundle import write_bundle
@@ -73,7 +73,7 @@ def test_where_a_splat_is_last_seen_is_where_its_opacity_meets_the_threshold():
     means, columns = scene()
     normalized = (np.linalg.norm(means, axis=1) / 8).astype(np.float32)
     sigma, opacity = columns["sigma_d"], columns["opacity"]
-    limit = last_seen_at(normalized, sigma, opacity, 0.004).astype(np.float64)
+    limit = max_visible_scale(normalized, sigma, opacity, 0.004).astype(np.float64)
     some = (sigma > 0.01) & (opacity > 0.01)
     attenuated = opacity * attenuation(normalized.astype(np.float64), sigma.astype(np.float64), limit)
     np.testing.assert_allclose(np.log(attenuated[some]), np.log(0.004 * limit[some]), atol=1e-4)
@@ -88,7 +88,7 @@ def test_a_budget_is_kept_by_the_splats_that_last_longest(at_most, eye):
     shown = weights(means, columns, at_most=at_most, eye=eye) > 0
     assert min(at_most, everything) - 2 <= shown.sum() <= at_most
     normalized = DECAY.normalized(means, np.float32(eye), FACTS)
-    limit = last_seen_at(normalized, columns["sigma_d"], columns["opacity"], 0.004)
+    limit = max_visible_scale(normalized, columns["sigma_d"], columns["opacity"], 0.004)
     assert limit[shown].min() >= limit[~shown].max() * (1 - 1e-4)
 
 

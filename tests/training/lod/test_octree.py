@@ -4,26 +4,26 @@ import numpy as np
 import pytest
 
 from training.lod.rule import collect_facts
-from training.lod.rules.octree import BIAS, RULE, faded, wanted_at
+from training.lod.rules.octree import BIAS, RULE, fade_weights, target_level
 
 
 def test_the_wanted_level_rises_by_one_with_every_half_of_the_distance():
     distances = np.array([64.0, 32.0, 16.0, 8.0, 4.0, 2.0, 1000.0])
-    assert wanted_at(distances, 0.0, 32.0, 4).tolist() == [1, 1, 2, 3, 4, 4, 1]
-    assert wanted_at(distances, 1.0, 32.0, 4).tolist() == [1, 2, 3, 4, 4, 4, 1]
+    assert target_level(distances, 0.0, 32.0, 4).tolist() == [1, 1, 2, 3, 4, 4, 1]
+    assert target_level(distances, 1.0, 32.0, 4).tolist() == [1, 2, 3, 4, 4, 4, 1]
 
 
 def test_a_level_fades_in_while_the_one_before_it_is_whole():
     wanted = np.array([1.0, 2.0, 2.25, 2.5, 2.625, 2.75, 3.0])
-    assert faded(wanted, 1).tolist() == [1, 1, 1, 1, 1, 1, 1]
-    assert faded(wanted, 2).tolist() == [0, 1, 1, 1, 1, 1, 1]
-    assert faded(wanted, 3).tolist() == [0, 0, 0, 0.5, 0.75, 1, 1]
-    assert (faded(wanted, 3) >= 0.5).tolist() == (np.round(wanted + 1e-9) >= 3).tolist()
+    assert fade_weights(wanted, 1).tolist() == [1, 1, 1, 1, 1, 1, 1]
+    assert fade_weights(wanted, 2).tolist() == [0, 1, 1, 1, 1, 1, 1]
+    assert fade_weights(wanted, 3).tolist() == [0, 0, 0, 0.5, 0.75, 1, 1]
+    assert (fade_weights(wanted, 3) >= 0.5).tolist() == (np.round(wanted + 1e-9) >= 3).tolist()
 
 
 def test_at_no_distance_at_all_everything_is_wanted():
     with np.errstate(divide="raise"):
-        assert wanted_at(np.zeros(1, np.float32), 0.0, 32.0, 4).tolist() == [4]
+        assert target_level(np.zeros(1, np.float32), 0.0, 32.0, 4).tolist() == [4]
 
 
 def test_numpy_and_torch_agree():
@@ -31,8 +31,10 @@ def test_numpy_and_torch_agree():
     rng = np.random.default_rng(0)
     distances, bias = rng.uniform(0.1, 50, 1000), rng.uniform(0, 1, 1000)
     level = rng.integers(1, 6, 1000)
-    by_numpy = faded(wanted_at(distances, bias, 20.0, 5), level)
-    by_torch = faded(wanted_at(torch.tensor(distances), torch.tensor(bias), 20.0, 5), torch.tensor(level))
+    by_numpy = fade_weights(target_level(distances, bias, 20.0, 5), level)
+    by_torch = fade_weights(
+        target_level(torch.tensor(distances), torch.tensor(bias), 20.0, 5), torch.tensor(level)
+    )
     assert np.allclose(by_numpy, by_torch.numpy(), atol=1e-12)
 
 

@@ -9,7 +9,7 @@ from training.errors import LodgsError
 from training.lod.blocks import SIZE, spatial_order
 from training.lod.partial_read import BLOCKS, block_table, read_part
 from training.lod.rule import rules
-from training.lod.rules.chunks import member_columns, members
+from training.lod.rules.chunks import in_chunk, member_columns
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
 from training.splats.levels import Bundle, Level
@@ -46,10 +46,10 @@ def test_a_region_is_what_the_whole_has_of_it(tmp_path, bundle, order, region):
     write_bundle(tmp_path / "bundle.ply", bundle, order)
     part, size = read_part(tmp_path / "bundle.ply", COUNTS, region)
     for level, whole in zip(part.levels, read_bundle(tmp_path / "bundle.ply").levels, strict=True):
-        some = np.any([members(whole.splats.extras, chunk) for chunk in region], axis=0)
+        some = np.any([in_chunk(whole.splats.extras, chunk) for chunk in region], axis=0)
         np.testing.assert_array_equal(level.splats.means, whole.splats.means[some])
         np.testing.assert_array_equal(level.splats.sh, whole.splats.sh[some])
-        assert all(members(level.splats.extras, region[0]) == members(whole.splats.extras, region[0])[some])
+        assert all(in_chunk(level.splats.extras, region[0]) == in_chunk(whole.splats.extras, region[0])[some])
     loaded, everything = sum(len(level.splats) for level in part.levels), sum(COUNTS.values())
     assert loaded * BYTES < size < 0.6 * everything * BYTES
 
@@ -61,7 +61,7 @@ def test_a_file_without_blocks_is_read_whole(tmp_path, bundle):
     (part, some), (same, size) = (read_part(tmp_path / name, COUNTS, (7, 8)) for name in ("a.ply", "b.ply"))
     assert some < size >= sum(COUNTS.values()) * BYTES
     for one, other in zip(part.levels, same.levels, strict=True):
-        inside = members(other.splats.extras, 7) | members(other.splats.extras, 8)
+        inside = in_chunk(other.splats.extras, 7) | in_chunk(other.splats.extras, 8)
         np.testing.assert_array_equal(one.splats.quats, other.splats.quats[inside])
 
 

@@ -10,11 +10,11 @@ import numpy as np
 from ...errors import LodgsError
 from ..rule import NO_COLUMNS, NO_TABLES, Control, Rule, Values, distances
 
-MOST = 64
+MAX_LEVEL = 64
 """The largest number of a level that can be asked for: more than any scene has."""
 
 
-def s_min_of(s_min_1: float, rho: float, levels: int) -> list[float]:
+def min_scales(s_min_1: float, rho: float, levels: int) -> list[float]:
     """FLoD's 3D scale constraint of each level (Eq. 3): s_min_1 * rho**(1 - l), and 0 at the last.
 
     Args:
@@ -44,11 +44,11 @@ class Bands(Rule):
             soft=(0.1, 10.0), unit="PIXEL",
         ),
         Control(
-            "first", 1, 1, MOST, "Coarsest", "Coarsest level in use: it is shown farthest away",
+            "first", 1, 1, MAX_LEVEL, "Coarsest", "Coarsest level in use: it is shown farthest away",
             whole=True, follows="coarsest",
         ),
         Control(
-            "last", MOST, 1, MOST, "Finest", "Finest level in use: it is shown nearest to the eye",
+            "last", MAX_LEVEL, 1, MAX_LEVEL, "Finest", "Finest level in use: it is shown nearest to the eye",
             whole=True, follows="finest",
         ),
     )  # fmt: skip
@@ -76,7 +76,9 @@ class Bands(Rule):
         """The three finest levels, as published figures have them (Sec. 5)."""
         return super().defaults(levels) | {"first": levels[-3:][0], "last": levels[-1]}
 
-    def resolve_controls(self, given: Values, levels: Sequence[int], recorded: Values | None = None) -> Values:
+    def resolve_controls(
+        self, given: Values, levels: Sequence[int], recorded: Values | None = None
+    ) -> Values:
         values = super().resolve_controls(given, levels, recorded)
         first, last = (int(values[name]) for name in ("first", "last"))
         if not levels[0] <= first <= last <= levels[-1]:

@@ -12,15 +12,15 @@ from ..rule import NO_COLUMNS, NO_FINER, NO_TABLES, Control, Region, Rule, Table
 
 COLUMNS = ("x", "y", "z", "radius")
 """Of the table of chunks."""
-BITS, MOST_CHUNKS = 24, 96
+BITS, MAX_CHUNKS = 24, 96
 """Chunks that one column tells of, as single precision holds so many bits; and chunks of a scene."""
-MEMBERS = tuple(f"chunks_{number}" for number in range(MOST_CHUNKS // BITS))
+MEMBER_COLUMNS = tuple(f"chunks_{number}" for number in range(MAX_CHUNKS // BITS))
 """Columns of splats: bit c % BITS of column c // BITS is set where chunk c has the splat in its set."""
 TABLE = "chunks"
 """The table of chunks, one a row: centres x, y, z, and radius, in scene units."""
 _BLOCK = 1 << 14
 """Places that are compared with all centres at a time."""
-LEAVING = 0.25
+FADE_SHARE = 0.25
 """Beyond its radius a chunk's set counts less and less, until nothing after this share of the radius."""
 
 
@@ -29,13 +29,13 @@ class Chunks(Rule):
 
     The finest level that there is begins at 0, the coarsest has no end. Where the scene has chunks, and they
     are in use, d is not the eye's but that of the two chunks whose centres are nearest to it: each has a set
-    of splats (``MEMBERS``), and they fade into each other (Eq. 4). Farther from a chunk than its radius its
+    of splats (``MEMBER_COLUMNS``), and they fade into each other (Eq. 4). Farther from a chunk than its radius its
     set, made for eyes within, gives way to what the eye's own distances choose; the paper has no such places.
     """
 
     name = "chunks"
     level_facts = ("d_l",)
-    columns = MEMBERS
+    columns = MEMBER_COLUMNS
     tables = (TABLE,)
     lengths = ("d_l", "radius")
     places = (("x", "y", "z"),)
@@ -72,7 +72,7 @@ class Chunks(Rule):
         inside = sum(share for _, share in near_chunks)
         weights = np.zeros(len(means), np.float32)
         for chunk, share in near_chunks:
-            weights += np.float32(share) * members(columns, chunk)
+            weights += np.float32(share) * in_chunk(columns, chunk)
         if inside < 1:
             near, far = _ends(facts)
             away = distances(means, eye) * np.float32(values["distance_scale"])
@@ -84,8 +84,8 @@ class Chunks(Rule):
         table = tables.get(TABLE, {})
         if missing := [name for name in COLUMNS if table and name not in table]:
             raise ValueError(f"its table '{TABLE}' has no {', '.join(missing)}")
-        if _rows(tables) > MOST_CHUNKS:
-            raise ValueError(f"there are {_rows(tables):,} chunks, of at most {MOST_CHUNKS}")
+        if _rows(tables) > MAX_CHUNKS:
+            raise ValueError(f"there are {_rows(tables):,} chunks, of at most {MAX_CHUNKS}")
         if not all((np.abs(table[name]) <= MAX_COORDINATE).all() for name in COLUMNS if table):
             raise ValueError("a chunk is nowhere")
 
@@ -96,9 +96,9 @@ class Chunks(Rule):
         return tuple(sorted(chunk for chunk, _ in near_chunks))
 
     def visible_in_region(self, columns, region: Region) -> np.ndarray:
-        found = members(columns, region[0])
+        found = in_chunk(columns, region[0])
         for chunk in region[1:]:
-            found |= members(columns, chunk)
+            found |= in_chunk(columns, chunk)
         return found
 
     def region_label(self, eye, values: Values, tables: Tables) -> str:
@@ -160,7 +160,7 @@ class Chunks(Rule):
             s = max(2 * float(t[third[0]]) - float(t[second]), 0.0) if third else 0.0
             near.append(int(second))
             share = (float(t[second]) - s) / max(1 - 2 * s, 1e-20)
-        left = (away[near] / np.maximum(radii[near], 1e-20) - 1) / LEAVING
+        left = (away[near] / np.maximum(radii[near], 1e-20) - 1) / FADE_SHARE
         inside = float(np.clip(1 - left, 0, 1).max()) if values["fade"] else float(left.min() <= 0)
         shares = [inside * (1 - share), inside * share]
         return [each for each in zip(near, shares, strict=False) if inside]
@@ -182,9 +182,9 @@ def _ends(facts: Mapping[str, float]) -> tuple[float, float]:
     return near, facts["coarser_d_l"] if facts["coarser"] else inf
 
 
-def members(columns: Mapping[str, np.ndarray], chunk: int) -> np.ndarray:
+def in_chunk(columns: Mapping[str, np.ndarray], chunk: int) -> np.ndarray:
     """(N,) bool, which splats are in the set of a chunk."""
-    found = columns[MEMBERS[chunk // BITS]].astype(np.int32)
+    found = columns[MEMBER_COLUMNS[chunk // BITS]].astype(np.int32)
     found &= 1 << (chunk % BITS)
     return found != 0
 
@@ -196,7 +196,7 @@ def member_columns(sets: np.ndarray) -> dict[str, np.ndarray]:
         sets: (chunks, N) bool.
     """
     columns = {}
-    for name, first in zip(MEMBERS, range(0, len(sets), BITS), strict=False):
+    for name, first in zip(MEMBER_COLUMNS, range(0, len(sets), BITS), strict=False):
         bits = np.zeros(sets.shape[1], np.int32)
         for bit, one in enumerate(sets[first : first + BITS]):
             bits |= one.astype(np.int32) << bit

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...splats.ply import Columns
 from ..colors import LEVEL_COLORS
-from ..rule import NO_COLUMNS, NO_TABLES, Control, Rule, Values, distances, distances_by_axes
+from ..rule import NO_COLUMNS, NO_TABLES, Control, Rule, Values, axis_distances, distances
 
 NODE_SIZE, PARENT_SIZE = "node_size", "parent_size"
 """Columns of sizes, in scene units: a splat's own, 0 for leaves, and its parent's."""
@@ -16,7 +16,7 @@ PARENT = ("parent_x", "parent_y", "parent_z")
 """Columns of the parent's mean."""
 ABOVE_ROOT = 3.0e38
 """The parent size of the root, which has none: larger than any distance, and finite, as files have it."""
-K_LEAST = 8.0
+MIN_DETAIL = 8.0
 """The least detail of an eye: sizes are made so that cuts are proper from there on."""
 ROUNDING = 2.0**-20
 """Share by which a parent's size is larger still: 16 units in float32's last place, of which comparing a
@@ -29,10 +29,10 @@ OCTAVES = len(LEVEL_COLORS) - 1
 
 def detail_of(focal_px: float, pixels: float) -> float:
     """k: the distance, over a node's size, from which on the node is fine enough for an eye."""
-    return max(focal_px / pixels, K_LEAST)
+    return max(focal_px / pixels, MIN_DETAIL)
 
 
-def acceptable(axes: Sequence[np.ndarray], sizes: np.ndarray, eye: np.ndarray, k: float) -> np.ndarray:
+def is_fine_enough(axes: Sequence[np.ndarray], sizes: np.ndarray, eye: np.ndarray, k: float) -> np.ndarray:
     """(N,) bool, which nodes are fine enough: ‖c - μ‖ >= k size.
 
     The same bits wherever the same node is asked for, as itself or as a parent: all is float32, operation by
@@ -45,10 +45,10 @@ def acceptable(axes: Sequence[np.ndarray], sizes: np.ndarray, eye: np.ndarray, k
         k: see :func:`detail_of`.
     """
     with np.errstate(over="ignore"):
-        return distances_by_axes(axes, eye) >= np.float32(k) * sizes
+        return axis_distances(axes, eye) >= np.float32(k) * sizes
 
 
-def least_size(child_sizes: np.ndarray, away: np.ndarray) -> np.ndarray:
+def min_parent_size(child_sizes: np.ndarray, away: np.ndarray) -> np.ndarray:
     """The least sizes (N,) float64 of parents that keep cuts proper, rounding in float32 included.
 
     size_child + away / K_LEAST: where a parent is fine enough, ‖c - μ_p‖ >= k size_p, its child is, because
@@ -58,16 +58,16 @@ def least_size(child_sizes: np.ndarray, away: np.ndarray) -> np.ndarray:
         child_sizes: (N,).
         away: (N,) distances of the children's means from their parents'.
     """
-    return (child_sizes + np.asarray(away, np.float64) / K_LEAST) * (1 + ROUNDING)
+    return (child_sizes + np.asarray(away, np.float64) / MIN_DETAIL) * (1 + ROUNDING)
 
 
-def rounded_up(values: np.ndarray) -> np.ndarray:
+def round_up(values: np.ndarray) -> np.ndarray:
     """The next float32 (N,) that are not below float64 values."""
     rounded = values.astype(np.float32)
     return np.where(rounded < values, np.nextafter(rounded, np.float32(np.inf)), rounded)
 
 
-def hashed(rows: np.ndarray) -> np.ndarray:
+def hash_rows(rows: np.ndarray) -> np.ndarray:
     """(N,) uint64 of rows (N, 4) float32: equal ones have equal numbers, and hardly any others."""
     words = np.ascontiguousarray(rows).view(np.uint32).astype(np.uint64)
     found = np.zeros(len(rows), np.uint64)
@@ -84,7 +84,7 @@ class Cut(Rule):
     than ``pixels`` pixels. Two levels: the leaves, which are the full model and always fine enough, and the
     nodes above them.
 
-    Sizes are saturated (:func:`least_size`), which is not in the paper. So from every eye whose k is at least
+    Sizes are saturated (:func:`min_parent_size`), which is not in the paper. So from every eye whose k is at least
     K_LEAST a node that is fine enough has no descendant that is not, and of every leaf and the nodes above it
     exactly one is drawn. The paper's M_d has the same triangle inequality with the root of an SPT, and its
     Eq. 5 is proper only as long as training leaves the heap condition whole.
@@ -112,9 +112,9 @@ class Cut(Rule):
         for begin in range(0, len(means), _BLOCK):
             block = slice(begin, begin + _BLOCK)
             parents, sizes = [columns[name][block] for name in PARENT], columns[NODE_SIZE][block]
-            chosen = ~acceptable(parents, columns[PARENT_SIZE][block], eye, k)
+            chosen = ~is_fine_enough(parents, columns[PARENT_SIZE][block], eye, k)
             if sizes.any() and chosen.any():  # there are others than leaves, and some are not too fine
-                chosen &= acceptable([*means[block].T], sizes, eye, k)
+                chosen &= is_fine_enough([*means[block].T], sizes, eye, k)
             shown[block] = chosen
         return shown
 
@@ -123,7 +123,7 @@ class Cut(Rule):
         if PARENT_SIZE not in highest:
             return 0.0, np.inf
         k = detail_of(focal_px, values["pixels"])
-        return 0.0, (k + K_LEAST) * (1 + 4 * ROUNDING) * highest[PARENT_SIZE].astype(np.float64)
+        return 0.0, (k + MIN_DETAIL) * (1 + 4 * ROUNDING) * highest[PARENT_SIZE].astype(np.float64)
 
     def reconcile(self, before: Columns, after: Columns) -> Columns:
         """Sizes with which cuts are proper still, and no two nodes are the same at the same place.
@@ -131,9 +131,9 @@ class Cut(Rule):
         They are what scaling makes of them, or larger in the last places.
         """
         inside = (before[PARENT_SIZE] > 0) & (before[PARENT_SIZE] < ABOVE_ROOT)
-        above = hashed(identities(*(before[name] for name in (PARENT_SIZE, *PARENT)))[inside])
+        above = hash_rows(node_keys(*(before[name] for name in (PARENT_SIZE, *PARENT)))[inside])
         keys, first, family = np.unique(above, return_index=True, return_inverse=True)
-        own = hashed(identities(*(before[name] for name in (NODE_SIZE, *"xyz"))))
+        own = hash_rows(node_keys(*(before[name] for name in (NODE_SIZE, *"xyz"))))
         heads = np.searchsorted(keys, own).clip(max=max(len(keys) - 1, 0))
         is_head = before[NODE_SIZE] > 0
         if len(keys):
@@ -145,10 +145,10 @@ class Cut(Rule):
         while len(keys):
             sizes[is_head] = of_keys[heads[is_head]]
             least = np.zeros(len(keys))
-            np.maximum.at(least, family, least_size(sizes[inside], away))
-            larger = np.maximum(of_keys, rounded_up(least))
+            np.maximum.at(least, family, min_parent_size(sizes[inside], away))
+            larger = np.maximum(of_keys, round_up(least))
             alike = np.ones(len(keys), bool)
-            alike[np.unique(hashed(np.column_stack([larger, places])), return_index=True)[1]] = False
+            alike[np.unique(hash_rows(np.column_stack([larger, places])), return_index=True)[1]] = False
             larger[alike] = np.nextafter(larger[alike], np.float32(np.inf))
             if np.array_equal(larger, of_keys):
                 break
@@ -169,7 +169,7 @@ class Cut(Rule):
         return self.raise_control(values, "pixels")
 
 
-def identities(sizes: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+def node_keys(sizes: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
     """(N, 4) float32 by which children and parents know each other, of sizes and places (N,) float32."""
     return np.stack([sizes, x, y, z], axis=1) + np.float32(0)  # no zero below zero
 

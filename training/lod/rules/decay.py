@@ -12,11 +12,11 @@ SIGMA = "sigma_d"
 """Column of each splat's decay, the paper's σ_d."""
 EPSILON = 1e-8
 """The paper's ε."""
-CLEAR = 1e-5
+LIMIT_MARGIN = 1e-5
 """Share by which a budget's virtual scale is larger than that of the first splat that it leaves out, so that
 rounding does not bring that one back."""
 NEWTON_STEPS = 6
-"""Steps of :func:`last_seen_at`, of which each doubles the digits."""
+"""Steps of :func:`max_visible_scale`, of which each doubles the digits."""
 
 
 def attenuation(normalized, sigma, s_v: float):
@@ -31,7 +31,9 @@ def attenuation(normalized, sigma, s_v: float):
     return exponent.exp() if hasattr(exponent, "exp") else np.exp(exponent)
 
 
-def last_seen_at(normalized: np.ndarray, sigma: np.ndarray, opacity: np.ndarray, tau: float) -> np.ndarray:
+def max_visible_scale(
+    normalized: np.ndarray, sigma: np.ndarray, opacity: np.ndarray, tau: float
+) -> np.ndarray:
     """The virtual scale (N,) at which each splat's attenuated opacity meets the threshold τ s_v.
 
     α exp(−a s² / 2) = τ s with a = 2 d′² / (2 ReLU(σ_d)² + ε) has the one solution s = (α / τ) exp(−W / 2),
@@ -88,9 +90,9 @@ class Decay(Rule):
         s_v, at_most = values["s_v"], int(values["at_most"])
         if not 0 < at_most < len(normalized):
             return s_v
-        limits = last_seen_at(normalized, columns[SIGMA], columns[OPACITY], tau)
+        limits = max_visible_scale(normalized, columns[SIGMA], columns[OPACITY], tau)
         first_left_out = np.partition(limits, len(limits) - at_most - 1)[len(limits) - at_most - 1]
-        return max(s_v, float(first_left_out) * (1 + CLEAR))
+        return max(s_v, float(first_left_out) * (1 + LIMIT_MARGIN))
 
     def weights(self, means, eye, focal_px, columns, facts, values, tables=NO_TABLES) -> np.ndarray:
         if facts["level"] < facts["levels"]:

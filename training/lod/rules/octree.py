@@ -15,11 +15,11 @@ FADE = 0.5
 """Over how many levels of what is wanted a level fades in."""
 STEP = 0.25
 """Levels that a budget goes without at a time."""
-CLEAR = 1e-4
+BAND_MARGIN = 1e-4
 """Levels by which a band is taken too far, against rounding."""
 
 
-def wanted_at(distances, bias, d_max: float, levels: float):
+def target_level(distances, bias, d_max: float, levels: float):
     """The level that is wanted at a distance, 1 to ``levels``, not rounded (Eq. 5 with the bias).
 
     Args:
@@ -33,7 +33,7 @@ def wanted_at(distances, bias, d_max: float, levels: float):
     return (log2 + bias).clip(0, levels - 1) + 1
 
 
-def faded(wanted, level):
+def fade_weights(wanted, level):
     """Weights (N,) of splats of a level: 1 below the wanted level, part of it near that, 0 above.
 
     Level 1 is always there. Sec. 4.1: piecewise linear in the wanted level. The paper rounds it in training,
@@ -41,7 +41,7 @@ def faded(wanted, level):
     paper: then up to half a level more is drawn than training knew).
 
     Args:
-        wanted: (N,) of :func:`wanted_at`, numpy or torch.
+        wanted: (N,) of :func:`target_level`, numpy or torch.
         level: (N,) or a number, 1 is the coarsest.
     """
     return ((wanted - level + 0.5) / FADE + 0.5).clip(0, 1)
@@ -73,14 +73,14 @@ class Octree(Rule):
         if facts["level"] <= 1 or BIAS not in highest:
             return 0.0, inf
         # faded(wanted, level) > 0, or >= 0.5 without fading, of wanted = log2(d_max / d) + bias + offset + 1
-        short = facts["level"] - 1.5 - (FADE / 2 if values["fade"] else 0) - CLEAR
+        short = facts["level"] - 1.5 - (FADE / 2 if values["fade"] else 0) - BAND_MARGIN
         levels = highest[BIAS].astype(np.float64) + (values["offset"] - short)
         with np.errstate(over="ignore", invalid="ignore"):  # of a bias that is no number
             return 0.0, _own_d_max(focal_px, facts) * np.exp2(levels)
 
     def weights(self, means, eye, focal_px, columns, facts, values, tables=NO_TABLES) -> np.ndarray:
         found = self._wanted(means, eye, focal_px, columns[BIAS], facts, values)
-        weight = faded(found, np.float32(facts["level"])).astype(np.float32)
+        weight = fade_weights(found, np.float32(facts["level"])).astype(np.float32)
         return weight if values["fade"] else (weight >= 0.5).astype(np.float32)
 
     def wanted_level(self, means, eye, focal_px, facts, values) -> np.ndarray:
@@ -95,7 +95,9 @@ class Octree(Rule):
     ) -> np.ndarray:
         """The level wanted where each splat is; the focal length counts as in Sec. 5.2."""
         d_max = _own_d_max(focal_px, facts)
-        return wanted_at(distances(means, eye), bias + np.float32(values["offset"]), d_max, facts["levels"])
+        return target_level(
+            distances(means, eye), bias + np.float32(values["offset"]), d_max, facts["levels"]
+        )
 
 
 def _own_d_max(focal_px: float, facts: Mapping[str, float]) -> float:

@@ -30,17 +30,17 @@ from ...splats.levels import Bundle, Level
 from ..blocks import ROUNDING, SIZE, Blocks, morton_codes
 from ..partial_read import BLOCKS
 from ..query import LodQuery
-from ..rule import distances_by_axes
+from ..rule import axis_distances
 from ..rules.cut import (
     ABOVE_ROOT,
-    K_LEAST,
+    MIN_DETAIL,
     NODE_SIZE,
     PARENT,
     PARENT_SIZE,
     RULE,
     detail_of,
-    hashed,
-    identities,
+    hash_rows,
+    node_keys,
 )
 
 BOUNDS = tuple(f"{end}_{axis}" for end in ("low", "high") for axis in "xyz")
@@ -166,7 +166,7 @@ class TreeFile:
             for begin in range(0, len(rows), _INDEXED * SIZE):
                 block = slice(begin, begin + _INDEXED * SIZE)
                 columns = _columns_of(rows, block)
-                away = 1.0 if eye is None else distances_by_axes([columns[name] for name in PARENT], eye)
+                away = 1.0 if eye is None else axis_distances([columns[name] for name in PARENT], eye)
                 found[number][block] = away / np.maximum(columns[PARENT_SIZE], np.float32(1e-30))
         return found
 
@@ -276,7 +276,7 @@ class PageIndex:
             direction: (3,) of length 1.
         """
         middle, half = (self.low + self.high) / 2, (self.high - self.low) / 2
-        reach = np.sqrt(np.square(half).sum(axis=1)) + K_LEAST * self.parent_size
+        reach = np.sqrt(np.square(half).sum(axis=1)) + MIN_DETAIL * self.parent_size
         to = middle - np.asarray(eye, np.float64)
         away = np.sqrt(np.square(to).sum(axis=1))
         aside = np.arccos(np.clip(to @ direction / np.maximum(away, 1e-30), -1, 1))
@@ -296,7 +296,7 @@ class PageIndex:
         """
         detail = self.detail(eye)
         some = np.flatnonzero(detail < k * (1 + ROUNDING))
-        wanted = np.maximum(detail[some], K_LEAST)
+        wanted = np.maximum(detail[some], MIN_DETAIL)
         if direction is not None:
             wanted[~self.ahead(eye, direction)[some]] *= BEHIND_FACTOR
         return some[np.lexsort((-self.parent_size[some], wanted))]
@@ -331,7 +331,7 @@ class ResidentTree:
         stay = ~changed[self._nodes]
         keys, nodes = self._keys[stay], self._nodes[stay]
         come = places[size[places] > 0]
-        new = hashed(self._family(come, NODE_SIZE, "xyz"))
+        new = hash_rows(self._family(come, NODE_SIZE, "xyz"))
         order = np.argsort(new, kind="stable")
         here = np.searchsorted(keys, new[order], side="right")
         self._keys, self._nodes = np.insert(keys, here, new[order]), np.insert(nodes, here, come[order])
@@ -341,7 +341,7 @@ class ResidentTree:
         seek = np.flatnonzero((self._parents < 0) & (above > size) & ~root)
         if len(self._nodes):
             sought = self._family(seek, PARENT_SIZE, PARENT)
-            place = np.searchsorted(self._keys, hashed(sought)).clip(max=len(self._nodes) - 1)
+            place = np.searchsorted(self._keys, hash_rows(sought)).clip(max=len(self._nodes) - 1)
             found = self._nodes[place]
             known = (self._family(found, NODE_SIZE, "xyz") == sought).all(axis=1)
             self._parents[seek[known]] = found[known]
@@ -365,7 +365,7 @@ class ResidentTree:
 
     def _family(self, places: np.ndarray, size: str, axes: Sequence[str]) -> np.ndarray:
         """(M, 4) by which children and parents know each other."""
-        return identities(*(self._columns[name][places] for name in (size, *axes)))
+        return node_keys(*(self._columns[name][places] for name in (size, *axes)))
 
 
 def read_budgeted(

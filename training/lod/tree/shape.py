@@ -18,10 +18,10 @@ from ..rules.cut import (
     PARENT,
     PARENT_SIZE,
     RULE,
-    hashed,
-    identities,
-    least_size,
-    rounded_up,
+    hash_rows,
+    min_parent_size,
+    node_keys,
+    round_up,
 )
 from .paging import streaming_order
 
@@ -96,8 +96,8 @@ class Tree:
         for layer in reversed(self.layers):
             below = self.children[layer - self.leaves]
             apart = means[below].astype(np.float64) - means[layer, None].astype(np.float64)
-            least = least_size(sizes[below], np.sqrt(np.square(apart).sum(axis=2))).max(axis=1)
-            sizes[layer] = larger(rounded_up(np.maximum(least, splat_size(log_scales[layer]))), means[layer])
+            least = min_parent_size(sizes[below], np.sqrt(np.square(apart).sum(axis=2))).max(axis=1)
+            sizes[layer] = larger(round_up(np.maximum(least, splat_size(log_scales[layer]))), means[layer])
         return sizes
 
     def columns(self, means: np.ndarray, sizes: np.ndarray) -> dict[str, np.ndarray]:
@@ -136,7 +136,7 @@ class UniqueSizes:
         """Those of ``Tree.sizes``; larger in the last places where a node has them that was here before."""
         sizes = tree.sizes(means, log_scales, of_leaves)
         some = np.flatnonzero(sizes[tree.leaves :]) + tree.leaves
-        keys = hashed(identities(sizes[some], *means[some].T))
+        keys = hash_rows(node_keys(sizes[some], *means[some].T))
         if self._free(keys).all():
             self._take(keys)
             return sizes
@@ -145,7 +145,7 @@ class UniqueSizes:
     def _apart(self, sizes: np.ndarray, means: np.ndarray) -> np.ndarray:
         sizes, waiting, most = sizes.copy(), np.flatnonzero(sizes), 1
         while len(waiting):
-            keys = hashed(identities(sizes[waiting], *means[waiting].T))
+            keys = hash_rows(node_keys(sizes[waiting], *means[waiting].T))
             free = self._free(keys)
             self._take(keys[free])
             waiting = waiting[~free]

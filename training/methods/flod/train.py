@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 
 from ...errors import LodgsError
 from ...lod.rule import Values, all_controls
-from ...lod.rules.bands import s_min_of
+from ...lod.rules.bands import min_scales
 from ...optimize import method
 from ...optimize.density_control import constrained_log, densify, prune, reset_opacities
 from ...optimize.initialize import distinct, from_points, from_splats, neighbour_distances, sampled
@@ -39,7 +39,7 @@ class Method(method.Method[FlodParameters, Drawing]):
     def setup(self, base: Splats | None) -> None:
         p, data = self.parameters, self.data
         s_min_1 = p.s_min_1 or p.footprint * data.median_depth / data.focal
-        self.s_min = s_min_of(s_min_1, p.rho, p.levels)
+        self.s_min = min_scales(s_min_1, p.rho, p.levels)
         self._before = sum(p.steps[: p.first_level - 1])
         self._ends = list(accumulate(p.steps[p.first_level - 1 : p.end]))
         points, colors = distinct(data.scene.points, data.scene.point_colors)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.cluster.vq import kmeans2
 from scipy.spatial.transform import Rotation
 
-from ...lod.rules.chunks import MOST_CHUNKS
+from ...lod.rules.chunks import MAX_CHUNKS
 from ...scenes.cameras import Camera
 from .composite import IndexedLevel, Rows, Stack, rows_at_distances, together
 
@@ -27,7 +27,7 @@ def chunk_count(centers: np.ndarray, d_1: float) -> int:
         d_1: the distance at which the finest level ends, in scene units.
     """
     reach = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
-    return int(min(np.ceil(4 * reach / max(d_1, 1e-20)), MOST_CHUNKS, len(centers)))
+    return int(min(np.ceil(4 * reach / max(d_1, 1e-20)), MAX_CHUNKS, len(centers)))
 
 
 def place_chunks(centers: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:

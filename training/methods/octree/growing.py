@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import torch
 
-from ...lod.rules.octree import faded, wanted_at
+from ...lod.rules.octree import fade_weights, target_level
 from ...optimize.initialize import distinct, neighbour_scale
 from ...optimize.model import Model
 from ...optimize.training_data import TrainingData
@@ -57,8 +57,8 @@ def wanted_by_views(schedule: Schedule, points: np.ndarray, level: np.ndarray) -
     for camera in cameras:
         distances = np.linalg.norm(points - camera.center, axis=1)
         distances *= octree.focal_px / camera.focal
-        wanted = wanted_at(distances, 0.0, octree.d_max, octree.levels)
-        wanting += faded(wanted, level) >= 0.5
+        wanted = target_level(distances, 0.0, octree.d_max, octree.levels)
+        wanting += fade_weights(wanted, level) >= 0.5
     return wanting >= max(schedule.parameters.visible_share * len(cameras), 1)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from ...lod.rules.octree import faded, wanted_at
+from ...lod.rules.octree import fade_weights, target_level
 from ...optimize.model import Model
 from ...optimize.training_data import TrainingData, TrainingView
 from ...rasterize.adam import LearningRate
@@ -81,14 +81,14 @@ class Schedule:
         means = model.look("means")
         distances = (means - torch.as_tensor(camera.center).to(means)).norm(dim=1)
         distances *= self.tree.focal_px / camera.focal
-        return wanted_at(distances, model.columns["bias"], self.tree.d_max, self.tree.levels)
+        return target_level(distances, model.columns["bias"], self.tree.d_max, self.tree.levels)
 
     def weights(self, camera: Camera, model: Model, step: int, full: bool = False) -> torch.Tensor:
         """1 for the anchors (N,) that a step draws, 0 for others; ``full``: sometimes for all that joined."""
         level, newest = model.columns["level"], self.level_at(step)
         if full and np.random.default_rng([self.seed, step, 4]).random() < self.parameters.full_share:
             return (level <= newest).float()
-        return (faded(self.wanted(camera, model).clip(1, newest), level) >= 0.5).float()
+        return (fade_weights(self.wanted(camera, model).clip(1, newest), level) >= 0.5).float()
 
     # -- what it changes -------------------------------------------------------------------------------
 

@@ -16,7 +16,7 @@ import torch
 from torch import nn
 from torch.nn.functional import normalize
 
-from ...lod.rules.octree import BIAS, faded
+from ...lod.rules.octree import BIAS, fade_weights
 from ...optimize import method
 from ...optimize.density_control import require_rows
 from ...optimize.model import Model
@@ -296,7 +296,7 @@ class Method(method.Method[NeuralOctreeParameters, Drawing]):
     def picture(self, camera: Camera) -> torch.Tensor:
         """What the networks show a camera, (H, W, 3), levels fading as the distance asks."""
         with torch.no_grad():
-            weights = faded(self.schedule.wanted(camera, self.model), self.model.columns["level"])
+            weights = fade_weights(self.schedule.wanted(camera, self.model), self.model.columns["level"])
             decoded = self.decode(camera, self.visible(camera, weights))
             return self.rasterize_decoded(decoded, camera, weights[decoded.anchor]).image
 
@@ -491,5 +491,5 @@ class Method(method.Method[NeuralOctreeParameters, Drawing]):
 
     def drawn_by(self, camera: Camera) -> torch.Tensor:
         """The anchors (indices) that a view draws, with all levels joined."""
-        weights = faded(self.schedule.wanted(camera, self.model), self.model.columns["level"])
+        weights = fade_weights(self.schedule.wanted(camera, self.model), self.model.columns["level"])
         return self.visible(camera, (weights >= 0.5).float())

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ...lod.rules.cut import K_LEAST, detail_of
+from ...lod.rules.cut import MIN_DETAIL, detail_of
 from ...lod.tree.forest import Forest, ForestShape, Piece, combine_trees
 from ...lod.tree.shape import Tree
 from ...optimize.memory import free_memory
@@ -188,7 +188,7 @@ class Store:
             try:
                 return self._take(camera, coarser * pixels, near)
             except NoRoom as error:
-                if detail_of(camera.focal, coarser * pixels) == K_LEAST:
+                if detail_of(camera.focal, coarser * pixels) == MIN_DETAIL:
                     raise
                 if coarser == 1:
                     self.wanted = max(self.wanted, error.budget)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from training.lod.rule import rules
-from training.lod.rules.cut import ABOVE_ROOT, K_LEAST
+from training.lod.rules.cut import ABOVE_ROOT, MIN_DETAIL
 from training.lod.selection import resolve_controls, select_levels
 from training.lod.tree.shape import complete_levels, leaf_only_columns, splat_area, splat_size
 from training.splats.bundle import read_bundle, write_bundle
@@ -44,8 +44,8 @@ def test_sizes_are_the_least_that_keep_cuts_proper(leaves):
         least = (a * b + a * c + b * c) ** 0.5
         for child in tree.children[node - leaves]:
             away = float(np.sqrt(((means[child] - means[node]) ** 2).sum()))
-            assert float(sizes[node]) >= (float(sizes[child]) + away / K_LEAST) * (1 + 2**-20)
-            least = max(least, (expected[child] + away / K_LEAST) * (1 + 2**-20))
+            assert float(sizes[node]) >= (float(sizes[child]) + away / MIN_DETAIL) * (1 + 2**-20)
+            least = max(least, (expected[child] + away / MIN_DETAIL) * (1 + 2**-20))
             assert tree.parents[child] == node
         expected[node] = least
     np.testing.assert_allclose(sizes, expected, rtol=1e-5)

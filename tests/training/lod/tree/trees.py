@@ -6,7 +6,7 @@ import numpy as np
 
 from training.lod.blocks import spatial_order
 from training.lod.partial_read import BLOCKS
-from training.lod.rules.cut import ABOVE_ROOT, least_size
+from training.lod.rules.cut import ABOVE_ROOT, min_parent_size
 from training.lod.tree.paging import page_table, streaming_order
 from training.lod.tree.shape import Tree
 from training.splats.bundle import write_bundle
@@ -72,7 +72,7 @@ def tree_of(leaves: Splats) -> Bundle:
         squares[new] = np.einsum("nt,nt->n", weight, squares[two] + away**2 / 3)
         sh[new] = np.einsum("nt,ntkc->nkc", weight, sh[two])
         opacity[new] = np.einsum("nt,nt->n", weight, opacity[two])
-        least = np.maximum(least_size(sizes[two], away).max(axis=1), np.sqrt(3 * squares[new]))
+        least = np.maximum(min_parent_size(sizes[two], away).max(axis=1), np.sqrt(3 * squares[new]))
         sizes[new] = np.nextafter(np.float32(least), np.float32(np.inf))
         parents[two] = new[:, None]
         row, first = np.append(new, row[2 * pairs :]), first + pairs

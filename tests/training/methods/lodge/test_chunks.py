@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from training.lod.blocks import spatial_order
-from training.lod.rules.chunks import members as members_of
+from training.lod.rules.chunks import in_chunk as members_of
 from training.methods import create, method_info
 from training.methods.lodge import chunks
 from training.methods.lodge.composite import IndexedLevel

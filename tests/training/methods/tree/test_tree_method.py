@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.training.lod.tree.trees import surfaces
-from training.lod.rules.cut import least_size
+from training.lod.rules.cut import min_parent_size
 from training.lod.selection import BundleSelector, resolve_controls
 from training.lod.tree.forest import merge_forest
 from training.lod.tree.shape import splat_size
@@ -153,7 +153,7 @@ def test_sizes_are_saturated_after_training(data, base):
         assert sizes[node] >= splat_size(splats.log_scales[node : node + 1])[0]
         for child in nodes.children[node - nodes.leaves]:
             away = np.linalg.norm(splats.means[child].astype(float) - splats.means[node].astype(float))
-            assert float(sizes[node]) >= least_size(np.array(float(sizes[child])), np.array(away))
+            assert float(sizes[node]) >= min_parent_size(np.array(float(sizes[child])), np.array(away))
     np.testing.assert_array_equal(
         np.sort(levels[0].splats.extras["node_size"]), np.sort(sizes[nodes.leaves :])
     )  # fmt: skip
