@@ -125,7 +125,7 @@ class Cluster:
                         each.kill()
 
 
-class Bench:
+class BlockAttack:
     """A scene, a cluster, and what the plan gives undisturbed.
 
     Args:
@@ -314,10 +314,10 @@ def disk(place: Path, size: int):
 
 
 @contextmanager
-def bench(chance: random.Random, steps: Sequence[int] = STEPS) -> Iterator[Bench]:
+def bench(chance: random.Random, steps: Sequence[int] = STEPS) -> Iterator[BlockAttack]:
     """All that attacks need, in a folder of its own."""
     with tempfile.TemporaryDirectory(prefix="lodgs-attacks-") as folder:
-        made = Bench(Path(folder), chance, steps)
+        made = BlockAttack(Path(folder), chance, steps)
         try:
             yield made
         finally:

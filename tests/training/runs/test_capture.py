@@ -139,7 +139,7 @@ def test_aerial_views_show_an_area_from_all_directions():
     np.testing.assert_allclose(np.abs(looks[:, 2]), np.where(np.abs(looks[:, 2]) > 0.9, 1, np.sqrt(0.5)))
     positions = np.random.default_rng(0).uniform((-30, 5, 1), (30, 35, 4), (300, 3))
     assert np.sum([view.sees(positions) for view in views], axis=0).min() >= 4
-    assert aerial_views(ground, 200, raised=11.0)[0][7].center[2] == pytest.approx(15)
+    assert aerial_views(ground, 200, altitude=11.0)[0][7].center[2] == pytest.approx(15)
     line, _ = aerial_views(np.array([[0, 0, 0], [0, 9, 0]], float), 9)
     np.testing.assert_allclose(np.ptp([view.center[2] for view in line]), 0, atol=1e-9)
     for invalid, message in ((ground[:0], "no opaque"), (ground[:1], "no extent")):

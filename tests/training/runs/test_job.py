@@ -1,4 +1,4 @@
-"""Jobs: files, presets, and mistakes in words."""
+"""Jobs: files, presets, and errors."""
 
 import json
 from dataclasses import asdict
@@ -14,14 +14,14 @@ def write(path, text):
     return path
 
 
-def test_toml_and_json_say_the_same_and_paths_are_relative_to_the_file(tmp_path):
+def test_toml_and_json_jobs_are_equal_and_paths_are_relative_to_the_file(tmp_path):
     toml = write(tmp_path / "job.toml", 'scene = "my scene"\nout = "run"\nseed = 3\n[parameters]\nrho = 2\n')
     text = json.dumps({"scene": "my scene", "out": "run", "seed": 3, "parameters": {"rho": 2}})
     assert Job.from_file(toml) == Job.from_file(write(tmp_path / "job.json", text))
     assert Job.from_file(toml).scene == str(tmp_path / "my scene")
 
 
-def test_a_written_job_reads_back_whatever_its_names(tmp_path):
+def test_job_with_unusual_paths_round_trips(tmp_path):
     job = Job(
         scene='/a "quoted" \\ folder/ü 日本',
         out="/b\tc",
@@ -31,22 +31,22 @@ def test_a_written_job_reads_back_whatever_its_names(tmp_path):
     assert asdict(Job.from_file(tmp_path / "job.toml")) == asdict(job)
 
 
-def test_a_resolved_job_holds_every_parameter_and_resolves_to_itself(tmp_path):
+def test_resolved_job_keeps_all_parameters(tmp_path):
     job = Job.from_dict({"scene": "/s", "out": "/o", "parameters": {"footprint": 30}}).resolved()
     job.write(tmp_path / "job.toml")
-    again = Job.from_file(tmp_path / "job.toml")
-    assert again.resolved_parameters() == job.resolved_parameters()
-    assert again.resolved_parameters().footprint == 30
+    reread = Job.from_file(tmp_path / "job.toml")
+    assert reread.resolved_parameters() == job.resolved_parameters()
+    assert reread.resolved_parameters().footprint == 30
 
 
-def test_one_number_serves_every_level_and_fewer_levels_keep_the_finest():
+def test_scalar_parameters_apply_to_all_levels_and_fewer_levels_keep_the_finest():
     job = Job.from_dict({"scene": "s", "out": "o", "parameters": {"levels": 3, "densify_interval": 50}})
     parameters = job.resolved_parameters()
     assert parameters.densify_interval == (50, 50, 50)
     assert parameters.steps == Job("s", "o").resolved_parameters().steps[-3:]
 
 
-def test_where_splats_are_their_own_truth_parameters_can_be_others():
+def test_captured_scenes_have_other_default_parameters():
     values = {"scene": "s", "out": "o", "method": "tree", "base": "b"}
     photographed = Job.from_dict(values).resolved_parameters()
     values |= {"capture": "dome", "scene": ""}
@@ -57,26 +57,26 @@ def test_where_splats_are_their_own_truth_parameters_can_be_others():
     assert chosen.resolved_parameters().leaf_rate == chosen.resolved().resolved_parameters().leaf_rate == 0.5
 
 
-def test_what_lies_in_the_run_is_found_where_the_run_lies(tmp_path):
+def test_paths_inside_a_run_follow_the_moved_run(tmp_path):
     run = tmp_path / "run"
     values = {"out": str(run), "method": "lodge", "base": str(run / "base.ply"), "capture": str(run / "dome")}
     Job.from_dict(values).write(run / "job.toml")
     moved = Job.from_file((run.rename(tmp_path / "moved")) / "job.toml")
-    places = [str(tmp_path / "moved" / name) for name in ("base.ply", "dome")]
-    assert [moved.base, moved.capture] == places and moved.out == str(tmp_path / "moved")
+    paths = [str(tmp_path / "moved" / name) for name in ("base.ply", "dome")]
+    assert [moved.base, moved.capture] == paths and moved.out == str(tmp_path / "moved")
     assert (moved.scene, Job.from_dict(values | {"capture": "dome"}).capture) == ("", "dome")
 
 
 @pytest.mark.parametrize(
-    "text, said",
+    "text, message",
     [
-        ('scene = "a"\nout = "b"\nsteps_total = 3\n', "unknown key 'steps_total'"),
+        ('scene = "a"\nout = "b"\nsteps_total = 3\n', "Unknown key in job: 'steps_total'"),
         ('scene = "a"\nout = "b"\n[parameters]\nfootprnt = 3\n', "unknown parameter 'footprnt'"),
-        ('out = "b"\n', "does not say 'scene'"),
-        ("scene = 3\nout = 'b'\n", "is not a path"),
+        ('out = "b"\n', "has no key 'scene'"),
+        ("scene = 3\nout = 'b'\n", "Invalid path scene = 3"),
         ('scene = "a"\nout = "b"\nmethod = "nerf"\n', "no method 'nerf'"),
         ('scene = "a"\nout = "b"\npreset = "fast"\n', "no preset 'fast'"),
-        ('scene = "a"\nout = "b"\nbackend = "metal"\n', "no backend 'metal'"),
+        ('scene = "a"\nout = "b"\nbackend = "metal"\n', "Unknown backend: 'metal'"),
         ('scene = "a"\nout = "b"\nimage_scale = 0\n', "image_scale = 0"),
         ('scene = "a"\nout = "b"\nseed = -1\n', "seed = -1"),
         ('scene = "a"\nout = "b"\nseed = 1.5\n', "seed = 1.5"),
@@ -86,13 +86,13 @@ def test_what_lies_in_the_run_is_found_where_the_run_lies(tmp_path):
         ('scene = "a"\nout = "b"\n[parameters]\nrho = "four"\n', "rho = 'four'"),
         ('scene = "a"\nout = "b"\n[parameters]\nmax_splats = true\n', "max_splats = True"),
         ('scene = "a"\nout = "b"\n[parameters]\nrejoin_points = 1\n', "rejoin_points = 1"),
-        ('out = "b"\ncapture = "dome"\n', "no splats to capture views of"),
+        ('out = "b"\ncapture = "dome"\n', "has no base"),
         (
             'scene = "a"\nout = "b"\ncapture = "dome"\nbase = "c"\nmethod = "lodge"\n',
             "both 'capture' and 'scene'",
         ),
-        ('out = "b"\ncapture = "dome"\nbase = "c"\n', "method 'flod' cannot begin with the splats"),
-        ('out = "b"\ncapture = 3\nbase = "c"\n', "capture = 3 is not a path"),
+        ('out = "b"\ncapture = "dome"\nbase = "c"\n', "method 'flod' cannot start from a base"),
+        ('out = "b"\ncapture = 3\nbase = "c"\n', "Invalid path capture = 3"),
         ('out = "b"\ncapture = "dome"\nbase = "c"\nmethod = "lodge"\nviews = 1\n', "views = 1"),
         (
             'out = "b"\ncapture = "dome"\nbase = "c"\nmethod = "lodge"\nview_width = 9000\n',
@@ -100,17 +100,17 @@ def test_what_lies_in_the_run_is_found_where_the_run_lies(tmp_path):
         ),
         ("scene = \n", "is not valid"),
         ('scene = "a"\nout = "b"\nexposure = nan\n', "exposure = nan is not a finite number"),
-        ('scene = "a"\nout = "b"\nexposure = 33\n', "exposure = 33 is not possible"),
-        ('scene = "a"\nout = "b"\nphoto_memory = -1\n', "photo_memory = -1 is not possible"),
-        ('scene = "a"\nout = "b"\nexposure = true\n', "exposure = True is not a number"),
-        ('scene = "a"\nout = "b"\nseed = true\n', "seed = True is not a whole number"),
+        ('scene = "a"\nout = "b"\nexposure = 33\n', "exposure = 33"),
+        ('scene = "a"\nout = "b"\nphoto_memory = -1\n', "photo_memory = -1"),
+        ('scene = "a"\nout = "b"\nexposure = true\n', "exposure = True"),
+        ('scene = "a"\nout = "b"\nseed = true\n', "seed = True"),
         ('scene = "a"\nout = "b"\nseed = 2147483648\n', "seed = 2147483648"),
         (
             'scene = "a"\nout = "b"\nmethod = ["flod"]\n',
-            r"method = \['flod'\] is not a text",
+            r"method = \['flod'\]",
         ),
-        ('scene = "a"\nout = "b"\npreset = {}\n', "preset = {} is not a text"),
-        ('scene = "a"\nout = "b"\nparameters = 3\n', "parameters = 3 is not a table"),
+        ('scene = "a"\nout = "b"\npreset = {}\n', "preset = {}"),
+        ('scene = "a"\nout = "b"\nparameters = 3\n', "parameters = 3"),
         ('scene = "a\\u0000b"\nout = "b"\n', "scene contains invalid characters"),
         ('scene = "a"\nout = "b"\n[parameters]\nlr_sh = 1e300\n', "lr_sh = 1e\\+300 is more than any use"),
         (
@@ -118,16 +118,16 @@ def test_what_lies_in_the_run_is_found_where_the_run_lies(tmp_path):
             "max_splats = 2147483648 is more",
         ),
         ("[" * 2000, "is not valid"),
-        (f'scene = "{"x" * 2001}"\nout = "b"\n', "scene is a path of 2[0-9]+ characters"),
+        (f'scene = "{"x" * 2001}"\nout = "b"\n', "The path scene has 2[0-9]+ characters"),
     ],
 )
-def test_mistakes_are_named(tmp_path, text, said):
-    with pytest.raises(LodgsError, match=said.replace("(", r"\(")):
+def test_invalid_jobs_are_rejected(tmp_path, text, message):
+    with pytest.raises(LodgsError, match=message):
         Job.from_file(write(tmp_path / "job.toml", text))
 
 
 @pytest.mark.parametrize(
-    ("method", "values", "said"),
+    ("method", "values", "message"),
     [
         ("flod", "densify_until = 1.5", "densify_until = 1.5 .* at most 1"),
         ("flod", "densify_interval = 0", "densify_interval = 0 .* above 0"),
@@ -146,23 +146,23 @@ def test_mistakes_are_named(tmp_path, text, said):
         ("octree_neural", "max_splats = 4", "max_splats = 4 .* 5 Gaussians"),
     ],
 )
-def test_impossible_parameters_are_named_before_training(tmp_path, method, values, said):
+def test_invalid_parameters_are_rejected_before_training(tmp_path, method, values, message):
     text = f'scene = "a"\nout = "b"\nmethod = "{method}"\n[parameters]\n{values}\n'
-    with pytest.raises(LodgsError, match=said):
+    with pytest.raises(LodgsError, match=message):
         Job.from_file(write(tmp_path / "job.toml", text))
 
 
-def test_a_missing_file_is_named(tmp_path):
+def test_missing_job_file_is_reported(tmp_path):
     with pytest.raises(LodgsError, match=r"absent\.toml"):
         Job.from_file(tmp_path / "absent.toml")
 
 
-def test_what_is_no_job_file_is_not_read_as_one(tmp_path):
-    with pytest.raises(LodgsError, match=r"scene\.zip is neither a job file .* nor the folder"):
+def test_other_files_are_not_read_as_jobs(tmp_path):
+    with pytest.raises(LodgsError, match=r"scene\.zip: it is neither a job file"):
         Job.from_file(write(tmp_path / "scene.zip", 'scene = "x"'))
 
 
-def test_unused_parameters_are_refused():
+def test_unused_parameters_are_rejected():
     values = {"scene": "/s", "out": "/o", "method": "octree_neural", "parameters": {"dropout": 0.1}}
     with pytest.raises(LodgsError, match="'dropout'"):
         Job.from_dict(values)

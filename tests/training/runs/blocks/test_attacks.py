@@ -1,4 +1,4 @@
-"""The attacks of ``make attacks`` on blocks, few and short; LODGS_KILLS=10 asks for all of them."""
+"""A short version of the attacks on blocks of ``make attacks``; LODGS_KILLS=10 runs all of them."""
 
 import os
 import random
@@ -11,19 +11,20 @@ KILLS = int(os.environ.get("LODGS_KILLS", "0"))
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.timeout(3000)
-@pytest.mark.skipif(os.name == "nt", reason="processes have no groups and no SIGKILL")
-def test_workers_that_are_killed_cost_no_bit(tmp_path):
-    from tools.attacks_blocks import STEPS, Bench
+@pytest.mark.skipif(os.name == "nt", reason="needs process groups and SIGKILL")
+def test_killed_workers_do_not_change_the_result(tmp_path):
+    from tools.attacks_blocks import STEPS, BlockAttack
 
-    made = Bench(tmp_path, random.Random(KILLS), STEPS if KILLS else (150, 200, 500))
+    attack = BlockAttack(tmp_path, random.Random(KILLS), STEPS if KILLS else (150, 200, 500))
     try:
-        found = {"kills": made.kill_all(KILLS) if KILLS else made.kill_all(1, once=())}
+        results = {"kills": attack.kill_all(KILLS) if KILLS else attack.kill_all(1, once=())}
         if KILLS:
-            found |= {on: made.stop(on) for on in ("here", "local:2", made.cluster.address)}
+            results |= {on: attack.stop(on) for on in ("here", "local:2", attack.cluster.address)}
             if os.geteuid() == 0:
-                found["disk"] = made.fill_disk()
+                results["disk"] = attack.fill_disk()
     finally:
-        made.cluster.close()
-    print(found)
-    assert not any(each["wrong"] for each in found.values()), found
+        attack.cluster.close()
+    print(results)
+    assert not any(result["wrong"] for result in results.values()), results

@@ -52,11 +52,14 @@ def test_base_of_a_seam_has_its_cell_its_neighbours_and_distant_splats_of_its_bl
     write_surroundings(division, division.seams[1])
     base = read_ply(division.seams[1].folder.base)
     left, middle, right = (levels[-1] for levels in sets)
-    expected = Splats.concatenated([
-        left.select((x_of(left) >= -0.4) & (x_of(left) < -0.3)),
-        middle.select(((x_of(middle) >= -0.3) & (x_of(middle) < 0.4)) | (x_of(middle) < -0.4) | (x_of(middle) >= 0.5)),
-        right.select((x_of(right) >= 0.4) & (x_of(right) < 0.5)),
-    ])  # fmt: skip
+    x = x_of(middle)
+    expected = Splats.concatenated(
+        [
+            left.select((x_of(left) >= -0.4) & (x_of(left) < -0.3)),
+            middle.select(((x >= -0.3) & (x < 0.4)) | (x < -0.4) | (x >= 0.5)),
+            right.select((x_of(right) >= 0.4) & (x_of(right) < 0.5)),
+        ]
+    )
     assert len(base) == len(expected) > 20
     for name in ("means", "sh", "log_scales"):
         np.testing.assert_array_equal(getattr(base, name), getattr(expected, name))

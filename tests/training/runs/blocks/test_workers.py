@@ -1,4 +1,4 @@
-"""Who trains blocks: here, and Dask's workers."""
+"""Workers that train blocks: this process and Dask clusters."""
 
 import os
 import socket
@@ -32,47 +32,48 @@ def block(tiny_scene, tmp_path):
 @pytest.mark.parametrize(
     "on", ["", "there", "local", "local:", "local:0", "local:-1", "local:x", "host:8786"]
 )
-def test_places_that_there_are_not_are_told(on):
+def test_unknown_workers_are_rejected(on):
     pytest.importorskip("distributed")
-    with pytest.raises(LodgsError, match="nothing to train on"), workers(on):
+    with pytest.raises(LodgsError, match="Unknown workers"), workers(on):
         pass
 
 
-def test_without_dask_it_says_what_to_install(monkeypatch):
+def test_missing_dask_is_reported_with_its_installation(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(LodgsError, match="Dask is not installed") as found, workers("local:2"):
+    with pytest.raises(LodgsError, match="Dask is not installed") as error, workers("local:2"):
         pass
-    assert "pip install" in found.value.remedy
+    assert "pip install" in error.value.remedy
 
 
 @pytest.mark.slow
-def test_a_scheduler_that_does_not_answer_is_told(monkeypatch):
+def test_unreachable_scheduler_is_reported(monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(workers_module, "TIMEOUT_SECONDS", 1)
-    with pytest.raises(LodgsError, match="No Dask scheduler answers"), workers("tcp://127.0.0.1:1"):
+    with pytest.raises(LodgsError, match="Cannot connect"), workers("tcp://127.0.0.1:1"):
         pass
 
 
-def test_a_trainer_that_was_left_behind_is_waited_for_and_stopped_with_its_run(block, monkeypatch):
-    """Whose worker was lost goes on; what it is asked to is not begun again by the next worker."""
+def test_worker_waits_for_the_trainer_of_a_lost_worker(block, monkeypatch):
+    """A run that this trainer cancels is not started again."""
     monkeypatch.setattr(workers_module.time, "sleep", lambda _: stop.set())
-    stop, begun = threading.Event(), threading.Event()
-    left = RunFolder(block.path)
+    stop = threading.Event()
+    started = threading.Event()
+    run = RunFolder(block.path)
 
     def trainer():
-        with left.locked():
-            begun.set()
+        with run.locked():
+            started.set()
             stop.wait(10)
-            with left.events_file.open("a") as file:
+            with run.events_file.open("a") as file:
                 file.write(event_line("hello") + "\n" + event_line("cancelled", message="Stopped.") + "\n")
 
     threading.Thread(target=trainer, daemon=True).start()
-    assert begun.wait(10)
+    assert started.wait(10)
     assert train_block(str(block.path)) == 3
     assert not block.log.exists(), "no other trainer was started"
 
 
-def test_a_block_that_was_asked_to_stop_does_not_begin(block):
+def test_cancelled_block_does_not_start(block):
     block.request_cancel()
     assert train_block(str(block.path)) == 3
     assert not block.events_file.exists()
@@ -80,28 +81,28 @@ def test_a_block_that_was_asked_to_stop_does_not_begin(block):
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_workers_of_dask_make_the_bundle_that_is_made_here(tiny_scene, tmp_path):
-    """Coarse levels, blocks and seams, two at a time."""
+def test_dask_workers_give_the_same_bundle_as_this_process(tiny_scene, tmp_path):
+    """Coarse part, blocks and seams, two at a time."""
     pytest.importorskip("distributed")
-    steps = {"levels": 3, "steps": [15, 15, 15], "footprint": 6.0}
-    here, there = (
-        job_for(tiny_scene, tmp_path / name, "flod", test_every=0, polish=4, parameters={**TINY, **steps})
-        for name in ("here", "there")
+    levels = {"levels": 3, "steps": [15, 15, 15], "footprint": 6.0}
+    local, cluster = (
+        job_for(tiny_scene, tmp_path / name, "flod", test_every=0, polish=4, parameters={**TINY, **levels})
+        for name in ("local", "cluster")
     )
-    assert train(here) == 0 and train(there, on="local:2", resources={"GPU": 1}) == 0
-    division = read_plan(RunFolder(there.out))
+    assert train(local) == 0 and train(cluster, on="local:2", resources={"GPU": 1}) == 0
+    division = read_plan(RunFolder(cluster.out))
     parts = [part for stage in division.stages for part in stage]
     assert [part.kind for part in parts] == ["coarse", "block", "block", "seam", "seam"]
     assert all(part.folder.state() == "done" and part.folder.log.exists() for part in parts)
-    assert RunFolder(there.out).bundle.read_bytes() == RunFolder(here.out).bundle.read_bytes()
+    assert RunFolder(cluster.out).bundle.read_bytes() == RunFolder(local.out).bundle.read_bytes()
 
 
-PRINTS_ITS_CARD = """
+RECORD_CARD = """
 import os, sys, time
 if "train" in sys.orig_argv:
     folder = os.path.dirname(__file__)
     open(os.path.join(folder, "card-" + os.environ["CUDA_VISIBLE_DEVICES"]), "w").close()
-    end = time.monotonic() + 30  # so that another worker takes the other block
+    end = time.monotonic() + 30  # the other worker takes the second block
     while time.monotonic() < end and sum(name.startswith("card-") for name in os.listdir(folder)) < 2:
         time.sleep(0.05)
     os._exit(0)
@@ -109,41 +110,41 @@ if "train" in sys.orig_argv:
 
 
 @pytest.fixture
-def cards_of(tmp_path, monkeypatch):
-    """``cards_of(block)``: the cards that two trainers see, each played by one that says it and ends."""
+def cards_used(tmp_path, monkeypatch):
+    """``cards_used(block)`` returns the cards visible to two simulated trainers."""
     pytest.importorskip("distributed")
     folder = tmp_path / "stand-in"
     folder.mkdir()
-    (folder / "sitecustomize.py").write_text(PRINTS_ITS_CARD)
+    (folder / "sitecustomize.py").write_text(RECORD_CARD)
     monkeypatch.setenv("PYTHONPATH", str(folder))
 
-    def seen(block):
+    def used(block):
         with workers("local:2") as submit:
             for pending in [submit(block.path) for _ in range(2)]:
                 assert pending.result() == 0
         return {path.name.removeprefix("card-") for path in folder.glob("card-*")}
 
-    return seen
+    return used
 
 
 @pytest.mark.slow
-def test_each_worker_of_this_computer_has_a_card_of_those_that_are_named(block, cards_of, monkeypatch):
+def test_each_local_worker_uses_one_of_the_given_cards(block, cards_used, monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3, 5,7")
-    assert cards_of(block) == {"3", "5"}
+    assert cards_used(block) == {"3", "5"}
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(os.name == "nt", reason="the stand-in for nvidia-smi is a shell script")
-def test_or_of_those_that_the_computer_has(block, cards_of, tmp_path, monkeypatch):
+@pytest.mark.skipif(os.name == "nt", reason="the simulated nvidia-smi is a shell script")
+def test_each_local_worker_uses_one_of_the_installed_cards(block, cards_used, tmp_path, monkeypatch):
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     program = tmp_path / "nvidia-smi"
     program.write_text("#!/bin/sh\nprintf 'GPU-a1\\nGPU-b2\\n'\n")
     program.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
-    assert cards_of(block) == {"GPU-a1", "GPU-b2"}
+    assert cards_used(block) == {"GPU-a1", "GPU-b2"}
 
 
-def test_a_computer_without_cards_has_none(monkeypatch):
+def test_computer_without_cards(monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     assert workers_module.graphics_cards() == []
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
@@ -153,18 +154,16 @@ def test_a_computer_without_cards_has_none(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_a_scheduler_that_was_started_by_hand_trains_a_block_and_its_loss_is_told(
-    block, tmp_path, monkeypatch
-):
+def test_external_scheduler_trains_a_block_and_its_loss_is_reported(block, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(workers_module, "TIMEOUT_SECONDS", 5)
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     address, root = f"tcp://127.0.0.1:{port}", Path(workers_module.__file__).parents[3]
 
-    def dask(*what):
+    def dask(*arguments):
         return subprocess.Popen(
-            [sys.executable, "-m", "dask", *what, "--dashboard-address", ":0"],
+            [sys.executable, "-m", "dask", *arguments, "--dashboard-address", ":0"],
             env={**os.environ, "PYTHONPATH": str(root)}, stderr=subprocess.DEVNULL,
         )  # fmt: skip
 
@@ -176,13 +175,13 @@ def test_a_scheduler_that_was_started_by_hand_trains_a_block_and_its_loss_is_tol
     try:
         while not listening(port):
             time.sleep(0.1)
-        with pytest.raises(LodgsError, match=r"scheduler .* is gone"), workers(address, {"GPU": 1}) as submit:
+        with pytest.raises(LodgsError, match="Lost the connection"), workers(address, {"GPU": 1}) as submit:
             assert submit(block.path).result() == 0
             assert block.state() == "done"
             scheduler.kill()
             scheduler.wait()
-            end = time.monotonic() + 60
-            while time.monotonic() < end:
+            deadline = time.monotonic() + 60
+            while time.monotonic() < deadline:
                 pending = submit(block.path)
                 while not pending.done():
                     time.sleep(0.05)
@@ -193,7 +192,7 @@ def test_a_scheduler_that_was_started_by_hand_trains_a_block_and_its_loss_is_tol
 
 
 def listening(port: int) -> bool:
-    """Whether anybody answers at a port of this computer."""
+    """Return whether a server listens on a local port."""
     try:
         socket.create_connection(("127.0.0.1", port)).close()
     except OSError:

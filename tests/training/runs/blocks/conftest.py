@@ -1,0 +1,23 @@
+"""Fixtures for scenes in cells."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from training.runs import train as training_loop
+from training.runs.blocks import workers as workers_module
+from training.runs.folder import RunFolder
+from training.runs.job import Job
+
+
+@pytest.fixture
+def blocks_in_process(monkeypatch) -> None:
+    """Train blocks in this process, which saves the start of a process for each."""
+
+    def train_block(folder: str) -> int:
+        run = RunFolder(Path(folder))
+        return training_loop.train(Job.from_file(run.job))
+
+    monkeypatch.setattr(workers_module, "train_block", train_block)
