@@ -69,7 +69,7 @@ class _CompareOperator(_ViewsOperator):
                 "Cannot compare: the active camera is not a view of this splat scene.",
                 "Choose a view in the list.",
             )
-        comparison = compare.show(context, root, view)
+        comparison = compare.show_comparison(context, root, view)
         if context.region_data is not None:
             context.region_data.view_perspective = "CAMERA"
         suffix = ", held out" if photographs.is_held_out(root, view) else ""
@@ -99,13 +99,13 @@ class LODGS_OT_compare_worst(_CompareOperator, bpy.types.Operator):
     def poll(cls, context):
         if not super().poll(context):
             return False
-        if compare.worst(roots.active_root(context)) is None:
+        if compare.worst_view(roots.active_root(context)) is None:
             cls.poll_message_set("Press Measure first")
             return False
         return True
 
     def view(self, context):
-        return compare.worst(roots.active_root(context))
+        return compare.worst_view(roots.active_root(context))
 
 
 CLASSES = (

@@ -9,7 +9,7 @@ from bpy_extras.io_utils import ExportHelper
 
 from ...training.scenes.cameras import write_camera
 from ..data import cameras, roots
-from ..render import compositing, engine, quick
+from ..render import compositing, engine, viewport_quality
 from .base import report_errors, show_image
 from .modal import FrameOperator
 
@@ -75,7 +75,7 @@ class LODGS_OT_render_mesh_depth(FrameOperator, bpy.types.Operator):
         return compositing.render_mesh_depth(context.scene, self.frames(context))
 
     def result_text(self, count):
-        folder = compositing.depth_files(bpy.context.scene).parent
+        folder = compositing.depth_file_pattern(bpy.context.scene).parent
         suffix = "" if bpy.data.filepath else " until Blender is closed"
         return f"{'1 depth image' if count == 1 else f'{count} depth images'} in {folder}{suffix}"
 
@@ -92,16 +92,16 @@ class LODGS_OT_render_quick(FrameOperator, bpy.types.Operator):
 
     def work(self, context):
         if self.animation:
-            yield from quick.render_animation(context, self.frames(context))
+            yield from viewport_quality.render_animation(context, self.frames(context))
         else:
-            image = quick.render(context)
+            image = viewport_quality.render(context)
             show_image(context, image)
             yield image
 
     def result_text(self, count):
         if self.animation:
             return f"{'1 frame' if count == 1 else f'{count} frames'} saved"
-        return f"Rendered to image '{quick.IMAGE}'"
+        return f"Rendered to image '{viewport_quality.IMAGE}'"
 
 
 class LODGS_OT_export_camera(bpy.types.Operator, ExportHelper):
@@ -126,7 +126,7 @@ class LODGS_OT_export_camera(bpy.types.Operator, ExportHelper):
 
     @report_errors
     def execute(self, context):
-        width, height = engine.size(context.scene.render)
+        width, height = engine.render_size(context.scene.render)
         camera, near = cameras.view_from(
             roots.active_root(context), context.evaluated_depsgraph_get(), width, height
         )

@@ -1,1 +1,1 @@
-"""What LODGS draws into pictures: the engine, its renderer beside Blender, and what goes with renders."""
+"""Rendering with LODGS: render engine, renderer process, compositing, captures and comparison with photos."""

@@ -1,8 +1,8 @@
-"""A Blender scene as a COLMAP scene: pictures and depths by its own engine, exact cameras, a model of them.
+"""Capture of a Blender scene as a COLMAP scene: rendered images, depth maps, exact cameras and points.
 
-What is rendered lies in a folder as ``training.scenes.rendered_views`` has it, view by view, whole or not at all:
-the same call goes on where one stopped, and several may work on ranges of the views at a time. This happens
-in a Blender of its own, in background (``blender --command lodgs capture``), because it changes the scene.
+The output folder has the layout of ``training.scenes.rendered_views``. Each view is written completely or not
+at all, so a repeated call continues, and several processes may render different ranges of views. Captures
+change the scene, so they run in a background Blender (``blender --command lodgs capture``).
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from ..data.cameras import scene_camera, view_of
 from ..runs import environment, processes
 from .engine import LodgsEngine
 
-Tell = Callable[[int, int], object]
-"""Is told before each view that is rendered which one it is, from 1 on, and of how many."""
-CLEAN = 256
-"""Samples of a pixel from which on Cycles leaves little noise without a denoiser."""
+ViewCallback = Callable[[int, int], object]
+"""Function that is called before each view is rendered, with its number (from 1) and the number of views."""
+LOW_NOISE_SAMPLES = 256
+"""Samples per pixel from which Cycles needs no denoiser."""
 
 
 def render_views(
@@ -37,107 +37,124 @@ def render_views(
     width: int,
     height: int,
     only: tuple[int, int] | None = None,
-    tell: Tell = lambda number, count: None,
+    on_view: ViewCallback = lambda number, count: None,
 ) -> int:
-    """Renders the views that the scene's settings (``Scene.lodgs_capture``) ask for, where they are missing.
+    """Render the missing views of a capture (``Scene.lodgs_capture``).
 
-    Blur, borders, the sequencer and what compositors write into files are switched off, splat scenes are left
-    out; all else is as the scene has it. The scene is not to be used on.
+    Motion blur, depth of field, render borders, the sequencer and file output nodes are disabled, and splat
+    scenes are hidden. The scene must not be used afterwards.
 
     Args:
-        only: first and last view, from 1 on, of those to render; there need not be so many.
+        context: context with the scene to render.
+        folder: output folder.
+        width: width of the images in pixels.
+        height: height of the images in pixels.
+        only: numbers of the first and last view to render, from 1. The range may exceed the number of views.
+        on_view: function called before each view.
 
     Returns:
-        How many views the settings ask for.
+        Number of views of the capture.
 
     Raises:
-        LodgsError: as ``viewpoints.of_scene``; the folder holds other views, or cannot be written.
+        LodgsError: see ``viewpoints.of_scene``, or the folder contains other views or is not writable.
     """
     check_render_size(width, height)
     _check(context.scene)
     shots = viewpoints.of_scene(context, width, height)
     names = [f"view_{number:04d}" for number in range(1, len(shots) + 1)]
-    there = {file.stem for file in (folder / CAMERAS).glob("*.json")}
-    if there - set(names):
-        raise _others(folder)
-    if not there and any((folder / kind).exists() for kind in ("sparse", CAMERAS, IMAGES, DEPTHS)):
-        raise LodgsError(f"{folder} holds another scene.", "Choose another folder.")
+    existing = {file.stem for file in (folder / CAMERAS).glob("*.json")}
+    if existing - set(names):
+        raise _different_views(folder)
+    if not existing and any((folder / kind).exists() for kind in ("sparse", CAMERAS, IMAGES, DEPTHS)):
+        raise LodgsError(f"Cannot capture to {folder}: it contains another scene.", "Choose another folder.")
     _prepare(context.scene, width, height)
     first, last = only or (1, len(shots))
     for number in range(first, min(last, len(shots)) + 1):
         name = names[number - 1]
-        camera, near = _look(context, shots[number - 1], width, height)
+        camera, near = _set_camera(context, shots[number - 1], width, height)
         file = folder / CAMERAS / f"{name}.json"
         if file.exists():
-            if not _same(camera, read_camera(file)[0]):
-                raise _others(folder)
+            if not _is_same_view(camera, read_camera(file)[0]):
+                raise _different_views(folder)
             continue
-        tell(number, len(shots))
+        on_view(number, len(shots))
         if bpy.ops.render.render() != {"FINISHED"}:
-            raise LodgsError(f"View {number} was not rendered to its end.", "Do it again: it goes on there.")
+            raise LodgsError(
+                f"The rendering of view {number} was cancelled.", "Start the capture again to continue."
+            )
         _save(context.scene, folder, name, (width, height))
-        write_camera(file, camera, near)  # the last: where it is, the view is whole
+        write_camera(file, camera, near)  # last, as it marks the view as complete
     return len(shots)
 
 
 def noise(scene: bpy.types.Scene) -> str | None:
-    """What to know of the noise of a scene's renders, which splats learn; None where there is little."""
-    if scene.render.engine != "CYCLES" or scene.cycles.samples >= CLEAN:
+    """Return a warning if the renders of a scene are noisy, because splats learn noise. None otherwise."""
+    if scene.render.engine != "CYCLES" or scene.cycles.samples >= LOW_NOISE_SAMPLES:
         return None
     count = scene.cycles.samples
-    left = f"{count} {'sample leaves' if count == 1 else 'samples leave'} noise, and splats learn it"
+    problem = f"{count} {'sample leaves' if count == 1 else 'samples leave'} noise, which splats learn"
     if not scene.cycles.use_denoising:
-        return f"Without a denoiser {left}. Switch on Denoise in Render > Sampling, or take {CLEAN} samples."
+        return (
+            f"Without a denoiser, {problem}. Enable Denoise in Render > Sampling, "
+            f"or use {LOW_NOISE_SAMPLES} samples."
+        )
     if not compat.DENOISES and scene.cycles.denoiser != "OPTIX":
-        return f"This Blender has no denoiser: {left}. Take blender.org's Blender, or {CLEAN} samples."
+        return (
+            f"This Blender has no denoiser: {problem}. Use Blender from blender.org, "
+            f"or {LOW_NOISE_SAMPLES} samples."
+        )
     return None
 
 
 def write_model(folder: Path) -> str:
-    """Has the trainer make the COLMAP model of all views that were rendered; returns what it says of it.
+    """Let the trainer write the COLMAP model of all rendered views. Return its output.
 
     Raises:
-        LodgsError: there is no trainer, or the views make no model.
+        LodgsError: the trainer is missing, or it cannot create the model.
     """
-    done = subprocess.run(
+    process = subprocess.run(
         [str(environment.trainer_python()), "-m", "training", "model", str(folder)],
         cwd=extension.FOLDER, env=processes.environment(), stdin=subprocess.DEVNULL, capture_output=True,
         text=True, encoding="utf-8", errors="replace", check=False,
         creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
     )  # fmt: skip
-    if done.returncode:
-        last = (done.stderr.strip().splitlines() or ["The trainer has ended without a word."])[-1]
+    if process.returncode:
+        no_output = f"The trainer stopped with exit code {process.returncode}."
+        last = (process.stderr.strip().splitlines() or [no_output])[-1]
         raise LodgsError(last.removeprefix("error: "))
-    return done.stdout.strip()
+    return process.stdout.strip()
 
 
 def _check(scene: bpy.types.Scene) -> None:
     if scene.render.engine == LodgsEngine.bl_idname:
-        raise LodgsError("LODGS renders splats and nothing else.", "Choose Cycles, EEVEE or Workbench.")
+        raise LodgsError(
+            "Cannot capture with the LODGS render engine: it renders only splats.",
+            "Choose Cycles, EEVEE or Workbench.",
+        )
     if not any(layer.use for layer in scene.view_layers):
         raise LodgsError(
-            "No view layer of the scene is rendered.",
-            "Switch one on in the View Layer tab: Use for Rendering.",
+            "Cannot capture the scene: none of its view layers is rendered.",
+            "Enable Use for Rendering in the View Layer tab.",
         )
 
 
-def _others(folder: Path) -> LodgsError:
+def _different_views(folder: Path) -> LodgsError:
     return LodgsError(
-        f"{folder} holds other views than these.",
-        "Choose another folder, or the settings that it began with.",
+        f"Cannot capture to {folder}: it contains other views.",
+        "Choose another folder, or restore the settings of the first capture.",
     )
 
 
-def _same(camera: Camera, before: Camera) -> bool:
-    """Whether two views are one, but for what other processors make of the same numbers."""
+def _is_same_view(camera: Camera, saved: Camera) -> bool:
+    """Compare two cameras with a tolerance for the rounding of different processors."""
     fields = "width", "height", "fx", "fy", "cx", "cy"
     return np.allclose(
-        [getattr(camera, name) for name in fields], [getattr(before, name) for name in fields], rtol=1e-5
-    ) and np.allclose(camera.world_to_camera, before.world_to_camera, rtol=1e-5, atol=1e-5)
+        [getattr(camera, name) for name in fields], [getattr(saved, name) for name in fields], rtol=1e-5
+    ) and np.allclose(camera.world_to_camera, saved.world_to_camera, rtol=1e-5, atol=1e-5)
 
 
 def _prepare(scene: bpy.types.Scene, width: int, height: int) -> None:
-    """Has a scene render sharp stills of one size, with depth, and nothing of what else renders do."""
+    """Set a scene up to render sharp stills of one size with depth, without other render effects."""
     render = scene.render
     render.resolution_x, render.resolution_y, render.resolution_percentage = width, height, 100
     render.use_border = render.use_multiview = render.use_sequencer = render.use_motion_blur = False
@@ -146,7 +163,7 @@ def _prepare(scene: bpy.types.Scene, width: int, height: int) -> None:
     used = [layer for layer in scene.view_layers if layer.use]
     for layer in used:
         layer.use_pass_z = True
-        # a picture that nobody composes is the first one's, and depths are to be of what it shows
+        # without a compositor, image and depth must come from the same layer: the first one
         layer.use = layer == used[0] or compat.composites(scene)
     trees = [getattr(scene, "node_tree", None), *bpy.data.node_groups]
     for tree in filter(None, trees):
@@ -155,17 +172,19 @@ def _prepare(scene: bpy.types.Scene, width: int, height: int) -> None:
                 node.mute = True
     for root in roots.roots(scene):
         for obj in root.children_recursive:
-            obj.driver_remove("hide_render")  # by which a level is shown alone
+            obj.driver_remove("hide_render")  # the driver would show a level
             obj.hide_render = True
 
 
-def _look(context: bpy.types.Context, shot: viewpoints.Shot, width: int, height: int) -> tuple[Camera, float]:
-    """Makes the scene's camera what a shot says; what it sees, in the world, and its near depth."""
+def _set_camera(
+    context: bpy.types.Context, shot: viewpoints.Shot, width: int, height: int
+) -> tuple[Camera, float]:
+    """Set the scene's camera for a shot. Return its view in world space and its near clipping distance."""
     scene = context.scene
     if isinstance(shot, int):
         scene.frame_set(shot)
     else:
-        for marker in scene.timeline_markers:  # which would choose another
+        for marker in scene.timeline_markers:  # markers would replace the camera
             marker.camera = None
         if isinstance(shot, tuple):
             view, near = shot
@@ -182,22 +201,25 @@ def _look(context: bpy.types.Context, shot: viewpoints.Shot, width: int, height:
 
 
 def _save(scene: bpy.types.Scene, folder: Path, name: str, size: tuple[int, int]) -> None:
-    """Writes what was rendered last: all its layers, and the picture as the display shows it."""
+    """Write the last render: all layers as EXR, and the display image as PNG."""
     settings, result = scene.render.image_settings, bpy.data.images["Render Result"]
     settings.color_management = "FOLLOW_SCENE"
-    for kind, ending in ((DEPTHS, "exr"), (IMAGES, "png")):
+    for kind, suffix in ((DEPTHS, "exr"), (IMAGES, "png")):
         if kind == DEPTHS:
             compat.multilayer_exr(settings)
             settings.exr_codec = "ZIP"
         else:
             compat.png(settings, alpha=scene.render.film_transparent)
-        file = folder / kind / f"{name}.{ending}"
+        file = folder / kind / f"{name}.{suffix}"
         with atomic_write(file) as temporary:
             try:
                 result.save_render(str(temporary), scene=scene)
-                whole = image_size(temporary) == size
-            except RuntimeError:  # which Blender raises without saying why
-                whole = False
-            if not whole:
-                also = ", or connect the compositor's output" if compat.composites(scene) else ""
-                raise LodgsError(f"{file} is not whole.", f"Free some space there{also}, then do it again.")
+                complete = image_size(temporary) == size
+            except RuntimeError:  # Blender gives no reason
+                complete = False
+            if not complete:
+                hint = ", or connect the compositor's output" if compat.composites(scene) else ""
+                raise LodgsError(
+                    f"Cannot write {file}: the image is incomplete.",
+                    f"Free some disk space{hint}, then start the capture again.",
+                )

@@ -1,7 +1,7 @@
-"""Photographs beside what the splats show from the same place: how alike they are.
+"""Comparison of photos with renders of the visible splats from the same views.
 
-Pictures and PSNR come from the renderer, at the size of the training images, as ``training evaluate`` has
-them, masks included; what is compared are the splats that the scene shows now.
+Images and PSNR come from the renderer, at the size of the training images and with masks, as in
+``training evaluate``.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from ..viewport.wipe import Comparison
 from . import engine, renderer
 
 
-def measurable(root: bpy.types.Object) -> list[bpy.types.Object]:
-    """The views of a splat scene that have a photograph that a pinhole camera can be compared with."""
+def measurable_views(root: bpy.types.Object) -> list[bpy.types.Object]:
+    """Return the views of a splat scene that have an undistorted photo."""
     return [
         view
         for view in photographs.views(root)
@@ -38,142 +38,159 @@ def compare_view(
     view: bpy.types.Object,
     on_progress: renderer.OnProgress = lambda fraction, text: True,
 ) -> Comparison | None:
-    """Renders one view as its photograph was taken, and keeps its PSNR; None where ``on_progress`` ended it.
+    """Render a view with the camera of its photo and store the PSNR.
 
-    Levels by distance are chosen from this view and for the picture's size, where they follow the scene's
-    camera.
+    If levels follow the scene's camera, they are selected for this view and image size.
+
+    Args:
+        context: context with the scene to render.
+        root: scene root.
+        view: camera object of the view.
+        on_progress: see ``renderer.OnProgress``.
+
+    Returns:
+        The comparison, or None if ``on_progress`` cancelled it.
 
     Raises:
-        LodgsError: the view has no photograph, or it cannot be read or rendered.
+        LodgsError: the view has no photo, or its photo cannot be read, or it cannot be rendered.
     """
-    facts, scene = view.data.lodgs, context.scene
+    facts = view.data.lodgs
+    scene = context.scene
     if not facts.photograph:
-        raise LodgsError(f"'{view.name}' has no photograph.", "Choose another view.")
+        raise LodgsError(f"Cannot compare '{view.name}': it has no photo.", "Choose another view.")
     if facts.distorted:
         raise LodgsError(
-            f"The lens of '{view.name}' bends lines; the splats were trained on a straightened photograph.",
-            "Measure with training evaluate.",
+            f"Cannot compare '{view.name}': its photo has lens distortion, but splats are trained on "
+            "undistorted photos.",
+            "Measure the run with training evaluate.",
         )
-    whole = Camera(view.name, facts.width, facts.height, facts.fx, facts.fy, 0, 0, np.eye(4))
-    # as typed, and as a job has it: Blender keeps the nearest number of 32 bits
+    full_size = Camera(view.name, facts.width, facts.height, facts.fx, facts.fy, 0, 0, np.eye(4))
+    # the value as typed, which the job has: Blender stores it rounded to 32 bits
     scale = float(str(np.float32(root.lodgs.training.image_scale)))
-    with _rendered_as(scene, view, whole.scaled(scale)) as (width, height):
+    with _render_settings(scene, view, full_size.scaled(scale)) as (width, height):
         depsgraph = context.evaluated_depsgraph_get()
         camera, near = cameras.view_of(view.evaluated_get(depsgraph), depsgraph, width, height)
-        drawn = renderer.frame(
+        frame = renderer.draw_frame(
             engine.placed_splats(depsgraph), camera, near, on_progress, background=(0.0, 0.0, 0.0),
             photograph=Path(bpy.path.abspath(facts.photograph)),
             mask=Path(bpy.path.abspath(facts.mask)) if facts.mask else None,
         )  # fmt: skip
-    if drawn is None:
+    if frame is None:
         return None
-    facts.psnr = drawn.psnr
+    facts.psnr = frame.psnr
     photograph, linear = (
-        np.stack([drawn.planes[f"{name}.{channel}"] for channel in "RGB"], axis=2)
+        np.stack([frame.planes[f"{name}.{channel}"] for channel in "RGB"], axis=2)
         for name in ("Photograph", "Combined")
     )
-    return Comparison(view.session_uid, photograph, srgb_from_linear(linear).astype(np.float32), drawn.psnr)
+    return Comparison(view.session_uid, photograph, srgb_from_linear(linear).astype(np.float32), frame.psnr)
 
 
 @contextmanager
-def _rendered_as(
+def _render_settings(
     scene: bpy.types.Scene, view: bpy.types.Object, size: photographs.View
 ) -> Iterator[tuple[int, int]]:
-    """Has a scene look through a view, and its render of that size and focal length, in the block.
+    """Set the camera, render size and pixel aspect of a scene for a view within the block.
 
-    Distances count in pixels of the picture that is drawn, whatever was rendered last.
+    Level selection depends on the focal length in pixels, and so on the size of the rendered image.
     """
     names = [
         "resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y",
     ]  # fmt: skip
-    camera, before = scene.camera, [getattr(scene.render, name) for name in names]
+    camera = scene.camera
+    values = [getattr(scene.render, name) for name in names]
     try:
         scene.camera = view
         photographs.match_render(scene, size)
         yield size.width, size.height
     finally:
         scene.camera = camera
-        for name, value in zip(names, before, strict=True):
+        for name, value in zip(names, values, strict=True):
             setattr(scene.render, name, value)
 
 
-def show(context: bpy.types.Context, root: bpy.types.Object, view: bpy.types.Object) -> Comparison:
-    """Compares a view, and shows it with the wipe: the viewport looks through it.
+def show_comparison(context: bpy.types.Context, root: bpy.types.Object, view: bpy.types.Object) -> Comparison:
+    """Compare a view, make it the scene's camera and show the comparison as a wipe.
 
     Raises:
-        LodgsError: as :func:`compare_view`.
+        LodgsError: see :func:`compare_view`.
     """
-    found = compare_view(context, root, view)
-    assert found is not None
+    comparison = compare_view(context, root, view)
+    assert comparison is not None
     photographs.through(context, view)
-    wipe.show(context, found)
-    return found
+    wipe.show(context, comparison)
+    return comparison
 
 
-def worst(root: bpy.types.Object) -> bpy.types.Object | None:
-    """The view that was least like its photograph when measured; None where none was."""
+def worst_view(root: bpy.types.Object) -> bpy.types.Object | None:
+    """Return the view with the lowest measured PSNR, or None if no view is measured."""
     measured = [view for view in photographs.views(root) if view.data.lodgs.psnr > 0]
     return min(measured, key=lambda view: view.data.lodgs.psnr, default=None)
 
 
 class Measurement:
-    """All views compared one after the other; ``processes.follow`` steps through them.
+    """Comparison of all views of a scene, one view per step of ``processes.follow``.
 
-    What was measured is one undo step at the end, and undoing something else meanwhile loses none of it.
+    All results become one undo step at the end. Other undo steps in between do not lose them.
 
     Attributes:
-        done, total: views measured, and to measure.
-        problem: why it ended early; empty when it did not.
-        running: whether it is still at work.
+        done: number of measured views.
+        total: number of views to measure.
+        problem: reason of a failure. Empty otherwise.
+        running: whether the measurement is running.
     """
 
     def __init__(self, context: bpy.types.Context, root: bpy.types.Object) -> None:
-        self._root, self._views = root.session_uid, [view.session_uid for view in measurable(root)]
+        self._root = root.session_uid
+        self._views = [view.session_uid for view in measurable_views(root)]
         if not self._views:
-            raise LodgsError(f"'{root.name}' has no photographs to measure on.", "Import a COLMAP folder.")
-        self.done, self.total, self.problem, self.running = 0, len(self._views), "", True
-        self._found: dict[int, float] = {}
+            raise LodgsError(f"Cannot measure '{root.name}': it has no photos.", "Import a COLMAP folder.")
+        self.done = 0
+        self.total = len(self._views)
+        self.problem = ""
+        self.running = True
+        self._psnr: dict[int, float] = {}  # by session_uid of the view
 
     def step(self) -> bool:
-        """Measure one view; return whether there are more."""
+        """Measure one view. Return whether more views remain."""
         objects = {obj.session_uid: obj for obj in bpy.data.objects}
         root = objects.get(self._root)
         try:
             if root is not None and self.running and self.done < self.total:
                 view = objects.get(self._views[self.done])
-                found = None if view is None else compare_view(bpy.context, root, view)
-                if found is not None:
-                    self._found[found.view] = found.psnr
+                comparison = None if view is None else compare_view(bpy.context, root, view)
+                if comparison is not None:
+                    self._psnr[comparison.view] = comparison.psnr
                 self.done += 1
         except LodgsError as error:
-            self.problem, self.running = str(error), False
+            self.problem = str(error)
+            self.running = False
         self.running = self.running and root is not None and self.done < self.total
-        if not self.running and self._found:
-            for uid in self._found.keys() & objects.keys():
-                objects[uid].data.lodgs.psnr = self._found[uid]
-            self._found.clear()
+        if not self.running and self._psnr:
+            for uid in self._psnr.keys() & objects.keys():
+                objects[uid].data.lodgs.psnr = self._psnr[uid]
+            self._psnr.clear()
             extension.undo_step("Measure")
         extension.redraw()
         return self.running
 
     def cancel(self) -> None:
-        """Stop after the view that is being measured."""
+        """Stop after the current view."""
         self.running = False
 
 
 measurement: Measurement | None = None
-"""The measuring that is at work, or was last."""
+"""The running or last measurement."""
 
 
 def measure(context: bpy.types.Context, root: bpy.types.Object) -> Measurement:
-    """Begin to measure every view; the caller follows it.
+    """Create the measurement of all views. The caller steps it.
 
     Raises:
-        LodgsError: there are no photographs, or it is at work already.
+        LodgsError: the scene has no photos, or a measurement is running.
     """
     global measurement
     if measurement is not None and measurement.running:
-        raise LodgsError("The views are being measured.", "Wait for it or cancel it.")
+        raise LodgsError("The views are already being measured.", "Wait for it or cancel it.")
     measurement = Measurement(context, root)
     return measurement
 

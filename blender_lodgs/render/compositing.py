@@ -1,4 +1,4 @@
-"""LODGS' picture of the splats and Cycles' of the meshes as one, joined by depth in the compositor."""
+"""Compositing of splats (LODGS) and meshes (another engine) by depth."""
 
 from __future__ import annotations
 
@@ -23,120 +23,136 @@ _COPIED = (
 )  # fmt: skip
 
 
-NEARER, OVER = _JOINS = "CompositorNodeZcombine", "CompositorNodeAlphaOver"
+Z_COMBINE = "CompositorNodeZcombine"
+ALPHA_OVER = "CompositorNodeAlphaOver"
 
 SAMPLES = 128
-"""Of Cycles for the meshes, to begin with: Blender's 4096 are for who has the time."""
+"""Initial number of Cycles samples for the meshes. Blender's default of 4096 is slow."""
 
 
 def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> bpy.types.Scene:
-    """Lets a scene render with LODGS, and over it or behind it, by depth, its meshes with another engine.
+    """Set a scene up to render splats with LODGS and meshes with another engine, combined by depth.
 
-    Where the meshes hold out, depth is dealt with and the splats are simply over them.
+    A second scene renders the meshes: it has the same objects without the splats. With a mesh holdout
+    (:func:`render_mesh_depth`), the splat image is simply placed over the mesh image.
 
-    The meshes are rendered by a second scene that has the same objects without the splats. Called again, it
-    takes over the size, camera, range and holdout that the scene has now.
+    A repeated call copies the current size, camera, frame range and holdout to the second scene.
+
+    Args:
+        scene: scene with splats.
+        mesh_engine: render engine for the meshes.
 
     Returns:
-        The meshes' scene.
+        The scene that renders the meshes.
 
     Raises:
-        LodgsError: the scene has a compositor tree of the artist's own, or no splats.
+        LodgsError: the scene has no splats, or it has compositor nodes of the user.
     """
     if not roots.roots(scene):
-        raise LodgsError(f"The scene '{scene.name}' has no splats.", "Import or train some first.")
+        raise LodgsError(
+            f"Cannot combine with meshes: the scene '{scene.name}' has no splats.",
+            "Import or train splats first.",
+        )
     meshes = scene.lodgs_render.meshes
-    tree, before = compat.compositor_tree(scene), _switched(scene)
-    join = OVER if scene.lodgs_render.holdout else NEARER
+    tree = compat.compositor_tree(scene)
+    previous = _changed_settings(scene)
+    join = ALPHA_OVER if scene.lodgs_render.holdout else Z_COMBINE
     if meshes is None:
         if not _is_ours(tree):
             raise LodgsError(
-                "This scene has compositor nodes already.",
-                "Add a Z Combine node with the depth of both pictures; docs/rendering.md shows which.",
+                f"Cannot combine with meshes: the scene '{scene.name}' has compositor nodes.",
+                "Add a Z Combine node for both images and depths, as docs/rendering.md explains.",
             )
         meshes = scene.lodgs_render.meshes = bpy.data.scenes.new(f"{scene.name} Meshes")
         meshes.render.engine = mesh_engine
         meshes.cycles.samples = SAMPLES
-        scene.lodgs_render.before_meshes = json.dumps(before)
-        _join(tree, join, scene, meshes)
-    elif _is_ours(tree) and join not in _kinds(tree):
-        _join(tree, join, scene, meshes)
+        scene.lodgs_render.before_meshes = json.dumps(previous)
+        _build_nodes(tree, join, scene, meshes)
+    elif _is_ours(tree) and join not in _node_types(tree):
+        _build_nodes(tree, join, scene, meshes)
     engine.use(scene)
-    for one in (scene, meshes):
-        one.render.film_transparent = True
-        for layer in one.view_layers:
+    for rendered in (scene, meshes):
+        rendered.render.film_transparent = True
+        for layer in rendered.view_layers:
             layer.use_pass_z = True
-    _match(scene, meshes)
+    _copy_settings(scene, meshes)
     return meshes
 
 
 def separate_meshes(scene: bpy.types.Scene) -> None:
-    """Takes back :func:`combine_with_meshes`: the meshes' scene, the nodes, and what it has switched on.
+    """Undo :func:`combine_with_meshes`: remove the second scene and the nodes, and restore the settings.
 
     Raises:
-        LodgsError: the scene is not combined, or its compositor has further nodes by now.
+        LodgsError: the scene is not combined, or its compositor has nodes of the user.
     """
-    meshes, tree = scene.lodgs_render.meshes, compat.compositor_tree(scene)
+    meshes = scene.lodgs_render.meshes
+    tree = compat.compositor_tree(scene)
     if meshes is None:
-        raise LodgsError(f"The scene '{scene.name}' is not combined with meshes.")
+        raise LodgsError(f"Cannot separate: the scene '{scene.name}' is not combined with meshes.")
     if not _is_ours(tree):
         raise LodgsError(
-            "This scene has compositor nodes of your own beside those that join the pictures.",
-            f"Take the join out there, then delete the scene '{meshes.name}'.",
+            f"Cannot separate: the scene '{scene.name}' has additional compositor nodes.",
+            f"Remove the nodes that combine the images, then delete the scene '{meshes.name}'.",
         )
-    before = selection.read_json(scene.lodgs_render.before_meshes)
-    scene.render.film_transparent = bool(before.get("film_transparent"))
+    previous = selection.read_json(scene.lodgs_render.before_meshes)
+    scene.render.film_transparent = bool(previous.get("film_transparent"))
     for layer in scene.view_layers:
-        layer.use_pass_z = layer.name in before.get("use_pass_z", ())
+        layer.use_pass_z = layer.name in previous.get("use_pass_z", ())
     compat.reset_compositor(scene)
     scene.lodgs_render.before_meshes = ""
     bpy.data.scenes.remove(meshes)
 
 
-def _switched(scene: bpy.types.Scene) -> dict:
-    """What combining switches on, as it is now."""
+def _changed_settings(scene: bpy.types.Scene) -> dict:
+    """Return the current values of the settings that combining changes."""
     return {
         "film_transparent": scene.render.film_transparent,
         "use_pass_z": [layer.name for layer in scene.view_layers if layer.use_pass_z],
     }
 
 
-def _kinds(tree: bpy.types.NodeTree) -> set[str]:
+def _node_types(tree: bpy.types.NodeTree) -> set[str]:
     return {node.bl_idname for node in tree.nodes}
 
 
 def _is_ours(tree: bpy.types.NodeTree) -> bool:
-    """Whether nobody but combining has worked on a compositor tree."""
-    return _kinds(tree) <= {*compat.COMPOSITOR_START, *_JOINS, "CompositorNodePremulKey"}
+    """Return whether a compositor tree has only default nodes and nodes of :func:`combine_with_meshes`."""
+    ours = {*compat.COMPOSITOR_START, Z_COMBINE, ALPHA_OVER, "CompositorNodePremulKey"}
+    return _node_types(tree) <= ours
 
 
 def render_mesh_depth(scene: bpy.types.Scene, frames: Iterable[int]) -> Iterator[Path]:
-    """Renders the depth of a scene's meshes with Cycles, a multilayer EXR a frame, and has them hold out.
+    """Render the depth of a scene's meshes with Cycles, so that meshes occlude splats.
 
-    The ray goes through each pixel's centre, where splats are looked at as well.
+    Each frame is a multilayer EXR file with one ray through each pixel centre, where splats are evaluated
+    too. After the last frame, the files become the holdout of the scene.
+
+    Args:
+        scene: scene with meshes and a camera.
+        frames: frame numbers.
 
     Yields:
-        Each frame's file (:func:`depth_files`), when it is written. Meshes hold out after the last one.
+        The written file of each frame (:func:`depth_file_pattern`).
 
     Raises:
-        LodgsError: the scene has no camera, or the files cannot be written.
+        LodgsError: the scene has no camera, or a file cannot be written.
     """
     scene_camera(scene)
-    pattern = depth_files(scene)
+    pattern = depth_file_pattern(scene)
     meshes = bpy.data.scenes.new(f"{scene.name} Depth")
     try:
-        _match(scene, meshes)
-        _only_depth(meshes)
+        _copy_settings(scene, meshes)
+        _set_depth_only(meshes)
         for frame in frames:
-            path = engine.at_frame(str(pattern), scene, frame)
-            # as an animation: a still of a scene in no window shows the frame of another
+            path = engine.frame_path(str(pattern), scene, frame)
+            # as an animation, because a still of an inactive scene shows another frame
             meshes.frame_start = meshes.frame_end = frame
             meshes.render.filepath = str(path.parent / pattern.name)
             bpy.ops.render.render(scene=meshes.name, animation=True)
             yield path
     except RuntimeError as error:
         raise LodgsError(
-            f"The depth of the meshes could not be rendered: {error}", "Choose another folder for the .blend."
+            f"Cannot render the depth of the meshes: {error}", "Save the .blend file in another folder."
         ) from error
     finally:
         bpy.data.scenes.remove(meshes)
@@ -145,25 +161,25 @@ def render_mesh_depth(scene: bpy.types.Scene, frames: Iterable[int]) -> Iterator
         combine_with_meshes(scene)
 
 
-def depth_files(scene: bpy.types.Scene) -> Path:
-    """The files of :func:`render_mesh_depth`, #### for the frame.
+def depth_file_pattern(scene: bpy.types.Scene) -> Path:
+    """Return the path of the depth files with #### for the frame number.
 
-    They lie in a folder beside the .blend, or before that is saved in a temporary one that nobody else knows.
+    The folder is next to the .blend file, or a private temporary folder if the file is not saved.
     """
     name = f"{bpy.path.clean_name(scene.name)}_####.exr"
     if bpy.data.filepath:
         return Path(bpy.path.abspath("//")) / f"{Path(bpy.data.filepath).stem}_depth" / name
-    return Path(bpy.app.tempdir or _own_folder()) / "depth" / name
+    return Path(bpy.app.tempdir or _temporary_folder()) / "depth" / name
 
 
 @cache
-def _own_folder() -> str:
-    """A temporary folder of this process alone, for where Blender has none."""
+def _temporary_folder() -> str:
+    """Create a temporary folder for this process, in case Blender has none."""
     return tempfile.mkdtemp(prefix="lodgs-")
 
 
-def _only_depth(scene: bpy.types.Scene) -> None:
-    """Has a scene render one ray a pixel, and into multilayer EXRs."""
+def _set_depth_only(scene: bpy.types.Scene) -> None:
+    """Set a scene up to render depth with one ray per pixel to multilayer EXR files."""
     render, settings = scene.render, scene.cycles
     render.engine = "CYCLES"
     render.use_compositing = render.use_sequencer = render.use_motion_blur = False
@@ -175,72 +191,84 @@ def _only_depth(scene: bpy.types.Scene) -> None:
     settings.pixel_filter_type, settings.filter_width = "BOX", 0.01
 
 
-def _match(scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:
-    """What the meshes' scene has of the scene: everything but the splats."""
+def _copy_settings(scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:
+    """Copy objects, camera and render settings of a scene to its mesh scene, without the splats."""
     for name in _COPIED:
         setattr(meshes.render, name, getattr(scene.render, name))
     meshes.camera, meshes.world = scene.camera, scene.world
     meshes.frame_start, meshes.frame_end = scene.frame_start, scene.frame_end
     meshes.view_settings.view_transform = scene.view_settings.view_transform
     for kind in ("children", "objects"):
-        there, here = getattr(meshes.collection, kind), getattr(scene.collection, kind)
-        for part in set(there) - set(here):
-            there.unlink(part)
-        for part in set(here) - set(there):
-            there.link(part)
+        target = getattr(meshes.collection, kind)
+        source = getattr(scene.collection, kind)
+        for item in set(target) - set(source):
+            target.unlink(item)
+        for item in set(source) - set(target):
+            target.link(item)
     meshes.timeline_markers.clear()
     for marker in scene.timeline_markers:
         if marker.camera is not None:
             meshes.timeline_markers.new(marker.name, frame=marker.frame).camera = marker.camera
-    left_out = {
+    _exclude_splats(scene, meshes)
+
+
+def _exclude_splats(scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:
+    """Exclude the same collections as in the scene, and those of splat scenes."""
+    splat_collections = {
         collection
         for root in roots.roots(scene)
         for obj in (root, *(item.object for item in root.lodgs.levels if item.exists))
         for collection in obj.users_collection
     }
-    shown = {part.collection: part for part in _parts(scene.view_layers[0].layer_collection)}
+    visible = {item.collection: item for item in _included(scene.view_layers[0].layer_collection)}
     for layer in meshes.view_layers:
-        layer.update()  # a new scene's has no parts yet
-        while parts := [
-            part
-            for part in _parts(layer.layer_collection)
-            if part.collection in left_out or part.collection not in shown
+        layer.update()  # creates the layer collections of a new scene
+        while unwanted := [
+            item
+            for item in _included(layer.layer_collection)
+            if item.collection in splat_collections or item.collection not in visible
         ]:
-            parts[0].exclude = True  # which makes all the parts anew
-        for part in _parts(layer.layer_collection):
-            like = shown[part.collection]
-            part.holdout, part.indirect_only = like.holdout, like.indirect_only
+            unwanted[0].exclude = True  # invalidates all layer collections
+        for item in _included(layer.layer_collection):
+            original = visible[item.collection]
+            item.holdout, item.indirect_only = original.holdout, original.indirect_only
 
 
-def _parts(part: bpy.types.LayerCollection):
-    """The parts of a view layer below one that are not excluded."""
-    for child in part.children:
+def _included(collection: bpy.types.LayerCollection) -> Iterator[bpy.types.LayerCollection]:
+    """Yield the layer collections below another one that are not excluded."""
+    for child in collection.children:
         if not child.exclude:
             yield child
-            yield from _parts(child)
+            yield from _included(child)
 
 
-def _join(tree: bpy.types.NodeTree, kind: str, scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:
-    """The tree: in each pixel the nearer of both scenes' layers, over the other where it is transparent; or
-    the first scene's over the other's."""
+def _build_nodes(
+    tree: bpy.types.NodeTree, kind: str, scene: bpy.types.Scene, meshes: bpy.types.Scene
+) -> None:
+    """Build compositor nodes that combine two scenes.
+
+    With Z_COMBINE, the nearer pixel is placed over the other one. With ALPHA_OVER, ``scene`` is placed over
+    ``meshes``.
+    """
     tree.nodes.clear()
-    join, by_depth = tree.nodes.new(kind), kind == NEARER
+    join = tree.nodes.new(kind)
+    by_depth = kind == Z_COMBINE
     join.location = (400, 0)
     if by_depth:
         join.inputs["Use Alpha"].default_value = join.inputs["Anti-Alias"].default_value = True
-    pictures = [socket for socket in join.inputs if socket.type == "RGBA"]
-    for place, one in enumerate((scene, meshes)):
-        one.view_layers[0].use_pass_z = True  # before the node, whose sockets are the layer's passes
+    image_inputs = [socket for socket in join.inputs if socket.type == "RGBA"]
+    for index, rendered in enumerate((scene, meshes)):
+        rendered.view_layers[0].use_pass_z = True  # before the node, whose sockets are the passes
         layers = tree.nodes.new("CompositorNodeRLayers")
-        layers.location = (0, -420 * place)
-        layers.scene, layers.layer = one, one.view_layers[0].name
-        layers.label = one.name
-        if by_depth:  # Z Combine multiplies by alpha, which pictures are already
+        layers.location = (0, -420 * index)
+        layers.scene, layers.layer = rendered, rendered.view_layers[0].name
+        layers.label = rendered.name
+        if by_depth:  # Z Combine multiplies by alpha, but images are premultiplied
             straight = compat.to_straight(tree)
-            straight.location = (180, -420 * place)
+            straight.location = (180, -420 * index)
             tree.links.new(layers.outputs["Image"], straight.inputs["Image"])
-            tree.links.new(straight.outputs["Image"], pictures[place])
-            tree.links.new(layers.outputs["Depth"], join.inputs[2 * place + 1])
+            tree.links.new(straight.outputs["Image"], image_inputs[index])
+            tree.links.new(layers.outputs["Depth"], join.inputs[2 * index + 1])
         else:
-            tree.links.new(layers.outputs["Image"], pictures[1 - place])
+            tree.links.new(layers.outputs["Image"], image_inputs[1 - index])
     tree.links.new(join.outputs[0], compat.compositor_output(tree))

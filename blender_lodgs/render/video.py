@@ -1,4 +1,4 @@
-"""Sharp frames of a video, by Blender's own reader, as photographs whose cameras are to be found."""
+"""Extraction of sharp video frames with Blender's video reader, as photos for the camera search."""
 
 from __future__ import annotations
 
@@ -16,71 +16,77 @@ import numpy as np
 from ...training.errors import LodgsError
 from .. import compat
 
-MOST_FRAMES = 120
-"""Frames that are kept of a video, if nothing is said."""
+MAX_FRAMES = 120
+"""Default maximum number of extracted frames."""
 CANDIDATES = 3
-"""Of so many frames that follow each other the sharpest is kept."""
+"""Number of frames per interval that are compared for sharpness."""
 _NAME = re.compile(r"frame_(\d{6})\.png")
 
 
 def extract_frames(
-    video: Path, folder: Path, most: int, tell: Callable[[int, int], object] = lambda number, count: None
+    video: Path,
+    folder: Path,
+    maximum: int,
+    on_frame: Callable[[int, int], object] = lambda number, count: None,
 ) -> int:
-    """Writes at most so many frames of a video, evenly over time, the sharpest of those about each.
+    """Write the sharpest frame of each of several equal time intervals of a video.
 
-    Frames are named by their numbers. Where some are there already, it goes on.
+    Files are named by frame numbers. Intervals with an existing file are skipped.
 
     Args:
-        tell: is told before each frame which one it is, from 1 on, and of how many.
+        video: path of the video.
+        folder: output folder.
+        maximum: maximum number of frames.
+        on_frame: function called before each frame with its number (from 1) and the number of frames.
 
     Returns:
-        How many there are.
+        Number of frames.
 
     Raises:
-        LodgsError: it cannot be read as a video, or the folder cannot be written.
+        LodgsError: the video cannot be read, or the folder is not writable.
     """
-    with _reading(video) as (scene, frames):
-        count = min(most, frames)
+    with _open_video(video) as (scene, frames):
+        count = min(maximum, frames)
         edges = np.linspace(0, frames, count + 1).astype(int)
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            there = [int(found[1]) for path in folder.iterdir() if (found := _NAME.fullmatch(path.name))]
+            matches = [_NAME.fullmatch(path.name) for path in folder.iterdir()]
+            existing = [int(match[1]) for match in matches if match]
             for number, (first, end) in enumerate(pairwise(edges), 1):
-                tell(number, count)
-                if any(first < frame <= end for frame in there):
+                on_frame(number, count)
+                if any(first < frame <= end for frame in existing):
                     continue
-                tried = np.unique(np.linspace(first + 1, end, CANDIDATES, dtype=int))
-                with tempfile.TemporaryDirectory(dir=folder, prefix=".frames-") as work:
-                    pictures = [_render(scene, int(frame), Path(work)) for frame in tried]
-                    best = max(pictures, key=lambda picture: sharpness(_light(picture)))
+                candidates = np.unique(np.linspace(first + 1, end, CANDIDATES, dtype=int))
+                with tempfile.TemporaryDirectory(dir=folder, prefix=".frames-") as temporary:
+                    images = [_render(scene, int(frame), Path(temporary)) for frame in candidates]
+                    best = max(images, key=lambda image: sharpness(_green_channel(image)))
                     os.replace(best, folder / best.name)
         except OSError as error:
             raise LodgsError(
-                f"{folder} could not be written: {error.strerror or error}.", "Choose another folder."
+                f"Cannot write to {folder}: {error.strerror or error}.", "Choose another folder."
             ) from error
     return count
 
 
-def sharpness(light: np.ndarray) -> float:
-    """How much a picture (H, W) differs from the mean of its neighbours: the variance of its Laplacian
-    (Pech-Pacheco et al. 2000)."""
-    middle = light[1:-1, 1:-1]
-    around = light[:-2, 1:-1] + light[2:, 1:-1] + light[1:-1, :-2] + light[1:-1, 2:]
-    return float(np.var(around - 4 * middle))
+def sharpness(image: np.ndarray) -> float:
+    """Return the sharpness of an image (H, W): the variance of its Laplacian (Pech-Pacheco et al. 2000)."""
+    centre = image[1:-1, 1:-1]
+    neighbours = image[:-2, 1:-1] + image[2:, 1:-1] + image[1:-1, :-2] + image[1:-1, 2:]
+    return float(np.var(neighbours - 4 * centre))
 
 
 def _render(scene: bpy.types.Scene, frame: int, folder: Path) -> Path:
-    """A frame as a file; an animation of it alone, because a still of another scene is always its first."""
+    """Render a frame to a file, as an animation: stills of an inactive scene always show its first frame."""
     scene.frame_start = scene.frame_end = frame
     scene.render.filepath = str(folder / "frame_######")
     path = folder / f"frame_{frame:06d}.png"
     if bpy.ops.render.render(animation=True, scene=scene.name) != {"FINISHED"} or not path.is_file():
-        raise LodgsError(f"Frame {frame} of the video could not be written.", "Free some space there.")
+        raise LodgsError(f"Cannot write frame {frame} of the video to {folder}.", "Free some disk space.")
     return path
 
 
-def _light(path: Path) -> np.ndarray:
-    """The green of a picture, (H, W) float32."""
+def _green_channel(path: Path) -> np.ndarray:
+    """Load the green channel of an image, (H, W) float32."""
     image = bpy.data.images.load(str(path))
     try:
         width, height = tuple(image.size)
@@ -92,14 +98,14 @@ def _light(path: Path) -> np.ndarray:
 
 
 @contextmanager
-def _reading(video: Path) -> Iterator[tuple[bpy.types.Scene, int]]:
-    """A scene of the video's size, whose frames are the video's, and how many these are."""
+def _open_video(video: Path) -> Iterator[tuple[bpy.types.Scene, int]]:
+    """Yield a temporary scene that renders the frames of a video, and their number."""
     scene = bpy.data.scenes.new("video")
     try:
         strip = compat.strips(scene).new_movie("video", str(video), channel=1, frame_start=1)
         element = strip.elements[0] if strip.elements else None
         if element is None or not (element.orig_width and element.orig_height) or strip.frame_duration < 2:
-            raise LodgsError(f"{video} cannot be read as a video.", "Choose another file.")
+            raise LodgsError(f"Cannot read {video} as a video.", "Choose another file.")
         render = scene.render
         render.resolution_x, render.resolution_y = element.orig_width, element.orig_height
         render.resolution_percentage = 100

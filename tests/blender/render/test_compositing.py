@@ -10,9 +10,9 @@ def test_depth_of_an_unsaved_file_lies_where_nobody_else_can_put_something(bpy, 
     monkeypatch.setattr(compositing.tempfile, "tempdir", str(tmp_path))
     without = SimpleNamespace(app=SimpleNamespace(tempdir=""), data=bpy.data, path=bpy.path)
     monkeypatch.setattr(compositing, "bpy", without)
-    compositing._own_folder.cache_clear()
-    found = compositing.depth_files(scene)
+    compositing._temporary_folder.cache_clear()
+    found = compositing.depth_file_pattern(scene)
     (own,) = tmp_path.iterdir()
-    assert found.is_relative_to(own) and found == compositing.depth_files(scene)
+    assert found.is_relative_to(own) and found == compositing.depth_file_pattern(scene)
     assert stat.S_IMODE(own.stat().st_mode) == 0o700
-    compositing._own_folder.cache_clear()
+    compositing._temporary_folder.cache_clear()

@@ -36,7 +36,7 @@ def test_frames_show_what_is_left(bpy, lodgs, camera, tmp_path, name, mode):
         root.location, root.rotation_euler = (1, 2, 0), (0.1, 0.2, 0.7)
         bpy.context.view_layer.update()
         depsgraph = bpy.context.evaluated_depsgraph_get()
-        planes = engine.frame(depsgraph, 96, 64, (0, 0, 96, 64)).planes
+        planes = engine.render_frame(depsgraph, 96, 64, (0, 0, 96, 64)).planes
         return np.stack([planes[f"Combined.{channel}"] for channel in "RGB"], axis=2)
 
     root = importing.import_splats(bpy.context, tmp_path / "in.ply", upright=False)
@@ -66,7 +66,7 @@ def test_a_tree_that_is_read_from_its_file_is_cropped(bpy, lodgs, camera, tmp_pa
         root.lodgs.controls.pixels = 0.1  # leaves
         bpy.context.view_layer.update()
         depsgraph = bpy.context.evaluated_depsgraph_get()
-        planes = engine.frame(depsgraph, 96, 64, (0, 0, 96, 64)).planes
+        planes = engine.render_frame(depsgraph, 96, 64, (0, 0, 96, 64)).planes
         return np.stack([planes[f"Combined.{channel}"] for channel in "RGB"], axis=2)
 
     pictures = []

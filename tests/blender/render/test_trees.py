@@ -35,7 +35,7 @@ def frame(bpy, lodgs):
         root.location, root.scale, root.rotation_euler = (0.3, 0.2, -1), (1.2,) * 3, (0.1, 0.2, 0.7)
         bpy.context.view_layer.update()
         depsgraph = bpy.context.evaluated_depsgraph_get()
-        planes = lodgs("render.engine").frame(depsgraph, 160, 120, (0, 0, 160, 120)).planes
+        planes = lodgs("render.engine").render_frame(depsgraph, 160, 120, (0, 0, 160, 120)).planes
         return np.stack([planes[f"Combined.{channel}"] for channel in "RGB"], axis=2)
 
     return drawn
@@ -88,11 +88,15 @@ def test_viewport_quality_waits_for_what_it_needs(bpy, lodgs, path, camera, fram
     for budget in (16_000, 0):
         root = lodgs("data.importing").import_splats(bpy.context, path, budget=budget)
         frame(root, 20.0)
-        lodgs("render.quick").render(bpy.context)
+        lodgs("render.viewport_quality").render(bpy.context)
         if budget:
             assert views.stream(root).ready and views.stream(root).splats <= budget
         depsgraph = bpy.context.evaluated_depsgraph_get()
-        drawn = lodgs("render.quick")._frame(depsgraph, 160, 120, (0, 0, 160, 120), lambda *_: True).planes
+        drawn = (
+            lodgs("render.viewport_quality")
+            ._render_frame(depsgraph, 160, 120, (0, 0, 160, 120), lambda *_: True)
+            .planes
+        )
         pictures.append(np.stack([drawn[f"Combined.{channel}"] for channel in "RGB"], axis=2))
         views.clear()
         views.close_streams()

@@ -25,7 +25,9 @@ def blurred(pixels: np.ndarray) -> np.ndarray:
 def drawn() -> list[np.ndarray]:
     """Twelve frames of a walk along EYES; some are blurred."""
     along = np.linspace(0, len(CAMERA_POSITIONS) - 1, 12)
-    eyes = np.stack([np.interp(along, range(len(CAMERA_POSITIONS)), column) for column in CAMERA_POSITIONS.T], axis=1)
+    eyes = np.stack(
+        [np.interp(along, range(len(CAMERA_POSITIONS)), column) for column in CAMERA_POSITIONS.T], axis=1
+    )
     frames = [render_photo(eye) for eye in eyes]
     return [blurred(frame) if number in BLURRED else frame for number, frame in enumerate(frames)]
 

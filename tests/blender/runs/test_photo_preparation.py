@@ -101,7 +101,7 @@ def test_distorted_scene_shows_undistorted_photos(bpy, lodgs, distorted):
             assert background.image.filepath == str(camera.image)
             assert tuple(background.image.size) == (camera.width, camera.height)
         assert root.lodgs.scene_folder == str(distorted)
-        assert len(lodgs("render.compare").measurable(root)) == 3
+        assert len(lodgs("render.compare").measurable_views(root)) == 3
         first = straight.cameras[0]
         assert bpy.context.scene.render.resolution_x == first.width
         bpy.ops.lodgs.remove_scene()
